@@ -16,7 +16,7 @@ from brainbench.core.errors import DataError
 from brainbench.core.files import to_plain
 from brainbench.core.records import ResultRecord, Score
 from leaderboards.audit import TOLERANCE
-from leaderboards.ranking import rank
+from leaderboards.boards import rank
 from leaderboards.store import StoredRecord, read_records
 
 RECORDS_ZIP = Path("data", "records.zip")
@@ -143,12 +143,11 @@ def _by_model(stored: Iterable[StoredRecord]) -> dict[tuple[Any, ...], dict[str,
     found: dict[tuple[Any, ...], dict[str, _Placed]] = defaultdict(dict)
     for board in rank(item.record for item in stored if item.record is not None):
         label = f"{board.recordings}, {board.metric or 'metric not stated'}, {board.estimator}"
-        for row in board.rows:
-            seed = row.record.card.seed if row.record.card else None
-            name = row.record.score.name
-            shown = f"{name} (seed {seed})" if seed is not None else name
-            key = (name, seed, board.recordings, board.metric, board.estimator, board.time)
-            found[key][row.record.identity] = _Placed(row.record, label, shown, row.rank)
+        for entry, record in ((one, record) for one in board.entries for record in one.records):
+            seed = record.card.seed if record.card else None
+            shown = f"{entry.name} (seed {seed})" if seed is not None else entry.name
+            key = (entry.name, seed, board.recordings, board.metric, board.estimator, board.time)
+            found[key][record.identity] = _Placed(record, label, shown, entry.rank)
     return found
 
 

@@ -4,17 +4,22 @@ from __future__ import annotations
 
 import json
 import math
+import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import fields
 from typing import Any
 
 from brainbench.core.records import Interval, ModelCard, ResultRecord, Score
+from leaderboards.entries import Standing, not_repeatable
 
-STATUS = {
-    "ok": "The recordings are reliable enough to trust this number.",
+STANDING: dict[Standing, str] = {
+    "above raw input": "Told apart from chance, and above the raw input of the models.",
+    "above chance": "Told apart from chance, but not above the raw input of the models.",
+    "not told apart from chance": "A model that knows nothing of these stimuli could score as high.",
     "unreliable": "Computed, but not to be trusted: the data are too noisy or too few.",
     "undefined": "No number exists.",
 }
+"""The ladder of words that every page uses, with their meaning."""
 
 SYNTHETIC = "Synthetic demo recordings: ranks say nothing about brains."
 
@@ -137,20 +142,18 @@ def card_rows(card: ModelCard) -> list[tuple[str, str]]:
     return rows
 
 
-def loading(record: ResultRecord) -> str:
-    """Return three lines of Python that load the model."""
-    card = record.card
-    name = record.score.name
-    if card is None or card.family in ("features computed elsewhere", ""):
-        return f"# {name}: activations that were computed elsewhere; the record names no model to load."
-    if card.family == "user module":
-        path = record.score.provenance.settings.get("model")
-        shown = path if isinstance(path, str) else name
-        made = f"model = load_user_model({shown!r}, seed={card.seed or 0})"
-        return f"from brainbench.models.user_models import load_user_model\n\n{made}"
-    seed = f", seed={card.seed}" if card.seed and card.objective == "untrained" else ""
-    made = f"model = brainbench.load_model({name!r}{seed})"
-    return f"import brainbench\n\n{made}  # [B, T, 30, 5, 7] in N and N·m → [B, classes]"
+def ways_to_get(record: ResultRecord) -> list[str]:
+    """Return the command that scores the model and the Python that loads it; nothing where nobody here can.
+
+    >>> ways_to_get(ResultRecord(Score("s4-small", 0.5, "ok"), card=ModelCard("s4-small", family="s4", seed=2)))
+    ['brainbench score s4-small --weights-seed 2', 'brainbench.load_model("s4-small", seed=2)']
+    """
+    card, name = record.card, record.score.name
+    if card is None or not_repeatable(record) or card.family == "policy":
+        return []
+    drawn = card.seed if card.seed and card.objective in (None, "untrained") else 0
+    flag, argument = (f" --weights-seed {drawn}", f", seed={drawn}") if drawn else ("", "")
+    return [f"brainbench score {shlex.quote(name)}{flag}", f"brainbench.load_model({json.dumps(name)}{argument})"]
 
 
 def training_rows(card: ModelCard) -> list[tuple[str, str]]:

@@ -1,7 +1,7 @@
 """Reports for a paper's supplement: methods, tables, vector figures and citations, as Markdown, HTML or PDF.
 
 Everything is said by the records. Figures are the SVG drawings of the site (:mod:`leaderboards.figures.charts`); PDF is
-printed by a Chromium browser where one is found, else by WeasyPrint (extra ``board``): both keep them vectors.
+made from the HTML by WeasyPrint (extra ``board``), which keeps them vectors.
 """
 
 from __future__ import annotations
@@ -12,22 +12,27 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from brainbench.core.errors import DataError, unknown_name
-from brainbench.core.files import write_text
+from brainbench.core.errors import DataError, missing_dependency, unknown_name
+from brainbench.core.files import atomic_path, write_text
 from brainbench.core.records import ResultRecord
 from leaderboards import text as words
-from leaderboards.entries import Entry, entries_of
+from leaderboards.boards import Board, rank
+from leaderboards.conclusions import conclusions
+from leaderboards.entries import Entry
 from leaderboards.figures.architecture import diagram
-from leaderboards.figures.charts import Figure, board_figures, layers_of
+from leaderboards.figures.charts import Figure, board_figures
+from leaderboards.figures.record import layers
 from leaderboards.figures.svg import STYLE, standalone
-from leaderboards.ranking import Board, rank
 from leaderboards.report.citations import Reference, references
-from leaderboards.report.pdf import html_to_pdf
 from leaderboards.site.page import render
 from leaderboards.store import StoredRecord
 
 FORMATS = ("md", "html", "pdf")
-_WORDY = ("model", "baseline", "animal", "statement", "value", "layer", "status")
+_WORDY = ("model", "baseline", "animal", "statement", "stated", "layer", "standing")
+RANKS = (
+    " Models were told apart by a paired t test over animals and stimuli on scores scaled between chance and all that "
+    "is reliable, at a false discovery rate of 5 % over all pairs; models that are not told apart share ranks."
+)
 
 
 @dataclass(frozen=True)
@@ -50,6 +55,7 @@ class Section:
 
     title: str
     methods: str
+    conclusions: tuple[str, ...]
     tables: tuple[PaperTable, ...]
     figures: tuple[Figure, ...]
     absent: tuple[Figure, ...]
@@ -89,7 +95,7 @@ def write_paper(
     Raises:
         UsageError: there is no such format.
         DataError: there is no usable record.
-        MissingDependencyError: neither Chromium nor WeasyPrint is there to make a PDF.
+        MissingDependencyError: WeasyPrint, which makes PDF, is not installed.
     """
     path = Path(path)
     kind = format or path.suffix.removeprefix(".").lower()
@@ -106,7 +112,7 @@ def write_paper(
     text = render("paper.html.j2", paper=paper, drawn=_inline)
     if kind == "html":
         return [write_text(path, text), bib]
-    html_to_pdf(text, path)
+    _write_pdf(text, path)
     return [path, bib]
 
 
@@ -123,14 +129,30 @@ def make_paper(records: Sequence[ResultRecord], title: str) -> Paper:
     )
 
 
-def board_methods(board: Board, entries: Sequence[Entry]) -> str:
+def _write_pdf(text: str, path: Path) -> None:
+    """Print a page that needs nothing from elsewhere."""
+    try:
+        import weasyprint  # pyright: ignore[reportMissingImports]
+    except (ImportError, OSError) as error:  # OSError: its system libraries are missing
+        purpose = f"Writing PDF (or write {path.with_suffix('.html').name} and print it from a browser)"
+        raise missing_dependency("weasyprint", extra="board", purpose=purpose) from error
+
+    def refuse(url: str, *_: object, **__: object) -> dict[str, object]:
+        raise ValueError(f"A report loads nothing from elsewhere; asked for {url}.")
+
+    with atomic_path(path) as temporary:
+        weasyprint.HTML(string=text, url_fetcher=refuse).write_pdf(temporary)
+
+
+def board_methods(board: Board) -> str:
     """Return a paragraph for a paper's methods section, made only of what the records state."""
+    entries, recorded = board.entries, [record for entry in board.entries for record in entry.records]
     score = max(entries, key=lambda entry: len(entry.score.layers)).score
-    if len(board.rows) == 1:
-        return words.methods(board.rows[0].record)
+    if len(recorded) == 1:
+        return words.methods(recorded[0])
     seeds = max(entry.seeds for entry in entries)
     fidelity = score.provenance.settings.get("fidelity")
-    models, records = words.plural(len(entries), "model"), words.plural(len(board.rows), "record")
+    models, records = words.plural(len(entries), "model"), words.plural(len(recorded), "record")
     animals, shown = words.plural(len(score.subjects), "animal"), len(board.conditions)
     text = (
         f"{models} ({records}) were compared with {board.recordings} ({animals}, "
@@ -143,23 +165,22 @@ def board_methods(board: Board, entries: Sequence[Entry]) -> str:
     text += words.stated("Interval of a record", words.level(score.interval) if score.interval else "")
     if seeds > 1:
         text += (
-            f" Untrained networks were drawn from up to {seeds} seeds; their score is the mean over seeds, "
-            "their interval joins the t intervals over animals and over seeds in squares, and the spread is the "
-            "standard deviation over seeds."
+            f" Untrained networks were drawn from up to {seeds} seeds; their score is the mean over seeds, the "
+            "variance over seeds is part of their interval, and the spread is the standard deviation over seeds."
         )
     # The mean under permutation is one record's own.
     text += words.stated("Significance", re.sub(r"; mean score under permutation [−\-.\d]+", "", score.p_method))
     text += words.stated("Noise ceiling", score.ceiling.method if score.ceiling else "")
-    text += f" Ranks are ranges. {board.ties}"
+    text += RANKS
     hashes = f" Hash of the recordings {board.recordings_hash}." if board.recordings_hash else ""
     hashes += f" Hash of the stimuli {board.stimuli_hash}." if board.stimuli_hash else ""
-    versions = sorted({row.record.score.provenance.version for row in board.rows})
+    versions = sorted({record.score.provenance.version for record in recorded})
     return text + words.made_by(versions, synthetic=board.synthetic, hashes=hashes)
 
 
 def _section(board: Board) -> Section:
-    entries = entries_of(board)
-    figures = board_figures(board, entries)
+    entries = board.entries
+    figures = board_figures(board)
     if len(entries) == 1:
         figures = _single(entries[0]) + [figure for figure in figures if figure.key in ("fit", "rdms")]
     tables = [_models(entries), _baselines(board)]
@@ -167,7 +188,8 @@ def _section(board: Board) -> Section:
         tables += [_animals(entries[0]), _card(entries[0])]
     return Section(
         f"{board.recordings}, {board.metric or 'metric not stated'}, {board.estimator}",
-        board_methods(board, entries),
+        board_methods(board),
+        tuple(conclusions(board)),
         tuple(table for table in tables if table.rows),
         tuple(figure for figure in figures if figure.drawing is not None),
         tuple(figure for figure in figures if figure.drawing is None),
@@ -175,54 +197,54 @@ def _section(board: Board) -> Section:
 
 
 def _single(entry: Entry) -> list[Figure]:
-    graph, layers = entry.card.graph, layers_of(entry)
+    graph, drawn = entry.card.graph, layers(entry.records)
     found = []
     if graph is not None:
         caption = "Solid arrows act within the stream, dashed ones are feedback."
         found.append(Figure("architecture", f"Architecture of {entry.name}", caption, diagram(graph, entry.name)))
-    if layers is not None:
+    if drawn is not None:
         caption = "Score of each layer; filled is the layer chosen on held-out data. For reading only."
-        found.append(Figure("layers", "Layers", caption, layers))
+        found.append(Figure("layers", "Layers", caption, drawn))
     return found
 
 
 def _models(entries: Sequence[Entry]) -> PaperTable:
-    columns = ("model", "rank", "score", "interval", "spread", "p", "raw r", "layer", "parameters", "top-1", "status")
     rows = [
-        (
-            entry.name,
-            entry.rank,
-            words.number(entry.value),
-            words.span(entry.interval),
-            words.number(entry.spread) if entry.seeds > 1 else "",
-            words.probability(entry.p),
-            words.number(entry.r),
-            entry.score.layer or "",
-            words.count(entry.card.parameters),
-            "" if entry.card.top1 is None else words.number(entry.card.top1),
-            entry.status,
-        )
+        {
+            "model": entry.name,
+            "rank": "" if entry.first is None else entry.rank,
+            "score": words.number(entry.scaled),
+            "interval": words.span(entry.interval),
+            "spread": words.number(entry.spread) if entry.seeds > 1 else "",
+            "p": words.probability(entry.p),
+            "value": words.number(entry.value),
+            "raw r": words.number(entry.r),
+            "layer": entry.score.layer or "",
+            "parameters": words.count(entry.card.parameters),
+            "top-1": "" if entry.card.top1 is None else words.number(entry.card.top1),
+            "standing": entry.standing + (f", same computation as {entry.same_as}" if entry.same_as else ""),
+        }
         for entry in entries
     ]
-    used = [i for i in range(len(columns)) if any(row[i] for row in rows)]
-    kept = tuple(tuple(row[i] for i in used) for row in rows)
-    return PaperTable("Models, best first.", tuple(columns[i] for i in used), kept)
+    used = tuple(name for name in rows[0] if any(row[name] for row in rows))
+    caption = "Models, best first; the score is 0 at chance and 1 at all that is reliable."
+    return PaperTable(caption, used, tuple(tuple(row[name] for name in used) for row in rows))
 
 
 def _baselines(board: Board) -> PaperTable:
     rows = [
-        (item.name, words.number(item.score.value), words.span(item.score.interval), item.score.status)
+        (item.name, *map(words.number, (item.score.scaled, item.score.value)), words.span(item.score.scaled_interval))
         for item in board.baselines
     ]
-    return PaperTable("Baselines and animal-to-animal.", ("baseline", "score", "interval", "status"), tuple(rows))
+    return PaperTable("Baselines and animal-to-animal.", ("baseline", "score", "value", "interval"), tuple(rows))
 
 
 def _animals(entry: Entry) -> PaperTable:
-    columns = ("animal", "score", "raw r", "reliability", "units", "trials", "layer", "status")
+    columns = ("animal", "value", "raw r", "reliability", "units", "trials", "layer")
     rows = [
         (
             item.subject, words.number(item.value), words.number(item.r), words.number(item.reliability, 2),
-            words.count(item.units), words.count(item.trials), item.layer or "", item.status,
+            words.count(item.units), words.count(item.trials), item.layer or "",
         )
         for item in entry.score.subjects
     ]  # fmt: skip
@@ -231,7 +253,7 @@ def _animals(entry: Entry) -> PaperTable:
 
 def _card(entry: Entry) -> PaperTable:
     rows = (*words.card_rows(entry.card), *words.training_rows(entry.card))
-    return PaperTable("The model.", ("statement", "value"), tuple(rows))
+    return PaperTable("The model.", ("statement", "stated"), tuple(rows))
 
 
 def _inline(figure: Figure) -> str:
@@ -258,6 +280,7 @@ def _markdown(paper: Paper, path: Path) -> str:
     blocks += [f"> **{words.SYNTHETIC}**"] if paper.synthetic else []
     for place, section in enumerate(paper.sections, start=1):
         blocks += [f"## {_escape(section.title)}", "### Methods", _escape(section.methods), "### Results"]
+        blocks += ["\n".join(f"- {_escape(text)}" for text in section.conclusions)]
         for table in section.tables:
             blocks += [_escape(table.caption), _rows(table)]
         for figure in section.figures:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from brainbench.core.files import to_plain
 from leaderboards import text as words
-from leaderboards.figures import marks
+from leaderboards.figures.rdms import colour_stops
 
 if TYPE_CHECKING:
     from jinja2 import Environment
@@ -61,11 +61,10 @@ def _environment() -> Environment:
     for helper in (words.number, words.probability, words.count, words.span, words.level):
         environment.filters[helper.__name__] = helper
     environment.globals |= {
-        "STATUS": words.STATUS,
-        "MARGIN": marks.MARGIN,
+        "STANDING": words.STANDING,
         "SYNTHETIC": words.SYNTHETIC,
         "p_sentence": words.p_sentence,
-        "colour_stops": marks.colour_stops(),
+        "colour_stops": colour_stops(),
     }
     return environment
 
