@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import fields
@@ -94,33 +95,42 @@ def p_sentence(score: Score) -> str:
     return "; ".join(parts)
 
 
-def stated(label: str, value: str) -> str:
-    """Return a sentence that says a value, empty without one."""
-    return f" {label}: {value}." if value else ""
-
-
-def methods(record: ResultRecord) -> str:
-    """Return a paragraph for a paper's methods section, made only of what the record states."""
-    score, origin = record.score, record.score.provenance
-    return (
-        f"The model {score.name} was compared with {origin.recordings_name} "
-        f"({plural(len(score.subjects), 'animal')}, {plural(len(score.stimuli), 'stimulus', 'stimuli')}) "
-        f"by representational similarity analysis{f' ({score.metric})' if score.metric else ''}, "
-        f"with noise correction by the estimator '{score.estimator}'."
-        + stated("Time axis", origin.time_rule)
-        + stated("Layer", score.layer_rule)
-        + stated("Interval", level(score.interval) if score.interval else "")
-        + stated("Significance", score.p_method)
-        + stated("Noise ceiling", score.ceiling.method if score.ceiling else "")
-        + made_by([origin.version], synthetic=record.synthetic)
+def methods(records: Sequence[ResultRecord]) -> str:
+    """Return a paragraph for a paper's methods section, made only of what the records of one board state."""
+    score, names = records[0].score, list(dict.fromkeys(record.score.name for record in records))
+    origin, many = score.provenance, f"{plural(len(names), 'model')} ({plural(len(records), 'record')}) were"
+    text = (
+        f"{many if len(names) > 1 else f'The model {names[0]} was'} compared with {origin.recordings_name} "
+        f"({plural(len(score.subjects), 'animal')}, {plural(len(score.stimuli), 'stimulus', 'stimuli')})"
+        f"{f' by {score.metric}' if score.metric else ''}, with noise correction by the estimator '{score.estimator}'."
     )
-
-
-def made_by(versions: Sequence[str], *, synthetic: bool, hashes: str = "") -> str:
-    """Return the end of a methods paragraph: versions of this package, hashes, and whether brains were recorded."""
-    named = ", ".join(filter(None, versions))
-    text = f" Computed with brainbench {named}." if named else ""
-    return text + hashes + (" The recordings are synthetic: the result says nothing about brains." if synthetic else "")
+    stated = {
+        "Stimuli": origin.stimuli_name.rstrip("."),
+        "Fidelity of the simulation": str(origin.settings.get("fidelity") or ""),
+        "Time axis": origin.time_rule,
+        "Layer": score.layer_rule,
+        "Interval": level(score.interval) if score.interval else "",
+        # The mean under permutation is one record's own.
+        "Significance": re.sub(r"; mean score under permutation [−\-.\d]+", "", score.p_method),
+        "Noise ceiling": score.ceiling.method if score.ceiling else "",
+    }
+    text += "".join(f" {label}: {value}." for label, value in stated.items() if value)
+    if len(names) < len(records):
+        text += (
+            " Networks that differ in the seed of their weights are one model: its score is the mean over seeds, the "
+            "variance over seeds is part of its interval, the spread is the standard deviation over seeds."
+        )
+    if len(names) > 1:
+        text += (
+            " Models were told apart by a paired t test over animals and stimuli on scores scaled between chance and "
+            "all that is reliable, at a false discovery rate of 5 % over all pairs; models that are not told apart "
+            "share ranks."
+        )
+    versions = filter(None, sorted({record.score.provenance.version for record in records}))
+    text += f" Computed with brainbench {', '.join(versions)}." if origin.version else ""
+    hashes = {"recordings": origin.recordings_hash, "stimuli": origin.stimuli_hash}
+    text += "".join(f" Hash of the {what} {found}." for what, found in hashes.items() if found)
+    return text + (f" {SYNTHETIC}" if records[0].synthetic else "")
 
 
 def card_rows(card: ModelCard) -> list[tuple[str, str]]:
@@ -166,16 +176,6 @@ def training_rows(card: ModelCard) -> list[tuple[str, str]]:
         if key not in ("augmentation", "objective")
     ]
     rows += [("untrained twin", card.twin)] if stated and card.twin else []
-    return [(label, text) for label, text in rows if text]
-
-
-def accuracy_rows(card: ModelCard) -> list[tuple[str, str]]:
-    """Return what the card says of the accuracy on held-out objects, as label and text."""
-    rows = [("top-1", number(card.top1)), ("interval", span(card.accuracy_interval))]
-    rows += [("top-5", number(card.top5))] if card.top5 is not None else []
-    if card.twin_top1 is not None:
-        rows.append(("untrained twin, top-1", f"{number(card.twin_top1)} {span(card.twin_interval)}".strip()))
-    rows += [("data (hash)", card.accuracy_data or ""), ("collapsed", "yes" if card.collapsed else "no")]
     return [(label, text) for label, text in rows if text]
 
 

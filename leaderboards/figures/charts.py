@@ -15,7 +15,6 @@ from leaderboards.entries import Entry, twins
 from leaderboards.figures.plots import (
     SHOWN,
     WIDTH,
-    ChartBar,
     ChartPoint,
     ChartRow,
     Figure,
@@ -175,20 +174,19 @@ def accuracy(entries: Sequence[Entry]) -> Figure:
     rows = []
     for entry, twin in zip(models, found, strict=True):
         kind, card = colour[_objective(entry)], entry.card
-        bars = [ChartBar(twin, -6, 4, f"{kind} faint", f"untrained twin {number(twin)}")] if twin is not None else []
-        bars.append(ChartBar(card.top1 or 0, -2, 8, kind, f"{entry.name}: top-1 {number(card.top1)}"))
-        top5 = (
-            ()
-            if card.top5 is None
-            else (ChartPoint(card.top5, f"{kind} open", f"top-5 {number(card.top5)}", 3.2, "diamond"),)
+        marks = (
+            (twin, "c0 open", f"untrained twin {number(twin)}", 3.5, "dot"),
+            (card.top5, f"{kind} open", f"top-5 {number(card.top5)}", 3.5, "diamond"),
+            (card.top1, kind, f"{entry.name}: top-1 {number(card.top1)}", 4.5, "dot"),
         )
-        rows.append(ChartRow(cut_name(entry.name, 36), top5, card.accuracy_interval, "line", bars=bars, drop=2))
+        points = [ChartPoint(value, *rest) for value, *rest in marks if value is not None]
+        rows.append(ChartRow(cut_name(entry.name, 36), points, card.accuracy_interval, kind))
     reach = max(0.05, *(max(e.card.top1 or 0, e.card.top5 or 0, e.card.twin_top1 or 0) for e in models))
     scale = Scale(0.0, min(1.0, reach * 1.05), 250, WIDTH - 20)
     drawing = row_chart(f"{title}: {len(models)} models", rows, scale, "accuracy on held-out objects")
     lack = " No record states the accuracy of an untrained twin." if set(found) == {None} else ""
     caption = (
-        f"Top-1 accuracy (bar, Wilson interval) and top-5 (diamond). The thin bar is the untrained twin's.{lack} "
+        f"Top-1 accuracy with its Wilson interval, top-5 (diamond) and the untrained twin's top-1 (hollow grey).{lack} "
         f"{legend_words(colour)}{cut_words(len(stated))}"
     )
     return Figure(key, title, caption, drawing)

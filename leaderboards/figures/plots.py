@@ -161,19 +161,8 @@ class ChartPoint:
 
 
 @dataclass(frozen=True)
-class ChartBar:
-    """A bar from the axis' start to a value; ``top`` and ``height`` in pixels from the row's middle."""
-
-    value: float
-    top: float
-    height: float
-    kind: str
-    tip: str
-
-
-@dataclass(frozen=True)
 class ChartRow:
-    """One row of a chart: a label, bars, an interval and marks, drawn in this order."""
+    """One row of a chart: a label, an interval and marks, drawn in this order."""
 
     label: str
     points: Sequence[ChartPoint]
@@ -183,9 +172,6 @@ class ChartRow:
     label_kind: str = "end"
     group: str | None = None
     """Heading of the rows that begin here, at the left edge."""
-    bars: Sequence[ChartBar] = ()
-    drop: float = 0.0
-    """Distance of interval and marks below the row's middle [px]."""
 
 
 def row_chart(
@@ -213,10 +199,6 @@ def row_chart(
         if row.group is not None:
             drawing.text(6, y + 4, row.group, "title small")
         drawing.text(scale.start - 8, y + 4, row.label, row.label_kind)
-        for bar in row.bars:
-            length = scale.at(bar.value) - scale.start
-            drawing.rect(scale.start, y + bar.top, length, bar.height, bar.kind, tip=bar.tip)
-        y += row.drop
         if ends := interval_ends(row.interval):
             left, right = map(scale.at, ends)
             drawing.line(left, y, right, y, f"span {row.kind}")

@@ -7,10 +7,10 @@ made from the HTML by WeasyPrint (extra ``board``), which keeps them vectors.
 from __future__ import annotations
 
 import os
-import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from brainbench.core.errors import DataError, missing_dependency, unknown_name
 from brainbench.core.files import atomic_path, write_text
@@ -23,16 +23,13 @@ from leaderboards.figures.architecture import diagram
 from leaderboards.figures.charts import Figure, board_figures
 from leaderboards.figures.record import layers
 from leaderboards.figures.svg import STYLE, standalone
-from leaderboards.report.citations import Reference, references
-from leaderboards.site.page import render
+from leaderboards.report.citations import references
+from leaderboards.site.page import render, render_markdown
+from leaderboards.site.table import board_label
 from leaderboards.store import StoredRecord
 
 FORMATS = ("md", "html", "pdf")
 _WORDY = ("model", "baseline", "animal", "statement", "stated", "layer", "standing")
-RANKS = (
-    " Models were told apart by a paired t test over animals and stimuli on scores scaled between chance and all that "
-    "is reliable, at a false discovery rate of 5 % over all pairs; models that are not told apart share ranks."
-)
 
 
 @dataclass(frozen=True)
@@ -47,31 +44,6 @@ class PaperTable:
     def numbers(self) -> tuple[bool, ...]:
         """True for each column of numbers, which are set flush right."""
         return tuple(name not in _WORDY for name in self.columns)
-
-
-@dataclass(frozen=True)
-class Section:
-    """One board of a report."""
-
-    title: str
-    methods: str
-    conclusions: tuple[str, ...]
-    tables: tuple[PaperTable, ...]
-    figures: tuple[Figure, ...]
-    absent: tuple[Figure, ...]
-    """Figures that the records cannot fill."""
-
-
-@dataclass(frozen=True)
-class Paper:
-    """A report before it has a format."""
-
-    title: str
-    synthetic: bool
-    sections: tuple[Section, ...]
-    references: tuple[Reference, ...]
-    commands: tuple[str, ...]
-    """Command lines that make the records again."""
 
 
 def write_paper(
@@ -105,28 +77,26 @@ def write_paper(
     usable = [record for record in found if record is not None]
     if not usable:
         raise DataError("There are no usable result records for a report; make one with: brainbench score MODEL")
-    paper = make_paper(usable, title)
-    bib = write_text(path.with_suffix(".bib"), "\n\n".join(item.bibtex for item in paper.references) + "\n")
+    boards = rank(usable)
+    cited = references(usable)
+    bib = write_text(path.with_suffix(".bib"), "\n\n".join(item.bibtex for item in cited) + "\n")
+    paper = {
+        "title": title,
+        "synthetic": any(board.synthetic for board in boards),
+        "sections": [_section(board, place, path) for place, board in enumerate(boards, start=1)],
+        "references": cited,
+        "commands": list(dict.fromkeys(text for record in usable if (text := record.score.provenance.command))),
+        "bib": bib.name,
+    }
     if kind == "md":
-        return [write_text(path, _markdown(paper, path)), bib, *_write_figures(paper, path)]
-    text = render("paper.html.j2", paper=paper, drawn=_inline)
+        drawn = [figure for section in paper["sections"] for figure in section["figures"]]
+        files = [write_text(place, standalone(figure.drawing)) for figure, place in drawn]
+        return [write_text(path, render_markdown("paper.md.j2", **paper)), bib, *files]
+    text = render("paper.html.j2", **paper, style_of_figures=STYLE)
     if kind == "html":
         return [write_text(path, text), bib]
     _write_pdf(text, path)
     return [path, bib]
-
-
-def make_paper(records: Sequence[ResultRecord], title: str) -> Paper:
-    """Return the report of records, board by board."""
-    boards = rank(records)
-    commands = dict.fromkeys(text for record in records if (text := record.score.provenance.command))
-    return Paper(
-        title,
-        any(board.synthetic for board in boards),
-        tuple(_section(board) for board in boards),
-        tuple(references(records)),
-        tuple(commands),
-    )
 
 
 def _write_pdf(text: str, path: Path) -> None:
@@ -144,56 +114,24 @@ def _write_pdf(text: str, path: Path) -> None:
         weasyprint.HTML(string=text, url_fetcher=refuse).write_pdf(temporary)
 
 
-def board_methods(board: Board) -> str:
-    """Return a paragraph for a paper's methods section, made only of what the records state."""
-    entries, recorded = board.entries, [record for entry in board.entries for record in entry.records]
-    score = max(entries, key=lambda entry: len(entry.score.layers)).score
-    if len(recorded) == 1:
-        return words.methods(recorded[0])
-    seeds = max(entry.seeds for entry in entries)
-    fidelity = score.provenance.settings.get("fidelity")
-    models, records = words.plural(len(entries), "model"), words.plural(len(recorded), "record")
-    animals, shown = words.plural(len(score.subjects), "animal"), len(board.conditions)
-    text = (
-        f"{models} ({records}) were compared with {board.recordings} ({animals}, "
-        f"{words.plural(shown, 'stimulus', 'stimuli')}){f' by {board.metric}' if board.metric else ''}, "
-        f"with noise correction by the estimator '{board.estimator}'."
-    )
-    text += words.stated("Stimuli", board.stimuli.rstrip("."))
-    text += f" They were simulated at the fidelity '{fidelity}'." if isinstance(fidelity, str) else ""
-    text += words.stated("Time axis", board.time) + words.stated("Layer", score.layer_rule)
-    text += words.stated("Interval of a record", words.level(score.interval) if score.interval else "")
-    if seeds > 1:
-        text += (
-            f" Untrained networks were drawn from up to {seeds} seeds; their score is the mean over seeds, the "
-            "variance over seeds is part of their interval, and the spread is the standard deviation over seeds."
-        )
-    # The mean under permutation is one record's own.
-    text += words.stated("Significance", re.sub(r"; mean score under permutation [−\-.\d]+", "", score.p_method))
-    text += words.stated("Noise ceiling", score.ceiling.method if score.ceiling else "")
-    text += RANKS
-    hashes = f" Hash of the recordings {board.recordings_hash}." if board.recordings_hash else ""
-    hashes += f" Hash of the stimuli {board.stimuli_hash}." if board.stimuli_hash else ""
-    versions = sorted({record.score.provenance.version for record in recorded})
-    return text + words.made_by(versions, synthetic=board.synthetic, hashes=hashes)
-
-
-def _section(board: Board) -> Section:
-    entries = board.entries
-    figures = board_figures(board)
+def _section(board: Board, place: int, path: Path) -> dict[str, Any]:
+    """Return what the templates show of one board; each figure with the file that Markdown brings along."""
+    entries, figures = board.entries, board_figures(board)
     if len(entries) == 1:
         figures = _single(entries[0]) + [figure for figure in figures if figure.key in ("fit", "rdms")]
     tables = [_models(entries), _baselines(board)]
     if len(entries) == 1:
         tables += [_animals(entries[0]), _card(entries[0])]
-    return Section(
-        f"{board.recordings}, {board.metric or 'metric not stated'}, {board.estimator}",
-        board_methods(board),
-        tuple(conclusions(board)),
-        tuple(table for table in tables if table.rows),
-        tuple(figure for figure in figures if figure.drawing is not None),
-        tuple(figure for figure in figures if figure.drawing is None),
-    )
+    folder = path.with_name(f"{path.stem}-figures")
+    return {
+        "title": board_label(board),
+        "methods": words.methods([record for entry in entries for record in entry.records]),
+        "conclusions": conclusions(board),
+        "tables": [table for table in tables if table.rows],
+        "figures": [(figure, folder / f"{place}-{figure.key}.svg") for figure in figures if figure.drawing is not None],
+        "absent": [figure for figure in figures if figure.drawing is None],
+        "folder": path.parent,
+    }
 
 
 def _single(entry: Entry) -> list[Figure]:
@@ -254,58 +192,3 @@ def _animals(entry: Entry) -> PaperTable:
 def _card(entry: Entry) -> PaperTable:
     rows = (*words.card_rows(entry.card), *words.training_rows(entry.card))
     return PaperTable("The model.", ("statement", "stated"), tuple(rows))
-
-
-def _inline(figure: Figure) -> str:
-    from markupsafe import Markup
-
-    return Markup(figure.drawing.render(style=STYLE)) if figure.drawing else Markup("")
-
-
-def _figure_path(path: Path, place: int, figure: Figure) -> Path:
-    return path.with_name(f"{path.stem}-figures") / f"{place}-{figure.key}.svg"
-
-
-def _write_figures(paper: Paper, path: Path) -> list[Path]:
-    return [
-        write_text(_figure_path(path, place, figure), standalone(figure.drawing))
-        for place, section in enumerate(paper.sections, start=1)
-        for figure in section.figures
-        if figure.drawing is not None
-    ]
-
-
-def _markdown(paper: Paper, path: Path) -> str:
-    blocks = [f"# {_escape(paper.title)}"]
-    blocks += [f"> **{words.SYNTHETIC}**"] if paper.synthetic else []
-    for place, section in enumerate(paper.sections, start=1):
-        blocks += [f"## {_escape(section.title)}", "### Methods", _escape(section.methods), "### Results"]
-        blocks += ["\n".join(f"- {_escape(text)}" for text in section.conclusions)]
-        for table in section.tables:
-            blocks += [_escape(table.caption), _rows(table)]
-        for figure in section.figures:
-            target = _figure_path(path, place, figure).relative_to(path.parent).as_posix().replace(" ", "%20")
-            title = _escape(figure.title)
-            blocks += [f"![{title}]({target})", f"*{title}.* {_escape(figure.caption)}"]
-        if section.absent:
-            blocks.append("Not drawn: " + " ".join(f"{f.title}: {f.lacking}." for f in section.absent))
-    if paper.commands:
-        commands = "\n".join(text.replace("`", "'") for text in paper.commands)
-        blocks += ["## To make these records again", f"```\n{commands}\n```"]
-    blocks += ["## References", "\n".join(f"- {_escape(item.text)}" for item in paper.references)]
-    blocks.append(f"BibTeX entries: `{path.with_suffix('.bib').name}`.")
-    return "\n\n".join(blocks) + "\n"
-
-
-def _rows(table: PaperTable) -> str:
-    ends = ["---:" if number else "---" for number in table.numbers]
-    lines = [table.columns, ends, *([_escape(cell) for cell in row] for row in table.rows)]
-    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
-
-
-_ESCAPED = str.maketrans({mark: f"\\{mark}" for mark in "\\`*_{}[]|#!"} | {"<": "&lt;", ">": "&gt;"})
-
-
-def _escape(text: str) -> str:
-    """Escape what Markdown or HTML inside it would read as markup."""
-    return " ".join(text.translate(_ESCAPED).split())

@@ -37,6 +37,21 @@ def render(template: str, **values: Any) -> str:
     return page.render(**values, policy=policy, style=Markup(style), script=Markup(script))
 
 
+def render_markdown(template: str, **values: Any) -> str:
+    """Fill ``template`` with every value escaped for Markdown, and for the HTML that Markdown may hold."""
+    environment = _environment().overlay(autoescape=False, finalize=_escape_markdown)
+    return environment.get_template(template).render(**values)
+
+
+_MARKDOWN = str.maketrans({mark: f"\\{mark}" for mark in "\\`*_{}[]|#!"} | {"<": "&lt;", ">": "&gt;"})
+
+
+def _escape_markdown(value: Any) -> Any:
+    from markupsafe import Markup
+
+    return value if isinstance(value, Markup) else " ".join(str(value).translate(_MARKDOWN).split())
+
+
 def script_json(value: Any) -> Any:
     """Return ``value`` as JSON that can stand inside a script element: nothing in it can end the element."""
     from markupsafe import Markup

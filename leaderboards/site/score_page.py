@@ -53,7 +53,6 @@ def model_page(entry: Entry) -> str:
         "graph": diagram(graph, entry.name) if graph else None,
         "connected": card.graph is not None,
         "layer_chart": layers(entry.records),
-        "task": text.accuracy_rows(card),
         "training": text.training_rows(card),
     }
     return render("model.html.j2", **view, here="", root="../")
@@ -105,7 +104,7 @@ def _score_view(record: ResultRecord) -> dict[str, Any]:
         "brain_rdm": rdm_picture(score.brain_rdm, score.stimuli),
         "pairs": pairs if len(pairs) <= _MOST_PAIRS else [],
         "comparisons": comparisons(record),
-        "methods": text.methods(record),
+        "methods": text.methods([record]),
         "command": score.provenance.command,
         "card": text.card_rows(card) if card else [],
         "provenance": text.provenance_rows(score.provenance),
