@@ -43,9 +43,9 @@ def _leader(board: Board, tested: Sequence[Entry]) -> list[str]:
     if not others:
         return [text]
     if not level:
-        return [f"{text} It is told apart from all {len(others)} others."]
+        return [f"{text} It is told apart from the {plural(len(others), 'other model')}."]
     if len(level) == len(others):
-        return [f"{text} It is not told apart from any of the {len(others)} others."]
+        return [f"{text} It is not told apart from any other model."]
     apart = len(others) - len(level)
     return [f"{text} It is told apart from {apart} of {len(others)} others, but not from {_names(level)}."]
 

@@ -22,7 +22,9 @@ from brainbench.core.statistics import is_finite
 from leaderboards.ranking import CHANCE_LEVEL, Sample
 
 UNTRAINED = "untrained"
-Standing = Literal["above raw input", "above chance", "not told apart from chance", "unreliable", "undefined"]
+Standing = Literal[
+    "above raw input", "above chance", "not told apart from chance", "not tested", "unreliable", "undefined"
+]
 """What can be said of a score, from the most to the least: every page uses these words and no others."""
 STANDINGS: tuple[Standing, ...] = get_args(Standing)
 
@@ -163,7 +165,9 @@ def standing_of(score: Score, *, above_raw: bool) -> Standing:
     """Return what can be said of a score, given whether it is told apart above the raw input."""
     if score.status != "ok":
         return score.status
-    if not score.p <= CHANCE_LEVEL:
+    if math.isnan(score.p):
+        return "not tested"
+    if score.p > CHANCE_LEVEL:
         return "not told apart from chance"
     return "above raw input" if above_raw else "above chance"
 

@@ -17,6 +17,7 @@ STANDING: dict[Standing, str] = {
     "above raw input": "Told apart from chance, and above the raw input of the models.",
     "above chance": "Told apart from chance, but not above the raw input of the models.",
     "not told apart from chance": "A model that knows nothing of these stimuli could score as high.",
+    "not tested": "The record states no test against chance.",
     "unreliable": "Computed, but not to be trusted: the data are too noisy or too few.",
     "undefined": "No number exists.",
 }

@@ -52,7 +52,7 @@ if (source) {
     return board.rows;
   };
   // A model that is not told apart from chance never stands above the raw input, whatever its score.
-  const TIERS = { "not told apart from chance": 1, unreliable: 2, undefined: 3 };
+  const TIERS = { "not told apart from chance": 1, "not tested": 2, unreliable: 3, undefined: 4 };
   const tier = (row) => (row.kind === "model" ? TIERS[row.standing] ?? 0 : 0);
 
   const shown = () => {
