@@ -163,16 +163,16 @@ def _details(statistics: Mapping[str, Any]) -> list[str]:
 
 def _over_time(course: Mapping[str, Any]) -> str:
     """Lay out the best time and the latency of each layer that matches at some lag."""
-    known = [point for point in course["points"] if point["value"] is not None]
-    best = max(known, key=lambda point: point["value"], default=None)
+    best = max(filter(_known, course["points"]), key=_scaled, default=None)
     clear = sum(point["p"] is not None and point["p"] <= 0.05 for point in course["points"])
     text = f"Over time, {len(course['points'])} bins of {course['bin']:g} s: "
     if best is None:
         text += "no animal is reliable in any bin"
     else:
-        span = f" [{best['interval']['low']:.3g}, {best['interval']['high']:.3g}]" if best["interval"] else ""
-        text += f"{clear} differ from chance (p of the best {course['p']:.2g}, corrected for all times); "
-        text += f"highest score {best['value']:.3g}{span} at {best['time']:.3g} s"
+        text += (
+            f"{clear} differ from chance (p of the best {course['p']:.2g}, corrected for all times); the best score, "
+        )
+        text += f"{_scaled(best):.2f} between chance (0) and all that is reliable (1), is at {best['time']:.3g} s"
     columns = {
         "layer": "{0[layer]}",
         ">latency": lambda row: "–" if row["latency"] is None else f"{1000 * row['latency']:.0f} ms",
@@ -184,6 +184,15 @@ def _over_time(course: Mapping[str, Any]) -> str:
     }
     rows = table_of("Neurons follow the model by", course["latencies"], columns)
     return "\n".join([text, *course["reasons"], "", rows])
+
+
+def _known(point: Mapping[str, Any]) -> bool:
+    return point["value"] is not None and point["chance"] is not None and point["chance"] < 1
+
+
+def _scaled(point: Mapping[str, Any]) -> float:
+    """Return the score at one time between chance (0) and all that is reliable (1)."""
+    return (point["value"] - point["chance"]) / (1 - point["chance"])
 
 
 def _number(value: float) -> str:

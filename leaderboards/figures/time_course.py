@@ -1,4 +1,7 @@
-"""A score over time with the latency of each layer, drawn from a record's statistics."""
+"""A score over time with the latency of each layer, drawn from a record's statistics.
+
+Scores are drawn on the scale that all metrics share: 0 is chance at that time and 1 all that is reliable.
+"""
 
 from __future__ import annotations
 
@@ -37,25 +40,24 @@ def draw_time_course(statistics: Mapping[str, Any]) -> Drawing | None:
 
 
 def _curve(drawing: Drawing, points: Sequence[Mapping[str, Any]], across: Scale) -> None:
-    ends = [_ends(point["interval"]) for point in points]
-    values = [_number(point["value"]) for point in points]
-    up = scale_of([*values, *(min(max(end, -0.5), 1.5) for pair in ends for end in pair)], _CURVE, 22, top=1.0)
-    drawing.text(_LEFT, 14, "score at each time", "title small")
+    shown = []
+    for point in points:
+        chance = _number(point["chance"])
+        value, *ends = ((one - chance) / (1 - chance) for one in (_number(point["value"]), *_ends(point["interval"])))
+        if math.isfinite(value):
+            shown.append((across.at(_number(point["time"])), value, ends, point))
+    held = [min(max(end, -0.5), 1.5) for _, _, ends, _ in shown for end in ends]
+    up = scale_of([*(value for _, value, *_ in shown), *held], _CURVE, 22, top=1.0)
+    drawing.text(_LEFT, 14, "score at each time: 0 chance, 1 all that is reliable", "title small")
     for tick in up.ticks:
-        drawing.line(_LEFT, up.at(tick), _WIDTH - _RIGHT, up.at(tick), "one" if tick == 1 else "grid")
+        drawing.line(_LEFT, up.at(tick), _WIDTH - _RIGHT, up.at(tick), "one" if tick in (0, 1) else "grid")
         drawing.text(_LEFT - 6, up.at(tick) + 4, tick_text(tick), "end quiet small")
     _ticks(drawing, across, _CURVE, "seconds after the window begins")
-    chance = [(across.at(_number(p["time"])), up.at(_number(p["chance"]))) for p in points if _finite(p["chance"])]
-    _path(drawing, chance, "one")
-    shown = [
-        (across.at(_number(point["time"])), value, span, point)
-        for point, value, span in zip(points, values, ends, strict=True)
-        if math.isfinite(value)
-    ]
-    _path(drawing, [(x, up.at(value)) for x, value, *_ in shown], "line")
-    for x, value, span, point in shown:
-        if span:
-            drawing.line(x, up.at(span[0]), x, up.at(span[1]), "span c1")
+    if len(shown) > 1:
+        drawing.path("M" + "L".join(f"{x:.1f} {up.at(value):.1f}" for x, value, *_ in shown), "line edge")
+    for x, value, ends, point in shown:
+        if ends:
+            drawing.line(x, up.at(ends[0]), x, up.at(ends[1]), "span c1")
         clear = _finite(point["p"]) and _number(point["p"]) <= ALPHA
         tip = f"{_number(point['time']):.3g} s: {value:.2f}, p = {_number(point['p']):.2g}"
         drawing.mark(x, up.at(value), "dot", "c1" if clear else "c1 open", tip, 3.5)
@@ -81,11 +83,6 @@ def _ticks(drawing: Drawing, across: Scale, y: float, words: str) -> None:
     for tick in across.ticks:
         drawing.text(across.at(tick), y + 15, tick_text(tick), "mid quiet small")
     drawing.text(across.end, y + 28, words, "end quiet small")
-
-
-def _path(drawing: Drawing, places: Sequence[tuple[float, float]], kind: str) -> None:
-    if len(places) > 1:
-        drawing.path("M" + "L".join(f"{x:.1f} {y:.1f}" for x, y in places), f"{kind} edge")
 
 
 def _number(value: Any) -> float:
