@@ -139,8 +139,10 @@ def _walk(steps: list[dict[str, Any]]) -> str:
 
 
 def _details(statistics: Mapping[str, Any]) -> list[str]:
-    """Lay out what single metrics add: accuracies by property, shares of variance."""
+    """Lay out what single metrics and options add: accuracies by property, shares of variance, times."""
     parts = []
+    if course := statistics.get("time_course"):
+        parts.append(_over_time(course))
     if accuracies := statistics.get("decoding"):
         columns = {
             "property": "{0[property]}",
@@ -157,6 +159,40 @@ def _details(statistics: Mapping[str, Any]) -> list[str]:
             f"{shares['unique_nuisance']:.2f}, by either {shares['shared']:.2f}"
         )
     return parts
+
+
+def _over_time(course: Mapping[str, Any]) -> str:
+    """Lay out the best time and the latency of each layer that matches at some lag."""
+    best = max(filter(_known, course["points"]), key=_scaled, default=None)
+    clear = sum(point["p"] is not None and point["p"] <= 0.05 for point in course["points"])
+    text = f"Over time, {len(course['points'])} bins of {course['bin']:g} s: "
+    if best is None:
+        text += "no animal is reliable in any bin"
+    else:
+        text += (
+            f"{clear} differ from chance (p of the best {course['p']:.2g}, corrected for all times); the best score, "
+        )
+        text += f"{_scaled(best):.2f} between chance (0) and all that is reliable (1), is at {best['time']:.3g} s"
+    columns = {
+        "layer": "{0[layer]}",
+        ">latency": lambda row: "–" if row["latency"] is None else f"{1000 * row['latency']:.0f} ms",
+        "interval": lambda row: (
+            f"[{1000 * row['interval']['low']:.0f}, {1000 * row['interval']['high']:.0f}]" if row["interval"] else ""
+        ),
+        ">p": lambda row: "–" if row["p"] is None else f"{row['p']:.2g}",
+        "": "{0[reason]}",
+    }
+    rows = table_of("Neurons follow the model by", course["latencies"], columns)
+    return "\n".join([text, *course["reasons"], "", rows])
+
+
+def _known(point: Mapping[str, Any]) -> bool:
+    return point["value"] is not None and point["chance"] is not None and point["chance"] < 1
+
+
+def _scaled(point: Mapping[str, Any]) -> float:
+    """Return the score at one time between chance (0) and all that is reliable (1)."""
+    return (point["value"] - point["chance"]) / (1 - point["chance"])
 
 
 def _number(value: float) -> str:

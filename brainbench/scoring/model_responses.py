@@ -42,6 +42,8 @@ class ModelResponses:
     """[K, T, F] what the model received; None for features computed elsewhere."""
     origin: Mapping[str, Any] = field(default_factory=dict)
     """Provenance of stimuli and weights."""
+    seconds: float | None = None
+    """Duration of the stimuli, over which the steps of every layer are spread evenly; None where unknown."""
 
     def features(self, rows: list[int]) -> dict[str, NDArray[np.floating]]:
         """Return every layer's features [K, F] of the stimuli ``rows``."""
@@ -95,7 +97,8 @@ class ResolvedModel:
             card = replace(card, input=note)
             steps = comparable if comparable.ndim > 2 else comparable[:, None, :]
             model_input = steps.reshape(*steps.shape[:2], -1)
-        return ModelResponses(card, labels, activations, options.time, model_input, origin)
+        seconds = None if shown is None else _seconds(shown)
+        return ModelResponses(card, labels, activations, options.time, model_input, origin, seconds)
 
 
 def resolve_model(model: Any, *, seed: int = 0) -> ResolvedModel:
@@ -189,6 +192,14 @@ def _stated(stimuli: Stimuli) -> dict[str, Any]:
     told = {name: getattr(stimuli, name) for name in ("description", "content_hash", "config_hash")}
     backend = None if stimuli.dataset is None else stimuli.dataset.attrs.get("backend")
     return {**told, "backend": str(backend)} if backend else told
+
+
+def _seconds(stimuli: Stimuli) -> float | None:
+    """Return the duration of simulated stimuli; None for arrays from a file, which do not say it."""
+    if stimuli.dataset is None or stimuli.dataset.sizes["time"] < 2:
+        return None
+    times = stimuli.dataset["time"].values
+    return float((times[-1] - times[0]) * len(times) / (len(times) - 1))
 
 
 def _network_input(module: torch.nn.Module, stimuli: Stimuli, normalize: bool) -> tuple[Any, Any, str]:

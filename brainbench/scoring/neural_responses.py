@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     import xarray as xr
     from numpy.typing import NDArray
 
+    from brainbench.core.trials import Trials
     from brainbench.metrics.measures.registry import Metric
 
 
@@ -52,21 +53,26 @@ class NeuralResponses:
         self, kept: tuple[str, ...], *, metric: Metric | None = None, time: str = "mean", seed: int = 0, draws: int = 0
     ) -> tuple[Any, ...]:
         """Prepare every animal by a metric (RSA by default) over the labels ``kept``, in that order."""
-        from brainbench.datasets.trials.session_trials import trials_by_subject
         from brainbench.metrics import get_metric
 
         metric = metric or get_metric("rsa")
-        index = np.full(len(self.vocabulary), -1)
-        index[[self.vocabulary.index(label) for label in kept]] = np.arange(len(kept))
         animals = []
-        for subject, sessions in trials_by_subject(self.dataset).items():
-            kept_trials = [session.take(index[session.labels] >= 0) for session in sessions]
-            trials = [
-                replace(item, responses=without_time(item.responses, time), labels=index[item.labels])
-                for item in kept_trials
-            ]
+        for subject, sessions in self.trials(kept).items():
+            trials = [replace(item, responses=without_time(item.responses, time)) for item in sessions]
             animals.append(metric.animal(subject, trials, len(kept), stimuli=kept, seed=seed, draws=draws))
         return tuple(animals)
+
+    def trials(self, kept: tuple[str, ...]) -> dict[str, tuple[Trials, ...]]:
+        """Return the sessions of each animal with trials of the labels ``kept``, numbered in that order."""
+        from brainbench.datasets.trials.session_trials import trials_by_subject
+
+        index = np.full(len(self.vocabulary), -1)
+        index[[self.vocabulary.index(label) for label in kept]] = np.arange(len(kept))
+        found = {}
+        for subject, sessions in trials_by_subject(self.dataset).items():
+            kept_trials = [session.take(index[session.labels] >= 0) for session in sessions]
+            found[subject] = tuple(replace(item, labels=index[item.labels]) for item in kept_trials)
+        return found
 
 
 def open_neural_responses(recordings: Any, *, progress: Progress | None, **selection: Any) -> NeuralResponses:

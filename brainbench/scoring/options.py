@@ -23,6 +23,8 @@ if TYPE_CHECKING:
     from brainbench.stimuli import Fidelity, Stimuli
 
 TIME_RULES = ("mean", "concatenate")
+TIME_BIN = 0.05
+"""Bin width of scores over time, seconds."""
 
 _ELSEWHERE = ("recordings", "match", "explain")
 """Fields whose effect stands in other entries of the provenance: ``recordings``, ``pairs`` and ``statistics``."""
@@ -58,6 +60,8 @@ class ScoreOptions:
     """Time axis of both sides: 'mean' averages over it, 'concatenate' keeps every step."""
     bin: float | None = None
     """Bin width of the spike counts in seconds."""
+    over_time: bool = False
+    """Also score each time, in bins of --bin (.05 s), and measure each layer's latency (RSA metrics only)."""
     estimator: str = "default"
     """default, thesis or thesis-input (as published)."""
     metric: str | Metric = "rsa"
@@ -105,7 +109,8 @@ class ScoreOptions:
     @property
     def selection(self) -> dict[str, Any]:
         """Arguments of :func:`brainbench.datasets.open_recordings`."""
-        return {"conditions": self.conditions, "select": self.select, "window": self.window, "bin": self.bin}
+        width = TIME_BIN if self.over_time and self.bin is None else self.bin
+        return {"conditions": self.conditions, "select": self.select, "window": self.window, "bin": width}
 
     @property
     def settings(self) -> dict[str, Any]:

@@ -89,6 +89,10 @@ def score_record(
     metric = metrics.get_metric(options.metric)
     if options.explain and metric.name != "rsa":
         raise UsageError(f"The published estimator is one of RSA; the metric {metric.name!r} has none to explain.")
+    if options.over_time:
+        from brainbench.scoring.over_time import check_metric, time_course
+
+        check_metric(metric)
     options = replace(options, metric=metric)
     resolved = resolve_model(model, seed=options.model_seed)
     brain = open_neural_responses(options.recordings, progress=progress, **options.selection)
@@ -126,6 +130,9 @@ def score_record(
 
         rdms = {layer: metrics.rdm(values) for layer, values in compared[network.card.name].items()}
         statistics[0] = {**statistics[0], "estimator_walk": to_plain(explain_score(rdms, animals))}
+    if options.over_time:
+        course = time_course(brain, network, metric, kept, rows, seed=options.seed, progress=progress)
+        statistics[0] = {**statistics[0], "time_course": to_plain(course)}
     first, *others = (
         replace(item, provenance=replace(origin, statistics=found))
         for item, found in zip(scores, statistics, strict=True)
