@@ -119,11 +119,11 @@ def write_set(folder: Path, sweeps: int) -> list[list[str]]:
     each = [seconds(lambda task=task: prepare_shard(task), 1) for task in plan.shards]
     ready = [(task, prepare_shard(task)) for task in plan.shards]
     ahead, running._built_ahead = running._built_ahead, lambda tasks, pool, ahead: iter(ready)
-    pool, running._pool = running._pool, ThreadPoolExecutor  # type: ignore[assignment]
+    pool, running.worker_pool = running.worker_pool, ThreadPoolExecutor  # type: ignore[assignment]
     try:
         took = seconds(lambda: generate(plan, folder), 1)
     finally:
-        running.run_here, running._pool, running._built_ahead = run, pool, ahead
+        running.run_here, running.worker_pool, running._built_ahead = run, pool, ahead
     means = [sum(item) / plan.sweeps * 2048 * 1e3 for item in zip(*each, strict=True)]
     what = f"{plan.sweeps:,} sweeps in {len(plan.shards)} shards: {running.WRITERS} threads hash, write, wait"
     prepare = [

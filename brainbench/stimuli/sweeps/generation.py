@@ -76,7 +76,7 @@ def generate(
         if len(missing) < len(plan.shards):
             _LOG.info("%d of %d shards are there already", len(plan.shards) - len(missing), len(plan.shards))
         if scheduler is not None:
-            running.run_on_cluster(missing, folder, scheduler, report)
+            running.run_shards_on_cluster(missing, folder, scheduler, report)
         elif missing:
             running.run_here(missing, folder, workers, report)
         _clean(folder)

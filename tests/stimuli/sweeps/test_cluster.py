@@ -7,6 +7,7 @@ import time
 
 import pytest
 
+from brainbench.core import jobs
 from brainbench.core.errors import DataError, MissingDependencyError, UsageError
 from brainbench.stimuli.sweeps import running
 from brainbench.stimuli.sweeps.generation import generate
@@ -79,7 +80,7 @@ def test_a_worker_killed_during_the_run_costs_nothing(tmp_path):
 
 
 def test_no_scheduler_at_the_address_is_said(tmp_path, monkeypatch):
-    monkeypatch.setattr(running, "TIMEOUT", 0.5)
+    monkeypatch.setattr(jobs, "TIMEOUT", 0.5)
     with pytest.raises(UsageError, match="No Dask scheduler answers at 'tcp:"):
         generate(small_plan(), tmp_path, scheduler="tcp://127.0.0.1:9")
 

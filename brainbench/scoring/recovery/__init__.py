@@ -1,0 +1,34 @@
+"""Recovery: animals are drawn from each candidate network, and all candidates are scored against them.
+
+``candidates`` runs the networks on the stimuli, ``boards`` draws animals from one of them and scores all (``design``
+says how many and how noisy), ``study`` does so for many boards, and ``confusion`` counts how often the true network
+wins. ``selection`` picks the stimuli of a larger pool that separate the candidates best, ``cheapest`` looks for the
+smallest design that suffices, and ``figure`` draws the confusion matrix.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from brainbench.core.lazy import lazy_exports
+
+if TYPE_CHECKING:
+    from brainbench.scoring.recovery.candidates import Candidate, open_candidates
+    from brainbench.scoring.recovery.cheapest import find_cheapest
+    from brainbench.scoring.recovery.confusion import Recovery
+    from brainbench.scoring.recovery.design import RecoveryDesign
+    from brainbench.scoring.recovery.figure import plot_confusion
+    from brainbench.scoring.recovery.selection import select_stimuli
+    from brainbench.scoring.recovery.study import recover
+
+_MODULES = {
+    ".candidates": ("Candidate", "open_candidates"),
+    ".cheapest": ("find_cheapest",),
+    ".confusion": ("Recovery",),
+    ".design": ("RecoveryDesign",),
+    ".figure": ("plot_confusion",),
+    ".selection": ("select_stimuli",),
+    ".study": ("recover",),
+}
+__all__ = [name for names in _MODULES.values() for name in names]
+__getattr__, __dir__ = lazy_exports(__name__, {name: module for module, names in _MODULES.items() for name in names})

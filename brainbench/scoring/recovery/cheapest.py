@@ -1,0 +1,107 @@
+"""Search for the cheapest design whose true candidate comes first as often as is wanted."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import product
+from typing import Any
+
+from brainbench.core.errors import UsageError
+from brainbench.core.progress import Progress
+from brainbench.core.records import Interval
+from brainbench.scoring.recovery.candidates import Candidate
+from brainbench.scoring.recovery.design import RecoveryDesign
+from brainbench.scoring.recovery.study import recover
+
+ANIMALS = (2, 4, 6, 10, 16)
+UNITS = (20, 60, 120)
+TRIALS = (5, 10, 20)
+STIMULI = (6, 10, 20, 40, 80)
+"""Numbers that are tried, as far as the pool allows."""
+
+
+@dataclass(frozen=True)
+class TriedDesign:
+    """One design of the search."""
+
+    animals: int
+    units: int
+    trials: int
+    """Trials of each stimulus."""
+    stimuli: int
+    win_rate: float
+    """Share of boards in which the true candidate came first."""
+    interval: Interval
+    """Wilson's interval of ``win_rate``."""
+
+    @property
+    def presentations(self) -> int:
+        """Trials of all animals together: the cost of the experiment."""
+        return self.animals * self.trials * self.stimuli
+
+
+def find_cheapest(
+    candidates: Sequence[Candidate],
+    design: RecoveryDesign,
+    wanted: float,
+    *,
+    boards: int = 5,
+    progress: Progress | None = None,
+    **where: Any,
+) -> tuple[TriedDesign | None, tuple[TriedDesign, ...]]:
+    """Try designs from the cheapest on, and return the first that reaches a win rate, with all that were tried.
+
+    Cost is the number of trials of all animals, then the number of units. A design with no more of anything than one
+    that failed clearly (interval below ``wanted``) is not tried. The one returned reaches the rate on boards of other
+    numbers too.
+
+    Args:
+        candidates: At least two.
+        design: Noise, metric and layer; its numbers of animals, units, trials and stimuli are replaced.
+        wanted: Win rate, between 0 and 1.
+        boards: Boards of each candidate and design.
+        progress: Called as ``progress(designs done, designs, what)``.
+        **where: ``workers`` and ``scheduler`` of :func:`recover`.
+
+    Raises:
+        UsageError: a rate outside (0, 1).
+    """
+    if not 0 < wanted < 1:
+        raise UsageError(f"A wanted rate lies between 0 and 1; received {wanted}.")
+    pool = len(candidates[0].stimuli)
+    sizes = [size for size in STIMULI if size < pool] + [pool]
+    grid = sorted(product(ANIMALS, UNITS, TRIALS, sizes), key=lambda one: (one[0] * one[2] * one[3], one[1], one[0]))
+    tried: list[TriedDesign] = []
+    failed: list[tuple[int, ...]] = []
+    for done, numbers in enumerate(grid):
+        if progress is not None:
+            progress(done, len(grid), "trying designs")
+        if any(all(mine <= other for mine, other in zip(numbers, one, strict=True)) for one in failed):
+            continue
+        found = _try(candidates, design, numbers, boards, 0, where)
+        tried.append(found)
+        if found.interval.high < wanted:
+            failed.append(numbers)
+        elif found.win_rate >= wanted:
+            # The first to reach a rate by luck would be returned too often: it must do so again.
+            again = _try(candidates, design, numbers, 2 * boards, boards, where)
+            tried[-1] = again
+            if again.win_rate >= wanted:
+                return again, tuple(tried)
+    return None, tuple(tried)
+
+
+def _try(
+    candidates: Sequence[Candidate],
+    design: RecoveryDesign,
+    numbers: tuple[int, int, int, int],
+    boards: int,
+    first: int,
+    where: dict[str, Any],
+) -> TriedDesign:
+    animals, units, trials, stimuli = numbers
+    population = replace(design.population, animals=animals, units=units, trials=trials)
+    changed = replace(design, population=population, stimuli=stimuli)
+    found = recover(candidates, changed, boards=boards, first=first, **where)
+    return TriedDesign(animals, units, trials, stimuli, found.win_rate, found.wins())

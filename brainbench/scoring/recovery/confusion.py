@@ -1,0 +1,119 @@
+"""What the boards of a recovery say: how often the true candidate wins, ties and loses, and against whom."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from brainbench.core.records import Interval
+from brainbench.core.statistics import FEWEST_ANIMALS, FEWEST_STIMULI, wilson_interval
+from brainbench.metrics.rdms.pairs import Floats, Ints
+from brainbench.scoring.recovery.boards import Board
+from brainbench.scoring.recovery.design import RecoveryDesign
+
+WANTED = 0.8
+"""Share of boards that the true candidate is to win."""
+
+
+@dataclass(frozen=True)
+class Recovery:
+    """Boards of every candidate, counted."""
+
+    names: tuple[str, ...]
+    """[C] candidates."""
+    design: RecoveryDesign
+    stimuli: int
+    """Stimuli of one board."""
+    boards: tuple[Board, ...]
+
+    @cached_property
+    def firsts(self) -> Ints:
+        """[C, C] boards in which the animals were drawn from one candidate (row) and another came first (column)."""
+        count = np.zeros((len(self.names),) * 2, dtype=np.int64)
+        for board in self.boards:
+            if board.first is not None:
+                count[board.true, board.first] += 1
+        return count
+
+    @cached_property
+    def made(self) -> Ints:
+        """[C] boards of each candidate."""
+        return np.bincount([board.true for board in self.boards], minlength=len(self.names))
+
+    @cached_property
+    def told(self) -> Floats:
+        """[C, C] share of the boards of a candidate (row) in which it is told apart above another (column)."""
+        return self._share(1)
+
+    @cached_property
+    def lost(self) -> Floats:
+        """[C, C] share of the boards of a candidate (row) in which another (column) is told apart above it."""
+        return self._share(-1)
+
+    def _share(self, sign: int) -> Floats:
+        count = np.zeros((len(self.names),) * 2)
+        for board in self.boards:
+            count[board.true] += np.array(board.told) == sign
+        return count / np.maximum(self.made[:, None], 1)
+
+    def wins(self, candidate: int | None = None) -> Interval:
+        """Return Wilson's interval of the share of boards in which the true candidate comes first."""
+        own = np.diag(self.firsts)
+        if candidate is None:
+            return wilson_interval(int(own.sum()), int(self.made.sum()), over="boards")
+        return wilson_interval(int(own[candidate]), int(self.made[candidate]), over="boards")
+
+    @property
+    def win_rate(self) -> float:
+        """Share of all boards in which the true candidate comes first."""
+        return float(np.diag(self.firsts).sum() / len(self.boards))
+
+    @property
+    def outcomes(self) -> dict[str, float]:
+        """Shares of pairs (true candidate, another): win, tie and loss by the test of a board."""
+        other = ~np.eye(len(self.names), dtype=bool)
+        win, loss = float(self.told[other].mean()), float(self.lost[other].mean())
+        return {"win": win, "tie": 1 - win - loss, "loss": loss}
+
+    @property
+    def reliability(self) -> float:
+        """Mean split-half reliability of the animals."""
+        values = [board.reliability for board in self.boards if np.isfinite(board.reliability)]
+        return float(np.mean(values)) if values else float("nan")
+
+    def answer(self, wanted: float = WANTED) -> str:
+        """Say in one sentence whether the design can tell the candidates apart.
+
+        Yes or no where the interval of the win rate lies above or below ``wanted``.
+        """
+        interval = self.wins()
+        said = f"the true network comes first in {self.win_rate:.0%} of {len(self.boards)} boards"
+        said += f" [{interval.low:.0%}, {interval.high:.0%}]; by chance it would in {1 / len(self.names):.0%}"
+        if interval.low >= wanted:
+            return f"Yes, this design finds the true network: {said}."
+        if interval.high < wanted:
+            return f"No, not in the {wanted:.0%} of boards that are wanted: {said}."
+        return f"Undecided beside the {wanted:.0%} that are wanted, more boards would tell: {said}."
+
+    def hardest(self, count: int = 3) -> list[tuple[str, str, float]]:
+        """Return the pairs (true, mistaken for, share of the true one's boards) that are confused most often."""
+        share = self.firsts / np.maximum(self.made[:, None], 1)
+        np.fill_diagonal(share, 0)
+        order = np.argsort(-share, axis=None, kind="stable")[:count]
+        pairs = [np.unravel_index(place, share.shape) for place in order.tolist()]
+        return [(self.names[i], self.names[j], float(share[i, j])) for i, j in pairs if share[i, j] > 0]
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What a reader must know beside the numbers."""
+        notes = []
+        if self.design.population.animals < FEWEST_ANIMALS or self.stimuli < FEWEST_STIMULI:
+            notes.append(
+                f"No pair is tested with fewer than {FEWEST_ANIMALS} animals or {FEWEST_STIMULI} stimuli, so all tie."
+            )
+        undefined = sum(board.first is None for board in self.boards)
+        if undefined:
+            notes.append(f"{undefined} boards have no score: their animals cannot be compared.")
+        return tuple(notes)

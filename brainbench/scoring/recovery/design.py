@@ -1,0 +1,58 @@
+"""Design of a recovery study: what is measured of how many animals, and how candidates are scored."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from brainbench.core.errors import UsageError
+from brainbench.datasets.synthetic.populations import PopulationDesign
+
+FEWEST_STIMULI = 4
+"""Fewest stimuli whose RDMs can be compared after one is left out."""
+
+
+@dataclass(frozen=True)
+class RecoveryDesign:
+    """An experiment that is repeated on the computer with every candidate in turn as the truth.
+
+    Raises:
+        UsageError: a number is out of range.
+    """
+
+    population: PopulationDesign = field(default_factory=PopulationDesign)
+    """Animals, units, trials and noise."""
+    stimuli: int | None = None
+    """Stimuli of one board, drawn anew for each from those that the candidates saw; all of them by default."""
+    metric: str = "rsa"
+    """Metric of the scores."""
+    layer: str = "any"
+    """Layer whose units the animals mix: any (drawn anew for each board), last, or the name of one."""
+    splits: int = 100
+    """Split halves that tell the reliability of an animal's RDM."""
+    orders: int = 20
+    """Random orders of the stimuli that tell the score expected by chance."""
+    seed: int = 0
+    """Seed of the animals."""
+
+    def __post_init__(self) -> None:
+        for name in ("splits", "orders"):
+            if getattr(self, name) < 1:
+                raise UsageError(f"A recovery needs at least one of {name}; received {getattr(self, name)}.")
+        if self.stimuli is not None and self.stimuli < FEWEST_STIMULI:
+            raise UsageError(f"A recovery needs at least {FEWEST_STIMULI} stimuli; received {self.stimuli}.")
+
+
+def parse_trials(text: str) -> int | tuple[int, int]:
+    """Return the trials of a stimulus: ``18``, or the fewest and the most as in ``16-20``.
+
+    >>> parse_trials("16-20")
+    (16, 20)
+
+    Raises:
+        UsageError: it is something else.
+    """
+    first, dash, last = text.partition("-")
+    try:
+        return (int(first), int(last)) if dash else int(first)
+    except ValueError as error:
+        raise UsageError(f"Trials are a number or a range such as 16-20; received {text!r}.") from error

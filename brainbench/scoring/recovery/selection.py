@@ -1,0 +1,145 @@
+"""Choice of the stimuli, out of a larger pool, that separate candidates best.
+
+Animals are drawn as for boards, once and over the whole pool, since the RDM of fewer stimuli is a part of it. A set of
+stimuli is as good as the margins by which the true candidates lead on these boards; it is improved by exchanging one
+stimulus at a time. Rates must be measured on boards of other numbers (:data:`FIRST_BOARD`): on the ones that chose
+they are too good.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import numpy as np
+
+from brainbench.core.errors import UsageError
+from brainbench.core.progress import Progress
+from brainbench.metrics.layers import held_out
+from brainbench.metrics.measures.registry import get_metric
+from brainbench.metrics.measures.rsa import RSA
+from brainbench.metrics.rdms.comparison import compare_all
+from brainbench.metrics.rdms.pairs import Floats, Ints
+from brainbench.scoring.recovery.boards import draw_board, pairs_of
+from brainbench.scoring.recovery.candidates import Candidate
+from brainbench.scoring.recovery.design import FEWEST_STIMULI, RecoveryDesign
+
+BOARDS = 4
+"""Boards of each candidate on which stimuli are chosen."""
+FIRST_BOARD = 1_000_000
+"""Number of the first of them, far from those on which rates are measured."""
+EXCHANGES = 1500
+"""Exchanges that are tried."""
+
+
+@dataclass(frozen=True)
+class Selection:
+    """Stimuli that were picked."""
+
+    stimuli: tuple[str, ...]
+    """Names, in the order of the pool."""
+    rows: tuple[int, ...]
+    """Their places in the pool."""
+    gain: float
+    """Rise of the mean margin over the random set from which the search began, in scores."""
+
+
+def select_stimuli(
+    candidates: Sequence[Candidate],
+    keep: int,
+    design: RecoveryDesign | None = None,
+    *,
+    boards: int = BOARDS,
+    exchanges: int = EXCHANGES,
+    progress: Progress | None = None,
+) -> Selection:
+    """Pick the stimuli of the pool that separate the candidates best.
+
+    Args:
+        candidates: At least two, for all stimuli of the pool.
+        keep: Number of stimuli.
+        design: What is measured of how many animals; the defaults if None. Its ``stimuli`` do not count.
+        boards: Boards of each candidate on which they are chosen.
+        exchanges: Exchanges that are tried.
+        progress: Called as ``progress(exchanges tried, exchanges, what)``.
+
+    Raises:
+        UsageError: the pool is too small, ``keep`` too few, or the metric does not compare RDMs.
+    """
+    design = replace(design or RecoveryDesign(), stimuli=None)
+    pool = len(candidates[0].stimuli)
+    if not FEWEST_STIMULI <= keep <= pool:
+        raise UsageError(f"The pool has {pool} stimuli; {keep} cannot be kept, only {FEWEST_STIMULI} to {pool}.")
+    metric = get_metric(design.metric)
+    if not isinstance(metric, RSA):
+        raise UsageError(f"Stimuli are chosen by RDMs; the metric {metric.name!r} does not compare any, 'rsa' does.")
+    margins = _Margins(candidates, design, metric, boards)
+    random = np.random.default_rng([design.seed, FIRST_BOARD])
+    order = random.permutation(pool)
+    kept, spare = order[:keep].copy(), order[keep:].copy()
+    first = margins(kept)
+    # A margin far above zero is not worth more than one that is safely above it.
+    scale = float(np.abs(first).mean()) or 1.0
+    best = _worth(first, scale)
+    if not len(spare):
+        exchanges = 0
+    for tried in range(exchanges):
+        out, new = int(random.integers(keep)), int(random.integers(len(spare)))
+        kept[out], spare[new] = spare[new], kept[out]
+        found = _worth(margins(kept), scale)
+        if found > best:
+            best = found
+        else:
+            kept[out], spare[new] = spare[new], kept[out]
+        if progress is not None and (tried + 1) % 25 == 0:
+            progress(tried + 1, exchanges, "exchanging stimuli")
+    rows = np.sort(kept)
+    gain = float(margins(rows).mean() - first.mean())
+    return Selection(tuple(candidates[0].stimuli[row] for row in rows), tuple(rows.tolist()), gain)
+
+
+def keep_stimuli(candidates: Sequence[Candidate], rows: Sequence[int]) -> tuple[Candidate, ...]:
+    """Return the candidates with some of their stimuli alone."""
+    names = tuple(candidates[0].stimuli[row] for row in rows)
+    return tuple(
+        Candidate.of(
+            item.name, names, {layer: values[list(rows)] for layer, values in item.features.items()}, item.weights
+        )
+        for item in candidates
+    )
+
+
+def _worth(margins: Floats, scale: float) -> float:
+    return float(np.tanh(margins / scale).mean())
+
+
+class _Margins:
+    """Leads [boards] of the true candidates over the best of the others, for any set of stimuli."""
+
+    def __init__(self, candidates: Sequence[Candidate], design: RecoveryDesign, metric: RSA, boards: int) -> None:
+        self.comparison = metric.comparison
+        self.pool = len(candidates[0].stimuli)
+        rdms = [item.rdms(metric.model_method) for item in candidates]
+        self.layers, self.ends = np.concatenate(rdms), np.cumsum([0, *map(len, rdms)])
+        drawn = []
+        self.true = np.repeat(np.arange(len(candidates)), boards)
+        for place, true in enumerate(self.true.tolist()):
+            # Their reliability does not matter here, so one split is enough.
+            animals = draw_board(candidates, replace(design, splits=1), true, FIRST_BOARD + place % boards)[2]
+            drawn.append(np.stack([one.rdm for one in animals]))
+        self.brain = np.stack(drawn)
+
+    def __call__(self, rows: Ints) -> Floats:
+        pairs = pairs_of(np.sort(rows), self.pool)
+        boards, animals = self.brain.shape[:2]
+        brain = self.brain[..., pairs].reshape(boards * animals, -1)
+        r = np.nan_to_num(compare_all(self.layers[:, pairs], brain, method=self.comparison), nan=-1.0)
+        r = r.reshape(len(self.layers), boards, animals).swapaxes(0, 1)
+        parts = [r[:, start:end] for start, end in pairwise(self.ends)]
+        several = animals > 1
+        # [boards, C]
+        scores = np.stack([(held_out(part) if several else part.max(axis=1)).mean(axis=-1) for part in parts], axis=1)
+        own = np.take_along_axis(scores, self.true[:, None], axis=1)[:, 0]
+        np.put_along_axis(scores, self.true[:, None], -np.inf, axis=1)
+        return own - scores.max(axis=1)

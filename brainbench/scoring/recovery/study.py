@@ -1,0 +1,142 @@
+"""Run the boards of a recovery, on this machine or a cluster, and go on where an earlier run stopped."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from brainbench.core.errors import UsageError
+from brainbench.core.files import content_hash, read_json, to_plain, write_json
+from brainbench.core.jobs import run_jobs
+from brainbench.core.progress import Progress
+from brainbench.metrics.measures.registry import get_metric
+from brainbench.scoring.recovery.boards import Board, make_board
+from brainbench.scoring.recovery.candidates import Candidate
+from brainbench.scoring.recovery.confusion import Recovery
+from brainbench.scoring.recovery.design import RecoveryDesign
+
+BOARDS = 20
+"""Boards of each candidate."""
+_TOGETHER = 5
+"""Boards that one job makes and one file keeps."""
+_CONFIG = "config.json"
+
+
+@dataclass(frozen=True)
+class _Job:
+    """Some boards of one true candidate."""
+
+    true: int
+    numbers: tuple[int, ...]
+
+    @property
+    def file(self) -> str:
+        return f"boards-{self.true:03d}-{self.numbers[0]:05d}.json"
+
+
+def recover(
+    candidates: Sequence[Candidate],
+    design: RecoveryDesign | None = None,
+    *,
+    boards: int = BOARDS,
+    first: int = 0,
+    folder: Path | None = None,
+    workers: int | None = None,
+    scheduler: str | None = None,
+    progress: Progress | None = None,
+) -> Recovery:
+    """Draw boards from every candidate and count how often the true one wins.
+
+    Neither ``workers`` nor the scheduler changes a number. With a folder, a run that was killed goes on when it is
+    started again.
+
+    Args:
+        candidates: At least two, for the same stimuli.
+        design: What is measured; the defaults if None.
+        boards: Boards of each candidate.
+        first: Number of the first board: boards of other numbers have other animals.
+        folder: Keeps finished boards; None keeps nothing.
+        workers: Processes on this machine; as many as there are usable processors when None.
+        scheduler: Address of a Dask scheduler, whose workers make the boards instead.
+        progress: Called as ``progress(boards done, boards in all, what)``.
+
+    Raises:
+        UsageError: fewer than two candidates, more stimuli asked for than there are, an unknown metric or layer, or
+            the folder holds another recovery.
+    """
+    design = design or RecoveryDesign()
+    _check(candidates, design, boards)
+    jobs = [
+        _Job(true, tuple(range(start, min(start + _TOGETHER, first + boards))))
+        for start in range(first, first + boards, _TOGETHER)
+        for true in range(len(candidates))
+    ]
+    found: dict[_Job, list[Board]] = {}
+    if folder is not None:
+        _begin(folder, {"candidates": [item.identity for item in candidates], "design": to_plain(design)})
+        for job in jobs:
+            if (folder / job.file).is_file():
+                kept = [Board.of(item) for item in read_json(folder / job.file)]
+                if [item.number for item in kept] == list(job.numbers):
+                    found[job] = kept
+    missing = [job for job in jobs if job not in found]
+    total = done = sum(len(job.numbers) for job in jobs)
+    done -= sum(len(job.numbers) for job in missing)
+    for place, made in run_jobs(
+        partial(_make_boards, tuple(candidates), design), missing, workers=workers, scheduler=scheduler
+    ):
+        job = missing[place]
+        found[job] = made
+        done += len(made)
+        if folder is not None:
+            write_json(folder / job.file, to_plain(made))
+        if progress is not None:
+            progress(done, total, "scoring boards")
+    every = sorted((board for job in jobs for board in found[job]), key=lambda one: (one.true, one.number))
+    return Recovery(tuple(item.name for item in candidates), design, _shown(candidates, design), tuple(every))
+
+
+def _make_boards(candidates: tuple[Candidate, ...], design: RecoveryDesign, job: _Job) -> list[Board]:
+    return [make_board(candidates, design, job.true, number) for number in job.numbers]
+
+
+def _shown(candidates: Sequence[Candidate], design: RecoveryDesign) -> int:
+    return design.stimuli or len(candidates[0].stimuli)
+
+
+def _check(candidates: Sequence[Candidate], design: RecoveryDesign, boards: int) -> None:
+    """Refuse what cannot be run, before any work."""
+    if len(candidates) < 2:
+        raise UsageError(f"A recovery tells candidates apart and needs at least two; received {len(candidates)}.")
+    if boards < 1:
+        raise UsageError(f"A recovery needs at least one board of each candidate; received {boards}.")
+    pool = len(candidates[0].stimuli)
+    if any(item.stimuli != candidates[0].stimuli for item in candidates):
+        raise UsageError("The candidates saw different stimuli; run all of them on the same ones in the same order.")
+    if _shown(candidates, design) > pool:
+        raise UsageError(f"A board of {design.stimuli} stimuli was asked for; the pool has {pool}.")
+    get_metric(design.metric)
+    if design.layer not in ("any", "last"):
+        import numpy as np
+
+        for item in candidates:
+            item.choose(design.layer, np.random.default_rng(0))
+
+
+def _begin(folder: Path, config: dict[str, Any]) -> None:
+    """Refuse to go on with what was begun otherwise; note what is begun."""
+    folder.mkdir(parents=True, exist_ok=True)
+    stated = {**config, "hash": content_hash(config)}
+    path = folder / _CONFIG
+    if not path.exists():
+        if any(folder.iterdir()):
+            raise UsageError(f"{str(folder)!r} is not empty and holds no recovery; choose a new folder.")
+        write_json(path, stated)
+    elif read_json(path).get("hash") != stated["hash"]:
+        raise UsageError(
+            f"{str(folder)!r} holds a recovery begun with other candidates, stimuli or options; give the same as then, "
+            "or choose another folder."
+        )
