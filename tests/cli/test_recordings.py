@@ -5,14 +5,15 @@ import json
 import numpy as np
 import pytest
 
-from brainbench.datasets.synthetic import Design, ResponseGeometry, write_files
+from brainbench.datasets.synthetic import ResponseGeometry, write_files
+from tests.factories.recordings import quiet_design
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     folder = tmp_path_factory.mktemp("synthetic")
     geometry = ResponseGeometry.from_features(np.random.default_rng(0).normal(size=(6, 4)))
-    write_files(folder, geometry, Design(animals=2, sessions=2, units=15, trials=12))
+    write_files(folder, geometry, quiet_design(animals=2, sessions=2, units=15, trials=12))
     return folder
 
 

@@ -11,10 +11,10 @@ from brainbench.core.errors import DataError
 from brainbench.core.trials import Trials
 from brainbench.datasets import check, inspect, open_recordings, write_recordings
 from brainbench.datasets.sessions import SessionTable, make_session
-from brainbench.datasets.synthetic import Design, ResponseGeometry, as_recordings, simulate
+from brainbench.datasets.synthetic import ResponseGeometry, as_recordings, simulate
 from brainbench.datasets.trials.session_trials import pooled, trials_by_subject
 from brainbench.metrics.reliability.subject_rdm import subject_rdm
-from tests.factories.recordings import make_simple_session
+from tests.factories.recordings import make_simple_session, quiet_design
 
 
 def make_geometry(stimuli):
@@ -78,7 +78,7 @@ def test_one_unit_is_read_and_its_correlation_rdm_is_undefined_in_words(tmp_path
 
 
 def test_two_stimuli_are_read_and_one_pair_cannot_be_compared():
-    dataset = as_recordings(make_geometry(2), Design(animals=2, units=10, trials=6))
+    dataset = as_recordings(make_geometry(2), quiet_design(animals=2, units=10, trials=6))
     assert dataset.attrs["vocabulary"] == ["s1", "s2"]
     assert result(dataset, "synthetic01").problem
 
@@ -92,7 +92,7 @@ def test_two_thousand_stimuli_keep_their_order_and_are_proposed(tmp_path):
     assert (len(proposal.labels), proposal.fewest) == (2000, 2)
     geometry = make_geometry(2000)
     assert geometry.rdm.shape == (1_999_000,)
-    (animal,) = simulate(geometry, Design(animals=1, units=10, trials=2))
+    (animal,) = simulate(geometry, quiet_design(animals=1, units=10, trials=2))
     assert animal.truth.shape == (1_999_000,)
 
 
@@ -131,7 +131,7 @@ def test_a_hundred_thousand_units_need_little_memory(tmp_path):
 
 
 def test_an_animal_that_lacks_a_stimulus_is_kept_and_undefined_in_words():
-    design = Design(animals=3, units=12, trials=6, missing=((1, 3),))
+    design = quiet_design(animals=3, units=12, trials=6, missing=((1, 3),))
     dataset = as_recordings(make_geometry(6), design)
     assert dataset.attrs["missing"] == {"synthetic02": ["s4"]}
     assert result(dataset, "synthetic01").problem is None
@@ -141,7 +141,7 @@ def test_an_animal_that_lacks_a_stimulus_is_kept_and_undefined_in_words():
 
 
 def test_a_single_animal_with_a_single_session_goes_through():
-    found = result(as_recordings(make_geometry(6), Design(animals=1, units=15, trials=8)), "synthetic01")
+    found = result(as_recordings(make_geometry(6), quiet_design(animals=1, units=15, trials=8)), "synthetic01")
     assert found.problem is None
     assert 0 < found.reliability <= 1
 

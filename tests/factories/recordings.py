@@ -6,6 +6,7 @@ import numpy as np
 
 from brainbench.core.contracts import CHANNELS
 from brainbench.datasets.sessions import Session, make_session
+from brainbench.datasets.synthetic import PopulationDesign
 
 LABELS = ("convex-close", "convex-medium", "convex-far", "concave-close", "concave-medium", "concave-far")
 
@@ -60,3 +61,9 @@ def make_simple_session(
         times[0], times[-1] = 0.0, 2.0 * trials + 2
     tables = {"trials": table | options.pop("columns", {})} | options.pop("tables", {})
     return make_session(subject, session, spikes, tables, **options)
+
+
+def quiet_design(**changes):
+    """A design without any noise but Poisson's and without individual differences, apart from ``changes``."""
+    quiet = {"animals": 11, "units": 40, "trials": 20, "rate": 8.0, "window": 1.0, "modulation": 0.3}
+    return PopulationDesign(**{**quiet, "emphasis": 0.0, "dispersion": 0.0, "shared_gain": 0.0, **changes})

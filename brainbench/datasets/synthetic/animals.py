@@ -25,8 +25,14 @@ from numpy.typing import NDArray
 
 from brainbench.core.errors import UsageError, unknown_name
 from brainbench.core.trials import Trials
-from brainbench.datasets.synthetic.design import MODULATION, Design, draw_sessions, entropy, stimulus_means
 from brainbench.datasets.synthetic.geometry import ResponseGeometry
+from brainbench.datasets.synthetic.populations import (
+    MODULATION,
+    PopulationDesign,
+    draw_sessions,
+    entropy,
+    stimulus_means,
+)
 from brainbench.datasets.synthetic.truth import correlation_rdm
 
 _EXACT = 2e-4
@@ -46,7 +52,7 @@ class SyntheticAnimal:
 
 def simulate(
     geometry: ResponseGeometry,
-    design: Design | None = None,
+    design: PopulationDesign | None = None,
     *,
     seed: int | Sequence[int] = 0,
     faults: Sequence[str] = (),
@@ -58,7 +64,7 @@ def simulate(
 
     Args:
         geometry: the shared truth.
-        design: what is recorded; the defaults of :class:`Design` if None.
+        design: what is recorded; the defaults of :class:`PopulationDesign` if None.
         seed: one integer, or several (such as study and simulation).
         faults: ``"zero-fill"``, ``"first-appearance"``: faults of the released analysis, for
             demonstrations of what they cost; see :data:`FAULTS`.
@@ -82,7 +88,7 @@ def simulate(
 
 
 def measure_ceiling(
-    geometry: ResponseGeometry, design: Design, *, simulations: int = 50, seed: int | Sequence[int] = 0
+    geometry: ResponseGeometry, design: PopulationDesign, *, simulations: int = 50, seed: int | Sequence[int] = 0
 ) -> tuple[float, float]:
     """Measure the noise ceiling of a design: what the true geometry itself scores.
 
@@ -116,12 +122,12 @@ def measure_ceiling(
 
 def calibrate(
     geometry: ResponseGeometry,
-    design: Design,
+    design: PopulationDesign,
     *,
     ceiling: float,
     simulations: int = 50,
     seed: int | Sequence[int] = 0,
-) -> Design:
+) -> PopulationDesign:
     """Return the design with the modulation at which it has a given noise ceiling.
 
     Found by Brent's method with common random numbers: the same animals are drawn at every step.

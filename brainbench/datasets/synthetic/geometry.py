@@ -13,10 +13,10 @@ from brainbench.core.errors import DataError, UsageError
 
 @dataclass(frozen=True)
 class ResponseGeometry:
-    """Directions of K stimuli in tuning space; their angles are the truth of synthetic recordings."""
+    """Directions of K stimuli in tuning space; the distances between them are the truth of synthetic recordings."""
 
     directions: NDArray[np.float64]
-    """[K, D] unit vectors."""
+    """[K, D] on their principal axes, D < K or so; the mean of their squared lengths is one."""
     labels: tuple[str, ...]
     """[K] names of the stimuli."""
     distortion: float = 0.0
@@ -32,20 +32,30 @@ class ResponseGeometry:
             UsageError: the features are not [K, F] with K ≥ 2 and F ≥ 2, or labels do not fit.
             DataError: a value is not finite or a row is constant and has no direction.
         """
-        values = np.asarray(features, dtype=np.float64)
-        if values.ndim != 2 or len(values) < 2 or values.shape[1] < 2:
-            raise UsageError(f"Features are [stimulus, feature], at least 2 × 2; received shape {values.shape}.")
-        if not np.isfinite(values).all():
-            raise DataError(f"{int((~np.isfinite(values)).sum())} feature values are not finite.")
+        values = _checked(features, 2)
         centred = values - values.mean(axis=1, keepdims=True)
         norms = np.linalg.norm(centred, axis=1)
         if np.any(norms <= 1e-12 * np.maximum(np.abs(values).max(axis=1), 1e-300)):
             raise DataError(f"The features of stimulus {int(np.argmin(norms))} are constant, so it has no direction.")
-        directions = centred / norms[:, None]
-        if directions.shape[1] > len(directions):
-            # K vectors span at most K dimensions; a rotation into them keeps every angle.
-            directions = np.asarray(np.linalg.qr(directions.T, mode="r")).T
-        return cls(directions, _labels(labels, len(directions)))
+        return cls(_principal_axes(centred / norms[:, None]), _labels(labels, len(values)))
+
+    @classmethod
+    def from_activations(cls, features: ArrayLike, labels: Sequence[str] | None = None) -> ResponseGeometry:
+        """Take the Euclidean distances between stimuli over features [K, F], each standardised over the stimuli.
+
+        Constant features are left out. Unlike :meth:`from_features`, stimuli may be near to the mean response.
+
+        Raises:
+            UsageError: the features are not [K, F] with K ≥ 2, or labels do not fit.
+            DataError: a value is not finite, or every feature is constant.
+        """
+        values = _checked(features, 1)
+        spread = values.std(axis=0)
+        varied = spread > 1e-9 * np.maximum(np.abs(values).max(axis=0), 1e-300)
+        if not varied.any():
+            raise DataError("Every feature is the same for all stimuli, so there is nothing for neurons to encode.")
+        standard = (values[:, varied] - values[:, varied].mean(axis=0)) / spread[varied]
+        return cls(_principal_axes(standard / np.sqrt(standard.shape[1])), _labels(labels, len(values)))
 
     @classmethod
     def from_rdm(cls, rdm: ArrayLike, labels: Sequence[str] | None = None) -> ResponseGeometry:
@@ -80,9 +90,28 @@ class ResponseGeometry:
 
     @property
     def rdm(self) -> NDArray[np.float64]:
-        """The truth [P]: one minus the cosine between directions."""
-        pairs = np.triu_indices(len(self.directions), 1)
-        return 1.0 - (self.directions @ self.directions.T)[pairs]
+        """The truth [P]: half the squared distance between directions, for unit vectors one minus their cosine."""
+        rows, columns = np.triu_indices(len(self.directions), 1)
+        return 0.5 * np.sum((self.directions[rows] - self.directions[columns]) ** 2, axis=1)
+
+
+def _checked(features: ArrayLike, width: int) -> NDArray[np.float64]:
+    """Return features [K, F] as finite numbers, K ≥ 2 and F ≥ width."""
+    values = np.asarray(features, dtype=np.float64)
+    if values.ndim != 2 or len(values) < 2 or values.shape[1] < width:
+        raise UsageError(f"Features are [stimulus, feature], at least 2 × {width}; received shape {values.shape}.")
+    if not np.isfinite(values).all():
+        raise DataError(f"{int((~np.isfinite(values)).sum())} feature values are not finite.")
+    return values
+
+
+def _principal_axes(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Rotate K vectors [K, F] into the at most K axes that they span; every angle and length stays."""
+    left, values, _ = np.linalg.svd(vectors, full_matrices=False)
+    kept = values > 1e-9 * values[0]
+    # A singular vector's sign is the machine's choice; the largest entry is made positive.
+    signs = np.sign(left[np.abs(left).argmax(axis=0), np.arange(left.shape[1])])
+    return (left * signs * values)[:, kept]
 
 
 def _labels(labels: Sequence[str] | None, stimuli: int) -> tuple[str, ...]:

@@ -11,7 +11,7 @@ from brainbench.core.trials import Trials
 from brainbench.datasets import open_recordings
 from brainbench.datasets.synthetic import (
     FAULTS,
-    Design,
+    PopulationDesign,
     ResponseGeometry,
     as_recordings,
     calibrate,
@@ -25,8 +25,9 @@ from brainbench.datasets.synthetic import (
 from brainbench.datasets.trials.session_trials import trials_by_subject
 from brainbench.metrics import noise_ceiling, rdm
 from brainbench.metrics.reliability.subject_rdm import subject_rdm
+from tests.factories.recordings import quiet_design
 
-SMALL = Design(animals=3, sessions=2, units=12, trials=5)
+SMALL = quiet_design(animals=3, sessions=2, units=12, trials=5)
 
 
 def make_geometry(seed=0, stimuli=6, features=4):
@@ -87,11 +88,11 @@ def test_an_impossible_rdm_says_by_how_much_it_was_changed():
             UsageError,
             "3 stimuli need as many different",
         ),
-        (lambda: Design(units=0), UsageError, "at least one of units; received 0"),
-        (lambda: Design(rate=0.0), UsageError, "rate of a design is positive"),
-        (lambda: Design(dispersion=-1.0), UsageError, "dispersion of a design is not negative"),
-        (lambda: Design(modulation=0.9), UsageError, "modulation lies between 0 and 0.4"),
-        (lambda: Design(individual=2.0), UsageError, "individual lies between 0 and 1"),
+        (lambda: PopulationDesign(units=0), UsageError, "at least one of units; received 0"),
+        (lambda: PopulationDesign(rate=0.0), UsageError, "rate of a design is positive"),
+        (lambda: PopulationDesign(dispersion=-1.0), UsageError, "dispersion of a design is not negative"),
+        (lambda: PopulationDesign(modulation=0.9), UsageError, "modulation lies between 0 and 0.4"),
+        (lambda: PopulationDesign(individual=2.0), UsageError, "individual lies between 0 and 1"),
         (lambda: simulate(make_geometry(), SMALL, faults=["zero-fil"]), UsageError, "did you mean 'zero-fill'"),
         (lambda: simulate(make_geometry(), replace(SMALL, missing=((0, 6),))), UsageError, "numbered 0 to 5"),
     ],
@@ -105,7 +106,7 @@ def test_wrong_requests_say_what_is_allowed(make, error, message):
 
 
 def test_poisson_counts_have_a_variance_equal_to_the_mean():
-    design = Design(animals=1, units=200, trials=400, spread=0.0, modulation=0.0, rate=6.0)
+    design = quiet_design(animals=1, units=200, trials=400, spread=0.0, modulation=0.0, rate=6.0)
     (animal,) = simulate(make_geometry(), design)
     counts = animal.sessions[0].responses[:, 0]
     assert counts.mean() == pytest.approx(6.0, rel=0.01)
@@ -113,14 +114,14 @@ def test_poisson_counts_have_a_variance_equal_to_the_mean():
 
 
 def test_dispersion_is_that_of_the_negative_binomial():
-    design = Design(animals=1, units=200, trials=400, spread=0.0, modulation=0.0, rate=6.0, dispersion=0.25)
+    design = quiet_design(animals=1, units=200, trials=400, spread=0.0, modulation=0.0, rate=6.0, dispersion=0.25)
     counts = simulate(make_geometry(), design)[0].sessions[0].responses[:, 0]
     assert counts.mean() == pytest.approx(6.0, rel=0.01)
     assert counts.var(axis=0).mean() == pytest.approx(6.0 + 0.25 * 36.0, rel=0.03)
 
 
 def test_a_shared_gain_correlates_units_and_nothing_else_does():
-    design = Design(animals=1, units=60, trials=500, spread=0.0, modulation=0.0, rate=10.0)
+    design = quiet_design(animals=1, units=60, trials=500, spread=0.0, modulation=0.0, rate=10.0)
 
     def correlation(**change):
         counts = simulate(make_geometry(), replace(design, **change))[0].sessions[0].responses[:, 0]
@@ -132,20 +133,20 @@ def test_a_shared_gain_correlates_units_and_nothing_else_does():
 
 
 def test_session_effects_change_rates_as_stated():
-    design = Design(animals=1, units=300, trials=100, rate=10.0, drift=0.5)
+    design = quiet_design(animals=1, units=300, trials=100, rate=10.0, drift=0.5)
     (animal,) = simulate(make_geometry(), design)
     rates = animal.sessions[0].responses.mean(axis=(1, 2))
     slope = np.polyfit(np.linspace(-0.5, 0.5, len(rates)), rates / rates.mean(), 1)[0]
     assert slope == pytest.approx(0.5, abs=0.02)
     gains = [
         np.log(item.sessions[0].responses.mean())
-        for item in simulate(make_geometry(), Design(animals=150, trials=2, session_gain=0.4, spread=0.0))
+        for item in simulate(make_geometry(), quiet_design(animals=150, trials=2, session_gain=0.4, spread=0.0))
     ]
     assert np.std(gains) == pytest.approx(0.4, rel=0.15)
 
 
 def test_trials_can_be_unbalanced_and_stimuli_missing():
-    design = replace(SMALL, imbalance=0.6, trials=12, missing=((1, 2), (1, 4)))
+    design = replace(SMALL, trials=(4, 20), missing=((1, 2), (1, 4)))
     animals = simulate(make_geometry(), design)
     number = np.array([[np.bincount(block.labels, minlength=6) for block in item.sessions] for item in animals])
     assert (number[1][:, [2, 4]] == 0).all()
@@ -169,7 +170,7 @@ def test_animals_do_not_depend_on_how_many_there_are():
 
 def test_with_many_units_the_noiseless_rdm_is_the_geometry():
     geometry = make_geometry(3)
-    (animal,) = simulate(geometry, Design(animals=1, units=20_000, trials=1, modulation=0.4))
+    (animal,) = simulate(geometry, quiet_design(animals=1, units=20_000, trials=1, modulation=0.4))
     assert pearson(animal.truth, geometry.rdm) > 0.995
     lines = np.polyfit(geometry.rdm, animal.truth, 1)
     # Proportional: with mean rates that differ (log-normal s), the factor is m² E b² / (var b + m² E b²).
@@ -180,7 +181,7 @@ def test_with_many_units_the_noiseless_rdm_is_the_geometry():
 
 def test_individual_geometry_bounds_what_animals_share():
     geometry = make_geometry()
-    design = Design(animals=40, units=400, trials=1)
+    design = quiet_design(animals=40, units=400, trials=1)
     shared, half, none = (
         np.mean([pearson(item.truth, geometry.rdm) for item in simulate(geometry, replace(design, individual=share))])
         for share in (0.0, 0.5, 1.0)
@@ -188,14 +189,14 @@ def test_individual_geometry_bounds_what_animals_share():
     assert shared > 0.95
     assert 0.4 < half < 0.9
     # One geometry for the animal, not one per session.
-    (two,) = simulate(geometry, Design(animals=1, sessions=2, units=5000, trials=1, individual=1.0))
+    (two,) = simulate(geometry, quiet_design(animals=1, sessions=2, units=5000, trials=1, individual=1.0))
     assert pearson(*measured([replace(two, sessions=two.sessions[:1]), replace(two, sessions=two.sessions[1:])])) > 0.5
     assert abs(none) < 0.2
 
 
 def test_a_calibrated_design_has_the_ceiling_that_was_asked_for():
     geometry, wanted = make_geometry(1), 0.7
-    design = calibrate(geometry, Design(animals=11, units=20, trials=10), ceiling=wanted, simulations=12)
+    design = calibrate(geometry, quiet_design(animals=11, units=20, trials=10), ceiling=wanted, simulations=12)
     reached, error = measure_ceiling(geometry, design, simulations=36, seed=77)
     # Both the calibration (on 12 studies) and this measurement (on 36) have a Monte-Carlo error.
     assert abs(reached - wanted) < 3 * error * np.sqrt(1 + 36 / 12)
@@ -206,14 +207,16 @@ def test_a_calibrated_design_has_the_ceiling_that_was_asked_for():
     assert upper - lower < 0.06
 
 
-NOISY = {"dispersion": 0.2, "shared_gain": 0.15, "sessions": 2, "imbalance": 0.3}
+NOISY = {"dispersion": 0.2, "shared_gain": 0.15, "sessions": 2, "trials": (8, 22)}
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("wanted", "noise"), [(0.3, {}), (0.6, {}), (0.9, {}), (0.6, NOISY)])
 def test_calibration_is_exact_within_its_monte_carlo_error(wanted, noise):
     geometry = make_geometry(2)
-    design = calibrate(geometry, Design(animals=11, units=60, trials=15, **noise), ceiling=wanted, simulations=60)
+    design = calibrate(
+        geometry, quiet_design(animals=11, units=60, **{"trials": 15, **noise}), ceiling=wanted, simulations=60
+    )
     reached, error = measure_ceiling(geometry, design, simulations=180, seed=77)
     assert error < 0.01
     assert abs(reached - wanted) < 3 * error * np.sqrt(1 + 180 / 60)
@@ -221,13 +224,13 @@ def test_calibration_is_exact_within_its_monte_carlo_error(wanted, noise):
 
 def test_a_ceiling_out_of_reach_says_what_is_reached():
     with pytest.raises(UsageError, match=r"0\.99 .* up to 0\.[0-8]"):
-        calibrate(make_geometry(), Design(animals=5, units=5, trials=1, rate=1.0), ceiling=0.99, simulations=5)
+        calibrate(make_geometry(), quiet_design(animals=5, units=5, trials=1, rate=1.0), ceiling=0.99, simulations=5)
 
 
 def test_an_undefined_ceiling_is_no_number():
-    assert np.isnan(measure_ceiling(make_geometry(stimuli=2), Design(animals=2), simulations=1)[0])
+    assert np.isnan(measure_ceiling(make_geometry(stimuli=2), quiet_design(animals=2), simulations=1)[0])
     everywhere = tuple((animal, 0) for animal in range(2))
-    assert np.isnan(measure_ceiling(make_geometry(), Design(animals=2, missing=everywhere), simulations=1)[0])
+    assert np.isnan(measure_ceiling(make_geometry(), quiet_design(animals=2, missing=everywhere), simulations=1)[0])
 
 
 # Faults
@@ -235,10 +238,10 @@ def test_an_undefined_ceiling_is_no_number():
 
 def test_the_released_faults_cost_agreement_between_animals():
     geometry = make_geometry(5)
-    design = Design(animals=11, sessions=3, units=40, trials=10)
+    design = quiet_design(animals=11, sessions=3, units=40, trials=10)
 
     def agreement(*faults):
-        rdms = measured(simulate(geometry, replace(design, imbalance=0.3), faults=faults))
+        rdms = measured(simulate(geometry, replace(design, trials=(6, 14)), faults=faults))
         return noise_ceiling(rdms).lower
 
     clean, filled, ordered, both = (
@@ -312,14 +315,14 @@ def test_an_unknown_format_suggests_the_nearest(tmp_path):
 
 
 def test_no_unit_fires_within_its_refractory_time():
-    for session in make_sessions(make_geometry(), Design(animals=1, units=10, rate=60.0, window=0.4)):
+    for session in make_sessions(make_geometry(), quiet_design(animals=1, units=10, rate=60.0, window=0.4)):
         units = session.units.data
         for times in np.split(units["spike_times"], units["spike_times_index"][:-1]):
             assert np.diff(times).min() > 0.00199
 
 
 def test_trial_blocks_take_simulated_sessions_as_they_are():
-    animal = simulate(make_geometry(), Design(animals=1))[0]
+    animal = simulate(make_geometry(), quiet_design(animals=1))[0]
     trials = [Trials(block.responses[:, 0], block.labels, block.keys) for block in animal.sessions]
     found = subject_rdm(animal.subject, trials, 6, splits=50)
     np.testing.assert_allclose(found.rdm, measured([animal])[0])

@@ -1,4 +1,17 @@
-"""Sessions of synthetic animals: expected rates from a geometry, trials, and spike counts around them."""
+"""Populations of synthetic neurons: tuning from features or a geometry, trials, and spike counts around expected rates.
+
+Every unit has a mean rate b (log-normal over units) and Gaussian weights w on the axes of a geometry
+(:class:`ResponseGeometry`). Its expected rate for stimulus k is b · max(0, 1 + m (√(1−ι) x_k·w + √ι y_k·w′)): x_k is
+the shared direction of the stimulus, y_k the animal's own random one, m the ``modulation``, ι the ``individual``
+share. Each animal multiplies the axes by its own log-normal ``emphasis``. Squared Euclidean distances over many units
+are then proportional to those between directions; rectification touches less than 0.7 % of the rates at the largest
+modulation.
+
+Counts are Poisson around that rate, times a gamma gain per unit and trial (``dispersion`` φ: variance =
+mean + φ mean², the negative binomial), times one gain common to all units of a trial (``shared_gain``).
+
+Letters: K stimulus, F feature, R trial, U unit.
+"""
 
 from __future__ import annotations
 
@@ -6,7 +19,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from brainbench.core.errors import UsageError
 from brainbench.core.trials import Trials
@@ -17,47 +30,50 @@ MODULATION = 0.4
 
 
 @dataclass(frozen=True)
-class Design:
-    """Size of synthetic recordings, and how noisy they are."""
+class PopulationDesign:
+    """Size of synthetic recordings, and how noisy they are; the defaults make RDMs of about half reliability."""
 
-    animals: int = 11
+    animals: int = 10
     sessions: int = 1
     """Sessions per animal; each has its own units."""
-    units: int = 40
+    units: int = 60
     """Units per session."""
-    trials: int = 20
-    """Trials of each stimulus in a session."""
-    rate: float = 8.0
+    trials: int | tuple[int, int] = (16, 20)
+    """Trials of each stimulus in a session: one number, or the fewest and the most, drawn evenly."""
+    rate: float = 6.0
     """Mean rate of a unit, Hz."""
-    window: float = 1.0
+    window: float = 0.5
     """Duration in which spikes are counted, s."""
-    modulation: float = 0.3
+    modulation: float = 0.2
     """Standard deviation of a unit's rate over stimuli, as a share of its mean; 0 is the null."""
     individual: float = 0.0
     """Share of the tuning variance that is an animal's own and not the shared geometry."""
+    emphasis: float = 0.3
+    """Standard deviation over animals of the logarithm of the weight of each axis of the geometry."""
     spread: float = 0.4
     """Standard deviation of the logarithm of mean rates over units."""
-    dispersion: float = 0.0
+    dispersion: float = 0.3
     """φ of the negative binomial: variance = mean + φ mean² per unit and trial; 0 is Poisson."""
-    shared_gain: float = 0.0
+    shared_gain: float = 0.2
     """Standard deviation of a gain (mean one) that all units of a trial share."""
     session_gain: float = 0.0
     """Standard deviation of the logarithm of each session's overall rate."""
     drift: float = 0.0
     """Relative change of all rates from the first trial of a session to the last, above −1."""
-    imbalance: float = 0.0
-    """Standard deviation of the logarithm of trial numbers over stimuli; 0 is balanced."""
     missing: tuple[tuple[int, int], ...] = ()
     """Pairs (animal, stimulus) without any trial."""
 
     def __post_init__(self) -> None:
-        for name in ("animals", "sessions", "units", "trials"):
+        for name in ("animals", "sessions", "units"):
             if getattr(self, name) < 1:
                 raise UsageError(f"A design needs at least one of {name}; received {getattr(self, name)}.")
+        fewest, most = self.trial_range
+        if not 1 <= fewest <= most:
+            raise UsageError(f"A design needs at least one of trials, fewest before most; received {self.trials}.")
         for name in ("rate", "window"):
             if not getattr(self, name) > 0:
                 raise UsageError(f"The {name} of a design is positive; received {getattr(self, name)}.")
-        for name in ("spread", "dispersion", "shared_gain", "session_gain", "imbalance"):
+        for name in ("emphasis", "spread", "dispersion", "shared_gain", "session_gain"):
             if not getattr(self, name) >= 0:
                 raise UsageError(f"The {name} of a design is not negative; received {getattr(self, name)}.")
         if not 0 <= self.modulation <= MODULATION:
@@ -66,6 +82,11 @@ class Design:
             raise UsageError(
                 f"individual lies between 0 and 1 and drift above -1; received {self.individual} and {self.drift}."
             )
+
+    @property
+    def trial_range(self) -> tuple[int, int]:
+        """Fewest and most trials of a stimulus in a session."""
+        return (self.trials, self.trials) if isinstance(self.trials, int) else self.trials
 
 
 @dataclass(frozen=True)
@@ -92,22 +113,49 @@ class DrawnSession:
         return Trials(self.counts[:, None] / self.window, self.labels, keys)
 
 
+def draw_animals(
+    features: ArrayLike | ResponseGeometry, design: PopulationDesign | None = None, seed: int | Sequence[int] = 0
+) -> dict[str, tuple[Trials, ...]]:
+    """Draw animals whose units mix features linearly, such as the activations of a network.
+
+    Every animal and session has its own random stream, so the first animals of a larger design are those of a smaller
+    one.
+
+    Args:
+        features: [K, F], each standardised over stimuli (:meth:`ResponseGeometry.from_activations`); or a geometry.
+        design: size and noise; the defaults of :class:`PopulationDesign` if None.
+        seed: one integer, or several (such as study and simulation).
+
+    Returns:
+        Subject → its sessions: ``responses`` [R, 1, U] Hz, ``labels`` [R], ``keys``.
+
+    Raises:
+        UsageError: features are not [K, F], or a missing stimulus does not exist.
+        DataError: a feature is not finite, or all are constant.
+    """
+    geometry = features if isinstance(features, ResponseGeometry) else ResponseGeometry.from_activations(features)
+    animals: dict[str, tuple[Trials, ...]] = {}
+    for drawn in draw_sessions(geometry, design, seed):
+        animals[drawn.subject] = (*animals.get(drawn.subject, ()), drawn.trials)
+    return animals
+
+
 def draw_sessions(
-    geometry: ResponseGeometry, design: Design | None, seed: int | Sequence[int]
+    geometry: ResponseGeometry, design: PopulationDesign | None, seed: int | Sequence[int]
 ) -> Iterator[DrawnSession]:
     """Draw the sessions of every animal; each is a pure function of geometry, design, seed, animal and session.
 
     Raises:
         UsageError: a missing stimulus does not exist.
     """
-    design = design or Design()
+    design = design or PopulationDesign()
     for animal in range(design.animals):
         for session in range(design.sessions):
             yield _draw_session(geometry, design, animal, session, entropy(seed))
 
 
 def _draw_session(
-    geometry: ResponseGeometry, design: Design, animal: int, session: int, seed: tuple[int, ...]
+    geometry: ResponseGeometry, design: PopulationDesign, animal: int, session: int, seed: tuple[int, ...]
 ) -> DrawnSession:
     stimuli = len(geometry.labels)
     absent = [which for owner, which in design.missing if owner == animal]
@@ -117,7 +165,11 @@ def _draw_session(
     own = np.random.default_rng([*seed, animal])
     random = np.random.default_rng([*seed, animal, session])
     # Variances add up to one: 1 − ι of the shared geometry and ι of the animal's own.
-    tuning = np.sqrt(1 - design.individual) * _project(geometry.directions, design.units, random)
+    # Log-normal weights of the axes; their mean square is one, so that the depth of tuning does not depend on them.
+    weight = np.exp(design.emphasis * own.standard_normal(geometry.directions.shape[1]))
+    axes = geometry.directions * weight
+    axes *= np.sqrt(np.sum(geometry.directions**2) / np.sum(axes**2))
+    tuning = np.sqrt(1 - design.individual) * _project(axes, design.units, random)
     if design.individual:
         private = own.standard_normal((stimuli, stimuli + 1))
         private /= np.linalg.norm(private, axis=1, keepdims=True)
@@ -164,13 +216,13 @@ def _project(directions: NDArray[np.float64], units: int, random: np.random.Gene
     return directions @ random.standard_normal((directions.shape[1], units))
 
 
-def _labels(design: Design, stimuli: int, absent: list[int], random: np.random.Generator) -> NDArray[np.int64]:
-    number = np.full(stimuli, float(design.trials))
-    if design.imbalance:
-        share = np.exp(design.imbalance * random.standard_normal(stimuli))
-        number = np.maximum(1, np.round(design.trials * share / share.mean()))
+def _labels(
+    design: PopulationDesign, stimuli: int, absent: list[int], random: np.random.Generator
+) -> NDArray[np.int64]:
+    fewest, most = design.trial_range
+    number = random.integers(fewest, most + 1, size=stimuli)
     number[absent] = 0
-    labels = np.repeat(np.arange(stimuli), number.astype(int))
+    labels = np.repeat(np.arange(stimuli), number)
     random.shuffle(labels)
     return labels
 
