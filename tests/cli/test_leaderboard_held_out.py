@@ -6,44 +6,17 @@ import json
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from brainbench.core.errors import DataError
 from brainbench.core.records import ModelCard
-from brainbench.datasets import open_recordings, write_recordings
-from brainbench.datasets.sessions import make_session
-from brainbench.models.features import write_features
+from brainbench.datasets import open_recordings
 from leaderboards.held_out import DATA, SALT, Commitment
 from leaderboards.store import read_record, write_record
 from tests.factories.records import make_record
 
 LABELS = tuple("abcdefgh")
 PARTS = ("--conditions", "trials:texture")
-
-
-@pytest.fixture
-def study(tmp_path) -> dict[str, str]:
-    """Four animals and eight stimuli; features and a module for them."""
-    rng = np.random.default_rng(0)
-    for animal in "wxyz":
-        order = np.repeat(np.arange(len(LABELS)), 8)
-        starts = 1.0 + np.arange(len(order))
-        rates = rng.gamma(2.0, 8.0, size=(len(LABELS), 12))
-        spikes = [
-            np.sort(
-                np.concatenate(
-                    [s + rng.uniform(0, 0.5, rng.poisson(rates[k, u])) for s, k in zip(starts, order, strict=True)]
-                )
-            )
-            for u in range(12)
-        ]
-        table = {"start_time": starts, "stop_time": starts + 0.5, "texture": [LABELS[k] for k in order]}
-        session = make_session(animal, "1", spikes, {"trials": table}, observed=[np.array([[0.0, 90.0]])] * 12)
-        write_recordings(tmp_path / "data" / f"{animal}.h5", session)
-    features = write_features(tmp_path / "features.h5", LABELS, {"fc": rng.normal(size=(len(LABELS), 6))})
-    return {"data": str(tmp_path / "data"), "features": str(features), "board": str(tmp_path / "board"),
-            "secret": str(tmp_path / "secret"), "out": str(tmp_path / "out")}  # fmt: skip
 
 
 def _hold_out(run, study, *what):
