@@ -23,70 +23,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from brainbench.core.errors import UsageError
 from brainbench.core.trials import Trials
+from brainbench.datasets.synthetic.design import PopulationDesign
 from brainbench.datasets.synthetic.geometry import ResponseGeometry
-
-MODULATION = 0.4
-"""Largest modulation: beyond it too many rates would be cut off at zero for the truth to hold."""
-
-
-@dataclass(frozen=True)
-class PopulationDesign:
-    """Size of synthetic recordings, and how noisy they are; the defaults make RDMs of about half reliability."""
-
-    animals: int = 10
-    sessions: int = 1
-    """Sessions per animal; each has its own units."""
-    units: int = 60
-    """Units per session."""
-    trials: int | tuple[int, int] = (16, 20)
-    """Trials of each stimulus in a session: one number, or the fewest and the most, drawn evenly."""
-    rate: float = 6.0
-    """Mean rate of a unit, Hz."""
-    window: float = 0.5
-    """Duration in which spikes are counted, s."""
-    modulation: float = 0.2
-    """Standard deviation of a unit's rate over stimuli, as a share of its mean; 0 is the null."""
-    individual: float = 0.0
-    """Share of the tuning variance that is an animal's own and not the shared geometry."""
-    emphasis: float = 0.3
-    """Standard deviation over animals of the logarithm of the weight of each axis of the geometry."""
-    spread: float = 0.4
-    """Standard deviation of the logarithm of mean rates over units."""
-    dispersion: float = 0.3
-    """φ of the negative binomial: variance = mean + φ mean² per unit and trial; 0 is Poisson."""
-    shared_gain: float = 0.2
-    """Standard deviation of a gain (mean one) that all units of a trial share."""
-    session_gain: float = 0.0
-    """Standard deviation of the logarithm of each session's overall rate."""
-    drift: float = 0.0
-    """Relative change of all rates from the first trial of a session to the last, above −1."""
-    missing: tuple[tuple[int, int], ...] = ()
-    """Pairs (animal, stimulus) without any trial."""
-
-    def __post_init__(self) -> None:
-        for name in ("animals", "sessions", "units"):
-            if getattr(self, name) < 1:
-                raise UsageError(f"A design needs at least one of {name}; received {getattr(self, name)}.")
-        fewest, most = self.trial_range
-        if not 1 <= fewest <= most:
-            raise UsageError(f"A design needs at least one of trials, fewest before most; received {self.trials}.")
-        for name in ("rate", "window"):
-            if not getattr(self, name) > 0:
-                raise UsageError(f"The {name} of a design is positive; received {getattr(self, name)}.")
-        for name in ("emphasis", "spread", "dispersion", "shared_gain", "session_gain"):
-            if not getattr(self, name) >= 0:
-                raise UsageError(f"The {name} of a design is not negative; received {getattr(self, name)}.")
-        if not 0 <= self.modulation <= MODULATION:
-            raise UsageError(f"The modulation lies between 0 and {MODULATION}; received {self.modulation}.")
-        if not 0 <= self.individual <= 1 or not self.drift > -1:
-            raise UsageError(
-                f"individual lies between 0 and 1 and drift above -1; received {self.individual} and {self.drift}."
-            )
-
-    @property
-    def trial_range(self) -> tuple[int, int]:
-        """Fewest and most trials of a stimulus in a session."""
-        return (self.trials, self.trials) if isinstance(self.trials, int) else self.trials
 
 
 @dataclass(frozen=True)
@@ -164,33 +102,9 @@ def _draw_session(
     # One stream for each animal and each session: a larger design begins with the animals of a smaller one.
     own = np.random.default_rng([*seed, animal])
     random = np.random.default_rng([*seed, animal, session])
-    # Variances add up to one: 1 − ι of the shared geometry and ι of the animal's own.
-    # Log-normal weights of the axes; their mean square is one, so that the depth of tuning does not depend on them.
-    weight = np.exp(design.emphasis * own.standard_normal(geometry.directions.shape[1]))
-    axes = geometry.directions * weight
-    axes *= np.sqrt(np.sum(geometry.directions**2) / np.sum(axes**2))
-    tuning = np.sqrt(1 - design.individual) * _project(axes, design.units, random)
-    if design.individual:
-        private = own.standard_normal((stimuli, stimuli + 1))
-        private /= np.linalg.norm(private, axis=1, keepdims=True)
-        tuning += np.sqrt(design.individual) * _project(private, design.units, random)
-    # Log-normal over units with the mean rate kept, since E exp(σz − σ²/2) = 1.
-    mean = design.rate * np.exp(design.spread * random.standard_normal(design.units) - design.spread**2 / 2)
-    mean *= np.exp(design.session_gain * random.standard_normal())
-    # Rectified-linear rates b max(0, 1 + m w·x): their covariance over units follows the cosines of the geometry.
-    expected = mean * np.maximum(0.0, 1.0 + design.modulation * tuning)
+    expected = expected_rates(geometry, design, own, random)
     labels = _labels(design, stimuli, absent, random)
-    # Drift is linear from the first trial to the last, with a mean of one.
-    gain = np.linspace(1 - design.drift / 2, 1 + design.drift / 2, len(labels))[:, None]
-    if design.shared_gain:
-        # A gamma with shape 1/σ² and scale σ² has mean one and standard deviation σ.
-        shape = design.shared_gain**-2
-        gain = gain * random.gamma(shape, 1 / shape, (len(labels), 1))
-    rates = expected[labels] * gain
-    if design.dispersion:
-        # A Poisson count with a gamma rate is negative binomial: variance = mean + φ mean².
-        rates *= random.gamma(1 / design.dispersion, design.dispersion, rates.shape)
-    counts = random.poisson(rates * design.window)
+    counts = draw_counts(random, design, expected[labels], design.window)
     return DrawnSession(
         subject=f"synthetic{animal + 1:02d}",
         session=f"{session + 1:02d}",
@@ -200,6 +114,55 @@ def _draw_session(
         expected=expected,
         window=design.window,
     )
+
+
+def expected_rates(
+    geometry: ResponseGeometry, design: PopulationDesign, own: np.random.Generator, random: np.random.Generator
+) -> NDArray[np.float64]:
+    """Draw units and return their expected rates [K, U], Hz.
+
+    Args:
+        geometry: what all animals share.
+        design: number of units, rates, modulation and individual differences.
+        own: stream of the animal, fresh: all of its sessions draw the same differences from it.
+        random: stream of the session.
+    """
+    stimuli = len(geometry.labels)
+    # Log-normal weights of the axes; their mean square is one, so that the depth of tuning does not depend on them.
+    weight = np.exp(design.emphasis * own.standard_normal(geometry.directions.shape[1]))
+    axes = geometry.directions * weight
+    axes *= np.sqrt(np.sum(geometry.directions**2) / np.sum(axes**2))
+    # Variances add up to one: 1 − ι of the shared geometry and ι of the animal's own.
+    tuning = np.sqrt(1 - design.individual) * _project(axes, design.units, random)
+    if design.individual:
+        private = own.standard_normal((stimuli, stimuli + 1))
+        private /= np.linalg.norm(private, axis=1, keepdims=True)
+        tuning += np.sqrt(design.individual) * _project(private, design.units, random)
+    # Log-normal over units with the mean rate kept, since E exp(σz − σ²/2) = 1.
+    mean = design.rate * np.exp(design.spread * random.standard_normal(design.units) - design.spread**2 / 2)
+    mean *= np.exp(design.session_gain * random.standard_normal())
+    # Rectified-linear rates b max(0, 1 + m w·x): their covariance over units follows the cosines of the geometry.
+    return mean * np.maximum(0.0, 1.0 + design.modulation * tuning)
+
+
+def draw_counts(
+    random: np.random.Generator,
+    design: PopulationDesign,
+    rates: NDArray[np.float64],
+    window: float | NDArray[np.float64],
+) -> NDArray[np.int64]:
+    """Draw spike counts [R, U] around expected rates [R, U] (Hz) in windows of one length or one each [R, 1], s."""
+    # Drift is linear from the first trial to the last, with a mean of one.
+    gain = np.linspace(1 - design.drift / 2, 1 + design.drift / 2, len(rates))[:, None]
+    if design.shared_gain:
+        # A gamma with shape 1/σ² and scale σ² has mean one and standard deviation σ.
+        shape = design.shared_gain**-2
+        gain = gain * random.gamma(shape, 1 / shape, (len(rates), 1))
+    rates = rates * gain
+    if design.dispersion:
+        # A Poisson count with a gamma rate is negative binomial: variance = mean + φ mean².
+        rates *= random.gamma(1 / design.dispersion, design.dispersion, rates.shape)
+    return random.poisson(rates * window)
 
 
 def stimulus_means(block: Trials, stimuli: int) -> NDArray[np.float64]:

@@ -1,8 +1,3 @@
-import json
-import multiprocessing
-import os
-import shutil
-
 import h5py
 import numpy as np
 import pytest
@@ -11,7 +6,6 @@ from brainbench.core.errors import DataError, UsageError
 from brainbench.core.files import file_hash
 from brainbench.datasets import inspect, open_recordings
 from brainbench.datasets.synthetic import ensure_rodgers_demo, make_rodgers_demo, read_truth
-from brainbench.datasets.synthetic.truth import TRUTH
 from brainbench.datasets.trials.session_trials import trials_by_subject
 from tests.factories.recordings import LABELS, make_stimuli
 
@@ -171,68 +165,6 @@ def test_files_are_valid_for_pynwb_and_free_of_critical_findings(folder):
         assert units["spike_times"].map(len).min() > 0
 
 
-def test_the_cache_makes_them_once(monkeypatch, tmp_path):
-    monkeypatch.setenv("BRAINBENCH_CACHE", str(tmp_path))
-    stimuli = make_stimuli()
-    made = ensure_rodgers_demo(stimuli, animals=1)
-    stamp = made.stat().st_mtime_ns
-    assert ensure_rodgers_demo(lambda: pytest.fail("not needed"), key="fake-0-30", animals=1) == made
-    assert made.stat().st_mtime_ns == stamp
-    assert [item.name for item in made.parent.iterdir()] == [made.name]
-
-
-def test_a_damaged_cache_is_made_again(monkeypatch, tmp_path, caplog):
-    monkeypatch.setenv("BRAINBENCH_CACHE", str(tmp_path))
-    made = ensure_rodgers_demo(make_stimuli(), animals=1)
-    file = next(made.glob("*.nwb"))
-    before = file_hash(file)
-    file.write_bytes(b"")
-    ensure_rodgers_demo(make_stimuli(), animals=1)
-    assert file_hash(file) == before
-    assert "damaged" in caplog.text
-    (made / TRUTH).unlink()
-    ensure_rodgers_demo(make_stimuli(), animals=1)
-    assert json.loads((made / TRUTH).read_text())["synthetic"] is True
-
-
-def test_what_a_killed_process_left_is_completed_and_removed_when_old(monkeypatch, folder, tmp_path):
-    monkeypatch.setenv("BRAINBENCH_CACHE", str(tmp_path))
-    half = ensure_rodgers_demo(make_stimuli(), animals=1)
-    for path in half.iterdir():
-        path.unlink()
-    first = sorted(folder.glob("*.nwb"))[0]
-    shutil.copy(first, half)
-    old, young = half / ".sub-old.nwb", half / ".sub-young.nwb"
-    old.touch()
-    young.touch()
-    os.utime(old, (0, 0))
-    assert ensure_rodgers_demo(make_stimuli(), animals=1) == half
-    assert not old.exists()
-    assert young.exists()
-    assert open_recordings(half).attrs["sessions"][1]["session"] == "02"
-    assert file_hash(half / first.name) == file_hash(first)
-
-
-def _ensure(queue):
-    queue.put(str(ensure_rodgers_demo(make_stimuli(), animals=1)))
-
-
-def test_two_processes_may_make_them_at_once(monkeypatch, tmp_path):
-    monkeypatch.setenv("BRAINBENCH_CACHE", str(tmp_path))
-    context = multiprocessing.get_context("spawn")
-    queue = context.Queue()
-    workers = [context.Process(target=_ensure, args=(queue,)) for _ in range(2)]
-    for worker in workers:
-        worker.start()
-    paths = {queue.get(timeout=60) for _ in workers}
-    for worker in workers:
-        worker.join()
-        assert worker.exitcode == 0
-    assert len(paths) == 1
-    assert open_recordings(paths.pop()).attrs["synthetic"] is True
-    assert not list((tmp_path / "recordings").glob("*/.*"))
-
-
 def test_unsuitable_stimuli_are_refused(monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
     stimuli = make_stimuli()
@@ -253,11 +185,3 @@ def test_unsuitable_stimuli_are_refused(monkeypatch, tmp_path):
     assert list(tmp_path.iterdir()) == []
     with pytest.raises(UsageError, match="needs a key"):
         ensure_rodgers_demo(make_stimuli)
-
-
-def test_no_folder_is_left_after_a_failure(monkeypatch, tmp_path):
-    monkeypatch.setenv("BRAINBENCH_CACHE", str(tmp_path))
-    with pytest.raises(DataError):
-        ensure_rodgers_demo(make_stimuli().drop_vars("contact"))
-    assert list((tmp_path / "recordings").iterdir()) == []
-    shutil.rmtree(tmp_path)
