@@ -125,7 +125,7 @@ class Entry:
     def standing(self) -> Standing:
         """What can be said of it; of several seeds the least."""
         found = [standing_of(record.score, above_raw=self.above_raw) for record in self.records]
-        return max(found, key=STANDINGS.index)
+        return STANDINGS[max(map(STANDINGS.index, found))]
 
     @property
     def not_repeatable(self) -> str:

@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -173,7 +174,7 @@ def _tests(samples: Sequence[Sample]) -> tuple[NDArray[np.float64], ...]:
     return difference, errors, freedoms, p
 
 
-def _with_seeds(error: NDArray[np.float64], freedom: NDArray[np.float64], seeds: Sequence[Sequence[float]]) -> tuple:
+def _with_seeds(error: NDArray[np.float64], freedom: NDArray[np.float64], seeds: Sequence[Any]) -> tuple:
     """Add (variance, degrees of freedom) of seeds to a standard error, after Welch and Satterthwaite."""
     total = error**2 + sum(variance for variance, _ in seeds)
     with np.errstate(invalid="ignore", divide="ignore"):

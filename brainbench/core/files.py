@@ -61,6 +61,11 @@ def to_plain(value: Any) -> Any:
     A field that came later than files and hashes which exist (its metadata say ``later=True``) appears only where it
     is used, so that those stay what they are.
     """
+    # Most of a record are the numbers of its RDMs: they come first.
+    if type(value) is float:
+        return value if math.isfinite(value) else None
+    if value is None or type(value) in (str, int, bool):
+        return value
     if isinstance(value, Mapping):
         return {str(key): to_plain(item) for key, item in value.items()}
     if is_dataclass(value) and not isinstance(value, type):

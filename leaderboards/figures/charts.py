@@ -174,12 +174,12 @@ def accuracy(entries: Sequence[Entry]) -> Figure:
     rows = []
     for entry, twin in zip(models, found, strict=True):
         kind, card = colour[_objective(entry)], entry.card
-        marks = (
-            (twin, "c0 open", f"untrained twin {number(twin)}", 3.5, "dot"),
-            (card.top5, f"{kind} open", f"top-5 {number(card.top5)}", 3.5, "diamond"),
-            (card.top1, kind, f"{entry.name}: top-1 {number(card.top1)}", 4.5, "dot"),
-        )
-        points = [ChartPoint(value, *rest) for value, *rest in marks if value is not None]
+        top1 = card.top1 or 0.0  # only models that state it are drawn
+        points = [ChartPoint(top1, kind, f"{entry.name}: top-1 {number(top1)}")]
+        if card.top5 is not None:
+            points.insert(0, ChartPoint(card.top5, f"{kind} open", f"top-5 {number(card.top5)}", 3.5, "diamond"))
+        if twin is not None:
+            points.insert(0, ChartPoint(twin, "c0 open", f"untrained twin {number(twin)}", 3.5))
         rows.append(ChartRow(cut_name(entry.name, 36), points, card.accuracy_interval, kind))
     reach = max(0.05, *(max(e.card.top1 or 0, e.card.top5 or 0, e.card.twin_top1 or 0) for e in models))
     scale = Scale(0.0, min(1.0, reach * 1.05), 250, WIDTH - 20)
