@@ -136,12 +136,12 @@ def fetch(
 
 def _found(source: str) -> str:
     """Return a source as the files' readers take it: the demo recordings by their folder."""
-    if source != "demo":
-        return source
-    from brainbench.scoring.neural_responses import demo_recordings
+    from brainbench.scoring.demo import DEMOS, demo_recordings
 
+    if source not in DEMOS:
+        return source
     with progress_bar() as progress:
-        return str(demo_recordings(progress=progress))
+        return str(demo_recordings(source, progress=progress))
 
 
 def _verdict(animal: SubjectRDM) -> str:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from brainbench.core.progress import Progress
+from brainbench.scoring.demo import DEMOS, demo_recordings
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -17,9 +18,6 @@ if TYPE_CHECKING:
 
     from brainbench.core.trials import Trials
     from brainbench.metrics.measures.registry import Metric
-
-DEMO_STIMULI = "rodgers"
-"""Recipe that the demo animals feel."""
 
 
 @dataclass(frozen=True)
@@ -34,6 +32,11 @@ class NeuralResponses:
     def vocabulary(self) -> tuple[str, ...]:
         """Ordered condition labels."""
         return tuple(self.dataset.attrs["vocabulary"])
+
+    @property
+    def stimuli(self) -> str | None:
+        """Recipe of the stimuli that the animals felt; None where the recordings name none."""
+        return self.dataset.attrs.get("stimuli") or None
 
     @property
     def synthetic(self) -> bool:
@@ -73,7 +76,7 @@ class NeuralResponses:
 
 
 def open_neural_responses(recordings: Any, *, progress: Progress | None, **selection: Any) -> NeuralResponses:
-    """Open recordings; ``"demo"`` is made from the simulated ``rodgers`` stimuli on first use."""
+    """Open recordings; demo recordings (:data:`brainbench.scoring.demo.DEMOS`) are made on first use."""
     import xarray as xr
 
     from brainbench.datasets import open_recordings
@@ -82,19 +85,11 @@ def open_neural_responses(recordings: Any, *, progress: Progress | None, **selec
         from brainbench.core.contracts import check_recordings
 
         return NeuralResponses(check_recordings(recordings), "data set")
-    if recordings == "demo":
-        return NeuralResponses(open_recordings(demo_recordings(progress=progress), **selection), "demo")
+    if isinstance(recordings, str) and recordings in DEMOS:
+        return NeuralResponses(open_recordings(demo_recordings(recordings, progress=progress), **selection), recordings)
     several = not isinstance(recordings, (str, os.PathLike))
     name = ", ".join(Path(item).name for item in recordings) if several else Path(recordings).name
     return NeuralResponses(open_recordings(recordings, **selection), name)
-
-
-def demo_recordings(*, progress: Progress | None = None) -> Path:
-    """Return the folder of the demo recordings, made once per machine from the ``rodgers`` stimuli."""
-    from brainbench.datasets.synthetic import ensure_demo
-    from brainbench.stimuli import get_recipe, simulate
-
-    return ensure_demo(simulate(get_recipe(DEMO_STIMULI).scenes, progress=progress), progress=progress)
 
 
 def without_time(values: NDArray[np.floating], time: str) -> NDArray[np.floating]:

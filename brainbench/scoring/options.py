@@ -39,9 +39,9 @@ class ScoreOptions:
     """
 
     recordings: str | os.PathLike[str] | Sequence[str | os.PathLike[str]] | xr.Dataset = "demo"
-    """'demo' (synthetic), an NWB or HDF5 file, a folder, or a glob; in Python also an opened data set."""
+    """'demo' or 'demo-rodgers' (synthetic), an NWB or HDF5 file, a folder, or a glob; in Python also a data set."""
     stimuli: str | os.PathLike[str] | Stimuli | xr.Dataset | None = None
-    """A recipe (rodgers by default), a scene file, a stimulus-set file, or an HDF5 array."""
+    """A recipe, a scene file, a stimulus-set file, or an HDF5 array; by default what the recordings name."""
     conditions: str | None = None
     """TABLE:COLUMN[,COLUMN] of the recordings that labels the trials; see 'recordings inspect'."""
     match: Path | str | Mapping[str, str | None] | None = None

@@ -73,18 +73,18 @@ def score_record(
     """
     from brainbench import metrics
     from brainbench.metrics.inference.bootstrap import DRAWS
-    from brainbench.scoring.model_responses import DEFAULT_STIMULI, resolve_model
-    from brainbench.scoring.neural_responses import DEMO_STIMULI, open_neural_responses
+    from brainbench.scoring.demo import DEMOS
+    from brainbench.scoring.model_responses import resolve_model
+    from brainbench.scoring.neural_responses import open_neural_responses
     from brainbench.stimuli.sources import prepare_stimuli
 
     started = clock.perf_counter()
     options = ScoreOptions.of({**vars(options or ScoreOptions()), **changes})
     # The simulation gets ready in a thread while the network loads, if any will be needed.
-    if isinstance(options.recordings, str) and options.recordings == "demo":
-        prepare_stimuli(DEMO_STIMULI, progress=progress)
-    elif not isinstance(model, Mapping):
-        source = options.stimuli if options.stimuli is not None else DEFAULT_STIMULI
-        prepare_stimuli(source, whiskers=options.whiskers, fidelity=options.fidelity, progress=progress)
+    if isinstance(options.recordings, str) and options.recordings in DEMOS:
+        prepare_stimuli(DEMOS[options.recordings], progress=progress)
+    elif not isinstance(model, Mapping) and options.stimuli is not None:
+        prepare_stimuli(options.stimuli, whiskers=options.whiskers, fidelity=options.fidelity, progress=progress)
     # Whatever can be wrong with a name or a file is found before the slow part, the simulation.
     metric = metrics.get_metric(options.metric)
     if options.explain and metric.name != "rsa":
@@ -96,6 +96,8 @@ def score_record(
     options = replace(options, metric=metric)
     resolved = resolve_model(model, seed=options.model_seed)
     brain = open_neural_responses(options.recordings, progress=progress, **options.selection)
+    # Recordings name the stimuli that the animals felt; the caller's choice goes first.
+    options = replace(options, stimuli=brain.stimuli if options.stimuli is None else options.stimuli)
     network = resolved.respond(options, progress=progress)
     pairs = join_labels(brain.vocabulary, network.labels, options.match)
     kept = tuple(pairs)

@@ -50,7 +50,7 @@ def score_again(
 
     Args:
         record: The record.
-        recordings: Where its recordings are; only ``demo`` is found without, since records keep no folders.
+        recordings: Where its recordings are; only demo recordings are found without, since records keep no folders.
         trust_code: Also run code and weights that do not come with this package.
         progress: Called with (done, total, what).
 
@@ -58,6 +58,7 @@ def score_again(
         DataError: the record does not say enough.
         UsageError: the recordings are not given, or differ in their labels; or the record names foreign code.
     """
+    from brainbench.scoring.demo import DEMOS
     from brainbench.scoring.scores import score_record
 
     origin = record.score.provenance
@@ -68,10 +69,10 @@ def score_again(
             "record of an earlier layout); score the model again."
         )
     refuse_foreign_code(record, trusted=trust_code)
-    if recordings is None and source != "demo":
+    if recordings is None and source not in DEMOS:
         raise UsageError(f"The record was made with the recordings {source!r}; give them with --recordings PATH.")
     match = origin.pairs if any(label != partner for label, partner in origin.pairs.items()) else None
-    options = ScoreOptions.stated_in(origin.settings, recordings=recordings or "demo", match=match)
+    options = ScoreOptions.stated_in(origin.settings, recordings=recordings or source, match=match)
     return score_record(model, options, progress=progress)
 
 
@@ -135,10 +136,11 @@ def missing(jobs: Sequence[ScoringJob], records: Iterable[ResultRecord]) -> list
     from brainbench.stimuli import load_stimuli
 
     options = jobs[0].options
-    brain = open_neural_responses(options.recordings, progress=None, **options.selection).origin["content_hash"]
-    shown = load_stimuli(options.stimuli or DEFAULT_STIMULI, whiskers=options.whiskers, fidelity=options.fidelity)
+    brain = open_neural_responses(options.recordings, progress=None, **options.selection)
+    source = options.stimuli or brain.stimuli or DEFAULT_STIMULI
+    shown = load_stimuli(source, whiskers=options.whiskers, fidelity=options.fidelity)
     names = ("metric", "estimator", "time", "weights_seed", "estimator_version")
-    common = (__version__, brain, shown.config_hash or shown.content_hash)
+    common = (__version__, brain.origin["content_hash"], shown.config_hash or shown.content_hash)
     known = set()
     for record in records:
         origin = record.score.provenance
