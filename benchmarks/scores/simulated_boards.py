@@ -7,7 +7,7 @@ user's would be; :mod:`benchmarks.scores.calibration` runs many of them on all p
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 from itertools import combinations
 from typing import Any
 
@@ -19,11 +19,14 @@ from brainbench.core.statistics import two_factor_error
 from brainbench.datasets.synthetic import PopulationDesign, ResponseGeometry
 from brainbench.datasets.synthetic.populations import draw_sessions
 from brainbench.metrics import get_metric, rdm
+from brainbench.metrics.measures.rsa import RSA
 from brainbench.metrics.rdms.comparison import compare_all
 from brainbench.metrics.time import AnimalMovie, score_over_time
 
 DIMENSIONS = 10
 RULES = ("animals alone", "two factors")
+BOARDS = {"unrelated": (0.0,) * 8, "equally good": (0.6,) * 8, "one better": (0.9,) + (0.4,) * 7}
+"""Shares of the models of three boards."""
 BIN = 0.05
 
 
@@ -34,11 +37,19 @@ class Study:
     seed: int
     stimuli: int
     animals: int
-    shares: tuple[float, ...]
+    shares: tuple[float, ...] = ()
     """Of each model, the correlation of its geometry with the shared one (about its true score on the common scale)."""
     metric: str = "rsa"
+    quick: bool = True
+    """Chance from 199 orders of the stimuli in place of 1,999; for RSA alone."""
     layers: int = 1
     """Layers of each model; the first has the share, the others know nothing."""
+
+
+class FewOrders(RSA):
+    """RSA whose p is coarse, which intervals and comparisons of models do not use."""
+
+    orders = 199
 
 
 def mixed(shared: np.ndarray, share: float, rng: np.random.Generator) -> np.ndarray:
@@ -57,6 +68,8 @@ def score_study(study: Study) -> tuple[list[Score], np.ndarray]:
     geometry = ResponseGeometry.from_activations(shared)
     names = [f"{'ab'[index % 2]}-{index // 2}" for index in range(study.stimuli)]
     metric: Any = get_metric(study.metric)
+    if study.quick and isinstance(metric, RSA):
+        metric = FewOrders(**{item.name: getattr(metric, item.name) for item in fields(metric)})
     prepared, noiseless = [], []
     for drawn in draw_sessions(geometry, PopulationDesign(animals=study.animals), study.seed):
         block = drawn.trials
@@ -94,34 +107,37 @@ def interval_found(study: Study) -> list[tuple[float, float, float, float, float
     ]
 
 
-def pairs_told_apart(study: Study) -> dict[str, tuple[float, float, float]]:
+def pairs_told_apart(study: Study) -> dict[str, dict[str, tuple[float, float, float]]]:
+    """Return the result of :func:`tested_pairs` for every board of :data:`BOARDS`, all against the same animals."""
+    scores, _ = score_study(replace(study, shares=sum(BOARDS.values(), ())))
+    found, start = {}, 0
+    for board, shares in BOARDS.items():
+        found[board] = tested_pairs(scores[start : start + len(shares)])
+        start += len(shares)
+    return found
+
+
+def tested_pairs(scores: list[Score]) -> dict[str, tuple[float, float, float]]:
     """Return, for each rule, three shares of pairs of models.
 
     Pairs with p ≤ .05; pairs told apart at a false discovery rate of 5 % over all pairs of the board; of the pairs
     with the first model, those told apart with the first one better.
     """
-    scores, _ = score_study(study)
-    found: dict[str, list[tuple[float, float]]] = {rule: [] for rule in RULES}
-    pairs = list(combinations(range(len(scores)), 2))
+    pairs = np.array(list(combinations(range(len(scores)), 2)))
     animals = np.array([[score.on_scale(one.value) for one in score.subjects] for score in scores])
     without = np.array([[score.on_scale(value) for value in score.without_stimulus] for score in scores])
-    for first, second in pairs:
-        difference, left_out = animals[first] - animals[second], without[first] - without[second]
-        mean = float(difference.mean())
-        alone = difference.std(ddof=1) / math.sqrt(len(difference))
-        error, freedom = (float(one) for one in two_factor_error(difference, left_out))
-        found["animals alone"].append((mean, 2 * stats.t.sf(abs(mean) / alone, len(difference) - 1)))
-        found["two factors"].append((mean, 2 * stats.t.sf(abs(mean) / error, freedom)))
+    difference = animals[pairs[:, 0]] - animals[pairs[:, 1]]
+    # An animal that is not reliable has no part in the scores.
+    difference = difference[:, np.isfinite(difference).all(axis=0)]
+    mean, count = difference.mean(axis=1), difference.shape[1]
+    error, freedom = two_factor_error(difference, without[pairs[:, 0]] - without[pairs[:, 1]])
+    alone = difference.std(axis=1, ddof=1) / math.sqrt(count)
     shares = {}
-    for rule, tests in found.items():
-        mean, p = np.array(tests).T
+    for rule, spread, degrees in (("animals alone", alone, count - 1), ("two factors", error, freedom)):
+        p = 2 * stats.t.sf(np.abs(mean) / spread, degrees)
         apart = stats.false_discovery_control(p) <= 0.05
-        with_first = np.array([first == 0 for first, _ in pairs])
-        shares[rule] = (
-            float((p <= 0.05).mean()),
-            float(apart.mean()),
-            float((apart & (mean > 0))[with_first].mean()),
-        )
+        better = apart & (mean > 0)
+        shares[rule] = (float((p <= 0.05).mean()), float(apart.mean()), float(better[pairs[:, 0] == 0].mean()))
     return shares
 
 
