@@ -52,13 +52,15 @@ def rdm(
     from dataclasses import replace
 
     from brainbench.datasets.trials.session_trials import pooled
+    from brainbench.metrics import get_metric
     from brainbench.scoring.neural_responses import open_neural_responses
+    from brainbench.scoring.options import ScoreOptions
 
     with progress_bar() as progress:
         brain = open_neural_responses(source, conditions=conditions, select=select, window=window, progress=progress)
     brain = replace(brain, dataset=pooled(brain.dataset, pool))
     labels = brain.vocabulary
-    animals = brain.animals(labels, time="mean", seed=seed)
+    animals = brain.animals(labels, get_metric("rsa-correlation"), ScoreOptions(seed=seed))
     told = ("subject", "units", "trials", "reliability", "problem", "rdm")
     data = {
         "labels": labels,

@@ -16,13 +16,8 @@ from brainbench.cli.output import JsonOption, emit, progress_bar, table, table_o
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from brainbench.core.records import ResultRecord, Score
+    from brainbench.core.records import Interval, ResultRecord, Score
     from brainbench.scoring import ScoreOptions
-
-_RELIABILITY = {
-    True: "split halves, Spearman-Brown, mean over animals",
-    False: "share of the variance between stimuli that is not trial noise, mean over animals",
-}
 
 
 def _complete_model(incomplete: str) -> list[str]:
@@ -97,22 +92,26 @@ def _text(record: ResultRecord) -> str:
     parts = [f"{score.name}  ·  {len(score.stimuli)} stimuli  ·  {len(known)} animals  ·  {source}"]
     if record.synthetic:
         parts[0] += "\nSynthetic recordings: ranks on them say nothing about brains."
-    rsa = score.metric.startswith("RSA")
-    explained = "noise-corrected RSA, 1 = explains all that is reliable" if rsa else score.metric
     ceiling = score.ceiling
+    scale = f"chance {_number(score.chance)}, attainable {_number(score.attainable)}"
     rows = [
-        ["score", _value(score), explained],
+        ["score", _scaled_value(score), "0 = chance, 1 = explains all that is reliable"],
         ["status", score.status, "; ".join(score.reasons)],
+        [
+            "value",
+            _value(score),
+            f"{score.metric}; chance {_number(score.chance)}, attainable {_number(score.attainable)}",
+        ],
         [
             "raw r",
             _number(score.r),
             f"noise ceiling {_number(ceiling.lower)} to {_number(ceiling.upper)}" if ceiling else "no noise ceiling",
         ],
-        ["reliability", _number(score.reliability), _RELIABILITY[rsa]],
+        ["reliability", _number(score.reliability), "of the animals' RDMs: split halves, Spearman-Brown, mean"],
         ["permutation p", _number(score.p), f"{score.p_method}; smallest possible {_number(score.p_smallest)}"],
         ["layer", str(score.layer), score.layer_rule],
         ["best layer", _number(score.best_layer_value), f"{score.best_layer}: optimistic maximum, not a result"],
-        ["estimator", score.estimator, score.metric],
+        ["estimator", score.estimator, ""],
     ]
     parts += [table("", ["", "", ""], rows), *_details(score.provenance.statistics)]
     if animals is not None and score.estimator == "default" and score.subjects:
@@ -121,9 +120,11 @@ def _text(record: ResultRecord) -> str:
     if walk := score.provenance.statistics.get("estimator_walk"):
         parts.append(_walk(walk))
     others = {"animal to animal": animals, **record.baselines}
-    rows = [[name, _value(item), item.status] for name, item in others.items() if item is not None]
+    rows = [
+        [name, _scaled_value(item), _number(item.p), item.status] for name, item in others.items() if item is not None
+    ]
     if rows:
-        parts.append(table("Baselines, same estimator", ["", "score", "status"], rows))
+        parts.append(table("Baselines, same metric and animals", ["", "score", "p", "status"], rows))
     return "\n\n".join(parts)
 
 
@@ -200,5 +201,13 @@ def _number(value: float) -> str:
 
 
 def _value(score: Score) -> str:
-    span = score.interval
-    return f"{_number(score.value)} {f'[{_number(span.low)}, {_number(span.high)}]' if span else ''}"
+    return _with_span(score.value, score.interval)
+
+
+def _scaled_value(score: Score) -> str:
+    """Return the score on the scale that all metrics share; its value where there is none."""
+    return _value(score) if math.isnan(score.scaled) else _with_span(score.scaled, score.scaled_interval)
+
+
+def _with_span(value: float, span: Interval | None) -> str:
+    return f"{_number(value)} {f'[{_number(span.low)}, {_number(span.high)}]' if span else ''}"

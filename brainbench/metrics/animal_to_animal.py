@@ -145,8 +145,7 @@ def _verdict(
     told = tuple(f"{animals.subjects[i].subject}: {factors[i].reason}" for i in factors if factors[i].reason)
     if not found:
         if count < metric.fewest:
-            few = f"{count} stimuli are too few for the metric {metric.name!r}; at least {metric.fewest} are needed"
-            told = (few,)
+            told = (f"{count} stimuli are too few; at least {metric.fewest} are needed",)
         elif not factors:
             told = ("fewer than two animals can be used",)
         return "undefined", told + animals.reasons

@@ -1,4 +1,4 @@
-"""Comparisons of all layers with all animals [N, L, A]: as given, under orders of the stimuli, and without each stimulus.
+"""Comparisons of all layers with all animals: as given, under orders of the stimuli, and without each stimulus.
 
 A layer that has no value for some stimuli is compared over the rest, in every order alike.
 """

@@ -98,7 +98,7 @@ def score_layers(
         raise unknown_name("layer", committed, layers)
     animals = gather(metric, subjects, len(stimuli), estimator=estimator)
     names, result, notes = list(layers), None, ()
-    defined = _defined(metric, layers, committed)
+    defined = _defined(metric, layers)
     if animals.scored and defined and len(stimuli) >= metric.fewest:
         compared = LayerComparisons(
             metric, [metric.take(layers[label], animals.order) for label in defined], animals.sorted, device
@@ -173,12 +173,14 @@ def layer_table(names: Sequence[str], null: Floats) -> list[dict[str, Any]]:
     ]
 
 
-def _defined(metric: Metric, layers: Mapping[str, Floats], committed: str | None) -> list[str]:
-    """Return the layers that have a value for enough stimuli: at least half of them, and as many as the metric needs."""
+def _defined(metric: Metric, layers: Mapping[str, Floats]) -> list[str]:
+    """Return the layers with a value for enough stimuli: at least half of them, and as many as the metric needs."""
     found = []
     for label, layer in layers.items():
         known = metric.known(layer)
-        if known.sum() >= max(metric.fewest, len(known) / 2) and metric.varies(metric.take(layer, np.flatnonzero(known))):
+        if known.sum() >= max(metric.fewest, len(known) / 2) and metric.varies(
+            metric.take(layer, np.flatnonzero(known))
+        ):
             found.append(label)
     return found
 
@@ -201,7 +203,9 @@ def _result(
     layers = [layer for layer, keep in zip(compared.layers, kept, strict=True) if keep]
     compared = LayerComparisons(metric, layers, compared.animals, compared.device)
     given = given[kept]
-    rule = layer_rule(names, 1 if metric.of_model_alone else len(factors), committed=committed, estimator=estimator, factors=factors)
+    rule = layer_rule(
+        names, 1 if metric.of_model_alone else len(factors), committed=committed, estimator=estimator, factors=factors
+    )
     judged, weights = compared, factors
     halves = metric.halves(animals.subjects[animals.scored[0]], animals.order) if len(factors) == 1 else None
     if halves is not None and rule.kind == "maximum" and estimator == "default":
@@ -240,7 +244,7 @@ def _result(
 
 
 def _test(judged: LayerComparisons, rule: LayerRule, weights: Floats, seed: int) -> tuple[PermutationTest, Floats]:
-    """Test the score by orders of the stimuli, the choice of layer repeated in each; also return every layer's means."""
+    """Test the score by orders of the stimuli, the choice of layer repeated in each; also return layers' means."""
     metric, count = judged.metric, judged.animals[0].count
     exact, draws = most_exact(metric.orders), metric.orders
     smallest = smallest_p(count, draws)
@@ -296,7 +300,9 @@ def _verdict(
     """Return the status of the score and its reasons, the gravest first."""
     if result is None:
         if stimuli < metric.fewest:
-            reason = f"{stimuli} stimuli are too few for the metric {metric.name!r}; at least {metric.fewest} are needed"
+            reason = (
+                f"{stimuli} stimuli are too few for the metric {metric.name!r}; at least {metric.fewest} are needed"
+            )
         elif committed is not None and committed not in defined and animals.scored:
             reason = f"activations of the layer committed to, {committed!r}, are constant or not finite"
         elif not defined:
@@ -349,9 +355,7 @@ def _subjects(
 def _subject(animals: Animals, index: int, value: float, r: float, layer: str | None) -> SubjectScore:
     subject, correction = animals.subjects[index], animals.corrections[index]
     status = "undefined" if math.isnan(value) else correction.status
-    return SubjectScore(
-        subject.subject, value, r, correction.reliability, status, subject.units, subject.trials, layer
-    )
+    return SubjectScore(subject.subject, value, r, correction.reliability, status, subject.units, subject.trials, layer)
 
 
 def splits_error(values: Floats, subjects: Sequence[Any], comparison: str) -> float:

@@ -76,7 +76,10 @@ class ResolvedModel:
     def respond(self, options: ScoreOptions, *, progress: Progress | None = None) -> ModelResponses:
         """Run the model on the stimuli, or take the features that were computed elsewhere."""
         card, labels, origin, model_input = self.card, self.labels, self.origin, None
-        shown = None
+        card, shown = replace(card, layer=options.layer or card.layer), None
+        names = getattr(self.module, "layers", None) if self.module is not None else self.activations
+        if card.layer is not None and names is not None and card.layer not in (options.layers or names):
+            raise unknown_name("layer", card.layer, options.layers or names)
         if labels is None:
             from brainbench.stimuli import load_stimuli
 
@@ -157,7 +160,8 @@ def resolve_model(model: Any, *, seed: int = 0) -> ResolvedModel:
     state = {name: value.detach().cpu() for name, value in module.state_dict().items()}
     digest = content_hash(*(part for name in sorted(state) for part in (name, state[name].numpy())))
     count = sum(parameter.numel() for parameter in module.parameters())
-    return ResolvedModel(replace(card, parameters=count, weights=digest, graph=graph_of(module)), module)
+    layer = card.layer or getattr(module, "committed_layer", None)
+    return ResolvedModel(replace(card, parameters=count, weights=digest, graph=graph_of(module), layer=layer), module)
 
 
 def _trained(config: Mapping[str, Any] | None) -> dict[str, Any]:
@@ -169,6 +173,7 @@ def _trained(config: Mapping[str, Any] | None) -> dict[str, Any]:
     options = {name: value for name, value in (config.get("training") or {}).items() if name not in ("model", "seed")}
     return {
         **{name: config.get(name) for name in ("objective", "augmentation", "twin", "seed")},
+        "layer": config.get("committed_layer"),
         **{name: found.get(name) for name in ("top1", "top5", "collapsed")},
         "accuracy_interval": Interval(**found["interval"]) if found.get("interval") else None,
         "accuracy_data": found.get("data"),

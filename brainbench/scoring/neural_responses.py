@@ -17,7 +17,8 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from brainbench.core.trials import Trials
-    from brainbench.metrics.measures.registry import Metric
+    from brainbench.metrics import Metric
+    from brainbench.scoring.options import ScoreOptions
 
 
 @dataclass(frozen=True)
@@ -49,17 +50,18 @@ class NeuralResponses:
         names = ("content_hash", "window", "selection", "removed", "synthetic")
         return {"source": self.source, **{name: self.dataset.attrs[name] for name in names}}
 
-    def animals(
-        self, kept: tuple[str, ...], *, metric: Metric | None = None, time: str = "mean", seed: int = 0, draws: int = 0
-    ) -> tuple[Any, ...]:
-        """Prepare every animal by a metric (RSA by default) over the labels ``kept``, in that order."""
-        from brainbench.metrics import get_metric
+    def animals(self, kept: tuple[str, ...], metric: Metric, options: ScoreOptions) -> tuple[Any, ...]:
+        """Prepare every animal by a metric over the labels ``kept``, in that order."""
+        from brainbench.metrics.reliability.units import reliable_units
 
-        metric = metric or get_metric("rsa")
         animals = []
         for subject, sessions in self.trials(kept).items():
-            trials = [replace(item, responses=without_time(item.responses, time)) for item in sessions]
-            animals.append(metric.animal(subject, trials, len(kept), stimuli=kept, seed=seed, draws=draws))
+            trials = tuple(replace(item, responses=without_time(item.responses, options.time)) for item in sessions)
+            note = ""
+            if options.units_reliability is not None:
+                trials, note = reliable_units(trials, len(kept), least=options.units_reliability, seed=options.seed)
+            animal = metric.animal(subject, trials, len(kept), stimuli=kept, seed=options.seed)
+            animals.append(replace(animal, notes=(note, *animal.notes)) if note else animal)
         return tuple(animals)
 
     def trials(self, kept: tuple[str, ...]) -> dict[str, tuple[Trials, ...]]:

@@ -12,7 +12,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
-from brainbench.core.errors import UsageError
+from brainbench.core.errors import UsageError, unknown_name
 from brainbench.core.files import provenance, to_plain
 from brainbench.core.labels import join_labels
 from brainbench.core.progress import Progress
@@ -72,7 +72,6 @@ def score_record(
         The result record; its scores share one brain side.
     """
     from brainbench import metrics
-    from brainbench.metrics.inference.bootstrap import DRAWS
     from brainbench.scoring.demo import DEMOS
     from brainbench.scoring.model_responses import resolve_model
     from brainbench.scoring.neural_responses import open_neural_responses
@@ -87,7 +86,12 @@ def score_record(
         prepare_stimuli(options.stimuli, whiskers=options.whiskers, fidelity=options.fidelity, progress=progress)
     # Whatever can be wrong with a name or a file is found before the slow part, the simulation.
     metric = metrics.get_metric(options.metric)
-    if options.explain and metric.name != "rsa":
+    if metric.name == "rsa" and (options.explain or options.estimator != "default"):
+        # The published estimators were those of correlation distances.
+        metric = metrics.get_metric("rsa-correlation")
+    if options.estimator not in metric.estimators:
+        raise unknown_name(f"estimator of the metric {metric.name!r}", options.estimator, metric.estimators)
+    if options.explain and metric.name != "rsa-correlation":
         raise UsageError(f"The published estimator is one of RSA; the metric {metric.name!r} has none to explain.")
     if options.over_time:
         from brainbench.scoring.over_time import check_metric, time_course
@@ -102,15 +106,13 @@ def score_record(
     pairs = join_labels(brain.vocabulary, network.labels, options.match)
     kept = tuple(pairs)
     rows = [network.labels.index(label) for label in pairs.values()]
-    animals = brain.animals(kept, metric=metric, time=options.time, seed=options.seed, draws=DRAWS)
+    animals = brain.animals(kept, metric, options)
 
-    compared = {network.card.name: network.features(rows)}
-    if baselines:
-        compared |= network.baseline_features(rows, options.seed)
-    common: dict[str, Any] = {"stimuli": kept, "estimator": options.estimator}
-    scores = [
-        metric.score(features, animals, name=name, seed=options.seed, **common) for name, features in compared.items()
-    ]
+    common: dict[str, Any] = {"stimuli": kept, "estimator": options.estimator, "seed": options.seed}
+    features = network.features(rows)
+    scores = [metric.score(features, animals, name=network.card.name, layer=network.card.layer, **common)]
+    others = network.baseline_features(rows, options.seed) if baselines else {}
+    scores += [metric.score(values, animals, name=name, **common) for name, values in others.items()]
     between = metric.score_animals(animals, **common) if baselines else None
 
     settings = {"estimator_version": ESTIMATOR_VERSION, "model": model if isinstance(model, str) else None}
@@ -128,7 +130,7 @@ def score_record(
     if options.explain:
         from brainbench.metrics.explain import explain_score
 
-        rdms = {layer: metrics.rdm(values) for layer, values in compared[network.card.name].items()}
+        rdms = {layer: metrics.rdm(values) for layer, values in features.items()}
         statistics[0] = {**statistics[0], "estimator_walk": to_plain(explain_score(rdms, animals))}
     if options.over_time:
         course = time_course(brain, network, metric, kept, rows, seed=options.seed, progress=progress)

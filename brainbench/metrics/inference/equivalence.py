@@ -84,8 +84,8 @@ def equivalence_test(
     if count < 2 or len(without) < 2:
         reason = f"{count} animals and {len(without)} stimuli have a difference; at least 2 of each are needed"
         return EquivalenceTest(math.nan, margin, None, math.nan, math.nan, math.nan, "undecided", "undefined", reason)
-    # Two one-sided t tests (Schuirmann 1987), t = (margin ± mean)/error. Both reject at level α exactly when the interval
-    # at level 1 − 2α lies within ±margin.
+    # Two one-sided t tests (Schuirmann 1987), t = (margin ± mean)/error. Both reject at level α exactly when the
+    # interval at level 1 − 2α lies within ±margin.
     mean = float(difference.mean())
     interval = two_factor_interval(mean, difference, without, 1 - 2 * alpha)
     error, freedom = (float(found) for found in two_factor_error(difference, without))
@@ -117,4 +117,3 @@ def turing_test(
             f"{animal_to_animal.estimator!r}."
         )
     return equivalence_test(*paired_differences(score, animal_to_animal), margin=margin, alpha=alpha)
-

@@ -43,7 +43,7 @@ class Metric:
     """True when values are corrected for noise."""
     comparison = "whitened-cosine"
     """Comparison of RDMs on which an animal's reliability rests."""
-    rdm_method = "crossnobis"
+    brain_method = "crossnobis"
     """RDM method of the animals."""
     noise = "none"
     """Noise covariance that their RDMs are divided by."""
@@ -68,13 +68,14 @@ class Metric:
         subject: str,
         blocks: Sequence[Trials],
         n_stimuli: int,
-        *,
-        stimuli: Sequence[str] | None = None,
-        seed: int = 0,
+        **options: Any,
     ) -> SubjectRDM:
-        """Prepare one animal from the trials of its sessions; what cannot be used says so in the score."""
-        options = {"method": self.rdm_method, "comparison": self.comparison, "noise": self.noise}
-        return subject_rdm(subject, blocks, n_stimuli, stimuli=stimuli, seed=seed, **options)
+        """Prepare one animal from the trials of its sessions; what cannot be used says so in the score.
+
+        Options are ``stimuli``, ``seed`` and ``splits`` of :func:`subject_rdm`.
+        """
+        how = {"method": self.brain_method, "comparison": self.comparison, "noise": self.noise}
+        return subject_rdm(subject, blocks, n_stimuli, **how, **options)
 
     def layer(self, features: ArrayLike) -> Floats:
         """Return what is compared of a layer's features [K, F]; a stimulus with a value that is not finite is NaN."""

@@ -183,7 +183,7 @@ class PartialRSA(PatternMetric):
     name = "rsa-partial"
     title = "correlation between RDMs without what contacts, licks and choices explain"
 
-    rdm_method = "correlation"
+    brain_method = "correlation"
     comparison = "pearson"
 
     def animal(self, subject: str, blocks: Sequence[Trials], n_stimuli: int, **options: Any) -> SubjectRDM:

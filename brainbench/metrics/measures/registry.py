@@ -14,7 +14,6 @@ from brainbench.core.errors import UsageError, unknown_name
 from brainbench.core.plugins import load_object
 from brainbench.metrics.measures.metric import Metric
 
-
 _METRICS: dict[str, Metric] = {}
 
 

@@ -34,7 +34,7 @@ class RSA(Metric):
 
     name: str = "rsa"
     title: str = ""
-    rdm_method: str = "crossnobis"
+    brain_method: str = "crossnobis"
     noise: str = "none"
     model_method: str = "sqeuclidean"
     """RDM method of the activations, which have no trial noise."""
@@ -86,7 +86,9 @@ class RSA(Metric):
         pairs = permuted_pairs(order[None])[0]
         agreement = animal.split_half_by(self.comparison)
         factor = 1 / math.sqrt(float(agreement[np.isfinite(agreement)].mean()))
-        return [replace(animal, rdm=half, halves=half[:0]) for half in kept.reshape(-1, kept.shape[-1])[:, pairs]], factor
+        return [
+            replace(animal, rdm=half, halves=half[:0]) for half in kept.reshape(-1, kept.shape[-1])[:, pairs]
+        ], factor
 
     def partner(self, animal: SubjectRDM, others: Sequence[SubjectRDM]) -> Floats:
         """Return the mean RDM of the other animals."""
