@@ -3,7 +3,7 @@
     python -m benchmarks.scores.calibration [NAME ...] [--simulations N] [--workers N] [--seed N] [--write]
 
 Names: nulls, coverage, pairs, over-time, dimensions, corrections, crossnobis, recovery, ceiling, faults; all by
-default. ``--write`` puts the tables into RESULTS.md and the figures into docs/images.
+default. ``--write`` puts the tables into RESULTS.md and docs/calibration.md, and the figures into docs/images.
 """
 
 from __future__ import annotations
@@ -24,6 +24,7 @@ from scipy import stats
 from benchmarks.report import table, write_section
 from benchmarks.scores import simulated_boards
 from benchmarks.scores.simulated_boards import BIN, BOARDS, RULES, Study
+from brainbench.core.files import write_text
 from brainbench.core.jobs import run_jobs
 from brainbench.core.trials import Trials
 from brainbench.metrics import compare, get_metric, noise_ceiling, rdm
@@ -35,7 +36,8 @@ from brainbench.metrics.rdms.comparison import compare_all, features
 from brainbench.metrics.rdms.pairs import permuted_pairs
 from brainbench.metrics.reliability.subject_rdm import SubjectRDM, subject_rdm
 
-IMAGES = Path(__file__).parents[2] / "docs" / "images"
+DOCS = Path(__file__).parents[2] / "docs"
+IMAGES = DOCS / "images"
 PAIRS = permuted_pairs(np.concatenate(list(label_orders(6, 0))))
 INK, ACCENT, WARN = "#333333", "#1f6f8b", "#c0504d"
 
@@ -472,6 +474,14 @@ def _save(figure: object, name: str) -> None:
     figure.savefig(IMAGES / name, dpi=150)
 
 
+def write_docs(name: str, body: str) -> None:
+    """Put a table where docs/calibration.md marks its place."""
+    page = DOCS / "calibration.md"
+    begin, end = f"<!-- begin {name} -->", f"<!-- end {name} -->"
+    before, _, rest = page.read_text(encoding="utf-8").partition(begin)
+    write_text(page, f"{before}{begin}\n\n{body}\n\n{end}{rest.partition(end)[2]}")
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("names", nargs="*", choices=[*JOBS, []])
@@ -493,6 +503,7 @@ def main() -> None:
         if options.write:
             command = f"python -m benchmarks.scores.calibration {name} --simulations {options.simulations} --write"
             write_section(f"Calibration: {name}", command, body, subject="scores")
+            write_docs(name, body)
             if result.picture:
                 result.picture()
 
