@@ -425,8 +425,9 @@ def faults(run: Run) -> Result:
     from brainbench.datasets.synthetic import PopulationDesign, ResponseGeometry, simulate
 
     rows, metric = [], get_metric("rsa")
-    for trials in (20, (8, 40)):
-        design = PopulationDesign(animals=11, sessions=3, units=20, trials=trials)
+    quiet = {"rate": 8.0, "window": 1.0, "modulation": 0.3, "emphasis": 0.0, "dispersion": 0.0, "shared_gain": 0.0}
+    for trials in ((20, 20), (8, 32)):
+        design = PopulationDesign(animals=11, sessions=3, units=20, trials=trials, **quiet)
         for given in ((), ("zero-fill",), ("first-appearance",), ("first-appearance", "zero-fill")):
             values, reliable = [], []
             for study in run.seeds():
@@ -439,7 +440,7 @@ def faults(run: Run) -> Result:
                 reliable.append(score.reliability)
             known = np.array(values)[np.isfinite(values)]
             spread = f"{known.mean():.3f} ± {known.std() / math.sqrt(len(known)):.3f}"
-            rows.append([str(trials), " + ".join(given) or "none", spread, f"{np.mean(reliable):.2f}"])
+            rows.append(["{} to {}".format(*trials), " + ".join(given) or "none", spread, f"{np.mean(reliable):.2f}"])
     title = "Animal-to-animal score of 11 animals of one geometry, with the released faults"
     return Result(title, ["trials of a stimulus", "fault", "score", "reliability"], rows)
 
