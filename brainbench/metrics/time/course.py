@@ -28,7 +28,7 @@ from brainbench.metrics.layers import most_chosen
 from brainbench.metrics.rdms.comparison import check_comparison
 from brainbench.metrics.rdms.pairs import Floats, rdm_stack
 from brainbench.metrics.reliability.noise_correction import RELIABILITY_GATE
-from brainbench.metrics.time.lags import LaggedRDMs, held_out_course, peak_lag, profile, votes
+from brainbench.metrics.time.lags import LaggedRDMs, best_lag, held_out_course, votes
 from brainbench.metrics.time.movies import AnimalMovie
 
 PERMUTATIONS = 1000
@@ -261,7 +261,7 @@ def _latencies(
     animals, step = excess.shape[-1], lags[1] - lags[0]
 
     def latency(values: Floats) -> Floats:
-        return lags[0] + step * peak_lag(profile(values))
+        return lags[0] + step * best_lag(values)
 
     best = latency(excess)
     # Pseudo-values, whose variance over animals is that of the jackknife.
