@@ -58,7 +58,7 @@ count = {count}
 average = {average}
 '''
 
-ENTRY = '''
+ENTRY = """
 [[scene]]
 label = "{label}"
 [[scene.object]]
@@ -70,19 +70,22 @@ collision = "hull"
 position_mm = {position}
 rotation_deg = [0, 0, {turn:g}]
 velocity_mm_s = [0, -{speed:g}, 0]
-'''
+"""
 
 
 def draws(family: str) -> Iterator[tuple[int, Sweep]]:
     """Yield seeds and sweeps of a family, always the same ones."""
     random = np.random.default_rng([zlib.crc32(family.encode()), 18])
     for seed in range(DRAWS):
-        yield seed, Sweep(
-            speed=1e-3 * float(random.integers(50, 71)),
-            height=1e-3 * float(random.integers(-3, 4)),
-            rotation=math.radians(5 * int(random.integers(72))),
-            distance=1e-3 * float(random.integers(4, 9)),
-            size=1e-3 * float(random.integers(20, 31)),
+        yield (
+            seed,
+            Sweep(
+                speed=1e-3 * float(random.integers(50, 71)),
+                height=1e-3 * float(random.integers(-3, 4)),
+                rotation=math.radians(5 * int(random.integers(72))),
+                distance=1e-3 * float(random.integers(4, 9)),
+                size=1e-3 * float(random.integers(20, 31)),
+            ),
         )
 
 
@@ -94,7 +97,12 @@ def main() -> None:
     for family in list_families():
         for seed, sweep in draws(family):
             solid = shape_solid(make(family, seed, detail=DETAIL), collision="hull")
-            tried[f"{family}-{seed}"] = (family, seed, sweep, grid.scene(solid, sweep, label=f"{family}-{seed}", array=array))
+            tried[f"{family}-{seed}"] = (
+                family,
+                seed,
+                sweep,
+                grid.scene(solid, sweep, label=f"{family}-{seed}", array=array),
+            )
     touched = simulate([scene for *_, scene in tried.values()])["contact"].any("time").sum("whisker")
     kept: dict[str, tuple[int, Sweep, Scene]] = {}
     for label, (family, seed, sweep, scene) in tried.items():
