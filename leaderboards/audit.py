@@ -13,6 +13,8 @@ from collections.abc import Iterable
 from itertools import permutations
 from typing import Any
 
+from packaging.version import InvalidVersion, Version
+
 from brainbench import __version__
 from brainbench.core.records import ESTIMATOR_VERSION, RECORD_SCHEMA, ResultRecord
 from leaderboards.store import StoredRecord
@@ -70,21 +72,15 @@ def computation(record: ResultRecord) -> tuple[Any, ...]:
 
 
 def older(version: str, than: str) -> bool:
-    """Tell whether a version is older, comparing numbers as numbers; one that is none is not.
+    """Tell whether a version is older; one that is none is not.
 
     >>> older("0.9.1", "0.10.0"), older("0.2", "0.2.0"), older("unknown", "0.2")
     (True, False, False)
     """
-    one, other = _numbers(version), _numbers(than)
-    if one is None or other is None:
+    try:
+        return Version(version) < Version(than)
+    except InvalidVersion:
         return False
-    length = max(len(one), len(other))
-    return one + (0,) * (length - len(one)) < other + (0,) * (length - len(other))
-
-
-def _numbers(version: str) -> tuple[int, ...] | None:
-    parts = version.split("+", maxsplit=1)[0].split(".")
-    return tuple(map(int, parts)) if all(part.isdigit() for part in parts) else None
 
 
 def _stale(record: ResultRecord, schema: int, newest: dict[tuple[Any, ...], tuple[str, str]]) -> list[str]:

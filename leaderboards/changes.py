@@ -4,23 +4,18 @@ from __future__ import annotations
 
 import math
 import os
-import tempfile
-import zipfile
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from brainbench.core.errors import DataError
 from brainbench.core.files import to_plain
 from brainbench.core.records import ResultRecord, Score
 from leaderboards.audit import TOLERANCE
-from leaderboards.ranking import rank
+from leaderboards.boards import rank
 from leaderboards.store import StoredRecord, read_records
 
-RECORDS_ZIP = Path("data", "records.zip")
-"""Place in a built site of the records it was made from."""
 _CAUSES = ("recordings", "stimuli", "brainbench version", "card.weights", "score.layer")
 
 
@@ -81,20 +76,9 @@ def open_build(source: str | os.PathLike[str]) -> list[StoredRecord]:
 
     Raises:
         DataFileNotFoundError: there is nothing there.
-        DataError: the site's archive is damaged.
     """
-    archive = Path(source) / RECORDS_ZIP
-    if not archive.is_file():
-        return read_records(source)
-    with tempfile.TemporaryDirectory() as folder:
-        try:
-            with zipfile.ZipFile(archive) as stored:
-                for entry in stored.infolist():
-                    # Whatever path an archive states, the file lands in the folder itself.
-                    (Path(folder) / Path(entry.filename).name).write_bytes(stored.read(entry))
-        except (zipfile.BadZipFile, OSError) as error:
-            raise DataError(f"{os.fspath(archive)!r} cannot be read ({error}).") from error
-        return read_records(folder)
+    records = Path(source) / "records"
+    return read_records(records if records.is_dir() else source)
 
 
 def compare_builds(before: Iterable[StoredRecord], after: Iterable[StoredRecord]) -> list[Change]:
@@ -106,49 +90,33 @@ def compare_builds(before: Iterable[StoredRecord], after: Iterable[StoredRecord]
     changes = []
     for key in dict.fromkeys([*new, *old]):
         ones, others = dict(old.get(key, {})), dict(new.get(key, {}))
-        same = sorted(ones.keys() & others.keys())
-        for identity in same:
-            one, other = ones.pop(identity), others.pop(identity)
-            if one.rank != other.rank:
-                changes.append(Change("moved", one.board, one.name, one.text, other.text))
-        pairs = zip(list(ones.values()), list(others.values()), strict=False)
-        for one, other in pairs:
-            ones.pop(one.record.identity)
-            others.pop(other.record.identity)
-            found = differences(one.record, other.record, tolerance=0.0)
+        pairs = [(ones.pop(identity), others.pop(identity)) for identity in sorted(ones.keys() & others.keys())]
+        changes += [Change("moved", *one[:2], one[2], other[2]) for one, other in pairs if one[2] != other[2]]
+        while ones and others:
+            (_, one), (_, other) = ones.popitem(), others.popitem()
+            found = differences(one[3], other[3], tolerance=0.0)
             causes = tuple(str(item) for item in found if item.what in _CAUSES)
-            kind = "changed" if found else "restated"
-            changes.append(Change(kind, other.board, other.name, one.text, other.text, causes))
-        changes += [Change("removed", one.board, one.name, one.text, "") for one in ones.values()]
-        changes += [Change("added", other.board, other.name, "", other.text) for other in others.values()]
+            changes.append(Change("changed" if found else "restated", *other[:2], one[2], other[2], causes))
+        changes += [Change("removed", *one[:3], "") for one in ones.values()]
+        changes += [Change("added", *other[:2], "", other[2]) for other in others.values()]
     order = ("added", "removed", "changed", "moved", "restated")
     return sorted(changes, key=lambda change: (order.index(change.kind), change.board, change.name, change.before))
 
 
-@dataclass(frozen=True)
-class _Placed:
-    record: ResultRecord
-    board: str
-    name: str
-    rank: str
-
-    @property
-    def text(self) -> str:
-        value = self.record.score.value
-        shown = self.record.score.status if math.isnan(value) else f"{value:.3f}"
-        return f"{shown}, rank {self.rank}"
+_Placed = tuple[str, str, str, ResultRecord]
+"""Board, name, value and rank in print, and the record."""
 
 
 def _by_model(stored: Iterable[StoredRecord]) -> dict[tuple[Any, ...], dict[str, _Placed]]:
     found: dict[tuple[Any, ...], dict[str, _Placed]] = defaultdict(dict)
     for board in rank(item.record for item in stored if item.record is not None):
         label = f"{board.recordings}, {board.metric or 'metric not stated'}, {board.estimator}"
-        for row in board.rows:
-            seed = row.record.card.seed if row.record.card else None
-            name = row.record.score.name
-            shown = f"{name} (seed {seed})" if seed is not None else name
-            key = (name, seed, board.recordings, board.metric, board.estimator, board.time)
-            found[key][row.record.identity] = _Placed(row.record, label, shown, row.rank)
+        for entry, record in ((one, record) for one in board.entries for record in one.records):
+            seed, value = record.card.seed if record.card else None, record.score.value
+            shown = f"{entry.name} (seed {seed})" if seed is not None else entry.name
+            told = f"{record.score.status if math.isnan(value) else f'{value:.3f}'}, rank {entry.rank}"
+            key = (entry.name, seed, board.recordings, board.metric, board.estimator, board.time)
+            found[key][record.identity] = (label, shown, told, record)
     return found
 
 

@@ -1,10 +1,7 @@
-"""From records to the rows that people read: one entry per model, its seeds folded together.
+"""The rows that people read: one entry per model, the seeds of its weights folded together.
 
-Networks that differ only in the seed of their weights are one **entry**. Its value is the mean over seeds.
-Its interval crosses animals and seeds: the half widths of the t intervals of each animal's mean over seeds and
-of each seed's mean over animals, added in squares (a little too wide, since both hold the residual). The
-spread over seeds stands beside it. Entries are ranked as records are (:mod:`leaderboards.ranking`): models that are
-not told apart are tied, and ranks are ranges.
+Networks that differ only in the seed of their weights are one **entry**: the mean over seeds, an interval over animals,
+stimuli and seeds (:class:`leaderboards.ranking.Sample`), and the spread over seeds beside it.
 """
 
 from __future__ import annotations
@@ -12,44 +9,71 @@ from __future__ import annotations
 import math
 import statistics
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Literal, get_args
+
+import numpy as np
 
 from brainbench.core.files import content_hash
-from brainbench.core.records import Interval, ModelCard, Score, Status
-from brainbench.core.statistics import is_finite, t_interval
-from leaderboards.ranking import Board, Ranked, RankedRecord, animals_of, rank_ranges
+from brainbench.core.records import Interval, ModelCard, ResultRecord, Score
+from brainbench.core.statistics import is_finite
+from leaderboards.ranking import CHANCE_LEVEL, Sample
 
-_SEVERITY: tuple[Status, ...] = ("ok", "unreliable", "undefined")
 UNTRAINED = "untrained"
+Standing = Literal[
+    "above raw input", "above chance", "not told apart from chance", "not tested", "unreliable", "undefined"
+]
+"""What can be said of a score, from the most to the least: every page uses these words and no others."""
+STANDINGS: tuple[Standing, ...] = get_args(Standing)
+
+_SAME = 1e-6
+"""Largest difference of values, and of RDMs scaled to length 1, of one computation (float32 sums differ)."""
 
 
 @dataclass(frozen=True)
-class Entry(Ranked):
+class Entry:
     """One model on a board: a record, or several that differ in the seed of the weights."""
 
-    rows: tuple[RankedRecord, ...]
+    records: tuple[ResultRecord, ...]
     """Its records, by seed."""
     page: str
     """File name of its page on a site; it stays when a seed is added."""
-    value: float
-    interval: Interval | None
-    status: Status
-    spread: float
-    """Standard deviation of the value over seeds; NaN for one."""
-    first: int | None = None
-    last: int | None = None
     notes: tuple[str, ...] = ()
+    first: int | None = None
+    """Best rank that the tests leave open, from 1; None when it is not ranked."""
+    last: int | None = None
+    """Worst rank that the tests leave open."""
+    unranked_because: str = ""
+    same_as: str = ""
+    """Name of the entry whose chosen layer is the same computation; empty for none."""
+    above_raw: bool = False
+    """True when it is told apart above the raw input."""
+    below_leader: bool = False
+    """True when it is told apart below the entry with the highest score."""
+    sample: Sample = field(init=False, repr=False, compare=False)
+
+    def __post_init__(self) -> None:
+        """Fold the seeds."""
+        object.__setattr__(self, "sample", Sample.of([record.score for record in self.records]))
+
+    @property
+    def rank(self) -> str:
+        """The rank in print: ``2``, ``2–5``, or a dash when not ranked."""
+        if self.first is None:
+            return "–"
+        return str(self.first) if self.first == self.last else f"{self.first}–{self.last}"
 
     @property
     def score(self) -> Score:
         """The score of its first seed, which stands for what all share."""
-        return self.rows[0].record.score
+        return self.records[0].score
 
     @property
     def card(self) -> ModelCard:
         """The model card of its first seed."""
-        return self.rows[0].record.card or ModelCard(self.score.name)
+        return self.records[0].card or ModelCard(self.score.name)
 
     @property
     def name(self) -> str:
@@ -59,27 +83,59 @@ class Entry(Ranked):
     @property
     def seeds(self) -> int:
         """Number of records."""
-        return len(self.rows)
+        return len(self.records)
+
+    @property
+    def value(self) -> float:
+        """Mean over seeds of the metric's own value."""
+        return self._mean("value")
+
+    @property
+    def scaled(self) -> float:
+        """Mean over seeds of the score between chance (0) and all that is reliable (1)."""
+        return self._mean("scaled")
+
+    @property
+    def r(self) -> float:
+        """Mean raw comparison over seeds."""
+        return self._mean("r")
+
+    @cached_property
+    def interval(self) -> Interval | None:
+        """Interval of :attr:`scaled`."""
+        own = self.score.scaled_interval if self.seeds == 1 else self.sample.interval
+        return own if is_finite(own) else None
+
+    @property
+    def spread(self) -> float:
+        """Standard deviation of :attr:`scaled` over seeds; NaN for one."""
+        return statistics.stdev(self.sample.seeds) if self.seeds > 1 else math.nan
+
+    @property
+    def p(self) -> float:
+        """The largest permutation p over seeds."""
+        return max((p for record in self.records if math.isfinite(p := record.score.p)), default=math.nan)
+
+    @property
+    def above_chance(self) -> bool:
+        """True when the permutation test tells every seed apart from chance."""
+        return self.p <= CHANCE_LEVEL
+
+    @property
+    def standing(self) -> Standing:
+        """What can be said of it; of several seeds the least."""
+        found = [standing_of(record.score, above_raw=self.above_raw) for record in self.records]
+        return max(found, key=STANDINGS.index)
+
+    @property
+    def not_repeatable(self) -> str:
+        """Reason why nobody here can compute it again; empty when everybody can."""
+        return next(filter(None, map(not_repeatable, self.records)), "")
 
     @property
     def trained(self) -> bool:
         """True for a model whose card names an objective that it was trained with."""
         return self.card.objective not in (None, UNTRAINED)
-
-    @property
-    def unranked_because(self) -> str:
-        """Reason why it has no rank; empty when it has one."""
-        return "" if self.first is not None else self.rows[0].unranked_because or "not every seed is ranked"
-
-    @property
-    def p(self) -> float:
-        """The largest permutation p over seeds."""
-        return max((p for row in self.rows if math.isfinite(p := row.record.score.p)), default=math.nan)
-
-    @property
-    def r(self) -> float:
-        """Mean raw comparison over seeds."""
-        return _mean([row.record.score.r for row in self.rows])
 
     @property
     def architecture(self) -> str:
@@ -92,33 +148,64 @@ class Entry(Ranked):
         value = self.card.training.get("masking")
         return float(value) if isinstance(value, (int, float)) and not isinstance(value, bool) else 0.0
 
+    @property
+    def order(self) -> tuple[bool, int, float, str, str]:
+        """Key that sorts a board: what stands apart last, then by standing, then the highest score first."""
+        # Chance is a matter of the test; above it the score alone gives the order.
+        place = max(STANDINGS.index(self.standing), 1)
+        value = self.scaled if math.isfinite(self.scaled) else self.value
+        return bool(self.not_repeatable), place, math.inf if math.isnan(value) else -value, self.name, self.page
 
-def entries_of(board: Board, remarks: Mapping[str, Sequence[str]] | None = None) -> list[Entry]:
-    """Return a board's entries, best first; those that cannot be ranked follow.
+    def _mean(self, name: str) -> float:
+        values = [value for record in self.records if math.isfinite(value := getattr(record.score, name))]
+        return math.fsum(values) / len(values) if values else math.nan
+
+
+def standing_of(score: Score, *, above_raw: bool) -> Standing:
+    """Return what can be said of a score, given whether it is told apart above the raw input."""
+    if score.status != "ok":
+        return score.status
+    if math.isnan(score.p):
+        return "not tested"
+    if score.p > CHANCE_LEVEL:
+        return "not told apart from chance"
+    return "above raw input" if above_raw else "above chance"
+
+
+def not_repeatable(record: ResultRecord) -> str:
+    """Return why a record cannot be computed again from this package alone, empty when it can.
+
+    >>> not_repeatable(ResultRecord(Score("features", 0.9, "ok"), card=ModelCard("features", family="user module")))
+    'its code is not in the registry'
+    """
+    card, name = record.card, record.score.name
+    if card is None or card.family in ("", "features computed elsewhere"):
+        return "its features were computed elsewhere"
+    if card.family == "user module":
+        return "its code is not in the registry"
+    return "its weights do not come with the package" if name.startswith(("local-dir:", "hf-hub:")) else ""
+
+
+def fold_seeds(
+    records: Iterable[ResultRecord], board: Sequence[object], remarks: Mapping[str, Sequence[str]]
+) -> list[Entry]:
+    """Return one entry per model, in any order.
 
     Args:
-        board: The board.
+        records: Records of one board.
+        board: What tells the board from others, for the addresses of pages.
         remarks: Doubts about records by identity (:func:`leaderboards.audit.remarks`), kept as notes.
     """
-    groups: dict[tuple[object, ...], list[RankedRecord]] = defaultdict(list)
+    groups: dict[tuple[object, ...], list[ResultRecord]] = defaultdict(list)
     taken: dict[tuple[object, ...], int] = defaultdict(int)
     # Of the same model and seed the newest is the entry's; older ones stay visible as entries of their own.
-    by_age = sorted(board.rows, key=lambda row: (row.record.score.provenance.time, row.record.identity))
-    for row in reversed(by_age):
-        kind = _kind(row)
-        seed = row.record.card.seed if row.record.card else None
+    by_age = sorted(records, key=lambda record: (record.score.provenance.time, record.identity))
+    for record in reversed(by_age):
+        kind, seed = _kind(record), record.card.seed if record.card else None
         copy = taken[*kind, seed]
         taken[*kind, seed] += 1
-        groups[*kind, copy].append(row)
-    entries = [_entry(board, key, rows, remarks or {}) for key, rows in groups.items()]
-    ranked, found = [], []
-    for entry in entries:
-        able = entry.interval and not any(row.unranked_because for row in entry.rows)
-        (ranked if able else found).append(entry)
-    intervals = [entry.interval for entry in ranked if entry.interval]
-    ranges = rank_ranges(intervals, [_animals(entry) for entry in ranked], [_chance(entry) for entry in ranked])
-    found += [replace(entry, first=first, last=last) for entry, (first, last) in zip(ranked, ranges, strict=True)]
-    return sorted(found, key=lambda entry: (*entry.order(entry.value), entry.name, entry.page))
+        groups[*kind, copy].append(record)
+    return [_entry(key, found, board, remarks) for key, found in groups.items()]
 
 
 def twins(entries: Sequence[Entry]) -> dict[str, Entry]:
@@ -126,67 +213,48 @@ def twins(entries: Sequence[Entry]) -> dict[str, Entry]:
     return {entry.architecture: entry for entry in reversed(entries) if not entry.trained}
 
 
-def _animals(entry: Entry) -> dict[str, float]:
-    """Return each animal's mean over seeds, of the animals that every seed was scored on."""
-    found = [animals_of(row.record.score) for row in entry.rows]
-    return {name: _mean([one[name] for one in found]) for name in found[0] if all(name in one for one in found)}
+def same_computation(one: Entry, other: Entry) -> bool:
+    """Return whether the chosen layers of two entries are one computation, seed by seed.
+
+    Their RDMs are equal up to a factor and every animal has the same score: variants that share an encoder, copies of
+    a layer, activations in other units.
+    """
+    pairs = zip(one.records, other.records, strict=False)
+    return one.seeds == other.seeds and all(_same_score(a.score, b.score) for a, b in pairs)
 
 
-def _chance(entry: Entry) -> float:
-    """Return the variance of the mean over seeds."""
-    return entry.spread**2 / entry.seeds if entry.seeds > 1 and math.isfinite(entry.spread) else 0.0
-
-
-def _kind(row: RankedRecord) -> tuple[object, ...]:
-    card = row.record.card
-    if card is None or card.seed is None:  # nobody can know what else differs
-        return (row.record.score.name, card.weights if card else None, row.record.identity if card is None else None)
-    masking = card.training.get("masking")
-    return (row.record.score.name, card.objective, card.augmentation, str(masking))
-
-
-def _entry(
-    board: Board, key: tuple[object, ...], rows: list[RankedRecord], remarks: Mapping[str, Sequence[str]]
-) -> Entry:
-    rows = sorted(rows, key=lambda row: ((row.record.card and row.record.card.seed) or 0, row.record.identity))
-    scores = [row.record.score for row in rows]
-    values = [score.value for score in scores if math.isfinite(score.value)]
-    where = (board.recordings_hash, board.stimuli_hash, board.conditions, board.time, board.estimator, board.metric)
-    slug = rows[0].record.file_name.rpartition("--")[0]
-    notes = list(dict.fromkeys(note for row in rows for note in (*remarks.get(row.record.identity, ()),)))
-    if key[-1]:
-        notes.append("an earlier record of a model that stands above or below once more")
-    return Entry(
-        rows=tuple(rows),
-        page=f"{slug}--{content_hash([str(part) for part in (*where, *key)], length=10)}.html",
-        value=_mean(values) if values else math.nan,
-        interval=_interval(scores),
-        status=_SEVERITY[max(_SEVERITY.index(score.status) for score in scores)],
-        spread=statistics.stdev(values) if len(values) > 1 else math.nan,
-        notes=tuple(notes),
+def _same_score(one: Score, other: Score) -> bool:
+    values = ([item.value for item in score.subjects] for score in (one, other))
+    rdms = [np.array(score.model_rdm, dtype=np.float64) for score in (one, other)]
+    if not len(rdms[0]) or len(rdms[0]) != len(rdms[1]) or len(one.subjects) != len(other.subjects):
+        return False
+    scales = [float(np.linalg.norm(rdm[np.isfinite(rdm)])) or 1.0 for rdm in rdms]
+    return all(
+        np.allclose(a, b, rtol=0, atol=_SAME, equal_nan=True)
+        for a, b in (tuple(values), [rdm / scale for rdm, scale in zip(rdms, scales, strict=True)])
     )
 
 
-def _interval(scores: Sequence[Score]) -> Interval | None:
-    if len(scores) == 1:
-        return scores[0].interval if is_finite(scores[0].interval) else None
-    animals: dict[str, list[float]] = defaultdict(list)
-    for score in scores:
-        for subject in score.subjects:
-            if math.isfinite(subject.value):
-                animals[subject.subject].append(subject.value)
-    means = [_mean(values) for values in animals.values() if len(values) == len(scores)]
-    if len(means) < 2:
-        return None
-    seeds = [score.value for score in scores]
-    if not all(map(math.isfinite, seeds)):
-        return None
-    half = math.hypot(*((span.high - span.low) / 2 for span in map(t_interval, (means, seeds)) if span))
-    middle = _mean(seeds)
-    text = f"t over {len(means)} animals and {len(scores)} seeds, added in squares"
-    return Interval(middle - half, middle + half, 0.95, text)
+def _kind(record: ResultRecord) -> tuple[object, ...]:
+    card = record.card
+    if card is None or card.seed is None:  # nobody can know what else differs
+        return (record.score.name, card.weights if card else None, record.identity if card is None else None)
+    return (record.score.name, card.objective, card.augmentation, str(card.training.get("masking")))
 
 
-def _mean(values: Sequence[float]) -> float:
-    finite = [value for value in values if math.isfinite(value)]
-    return math.fsum(finite) / len(finite) if finite else math.nan
+def _entry(
+    key: tuple[object, ...],
+    records: list[ResultRecord],
+    board: Sequence[object],
+    remarks: Mapping[str, Sequence[str]],
+) -> Entry:
+    records = sorted(records, key=lambda record: ((record.card and record.card.seed) or 0, record.identity))
+    slug = records[0].file_name.rpartition("--")[0]
+    notes = list(dict.fromkeys(note for record in records for note in remarks.get(record.identity, ())))
+    if key[-1]:
+        notes.append("an earlier record of a model that stands above or below once more")
+    return Entry(
+        tuple(records),
+        f"{slug}--{content_hash([str(part) for part in (*board, *key)], length=10)}.html",
+        tuple(notes),
+    )

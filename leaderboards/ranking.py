@@ -1,312 +1,183 @@
-"""Boards of comparable scores, and the ranks that their intervals leave open.
+"""Which scores are told apart when animals and stimuli are both samples, and the ranks that this leaves open.
 
-Scores are comparable only within a **board**: same recordings, same stimuli, same estimator, same
-metric, same use of the time axis. Within a board only scores of status ``ok`` that carry an
-interval are ranked. Models that are not told apart are tied, so every model has a range of ranks: from
-one more than the number of models told apart above it, to the number of ranked models less those told
-apart below.
-
-Two models that were scored on at least five animals in common are told apart by a paired t test over
-these animals, at a false discovery rate of 5 % over all pairs of the board (Benjamini & Hochberg 1995):
-they share the animals, so their difference is known better than either. With fewer animals, where no such
-test is to be trusted, they are told apart when their intervals do not overlap.
+Scores are compared on the scale that all metrics share (:attr:`Score.scaled`). Two models were scored on the same
+animals and stimuli, so the test is paired: the difference of every animal, and the difference without each stimulus
+in turn, give the standard error (:func:`brainbench.core.statistics.two_factor_error`); seeds of weights add their
+own variance. Letters: N models, A animals, K stimuli.
 """
 
 from __future__ import annotations
 
 import math
-from collections import Counter, defaultdict
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
-from brainbench.core.records import Interval, ResultRecord, Score
-from brainbench.core.statistics import is_finite, t_interval
-from leaderboards.text import number, span
+from brainbench.core.records import Interval, Score
+from brainbench.core.statistics import FEWEST_ANIMALS, FEWEST_STIMULI, LEVEL, two_factor_error
 
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-PAIRED_ANIMALS = 5
-"""Fewest animals in common for a paired test; coverage of t intervals was verified from five up."""
 FALSE_DISCOVERY_RATE = 0.05
-
-
-class Ranked:
-    """Base of a model on a board, which has a range of ranks."""
-
-    first: int | None
-    last: int | None
-
-    @property
-    def rank(self) -> str:
-        """The rank in print: ``2``, ``2–5``, or a dash when not ranked."""
-        if self.first is None:
-            return "–"
-        return str(self.first) if self.first == self.last else f"{self.first}–{self.last}"
-
-    def order(self, value: float) -> tuple[int, float]:
-        """Return a key that sorts ranked before unranked and undefined, and each by its value, the highest first."""
-        place = 0 if self.first is not None else 2 if math.isnan(value) else 1
-        return place, 0.0 if math.isnan(value) else -value
+"""Largest expected share of wrong statements among all pairs of a board that are told apart."""
+CHANCE_LEVEL = 0.05
+"""A score with a permutation p above this is not told apart from chance."""
 
 
 @dataclass(frozen=True)
-class RankedRecord(Ranked):
-    """One row of a board."""
+class Sample:
+    """The scaled score of a model, as the tests read it."""
 
-    record: ResultRecord
-    first: int | None = None
-    """Best rank that the intervals allow, from 1; None when the score is not ranked."""
-    last: int | None = None
-    """Worst rank that the intervals allow."""
-    unranked_because: str = ""
-    notes: tuple[str, ...] = ()
+    value: float
+    """Mean over seeds."""
+    animals: dict[str, float]
+    """Value of each reliable animal, mean over seeds."""
+    without_stimulus: NDArray[np.float64]
+    """[K] value without each stimulus in turn, mean over seeds."""
+    seeds: tuple[float, ...]
+    """Value of each seed."""
 
-
-@dataclass(frozen=True)
-class Baseline:
-    """A baseline of a board, taken from the records in it."""
-
-    name: str
-    score: Score
-    kind: str
-    """``baseline`` or ``animals`` (animal-to-animal)."""
-    notes: tuple[str, ...] = ()
-
-
-@dataclass(frozen=True)
-class Board:
-    """The records that may be compared with one another, best first."""
-
-    recordings: str
-    recordings_hash: str | None
-    stimuli: str
-    stimuli_hash: str | None
-    """None when the features were computed elsewhere, from stimuli that the record cannot name."""
-    conditions: tuple[str, ...]
-    """Labels that were compared, in the order of the RDMs."""
-    time: str
-    """Rule by which the time axis entered the RDMs; empty when not stated."""
-    estimator: str
-    metric: str
-    synthetic: bool
-    rows: tuple[RankedRecord, ...]
-    baselines: tuple[Baseline, ...] = field(default=())
-    ties: str = ""
-    """By which rule its models are told apart, in words."""
-
-    @property
-    def comparable(self) -> bool:
-        """False when the hash of the recordings is missing, so that nobody can know what was compared."""
-        return self.recordings_hash is not None
-
-
-def rank(records: Iterable[ResultRecord]) -> list[Board]:
-    """Sort records into boards and rank each board; the largest board comes first."""
-    groups: dict[tuple[Any, ...], list[ResultRecord]] = defaultdict(list)
-    for record in records:
-        score = record.score
-        brain, shown = score.provenance.recordings_hash, score.provenance.stimuli_hash
-        groups[brain, shown, score.stimuli, score.provenance.time_rule, score.estimator, score.metric].append(record)
-    boards = [_board(key, group) for key, group in groups.items()]
-    return sorted(boards, key=lambda board: (-len(board.rows), board.recordings, board.estimator, board.metric))
-
-
-def rank_ranges(
-    intervals: Sequence[Interval],
-    animals: Sequence[Mapping[str, float]] | None = None,
-    chance: Sequence[float] | None = None,
-) -> list[tuple[int, int]]:
-    """Return the best and the worst rank that each model may have among all of them.
-
-    Args:
-        intervals: One per model.
-        animals: Score of each animal, per model; pairs with :data:`PAIRED_ANIMALS` in common are compared on them.
-        chance: Variance of each model's score beside that of the animals (its seeds'); 0 if not given.
-
-    >>> rank_ranges([Interval(0.7, 0.9), Interval(0.6, 0.8), Interval(0.1, 0.3)])
-    [(1, 2), (1, 2), (3, 3)]
-    """
-    if not intervals:
-        return []
-    low = np.array([interval.low for interval in intervals])
-    high = np.array([interval.high for interval in intervals])
-    above = low[None, :] > high[:, None]  # [i, j]: j is told apart above i
-    if animals is not None:
-        _compare_pairs(above, animals, np.zeros(len(low)) if chance is None else np.array(chance))
-    best, worst = 1 + above.sum(axis=1), len(low) - above.sum(axis=0)
-    return [(int(first), int(last)) for first, last in zip(best, worst, strict=True)]
-
-
-def animals_of(score: Score) -> dict[str, float]:
-    """Return the score of each animal that has one."""
-    return {item.subject: item.value for item in score.subjects if math.isfinite(item.value)}
-
-
-def paired_difference(one: Score, other: Score, level: float = 0.95) -> tuple[float, Interval, int] | None:
-    """Return the mean difference of two scores over the animals both could use, its t interval and their number.
-
-    None with fewer than :data:`PAIRED_ANIMALS` of them.
-    """
-    first, second = ({item.subject: item.value for item in x.subjects if item.status == "ok"} for x in (one, other))
-    difference = np.array([first[name] - second[name] for name in sorted(first.keys() & second.keys())])
-    difference = difference[np.isfinite(difference)]
-    interval = t_interval(difference, level, over="animals")
-    if interval is None or len(difference) < PAIRED_ANIMALS:
-        return None
-    return float(difference.mean()), replace(interval, method=f"paired {interval.method}"), len(difference)
-
-
-def comparisons(record: ResultRecord) -> list[str]:
-    """Say how the score stands to each baseline: by the paired difference over animals, with few of them by overlap."""
-    score = record.score
-    others = list(record.baselines.items())
-    if record.animal_to_animal is not None:
-        others.append(("animal-to-animal", record.animal_to_animal))
-    if score.status != "ok" or score.interval is None or not is_finite(score.interval):
-        return []
-    sentences = []
-    for name, other in others:
-        if other.status != "ok" or other.interval is None or not is_finite(other.interval):
-            reason = "has no interval" if other.status == "ok" else f"is {other.status}"
-            sentences.append(f"Cannot be compared with {name}, which {reason}.")
-        elif (paired := paired_difference(score, other)) is not None:
-            mean, interval, animals = paired
-            verdict = "Above" if interval.low > 0 else "Below" if interval.high < 0 else "Not told apart from"
-            sentences.append(
-                f"{verdict} {name} ({number(other.value)}): difference {number(mean)} {span(interval)}, paired over "
-                f"{animals} animals."
-            )
-        else:
-            above, below = score.interval.low > other.interval.high, score.interval.high < other.interval.low
-            verdict = "Above" if above else "Below" if below else "Not told apart from"
-            how = "do not overlap" if above or below else "overlap"
-            sentences.append(f"{verdict} {name} ({number(other.value)}): the intervals {how}.")
-    if any("overlap" in sentence for sentence in sentences):
-        sentences.append(f"With fewer than {PAIRED_ANIMALS} animals in common no paired test is trusted.")
-    return sentences
-
-
-def pairs_rule(animals: Sequence[Mapping[str, float]]) -> str:
-    """Return by which rule models with these animals are told apart, in words."""
-    most = max((len(set(one)) for one in animals), default=0)
-    if most >= PAIRED_ANIMALS:
-        return (
-            "Models are tied unless a paired t test over the animals tells them apart, at a false discovery rate of "
-            "5 % over all pairs."
+    @classmethod
+    def of(cls, scores: Sequence[Score]) -> Sample:
+        """Return the sample of one model's scores, which differ in the seed of the weights alone."""
+        found = [
+            {item.subject: score.on_scale(item.value) for item in score.subjects if item.status == "ok"}
+            for score in scores
+        ]
+        shared = [name for name in found[0] if all(math.isfinite(one.get(name, math.nan)) for one in found)]
+        left_out = [[score.on_scale(value) for value in score.without_stimulus] for score in scores]
+        alike = len({len(values) for values in left_out}) == 1
+        seeds = tuple(score.scaled for score in scores)
+        return cls(
+            float(np.mean(seeds)),
+            {name: float(np.mean([one[name] for one in found])) for name in shared},
+            np.mean(left_out, axis=0) if alike else np.empty(0),
+            seeds,
         )
-    return (
-        f"Models whose intervals overlap are tied (with fewer than {PAIRED_ANIMALS} animals no paired test is trusted)."
-    )
+
+    @property
+    def seed_variance(self) -> tuple[float, float]:
+        """Variance of the mean over seeds, and its degrees of freedom; zeros for one seed."""
+        count = len(self.seeds)
+        return (float(np.var(self.seeds, ddof=1)) / count, count - 1.0) if count > 1 else (0.0, 0.0)
+
+    @property
+    def interval(self) -> Interval | None:
+        """95 % interval over animals, stimuli and seeds; None where a variance is unknown."""
+        from scipy.special import stdtrit
+
+        error, freedom = two_factor_error(list(self.animals.values()), self.without_stimulus)
+        error, freedom = _with_seeds(error, freedom, [self.seed_variance])
+        if not math.isfinite(error) or not math.isfinite(self.value):
+            return None
+        half = float(stdtrit(freedom, (1 + LEVEL) / 2) * error)
+        over = f"{len(self.animals)} animals, {np.isfinite(self.without_stimulus).sum()} stimuli"
+        over += f" and {len(self.seeds)} seeds" if len(self.seeds) > 1 else ""
+        return Interval(self.value - half, self.value + half, LEVEL, f"t over {over}")
 
 
-def _compare_pairs(
-    above: NDArray[np.bool_], animals: Sequence[Mapping[str, float]], chance: NDArray[np.float64]
-) -> None:
-    """Overwrite ``above`` [N, N] for the pairs that a paired test can compare."""
-    from scipy.special import stdtr
+@dataclass(frozen=True)
+class Comparison:
+    """The paired difference of two models on the common scale."""
+
+    difference: float
+    interval: Interval
+    p: float
+    """Two-sided, of this pair alone."""
+
+
+def compare(one: Score, other: Score) -> Comparison | None:
+    """Return the difference ``one`` − ``other``; None with too few animals or stimuli in common to test it."""
+    from scipy.special import stdtrit
+
+    pair = [Sample.of([one]), Sample.of([other])]
+    mean, error, freedom, p = (float(values[0, 1]) for values in _tests(pair))
+    if math.isnan(p):
+        return None
+    half = float(stdtrit(freedom, (1 + LEVEL) / 2)) * error if error > 0 else 0.0
+    return Comparison(mean, Interval(mean - half, mean + half, LEVEL, "t over animals and stimuli, paired"), p)
+
+
+def told_apart(samples: Sequence[Sample]) -> NDArray[np.bool_]:
+    """Return [N, N] for each pair whether model j is told apart above model i.
+
+    The false discovery rate over all pairs that can be tested is :data:`FALSE_DISCOVERY_RATE` (Benjamini & Hochberg
+    1995).
+    """
     from scipy.stats import false_discovery_control
 
-    names = sorted({name for values in animals for name in values})
-    table = np.array([[values.get(name, math.nan) for name in names] for values in animals]).reshape(len(animals), -1)
-    p = np.full(above.shape, math.nan)
-    higher = np.zeros_like(above)
-    for i, row in enumerate(table):
-        difference = table - row
-        shared = np.isfinite(difference).sum(axis=1)
-        tested = np.flatnonzero((shared >= PAIRED_ANIMALS) & (np.arange(len(table)) != i))
-        if not len(tested):
-            continue
-        mean, spread = np.nanmean(difference[tested], axis=1), np.nanvar(difference[tested], axis=1, ddof=1)
-        error = np.sqrt(spread / shared[tested] + chance[tested] + chance[i])
-        t = np.divide(np.abs(mean), error, out=np.where(mean == 0, 0.0, math.inf), where=error > 0)
-        p[i, tested] = 2 * stdtr(shared[tested] - 1.0, -t)
-        higher[i, tested] = mean > 0
-    known = np.isfinite(p)
-    pairs = np.triu(known, 1)
+    if not samples:
+        return np.zeros((0, 0), dtype=bool)
+    difference, _, _, p = _tests(samples)
+    pairs = np.triu(np.isfinite(p), 1)
     adjusted = np.ones_like(p)
     if pairs.any():
         adjusted[pairs] = false_discovery_control(p[pairs])
-    adjusted = np.minimum(adjusted, adjusted.T)
-    above[known] = ((adjusted <= FALSE_DISCOVERY_RATE) & higher)[known]
+    return (np.minimum(adjusted, adjusted.T) <= FALSE_DISCOVERY_RATE) & (difference < 0)
 
 
-def _board(key: tuple[Any, ...], records: list[ResultRecord]) -> Board:
-    recordings_hash, stimuli_hash, conditions, time, estimator, metric = key
-    repeats = Counter(_model(record) for record in records)
-    reasons = [_unranked(record, recordings_hash is not None) for record in records]
-    ranked = [record for record, reason in zip(records, reasons, strict=True) if not reason]
-    animals = [animals_of(record.score) for record in ranked]
-    ranges = iter(rank_ranges([record.score.interval for record in ranked if record.score.interval], animals))
-    rows = []
-    for record, reason in zip(records, reasons, strict=True):
-        first, last = (None, None) if reason else next(ranges)
-        times = repeats[_model(record)]
-        notes = (f"scored {times} times on this board; compare the versions",) if times > 1 else ()
-        rows.append(RankedRecord(record, first, last, reason, notes))
-    rows.sort(key=lambda row: (*row.order(row.record.score.value), row.record.score.name))
-    return Board(
-        recordings=_most_common(record.score.provenance.recordings_name for record in records),
-        recordings_hash=recordings_hash,
-        stimuli=_most_common(record.score.provenance.stimuli_name for record in records),
-        stimuli_hash=stimuli_hash,
-        conditions=conditions,
-        time=time,
-        estimator=estimator,
-        metric=metric,
-        synthetic=any(record.synthetic for record in records),
-        rows=tuple(rows),
-        baselines=tuple(_baselines([row.record for row in rows])),
-        ties=pairs_rule(animals),
-    )
+def rank_ranges(above: NDArray[np.bool_]) -> list[tuple[int, int]]:
+    """Return the best and the worst rank of each model, from :func:`told_apart`.
+
+    The best is one more than the number of models told apart above it; the worst leaves out those told apart below.
+
+    >>> rank_ranges(np.array([[False, False, False], [False, False, False], [True, True, False]]))
+    [(1, 2), (1, 2), (3, 3)]
+    """
+    best, worst = 1 + above.sum(axis=1), len(above) - above.sum(axis=0)
+    return [(int(first), int(last)) for first, last in zip(best, worst, strict=True)]
 
 
-def _unranked(record: ResultRecord, comparable: bool) -> str:
-    score = record.score
-    if score.status != "ok":
-        return score.status
-    if not is_finite(score.interval):
-        return "no interval"
-    return "" if comparable else "recordings not identified"
+def lacking(animals: int, stimuli: int) -> str:
+    """Return what a design lacks for ranks, in words; empty when it has enough animals and stimuli.
+
+    >>> lacking(10, 6)
+    'at least 10 stimuli (here 6)'
+    """
+    needs = [
+        f"at least {fewest} {what} (here {count})"
+        for what, fewest, count in (("animals", FEWEST_ANIMALS, animals), ("stimuli", FEWEST_STIMULI, stimuli))
+        if count < fewest
+    ]
+    return " and ".join(needs)
 
 
-def _model(record: ResultRecord) -> tuple[object, ...]:
-    card = record.card
-    return (record.score.name, card.weights if card else None, card.seed if card else None)
+def _tests(samples: Sequence[Sample]) -> tuple[NDArray[np.float64], ...]:
+    """Return differences i − j, standard errors, degrees of freedom and two-sided p, each [N, N]; NaN: not tested."""
+    from scipy.special import stdtr
+
+    names = sorted({name for sample in samples for name in sample.animals})
+    size = max(len(sample.without_stimulus) for sample in samples)
+    table = np.array([[sample.animals.get(name, math.nan) for name in names] for sample in samples])
+    table = table.reshape(len(samples), -1)
+    left_out = np.full((len(samples), size), math.nan)
+    for row, sample in zip(left_out, samples, strict=True):
+        if len(sample.without_stimulus) == size:
+            row[:] = sample.without_stimulus
+    shape = (len(samples), len(samples))
+    difference, errors, freedoms, p = (np.full(shape, math.nan) for _ in range(4))
+    variances = np.array([sample.seed_variance for sample in samples])
+    for i in range(len(samples)):
+        animals, stimuli = table[i] - table, left_out[i] - left_out
+        enough = np.isfinite(animals).sum(axis=1) >= FEWEST_ANIMALS
+        enough &= np.isfinite(stimuli).sum(axis=1) >= FEWEST_STIMULI
+        enough[i] = False
+        if not enough.any():
+            continue
+        mean = np.nanmean(animals[enough], axis=1)
+        error, freedom = two_factor_error(animals[enough], stimuli[enough])
+        error, freedom = _with_seeds(error, freedom, [variances[i], variances[enough].T])
+        t = np.divide(np.abs(mean), error, out=np.where(mean == 0, 0.0, math.inf), where=error > 0)
+        difference[i, enough], errors[i, enough], freedoms[i, enough] = mean, error, freedom
+        p[i, enough] = 2 * stdtr(np.where(error > 0, freedom, 1.0), -t)
+    return difference, errors, freedoms, p
 
 
-def _outcome(score: Score) -> tuple[str, float | None]:
-    """Status and value to nine digits: sums on other machines, or by more threads, end in other last digits."""
-    return score.status, None if math.isnan(score.value) else round(score.value, 9)
-
-
-def _baselines(records: list[ResultRecord]) -> list[Baseline]:
-    """Take each baseline once; records of one board should agree on it, and a note says when they do not."""
-    found: dict[tuple[str, str], list[Score]] = defaultdict(list)
-    for record in records:
-        if record.animal_to_animal is not None:
-            found["animals", "animal-to-animal"].append(record.animal_to_animal)
-        for name, score in record.baselines.items():
-            found["baseline", name].append(score)
-    baselines = []
-    for (kind, name), scores in found.items():
-        counts = Counter(map(_outcome, scores))
-        usual = counts.most_common(1)[0][0]
-        score = next(score for score in scores if _outcome(score) == usual)
-        notes: tuple[str, ...] = ()
-        if len(counts) > 1:
-            values = [value for _, value in counts if value is not None]
-            notes = (
-                f"the records disagree: {len(counts)} different values"
-                + (f" from {min(values):.3f} to {max(values):.3f}" if values else "")
-                + f"; shown is that of {counts[usual]} of {len(scores)} records",
-            )
-        baselines.append(Baseline(name, score, kind, notes))
-    return baselines
-
-
-def _most_common(names: Iterable[str]) -> str:
-    return Counter(names).most_common(1)[0][0]
+def _with_seeds(error: NDArray[np.float64], freedom: NDArray[np.float64], seeds: Sequence[Sequence[float]]) -> tuple:
+    """Add (variance, degrees of freedom) of seeds to a standard error, after Welch and Satterthwaite."""
+    total = error**2 + sum(variance for variance, _ in seeds)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        spent = np.where(error > 0, error**4 / freedom, 0.0)
+        for variance, count in seeds:
+            spent = spent + np.where(np.asarray(count) > 0, np.square(variance) / np.maximum(count, 1.0), 0.0)
+        return np.sqrt(total), total**2 / spent

@@ -4,17 +4,24 @@ from __future__ import annotations
 
 import json
 import math
+import re
+import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import fields
 from typing import Any
 
 from brainbench.core.records import Interval, ModelCard, ResultRecord, Score
+from leaderboards.entries import Standing, not_repeatable
 
-STATUS = {
-    "ok": "The recordings are reliable enough to trust this number.",
+STANDING: dict[Standing, str] = {
+    "above raw input": "Told apart from chance, and above the raw input of the models.",
+    "above chance": "Told apart from chance, but not above the raw input of the models.",
+    "not told apart from chance": "A model that knows nothing of these stimuli could score as high.",
+    "not tested": "The record states no test against chance.",
     "unreliable": "Computed, but not to be trusted: the data are too noisy or too few.",
     "undefined": "No number exists.",
 }
+"""The ladder of words that every page uses, with their meaning."""
 
 SYNTHETIC = "Synthetic demo recordings: ranks say nothing about brains."
 
@@ -89,33 +96,42 @@ def p_sentence(score: Score) -> str:
     return "; ".join(parts)
 
 
-def stated(label: str, value: str) -> str:
-    """Return a sentence that says a value, empty without one."""
-    return f" {label}: {value}." if value else ""
-
-
-def methods(record: ResultRecord) -> str:
-    """Return a paragraph for a paper's methods section, made only of what the record states."""
-    score, origin = record.score, record.score.provenance
-    return (
-        f"The model {score.name} was compared with {origin.recordings_name} "
-        f"({plural(len(score.subjects), 'animal')}, {plural(len(score.stimuli), 'stimulus', 'stimuli')}) "
-        f"by representational similarity analysis{f' ({score.metric})' if score.metric else ''}, "
-        f"with noise correction by the estimator '{score.estimator}'."
-        + stated("Time axis", origin.time_rule)
-        + stated("Layer", score.layer_rule)
-        + stated("Interval", level(score.interval) if score.interval else "")
-        + stated("Significance", score.p_method)
-        + stated("Noise ceiling", score.ceiling.method if score.ceiling else "")
-        + made_by([origin.version], synthetic=record.synthetic)
+def methods(records: Sequence[ResultRecord]) -> str:
+    """Return a paragraph for a paper's methods section, made only of what the records of one board state."""
+    score, names = records[0].score, list(dict.fromkeys(record.score.name for record in records))
+    origin, many = score.provenance, f"{plural(len(names), 'model')} ({plural(len(records), 'record')}) were"
+    text = (
+        f"{many if len(names) > 1 else f'The model {names[0]} was'} compared with {origin.recordings_name} "
+        f"({plural(len(score.subjects), 'animal')}, {plural(len(score.stimuli), 'stimulus', 'stimuli')})"
+        f"{f' by {score.metric}' if score.metric else ''}, with noise correction by the estimator '{score.estimator}'."
     )
-
-
-def made_by(versions: Sequence[str], *, synthetic: bool, hashes: str = "") -> str:
-    """Return the end of a methods paragraph: versions of this package, hashes, and whether brains were recorded."""
-    named = ", ".join(filter(None, versions))
-    text = f" Computed with brainbench {named}." if named else ""
-    return text + hashes + (" The recordings are synthetic: the result says nothing about brains." if synthetic else "")
+    stated = {
+        "Stimuli": origin.stimuli_name.rstrip("."),
+        "Fidelity of the simulation": str(origin.settings.get("fidelity") or ""),
+        "Time axis": origin.time_rule,
+        "Layer": score.layer_rule,
+        "Interval": level(score.interval) if score.interval else "",
+        # The mean under permutation is one record's own.
+        "Significance": re.sub(r"; mean score under permutation [−\-.\d]+", "", score.p_method),
+        "Noise ceiling": score.ceiling.method if score.ceiling else "",
+    }
+    text += "".join(f" {label}: {value}." for label, value in stated.items() if value)
+    if len(names) < len(records):
+        text += (
+            " Networks that differ in the seed of their weights are one model: its score is the mean over seeds, the "
+            "variance over seeds is part of its interval, the spread is the standard deviation over seeds."
+        )
+    if len(names) > 1:
+        text += (
+            " Models were told apart by a paired t test over animals and stimuli on scores scaled between chance and "
+            "all that is reliable, at a false discovery rate of 5 % over all pairs; models that are not told apart "
+            "share ranks."
+        )
+    versions = filter(None, sorted({record.score.provenance.version for record in records}))
+    text += f" Computed with brainbench {', '.join(versions)}." if origin.version else ""
+    hashes = {"recordings": origin.recordings_hash, "stimuli": origin.stimuli_hash}
+    text += "".join(f" Hash of the {what} {found}." for what, found in hashes.items() if found)
+    return text + (f" {SYNTHETIC}" if records[0].synthetic else "")
 
 
 def card_rows(card: ModelCard) -> list[tuple[str, str]]:
@@ -137,20 +153,18 @@ def card_rows(card: ModelCard) -> list[tuple[str, str]]:
     return rows
 
 
-def loading(record: ResultRecord) -> str:
-    """Return three lines of Python that load the model."""
-    card = record.card
-    name = record.score.name
-    if card is None or card.family in ("features computed elsewhere", ""):
-        return f"# {name}: activations that were computed elsewhere; the record names no model to load."
-    if card.family == "user module":
-        path = record.score.provenance.settings.get("model")
-        shown = path if isinstance(path, str) else name
-        made = f"model = load_user_model({shown!r}, seed={card.seed or 0})"
-        return f"from brainbench.models.user_models import load_user_model\n\n{made}"
-    seed = f", seed={card.seed}" if card.seed and card.objective == "untrained" else ""
-    made = f"model = brainbench.load_model({name!r}{seed})"
-    return f"import brainbench\n\n{made}  # [B, T, 30, 5, 7] in N and N·m → [B, classes]"
+def ways_to_get(record: ResultRecord) -> list[str]:
+    """Return the command that scores the model and the Python that loads it; nothing where nobody here can.
+
+    >>> ways_to_get(ResultRecord(Score("s4-small", 0.5, "ok"), card=ModelCard("s4-small", family="s4", seed=2)))
+    ['brainbench score s4-small --weights-seed 2', 'brainbench.load_model("s4-small", seed=2)']
+    """
+    card, name = record.card, record.score.name
+    if card is None or not_repeatable(record) or card.family == "policy":
+        return []
+    drawn = card.seed if card.seed and card.objective in (None, "untrained") else 0
+    flag, argument = (f" --weights-seed {drawn}", f", seed={drawn}") if drawn else ("", "")
+    return [f"brainbench score {shlex.quote(name)}{flag}", f"brainbench.load_model({json.dumps(name)}{argument})"]
 
 
 def training_rows(card: ModelCard) -> list[tuple[str, str]]:
@@ -163,16 +177,6 @@ def training_rows(card: ModelCard) -> list[tuple[str, str]]:
         if key not in ("augmentation", "objective")
     ]
     rows += [("untrained twin", card.twin)] if stated and card.twin else []
-    return [(label, text) for label, text in rows if text]
-
-
-def accuracy_rows(card: ModelCard) -> list[tuple[str, str]]:
-    """Return what the card says of the accuracy on held-out objects, as label and text."""
-    rows = [("top-1", number(card.top1)), ("interval", span(card.accuracy_interval))]
-    rows += [("top-5", number(card.top5))] if card.top5 is not None else []
-    if card.twin_top1 is not None:
-        rows.append(("untrained twin, top-1", f"{number(card.twin_top1)} {span(card.twin_interval)}".strip()))
-    rows += [("data (hash)", card.accuracy_data or ""), ("collapsed", "yes" if card.collapsed else "no")]
     return [(label, text) for label, text in rows if text]
 
 

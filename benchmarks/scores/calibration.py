@@ -16,19 +16,19 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from brainbench.metrics.inference.bootstrap import animal_counts, ceilings, drawn_scores, noise_factors
 from scipy import stats
 
 from benchmarks.report import table, write_section
 from brainbench.core.trials import Trials
 from brainbench.metrics import compare, rdm
-from brainbench.metrics.animal_to_animal import score_animals
-from brainbench.metrics.inference.bootstrap import animal_counts, ceilings, drawn_scores, noise_factors
 from brainbench.metrics.inference.equivalence import equivalence_test
 from brainbench.metrics.inference.intervals import bca_interval, percentile_interval, t_interval
 from brainbench.metrics.inference.multiple import sign_flip_p, step_down
 from brainbench.metrics.inference.permutation import label_orders
 from brainbench.metrics.inference.power import ExperimentDesign, simulate_experiments
 from brainbench.metrics.layers import held_out
+from brainbench.metrics.measures.rsa import score_animals
 from brainbench.metrics.rdms.comparison import compare_all, features
 from brainbench.metrics.rdms.pairs import permuted_pairs
 from brainbench.metrics.reliability.subject_rdm import SubjectRDM, subject_rdm

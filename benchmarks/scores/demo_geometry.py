@@ -21,7 +21,7 @@ from brainbench.datasets import open_recordings
 from brainbench.datasets.synthetic import ensure_demo, read_truth
 from brainbench.datasets.trials.session_trials import trials_by_subject
 from brainbench.metrics import rdm
-from brainbench.metrics.animal_to_animal import score_animals
+from brainbench.metrics.measures.rsa import score_animals
 from brainbench.metrics.reliability.subject_rdm import subject_rdm
 from brainbench.stimuli import load_stimuli
 

@@ -20,14 +20,13 @@ from collections.abc import Callable, Iterator
 from functools import partial
 
 import numpy as np
+from brainbench.metrics.inference.bootstrap import bootstrap_ceiling, bootstrap_comparisons
 
 from benchmarks.report import table, write_section
 from brainbench.core.trials import Trials
 from brainbench.metrics import compare_models, noise_precision, permutation_test, rdm
-from brainbench.metrics.animal_to_animal import score_animals
-from brainbench.metrics.inference.bootstrap import bootstrap_ceiling, bootstrap_comparisons
+from brainbench.metrics.measures.rsa import score_animals, score_rdms
 from brainbench.metrics.reliability.subject_rdm import subject_rdm
-from brainbench.metrics.score import score_rdms
 
 STIMULI = [f"s{k}" for k in range(6)]
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Annotated, Any
 
 import typer
@@ -15,11 +16,24 @@ _EFFECTS = (0.0, 0.3, 0.5, 0.7)
 DESIGN = "brainbench.metrics.inference.power:ExperimentDesign"
 
 
-@with_options(DESIGN, [name for name in option_fields(DESIGN) if name != "effect"], build=False)
+@with_options(DESIGN, [name for name in option_fields(DESIGN) if name not in ("effect", "dimensions")], build=False)
 def power(
     options: dict[str, Any],
     effect: Annotated[
-        float | None, typer.Option(help="True noise-corrected score of the model; several are shown without it.")
+        float | None,
+        typer.Option(help="True score between chance (0) and all that is reliable (1); several are shown without it."),
+    ] = None,
+    dimensions: Annotated[
+        str, typer.Option(help="Dimensions of the representations: a number, or 'auto' to estimate them.")
+    ] = "auto",
+    recordings: Annotated[
+        str | None, typer.Option("--recordings", "-r", help="Pilot recordings from which 'auto' estimates them.")
+    ] = None,
+    conditions: Annotated[
+        str | None, typer.Option(help="TABLE:COLUMN[,COLUMN] that labels the pilot's trials, where no layout says so.")
+    ] = None,
+    model: Annotated[
+        str | None, typer.Option(help="Model whose layers 'auto' estimates them from (median), without recordings.")
     ] = None,
     target: Annotated[float, typer.Option(help="Power that is wanted.")] = 0.8,
     simulations: Annotated[int, typer.Option(help="Simulated experiments per number.")] = 500,
@@ -35,7 +49,10 @@ def power(
     from brainbench.metrics.inference import power as experiments
 
     effects = _EFFECTS if effect is None else (effect,)
+    # Whatever is wrong with the design is told before recordings are opened.
     designs = [experiments.ExperimentDesign(effect=one, **options) for one in effects]
+    number, origin = _dimensions(dimensions, recordings, conditions, model)
+    designs = [replace(design, dimensions=number) for design in designs]
     found = []
     with progress_bar() as progress:
         for index, design in enumerate(designs):
@@ -59,8 +76,8 @@ def power(
     one = designs[0]
     title = (
         f"{one.stimuli} stimuli, {one.animals} animals, consistency {one.consistency:g}, reliability "
-        f"{one.reliability:g}, {one.layers} layer{'s' if one.layers > 1 else ''}, α {one.alpha:g}; "
-        f"smallest possible p {found[0][0].p_smallest:.2g}"
+        f"{one.reliability:g}, {one.layers} layer{'s' if one.layers > 1 else ''}, α {one.alpha:g}, "
+        f"{number} dimension{'s' if number > 1 else ''} ({origin}); smallest possible p {found[0][0].p_smallest:.2g}"
     )
     columns = {
         ">true score": "{0[0].design.effect:g}",
@@ -69,5 +86,57 @@ def power(
         f">animals for {target:.0%}": lambda item: told(item, "animals"),
     }
     note = "True score 0 is the rate of false alarms. Animals needed are for the given stimuli, and the reverse."
-    data = {"results": [{**to_plain(result), "needed": enough, "target": target} for result, enough in found]}
+    data = {
+        "dimensions": {"number": number, "origin": origin},
+        "results": [{**to_plain(result), "needed": enough, "target": target} for result, enough in found],
+    }
     emit(data, f"{title}\n\n{table_of('', found, columns)}\n\n{note}", as_json=as_json)
+
+
+def _dimensions(asked: str, recordings: str | None, conditions: str | None, model: str | None) -> tuple[int, str]:
+    """Return the number of dimensions, and where it comes from in words.
+
+    Raises:
+        UsageError: it is neither a number nor 'auto', or more than one source is given.
+    """
+    from brainbench.core.errors import UsageError
+    from brainbench.metrics.inference.power import DIMENSIONS
+
+    sources = [name for name, given in (("--recordings", recordings), ("--model", model)) if given is not None]
+    if asked != "auto":
+        if not asked.isdecimal() or int(asked) < 1:
+            raise UsageError(f"--dimensions is a whole number of at least 1 or 'auto'; received {asked!r}.")
+        if sources:
+            raise UsageError(f"--dimensions {asked} is given, so {sources[0]} has nothing to estimate; leave one out.")
+        return int(asked), "given"
+    if len(sources) > 1:
+        raise UsageError("Dimensions are estimated from --recordings or from --model, not both.")
+    if recordings is not None:
+        return _of_recordings(recordings, conditions)
+    return (DIMENSIONS, "assumed; --recordings or --model estimates them") if model is None else _of_model(model)
+
+
+def _of_recordings(recordings: str, conditions: str | None) -> tuple[int, str]:
+    from brainbench.datasets.trials.session_trials import trials_by_subject
+    from brainbench.metrics.inference.dimension import signal_dimensions
+    from brainbench.scoring.neural_responses import open_neural_responses
+
+    with progress_bar() as progress:
+        brain = open_neural_responses(recordings, progress=progress, conditions=conditions)
+    found = signal_dimensions(trials_by_subject(brain.dataset).values(), len(brain.vocabulary))
+    return round(found), f"{found:.1f} estimated from {brain.source}"
+
+
+def _of_model(model: str) -> tuple[int, str]:
+    import numpy as np
+
+    from brainbench.metrics.inference.dimension import pattern_dimensions
+    from brainbench.scoring.model_responses import resolve_model
+    from brainbench.scoring.options import ScoreOptions
+
+    with progress_bar() as progress:
+        responses = resolve_model(model).respond(ScoreOptions(), progress=progress)
+    layers = responses.features(list(range(len(responses.labels)))).values()
+    varied = [layer for layer in layers if np.isfinite(layer).all() and np.ptp(layer, axis=0).any()]
+    found = float(np.median([pattern_dimensions(layer) for layer in varied]))
+    return round(found), f"{found:.1f} estimated from {len(varied)} layers of {model}"

@@ -52,13 +52,15 @@ def rdm(
     from dataclasses import replace
 
     from brainbench.datasets.trials.session_trials import pooled
+    from brainbench.metrics import get_metric
     from brainbench.scoring.neural_responses import open_neural_responses
+    from brainbench.scoring.options import ScoreOptions
 
     with progress_bar() as progress:
         brain = open_neural_responses(source, conditions=conditions, select=select, window=window, progress=progress)
     brain = replace(brain, dataset=pooled(brain.dataset, pool))
     labels = brain.vocabulary
-    animals = brain.animals(labels, time="mean", seed=seed)
+    animals = brain.animals(labels, get_metric("rsa-correlation"), ScoreOptions(seed=seed))
     told = ("subject", "units", "trials", "reliability", "problem", "rdm")
     data = {
         "labels": labels,
@@ -136,12 +138,12 @@ def fetch(
 
 def _found(source: str) -> str:
     """Return a source as the files' readers take it: the demo recordings by their folder."""
-    if source != "demo":
-        return source
-    from brainbench.scoring.neural_responses import demo_recordings
+    from brainbench.scoring.demo import DEMOS, demo_recordings
 
+    if source not in DEMOS:
+        return source
     with progress_bar() as progress:
-        return str(demo_recordings(progress=progress))
+        return str(demo_recordings(source, progress=progress))
 
 
 def _verdict(animal: SubjectRDM) -> str:

@@ -16,13 +16,8 @@ from brainbench.cli.output import JsonOption, emit, progress_bar, table, table_o
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from brainbench.core.records import ResultRecord, Score
+    from brainbench.core.records import Interval, ResultRecord, Score
     from brainbench.scoring import ScoreOptions
-
-_RELIABILITY = {
-    True: "split halves, Spearman-Brown, mean over animals",
-    False: "share of the variance between stimuli that is not trial noise, mean over animals",
-}
 
 
 def _complete_model(incomplete: str) -> list[str]:
@@ -97,22 +92,26 @@ def _text(record: ResultRecord) -> str:
     parts = [f"{score.name}  ·  {len(score.stimuli)} stimuli  ·  {len(known)} animals  ·  {source}"]
     if record.synthetic:
         parts[0] += "\nSynthetic recordings: ranks on them say nothing about brains."
-    rsa = score.metric.startswith("RSA")
-    explained = "noise-corrected RSA, 1 = explains all that is reliable" if rsa else score.metric
     ceiling = score.ceiling
+    scale = f"chance {_number(score.chance)}, attainable {_number(score.attainable)}"
     rows = [
-        ["score", _value(score), explained],
+        ["score", _scaled_value(score), "0 = chance, 1 = explains all that is reliable"],
         ["status", score.status, "; ".join(score.reasons)],
+        [
+            "value",
+            _value(score),
+            f"{score.metric}; chance {_number(score.chance)}, attainable {_number(score.attainable)}",
+        ],
         [
             "raw r",
             _number(score.r),
             f"noise ceiling {_number(ceiling.lower)} to {_number(ceiling.upper)}" if ceiling else "no noise ceiling",
         ],
-        ["reliability", _number(score.reliability), _RELIABILITY[rsa]],
+        ["reliability", _number(score.reliability), "of the animals' RDMs: split halves, Spearman-Brown, mean"],
         ["permutation p", _number(score.p), f"{score.p_method}; smallest possible {_number(score.p_smallest)}"],
         ["layer", str(score.layer), score.layer_rule],
         ["best layer", _number(score.best_layer_value), f"{score.best_layer}: optimistic maximum, not a result"],
-        ["estimator", score.estimator, score.metric],
+        ["estimator", score.estimator, ""],
     ]
     parts += [table("", ["", "", ""], rows), *_details(score.provenance.statistics)]
     if animals is not None and score.estimator == "default" and score.subjects:
@@ -121,9 +120,11 @@ def _text(record: ResultRecord) -> str:
     if walk := score.provenance.statistics.get("estimator_walk"):
         parts.append(_walk(walk))
     others = {"animal to animal": animals, **record.baselines}
-    rows = [[name, _value(item), item.status] for name, item in others.items() if item is not None]
+    rows = [
+        [name, _scaled_value(item), _number(item.p), item.status] for name, item in others.items() if item is not None
+    ]
     if rows:
-        parts.append(table("Baselines, same estimator", ["", "score", "status"], rows))
+        parts.append(table("Baselines, same metric and animals", ["", "score", "p", "status"], rows))
     return "\n\n".join(parts)
 
 
@@ -139,8 +140,10 @@ def _walk(steps: list[dict[str, Any]]) -> str:
 
 
 def _details(statistics: Mapping[str, Any]) -> list[str]:
-    """Lay out what single metrics add: accuracies by property, shares of variance."""
+    """Lay out what single metrics and options add: accuracies by property, shares of variance, times."""
     parts = []
+    if course := statistics.get("time_course"):
+        parts.append(_over_time(course))
     if accuracies := statistics.get("decoding"):
         columns = {
             "property": "{0[property]}",
@@ -159,10 +162,52 @@ def _details(statistics: Mapping[str, Any]) -> list[str]:
     return parts
 
 
+def _over_time(course: Mapping[str, Any]) -> str:
+    """Lay out the best time and the latency of each layer that matches at some lag."""
+    best = max(filter(_known, course["points"]), key=_scaled, default=None)
+    clear = sum(point["p"] is not None and point["p"] <= 0.05 for point in course["points"])
+    text = f"Over time, {len(course['points'])} bins of {course['bin']:g} s: "
+    if best is None:
+        text += "no animal is reliable in any bin"
+    else:
+        text += (
+            f"{clear} differ from chance (p of the best {course['p']:.2g}, corrected for all times); the best score, "
+        )
+        text += f"{_scaled(best):.2f} between chance (0) and all that is reliable (1), is at {best['time']:.3g} s"
+    columns = {
+        "layer": "{0[layer]}",
+        ">latency": lambda row: "–" if row["latency"] is None else f"{1000 * row['latency']:.0f} ms",
+        "interval": lambda row: (
+            f"[{1000 * row['interval']['low']:.0f}, {1000 * row['interval']['high']:.0f}]" if row["interval"] else ""
+        ),
+        ">p": lambda row: "–" if row["p"] is None else f"{row['p']:.2g}",
+        "": "{0[reason]}",
+    }
+    rows = table_of("Neurons follow the model by", course["latencies"], columns)
+    return "\n".join([text, *course["reasons"], "", rows])
+
+
+def _known(point: Mapping[str, Any]) -> bool:
+    return point["value"] is not None and point["chance"] is not None and point["chance"] < 1
+
+
+def _scaled(point: Mapping[str, Any]) -> float:
+    """Return the score at one time between chance (0) and all that is reliable (1)."""
+    return (point["value"] - point["chance"]) / (1 - point["chance"])
+
+
 def _number(value: float) -> str:
     return f"{value:.3g}" if math.isfinite(value) else "–"
 
 
 def _value(score: Score) -> str:
-    span = score.interval
-    return f"{_number(score.value)} {f'[{_number(span.low)}, {_number(span.high)}]' if span else ''}"
+    return _with_span(score.value, score.interval)
+
+
+def _scaled_value(score: Score) -> str:
+    """Return the score on the scale that all metrics share; its value where there is none."""
+    return _value(score) if math.isnan(score.scaled) else _with_span(score.scaled, score.scaled_interval)
+
+
+def _with_span(value: float, span: Interval | None) -> str:
+    return f"{_number(value)} {f'[{_number(span.low)}, {_number(span.high)}]' if span else ''}"

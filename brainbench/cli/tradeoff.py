@@ -94,7 +94,7 @@ def score(
     repeats: Annotated[int, typer.Option(help="Seeds per setting; their spread is the error.")] = 8,
     as_json: JsonOption = False,
 ) -> None:
-    """Measure the Monte-Carlo error of a score against its time: split halves, bootstrap draws, permutations."""
+    """Measure the Monte-Carlo error of a score against its time: split halves and permutations."""
     from brainbench.metrics.tradeoff import measure_tradeoff
 
     with progress_bar() as progress:

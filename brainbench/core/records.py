@@ -27,7 +27,7 @@ it; ``undefined``: no number exists. The reason stands in words beside it."""
 RECORD_SCHEMA: Literal[2] = 2
 """Version of the result-record JSON layout; :meth:`ResultRecord.from_json` also reads every earlier one."""
 
-ESTIMATOR_VERSION = 1
+ESTIMATOR_VERSION = 2
 """Raised whenever the same recordings and activations would get another number from the default estimator."""
 
 if TYPE_CHECKING:
@@ -169,9 +169,11 @@ class Score(_NullIsNaN):
     chance: Number = field(default=math.nan, metadata={"later": True})
     """Mean of ``value`` under permuted stimuli, the choice of layer repeated in each permutation."""
     attainable: Number = field(default=math.nan, metadata={"later": True})
-    """``value`` of a model that explains all that is reliable: 1 where the metric corrects for noise."""
+    """``value`` of a model that explains all that is reliable: 1 where the metric corrects for noise. NaN where chance
+    reaches it, so that there is no scale."""
     without_stimulus: tuple[Number, ...] = field(default=(), metadata={"later": True})
-    """[K] ``value`` without each stimulus in turn, for the variance over stimuli (jackknife)."""
+    """[K] ``value`` without each stimulus in turn, for the variance over stimuli (jackknife); layers and corrections
+    for noise are those of the whole."""
     provenance: _StatedProvenance = field(default_factory=Provenance)
     """Versions, machine, data with hashes, settings and the command that makes it again; a mapping becomes typed."""
 
@@ -323,6 +325,8 @@ class ModelCard:
     """Top-1 accuracy of the untrained twin, its decoder trained on the same data."""
     twin_interval: Interval | None = field(default=None, metadata={"later": True})
     """Interval of ``twin_top1``."""
+    layer: str | None = field(default=None, metadata={"later": True})
+    """Layer that was committed to before anything was scored."""
 
 
 @dataclass(frozen=True)

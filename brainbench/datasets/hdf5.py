@@ -4,7 +4,8 @@ The root carries the attributes ``format`` = "brainbench-recordings", ``version`
 
 ``kind`` = "spikes": one file, any number of sessions; names in <> are free::
 
-    /sessions/<name>            attributes subject, session, start (ISO 8601 or ""), synthetic (bool)
+    /sessions/<name>            attributes subject, session, start (ISO 8601 or ""), synthetic (bool),
+                                stimuli (optional: recipe of the stimuli)
         units/                  one row per unit
             spike_times         float64 [spikes], s, ascending within a unit; units one after another
             spike_times_index   int64 [units], end of each unit in spike_times
@@ -119,6 +120,7 @@ def read_sessions(file: h5py.File, path: Path) -> list[Session]:
                 start=text(group.attrs.get("start", "")),
                 format=f"{FORMAT} {VERSION}",
                 synthetic=bool(group.attrs.get("synthetic", False)),
+                stimuli=text(group.attrs.get("stimuli", "")),
             )
         )
     return sessions
@@ -175,7 +177,7 @@ def _write_sessions(file: h5py.File, sessions: list[Session]) -> None:
         group = root.create_group(name)
         group.attrs.update(
             {"subject": session.subject, "session": session.session, "start": session.start}
-            | {"synthetic": session.synthetic}
+            | {"synthetic": session.synthetic, "stimuli": session.stimuli}
         )
         _write_table(group.create_group("units"), session.units)
         group.create_group("tables")

@@ -20,6 +20,9 @@ from brainbench.datasets.trials.covariates import LICKS
 if TYPE_CHECKING:
     import h5py
 
+STIMULI = "brainbench stimuli: "
+"""Begin of ``/general/stimulus`` (NWB's notes on stimuli) where it names a recipe."""
+
 _INTRACELLULAR = ("CurrentClampSeries", "VoltageClampSeries", "IZeroClampSeries", "PatchClampSeries")
 
 
@@ -65,7 +68,12 @@ def read_nwb(file: h5py.File, path: Path) -> Session:
         modules={name: tuple(module) for name, module in _groups(file.get("processing"))},
         notes=tuple(notes),
         series=dict([*_series(file.get("acquisition")), *_licks(file)]),
+        stimuli=_recipe(_string(file, "general/stimulus")),
     )
+
+
+def _recipe(notes: str) -> str:
+    return notes.removeprefix(STIMULI) if notes.startswith(STIMULI) else ""
 
 
 def _interval_tables(file: h5py.File, path: Path) -> dict[str, SessionTable]:

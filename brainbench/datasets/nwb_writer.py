@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from brainbench.core.errors import DataError
 from brainbench.core.files import atomic_path
+from brainbench.datasets.nwb import STIMULI
 from brainbench.datasets.sessions import Session, SessionTable, as_labels
 
 if TYPE_CHECKING:
@@ -69,6 +70,7 @@ def write_nwb(
         raise DataError(f"{session.source} has no units table; there are no spikes to write.")
     made = "SYNTHETIC: " if session.synthetic else ""
     keywords = ["synthetic"] * session.synthetic + ["brainbench"]
+    stimuli = {"stimulus": STIMULI + session.stimuli} if session.stimuli else {}
     meanings = _DESCRIPTIONS | dict(columns or {})
     with atomic_path(path) as temporary, h5py.File(temporary, "w") as file:
         writer = NwbWriter(
@@ -76,7 +78,7 @@ def write_nwb(
             identifier=session.identifier or f"{session.subject}-{session.session}",
             description=f"{made}{description}",
             start=session.start or _NO_START,
-            general={"session_id": session.session, "keywords": keywords, **(general or {})},
+            general={"session_id": session.session, "keywords": keywords, **stimuli, **(general or {})},
             subject={"subject_id": session.subject, **(subject or {})},
         )
         units = "Units with their spike times."

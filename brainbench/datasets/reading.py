@@ -164,10 +164,10 @@ def _expand(source: str) -> list[Path]:
         if not found:
             raise DataFileNotFoundError(f"The pattern {source!r} matches no file.")
         return found
-    if source == "demo":
+    if source in ("demo", "demo-rodgers"):
         raise UsageError(
-            "The demo recordings are made from simulated stimuli on first use: ask for recordings='demo' in "
-            "brainbench.score, or pass the folder that brainbench.datasets.synthetic.ensure_demo returns."
+            f"The demo recordings are made from simulated stimuli on first use: ask for recordings={source!r} in "
+            "brainbench.score, or pass the folder that brainbench.scoring.demo.demo_recordings returns."
         )
     siblings = [item.name for item in path.parent.iterdir()] if path.parent.is_dir() else []
     guess = nearest(path.name, siblings)

@@ -189,6 +189,8 @@ class Session:
     notes: tuple[str, ...] = ()
     series: Mapping[str, Series] = field(default_factory=dict)
     """Acquired signals by path; their samples stay in the file."""
+    stimuli: str = ""
+    """Recipe of the stimuli that this session's animal felt, where the file names one."""
 
     def table(self, name: str) -> SessionTable:
         """Return one interval table.
@@ -215,6 +217,7 @@ def make_session(
     observed: Sequence[NDArray[Any]] | None = None,
     start: str = "",
     synthetic: bool = False,
+    stimuli: str = "",
 ) -> Session:
     """Build a session from arrays, to be written with :func:`~brainbench.datasets.write_recordings`.
 
@@ -227,6 +230,7 @@ def make_session(
         observed: per unit the recorded spans [n, 2] (s), if known.
         start: session start, ISO 8601.
         synthetic: whether the spikes were made by a computer.
+        stimuli: recipe of the stimuli, such as ``rodgers``, if there is one.
 
     Raises:
         DataError: columns differ in length or a table has no ``start_time``.
@@ -247,7 +251,8 @@ def make_session(
                 raise DataError(f"Column {name!r} of {table.label} has {len(table.data[name])} of {len(table)} rows.")
     for table in made.values():
         table.require("start_time")
-    return Session(subject, session, units, made, source=session, start=start, synthetic=synthetic, format="arrays")
+    stated = {"source": session, "start": start, "synthetic": synthetic, "stimuli": stimuli}
+    return Session(subject, session, units, made, format="arrays", **stated)
 
 
 def ragged(name: str, rows: Sequence[NDArray[Any]]) -> dict[str, NDArray[Any]]:

@@ -1,15 +1,16 @@
 """Metrics: how alike a model's responses and animals' are, and what can be concluded from it.
 
 ``rdms`` makes and compares representational dissimilarity matrices (RDMs), ``reliability`` splits trials into halves
-and corrects for noise, ``score`` and ``animal_to_animal`` join both, ``inference`` tests and gives intervals,
-``measures`` holds the registered metrics. Data pass in this order: :class:`Trials` → :func:`subject_rdm` →
-:func:`score_rdms` and :func:`score_animals` → a score.
+and corrects for noise, ``measures`` holds the registered metrics, ``score`` and ``animal_to_animal`` are the engine of
+all of them, ``inference`` tests and gives intervals. Data pass in this order: :class:`Trials` → :meth:`Metric.animal`
+→ :meth:`Metric.score` and :meth:`Metric.score_animals` → a score.
 """
 
 from __future__ import annotations
 
 from brainbench.metrics.inference.multiple import compare_models
 from brainbench.metrics.inference.permutation import permutation_test
+from brainbench.metrics.measures.metric import Metric
 from brainbench.metrics.measures.patterns import PatternMetric
 from brainbench.metrics.measures.registry import get_metric, list_metrics, register_metric
 from brainbench.metrics.rdms.comparison import compare
@@ -21,6 +22,7 @@ from brainbench.metrics.reliability.noise_correction import noise_corrected
 
 __all__ = [
     "RDM",
+    "Metric",
     "PatternMetric",
     "compare",
     "compare_models",

@@ -5,21 +5,27 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from brainbench.core.errors import UsageError
 from brainbench.core.records import Ceiling, Interval, Status
 from brainbench.metrics.inference.intervals import t_interval
-from brainbench.metrics.rdms.pairs import Floats, stimulus_count
+from brainbench.metrics.inference.permutation import canonical_order
+from brainbench.metrics.rdms.pairs import Floats, Ints
 from brainbench.metrics.reliability.ceiling import noise_ceiling
-from brainbench.metrics.reliability.noise_correction import Corrected, noise_corrected
+from brainbench.metrics.reliability.noise_correction import RELIABILITY_GATE, Corrected
 from brainbench.metrics.reliability.subject_rdm import SubjectRDM, is_flat
+
+if TYPE_CHECKING:
+    from brainbench.metrics.measures.metric import Metric
 
 
 @dataclass(frozen=True)
 class Animals:
-    """Subjects in the order of their names, and the indices of those whose RDM can be used."""
+    """Subjects in the order of their names, and the indices of those that can be used."""
 
     subjects: tuple[SubjectRDM, ...]
     corrections: tuple[Corrected, ...]
@@ -43,9 +49,19 @@ class Animals:
         """Return the status of one subject."""
         return self.corrections[index].status
 
+    @cached_property
+    def order(self) -> Ints:
+        """An order of the stimuli [K] that depends on the scored animals alone, not on how stimuli were listed."""
+        return canonical_order(self.rdms(self.scored))
 
-def gather(subjects: Sequence[SubjectRDM], *, estimator: str, comparison: str, pairs: int) -> Animals:
-    """Sort subjects by name, correct each for noise and decide who is scored.
+    @cached_property
+    def sorted(self) -> tuple[SubjectRDM, ...]:
+        """The scored subjects, their stimuli in :attr:`order`."""
+        return tuple(self.subjects[i].take(self.order) for i in self.scored)
+
+
+def gather(metric: Metric, subjects: Sequence[SubjectRDM], stimuli: int, *, estimator: str = "default") -> Animals:
+    """Sort subjects by name, correct each for noise as the metric does and decide who is scored.
 
     Raises:
         UsageError: no subjects, repeated names, or RDMs of another number of stimuli.
@@ -58,12 +74,11 @@ def gather(subjects: Sequence[SubjectRDM], *, estimator: str, comparison: str, p
         repeated = next(name for name in names if names.count(name) > 1)
         raise UsageError(f"Subject {repeated!r} appears twice; join the sessions of an animal in one SubjectRDM.")
     for subject in ordered:
-        if len(subject.rdm) != pairs:
+        if subject.count != stimuli:
             raise UsageError(
-                f"Subject {subject.subject!r} has an RDM of {stimulus_count(len(subject.rdm))} stimuli; "
-                f"{stimulus_count(pairs)} are scored."
+                f"Subject {subject.subject!r} has an RDM of {subject.count} stimuli; {stimuli} are scored."
             )
-    corrections = tuple(_correction(subject, estimator, comparison) for subject in ordered)
+    corrections = tuple(_correction(metric, subject, estimator) for subject in ordered)
     usable = tuple(i for i, found in enumerate(corrections) if found.status != "undefined")
     good = tuple(i for i in usable if corrections[i].status == "ok")
     # The published estimators knew no gate: they average whatever has a value.
@@ -78,13 +93,20 @@ def gather(subjects: Sequence[SubjectRDM], *, estimator: str, comparison: str, p
     return Animals(ordered, corrections, usable, scored, reliable, tuple(reasons))
 
 
-def _correction(subject: SubjectRDM, estimator: str, comparison: str) -> Corrected:
+def _correction(metric: Metric, subject: SubjectRDM, estimator: str) -> Corrected:
     if subject.problem is not None:
         return Corrected(math.nan, "undefined", subject.problem)
     if is_flat(subject.rdm):
         return Corrected(math.nan, "undefined", "its RDM has missing pairs or no differences between pairs")
-    # The correction is linear in the comparison, so the value for a comparison of 1 is the factor for any.
-    return noise_corrected(1.0, subject.split_half_by(comparison), estimator=estimator)
+    return metric.correction(subject, estimator)
+
+
+def gated(factor: float, reliability: float) -> Corrected:
+    """Return a factor with the status that the animal's reliability gives it."""
+    if not reliability >= RELIABILITY_GATE:
+        text = f"reliability {reliability:.2f} is below {RELIABILITY_GATE}"
+        return Corrected(factor, "unreliable", text, 1.0, reliability)
+    return Corrected(factor, "ok", "", 1.0, reliability)
 
 
 def mean_reliability(animals: Animals) -> tuple[float, Interval | None]:

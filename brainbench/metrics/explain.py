@@ -30,8 +30,9 @@ from brainbench.core.errors import DataError, DataFileNotFoundError, UsageError
 from brainbench.core.records import Status
 from brainbench.metrics.animals import gather
 from brainbench.metrics.layers import held_out
+from brainbench.metrics.measures.rsa import RSA
 from brainbench.metrics.rdms.comparison import compare as compare_rdms
-from brainbench.metrics.rdms.pairs import Floats, rdm_stack
+from brainbench.metrics.rdms.pairs import Floats, rdm_stack, stimulus_count
 from brainbench.metrics.reliability.noise_correction import RELIABILITY_GATE, THESIS_FILTER, spearman_brown
 from brainbench.metrics.reliability.subject_rdm import SubjectRDM, is_flat
 
@@ -181,7 +182,7 @@ def explain_score(
     """
     rdms = rdm_stack(list(layer_rdms.values()), "layer_rdms")
     rdms = rdms[~is_flat(rdms)]
-    animals = gather(subjects, estimator="thesis-input", comparison=compare, pairs=rdms.shape[-1])
+    animals = gather(RSA(comparison=compare), subjects, stimulus_count(rdms.shape[-1]), estimator="thesis-input")
     # Without the published estimators' own demands: whoever has an RDM takes part.
     usable = [subject for subject in animals.subjects if subject.problem is None and not is_flat(subject.rdm)]
     if not len(rdms) or not usable:

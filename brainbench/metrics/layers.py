@@ -2,23 +2,79 @@
 
 The best of many layers looks good by luck alone: with six stimuli the largest of 40 unrelated
 comparisons is expected near .56. So the layer for an animal is the one that compares best with the
-*other* animals. Comparisons vote raw: dividing by reliability would give the noisiest animals the
-loudest vote. Ties go to the first layer.
+*other* animals, unless one was committed to beforehand. Comparisons vote raw: dividing by reliability would give
+the noisiest animals the loudest vote. Ties go to the first layer.
 
 Other animals saw the same few stimuli, so what they share by luck is not held out: ten layers that know
 nothing score .41 on average against animals of one geometry and six stimuli. The permutation p-value
-does account for it, because the functions here broadcast over leading axes and a test repeats the whole
-choice inside every permutation; the mean score under permutation is the chance level to read beside a
-score.
+does account for it, because the rules here broadcast over leading axes and a test repeats the whole
+choice inside every permutation; the mean score under permutation is a score's ``chance``.
 """
 
 from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 
 from brainbench.metrics.rdms.pairs import Floats, Ints
 
 _TIE = 1e-12
+
+Kind = Literal["fixed", "others", "halves", "maximum"]
+
+
+@dataclass(frozen=True)
+class LayerRule:
+    """How the layer for each animal is chosen among comparisons [..., L, A]."""
+
+    kind: Kind
+    words: str
+    """The rule, as a record states it."""
+    fixed: int = 0
+    """The layer, where it is given."""
+    factors: Floats | None = None
+    """[A] weights of the animals, where the maximum of the corrected mean is taken."""
+
+    def choose(self, r: Floats) -> Ints:
+        """Return the layer [..., A] for each animal."""
+        if self.kind == "others":
+            return choose_on_others(r)
+        if self.kind == "halves":
+            # Animals are the halves of one animal's splits: each is scored by the layer best on its other half.
+            pairs = r.reshape(*r.shape[:-1], -1, 2)[..., ::-1]
+            return _first_best(pairs.reshape(r.shape))
+        shape = (*r.shape[:-2], r.shape[-1])
+        if self.kind == "maximum":
+            weighted = r if self.factors is None else r * self.factors
+            return np.broadcast_to(_first_best(weighted.mean(axis=-1)[..., None]), shape)
+        return np.full(shape, self.fixed)
+
+    def held(self, r: Floats) -> Floats:
+        """Return the comparison [..., A] of each animal with the layer chosen for it."""
+        return r[..., self.fixed, :] if self.kind == "fixed" else take_layers(r, self.choose(r))
+
+
+def layer_rule(
+    names: list[str], animals: int, *, committed: str | None = None, estimator: str = "default", factors: Floats
+) -> LayerRule:
+    """Return the rule for layers ``names`` [L] and a number of animals (a single one whose halves are not known)."""
+    if committed is not None:
+        return LayerRule("fixed", "committed to beforehand", names.index(committed))
+    if len(names) == 1:
+        return LayerRule("fixed", "only layer")
+    if estimator != "default":
+        # The published rule; the test takes the same maximum, so its p stays honest where the value is not.
+        words = "maximum over layers on the data that are scored (as published; optimistic)"
+        return LayerRule("maximum", words, factors=factors)
+    if animals == 1:
+        words = "maximum over layers on the only animal (optimistic; the permutation takes the same maximum)"
+        return LayerRule("maximum", words)
+    return LayerRule("others", "chosen on the other animals, evaluated on the animal held out")
+
+
+HALVES = LayerRule("halves", "chosen on one half of the only animal's trials, evaluated on the other half")
 
 
 def choose_on_others(r: Floats) -> Ints:
@@ -34,21 +90,7 @@ def choose_on_others(r: Floats) -> Ints:
 
 def held_out(r: Floats) -> Floats:
     """Return the comparison [..., A] of each animal with the layer chosen on the others, from r [..., L, A]."""
-    return _take(r, choose_on_others(r))
-
-
-def choose_on_halves(first: Floats, second: Floats) -> tuple[Ints, Floats]:
-    """Choose on one half of an animal's trials and evaluate on the other, both ways.
-
-    Args:
-        first, second: [..., L, S] comparisons with the RDMs of the two halves of each split.
-
-    Returns:
-        Layers [..., 2S] and their comparisons [..., 2S] with the half they were not chosen on.
-    """
-    on_first, on_second = _first_best(first), _first_best(second)
-    chosen = np.concatenate([on_first, on_second], axis=-1)
-    return chosen, np.concatenate([_take(second, on_first), _take(first, on_second)], axis=-1)
+    return take_layers(r, choose_on_others(r))
 
 
 def most_chosen(chosen: Ints) -> int:
@@ -67,5 +109,7 @@ def _first_best(values: Floats) -> Ints:
     return np.argmax(values >= values.max(axis=-2, keepdims=True) - _TIE, axis=-2)
 
 
-def _take(values: Floats, index: Ints) -> Floats:
+def take_layers(values: Floats, index: Ints) -> Floats:
+    """Return the values [..., A] of one layer for each animal, from [..., L, A] and layers [A] or [..., A]."""
+    index = np.broadcast_to(index, (*values.shape[:-2], values.shape[-1]))
     return np.take_along_axis(values, index[..., None, :], axis=-2)[..., 0, :]

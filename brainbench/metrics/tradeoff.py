@@ -1,9 +1,8 @@
-"""Monte-Carlo error of a score against its time: splits, bootstrap draws and permutations.
+"""Monte-Carlo error of a score against its time: splits and permutations.
 
 Each setting is repeated with other seeds on the same synthetic animals; what varies is the error that
-a larger number would take away. At the defaults the error of a score is near .0002, that of an
-interval's end near .006 and that of a p of .05 near .0025: far below what the number of animals leaves
-open. Fewer splits would do, but they are the cheapest of the three.
+a larger number would take away. At the defaults the error of a score is near .0002 and that of a p of .05 near .005:
+far below what the number of animals leaves open.
 """
 
 from __future__ import annotations
@@ -17,18 +16,15 @@ import numpy as np
 from brainbench.core.errors import UsageError
 from brainbench.core.progress import Progress
 from brainbench.core.trials import Trials
-from brainbench.metrics.inference.bootstrap import bootstrap_score
 from brainbench.metrics.inference.permutation import label_orders
+from brainbench.metrics.measures.rsa import RSA, score_rdms
 from brainbench.metrics.rdms.comparison import compare
 from brainbench.metrics.rdms.dissimilarity import rdm
 from brainbench.metrics.rdms.pairs import Floats, permuted_pairs
 from brainbench.metrics.reliability.subject_rdm import SubjectRDM, subject_rdm
-from brainbench.metrics.score import score_rdms
 
 SPLITS = (10, 30, 100, 300, 1000, 3000)
-DRAWS = (30, 100, 300, 1000, 3000)
-DRAW_SPLITS = (1, 5, 20, 60)
-PERMUTATIONS = (100, 1000, 10_000)
+PERMUTATIONS = (100, 500, 1999, 10_000)
 REPEATS = 8
 
 _STIMULI = 12
@@ -39,7 +35,7 @@ class MonteCarloPoint:
     """Error and time of one setting."""
 
     quantity: str
-    """``splits``, ``draws``, ``draw_splits`` or ``permutations``."""
+    """``splits`` or ``permutations``."""
     count: int
     error: float
     """Standard deviation over seeds, of what :attr:`of` names."""
@@ -56,8 +52,6 @@ def measure_tradeoff(
     trials: int = 20,
     noise: float = 3.0,
     splits: Sequence[int] = SPLITS,
-    draws: Sequence[int] = DRAWS,
-    draw_splits: Sequence[int] = DRAW_SPLITS,
     permutations: Sequence[int] = PERMUTATIONS,
     repeats: int = REPEATS,
     progress: Progress | None = None,
@@ -70,8 +64,6 @@ def measure_tradeoff(
         trials: Trials of each stimulus.
         noise: Standard deviation of trial noise relative to tuning of variance 4.
         splits: Numbers of split halves.
-        draws: Numbers of bootstrap draws.
-        draw_splits: Split halves within each draw.
         permutations: Random orders of the stimuli (for more than eight stimuli).
         repeats: Seeds per setting, at least 2.
         progress: Called with (done, total, what).
@@ -79,24 +71,15 @@ def measure_tradeoff(
     Raises:
         UsageError: fewer than two repeats, or numbers that are not positive.
     """
-    if repeats < 2 or min(*splits, *draws, *draw_splits, *permutations, animals, units, trials) < 1:
+    if repeats < 2 or min(*splits, *permutations, animals, units, trials) < 1:
         raise UsageError("A trade-off needs at least 2 repeats and positive numbers.")
     blocks, layer = _data(animals, units, trials, noise)
 
-    def subjects(seed: int, splits: int, draws: int = 0, inner: int = 1) -> list[SubjectRDM]:
-        return [
-            subject_rdm(str(i), [block], 6, seed=seed, splits=splits, draws=draws, draw_splits=inner)
-            for i, block in enumerate(blocks)
-        ]
+    def subjects(seed: int, splits: int) -> list[SubjectRDM]:
+        return [subject_rdm(str(i), [block], 6, seed=seed, splits=splits) for i, block in enumerate(blocks)]
 
     def value(seed: int, count: int) -> float:
         return score_rdms({"a": layer}, subjects(seed, count), name="x", stimuli=list("abcdef")).value
-
-    def interval_end(seed: int, number: int, inner: int) -> float:
-        # An interval's end rests on the few draws in its tail, so it needs more draws than a standard error does.
-        found = bootstrap_score([layer], subjects(seed, 100, number, inner), draws=number, seed=seed)
-        interval = found.interval("percentile")
-        return float("nan") if interval is None else interval.low
 
     model, brain, threshold = _p_near_five_percent()
 
@@ -106,12 +89,7 @@ def measure_tradeoff(
 
     jobs: list[tuple[str, int, str, bool, Callable[[int], float]]] = [
         *(("splits", n, "score", n == 1000, lambda seed, n=n: value(seed, n)) for n in splits),
-        *(("draws", n, "interval end", n == 1000, lambda seed, n=n: interval_end(seed, n, 20)) for n in draws),
-        *(
-            ("draw_splits", n, "interval end", n == 20, lambda seed, n=n: interval_end(seed, 1000, n))
-            for n in draw_splits
-        ),
-        *(("permutations", n, "p near .05", n == 10_000, lambda seed, n=n: p_value(seed, n)) for n in permutations),
+        *(("permutations", n, "p near .05", n == RSA.orders, lambda seed, n=n: p_value(seed, n)) for n in permutations),
     ]
     points = []
     for index, (quantity, count, of, default, job) in enumerate(jobs):

@@ -42,6 +42,8 @@ class ModelResponses:
     """[K, T, F] what the model received; None for features computed elsewhere."""
     origin: Mapping[str, Any] = field(default_factory=dict)
     """Provenance of stimuli and weights."""
+    seconds: float | None = None
+    """Duration of the stimuli, over which the steps of every layer are spread evenly; None where unknown."""
 
     def features(self, rows: list[int]) -> dict[str, NDArray[np.floating]]:
         """Return every layer's features [K, F] of the stimuli ``rows``."""
@@ -74,7 +76,10 @@ class ResolvedModel:
     def respond(self, options: ScoreOptions, *, progress: Progress | None = None) -> ModelResponses:
         """Run the model on the stimuli, or take the features that were computed elsewhere."""
         card, labels, origin, model_input = self.card, self.labels, self.origin, None
-        shown = None
+        card, shown = replace(card, layer=options.layer or card.layer), None
+        names = getattr(self.module, "layers", None) if self.module is not None else self.activations
+        if card.layer is not None and names is not None and card.layer not in (options.layers or names):
+            raise unknown_name("layer", card.layer, options.layers or names)
         if labels is None:
             from brainbench.stimuli import load_stimuli
 
@@ -95,7 +100,8 @@ class ResolvedModel:
             card = replace(card, input=note)
             steps = comparable if comparable.ndim > 2 else comparable[:, None, :]
             model_input = steps.reshape(*steps.shape[:2], -1)
-        return ModelResponses(card, labels, activations, options.time, model_input, origin)
+        seconds = None if shown is None else _seconds(shown)
+        return ModelResponses(card, labels, activations, options.time, model_input, origin, seconds)
 
 
 def resolve_model(model: Any, *, seed: int = 0) -> ResolvedModel:
@@ -154,7 +160,8 @@ def resolve_model(model: Any, *, seed: int = 0) -> ResolvedModel:
     state = {name: value.detach().cpu() for name, value in module.state_dict().items()}
     digest = content_hash(*(part for name in sorted(state) for part in (name, state[name].numpy())))
     count = sum(parameter.numel() for parameter in module.parameters())
-    return ResolvedModel(replace(card, parameters=count, weights=digest, graph=graph_of(module)), module)
+    layer = card.layer or getattr(module, "committed_layer", None)
+    return ResolvedModel(replace(card, parameters=count, weights=digest, graph=graph_of(module), layer=layer), module)
 
 
 def _trained(config: Mapping[str, Any] | None) -> dict[str, Any]:
@@ -166,6 +173,7 @@ def _trained(config: Mapping[str, Any] | None) -> dict[str, Any]:
     options = {name: value for name, value in (config.get("training") or {}).items() if name not in ("model", "seed")}
     return {
         **{name: config.get(name) for name in ("objective", "augmentation", "twin", "seed")},
+        "layer": config.get("committed_layer"),
         **{name: found.get(name) for name in ("top1", "top5", "collapsed")},
         "accuracy_interval": Interval(**found["interval"]) if found.get("interval") else None,
         "accuracy_data": found.get("data"),
@@ -189,6 +197,14 @@ def _stated(stimuli: Stimuli) -> dict[str, Any]:
     told = {name: getattr(stimuli, name) for name in ("description", "content_hash", "config_hash")}
     backend = None if stimuli.dataset is None else stimuli.dataset.attrs.get("backend")
     return {**told, "backend": str(backend)} if backend else told
+
+
+def _seconds(stimuli: Stimuli) -> float | None:
+    """Return the duration of simulated stimuli; None for arrays from a file, which do not say it."""
+    if stimuli.dataset is None or stimuli.dataset.sizes["time"] < 2:
+        return None
+    times = stimuli.dataset["time"].values
+    return float((times[-1] - times[0]) * len(times) / (len(times) - 1))
 
 
 def _network_input(module: torch.nn.Module, stimuli: Stimuli, normalize: bool) -> tuple[Any, Any, str]:

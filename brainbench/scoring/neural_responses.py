@@ -10,15 +10,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from brainbench.core.progress import Progress
+from brainbench.scoring.demo import DEMOS, demo_recordings
 
 if TYPE_CHECKING:
     import xarray as xr
     from numpy.typing import NDArray
 
-    from brainbench.metrics.measures.registry import Metric
-
-DEMO_STIMULI = "rodgers"
-"""Recipe that the demo animals feel."""
+    from brainbench.core.trials import Trials
+    from brainbench.metrics import Metric
+    from brainbench.scoring.options import ScoreOptions
 
 
 @dataclass(frozen=True)
@@ -35,6 +35,11 @@ class NeuralResponses:
         return tuple(self.dataset.attrs["vocabulary"])
 
     @property
+    def stimuli(self) -> str | None:
+        """Recipe of the stimuli that the animals felt; None where the recordings name none."""
+        return self.dataset.attrs.get("stimuli") or None
+
+    @property
     def synthetic(self) -> bool:
         """True when the recordings were made by a program."""
         return bool(self.dataset.attrs["synthetic"])
@@ -45,29 +50,35 @@ class NeuralResponses:
         names = ("content_hash", "window", "selection", "removed", "synthetic")
         return {"source": self.source, **{name: self.dataset.attrs[name] for name in names}}
 
-    def animals(
-        self, kept: tuple[str, ...], *, metric: Metric | None = None, time: str = "mean", seed: int = 0, draws: int = 0
-    ) -> tuple[Any, ...]:
-        """Prepare every animal by a metric (RSA by default) over the labels ``kept``, in that order."""
-        from brainbench.datasets.trials.session_trials import trials_by_subject
-        from brainbench.metrics import get_metric
+    def animals(self, kept: tuple[str, ...], metric: Metric, options: ScoreOptions) -> tuple[Any, ...]:
+        """Prepare every animal by a metric over the labels ``kept``, in that order."""
+        from brainbench.metrics.reliability.units import reliable_units
 
-        metric = metric or get_metric("rsa")
+        animals = []
+        for subject, sessions in self.trials(kept).items():
+            trials = tuple(replace(item, responses=without_time(item.responses, options.time)) for item in sessions)
+            note = ""
+            if options.units_reliability is not None:
+                trials, note = reliable_units(trials, len(kept), least=options.units_reliability, seed=options.seed)
+            animal = metric.animal(subject, trials, len(kept), stimuli=kept, seed=options.seed)
+            animals.append(replace(animal, notes=(note, *animal.notes)) if note else animal)
+        return tuple(animals)
+
+    def trials(self, kept: tuple[str, ...]) -> dict[str, tuple[Trials, ...]]:
+        """Return the sessions of each animal with trials of the labels ``kept``, numbered in that order."""
+        from brainbench.datasets.trials.session_trials import trials_by_subject
+
         index = np.full(len(self.vocabulary), -1)
         index[[self.vocabulary.index(label) for label in kept]] = np.arange(len(kept))
-        animals = []
+        found = {}
         for subject, sessions in trials_by_subject(self.dataset).items():
             kept_trials = [session.take(index[session.labels] >= 0) for session in sessions]
-            trials = [
-                replace(item, responses=without_time(item.responses, time), labels=index[item.labels])
-                for item in kept_trials
-            ]
-            animals.append(metric.animal(subject, trials, len(kept), stimuli=kept, seed=seed, draws=draws))
-        return tuple(animals)
+            found[subject] = tuple(replace(item, labels=index[item.labels]) for item in kept_trials)
+        return found
 
 
 def open_neural_responses(recordings: Any, *, progress: Progress | None, **selection: Any) -> NeuralResponses:
-    """Open recordings; ``"demo"`` is made from the simulated ``rodgers`` stimuli on first use."""
+    """Open recordings; demo recordings (:data:`brainbench.scoring.demo.DEMOS`) are made on first use."""
     import xarray as xr
 
     from brainbench.datasets import open_recordings
@@ -76,19 +87,11 @@ def open_neural_responses(recordings: Any, *, progress: Progress | None, **selec
         from brainbench.core.contracts import check_recordings
 
         return NeuralResponses(check_recordings(recordings), "data set")
-    if recordings == "demo":
-        return NeuralResponses(open_recordings(demo_recordings(progress=progress), **selection), "demo")
+    if isinstance(recordings, str) and recordings in DEMOS:
+        return NeuralResponses(open_recordings(demo_recordings(recordings, progress=progress), **selection), recordings)
     several = not isinstance(recordings, (str, os.PathLike))
     name = ", ".join(Path(item).name for item in recordings) if several else Path(recordings).name
     return NeuralResponses(open_recordings(recordings, **selection), name)
-
-
-def demo_recordings(*, progress: Progress | None = None) -> Path:
-    """Return the folder of the demo recordings, made once per machine from the ``rodgers`` stimuli."""
-    from brainbench.datasets.synthetic import ensure_demo
-    from brainbench.stimuli import get_recipe, simulate
-
-    return ensure_demo(simulate(get_recipe(DEMO_STIMULI).scenes, progress=progress), progress=progress)
 
 
 def without_time(values: NDArray[np.floating], time: str) -> NDArray[np.floating]:

@@ -12,17 +12,19 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from brainbench.core.errors import unknown_name
+from brainbench.core.errors import UsageError, unknown_name
 
 if TYPE_CHECKING:
     import xarray as xr
 
     from brainbench.datasets.trials.selection import Selection
     from brainbench.datasets.trials.windows import Window
-    from brainbench.metrics.measures.registry import Metric
+    from brainbench.metrics import Metric
     from brainbench.stimuli import Fidelity, Stimuli
 
 TIME_RULES = ("mean", "concatenate")
+TIME_BIN = 0.05
+"""Bin width of scores over time, seconds."""
 
 _ELSEWHERE = ("recordings", "match", "explain")
 """Fields whose effect stands in other entries of the provenance: ``recordings``, ``pairs`` and ``statistics``."""
@@ -33,13 +35,13 @@ class ScoreOptions:
     """Options of scoring a model against recordings.
 
     Raises:
-        UsageError: an unknown rule for time.
+        UsageError: an unknown rule for time, or a reliability outside (−1, 1).
     """
 
     recordings: str | os.PathLike[str] | Sequence[str | os.PathLike[str]] | xr.Dataset = "demo"
-    """'demo' (synthetic), an NWB or HDF5 file, a folder, or a glob; in Python also an opened data set."""
+    """'demo' or 'demo-rodgers' (synthetic), an NWB or HDF5 file, a folder, or a glob; in Python also a data set."""
     stimuli: str | os.PathLike[str] | Stimuli | xr.Dataset | None = None
-    """A recipe (rodgers by default), a scene file, a stimulus-set file, or an HDF5 array."""
+    """A recipe, a scene file, a stimulus-set file, or an HDF5 array; by default what the recordings name."""
     conditions: str | None = None
     """TABLE:COLUMN[,COLUMN] of the recordings that labels the trials; see 'recordings inspect'."""
     match: Path | str | Mapping[str, str | None] | None = None
@@ -54,14 +56,22 @@ class ScoreOptions:
     """Simulation preset: balanced, accurate, or fast (to try things out; coarse RDMs)."""
     layers: tuple[str, ...] | None = None
     """Comma-separated layers to compare; all by default."""
+    layer: str | None = None
+    """The layer committed to before anything is scored; by default the one that the model names, else a held-out
+    choice among all."""
     time: str = "mean"
     """Time axis of both sides: 'mean' averages over it, 'concatenate' keeps every step."""
     bin: float | None = None
     """Bin width of the spike counts in seconds."""
+    over_time: bool = False
+    """Also score each time, in bins of --bin (.05 s), and measure each layer's latency (RSA metrics only)."""
     estimator: str = "default"
     """default, thesis or thesis-input (as published)."""
     metric: str | Metric = "rsa"
-    """rsa, rsa-crossnobis, rsa-partial, cka, decoding, ridge, procrustes, or FILE.py:CLASS of your own."""
+    """rsa, rsa-correlation, rsa-crossnobis, rsa-partial, cka, decoding, ridge, procrustes, or FILE.py:CLASS of your
+    own."""
+    units_reliability: float | None = None
+    """Leave out units whose tuning is less reliable than this (published: .5); a choice made on the scored data."""
     normalize: bool = True
     """Give plain modules forces in 1e-4 N and moments in 1e-6 N·m instead of SI."""
     seed: int = 0
@@ -73,9 +83,13 @@ class ScoreOptions:
     of stored splits (arrays r_xy, r_yy and r_xx)."""
 
     def __post_init__(self) -> None:
-        """Refuse an unknown rule for time before anything is loaded."""
+        """Refuse what no score can be made with, before anything is loaded."""
         if self.time not in TIME_RULES:
             raise unknown_name("time rule", self.time, TIME_RULES)
+        if self.units_reliability is not None and not -1 < self.units_reliability < 1:
+            raise UsageError(
+                f"A reliability of units lies between −1 and 1, such as 0.5; received {self.units_reliability}."
+            )
 
     @classmethod
     def of(cls, values: Mapping[str, Any]) -> ScoreOptions:
@@ -105,7 +119,8 @@ class ScoreOptions:
     @property
     def selection(self) -> dict[str, Any]:
         """Arguments of :func:`brainbench.datasets.open_recordings`."""
-        return {"conditions": self.conditions, "select": self.select, "window": self.window, "bin": self.bin}
+        width = TIME_BIN if self.over_time and self.bin is None else self.bin
+        return {"conditions": self.conditions, "select": self.select, "window": self.window, "bin": width}
 
     @property
     def settings(self) -> dict[str, Any]:

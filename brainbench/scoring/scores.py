@@ -12,7 +12,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
-from brainbench.core.errors import UsageError
+from brainbench.core.errors import UsageError, unknown_name
 from brainbench.core.files import provenance, to_plain
 from brainbench.core.labels import join_labels
 from brainbench.core.progress import Progress
@@ -72,39 +72,47 @@ def score_record(
         The result record; its scores share one brain side.
     """
     from brainbench import metrics
-    from brainbench.metrics.inference.bootstrap import DRAWS
-    from brainbench.scoring.model_responses import DEFAULT_STIMULI, resolve_model
-    from brainbench.scoring.neural_responses import DEMO_STIMULI, open_neural_responses
+    from brainbench.scoring.demo import DEMOS
+    from brainbench.scoring.model_responses import resolve_model
+    from brainbench.scoring.neural_responses import open_neural_responses
     from brainbench.stimuli.sources import prepare_stimuli
 
     started = clock.perf_counter()
     options = ScoreOptions.of({**vars(options or ScoreOptions()), **changes})
     # The simulation gets ready in a thread while the network loads, if any will be needed.
-    if isinstance(options.recordings, str) and options.recordings == "demo":
-        prepare_stimuli(DEMO_STIMULI, progress=progress)
-    elif not isinstance(model, Mapping):
-        source = options.stimuli if options.stimuli is not None else DEFAULT_STIMULI
-        prepare_stimuli(source, whiskers=options.whiskers, fidelity=options.fidelity, progress=progress)
+    if isinstance(options.recordings, str) and options.recordings in DEMOS:
+        prepare_stimuli(DEMOS[options.recordings], progress=progress)
+    elif not isinstance(model, Mapping) and options.stimuli is not None:
+        prepare_stimuli(options.stimuli, whiskers=options.whiskers, fidelity=options.fidelity, progress=progress)
     # Whatever can be wrong with a name or a file is found before the slow part, the simulation.
     metric = metrics.get_metric(options.metric)
-    if options.explain and metric.name != "rsa":
+    if metric.name == "rsa" and (options.explain or options.estimator != "default"):
+        # The published estimators were those of correlation distances.
+        metric = metrics.get_metric("rsa-correlation")
+    if options.estimator not in metric.estimators:
+        raise unknown_name(f"estimator of the metric {metric.name!r}", options.estimator, metric.estimators)
+    if options.explain and metric.name != "rsa-correlation":
         raise UsageError(f"The published estimator is one of RSA; the metric {metric.name!r} has none to explain.")
+    if options.over_time:
+        from brainbench.scoring.over_time import check_metric, time_course
+
+        check_metric(metric)
     options = replace(options, metric=metric)
     resolved = resolve_model(model, seed=options.model_seed)
     brain = open_neural_responses(options.recordings, progress=progress, **options.selection)
+    # Recordings name the stimuli that the animals felt; the caller's choice goes first.
+    options = replace(options, stimuli=brain.stimuli if options.stimuli is None else options.stimuli)
     network = resolved.respond(options, progress=progress)
     pairs = join_labels(brain.vocabulary, network.labels, options.match)
     kept = tuple(pairs)
     rows = [network.labels.index(label) for label in pairs.values()]
-    animals = brain.animals(kept, metric=metric, time=options.time, seed=options.seed, draws=DRAWS)
+    animals = brain.animals(kept, metric, options)
 
-    compared = {network.card.name: network.features(rows)}
-    if baselines:
-        compared |= network.baseline_features(rows, options.seed)
-    common: dict[str, Any] = {"stimuli": kept, "estimator": options.estimator}
-    scores = [
-        metric.score(features, animals, name=name, seed=options.seed, **common) for name, features in compared.items()
-    ]
+    common: dict[str, Any] = {"stimuli": kept, "estimator": options.estimator, "seed": options.seed}
+    features = network.features(rows)
+    scores = [metric.score(features, animals, name=network.card.name, layer=network.card.layer, **common)]
+    others = network.baseline_features(rows, options.seed) if baselines else {}
+    scores += [metric.score(values, animals, name=name, **common) for name, values in others.items()]
     between = metric.score_animals(animals, **common) if baselines else None
 
     settings = {"estimator_version": ESTIMATOR_VERSION, "model": model if isinstance(model, str) else None}
@@ -122,8 +130,11 @@ def score_record(
     if options.explain:
         from brainbench.metrics.explain import explain_score
 
-        rdms = {layer: metrics.rdm(values) for layer, values in compared[network.card.name].items()}
+        rdms = {layer: metrics.rdm(values) for layer, values in features.items()}
         statistics[0] = {**statistics[0], "estimator_walk": to_plain(explain_score(rdms, animals))}
+    if options.over_time:
+        course = time_course(brain, network, metric, kept, rows, seed=options.seed, progress=progress)
+        statistics[0] = {**statistics[0], "time_course": to_plain(course)}
     first, *others = (
         replace(item, provenance=replace(origin, statistics=found))
         for item, found in zip(scores, statistics, strict=True)

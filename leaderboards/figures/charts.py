@@ -10,11 +10,11 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 
 from brainbench.core.statistics import is_finite
+from leaderboards.boards import RAW_INPUT, Board
 from leaderboards.entries import Entry, twins
 from leaderboards.figures.plots import (
     SHOWN,
     WIDTH,
-    ChartBar,
     ChartPoint,
     ChartRow,
     Figure,
@@ -22,25 +22,26 @@ from leaderboards.figures.plots import (
     cut,
     cut_name,
     cut_words,
-    draw_matrix,
     legend_words,
     row_chart,
     scatter,
     score_scale,
 )
+from leaderboards.figures.rdms import draw_rdm, rdm_picture
+from leaderboards.figures.record import PARTS
 from leaderboards.figures.svg import Drawing, Scale, scale_of, tick_text
-from leaderboards.ranking import Board
 from leaderboards.text import number, span
 
-_PARTS = {"encoder": "c1", "attender": "c2", "decoder": "c3"}
+DOUBTFUL = ("unreliable", "undefined")
 
 
-def board_figures(board: Board, entries: Sequence[Entry]) -> list[Figure]:
+def board_figures(board: Board) -> list[Figure]:
     """Return all figures of a board, drawn or with what they lack."""
+    entries = board.entries
     return [
-        fit_per_model(board, entries),
+        fit_per_model(board),
         layer_fit(entries),
-        rdm_panel(board, entries),
+        rdm_panel(board),
         accuracy(entries),
         accuracy_against_fit(entries),
         parameters_against_fit(entries),
@@ -49,44 +50,41 @@ def board_figures(board: Board, entries: Sequence[Entry]) -> list[Figure]:
     ]
 
 
-def fit_per_model(board: Board, entries: Sequence[Entry]) -> Figure:
+def fit_per_model(board: Board) -> Figure:
     """Draw the neural fit of every model beside its untrained twin, with all baselines (figure 3.7 b)."""
     title = "Neural fit of every model"
-    shown = [entry for entry in entries if math.isfinite(entry.value)]
+    shown = [entry for entry in board.entries if math.isfinite(entry.scaled)]
     # A twin is drawn on the row of the network trained from it, not once more on its own.
     partnered = {entry.architecture for entry in shown if entry.trained}
     shown = [entry for entry in shown if entry.trained or entry.architecture not in partnered]
     if not shown:
-        return Figure("fit", title, lacking="no record has a defined score")
-    models, untrained = shown[:SHOWN], twins(entries)
-    base = [item for item in board.baselines if math.isfinite(item.score.value)]
+        return Figure("fit", title, lacking="no record has a defined score that states its chance")
+    models, untrained = shown[:SHOWN], twins(board.entries)
+    base = [item for item in board.baselines if math.isfinite(item.score.scaled)]
     colour = colours(map(_objective, models))
     rows = []
     for entry in models:
         kind = colour[_objective(entry)]
-        seeds = [ChartPoint(row.record.score.value, f"{kind} faint", size=2) for row in entry.rows]
+        seeds = [ChartPoint(value, f"{kind} faint", size=2) for value in entry.sample.seeds]
         twin = _twin_points(entry, untrained, 3.5) if entry.trained else ()
-        hollow = " open" if entry.status != "ok" else ""
-        mark = ChartPoint(entry.value, kind + hollow, f"{entry.name}: {number(entry.value)} {span(entry.interval)}")
+        hollow = " open" if not entry.above_chance or entry.standing in DOUBTFUL else ""
+        mark = ChartPoint(entry.scaled, kind + hollow, f"{entry.name}: {number(entry.scaled)} {span(entry.interval)}")
         points = (*(seeds if entry.seeds > 1 else ()), *twin, mark)
-        label_kind = "end" if entry.first is not None else "end quiet"
+        label_kind = "end" if not entry.unranked_because else "end quiet"
         rows.append(ChartRow(cut_name(entry.name, 36), points, entry.interval, kind, label_kind))
     for item in base:
         kind, shape = ("c7", "square") if item.kind == "animals" else ("c0", "diamond")
-        mark = ChartPoint(item.score.value, kind, f"{item.name}: {number(item.score.value)}", 4, shape)
-        rows.append(ChartRow(item.name, (mark,), item.score.interval, kind, "end quiet"))
-    values = [entry.value for entry in models] + [item.score.value for item in base]
+        mark = ChartPoint(item.score.scaled, kind, f"{item.name}: {number(item.score.scaled)}", 4, shape)
+        rows.append(ChartRow(item.name, (mark,), item.score.scaled_interval, kind, "end quiet"))
+    values = [entry.scaled for entry in models] + [item.score.scaled for item in base]
     scale = score_scale(values, [row.interval for row in rows], 250, WIDTH - 20)
-    animals = next((b.score for b in base if b.kind == "animals" and is_finite(b.score.interval)), None)
-    words = f"{title}: {len(models)} models, best first"
-    drawing = row_chart(words, rows, scale, "noise-corrected RSA", band=animals.interval if animals else None)
-    ceiling = next((e.score.ceiling for e in models if e.score.ceiling), None)
-    caption = "Noise-corrected score with its interval; 1 is all that recordings this noisy can show. "
-    caption += "The band is the interval of animal-to-animal. " if animals else ""
+    spans = (item.score.scaled_interval for item in base if item.kind == "animals")
+    band = next(filter(is_finite, spans), None)
+    drawing = row_chart(f"{title}: {len(models)} models, best first", rows, scale, "scaled score", band=band)
+    caption = "Score with its interval: 0 is chance, 1 all that is reliable. Hollow: not told apart from chance. "
+    caption += "The band is the interval of animal-to-animal. " if band else ""
     caption += "Small dots are seeds. " if any(e.seeds > 1 for e in models) else ""
     caption += "Hollow grey points are untrained twins. " if any(e.trained for e in models) else ""
-    if ceiling:
-        caption += f"Noise ceiling of the raw comparison: {number(ceiling.lower)} to {number(ceiling.upper)}. "
     return Figure("fit", f"{title} (as figure 3.7 b)", caption + legend_words(colour) + cut_words(len(shown)), drawing)
 
 
@@ -113,7 +111,7 @@ def layer_fit(entries: Sequence[Entry]) -> Figure:
             if not math.isfinite(layer.value):
                 continue
             zero, top = scale.at(0.0), scale.at(layer.value)
-            kind = _PARTS.get(layer.layer.partition(".")[0], "c0")
+            kind = PARTS.get(layer.layer.partition(".")[0], "c0")
             tip = f"{layer.layer}: {number(layer.value)} {span(layer.interval)}"
             drawing.rect(x0 + 26 + i * step, min(zero, top), max(step - 1.5, 1), abs(zero - top), kind, tip=tip)
     caption = (
@@ -124,35 +122,36 @@ def layer_fit(entries: Sequence[Entry]) -> Figure:
     return Figure(key, title, caption, drawing)
 
 
-def rdm_panel(board: Board, entries: Sequence[Entry]) -> Figure:
+def rdm_panel(board: Board) -> Figure:
     """Draw the RDMs of the raw input, of the best models of each kind and of the brain (figure 3.5)."""
-    key, title = "rdms", "Representational dissimilarity (as figure 3.5)"
+    key, title, entries = "rdms", "Representational dissimilarity (as figure 3.5)", board.entries
     picked: list[tuple[str, str, Sequence[float]]] = []
-    raw = next((b.score for b in board.baselines if b.name == "raw input"), None)
+    raw = next((b.score for b in board.baselines if b.name == RAW_INPUT), None)
     if raw is not None and raw.model_rdm:
-        picked.append(("raw input", f"score {number(raw.value)}", raw.model_rdm))
+        picked.append((RAW_INPUT, f"score {number(raw.scaled)}", raw.model_rdm))
     for label, test in (
         ("supervised", lambda e: e.card.objective == "supervised"),
         ("self-supervised", lambda e: e.trained and e.card.objective != "supervised"),
         ("untrained", lambda e: not e.trained),
     ):
-        best = next((e for e in entries if e.score.model_rdm and e.status == "ok" and test(e)), None)
+        best = next((e for e in entries if e.score.model_rdm and e.standing not in DOUBTFUL and test(e)), None)
         if best is not None:
             picked.append((f"best {label}", f"{best.name}, {best.score.layer}", best.score.model_rdm))
     brain = next((e.score.brain_rdm for e in entries if e.score.brain_rdm), ())
     if brain:
         picked.append(("brain", board.recordings, brain))
     size = len(board.conditions)
-    picked = [item for item in picked if len(item[2]) == size * (size - 1) // 2]
-    if not picked or size < 2:
+    pictures = [(name, detail, rdm_picture(pairs, board.conditions)) for name, detail, pairs in picked]
+    drawn = [(name, detail, picture) for name, detail, picture in pictures if picture is not None]
+    if not drawn:
         return Figure(key, title, lacking="no record holds RDMs")
-    side = min(WIDTH / len(picked) - 16, 170.0)
-    drawing = Drawing(WIDTH, side + 48, f"{len(picked)} dissimilarity matrices of {size} stimuli")
-    for index, (name, detail, pairs) in enumerate(picked):
-        x0 = index * (WIDTH / len(picked))
+    side = min(WIDTH / len(drawn) - 16, 170.0)
+    drawing = Drawing(WIDTH, side + 48, f"{len(drawn)} dissimilarity matrices of {size} stimuli")
+    for index, (name, detail, picture) in enumerate(drawn):
+        x0 = index * (WIDTH / len(drawn))
         drawing.text(x0, 13, name, "title")
         drawing.text(x0, 28, cut(detail, max(12, int(side / 6.3))), "quiet small")
-        draw_matrix(drawing, x0, 38, side, pairs, board.conditions)
+        draw_rdm(drawing, x0, 38, side, picture)
     caption = (
         "Each cell is the dissimilarity of two stimuli in the order of the records "
         f"({', '.join(board.conditions[:8])}{', …' if size > 8 else ''}); dark is alike, bright is different, each "
@@ -175,20 +174,19 @@ def accuracy(entries: Sequence[Entry]) -> Figure:
     rows = []
     for entry, twin in zip(models, found, strict=True):
         kind, card = colour[_objective(entry)], entry.card
-        bars = [ChartBar(twin, -6, 4, f"{kind} faint", f"untrained twin {number(twin)}")] if twin is not None else []
-        bars.append(ChartBar(card.top1 or 0, -2, 8, kind, f"{entry.name}: top-1 {number(card.top1)}"))
-        top5 = (
-            ()
-            if card.top5 is None
-            else (ChartPoint(card.top5, f"{kind} open", f"top-5 {number(card.top5)}", 3.2, "diamond"),)
+        marks = (
+            (twin, "c0 open", f"untrained twin {number(twin)}", 3.5, "dot"),
+            (card.top5, f"{kind} open", f"top-5 {number(card.top5)}", 3.5, "diamond"),
+            (card.top1, kind, f"{entry.name}: top-1 {number(card.top1)}", 4.5, "dot"),
         )
-        rows.append(ChartRow(cut_name(entry.name, 36), top5, card.accuracy_interval, "line", bars=bars, drop=2))
+        points = [ChartPoint(value, *rest) for value, *rest in marks if value is not None]
+        rows.append(ChartRow(cut_name(entry.name, 36), points, card.accuracy_interval, kind))
     reach = max(0.05, *(max(e.card.top1 or 0, e.card.top5 or 0, e.card.twin_top1 or 0) for e in models))
     scale = Scale(0.0, min(1.0, reach * 1.05), 250, WIDTH - 20)
     drawing = row_chart(f"{title}: {len(models)} models", rows, scale, "accuracy on held-out objects")
     lack = " No record states the accuracy of an untrained twin." if set(found) == {None} else ""
     caption = (
-        f"Top-1 accuracy (bar, Wilson interval) and top-5 (diamond). The thin bar is the untrained twin's.{lack} "
+        f"Top-1 accuracy with its Wilson interval, top-5 (diamond) and the untrained twin's top-1 (hollow grey).{lack} "
         f"{legend_words(colour)}{cut_words(len(stated))}"
     )
     return Figure(key, title, caption, drawing)
@@ -197,7 +195,7 @@ def accuracy(entries: Sequence[Entry]) -> Figure:
 def accuracy_against_fit(entries: Sequence[Entry]) -> Figure:
     """Draw the task accuracy against the neural fit, with regression and its interval (figure 3.8 a, b)."""
     key, title = "accuracy-fit", "Task accuracy against neural fit (as figure 3.8)"
-    points = [(e.card.top1, e.value, e) for e in entries if e.card.top1 is not None and e.status == "ok"]
+    points = [(e.card.top1, e.scaled, e) for e in entries if e.card.top1 is not None and _trusted(e)]
     if len(points) < 3:
         lacking = f"{len(points)} records state both a task accuracy and a trusted score; at least 3 are needed"
         return Figure(key, title, lacking=lacking)
@@ -207,7 +205,7 @@ def accuracy_against_fit(entries: Sequence[Entry]) -> Figure:
 def parameters_against_fit(entries: Sequence[Entry]) -> Figure:
     """Draw the number of parameters against the neural fit (figure 3.3)."""
     key, title = "parameters", "Parameters against neural fit (as figure 3.3)"
-    points = [(float(e.card.parameters), e.value, e) for e in entries if e.card.parameters and e.status == "ok"]
+    points = [(float(e.card.parameters), e.scaled, e) for e in entries if e.card.parameters and _trusted(e)]
     if len(points) < 2:
         return Figure(key, title, lacking="fewer than 2 records state parameters and have a trusted score")
     return scatter(key, title, points, "parameters", log=True)
@@ -224,31 +222,6 @@ def masking(entries: Sequence[Entry]) -> Figure:
     return _ablation("masking", "Temporal masking", entries, _masking, _augmentation, "share of masked steps")
 
 
-def layers_of(entry: Entry) -> Drawing | None:
-    """Draw the layers of one model against their scores, all seeds; None without layers."""
-    layers = entry.score.layers
-    if not layers:
-        return None
-    seeds = [row.record.score.layers for row in entry.rows]
-    rows = []
-    for index, layer in enumerate(layers):
-        kind = _PARTS.get(layer.layer.partition(".")[0], "c1")
-        chosen = layer.layer == entry.score.layer
-        found = [one[index].value for one in seeds if len(one) == len(layers)]
-        finite = [value for value in found if math.isfinite(value)]
-        points = [ChartPoint(value, f"{kind} faint", size=2.2) for value in finite if entry.seeds > 1]
-        if finite:
-            mean = math.fsum(finite) / len(finite)
-            tip = f"{layer.layer}: {number(mean)} {span(layer.interval) if entry.seeds == 1 else ''}"
-            points.append(ChartPoint(mean, kind if chosen else f"{kind} open", tip, 4))
-        interval = layer.interval if entry.seeds == 1 else None
-        rows.append(ChartRow(cut(layer.layer, 22), points, interval, kind, "end title" if chosen else "end"))
-    values = [layer.value for one in seeds for layer in one]
-    scale = score_scale(values, [row.interval for row in rows], 132, 470)
-    words = f"Score of {len(layers)} layers of {entry.name}"
-    return row_chart(words, rows, scale, "noise-corrected score", step=20, width=490)
-
-
 def _ablation(
     key: str,
     title: str,
@@ -260,7 +233,7 @@ def _ablation(
     """Draw the models trained at several levels of one thing, the other thing ``held`` fixed, and on the same data."""
     groups: dict[tuple[str, ...], dict[str, Entry]] = {}
     for entry in entries:
-        if entry.trained and level(entry) and math.isfinite(entry.value):
+        if entry.trained and level(entry) and math.isfinite(entry.scaled):
             model = (entry.architecture, entry.card.objective or "", held(entry), entry.card.accuracy_data or "")
             groups.setdefault(model, {}).setdefault(level(entry), entry)
     groups = {name: levels for name, levels in groups.items() if len(levels) > 1}
@@ -273,15 +246,19 @@ def _ablation(
         group = cut(", ".join(part for part in model[:-1] if part), 50)
         for label, entry in sorted(levels.items()):
             top1 = f", top-1 {number(entry.card.top1)}" if entry.card.top1 is not None else ""
-            mark = ChartPoint(entry.value, colour[label], f"{entry.name}, {label}: {number(entry.value)}{top1}")
+            mark = ChartPoint(entry.scaled, colour[label], f"{entry.name}, {label}: {number(entry.scaled)}{top1}")
             points = (*_twin_points(entry, untrained, 3.2), mark)
             rows.append(ChartRow(cut(label, 22), points, entry.interval, colour[label], group=group))
-            values.append(entry.value)
+            values.append(entry.scaled)
             group = ""
     scale = score_scale(values, [row.interval for row in rows], 400, WIDTH - 20)
-    drawing = row_chart(f"{title}: {len(groups)} models", rows, scale, "noise-corrected RSA", step=20)
-    caption = f"Noise-corrected score with its interval by {what}; hollow grey points are untrained twins."
+    drawing = row_chart(f"{title}: {len(groups)} models", rows, scale, "scaled score", step=20)
+    caption = f"Scaled score with its interval by {what}; hollow grey points are untrained twins."
     return Figure(key, title, caption, drawing)
+
+
+def _trusted(entry: Entry) -> bool:
+    return entry.standing not in DOUBTFUL and math.isfinite(entry.scaled)
 
 
 def _objective(entry: Entry) -> str:
@@ -303,7 +280,7 @@ def _any_masking(entry: Entry) -> str:
 def _twin_points(entry: Entry, untrained: Mapping[str, Entry], size: float) -> tuple[ChartPoint, ...]:
     """Return the mark of a model's untrained twin, if its score is on the board."""
     twin = untrained.get(entry.architecture)
-    return () if twin is None else (ChartPoint(twin.value, "c0 open", f"untrained twin {number(twin.value)}", size),)
+    return () if twin is None else (ChartPoint(twin.scaled, "c0 open", f"untrained twin {number(twin.scaled)}", size),)
 
 
 def _twin_accuracy(entry: Entry, untrained: Mapping[str, Entry]) -> float | None:

@@ -5,13 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from itertools import combinations
 
 import numpy as np
 
 from brainbench.core.records import Interval
+from brainbench.core.statistics import is_finite
 from leaderboards.entries import Entry
-from leaderboards.figures.marks import colour_at, interval_ends
 from leaderboards.figures.svg import COLOURS, Drawing, Scale, scale_of, shorten, tick_text
 from leaderboards.text import number, span
 
@@ -136,21 +135,9 @@ def fitted(drawing: Drawing, across: Scale, up: Scale, xs: Sequence[float], ys: 
     return f"Least-squares line with the 95 % band of its mean over {n} models: r = {number(r, 2)}{text}. "
 
 
-def draw_matrix(
-    drawing: Drawing, x0: float, y0: float, side: float, pairs: Sequence[float], labels: Sequence[str]
-) -> None:
-    """Draw the upper triangle of an RDM as a square of shaded cells, with its labels."""
-    size = len(labels)
-    cell = side / size
-    finite = [value for value in pairs if math.isfinite(value)]
-    low, high = (min(finite), max(finite)) if finite else (0.0, 1.0)
-    drawing.rect(x0, y0, side, side, "box")
-    for value, (i, j) in zip(pairs, combinations(range(size), 2), strict=True):
-        share = (value - low) / (high - low) if high > low else 0.0
-        fill = colour_at(share) if math.isfinite(value) else "#808080"
-        tip = f"{labels[i]}, {labels[j]}: {value:.3g}"
-        drawing.rect(x0 + j * cell, y0 + i * cell, cell, cell, fill=fill, tip=tip)
-        drawing.rect(x0 + i * cell, y0 + j * cell, cell, cell, fill=fill, tip=tip)
+def interval_ends(interval: Interval | None) -> tuple[float, ...]:
+    """Return both ends of an interval, nothing where it has none."""
+    return (interval.low, interval.high) if interval and is_finite(interval) else ()
 
 
 def score_scale(values: Sequence[float], intervals: Sequence[Interval | None], start: float, end: float) -> Scale:
@@ -174,19 +161,8 @@ class ChartPoint:
 
 
 @dataclass(frozen=True)
-class ChartBar:
-    """A bar from the axis' start to a value; ``top`` and ``height`` in pixels from the row's middle."""
-
-    value: float
-    top: float
-    height: float
-    kind: str
-    tip: str
-
-
-@dataclass(frozen=True)
 class ChartRow:
-    """One row of a chart: a label, bars, an interval and marks, drawn in this order."""
+    """One row of a chart: a label, an interval and marks, drawn in this order."""
 
     label: str
     points: Sequence[ChartPoint]
@@ -196,9 +172,6 @@ class ChartRow:
     label_kind: str = "end"
     group: str | None = None
     """Heading of the rows that begin here, at the left edge."""
-    bars: Sequence[ChartBar] = ()
-    drop: float = 0.0
-    """Distance of interval and marks below the row's middle [px]."""
 
 
 def row_chart(
@@ -226,10 +199,6 @@ def row_chart(
         if row.group is not None:
             drawing.text(6, y + 4, row.group, "title small")
         drawing.text(scale.start - 8, y + 4, row.label, row.label_kind)
-        for bar in row.bars:
-            length = scale.at(bar.value) - scale.start
-            drawing.rect(scale.start, y + bar.top, length, bar.height, bar.kind, tip=bar.tip)
-        y += row.drop
         if ends := interval_ends(row.interval):
             left, right = map(scale.at, ends)
             drawing.line(left, y, right, y, f"span {row.kind}")

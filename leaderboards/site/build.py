@@ -2,12 +2,14 @@
 
 ``index.html`` holds the table as compact columns that its script shows 50 rows at a time, so that it opens
 quickly however many records there are; what concerns one model alone is on that model's page. Besides
-there are ``figures.html``, the records themselves, and the table as CSV, JSON and Parquet.
+there are ``figures.html``, the records themselves, and the table as CSV and JSON.
 """
 
 from __future__ import annotations
 
+import io
 import os
+import zipfile
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -17,15 +19,13 @@ from brainbench.core.files import atomic_path, write_json, write_text
 from brainbench.core.records import ResultRecord
 from leaderboards import text as words
 from leaderboards.audit import remarks
-from leaderboards.entries import Entry, entries_of
+from leaderboards.boards import Board, rank
+from leaderboards.conclusions import conclusions
 from leaderboards.figures.charts import board_figures
-from leaderboards.figures.marks import MARGIN
-from leaderboards.ranking import Board, rank
 from leaderboards.schema import record_schema
-from leaderboards.site.downloads import boards_table, records_zip, table_csv, table_parquet
 from leaderboards.site.page import render, script_json
 from leaderboards.site.score_page import model_page
-from leaderboards.site.table import COLUMNS, board_label, compact
+from leaderboards.site.table import COLUMNS, board_label, page_data, table_csv, table_rows
 from leaderboards.store import StoredRecord
 
 PAGE = 50
@@ -60,16 +60,13 @@ def build_leaderboard(
             "brainbench score MODEL --out FOLDER"
         )
     root = _folder(Path(folder))
-    usable = [item.record for item in stored if item.record is not None]
-    boards = rank(usable)
-    doubts = remarks(stored)
-    listed = [(board, entries_of(board, doubts)) for board in boards]
-    kept, downloads = _write_models(root, listed), _write_data(root, boards)
+    boards = rank([item.record for item in stored if item.record is not None], remarks(stored))
+    kept, downloads = _write_models(root, boards), _write_data(root, boards)
     synthetic = any(board.synthetic for board in boards)
     shown = []
-    for place, (board, entries) in enumerate(listed, start=1):
-        figures = board_figures(board, entries)
-        if len(listed) > 1:
+    for place, board in enumerate(boards, start=1):
+        figures = board_figures(board)
+        if len(boards) > 1:
             figures = [replace(figure, key=f"{figure.key}-{place}") for figure in figures]
         shown.append({"label": board_label(board), "figures": figures})
     write_text(
@@ -82,13 +79,14 @@ def build_leaderboard(
         render(
             "index.html.j2",
             title=title,
-            count_sentence=_count(listed),
+            count_sentence=_count(boards),
             boards=boards,
+            labels=[board_label(board) for board in boards],
+            concluded=[conclusions(board) for board in boards],
             synthetic=synthetic,
-            tie_rules=list(dict.fromkeys(board.ties for board in boards)),
             problems=[item for item in stored if item.record is None],
             downloads=[(path.relative_to(root).as_posix(), label) for path, label in downloads.items()],
-            data=script_json({"boards": compact(listed), "columns": COLUMNS, "page": PAGE, "margin": MARGIN}),
+            data=script_json({"boards": page_data(boards), "columns": COLUMNS, "page": PAGE}),
             here="table",
             root="",
         ),
@@ -107,41 +105,50 @@ def _folder(root: Path) -> Path:
     return root
 
 
-def _count(listed: Sequence[tuple[Board, Sequence[Entry]]]) -> str:
-    models = sum(len(entries) for _, entries in listed)
-    results = sum(len(board.rows) for board, _ in listed)
+def _count(boards: Sequence[Board]) -> str:
+    models = sum(len(board.entries) for board in boards)
+    results = sum(entry.seeds for board in boards for entry in board.entries)
     text = f"{words.plural(models, 'model')}"
     text += f", {words.plural(results, 'record')}" if results != models else ""
-    return text + (f" on {words.plural(len(listed), 'board')}." if len(listed) != 1 else ".")
+    return text + (f" on {words.plural(len(boards), 'board')}." if len(boards) != 1 else ".")
 
 
-def _write_models(root: Path, listed: Sequence[tuple[Board, Sequence[Entry]]]) -> set[Path]:
+def _write_models(root: Path, boards: Sequence[Board]) -> set[Path]:
     kept = set()
-    for _, entries in listed:
-        for entry in entries:
-            path = root / "models" / entry.page
-            write_text(path, model_page(entry))
-            kept.add(path)
-            for row in entry.rows:
-                file = root / "records" / row.record.file_name
-                if not file.is_file():
-                    write_text(file, row.record.to_json() + "\n")
-                kept.add(file)
+    for entry in (entry for board in boards for entry in board.entries):
+        kept.add(write_text(root / "models" / entry.page, model_page(entry)))
+        for record in entry.records:
+            file = root / "records" / record.file_name
+            if not file.is_file():
+                write_text(file, record.to_json() + "\n")
+            kept.add(file)
     return kept
 
 
 def _write_data(root: Path, boards: Sequence[Board]) -> dict[Path, str]:
     """Write the downloads and return each file with its label."""
-    data, table = root / "data", boards_table(boards)
-    offered = {write_text(data / "leaderboard.csv", table_csv(table)): "Table (CSV)"}
-    if table_parquet(table, data / "leaderboard.parquet"):
-        offered[data / "leaderboard.parquet"] = "Table (Parquet)"
-    offered[write_json(data / "leaderboard.json", table)] = "Table (JSON)"
+    data, rows = root / "data", [row for board in boards for row in table_rows(board)]
+    offered = {
+        write_text(data / "leaderboard.csv", table_csv(rows)): "Table (CSV)",
+        write_json(data / "leaderboard.json", rows): "Table (JSON)",
+    }
     with atomic_path(data / "records.zip") as temporary:
-        temporary.write_bytes(records_zip(boards))
+        temporary.write_bytes(_records_zip(boards))
     offered[data / "records.zip"] = "All records (JSON files, zip)"
     offered[write_json(data / "record.schema.json", record_schema())] = "JSON Schema of a record"
     return offered
+
+
+def _records_zip(boards: Sequence[Board]) -> bytes:
+    """Return the record files under their content-hash names: unpacking into a folder merges them."""
+    stream = io.BytesIO()
+    with zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED, compresslevel=9) as archive:
+        records = [record for board in boards for entry in board.entries for record in entry.records]
+        for record in sorted(records, key=lambda record: record.file_name):
+            entry = zipfile.ZipInfo(record.file_name)  # its fixed date of 1980 keeps the bytes equal
+            entry.compress_type = zipfile.ZIP_DEFLATED
+            archive.writestr(entry, record.to_json() + "\n")
+    return stream.getvalue()
 
 
 def _sweep(root: Path, kept: set[Path]) -> None:

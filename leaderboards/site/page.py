@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from brainbench.core.files import to_plain
 from leaderboards import text as words
-from leaderboards.figures import marks
+from leaderboards.figures.rdms import colour_stops
 
 if TYPE_CHECKING:
     from jinja2 import Environment
@@ -35,6 +35,21 @@ def render(template: str, **values: Any) -> str:
     )
     page = _environment().get_template(template)
     return page.render(**values, policy=policy, style=Markup(style), script=Markup(script))
+
+
+def render_markdown(template: str, **values: Any) -> str:
+    """Fill ``template`` with every value escaped for Markdown, and for the HTML that Markdown may hold."""
+    environment = _environment().overlay(autoescape=False, finalize=_escape_markdown)
+    return environment.get_template(template).render(**values)
+
+
+_MARKDOWN = str.maketrans({mark: f"\\{mark}" for mark in "\\`*_{}[]|#!"} | {"<": "&lt;", ">": "&gt;"})
+
+
+def _escape_markdown(value: Any) -> Any:
+    from markupsafe import Markup
+
+    return value if isinstance(value, Markup) else " ".join(str(value).translate(_MARKDOWN).split())
 
 
 def script_json(value: Any) -> Any:
@@ -61,11 +76,10 @@ def _environment() -> Environment:
     for helper in (words.number, words.probability, words.count, words.span, words.level):
         environment.filters[helper.__name__] = helper
     environment.globals |= {
-        "STATUS": words.STATUS,
-        "MARGIN": marks.MARGIN,
+        "STANDING": words.STANDING,
         "SYNTHETIC": words.SYNTHETIC,
         "p_sentence": words.p_sentence,
-        "colour_stops": marks.colour_stops(),
+        "colour_stops": colour_stops(),
     }
     return environment
 

@@ -1,73 +1,112 @@
 """The pages of one score: a report that stands alone, and a model's page on a site.
 
-Each page is one file without script libraries, fonts or anything else from the network. Charts are
-table rows with small inline SVG (:mod:`leaderboards.figures.marks`); every text of a record is escaped
-and a content security policy stops whatever else might try to run (:mod:`leaderboards.site.page`).
-Equal records give equal pages.
+Each page is one file without script libraries, fonts or anything else from the network; every text of a record is
+escaped and a content security policy stops whatever else might try to run (:mod:`leaderboards.site.page`). Equal
+records give equal pages.
 """
 
 from __future__ import annotations
 
 import base64
+import math
 import os
+from itertools import combinations
 from pathlib import Path
 from typing import Any
 
 from brainbench.core.files import write_text
 from brainbench.core.records import ResultRecord
 from leaderboards import text
-from leaderboards.entries import Entry
+from leaderboards.boards import RAW_INPUT
+from leaderboards.entries import Entry, not_repeatable, standing_of
 from leaderboards.figures.architecture import diagram, layer_order
-from leaderboards.figures.charts import layers_of
-from leaderboards.figures.marks import axis_of, interval_ends, record_charts
-from leaderboards.ranking import comparisons
+from leaderboards.figures.rdms import rdm_picture
+from leaderboards.figures.record import beside, layers, raw
+from leaderboards.figures.time_course import draw_time_course
+from leaderboards.ranking import compare, lacking
 from leaderboards.site.page import render
+
+_MOST_PAIRS = 100
+"""An RDM with more pairs than this is shown as a picture only; its numbers are in the record."""
 
 
 def write_report(record: ResultRecord, path: str | os.PathLike[str]) -> Path:
     """Write the report of one score as a self-contained HTML page, atomically, and return its path.
 
-    The page shows the score with interval, status and reasons, p, reliability and noise ceiling;
-    baselines and animal-to-animal beside it; both RDMs; every layer with the held-out choice and
-    the optimistic maximum marked; the animals; methods, model card and provenance.
+    The page shows the score with interval, standing and reasons, p, reliability and noise ceiling; baselines and
+    animal-to-animal beside it; both RDMs; every layer with the held-out choice marked; the animals; methods, model
+    card and provenance.
     """
-    view = _score_view(record)
     # Base64, so that nothing in the record can be read as markup.
     embedded = base64.b64encode((record.to_json() + "\n").encode()).decode()
-    return write_text(path, render("report.html.j2", **view, record_link=f"data:application/json;base64,{embedded}"))
+    link = f"data:application/json;base64,{embedded}"
+    return write_text(path, render("report.html.j2", **_score_view(record), record_link=link))
 
 
 def model_page(entry: Entry) -> str:
     """Return a model's page on a site."""
-    record, card = entry.rows[0].record, entry.card
-    scores = [row.record.score for row in entry.rows]
-    axis = axis_of([*(score.value for score in scores), *(end for s in scores for end in interval_ends(s.interval))])
+    record, card = entry.records[0], entry.card
     graph = card.graph or layer_order(record.score)
     view = _score_view(record) | {
         "title": f"{entry.name}: brainbench leaderboard",
         "entry": entry,
-        "seeds": [(row.record, axis.mark(row.record.score.value, row.record.score.interval)) for row in entry.rows],
-        "seed_axis": axis,
-        "loading": text.loading(record),
+        "standing": entry.standing,
         "graph": diagram(graph, entry.name) if graph else None,
         "connected": card.graph is not None,
-        "layer_chart": layers_of(entry),
-        "task": text.accuracy_rows(card),
+        "layer_chart": layers(entry.records),
         "training": text.training_rows(card),
     }
     return render("model.html.j2", **view, here="", root="../")
 
 
+def comparisons(record: ResultRecord) -> list[str]:
+    """Say how the score stands to each baseline, by the paired test over animals and stimuli."""
+    score, others = record.score, dict(record.baselines)
+    if record.animal_to_animal is not None:
+        others["animal-to-animal"] = record.animal_to_animal
+    sentences, untested = [], []
+    for name, other in others.items():
+        found = compare(score, other) if "ok" == score.status == other.status else None
+        if found is None:
+            untested.append(name)
+            continue
+        low, high = found.interval.low, found.interval.high
+        verdict = "Above" if low > 0 else "Below" if high < 0 else "Not told apart from"
+        sentences.append(f"{verdict} {name}: difference {text.number(found.difference)} {text.span(found.interval)}.")
+    if untested:
+        lacks = lacking(sum(item.status == "ok" for item in score.subjects), len(score.stimuli))
+        why = f"this needs {lacks}" if lacks else "not both state reliable values of single animals and stimuli"
+        sentences.append(f"Not compared with {', '.join(untested)}: {why}.")
+    return sentences
+
+
 def _score_view(record: ResultRecord) -> dict[str, Any]:
     """Return what both templates show of a score."""
     score, card = record.score, record.card
+    raw_input = record.baselines.get(RAW_INPUT)
+    found = compare(score, raw_input) if raw_input is not None else None
+    named = [("model", score.name, score), ("animals", "animal-to-animal", record.animal_to_animal)]
+    named += [("baseline", name, item) for name, item in record.baselines.items()]
+    pairs = list(zip(combinations(score.stimuli, 2), score.model_rdm, score.brain_rdm, strict=False))
     return {
         "title": f"{score.name}: brainbench score",
         "record": record,
+        "standing": standing_of(score, above_raw=found is not None and found.interval.low > 0),
+        "scaled": math.isfinite(score.scaled),
+        "not_repeatable": not_repeatable(record),
+        "ways": text.ways_to_get(record),
         "recordings": score.provenance.recordings_name,
-        **record_charts(record),
+        "beside": beside(record),
+        "raw": raw(record),
+        "rows": [item for item in named if item[2] is not None],
+        "layer_chart": layers([record]),
+        "layer_p": score.provenance.layer_p,
+        "model_rdm": rdm_picture(score.model_rdm, score.stimuli),
+        "brain_rdm": rdm_picture(score.brain_rdm, score.stimuli),
+        "pairs": pairs if len(pairs) <= _MOST_PAIRS else [],
+        "time_course": draw_time_course(score.provenance.statistics),
         "comparisons": comparisons(record),
-        "methods": text.methods(record),
+        "methods": text.methods([record]),
         "command": score.provenance.command,
         "card": text.card_rows(card) if card else [],
         "provenance": text.provenance_rows(score.provenance),

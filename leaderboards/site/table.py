@@ -1,40 +1,55 @@
-"""The table of the site as data: its columns, and every board's rows in compact form."""
+"""The table of a leaderboard as data: one list of rows for the page, the CSV and the JSON, so that they agree."""
 
 from __future__ import annotations
 
+import csv
+import io
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
-from brainbench.core.records import Interval
-from leaderboards.entries import Entry
-from leaderboards.figures.marks import interval_ends, score_axis
-from leaderboards.ranking import Baseline, Board, RankedRecord
+from brainbench.core.records import Interval, Score
+from leaderboards.boards import Baseline, Board
+from leaderboards.conclusions import conclusions
+from leaderboards.entries import Entry, standing_of
+from leaderboards.figures.plots import interval_ends, score_scale
+from leaderboards.text import ways_to_get
 
 COLUMNS: tuple[dict[str, Any], ...] = (
     {"key": "rank", "label": "rank", "title": "rank", "number": True, "shown": True},
-    {"key": "model", "label": "model", "title": "model", "shown": True},
+    {"key": "name", "label": "model", "title": "model", "shown": True},
     {"key": "score", "label": "score", "title": "score and interval", "number": True, "shown": True, "down": True},
     {"key": "interval", "label": "interval", "title": "interval as a picture", "shown": True},
-    {"key": "spread", "label": "spread", "title": "spread over seeds", "number": True, "wide": True, "shown": True},
+    {"key": "standing", "label": "standing", "title": "standing", "wide": True, "shown": True},
     {"key": "p", "label": "p", "title": "permutation p", "number": True, "wide": True, "shown": True},
-    {"key": "raw", "label": "raw r", "title": "raw r", "number": True, "wide": True, "down": True},
+    {"key": "spread", "label": "spread", "title": "spread over seeds", "number": True, "wide": True},
+    {"key": "value", "label": "value", "title": "value in the metric's own unit", "number": True, "wide": True,
+     "down": True, "shown": True},
+    {"key": "r", "label": "raw r", "title": "raw r", "number": True, "wide": True, "down": True},
     {"key": "top1", "label": "top-1", "title": "top-1 accuracy", "number": True, "wide": True, "down": True},
     {"key": "top5", "label": "top-5", "title": "top-5 accuracy", "number": True, "wide": True, "down": True},
     {"key": "layer", "label": "layer", "title": "layer", "wide": True, "shown": True},
     {"key": "parameters", "label": "parameters", "title": "parameters", "number": True, "whole": True, "wide": True,
      "shown": True, "down": True},
-    {"key": "cost", "label": "multiply-adds", "title": "multiply-adds per step", "number": True, "whole": True,
-     "wide": True, "down": True},
+    {"key": "multiply_adds", "label": "multiply-adds", "title": "multiply-adds per step", "number": True,
+     "whole": True, "wide": True, "down": True},
     {"key": "encoder", "label": "encoder", "title": "encoder", "wide": True},
     {"key": "attender", "label": "attender", "title": "attender", "wide": True},
     {"key": "objective", "label": "objective", "title": "objective", "wide": True},
     {"key": "augmentation", "label": "augmentation", "title": "augmentation", "wide": True},
     {"key": "seeds", "label": "seeds", "title": "number of seeds", "number": True, "whole": True, "wide": True},
     {"key": "animals", "label": "animals", "title": "number of animals", "number": True, "whole": True, "wide": True},
-    {"key": "status", "label": "status", "title": "status", "wide": True, "shown": True},
     {"key": "version", "label": "version", "title": "brainbench version", "wide": True},
 )  # fmt: skip
+
+_COMMON = ("recordings", "recordings_hash", "stimuli_hash", "time", "estimator", "metric", "synthetic")
+_CARD = ("family", "encoder", "attender", "objective", "augmentation", "parameters", "multiply_adds", "top1", "top5")
+FIELDS = (
+    *_COMMON, "kind", "rank_first", "rank_last", "name", "scaled", "scaled_low", "scaled_high", "standing", "same_as",
+    "unranked_because", "notes", "p", "spread", "value", "low", "high", "r", "reliability", "ceiling_lower",
+    "ceiling_upper", "layer", "seeds", "animals", *_CARD, "seed", "weights", "version", "get", "page", "records",
+)  # fmt: skip
+"""Columns of the downloads."""
 
 
 def board_label(board: Board) -> str:
@@ -42,26 +57,56 @@ def board_label(board: Board) -> str:
     return f"{board.recordings}: {_rules(board)}"
 
 
-def compact(listed: Sequence[tuple[Board, Sequence[Entry]]]) -> list[dict[str, Any]]:
+def table_rows(board: Board) -> list[dict[str, Any]]:
+    """Return every entry of a board and its baselines by :data:`FIELDS`; None where nothing is known."""
+    common = {name: getattr(board, name) for name in _COMMON}
+    rows = [*map(_entry_row, board.entries), *map(_baseline_row, board.baselines)]
+    return [{name: _known((common | row).get(name)) for name in FIELDS} for row in rows]
+
+
+def table_csv(rows: Iterable[dict[str, Any]]) -> str:
+    """Return :func:`table_rows` as CSV with one header line."""
+    stream = io.StringIO()
+    writer: csv.DictWriter[str] = csv.DictWriter(stream, FIELDS, lineterminator="\n")
+    writer.writeheader()
+    writer.writerows({name: _cell(value) for name, value in row.items()} for row in rows)
+    return stream.getvalue()
+
+
+def page_data(boards: Sequence[Board]) -> list[dict[str, Any]]:
     """Return every board as columns: what the script of the first page shows."""
+    return [_page_board(str(index), board) for index, board in enumerate(boards, start=1)]
+
+
+def _page_board(key: str, board: Board) -> dict[str, Any]:
+    rows = table_rows(board)
+    # Records of earlier versions state no chance: a board of such alone shows the metric's own values.
+    scaled = any(row["scaled"] is not None for row in rows)
+    score, low, high = ("scaled", "scaled_low", "scaled_high") if scaled else ("value", "low", "high")
     found = []
-    for index, (board, entries) in enumerate(listed, start=1):
-        axis = score_axis(item.score for item in (*entries, *board.baselines))
-        animals = next((b.score for b in board.baselines if b.kind == "animals" and b.score.status == "ok"), None)
-        rows = [*map(_model_row, entries), *map(_baseline_row, board.baselines)]
-        keys = dict.fromkeys(key for row in rows for key in row)
-        found.append(
-            {
-                "key": str(index),
-                "recordings": board.recordings + (f" ({board.recordings_hash[:6]})" if board.recordings_hash else ""),
-                "label": _rules(board),
-                "about": _about(board),
-                "axis": {"low": axis.low, "high": axis.high, "ticks": axis.ticks},
-                "band": list(interval_ends(animals.interval)) or None if animals else None,
-                "data": {key: [row.get(key) for row in rows] for key in keys},
-            }
-        )
-    return found
+    for row, entry in zip(rows, [*board.entries, *[None] * len(board.baselines)], strict=True):
+        shown = {name: value for name, value in row.items() if name not in _COMMON}
+        shown |= {"score": row[score], "score_low": row[low], "score_high": row[high]}
+        if entry is not None:
+            shown |= {"apart": entry.not_repeatable or None, "seed": entry.card.seed}
+            shown |= {"runs": [record.score.scaled for record in entry.records] if entry.seeds > 1 else None}
+        found.append({name: _rounded(value) for name, value in shown.items()})
+    trusted = [row for row in found if row["standing"] != "unreliable"]
+    values = [row[name] for row in trusted for name in ("score", "score_low", "score_high") if row[name] is not None]
+    axis = score_scale(values, [], 0, 1)
+    animals = next((row for row in found if row["kind"] == "animals" and row["score_low"] is not None), None)
+    return {
+        "key": key,
+        "recordings": board.recordings + (f" ({board.recordings_hash[:6]})" if board.recordings_hash else ""),
+        "label": _rules(board),
+        "about": _about(board),
+        "conclusions": conclusions(board),
+        "scaled": scaled,
+        "ranked": bool(board.ranked),
+        "axis": {"low": axis.low, "high": axis.high, "ticks": axis.ticks},
+        "band": [animals["score_low"], animals["score_high"]] if animals else None,
+        "data": {name: [row.get(name) for row in found] for name in dict.fromkeys(key for row in found for key in row)},
+    }
 
 
 def _rules(board: Board) -> str:
@@ -79,78 +124,75 @@ def _about(board: Board) -> list[str]:
         f"Hash of the recordings {board.recordings_hash or 'unknown'}, "
         f"of the stimuli {board.stimuli_hash or 'unknown'}."
     )
-    if not board.comparable:
-        parts.append("These records do not say which recordings they used, so they are listed but not ranked.")
     return parts
 
 
-def _model_row(entry: Entry) -> dict[str, Any]:
-    card, score = entry.card, entry.score
-    low, high = _ends(entry.interval)
-    unranked = [f"not ranked: {entry.unranked_because}"] if entry.unranked_because else []
-    return {
+def _entry_row(entry: Entry) -> dict[str, Any]:
+    score, card = entry.score, entry.card
+    low, high = interval_ends(entry.interval) or (None, None)
+    return _score_row(score) | {name: getattr(card, name) for name in _CARD} | {
         "kind": "model",
-        "model": entry.name,
+        "rank_first": entry.first,
+        "rank_last": entry.last,
         "name": entry.name,
-        "page": entry.page,
-        "first": entry.first,
-        "last": entry.last,
-        "placed": entry.first is not None,
-        "score": _short(entry.value),
-        "low": low,
-        "high": high,
-        "spread": _short(entry.spread),
-        "p": _short(entry.p, 6),
-        "raw": _short(entry.r),
-        "layer": score.layer,
-        "status": entry.status,
-        "notes": [*entry.notes, *unranked] or None,
-        "parameters": card.parameters,
-        "cost": card.multiply_adds,
-        "top1": _short(card.top1),
-        "top5": _short(card.top5),
-        "encoder": card.encoder,
-        "attender": card.attender,
-        "objective": card.objective,
-        "augmentation": card.augmentation,
-        "seed": card.seed,
+        "scaled": entry.scaled,
+        "scaled_low": low,
+        "scaled_high": high,
+        "standing": entry.standing,
+        "same_as": entry.same_as or None,
+        "unranked_because": entry.unranked_because or None,
+        "notes": "; ".join(entry.notes) or None,
+        "p": entry.p,
+        "spread": entry.spread,
+        "value": entry.value,
+        "r": entry.r,
         "seeds": entry.seeds,
-        "animals": len(score.subjects) or None,
+        "seed": card.seed if entry.seeds == 1 else None,
+        "weights": card.weights if entry.seeds == 1 else None,
         "version": score.provenance.version or None,
-        "runs": [_run(row) for row in entry.rows] if entry.seeds > 1 else None,
-    }
-
-
-def _run(row: RankedRecord) -> list[Any]:
-    score, card = row.record.score, row.record.card
-    placed = (_short(score.value), *_ends(score.interval), _short(score.p, 6), row.first, row.last)
-    return [card.seed if card else None, *placed, score.status, _short(score.r), score.layer]
+        "get": "; ".join(ways_to_get(entry.records[0])),
+        "page": entry.page,
+        "records": " ".join(record.identity for record in entry.records),
+    } | ({"low": None, "high": None} if entry.seeds > 1 else {})  # fmt: skip
 
 
 def _baseline_row(baseline: Baseline) -> dict[str, Any]:
     score = baseline.score
-    low, high = _ends(score.interval)
-    return {
+    tested = math.isfinite(score.p) or score.status != "ok"
+    return _score_row(score) | {
         "kind": baseline.kind,
-        "model": baseline.name,
         "name": baseline.name,
-        "placed": score.status == "ok",
-        "first": None,
-        "last": None,
-        "score": _short(score.value),
-        "low": low,
-        "high": high,
-        "p": _short(score.p, 6),
-        "raw": _short(score.r),
-        "status": score.status,
-        "notes": list(baseline.notes) or None,
+        "standing": standing_of(score, above_raw=False) if tested else None,
+        "notes": "; ".join(baseline.notes) or None,
     }
 
 
-def _ends(interval: Interval | None) -> tuple[float | None, float | None]:
-    low, high = interval_ends(interval) or (None, None)
-    return _short(low), _short(high)
+def _score_row(score: Score) -> dict[str, Any]:
+    def ends(interval: Interval | None, prefix: str) -> dict[str, float]:
+        return dict(zip((f"{prefix}low", f"{prefix}high"), interval_ends(interval), strict=False))
+
+    row = {name: getattr(score, name) for name in ("scaled", "value", "p", "r", "reliability", "layer")}
+    row |= ends(score.interval, "") | ends(score.scaled_interval, "scaled_")
+    row |= {"animals": len(score.subjects) or None}
+    if score.ceiling:
+        row |= {"ceiling_lower": score.ceiling.lower, "ceiling_upper": score.ceiling.upper}
+    return row
 
 
-def _short(value: float | None, digits: int = 4) -> float | None:
-    return None if value is None or not math.isfinite(value) else round(value, digits)
+def _known(value: Any) -> Any:
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def _rounded(value: Any) -> Any:
+    if isinstance(value, list):
+        return [_rounded(item) for item in value]
+    return round(value, 6) if isinstance(value, float) and math.isfinite(value) else _known(value)
+
+
+def _cell(value: Any) -> Any:
+    if value is None:
+        return ""
+    # A spreadsheet would run text that starts like a formula.
+    if isinstance(value, str) and value.startswith(("=", "+", "-", "@", "\t", "\r")):
+        return f"'{value}"
+    return value

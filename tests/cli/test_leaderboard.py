@@ -43,7 +43,7 @@ def test_a_record_is_added_known_and_confirmed_by_scoring_again(run, scored, tmp
     assert [item["state"] for item in first["results"]] == ["added"]
     again = json.loads(run("leaderboard", "add", str(path), "--to", str(board), "--json").out)
     assert [item["state"] for item in again["results"]] == ["known"]
-    result = run("leaderboard", "verify", str(board), "--recordings", where)
+    result = run("leaderboard", "verify", str(board), "--recordings", where, "--trust-code")
     assert result.status == 0, result.err
     assert "confirmed: scored again with the same result" in result.out
 
@@ -68,7 +68,7 @@ def test_an_edited_record_is_refused_and_a_renamed_forgery_does_not_repeat(run, 
     assert refused.status == 1
     assert "the same computation gave" in refused.out
     assert len(list(board.iterdir())) == 1
-    checked = run("leaderboard", "verify", str(forged), "--recordings", where)
+    checked = run("leaderboard", "verify", str(forged), "--recordings", where, "--trust-code")
     assert checked.status == 1
     assert "differs: scored again with another result" in checked.out
     assert "score.value" in checked.out
@@ -82,7 +82,7 @@ def test_an_edited_record_is_refused_and_a_renamed_forgery_does_not_repeat(run, 
 
 def test_recordings_elsewhere_must_be_given_to_repeat_a_score(run, scored):
     path, _ = scored
-    result = run("leaderboard", "verify", str(path))
+    result = run("leaderboard", "verify", str(path), "--trust-code")
     assert result.status == 1
     assert "give them with --recordings PATH" in result.out
 

@@ -1,5 +1,7 @@
 import json
 
+import numpy as np
+
 
 def test_power_says_how_often_and_how_many(run):
     found = run("power", "--stimuli", "6", "--animals", "5", "--effect", "0.7", "--simulations", "100", "--json")
@@ -17,3 +19,28 @@ def test_an_impossible_design_is_refused(run):
     found = run("power", "--effect", "0.99", "--consistency", "0.5")
     assert found.status == 2
     assert "bounds it by √consistency" in found.err
+
+
+def test_dimensions_are_estimated_given_or_assumed(run, tmp_path):
+    from brainbench.datasets.synthetic import PopulationDesign, ResponseGeometry, write_files
+
+    features = np.random.default_rng(0).normal(size=(12, 2))
+    geometry = ResponseGeometry.from_activations(features)
+    write_files(tmp_path / "pilot", geometry, PopulationDesign(animals=2, units=80, emphasis=0.0), seed=1)
+    common = ("power", "--animals", "4", "--effect", "0.5", "--simulations", "50", "--json")
+    pilot = run(*common, "-r", str(tmp_path / "pilot"), "--conditions", "trials:stimulus")
+    assert pilot.status == 0, pilot.err
+    found = json.loads(pilot.out)
+    assert found["dimensions"]["number"] in (1, 2, 3)
+    assert found["results"][0]["design"]["dimensions"] == found["dimensions"]["number"]
+    assert json.loads(run(*common, "--dimensions", "7").out)["dimensions"] == {"number": 7, "origin": "given"}
+    assert json.loads(run(*common).out)["dimensions"]["number"] == 10
+
+
+def test_dimensions_that_are_no_number_are_refused(run):
+    found = run("power", "--dimensions", "many")
+    assert found.status == 2
+    assert "'many'" in found.err
+    both = run("power", "--dimensions", "3", "--model", "pixels")
+    assert both.status == 2
+    assert "--model" in both.err

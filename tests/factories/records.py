@@ -3,11 +3,16 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
+from dataclasses import replace
 from itertools import combinations
 
+import numpy as np
 from jsonschema import Draft202012Validator
+from scipy.special import stdtrit
 
 from brainbench.core.records import Ceiling, Interval, LayerScore, ModelCard, ResultRecord, Score, SubjectScore
+from brainbench.core.statistics import two_factor_error
 from leaderboards.schema import record_schema
 
 VALIDATOR = Draft202012Validator(record_schema())
@@ -45,6 +50,9 @@ def make_score(name: str = "zhuang", value: float = 0.523, *, status: str = "ok"
         "stimuli": STIMULI,
         "model_rdm": MODEL_RDM,
         "brain_rdm": BRAIN_RDM,
+        "chance": 0.0,
+        "attainable": 1.0,
+        "without_stimulus": tuple(value + 0.01 * (k - 2.5) for k in range(len(STIMULI))),
         "provenance": {
             "version": "0.1.0",
             "time": "2026-11-21T07:50:00+00:00",
@@ -69,3 +77,71 @@ def make_record(
         ModelCard(name, "recurrent", "SimCLR", parameters=37_988_821, top1=0.352, seed=3, collapsed=False),
         synthetic,
     )
+
+
+def draw_board(
+    truths: Mapping[str, float],
+    *,
+    animals: int = 10,
+    stimuli: int = 40,
+    noise: float = 0.1,
+    spread: float = 0.5,
+    raw: float = 0.1,
+    chance: float = 0.0,
+    truth: str = "",
+    seed: int = 0,
+) -> list[ResultRecord]:
+    """Return one record per model whose values are drawn around its truth, animals and stimuli both sampled.
+
+    Args:
+        truths: Expected scaled value of each model.
+        animals, stimuli: Size of the design.
+        noise: Standard deviation of an animal's value around its model's.
+        spread: Standard deviation over stimuli of what single stimuli add to a model's value, of each model its own.
+        raw: Expected scaled value of the raw input.
+        chance: Value of a model that knows nothing; 1 is attainable.
+        truth: Name of the network that made the recordings.
+        seed: Seed of the draw.
+    """
+    rng = np.random.default_rng(seed)
+    labels = tuple(f"object-{k:02d}" for k in range(stimuli))
+    shared = rng.normal(0, noise, animals)
+
+    def score(name: str, expected: float) -> Score:
+        parts = expected + rng.normal(0, spread, stimuli)
+        values = parts.mean() + shared + rng.normal(0, noise, animals)
+        value = float(values.mean())
+        without = value + (parts.mean() - parts) / (stimuli - 1)
+
+        def unscaled(one: float) -> float:
+            return float(chance + (1 - chance) * one)
+
+        error, freedom = two_factor_error(values, without)
+        half = float((1 - chance) * error * stdtrit(freedom, 0.975))
+        middle = unscaled(value)
+        pairs = stimuli * (stimuli - 1) // 2
+        subjects = tuple(
+            SubjectScore(f"animal-{i}", unscaled(one), unscaled(one), 0.8, "ok", 60, 700, "encoder.conv3")
+            for i, one in enumerate(values)
+        )
+        found = make_score(
+            name, middle, subjects=subjects, stimuli=labels, chance=chance, attainable=1.0,
+            without_stimulus=tuple(map(unscaled, without)), p=0.001 if value > 0.1 else 0.4, layer="encoder.conv3",
+            interval=Interval(middle - half, middle + half, method=f"t over {animals} animals and {stimuli} stimuli"),
+            model_rdm=tuple(rng.random(pairs)), brain_rdm=tuple(rng.random(pairs)),
+        )  # fmt: skip
+        made = {**found.provenance, "recordings": {"source": "demo", "content_hash": "9f3c2a7b", "truth": truth}}
+        return replace(found, provenance={**made, "settings": {**made["settings"], "model": name}})
+
+    base = {"raw input": score("raw input", raw), "random features": score("random features", raw)}
+    between = score("animal-to-animal", 0.9)
+    return [
+        ResultRecord(
+            score(name, expected),
+            between,
+            base,
+            ModelCard(name, "recurrent", "untrained", parameters=2_000_000 + i, seed=0, weights=f"{seed}-{i}"),
+            True,
+        )
+        for i, (name, expected) in enumerate(truths.items())
+    ]

@@ -1,102 +1,136 @@
-"""Seeds fold into one entry whose interval is that of the animals' means."""
+"""Seeds fold into one entry, copies of a computation are known, and one ladder of words says what a score is worth."""
 
 from __future__ import annotations
 
+import doctest
 import math
 from dataclasses import replace
 
-import numpy as np
 import pytest
-from scipy import stats
 
-from brainbench.core.records import SubjectScore
-from brainbench.core.statistics import t_interval
-from leaderboards.entries import entries_of, twins
-from leaderboards.ranking import rank
+from brainbench.core.records import ModelCard
+from leaderboards import entries as module
+from leaderboards.boards import rank
+from leaderboards.entries import STANDINGS, not_repeatable, same_computation, standing_of, twins
+from tests.factories.records import draw_board
 
 
-def _run(record, seed: int, values: list[float], *, objective: str = "untrained", **changes):
+def _run(record, seed: int, by: float = 0.0, *, objective: str = "untrained", **changes):
     card = replace(record.card, seed=seed, objective=objective, weights=f"{objective}{seed}", **changes)
-    subjects = tuple(SubjectScore(f"animal-{i}", value, value, 0.9) for i, value in enumerate(values))
-    return replace(record, card=card, score=replace(record.score, value=float(np.mean(values)), subjects=subjects))
+    subjects = tuple(replace(item, value=item.value + by) for item in record.score.subjects)
+    left_out = tuple(value + by for value in record.score.without_stimulus)
+    score = replace(record.score, value=record.score.value + by, subjects=subjects, without_stimulus=left_out)
+    return replace(record, card=card, score=score)
 
 
 def _entries(*records):
     (board,) = rank(records)
-    return entries_of(board)
+    return board.entries
 
 
-def test_the_interval_joins_the_t_intervals_over_animals_and_over_seeds(make_record):
-    values = np.random.default_rng(0).normal(0.6, 0.1, size=(3, 5))  # seed, animal
-    (entry,) = _entries(*(_run(make_record("net"), seed, list(row)) for seed, row in enumerate(values)))
-    halves = [stats.t.ppf(0.975, len(means) - 1) * stats.sem(means) for means in (values.mean(0), values.mean(1))]
-    half = math.hypot(*halves)
-    assert entry.interval.low == pytest.approx(values.mean() - half)
-    assert entry.interval.high == pytest.approx(values.mean() + half)
-    assert entry.value == pytest.approx(values.mean())
-    assert entry.spread == pytest.approx(values.mean(axis=1).std(ddof=1))
-    assert entry.interval.method == "t over 5 animals and 3 seeds, added in squares"
+def test_seeds_are_one_entry_with_mean_interval_and_spread():
+    (record,) = draw_board({"net": 0.6})
+    (entry,) = _entries(*(_run(record, seed, by) for seed, by in enumerate((-0.1, 0.0, 0.1))))
+    assert entry.seeds == 3
+    assert entry.scaled == pytest.approx(record.score.scaled)
+    assert entry.spread == pytest.approx(0.1)
+    assert "3 seeds" in entry.interval.method
+    single = record.score.scaled_interval
+    assert entry.interval.high - entry.interval.low > single.high - single.low
 
 
-def test_a_single_record_keeps_its_own_interval(make_record):
-    record = make_record("net")
+def test_a_single_record_keeps_its_own_interval():
+    (record,) = draw_board({"net": 0.6})
     (entry,) = _entries(record)
-    assert entry.interval == record.score.interval
+    assert entry.interval == record.score.scaled_interval
     assert math.isnan(entry.spread)
 
 
-def test_objectives_and_augmentations_are_entries_of_their_own_and_twins_are_found(make_record):
-    plain = _run(make_record("zhuang-small"), 0, [0.3, 0.4])
-    trained = _run(make_record("zhuang-small.simclr"), 0, [0.7, 0.8], objective="simclr", twin="zhuang-small")
-    masked = replace(trained, card=replace(trained.card, training={"masking": 0.75}, weights="m"))
-    masked = replace(masked, score=replace(masked.score, value=0.71))
-    entries = _entries(plain, trained, masked)
-    assert [(entry.name, entry.trained, entry.masking) for entry in entries] == [
+def test_objectives_and_augmentations_are_entries_of_their_own_and_twins_are_found():
+    plain, trained, masked = draw_board({"zhuang-small": 0.3, "zhuang-small.simclr": 0.8, "other": 0.6})
+    trained = _run(trained, 0, objective="simclr", twin="zhuang-small")
+    masked = replace(masked, card=replace(trained.card, training={"masking": 0.75}, weights="m"))
+    masked = replace(masked, score=replace(masked.score, name="zhuang-small.simclr"))
+    found = _entries(plain, trained, masked)
+    assert {(entry.name, entry.trained, entry.masking) for entry in found} == {
         ("zhuang-small.simclr", True, 0.0),
         ("zhuang-small.simclr", True, 0.75),
         ("zhuang-small", False, 0.0),
-    ]
-    assert twins(entries)[entries[0].architecture].name == "zhuang-small"
+    }
+    assert twins(found)[found[0].architecture].name == "zhuang-small"
 
 
-def test_a_second_record_of_a_seed_is_not_averaged_in(make_record):
-    old = _run(make_record("net"), 0, [0.2, 0.3])
-    new = _run(make_record("net"), 0, [0.6, 0.7])
-    old, new = (
-        replace(record, score=replace(record.score, provenance={**record.score.provenance, "time": time}))
-        for record, time in ((old, "2026-01"), (new, "2026-02"))
-    )
-    first, second = _entries(old, new)
+def test_a_second_record_of_a_seed_is_not_averaged_in():
+    (record,) = draw_board({"net": 0.5})
+
+    def at(time, by):
+        made = _run(record, 0, by)
+        return replace(made, score=replace(made.score, provenance={**made.score.provenance, "time": time}))
+
+    first, second = _entries(at("2026-01", -0.2), at("2026-02", 0.2))
     assert (first.seeds, second.seeds) == (1, 1)
-    assert first.value == pytest.approx(0.65)
+    assert first.value == pytest.approx(record.score.value + 0.2)
     assert second.notes == ("an earlier record of a model that stands above or below once more",)
 
 
-def test_one_seed_without_a_trusted_score_keeps_the_entry_from_being_ranked(make_record):
-    good = _run(make_record("net"), 0, [0.6, 0.7])
-    bad = _run(make_record("net"), 1, [0.6, 0.7])
-    bad = replace(bad, score=replace(bad.score, status="unreliable"))
-    (entry,) = _entries(good, bad)
-    assert entry.status == "unreliable"
-    assert entry.rank == "–"
-    assert entry.unranked_because
+def test_one_seed_without_a_trusted_score_keeps_the_entry_from_being_ranked():
+    (record,) = draw_board({"net": 0.6})
+    bad = _run(record, 1)
+    (entry,) = _entries(_run(record, 0), replace(bad, score=replace(bad.score, status="unreliable")))
+    assert (entry.standing, entry.rank, entry.unranked_because) == ("unreliable", "–", "unreliable")
 
 
-def _half_width(values):
-    interval = t_interval(values)
-    return (interval.high - interval.low) / 2
-
-
-def test_the_interval_covers_the_architectures_mean_under_both_kinds_of_chance():
-    rng = np.random.default_rng(1)
-    covered = 0
-    for _ in range(1000):
-        values = rng.normal(0, 0.1, (5, 1)) + rng.normal(0, 0.1, (1, 6)) + rng.normal(0, 0.05, (5, 6))
-        covered += abs(values.mean()) <= math.hypot(*(_half_width(values.mean(axis)) for axis in (0, 1)))
-    assert 0.94 < covered / 1000 < 0.995
-
-
-def test_the_page_keeps_its_address_when_a_seed_is_added(make_record):
-    runs = [_run(make_record("net"), seed, [0.4 + 0.1 * seed, 0.5]) for seed in range(3)]
+def test_the_page_keeps_its_address_when_a_seed_is_added():
+    (record,) = draw_board({"net": 0.6})
+    runs = [_run(record, seed, 0.1 * seed) for seed in range(3)]
     (before,), (after,) = _entries(*runs[:2]), _entries(*runs)
     assert before.page == after.page
+
+
+@pytest.mark.parametrize(
+    ("change", "above_raw", "standing"),
+    [
+        ({"p": 0.001}, True, "above raw input"),
+        ({"p": 0.001}, False, "above chance"),
+        ({"p": 0.2}, True, "not told apart from chance"),
+        ({"p": math.nan}, True, "not tested"),
+        ({"p": 0.001, "status": "unreliable"}, True, "unreliable"),
+        ({"value": math.nan, "status": "undefined"}, True, "undefined"),
+    ],
+)
+def test_every_score_stands_on_one_rung(make_score, change, above_raw, standing):
+    score = replace(make_score(), **change)
+    assert standing_of(score, above_raw=above_raw) == standing
+    assert standing in STANDINGS
+
+
+def test_copies_of_a_layer_and_other_units_are_the_same_computation():
+    one, other = _entries(*draw_board({"one": 0.6, "other": 0.4}))
+    assert not same_computation(one, other)
+    copy = replace(one.records[0].score, name="copy", layer="another.name")
+    scaled = replace(copy, model_rdm=tuple(1e12 * value for value in copy.model_rdm))
+    nudged = replace(copy, model_rdm=(copy.model_rdm[0] + 0.01, *copy.model_rdm[1:]))
+    for score, same in ((copy, True), (scaled, True), (nudged, False)):
+        entry = replace(one, records=(replace(one.records[0], score=score),))
+        assert same_computation(one, entry) is same
+
+
+@pytest.mark.parametrize(
+    ("name", "family", "repeatable"),
+    [
+        ("s4-small.simclr", "s4", True),
+        ("features", "features computed elsewhere", False),
+        ("mine.py:Mine", "user module", False),
+        ("local-dir:there", "s4", False),
+        ("hf-hub:me/there", "s4", False),
+        ("bare", "", False),
+    ],
+)
+def test_only_what_comes_with_the_package_can_be_repeated(make_record, name, family, repeatable):
+    record = make_record(name)
+    record = replace(record, card=ModelCard(name, family=family))
+    assert (not_repeatable(record) == "") is repeatable
+
+
+def test_the_examples_hold():
+    assert doctest.testmod(module).failed == 0

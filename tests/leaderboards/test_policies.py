@@ -11,7 +11,6 @@ from typer.testing import CliRunner
 
 from brainbench.cli import app
 from leaderboards import rank, read_records
-from leaderboards.entries import entries_of
 from tests.factories.records import VALIDATOR
 
 POLICIES = Path(__file__).parents[2] / "leaderboards" / "policies"
@@ -27,7 +26,7 @@ def test_records_are_intact_and_make_one_board_on_which_touch_leads(stored) -> N
     for item in stored:
         VALIDATOR.validate(json.loads(item.path.read_text(encoding="utf-8")))
     (board,) = rank(item.record for item in stored if item.record)
-    names = [entry.name for entry in entries_of(board)]
+    names = [entry.name for entry in board.entries]
     assert names[0].startswith("in_palm_rotate_xhand1_force_torque_hand")
     assert names[-1] == "in_palm_rotate_xhand1_none"
 

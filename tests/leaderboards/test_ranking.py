@@ -1,7 +1,8 @@
-"""Ranks say no more than the intervals do."""
+"""Models are told apart where they differ for new animals and new stimuli, and no more often than stated."""
 
 from __future__ import annotations
 
+import doctest
 import math
 from dataclasses import replace
 
@@ -11,187 +12,112 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
 
-from brainbench.core.records import Interval
-from leaderboards.ranking import PAIRED_ANIMALS, rank, rank_ranges
-
-INTERVALS = st.lists(
-    st.tuples(st.floats(-1, 1), st.floats(0, 1), st.floats(0, 1)).map(
-        lambda drawn: (Interval(drawn[0], drawn[0] + drawn[1]), drawn[0] + drawn[1] * drawn[2])
-    ),
-    min_size=1,
-    max_size=12,
-)
+from brainbench.core.statistics import FEWEST_ANIMALS, FEWEST_STIMULI
+from leaderboards import ranking
+from leaderboards.ranking import Sample, compare, lacking, rank_ranges, told_apart
+from tests.factories.records import draw_board
 
 
-@given(INTERVALS)
-def test_ranges_equal_counting_every_pair(drawn):
-    intervals = [interval for interval, _ in drawn]
-    expected = [
-        (
-            1 + sum(other.low > interval.high for other in intervals),
-            len(intervals) - sum(other.high < interval.low for other in intervals),
-        )
-        for interval in intervals
-    ]
-    assert rank_ranges(intervals) == expected
+def _samples(truths, **design):
+    return [Sample.of([record.score]) for record in draw_board(truths, **design)]
 
 
-@given(INTERVALS)
-def test_if_the_truth_lies_in_every_interval_the_true_rank_lies_in_every_range(drawn):
-    truths = [truth for _, truth in drawn]
-    for (first, last), truth in zip(rank_ranges([interval for interval, _ in drawn]), truths, strict=True):
-        ahead = sum(other > truth for other in truths)
-        level = sum(other == truth for other in truths)
-        assert first <= ahead + level
-        assert last >= ahead + 1
-
-
-def test_separate_intervals_give_single_ranks_and_overlap_gives_shared_ones(make_record):
-    (board,) = rank([make_record("low", 0.1), make_record("a", 0.8), make_record("b", 0.75)])
-    assert [(row.record.score.name, row.rank) for row in board.rows] == [("a", "1–2"), ("b", "1–2"), ("low", "3")]
-
-
-def test_only_trustworthy_scores_are_ranked(make_record):
-    records = [
-        make_record("good", 0.4),
-        make_record("noisy", 0.9, status="unreliable"),
-        make_record("none", status="undefined"),
-        make_record("bare", 0.8, interval=None),
-        make_record("endless", 0.7, interval=Interval(math.nan, math.nan)),
-    ]
-    (board,) = rank(records)
-    assert [(row.record.score.name, row.rank, row.unranked_because) for row in board.rows] == [
-        ("good", "1", ""),
-        ("noisy", "–", "unreliable"),
-        ("bare", "–", "no interval"),
-        ("endless", "–", "no interval"),
-        ("none", "–", "undefined"),
-    ]
-
-
-@pytest.mark.parametrize(
-    "change",
-    [
-        {"recordings": {"source": "demo", "content_hash": "other"}},
-        {"stimuli": {"description": "rodgers", "content_hash": "other"}},
-        {"settings": {"time": "concatenate"}},
-    ],
-)
-def test_other_recordings_stimuli_or_time_rule_make_another_board(make_record, change):
-    here, there = make_record("a"), make_record("b")
-    there = replace(there, score=replace(there.score, provenance={**there.score.provenance, **change}))
-    assert [len(board.rows) for board in rank([here, there])] == [1, 1]
-
-
-def test_other_estimators_and_metrics_make_other_boards(make_record):
-    records = [make_record("a"), make_record("b", estimator="thesis"), make_record("c", metric="crossnobis")]
-    assert [len(board.rows) for board in rank(records)] == [1, 1, 1]
-
-
-def test_records_that_do_not_say_what_they_used_are_listed_without_a_rank(make_record):
-    (board,) = rank([make_record("a", provenance={}), make_record("b", provenance={})])
-    assert not board.comparable
-    assert {row.unranked_because for row in board.rows} == {"recordings not identified"}
-
-
-def test_features_computed_elsewhere_are_ranked_among_themselves_when_their_labels_agree(make_record):
-    here = make_record("simulated")
-    elsewhere = [make_record(name, value) for name, value in (("a", 0.2), ("b", 0.8))]
-    for i, record in enumerate(elsewhere):
-        known = {key: value for key, value in record.score.provenance.items() if key != "stimuli"}
-        elsewhere[i] = replace(record, score=replace(record.score, provenance=known))
-    boards = rank([here, *elsewhere])
-    assert [[(row.record.score.name, row.rank) for row in board.rows] for board in boards] == [
-        [("b", "1"), ("a", "2")],
-        [("simulated", "1")],
-    ]
-    renamed = make_record("c", stimuli=tuple("uvwxyz"), provenance=elsewhere[0].score.provenance)
-    assert len(rank([*elsewhere, renamed])) == 2
-
-
-@pytest.mark.parametrize(
-    ("source", "name"),
-    [
-        ("/home/me/.cache/brainbench/demo", "demo"),
-        ("C:\\data\\rodgers\\", "rodgers"),
-        (["a/1.nwb", "a/2.nwb", "a/3.nwb", "a/4.nwb"], "1.nwb, 2.nwb, 3.nwb and 1 more"),
-        (None, "unnamed recordings"),
-        ({"x": 1}, "{'x': 1}"),
-    ],
-)
-def test_boards_are_named_after_the_recordings_without_private_folders(make_record, source, name):
-    (board,) = rank([make_record(provenance={"recordings": {"source": source}})])
-    assert board.recordings == name
-
-
-def test_baselines_appear_once_and_disagreement_is_said(make_record, make_score):
-    records = [make_record(name) for name in "abc"]
-    (board,) = rank(records)
-    assert [(item.name, item.score.value, item.notes) for item in board.baselines] == [
-        ("animal-to-animal", 0.712, ()),
-        ("raw input", 0.223, ()),
-        ("random features", 0.487, ()),
-    ]
-    records[0] = replace(records[0], baselines={"raw input": make_score("raw input", 0.223 + 1e-15)})
-    assert not any(item.notes for item in rank(records)[0].baselines)
-    records[0] = replace(records[0], baselines={"raw input": make_score("raw input", 0.9)})
-    (board,) = rank(records)
-    (raw,) = [item for item in board.baselines if item.name == "raw input"]
-    assert raw.score.value == 0.223
-    assert raw.notes == (
-        "the records disagree: 2 different values from 0.223 to 0.900; shown is that of 2 of 3 records",
+@given(
+    st.integers(1, 8).flatmap(
+        lambda n: st.lists(st.lists(st.booleans(), min_size=n, max_size=n), min_size=n, max_size=n)
     )
-
-
-def test_a_model_scored_twice_is_pointed_out(make_record):
-    (board,) = rank([make_record("a", 0.5), make_record("a", 0.6), make_record("b", 0.4)])
-    assert [bool(row.notes) for row in board.rows] == [True, True, False]
-    assert "scored 2 times" in board.rows[0].notes[0]
-
-
-def _paired(values, chance=None):
-    """Rank models by the scores [model, animal] under intervals that all overlap."""
-    animals = [{f"animal-{i}": float(value) for i, value in enumerate(row)} for row in values]
-    return rank_ranges([Interval(0.0, 1.0)] * len(values), animals, chance)
-
-
-def test_models_that_share_animals_are_told_apart_by_their_paired_difference():
-    animal = np.random.default_rng(0).normal(0.5, 0.2, 11)
-    noise = np.random.default_rng(1).normal(0, 0.02, (3, 11))
-    assert _paired(animal + noise + np.array([[0.2], [0.1], [0.0]])) == [(1, 1), (2, 2), (3, 3)]
-
-
-def test_too_few_animals_leave_the_decision_to_the_intervals():
-    values = np.array([[0.9], [0.1]]) + np.linspace(0, 0.01, PAIRED_ANIMALS - 1)
-    assert _paired(values) == [(1, 2), (1, 2)]
-
-
-def test_paired_ranks_equal_scipys_tests_with_benjamini_and_hochberg():
-    rng = np.random.default_rng(2)
-    values = rng.normal(0, 0.1, (8, 9)) + np.linspace(0, 0.3, 8)[:, None]
-    pairs = [(i, j) for i in range(8) for j in range(i)]
-    p = stats.false_discovery_control([stats.ttest_rel(values[i], values[j]).pvalue for i, j in pairs], method="bh")
-    apart = {pair for pair, value in zip(pairs, p, strict=True) if value <= 0.05}
-    above = [sum(values[j].mean() > values[i].mean() for j in range(8) if {(i, j), (j, i)} & apart) for i in range(8)]
-    below = [sum(values[j].mean() < values[i].mean() for j in range(8) if {(i, j), (j, i)} & apart) for i in range(8)]
-    assert 0 < len(apart) < len(pairs)
-    assert _paired(values) == [(1 + a, 8 - b) for a, b in zip(above, below, strict=True)]
+)
+def test_a_range_counts_who_is_above_and_who_is_below(drawn):
+    above = np.array(drawn)
+    for i, (first, last) in enumerate(rank_ranges(above)):
+        assert first == 1 + sum(above[i])
+        assert last == len(above) - sum(above[:, i])
 
 
 def test_equal_models_are_rarely_told_apart():
-    rng = np.random.default_rng(3)
-    split = sum(_paired(rng.normal(0, 0.1, (6, 8))) != [(1, 6)] * 6 for _ in range(300))
-    assert split / 300 < 0.08
+    wrong = 0
+    for seed in range(200):
+        samples = _samples({f"m{i}": 0.5 for i in range(6)}, seed=seed)
+        wrong += told_apart(samples).any()
+    assert wrong / 200 <= 0.08  # 5 % of the boards, and chance of the simulation
 
 
-def test_the_chance_of_seeds_widens_the_ties():
-    animal = np.random.default_rng(0).normal(0.5, 0.2, 11)
-    noise = np.random.default_rng(1).normal(0, 0.02, (2, 11))
-    values = animal + noise + np.array([[0.1], [0.0]])
-    assert _paired(values) == [(1, 1), (2, 2)]
-    assert _paired(values, [0.01, 0.01]) == [(1, 2), (1, 2)]
+def test_variance_over_animals_alone_would_tell_equal_models_apart():
+    p = []
+    for seed in range(100):
+        one, other = _samples({"a": 0.5, "b": 0.5}, seed=seed)
+        p.append(stats.ttest_rel(list(one.animals.values()), list(other.animals.values())).pvalue)
+    assert np.mean(np.array(p) <= 0.05) > 0.15
 
 
-def test_the_rule_that_was_used_is_said(make_record):
-    (board,) = rank([make_record("a"), make_record("b")])
-    assert board.ties.startswith("Models whose intervals overlap are tied")
+def test_a_better_model_is_found_with_forty_stimuli():
+    found = [told_apart(_samples({"good": 0.9, "weak": 0.4}, seed=seed))[1, 0] for seed in range(100)]
+    assert np.mean(found) >= 0.8
+
+
+def test_the_test_is_the_two_factor_t_test():
+    one, other = (record.score for record in draw_board({"a": 0.8, "b": 0.4}))
+    found = compare(one, other)
+    animals = np.array([a.value - b.value for a, b in zip(one.subjects, other.subjects, strict=True)])
+    left_out = np.array(one.without_stimulus) - np.array(other.without_stimulus)
+    size, count = len(animals), len(left_out)
+    over_animals = animals.var(ddof=1) / size
+    over_stimuli = (count - 1) / count * ((left_out - left_out.mean()) ** 2).sum()
+    freedom = (over_animals + over_stimuli) ** 2 / (over_animals**2 / (size - 1) + over_stimuli**2 / (count - 1))
+    error = math.sqrt(over_animals + over_stimuli)
+    assert found.difference == pytest.approx(animals.mean())
+    assert found.p == pytest.approx(2 * stats.t.sf(abs(animals.mean()) / error, freedom))
+    assert found.interval.high - found.difference == pytest.approx(error * stats.t.ppf(0.975, freedom))
+
+
+def test_metrics_with_another_chance_are_compared_on_the_common_scale():
+    plain = [record.score for record in draw_board({"a": 0.8, "b": 0.4})]
+    lifted = [record.score for record in draw_board({"a": 0.8, "b": 0.4}, chance=0.6)]
+    assert lifted[0].value == pytest.approx(0.6 + 0.4 * plain[0].value)
+    assert compare(*lifted).difference == pytest.approx(compare(*plain).difference)
+    assert compare(*lifted).p == pytest.approx(compare(*plain).p)
+
+
+@pytest.mark.parametrize("design", [{"animals": FEWEST_ANIMALS - 1}, {"stimuli": FEWEST_STIMULI - 1}])
+def test_too_few_animals_or_stimuli_are_not_tested(design):
+    records = draw_board({"a": 0.9, "b": 0.1}, **design)
+    assert compare(*(record.score for record in records)) is None
+    assert not told_apart([Sample.of([record.score]) for record in records]).any()
+
+
+def test_what_a_design_lacks_is_said():
+    assert lacking(10, 40) == ""
+    assert lacking(3, 40) == f"at least {FEWEST_ANIMALS} animals (here 3)"
+    assert "and" in lacking(1, 2)
+
+
+def test_a_model_does_not_differ_from_itself():
+    (record,) = draw_board({"a": 0.8})
+    found = compare(record.score, record.score)
+    assert (found.difference, found.p) == (0.0, 1.0)
+
+
+def test_the_variance_of_seeds_widens_intervals_and_ties():
+    one, other = (record.score for record in draw_board({"a": 0.9, "b": 0.5}, spread=0.05))
+    assert told_apart([Sample.of([one]), Sample.of([other])])[1, 0]
+
+    def shifted(score, by):
+        subjects = tuple(replace(item, value=item.value + by) for item in score.subjects)
+        left_out = tuple(value + by for value in score.without_stimulus)
+        return replace(score, value=score.value + by, subjects=subjects, without_stimulus=left_out)
+
+    seeds = [Sample.of([shifted(score, by) for by in (-0.5, 0.0, 0.5)]) for score in (one, other)]
+    assert seeds[0].value == pytest.approx(one.value)
+    assert seeds[0].seed_variance == (pytest.approx(0.25 / 3), 2)
+    assert not told_apart(seeds).any()
+    narrow, wide = Sample.of([one]).interval, seeds[0].interval
+    assert wide.high - wide.low > narrow.high - narrow.low
+
+
+def test_nothing_to_rank_is_no_error():
+    assert told_apart([]).shape == (0, 0)
+    assert rank_ranges(np.zeros((0, 0), bool)) == []
+
+
+def test_the_examples_hold():
+    assert doctest.testmod(ranking).failed == 0

@@ -1,15 +1,12 @@
-"""What pages say of a model: how to load it, how it was trained."""
+"""Pages say how to get a model and how it was trained."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 
-import numpy as np
-
-from brainbench.core.records import Interval, SubjectScore
+from brainbench.core.records import Interval
 from leaderboards import build_leaderboard
 from leaderboards import text as words
-from leaderboards.ranking import comparisons
 from tests.factories.html_page import Page
 
 
@@ -18,23 +15,25 @@ def _with(record, name="net", **changes):
     return replace(record, score=replace(record.score, name=name), card=card)
 
 
-def test_the_lines_that_load_a_model_run_for_every_kind(make_record):
+def test_every_repeatable_model_says_how_to_get_it(make_record):
     import torch
 
-    twin = _with(make_record(), "s4-small", objective="untrained", seed=3, family="s4")
-    lines = words.loading(twin)
-    assert len(lines.splitlines()) == 3
-    made: dict[str, torch.nn.Module] = {}
-    exec(lines, made)
     from brainbench import load_model
 
-    for one, other in zip(made["model"].parameters(), load_model("s4-small", seed=3).parameters(), strict=True):
+    twin = _with(make_record(), "s4-small", objective="untrained", seed=3, family="s4")
+    command, python = words.ways_to_get(twin)
+    assert command == "brainbench score s4-small --weights-seed 3"
+    made = eval(python, {"brainbench": __import__("brainbench")})
+    for one, other in zip(made.parameters(), load_model("s4-small", seed=3).parameters(), strict=True):
         assert torch.equal(one, other)
     trained = _with(make_record(), "s4-small.simclr", objective="simclr", family="s4", seed=1)
-    assert "load_model('s4-small.simclr')" in words.loading(trained)
-    own = _with(make_record(), "a.py:Mine", family="user module", seed=0)
-    assert "load_user_model('a.py:Mine', seed=0)" in words.loading(own)
-    assert "names no model to load" in words.loading(_with(make_record(), family="features computed elsewhere"))
+    assert words.ways_to_get(trained) == [
+        "brainbench score s4-small.simclr",
+        'brainbench.load_model("s4-small.simclr")',
+    ]
+    for family in ("user module", "features computed elsewhere", "policy"):
+        assert words.ways_to_get(_with(make_record(), family=family)) == []
+    assert words.ways_to_get(_with(make_record(), "local-dir:mine.simclr")) == []
 
 
 def test_a_trained_models_page_shows_accuracy_and_training(make_record, tmp_path):
@@ -81,27 +80,3 @@ def test_statistics_of_the_provenance_are_rounded_and_what_a_table_shows_is_not_
     assert rows["statistics: bootstrap"] == "draws: 1000, interval: low: -0.47, high: 0.8, spread: 0.333"
     assert rows["settings: bin"] == "0.0123456"
     assert "statistics: layer tests" not in rows
-
-
-def _on(score, values):
-    return replace(score, subjects=tuple(SubjectScore(f"m{i}", v, v, 0.9, "ok", 9, 9) for i, v in enumerate(values)))
-
-
-def test_five_animals_tell_apart_what_overlapping_intervals_do_not(make_record):
-    from scipy.stats import ttest_rel
-
-    record = make_record()
-    brain, mine = [0.3, 0.4, 0.5, 0.6, 0.7], [0.36, 0.47, 0.55, 0.68, 0.75]
-    raw, random = record.baselines["raw input"], record.baselines["random features"]
-    record = replace(
-        record,
-        score=_on(record.score, mine),
-        baselines={"raw input": _on(raw, brain), "random features": _on(random, mine[:4])},
-    )
-    interval = ttest_rel(mine, brain).confidence_interval(0.95)
-    above, overlap, *_ = comparisons(record)
-    assert above == (
-        f"Above raw input (0.223): difference {np.mean(np.subtract(mine, brain)):.3f} "
-        f"[{interval.low:.3f}, {interval.high:.3f}], paired over 5 animals."
-    )
-    assert overlap.startswith("Not told apart from random features (0.487): the intervals overlap")

@@ -9,8 +9,8 @@ import pytest
 from scipy import stats
 
 from brainbench.core.errors import UsageError
-from brainbench.metrics import compare, noise_corrected
-from brainbench.metrics.animal_to_animal import pairwise_consistency, score_animals
+from brainbench.metrics import compare
+from brainbench.metrics.measures.rsa import score_animals
 from brainbench.metrics.rdms.pairs import permuted_pairs
 from brainbench.metrics.reliability.noise_correction import spearman_brown
 from brainbench.metrics.reliability.subject_rdm import subject_rdm
@@ -113,20 +113,3 @@ def test_misuse_is_told_in_a_sentence():
         score_animals([])
     with pytest.raises(UsageError, match="6 stimuli; received 2 names"):
         score_animals(_make_animals(2), stimuli=["a", "b"])
-
-
-def test_every_two_animals_are_compared_with_both_sides_corrected():
-    rng = np.random.default_rng(20)
-    shared = make_rdm(rng)
-    animals = [make_subject(f"m{i}", shared + 0.05 * rng.normal(size=15), seed=i) for i in range(3)]
-    names, found = pairwise_consistency(animals[::-1])
-    assert names == ("m0", "m1", "m2")
-    expected = noise_corrected(
-        float(compare(animals[0].rdm, animals[2].rdm)),
-        animals[0].split_half_r,
-        other_split_half_r=animals[2].split_half_r,
-    )
-    assert found[0, 2] == found[2, 0] == pytest.approx(expected.value)
-    assert np.isnan(np.diag(found)).all()
-    with pytest.raises(UsageError, match="no animals"):
-        pairwise_consistency([])

@@ -9,10 +9,10 @@ import torch
 from brainbench.core.errors import DataError, UsageError
 from brainbench.metrics import compare_models, noise_precision, permutation_test, rdm
 from brainbench.metrics.inference.multiple import layer_tests
+from brainbench.metrics.measures.rsa import score_rdms
 from brainbench.metrics.rdms.comparison import COMPARISONS
 from brainbench.metrics.rdms.dissimilarity import RDM_METHODS, rdm_movie, rdm_problem
 from brainbench.metrics.rdms.noise import NOISE_METHODS
-from brainbench.metrics.score import score_rdms
 from tests.factories.animals import STIMULI, make_rdm, make_subject
 
 DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.gpu)]

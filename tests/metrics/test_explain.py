@@ -19,7 +19,7 @@ from brainbench.metrics.explain import (
     explain_score,
     explain_splits,
 )
-from brainbench.metrics.score import score_rdms
+from brainbench.metrics.measures.rsa import score_rdms
 from tests.factories.animals import STIMULI, make_rdm, make_subject
 
 

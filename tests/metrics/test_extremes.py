@@ -12,10 +12,9 @@ import pytest
 from brainbench.core.errors import DataError
 from brainbench.core.trials import Trials
 from brainbench.metrics import compare, noise_corrected, rdm
-from brainbench.metrics.animal_to_animal import score_animals
+from brainbench.metrics.measures.rsa import score_animals, score_rdms
 from brainbench.metrics.rdms.dissimilarity import rdm_problem
 from brainbench.metrics.reliability.subject_rdm import subject_rdm
-from brainbench.metrics.score import score_rdms
 from tests.factories.animals import STIMULI, make_block, make_latent, make_rdm, make_subject
 
 LABELS = np.repeat(np.arange(6), 8)

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from brainbench.metrics.layers import choose_on_halves, choose_on_others, first_best, held_out, most_chosen
-from brainbench.metrics.score import score_rdms
+from brainbench.metrics.layers import HALVES, choose_on_others, first_best, held_out, most_chosen
+from brainbench.metrics.measures.rsa import score_rdms
 from tests.factories.animals import STIMULI, make_rdm, make_subject
 
 
@@ -24,10 +24,10 @@ def test_permutations_are_chosen_one_by_one():
 
 
 def test_what_is_chosen_on_one_half_is_evaluated_on_the_other():
-    first, second = np.array([[0.9, 0.1], [0.2, 0.8]]), np.array([[0.3, 0.7], [0.6, 0.5]])
-    chosen, held = choose_on_halves(first, second)
-    assert chosen.tolist() == [0, 1, 1, 0]
-    assert held.tolist() == [0.3, 0.5, 0.2, 0.1]
+    # Two splits of two halves each, side by side.
+    r = np.array([[0.9, 0.3, 0.1, 0.7], [0.2, 0.6, 0.8, 0.5]])
+    assert HALVES.choose(r).tolist() == [1, 0, 0, 1]
+    assert HALVES.held(r).tolist() == [0.2, 0.3, 0.1, 0.5]
 
 
 def test_ties_go_to_the_first_layer_even_when_rounding_differs():

@@ -1,5 +1,12 @@
 import numpy as np
+import pytest
 
+from brainbench import score
+from brainbench.core.errors import DataError, UsageError
+from brainbench.datasets import write_recordings
+from brainbench.datasets.sessions import make_session
+from brainbench.datasets.synthetic import PopulationDesign, ResponseGeometry, as_recordings
+from brainbench.models.features import write_features
 from brainbench.scoring.neural_responses import without_time
 
 
@@ -7,3 +14,85 @@ def test_the_time_rule_averages_only_what_was_recorded():
     responses = np.array([[[1.0, np.nan], [3.0, np.nan]], [[np.nan, 4.0], [5.0, 8.0]]])
     np.testing.assert_array_equal(without_time(responses, "mean"), [[2.0, np.nan], [5.0, 6.0]])
     assert without_time(responses, "concatenate").shape == (2, 4)
+
+
+# Recordings that are too little, or not what they should be: a status with its reason, or one sentence.
+
+
+@pytest.fixture
+def features(tmp_path):
+    def write(count=12):
+        random = np.random.default_rng(1)
+        layers = {"one": random.normal(size=(count, 20)), "two": random.normal(size=(count, 9))}
+        return write_features(tmp_path / "features.h5", [f"s{index + 1}" for index in range(count)], layers)
+
+    return write
+
+
+def make_recordings(stimuli=12, **changes):
+    geometry = ResponseGeometry.from_activations(np.random.default_rng(0).normal(size=(stimuli, 20)))
+    design = {"animals": 3, "units": 20, "trials": (6, 8), "modulation": 0.4, "emphasis": 0.0}
+    return as_recordings(geometry, PopulationDesign(**{**design, **changes}))
+
+
+def with_counts(change, where=None):
+    """Recordings whose counts are ``change``, everywhere or in the trials of one stimulus."""
+    dataset = make_recordings().copy(deep=True)
+    counts = dataset["counts"].values
+    chosen = np.ones(len(counts), bool) if where is None else dataset["stimulus"].values == where
+    counts[chosen] = np.where(np.isnan(counts[chosen]), np.nan, change)
+    return dataset
+
+
+def test_one_animal_has_a_score_without_an_interval_over_animals(features):
+    found = score(features(), recordings=make_recordings(animals=1))
+    assert found.interval is None
+    assert [item.subject for item in found.subjects] == ["synthetic01"]
+
+
+def test_two_stimuli_have_no_score(features):
+    found = score(features(2), recordings=make_recordings(2))
+    assert found.status == "undefined"
+    assert any("2 stimuli" in reason for reason in found.reasons)
+
+
+def test_an_animal_without_a_stimulus_is_named_and_the_others_are_scored(features):
+    found = score(features(), recordings=make_recordings(missing=((1, 3),)))
+    assert found.status != "undefined"
+    animal = {item.subject: item for item in found.subjects}["synthetic02"]
+    assert animal.status == "undefined" or np.isfinite(animal.value)
+    assert any("synthetic02" in reason for reason in found.reasons) == (animal.status == "undefined")
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda: with_counts(0.0, where="s4"),
+        lambda: with_counts(3.0),
+        lambda: make_recordings(units=1),
+        lambda: make_recordings(trials=1),
+    ],
+    ids=["silent stimulus", "all trials equal", "one unit", "one trial of each"],
+)
+@pytest.mark.filterwarnings("error")
+def test_recordings_that_hold_too_little_get_a_status_with_its_reason(features, make):
+    found = score(features(), recordings=make())
+    assert found.status in ("ok", "unreliable", "undefined")
+    assert np.isfinite(found.value) == (found.status != "undefined")
+    assert found.reasons or found.status == "ok"
+
+
+def _session(folder, **columns):
+    begin = np.arange(0.0, 60.0)
+    spikes = [np.sort(np.random.default_rng(unit).uniform(0, 60, 200)) for unit in range(4)]
+    tables = {"trials": {"start_time": begin, "stop_time": begin + 0.5, **columns}}
+    return write_recordings(folder / "a.h5", make_session("m1", "1", spikes, tables))
+
+
+def test_recordings_without_labels_say_what_is_there(features, tmp_path):
+    with pytest.raises(DataError, match="'trials'"):
+        score(features(), recordings=_session(tmp_path))
+    with pytest.raises(UsageError, match="'trials:thing'"):
+        score(features(), recordings=_session(tmp_path, thing=np.tile(["a", "b", "c"], 20)))
+    with pytest.raises(DataError, match="stimulus"):
+        score(features(), recordings=_session(tmp_path, stimulus=np.array([""] * 60)), conditions="trials:stimulus")

@@ -1,9 +1,9 @@
-"""``brainbench leaderboard``: add, check and compare result records; build the site, reports, and serve it."""
+"""``brainbench leaderboard``: add, check and compare result records, hold recordings back, build sites and reports."""
 
 import typer
 
-from brainbench.cli.leaderboard import records, site
+from brainbench.cli.leaderboard import held_out, records, site
 
 app = typer.Typer(no_args_is_help=True, help="Collect result records, check them, and show them as a leaderboard.")
-for _command in (records.add, records.verify, site.diff, site.build, site.report, site.serve):
-    app.command(_command.__name__)(_command)
+for _command in (records.add, records.verify, held_out.hold_out, site.diff, site.build, site.report):
+    app.command(_command.__name__.replace("_", "-"))(_command)

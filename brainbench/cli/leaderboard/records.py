@@ -177,11 +177,20 @@ def verify(
         bool, typer.Option("--score/--no-score", help="Score the model again and compare; else only read the files.")
     ] = True,
     tolerance: Annotated[float, typer.Option(help="Numbers that differ by no more are equal.")] = 1e-3,
+    trust_code: Annotated[
+        bool, typer.Option("--trust-code", help="Also run code and weights that do not come with this package.")
+    ] = False,
+    held_out: Annotated[
+        Path | None, typer.Option("--held-out", help="Published commitment; also score on what it holds back.")
+    ] = None,
+    secret: Annotated[Path, typer.Option(help="Folder of the held-out recordings.")] = Path("held-out-secret"),
     as_json: JsonOption = False,
 ) -> None:
     """Check records: the file against its hash, the records against one another, the numbers against a repetition.
 
-    Exit status 1 if a file was edited or a repetition gives something else; what differs is printed.
+    Only models of the registry and weights that come with the package are repeated: code that a record names could do
+    anything, and could read the answer. Exit status 1 if a file was edited, a repetition gives something else or
+    cannot be made; what differs is printed.
     """
     from leaderboards.audit import remarks
     from leaderboards.store import read_records
@@ -196,20 +205,34 @@ def verify(
             if item.record is not None:
                 result |= {"verdict": "intact", "doubts": doubts.get(item.record.identity, ())}
                 if score:
-                    result |= _repeat(item.record, recordings, tolerance)
+                    result |= _repeat(item.record, recordings, tolerance, trust_code=trust_code)
+                if held_out is not None and result["verdict"] in ("intact", "confirmed"):
+                    result |= _on_held_out(item.record, held_out, secret, trust_code=trust_code)
             results.append(result)
     emit(results, "\n".join(_verdict(result) for result in results), as_json=as_json)
     if any(result["verdict"] in ("refused", "differs", "not repeated") for result in results):
         raise typer.Exit(1)
 
 
-def _repeat(record: Any, recordings: str | None, tolerance: float) -> dict[str, Any]:
+def _on_held_out(record: Any, held_out: Path, secret: Path, *, trust_code: bool) -> dict[str, Any]:
+    from brainbench.cli.leaderboard.held_out import score_held_out
+    from brainbench.cli.leaderboard.scoring import refuse_foreign_code
+    from brainbench.core.errors import UsageError
+
+    try:
+        refuse_foreign_code(record, trusted=trust_code)
+    except UsageError as error:
+        return {"verdict": "not repeated", "problem": str(error)}
+    return score_held_out(record, held_out, secret)
+
+
+def _repeat(record: Any, recordings: str | None, tolerance: float, *, trust_code: bool) -> dict[str, Any]:
     from brainbench.cli.leaderboard.scoring import score_again
     from brainbench.core.errors import BrainbenchError
     from leaderboards.changes import differences
 
     try:
-        again = score_again(record, recordings=recordings)
+        again = score_again(record, recordings=recordings, trust_code=trust_code)
     except BrainbenchError as error:
         return {"verdict": "not repeated", "problem": str(error)}
     found = differences(record, again, tolerance=tolerance)
@@ -226,6 +249,10 @@ def _verdict(result: dict[str, Any]) -> str:
     }
     lines = [f"{result['record']}\n  {words[result['verdict']]}"]
     lines += [f"  {doubt}" for doubt in result.get("doubts", ())]
+    if held := result.get("held_out"):
+        columns = {name: f"{{0[{name}]}}" for name in ("score", "low", "high", "standing")}
+        rows = [{"on": "public part", **result["on_public"]}, {"on": f"held-out {held}", **result["on_held_out"]}]
+        lines.append(table_of("", rows, {"on": "{0[on]}", **columns}))
     if found := result.get("differences"):
         columns = {
             "what": "{0.what}",

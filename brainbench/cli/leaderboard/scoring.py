@@ -40,19 +40,25 @@ def jobs_of(patterns: Sequence[str], seeds: Sequence[int], options: dict[str, An
 
 
 def score_again(
-    record: ResultRecord, *, recordings: str | None = None, progress: Progress | None = None
+    record: ResultRecord,
+    *,
+    recordings: str | None = None,
+    trust_code: bool = False,
+    progress: Progress | None = None,
 ) -> ResultRecord:
     """Repeat a record's computation from its provenance.
 
     Args:
         record: The record.
-        recordings: Where its recordings are; only ``demo`` is found without, since records keep no folders.
+        recordings: Where its recordings are; only demo recordings are found without, since records keep no folders.
+        trust_code: Also run code and weights that do not come with this package.
         progress: Called with (done, total, what).
 
     Raises:
         DataError: the record does not say enough.
-        UsageError: the recordings are not given, or differ in their labels.
+        UsageError: the recordings are not given, or differ in their labels; or the record names foreign code.
     """
+    from brainbench.scoring.demo import DEMOS
     from brainbench.scoring.scores import score_record
 
     origin = record.score.provenance
@@ -62,11 +68,32 @@ def score_again(
             f"The record of {record.score.name!r} does not name a model that can be loaded (a module in memory or a "
             "record of an earlier layout); score the model again."
         )
-    if recordings is None and source != "demo":
+    refuse_foreign_code(record, trusted=trust_code)
+    if recordings is None and source not in DEMOS:
         raise UsageError(f"The record was made with the recordings {source!r}; give them with --recordings PATH.")
     match = origin.pairs if any(label != partner for label, partner in origin.pairs.items()) else None
-    options = ScoreOptions.stated_in(origin.settings, recordings=recordings or "demo", match=match)
+    options = ScoreOptions.stated_in(origin.settings, recordings=recordings or source, match=match)
     return score_record(model, options, progress=progress)
+
+
+def refuse_foreign_code(record: ResultRecord, *, trusted: bool) -> None:
+    """Refuse to run what a record names unless it is in the registry or comes with the package.
+
+    Raises:
+        UsageError: model or metric of the record are something else, and not ``trusted``.
+    """
+    from brainbench.metrics import list_metrics
+    from brainbench.models.registry import list_models
+    from brainbench.models.training.checkpoints import shipped
+
+    settings = record.score.provenance.settings
+    known = {"model": {*list_models(), *shipped()}, "metric": {*list_metrics()}}
+    for what, names in known.items():
+        if not trusted and settings.get(what) not in names:
+            raise UsageError(
+                f"The {what} {settings.get(what)!r} of the record is not in the registry and does not come with this "
+                "package; read its code, then run it with --trust-code."
+            )
 
 
 def find_models(patterns: Sequence[str]) -> list[str]:
@@ -109,10 +136,11 @@ def missing(jobs: Sequence[ScoringJob], records: Iterable[ResultRecord]) -> list
     from brainbench.stimuli import load_stimuli
 
     options = jobs[0].options
-    brain = open_neural_responses(options.recordings, progress=None, **options.selection).origin["content_hash"]
-    shown = load_stimuli(options.stimuli or DEFAULT_STIMULI, whiskers=options.whiskers, fidelity=options.fidelity)
+    brain = open_neural_responses(options.recordings, progress=None, **options.selection)
+    source = options.stimuli or brain.stimuli or DEFAULT_STIMULI
+    shown = load_stimuli(source, whiskers=options.whiskers, fidelity=options.fidelity)
     names = ("metric", "estimator", "time", "weights_seed", "estimator_version")
-    common = (__version__, brain, shown.config_hash or shown.content_hash)
+    common = (__version__, brain.origin["content_hash"], shown.config_hash or shown.content_hash)
     known = set()
     for record in records:
         origin = record.score.provenance

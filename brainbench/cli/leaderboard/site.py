@@ -1,10 +1,8 @@
-"""``brainbench leaderboard build | report | serve | diff``: what people read of a folder of records."""
+"""``brainbench leaderboard build | report | diff``: what people read of a folder of records."""
 
 from __future__ import annotations
 
-import contextlib
-import sys
-import tempfile
+import webbrowser
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -22,6 +20,7 @@ def build(
     ] = None,
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder of the site.")] = Path("leaderboard"),
     title: Annotated[str, typer.Option(help="Title of the page.")] = "Which networks process touch like a brain?",
+    show: Annotated[bool, typer.Option("--open", help="Open the site in a browser.")] = False,
     as_json: JsonOption = False,
 ) -> None:
     """Write the static site of a leaderboard: a folder of pages that need no server and no network."""
@@ -38,6 +37,8 @@ def build(
     text = f"{page}  ({len(good)} records, {len(bad)} with problems)"
     text += "".join(f"\n  {item['path']}: {item['problem']}" for item in bad)
     emit({"page": page, "records": len(good), "problems": bad}, text, as_json=as_json)
+    if show and not webbrowser.open(page.resolve().as_uri()):
+        typer.echo("No browser could be opened here; open the file above.", err=True)
 
 
 def report(
@@ -61,33 +62,6 @@ def report(
     problems = _problems(stored)
     text = "\n".join([*map(str, files), *(f"  left out: {item['path']}: {item['problem']}" for item in problems)])
     emit({"files": files, "problems": problems}, text, as_json=as_json)
-
-
-def serve(
-    source: Annotated[Path, typer.Argument(help="A built site, or a folder of records to build one from.")] = RECORDS,
-    host: Annotated[str, typer.Option(help="Address to listen on; the default is seen by this machine alone.")] = (
-        "127.0.0.1"
-    ),
-    port: Annotated[int, typer.Option(help="Port; 0 takes a free one.")] = 8000,
-    as_json: JsonOption = False,
-) -> None:
-    """Serve a leaderboard for local reading, without writing anything; stop it with Ctrl-C."""
-    from leaderboards.site.build import build_leaderboard
-    from leaderboards.site.serve import LOOPBACK, make_server
-    from leaderboards.store import read_records
-
-    _require(source)
-    with tempfile.TemporaryDirectory() as folder:
-        built = (source / "index.html").is_file() and (source / "data").is_dir()
-        site = source if built else build_leaderboard(read_records(source), Path(folder) / "site").parent
-        server = make_server(site, host=host, port=port)
-        shown = f"[{host}]" if ":" in host else host
-        address = f"http://{shown}:{server.server_address[1]}/"
-        everyone = "" if host in LOOPBACK else "\nOther machines can read this."
-        emit({"address": address, "site": site}, f"{address}  (Ctrl-C ends){everyone}", as_json=as_json)
-        sys.stdout.flush()
-        with server, contextlib.suppress(KeyboardInterrupt):
-            server.serve_forever()
 
 
 def diff(

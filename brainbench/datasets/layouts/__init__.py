@@ -3,7 +3,7 @@
 A session is matched by the columns of its trials (``registry``) and then adapted by its layout, before it is counted.
 """
 
-from brainbench.datasets.layouts import area2_bump, hires, rodgers, yu
+from brainbench.datasets.layouts import area2_bump, hires, rodgers, synthetic, yu
 from brainbench.datasets.layouts.registry import register_layout
 
 for _layout in (
@@ -13,5 +13,6 @@ for _layout in (
     yu.LAYOUT,
     hires.LAYOUT,
     area2_bump.LAYOUT,
+    synthetic.LAYOUT,
 ):
     register_layout(_layout)

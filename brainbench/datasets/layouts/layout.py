@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
 
 from brainbench.datasets.sessions import Session
@@ -38,15 +38,21 @@ class RecordingLayout:
     """Number on the DANDI archive."""
     assets: str = ""
     """Glob of the archive's files that hold units; all of them if empty."""
+    stimuli: str = ""
+    """Recipe of the stimuli that the animals felt, if there is one."""
+    synthetic: bool = False
+    """Layout of files that a program made; no others are recognised by it."""
 
     def matches(self, session: Session) -> bool:
         """Return whether a session's condition table has the columns of this data set."""
         table = session.tables.get(self.conditions.table)
-        return bool(self.columns) and table is not None and all(column in table for column in self.columns)
+        known = table is not None and all(column in table for column in self.columns)
+        return bool(self.columns) and known and (session.synthetic or not self.synthetic)
 
     def adapted(self, session: Session) -> Session:
         """Return the session with the units and tables that this data set stores in its own way."""
-        return session if self.adapt is None else self.adapt(session)
+        named = session if session.stimuli else replace(session, stimuli=self.stimuli)
+        return named if self.adapt is None else self.adapt(named)
 
     def vocabulary(self, conditions: Conditions) -> tuple[str, ...] | None:
         """Return the fixed labels, or None if a column's values are not declared here."""

@@ -101,6 +101,7 @@ LAYOUT = RecordingLayout(
     adapt=adapt,
     dandiset="000231",
     assets="*ecephys*",
+    stimuli="rodgers",
 )
 DISCRIMINATION = replace(
     LAYOUT,

@@ -13,9 +13,9 @@ from brainbench.core.lazy import lazy_exports
 
 if TYPE_CHECKING:
     from brainbench.datasets.synthetic.animals import FAULTS, SyntheticAnimal, calibrate, measure_ceiling, simulate
-    from brainbench.datasets.synthetic.demo import ensure_demo, make_demo
     from brainbench.datasets.synthetic.geometry import ResponseGeometry
     from brainbench.datasets.synthetic.populations import PopulationDesign, draw_animals, stimulus_means
+    from brainbench.datasets.synthetic.rodgers_demo import ensure_rodgers_demo, make_rodgers_demo
     from brainbench.datasets.synthetic.sessions import as_recordings, make_sessions, write_files
     from brainbench.datasets.synthetic.truth import read_truth
 
@@ -27,8 +27,8 @@ __all__ = [
     "as_recordings",
     "calibrate",
     "draw_animals",
-    "ensure_demo",
-    "make_demo",
+    "ensure_rodgers_demo",
+    "make_rodgers_demo",
     "make_sessions",
     "measure_ceiling",
     "read_truth",
@@ -39,7 +39,7 @@ __all__ = [
 
 _MODULES = {
     ".animals": ("FAULTS", "SyntheticAnimal", "calibrate", "measure_ceiling", "simulate"),
-    ".demo": ("ensure_demo", "make_demo"),
+    ".rodgers_demo": ("ensure_rodgers_demo", "make_rodgers_demo"),
     ".populations": ("PopulationDesign", "draw_animals", "stimulus_means"),
     ".geometry": ("ResponseGeometry",),
     ".sessions": ("as_recordings", "make_sessions", "write_files"),

@@ -48,7 +48,7 @@ class PopulationDesign:
     """Standard deviation of a unit's rate over stimuli, as a share of its mean; 0 is the null."""
     individual: float = 0.0
     """Share of the tuning variance that is an animal's own and not the shared geometry."""
-    emphasis: float = 0.5
+    emphasis: float = 0.3
     """Standard deviation over animals of the logarithm of the weight of each axis of the geometry."""
     spread: float = 0.4
     """Standard deviation of the logarithm of mean rates over units."""
@@ -164,6 +164,32 @@ def _draw_session(
     # One stream for each animal and each session: a larger design begins with the animals of a smaller one.
     own = np.random.default_rng([*seed, animal])
     random = np.random.default_rng([*seed, animal, session])
+    expected = expected_rates(geometry, design, own, random)
+    labels = _labels(design, stimuli, absent, random)
+    counts = draw_counts(random, design, expected[labels], design.window)
+    return DrawnSession(
+        subject=f"synthetic{animal + 1:02d}",
+        session=f"{session + 1:02d}",
+        stream=(*seed, animal, session),
+        counts=counts,
+        labels=labels,
+        expected=expected,
+        window=design.window,
+    )
+
+
+def expected_rates(
+    geometry: ResponseGeometry, design: PopulationDesign, own: np.random.Generator, random: np.random.Generator
+) -> NDArray[np.float64]:
+    """Draw units and return their expected rates [K, U], Hz.
+
+    Args:
+        geometry: what all animals share.
+        design: number of units, rates, modulation and individual differences.
+        own: stream of the animal, fresh: all of its sessions draw the same differences from it.
+        random: stream of the session.
+    """
+    stimuli = len(geometry.labels)
     # Variances add up to one: 1 − ι of the shared geometry and ι of the animal's own.
     # Log-normal weights of the axes; their mean square is one, so that the depth of tuning does not depend on them.
     weight = np.exp(design.emphasis * own.standard_normal(geometry.directions.shape[1]))
@@ -178,28 +204,27 @@ def _draw_session(
     mean = design.rate * np.exp(design.spread * random.standard_normal(design.units) - design.spread**2 / 2)
     mean *= np.exp(design.session_gain * random.standard_normal())
     # Rectified-linear rates b max(0, 1 + m w·x): their covariance over units follows the cosines of the geometry.
-    expected = mean * np.maximum(0.0, 1.0 + design.modulation * tuning)
-    labels = _labels(design, stimuli, absent, random)
+    return mean * np.maximum(0.0, 1.0 + design.modulation * tuning)
+
+
+def draw_counts(
+    random: np.random.Generator,
+    design: PopulationDesign,
+    rates: NDArray[np.float64],
+    window: float | NDArray[np.float64],
+) -> NDArray[np.int64]:
+    """Draw spike counts [R, U] around expected rates [R, U] (Hz) in windows of one length or one each [R, 1], s."""
     # Drift is linear from the first trial to the last, with a mean of one.
-    gain = np.linspace(1 - design.drift / 2, 1 + design.drift / 2, len(labels))[:, None]
+    gain = np.linspace(1 - design.drift / 2, 1 + design.drift / 2, len(rates))[:, None]
     if design.shared_gain:
         # A gamma with shape 1/σ² and scale σ² has mean one and standard deviation σ.
         shape = design.shared_gain**-2
-        gain = gain * random.gamma(shape, 1 / shape, (len(labels), 1))
-    rates = expected[labels] * gain
+        gain = gain * random.gamma(shape, 1 / shape, (len(rates), 1))
+    rates = rates * gain
     if design.dispersion:
         # A Poisson count with a gamma rate is negative binomial: variance = mean + φ mean².
         rates *= random.gamma(1 / design.dispersion, design.dispersion, rates.shape)
-    counts = random.poisson(rates * design.window)
-    return DrawnSession(
-        subject=f"synthetic{animal + 1:02d}",
-        session=f"{session + 1:02d}",
-        stream=(*seed, animal, session),
-        counts=counts,
-        labels=labels,
-        expected=expected,
-        window=design.window,
-    )
+    return random.poisson(rates * window)
 
 
 def stimulus_means(block: Trials, stimuli: int) -> NDArray[np.float64]:

@@ -6,7 +6,8 @@ All three hold the same counts as ``simulate`` with the same seed.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,12 +15,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brainbench.core.errors import unknown_name
+from brainbench.core.progress import Progress
 from brainbench.datasets.hdf5 import write_recordings
-from brainbench.datasets.nwb_writer import write_nwb
 from brainbench.datasets.sessions import Session, make_session
 from brainbench.datasets.synthetic.geometry import ResponseGeometry
 from brainbench.datasets.synthetic.populations import DrawnSession, PopulationDesign, draw_sessions
-from brainbench.datasets.synthetic.truth import SyntheticSession, write_with_truth
+from brainbench.datasets.synthetic.truth import SyntheticSession, correlation_rdm, write_synthetic_nwb, write_with_truth
 from brainbench.datasets.trials.conditions import Conditions
 from brainbench.datasets.trials.counting import UNIT_COLUMNS, ReadingOptions, SessionCounts, missing_column
 from brainbench.datasets.trials.joining import join_sessions
@@ -104,30 +105,53 @@ def write_files(
     *,
     seed: int | Sequence[int] = 0,
     format: str = "nwb",
+    stimuli: str = "",
+    distance: Callable[[NDArray[np.float64]], NDArray[np.float64]] = correlation_rdm,
+    progress: Progress | None = None,
+    **about: Any,
 ) -> list[Path]:
     """Write synthetic animals as files, one per session, with ``truth.json`` beside them.
 
-    Opened with ``conditions="trials:stimulus", window="first-contact..choice"`` they give the counts of
-    :func:`~brainbench.datasets.synthetic.simulate`; ``read_truth`` reads the truth.
+    Opened again (layout ``synthetic``) they give the counts of :func:`~brainbench.datasets.synthetic.draw_animals`;
+    ``read_truth`` reads the truth.
+
+    Args:
+        folder: created if needed; files of the same names are replaced.
+        geometry: what the units encode.
+        design: size and noise; the defaults of :class:`PopulationDesign` if None.
+        seed: as in ``draw_animals``.
+        format: ``nwb`` or ``h5``.
+        stimuli: recipe of the stimuli, which the files then name.
+        distance: makes the RDM of each animal's expected rates [K, U] for the truth.
+        progress: called as ``progress(done, total, what)`` after each session.
+        about: what else the truth holds.
 
     Raises:
         UsageError: a format other than ``nwb`` and ``h5``.
     """
-    writers: dict[str, Callable[[Path, Session], Path]] = {"nwb": write_nwb, "h5": write_recordings}
+    writers: dict[str, Callable[[Path, Session], Path]] = {"nwb": write_synthetic_nwb, "h5": write_recordings}
     if format not in writers:
         raise unknown_name("format", format, writers)
+    design = design or PopulationDesign()
+
+    def draw() -> Iterator[SyntheticSession]:
+        for done, drawn in enumerate(draw_sessions(geometry, design, seed), start=1):
+            yield SyntheticSession(replace(_session(geometry, drawn), stimuli=stimuli), drawn.expected)
+            if progress is not None:
+                progress(done, design.animals * design.sessions, f"synthetic recordings {drawn.subject}")
+
     return write_with_truth(
         folder,
-        (
-            SyntheticSession(_session(geometry, drawn), drawn.expected)
-            for drawn in draw_sessions(geometry, design, seed)
-        ),
+        draw(),
         write=writers[format],
         suffix=f".{format}",
+        distance=distance,
         seed=seed,
-        design=design or PopulationDesign(),
+        design=design,
+        stimuli=stimuli,
         labels=geometry.labels,
         shared=geometry.rdm,
+        **about,
     )
 
 

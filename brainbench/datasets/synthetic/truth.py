@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -12,9 +13,30 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brainbench.core.files import file_hash, read_json, write_json
+from brainbench.datasets.nwb_writer import write_nwb
 from brainbench.datasets.sessions import Session
 
 TRUTH = "truth.json"
+NOTE = "SYNTHETIC recordings: ranks of models on them say nothing about brains."
+
+write_synthetic_nwb = partial(
+    write_nwb,
+    description="simulated stimuli encoded by simulated neurons, made by brainbench.",
+    general={
+        "experimenter": ["Simulation, A"],
+        "institution": "none (synthetic data)",
+        "lab": "none (synthetic data)",
+        "experiment_description": NOTE,
+        "keywords": ["synthetic", "whisker", "barrel cortex", "demo"],
+    },
+    subject={
+        "species": "Mus musculus",
+        "sex": "U",
+        "age": "P90D",
+        "description": "SYNTHETIC subject: no animal was recorded.",
+    },
+)
+"""Writes a session as NWB that says in every description that it is synthetic."""
 
 
 @dataclass(frozen=True)
@@ -32,6 +54,7 @@ def write_with_truth(
     *,
     write: Callable[[Path, Session], Path],
     suffix: str,
+    distance: Callable[[NDArray[np.float64]], NDArray[np.float64]],
     **about: Any,
 ) -> list[Path]:
     """Write sessions as files ``sub-…_ses-…SUFFIX``, and last their truth.
@@ -41,6 +64,7 @@ def write_with_truth(
         sessions: drawn one after the other, all of one subject together.
         write: writes one of them atomically.
         suffix: end of the files' names.
+        distance: makes the RDM [P] of expected responses [K, U].
         about: what else ``truth.json`` holds: ``labels``, and ``shared``, the RDM [P] of the shared geometry.
 
     Returns:
@@ -56,10 +80,10 @@ def write_with_truth(
     write_json(
         folder / TRUTH,
         {
-            "note": "SYNTHETIC recordings: ranks of models on them say nothing about brains.",
+            "note": NOTE,
             "synthetic": True,
             **about,
-            "subjects": {name: correlation_rdm(np.concatenate(rates, axis=1)) for name, rates in expected.items()},
+            "subjects": {name: distance(np.concatenate(rates, axis=1)) for name, rates in expected.items()},
             "files": {path.name: {"bytes": path.stat().st_size, "hash": file_hash(path)} for path in paths},
         },
     )
@@ -76,6 +100,12 @@ def read_truth(folder: str | os.PathLike[str]) -> dict[str, Any]:
     truth["shared"] = np.array(truth["shared"])
     truth["subjects"] = {name: np.array(values) for name, values in truth["subjects"].items()}
     return truth
+
+
+def squared_euclidean_rdm(responses: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the squared Euclidean distances [P] between rows [K, U], divided by the number of units."""
+    rows, columns = np.triu_indices(len(responses), 1)
+    return np.mean((responses[rows] - responses[columns]) ** 2, axis=1)
 
 
 def correlation_rdm(responses: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -65,6 +65,8 @@ class SessionCounts:
     units: int
     """Units in the file before any rule."""
     synthetic: bool
+    stimuli: str = ""
+    """Recipe of the stimuli, where the file names one."""
 
 
 def count_session(session: Session, options: ReadingOptions) -> SessionCounts:
@@ -121,6 +123,7 @@ def count_session(session: Session, options: ReadingOptions) -> SessionCounts:
         trials=len(table),
         units=len(session.units),
         synthetic=session.synthetic,
+        stimuli=session.stimuli,
     )
 
 

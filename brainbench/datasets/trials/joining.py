@@ -94,10 +94,17 @@ def join_sessions(
         "notes": [*notes, *(note for part in everything for note in part.tally.notes)],
         "source": source,
         "synthetic": any(part.synthetic for part in everything),
+        "stimuli": _one_recipe(everything),
         "content_hash": content_hash(vocabulary, *(item for part in parts for item in _content(part))),
     }
     dataset.attrs["missing"] = missing_labels(dataset)
     return dataset
+
+
+def _one_recipe(parts: list[SessionCounts]) -> str:
+    """Return the recipe that all sessions name; "" where they name none, or different ones."""
+    named = {part.stimuli for part in parts}
+    return named.pop() if len(named) == 1 else ""
 
 
 def _covariate(parts: list[SessionCounts], name: str) -> NDArray[np.float64]:

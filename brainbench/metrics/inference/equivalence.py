@@ -2,8 +2,8 @@
 
 A large p of a difference is no evidence of equality. Two one-sided tests (Schuirmann 1987) ask instead
 whether the difference between the model's score and the animals' consistency with one another, paired
-by animal, is demonstrably smaller than a stated margin. Both scores are noise-corrected by the same
-estimator, so both would be 1 without noise and individual differences.
+by animal and by stimulus, is demonstrably smaller than a stated margin. Both scores are on the scale that all metrics
+share: 0 is chance and 1 all that is reliable.
 """
 
 from __future__ import annotations
@@ -16,11 +16,12 @@ from numpy.typing import ArrayLike
 
 from brainbench.core.errors import UsageError
 from brainbench.core.records import Interval, Score, Status
-from brainbench.metrics.inference.intervals import VERIFIED_ANIMALS, t_interval
-from brainbench.metrics.inference.multiple import paired_values
+from brainbench.core.statistics import FEWEST_ANIMALS, FEWEST_STIMULI, two_factor_error
+from brainbench.metrics.inference.intervals import two_factor_interval
+from brainbench.metrics.inference.multiple import paired_differences, student_tail
 
 MARGIN = 0.1
-"""Difference in noise-corrected score below which model and animals count as alike."""
+"""Difference on the common scale below which model and animals count as alike."""
 
 
 @dataclass(frozen=True)
@@ -56,20 +57,20 @@ class EquivalenceTest:
 
 
 def equivalence_test(
-    values: ArrayLike, consistency: ArrayLike, *, margin: float = MARGIN, alpha: float = 0.05
+    differences: ArrayLike, without_stimulus: ArrayLike, *, margin: float = MARGIN, alpha: float = 0.05
 ) -> EquivalenceTest:
-    """Test whether values [A] of a model equal the animals' consistency [A] up to ``margin``.
+    """Test whether a model equals the animals' consistency with one another up to ``margin``.
 
     Args:
-        values: Noise-corrected score of the model on each animal.
-        consistency: Noise-corrected score of each animal against the others.
+        differences: [A] score of the model on each animal less that of the animal against the others.
+        without_stimulus: [K] the mean difference without each stimulus in turn.
         margin: Largest difference that still counts as alike, > 0.
         alpha: Level of each one-sided test; the interval has level 1 − 2α.
 
     Raises:
-        UsageError: a margin or an alpha out of range, or arrays that differ in length.
+        UsageError: a margin or an alpha out of range.
 
-    >>> test = equivalence_test([0.90, 0.93, 0.88, 0.91, 0.92], [0.91, 0.90, 0.90, 0.92, 0.90])
+    >>> test = equivalence_test([-0.01, 0.03, -0.02, -0.01, 0.02], [0.0, 0.004] * 6)
     >>> test.verdict, round(test.difference, 3)
     ('equivalent', 0.002)
     """
@@ -77,28 +78,26 @@ def equivalence_test(
         raise UsageError(f"An equivalence margin is positive; received {margin}.")
     if not 0 < alpha < 0.5:
         raise UsageError(f"alpha lies between 0 and 0.5, such as 0.05; received {alpha}.")
-    model, animals = np.asarray(values, dtype=np.float64).ravel(), np.asarray(consistency, dtype=np.float64).ravel()
-    if len(model) != len(animals):
-        raise UsageError(f"Values are paired by animal; received {len(model)} and {len(animals)}.")
-    # Differences are paired by animal, so an animal without either value is left out.
-    both = np.isfinite(model) & np.isfinite(animals)
-    difference = (model - animals)[both]
+    difference, without = (np.asarray(part, dtype=np.float64).ravel() for part in (differences, without_stimulus))
+    difference, without = difference[np.isfinite(difference)], without[np.isfinite(without)]
     count = len(difference)
-    if count < 2:
-        reason = f"{count} animals have both a model's value and a consistency; at least 2 are needed"
+    if count < 2 or len(without) < 2:
+        reason = f"{count} animals and {len(without)} stimuli have a difference; at least 2 of each are needed"
         return EquivalenceTest(math.nan, margin, None, math.nan, math.nan, math.nan, "undecided", "undefined", reason)
-    # Two one-sided t tests (Schuirmann 1987), t = (margin ± mean)/error with A − 1 degrees of freedom. Both reject at
-    # level α exactly when the interval at level 1 − 2α lies within ±margin.
-    mean, interval = float(difference.mean()), t_interval(difference, 1 - 2 * alpha)
-    error = float(difference.std(ddof=1)) / math.sqrt(count)
-    lower, upper = (_tail(distance, error, count) for distance in (mean + margin, margin - mean))
+    # Two one-sided t tests (Schuirmann 1987), t = (margin ± mean)/error. Both reject at level α exactly when the
+    # interval at level 1 − 2α lies within ±margin.
+    mean = float(difference.mean())
+    interval = two_factor_interval(mean, difference, without, 1 - 2 * alpha)
+    error, freedom = (float(found) for found in two_factor_error(difference, without))
+    lower, upper = (student_tail(distance, error, freedom) for distance in (mean + margin, margin - mean))
     low, high = (interval.low, interval.high) if interval else (math.nan, math.nan)
     if low > -margin and high < margin:
         verdict = "equivalent"
     else:
         verdict = "worse" if high < -margin else "better" if low > margin else "undecided"
-    few = count < VERIFIED_ANIMALS
-    reason = f"{count} animals: coverage of the interval not verified below {VERIFIED_ANIMALS}" if few else ""
+    few = count < FEWEST_ANIMALS or len(without) < FEWEST_STIMULI
+    needed = f"at least {FEWEST_ANIMALS} and {FEWEST_STIMULI} are needed"
+    reason = f"{count} animals and {len(without)} stimuli; {needed}" if few else ""
     return EquivalenceTest(
         mean, margin, interval, max(lower, upper), lower, upper, verdict, "unreliable" if few else "ok", reason, count
     )
@@ -107,7 +106,7 @@ def equivalence_test(
 def turing_test(
     score: Score, animal_to_animal: Score, *, margin: float = MARGIN, alpha: float = 0.05
 ) -> EquivalenceTest:
-    """Test a model's score against the animals' consistency with one another, paired by animal.
+    """Test a model's score against the animals' consistency with one another, paired by animal and stimulus.
 
     Raises:
         UsageError: a margin or an alpha out of range, or scores by different estimators.
@@ -117,14 +116,4 @@ def turing_test(
             f"Model and animals must be scored by one estimator; received {score.estimator!r} and "
             f"{animal_to_animal.estimator!r}."
         )
-    return equivalence_test(*paired_values(score, animal_to_animal), margin=margin, alpha=alpha)
-
-
-def _tail(distance: float, error: float, count: int) -> float:
-    """Return P(t ≥ distance/error) with count − 1 degrees of freedom."""
-    from scipy.special import stdtr
-
-    # Without spread the t statistic is infinite; the sign of the distance alone decides.
-    if error == 0:
-        return 0.0 if distance > 0 else 1.0
-    return float(stdtr(count - 1, -distance / error))
+    return equivalence_test(*paired_differences(score, animal_to_animal), margin=margin, alpha=alpha)

@@ -4,8 +4,8 @@
 luck; the corrected p asks how often *the luckiest of them all* would, under the same permutations for
 all (Westfall & Young 1993, step-down maximum statistic), which keeps the correlations between models.
 
-Models are compared with one another on the same animals: the test flips the signs of the animals'
-differences, so it generalises to animals and not to other stimuli.
+Models are compared with one another on the same animals and stimuli, on the scale that all metrics share. The
+standard error of a difference holds its spread over animals and over stimuli, so a test generalises to others of both.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -21,21 +21,18 @@ from numpy.typing import ArrayLike
 
 from brainbench.core.errors import UsageError, unknown_name
 from brainbench.core.records import Interval, Score
+from brainbench.core.statistics import FEWEST_ANIMALS, FEWEST_STIMULI, two_factor_error
 from brainbench.metrics.animals import gather
-from brainbench.metrics.inference.intervals import t_interval
+from brainbench.metrics.inference.intervals import two_factor_interval
 from brainbench.metrics.inference.permutation import SMALLEST_STIMULI, layer_p, permuted_values, tail_p
+from brainbench.metrics.measures.rsa import RSA, check_layers
 from brainbench.metrics.rdms.comparison import check_comparison
-from brainbench.metrics.rdms.pairs import Floats, rdm_stack
+from brainbench.metrics.rdms.pairs import Floats, rdm_stack, stimulus_count
 from brainbench.metrics.reliability.subject_rdm import SubjectRDM, is_flat
-from brainbench.metrics.score import score_with_test
+from brainbench.metrics.score import score_layers
 
 CORRECTIONS = ("holm", "fdr", "none")
 """Corrections of the pairwise tests: Holm (family-wise), Benjamini & Hochberg (false discovery rate)."""
-
-EXACT_ANIMALS = 14
-"""Up to this many animals all 2^A signs are taken."""
-
-_RANDOM_FLIPS = 10_000
 
 
 @dataclass(frozen=True)
@@ -49,18 +46,18 @@ class ModelTest:
 
 @dataclass(frozen=True)
 class PairTest:
-    """Two models on the same animals."""
+    """Two models on the same animals and stimuli."""
 
     first: str
     """Name of one model."""
     second: str
     """Name of the other model."""
     difference: float
-    """Mean over animals of the first's value minus the second's."""
+    """The first's value minus the second's, on the common scale."""
     interval: Interval | None
-    """Interval of the difference, over animals."""
+    """Interval of the difference, over animals and stimuli."""
     p: float
-    """Two-sided, by flipping the signs of the animals' differences."""
+    """Two-sided, by Student's t of the difference over its two-factor standard error."""
     p_corrected: float
     """Corrected for the number of pairs."""
     reason: str = ""
@@ -69,7 +66,7 @@ class PairTest:
 
 @dataclass(frozen=True)
 class ModelComparison:
-    """Models compared on the same animals."""
+    """Models compared on the same animals and stimuli."""
 
     models: tuple[ModelTest, ...]
     """In the order given."""
@@ -84,7 +81,7 @@ def compare_models(
     *,
     stimuli: Sequence[str],
     compare: str = "pearson",
-    correction: str = "holm",
+    correction: str = "fdr",
     seed: int = 0,
     device: Any = None,
 ) -> ModelComparison:
@@ -96,7 +93,7 @@ def compare_models(
         stimuli: Names of the K stimuli.
         compare: Comparison of RDMs.
         correction: ``holm``, ``fdr`` or ``none``, for the pairwise tests.
-        seed: Seed of random permutations and sign flips.
+        seed: Seed of random permutations.
         device: Torch device for the permutations; numpy by default.
 
     Raises:
@@ -105,25 +102,24 @@ def compare_models(
     check_correction(correction)
     if not models:
         raise UsageError("There are no models to compare; give the layers' RDMs of at least one.")
+    check_comparison(compare)
+    metric, options = RSA(comparison=compare), {"stimuli": stimuli, "seed": seed, "device": device}
     found = {
-        name: score_with_test(layers, subjects, name, stimuli, "default", compare, seed, device)
+        name: score_layers(metric, check_layers(layers, stimuli), subjects, name=name, **options)
         for name, layers in models.items()
     }
     # All models met the same permutations, so the maximum over models keeps the correlations between them.
     tested = {name: test.null for name, (_, test) in found.items() if test is not None and math.isfinite(test.p)}
     corrected = dict(zip(tested, step_down(np.stack(list(tested.values()))), strict=True)) if tested else {}
     scores = {name: score for name, (score, _) in found.items()}
-    pairs = [_pair(scores[a], scores[b], seed) for a, b in itertools.combinations(scores, 2)]
-    adjusted = adjust([pair[3] for pair in pairs], correction)
+    pairs = [compare_scores(scores[a], scores[b]) for a, b in itertools.combinations(scores, 2)]
+    adjusted = adjust([pair.p for pair in pairs], correction)
     return ModelComparison(
         models=tuple(ModelTest(score, corrected.get(name, math.nan)) for name, score in scores.items()),
-        pairs=tuple(
-            PairTest(a, b, difference, interval, p, float(q), reason)
-            for ((a, b), difference, interval, p, reason), q in zip(pairs, adjusted, strict=True)
-        ),
+        pairs=tuple(replace(pair, p_corrected=float(q)) for pair, q in zip(pairs, adjusted, strict=True)),
         correction=correction,
         method=f"models: step-down maximum over {len(tested)} models, same permutations for all; "
-        f"pairs: sign flips over animals, {correction}",
+        f"pairs: t over animals and stimuli, {correction}",
     )
 
 
@@ -159,7 +155,7 @@ def layer_tests(
     if not layer_rdms:
         raise UsageError("There are no layers to test; give the RDM of at least one layer.")
     rdms = rdm_stack(list(layer_rdms.values()), "layer_rdms")
-    animals = gather(subjects, estimator="default", comparison=compare, pairs=rdms.shape[1])
+    animals = gather(RSA(comparison=compare), subjects, stimulus_count(rdms.shape[1]))
     nothing = [LayerTest(name, math.nan, math.nan, math.nan) for name in layer_rdms]
     usable = np.flatnonzero(~is_flat(rdms))
     if not len(usable) or not animals.scored or rdms.shape[1] < SMALLEST_STIMULI * (SMALLEST_STIMULI - 1) // 2:
@@ -230,47 +226,52 @@ def check_correction(correction: str) -> None:
         raise unknown_name("correction for multiple tests", correction, CORRECTIONS)
 
 
-def sign_flip_p(differences: ArrayLike, *, seed: int = 0) -> float:
-    """Return the two-sided p of a mean difference over animals [A] when its signs are flipped.
+def compare_scores(first: Score, second: Score) -> PairTest:
+    """Test the difference of two scores over the animals and the stimuli that both have.
 
-    All 2^A signs up to 14 animals, else 10,000 random ones, (b+1)/(n+1). Exact when differences are
-    symmetric about zero. The smallest possible p is 2/2^A.
+    Fewer than :data:`FEWEST_ANIMALS` animals or :data:`FEWEST_STIMULI` stimuli give no p.
     """
-    d = np.asarray(differences, dtype=np.float64)
-    if not d.size or not np.isfinite(d).all():
-        return math.nan
-    # Sums do not depend on the order of animals up to rounding, which the tie absorbs.
-    d = np.sort(d)
-    # Under symmetry about zero all 2^A signs are equally likely; the bits of 0 … 2^A − 1 list them, all plus first.
-    if len(d) <= EXACT_ANIMALS:
-        signs = 1.0 - 2.0 * ((np.arange(2 ** len(d))[:, None] >> np.arange(len(d))) & 1)
-    else:
-        signs = np.random.default_rng(seed).choice([-1.0, 1.0], (_RANDOM_FLIPS + 1, len(d)))
-        signs[0] = 1.0
-    sums = np.abs(signs @ d)
-    return float(tail_p(sums))
+    animals, without = paired_differences(first, second)
+    names = first.name, second.name
+    if len(animals) < 2:
+        why = "fewer than two animals have a value for both models"
+        return PairTest(*names, float(animals.mean()) if len(animals) else math.nan, None, math.nan, math.nan, why)
+    difference = float(animals.mean())
+    interval = two_factor_interval(difference, animals, without)
+    if len(animals) < FEWEST_ANIMALS or np.isfinite(without).sum() < FEWEST_STIMULI:
+        why = (
+            f"{len(animals)} animals and {len(without)} stimuli; at least {FEWEST_ANIMALS} and {FEWEST_STIMULI} are "
+            "needed"
+        )
+        return PairTest(*names, difference, interval, math.nan, math.nan, why)
+    error, freedom = two_factor_error(animals, without)
+    p = 2 * student_tail(abs(difference), float(error), float(freedom))
+    return PairTest(*names, difference, interval, p, math.nan)
 
 
-def paired_values(first: Score, second: Score) -> tuple[Floats, Floats]:
-    """Return the values [A] of two scores on the animals that both could use with status ``ok`` (else any value)."""
+def paired_differences(first: Score, second: Score) -> tuple[Floats, Floats]:
+    """Return the differences of two scores on the common scale: of animals [A], and without each stimulus [K].
+
+    Animals are those that both could use with status ``ok`` (else with any value).
+    """
     pairs = []
     for wanted in (("ok",), ("ok", "unreliable")):
         one, two = ({s.subject: s.value for s in x.subjects if s.status in wanted} for x in (first, second))
-        pairs = [
-            (one[name], two[name])
-            for name in sorted(one.keys() & two.keys())
-            if math.isfinite(one[name]) and math.isfinite(two[name])
-        ]
-        if pairs:
+        pairs = [first.on_scale(one[name]) - second.on_scale(two[name]) for name in sorted(one.keys() & two.keys())]
+        if pairs := [difference for difference in pairs if math.isfinite(difference)]:
             break
-    array = np.array(pairs, dtype=np.float64).reshape(-1, 2)
-    return array[:, 0], array[:, 1]
+    without = []
+    if set(first.stimuli) == set(second.stimuli):
+        one, two = (dict(zip(x.stimuli, x.without_stimulus, strict=False)) for x in (first, second))
+        without = [first.on_scale(one[k]) - second.on_scale(two[k]) for k in one.keys() & two.keys()]
+    return np.array(pairs, dtype=np.float64), np.array(without, dtype=np.float64)
 
 
-def _pair(first: Score, second: Score, seed: int) -> tuple[tuple[str, str], float, Interval | None, float, str]:
-    one, two = paired_values(first, second)
-    names = first.name, second.name
-    if len(one) < 2:
-        why = "fewer than two animals have a value for both models"
-        return names, float((one - two).mean()) if len(one) else math.nan, None, math.nan, why
-    return names, float((one - two).mean()), t_interval(one - two), sign_flip_p(one - two, seed=seed), ""
+def student_tail(distance: float, error: float, freedom: float) -> float:
+    """Return P(t ≥ distance/error) with some degrees of freedom."""
+    from scipy.special import stdtr
+
+    # Without spread the t statistic is infinite; the sign of the distance alone decides.
+    if error == 0:
+        return 0.0 if distance > 0 else 1.0 if distance < 0 else 0.5
+    return float(stdtr(freedom, -distance / error))

@@ -199,12 +199,17 @@ def layer_p(null: Floats) -> tuple[Floats, Floats]:
     return tail_p(null), tail_p(null.max(axis=1, keepdims=True), null[0])
 
 
-def smallest_p(stimuli: int) -> float:
-    """Return the smallest p that permuting this many stimuli can give."""
+def most_exact(draws: int) -> int:
+    """Return the largest number of stimuli of which all orders are taken: they are at most five times ``draws``."""
+    return max(count for count in range(EXACT_STIMULI + 1) if math.factorial(count) <= 5 * draws)
+
+
+def smallest_p(stimuli: int, draws: int = RANDOM_PERMUTATIONS) -> float:
+    """Return the smallest p that permuting this many stimuli can give, with random orders where all are too many."""
     # Swapping two stimuli leaves their one distance as it is.
     if stimuli < 3:
         return 1.0
-    return 1 / (math.factorial(stimuli) if stimuli <= EXACT_STIMULI else RANDOM_PERMUTATIONS + 1)
+    return 1 / (math.factorial(stimuli) if stimuli <= most_exact(draws) else draws + 1)
 
 
 def label_orders(

@@ -1,15 +1,17 @@
 """Power analysis: the share of experiments that find a model which is truly alike.
 
-Experiments are simulated at the level of RDMs. Every RDM is a standardised vector of correlation
-distances between random patterns, so distances that share a stimulus are dependent as they are in
-data. With s shared by all animals and the other terms drawn anew for each:
+Experiments are simulated at the level of RDMs. Every RDM is a standardised vector of squared Euclidean
+distances between random patterns of ``dimensions``, so distances that share a stimulus are dependent as
+they are in data: the fewer dimensions, the more of them depend on a few directions, and the easier unrelated
+models agree by luck. With s shared by all animals and the other terms drawn anew for each:
 
     animal      t = √c · s + √(1 − c) · own        c: consistency between animals' noiseless RDMs
     measured    √q · t + √(1 − q) · noise          q: reliability of an animal's RDM
-    model       (e/√c) · s + √(1 − e²/c) · other   e: the effect, the noise-corrected score that is true
+    model       (e/√c) · s + √(1 − e²/c) · other   e: the effect, the score that is true, between chance and 1
 
 Each experiment goes through the permutation test of :func:`brainbench.metrics.score_rdms`, with the
-choice among ``layers`` of which one has the effect and the others know nothing.
+choice among ``layers`` of which one has the effect and the others know nothing. The comparison is the whitened one
+with the mean distance taken away, which has the same permutations as the whitened cosine and a chance of 0.
 """
 
 from __future__ import annotations
@@ -26,14 +28,16 @@ from brainbench.core.statistics import wilson_interval
 from brainbench.metrics.inference.permutation import SMALLEST_STIMULI, label_orders, smallest_p, tail_p
 from brainbench.metrics.layers import held_out
 from brainbench.metrics.rdms.comparison import features
-from brainbench.metrics.rdms.pairs import Floats, permuted_pairs, upper
+from brainbench.metrics.rdms.pairs import Floats, Ints, upper
 
 SIMULATIONS = 1000
 STIMULUS_COUNTS = (4, 5, 6, 7, 8, 10, 12, 16, 20, 24, 32)
 ANIMAL_COUNTS = (1, 2, 3, 4, 5, 6, 8, 11, 15, 20, 30, 50, 100)
 """Numbers that :func:`needed` tries, in order."""
 
-_DIMENSIONS = 10
+DIMENSIONS = 10
+"""Dimensions of the patterns where nothing is known of them."""
+_COMPARISON = "whitened-pearson"
 _ORDERS = 999
 """Random orders above this many stimuli; up to it all are taken."""
 _EXACT_STIMULI = 6
@@ -53,7 +57,7 @@ class ExperimentDesign:
     animals: int = 11
     """Number of animals."""
     effect: float = 0.5
-    """True noise-corrected score of the model, −1 … 1; 0 gives the rate of false alarms."""
+    """True score of the model on the scale from chance (0) to all that is reliable (1); 0 gives the false alarms."""
     consistency: float = 0.8
     """Correlation of two animals' noiseless RDMs, 0 … 1."""
     reliability: float = 0.8
@@ -62,6 +66,8 @@ class ExperimentDesign:
     """Layers among which one is chosen; one of them has the effect."""
     alpha: float = 0.05
     """Level of the test."""
+    dimensions: int = DIMENSIONS
+    """Dimensions of the representations, see :mod:`brainbench.metrics.inference.dimension`."""
 
     def __post_init__(self) -> None:
         """Refuse what no experiment can be."""
@@ -70,6 +76,8 @@ class ExperimentDesign:
                 f"A design needs at least 2 stimuli, 1 animal and 1 layer; received {self.stimuli}, {self.animals} and "
                 f"{self.layers}."
             )
+        if self.dimensions < 1:
+            raise UsageError(f"Representations have at least 1 dimension; received {self.dimensions}.")
         for name, low, high in (("consistency", 0, 1), ("reliability", 0, 1), ("alpha", 0, 1), ("effect", -1, 1)):
             value = getattr(self, name)
             if not low <= value <= high or (name == "alpha" and value in (0, 1)):
@@ -116,13 +124,14 @@ def power(design: ExperimentDesign, *, simulations: int = SIMULATIONS, seed: int
         reason = f"{design.stimuli} stimuli allow no p below {smallest:.3g}, whatever is true"
         return Power(design, 0.0, None, 0, smallest, reason=reason)
     generator = np.random.default_rng(seed)
-    # All experiments share their orders of the stimuli, so pairs are looked up once.
-    orders = label_orders(design.stimuli, seed, exact=_EXACT_STIMULI, draws=_ORDERS)
-    pairs = permuted_pairs(np.concatenate(list(orders)))
+    # All experiments share their orders of the stimuli, so places are looked up once.
+    orders = np.concatenate(list(label_orders(design.stimuli, seed, exact=_EXACT_STIMULI, draws=_ORDERS)))
+    # A square matrix read row by row: the entry (i, j) comes from (order[i], order[j]).
+    places = (orders[:, :, None] * design.stimuli + orders[:, None, :]).reshape(len(orders), -1)
     found, total = 0, 0.0
-    for size in _chunks(simulations, design, len(pairs)):
+    for size in _chunks(simulations, design, len(places)):
         model, brain = simulate_experiments(generator, design, size)
-        null = _statistics(model, brain, pairs)
+        null = _statistics(model, brain, places)
         found += int((tail_p(null.T) <= design.alpha).sum())
         total += float(null[:, 0].sum())
     interval = wilson_interval(found, simulations, over="simulated experiments")
@@ -155,11 +164,9 @@ def needed(
 
 
 def _chunks(simulations: int, design: ExperimentDesign, orders: int) -> Iterator[int]:
-    pairs = design.stimuli * (design.stimuli - 1) // 2
-    # Bounds the comparisons that are held at once, over experiments, orders, layers and animals.
-    step = max(
-        1, _CHUNK_ELEMENTS // (orders * max(pairs, design.layers * (design.animals if design.layers > 1 else 1)))
-    )
+    # Bounds the models' moved entries and the comparisons, held at once over experiments and orders.
+    each = design.layers * max(design.stimuli**2, design.animals)
+    step = max(1, _CHUNK_ELEMENTS // (orders * each))
     for start in range(0, simulations, step):
         yield min(step, simulations - start)
 
@@ -168,11 +175,12 @@ def simulate_experiments(generator: np.random.Generator, design: ExperimentDesig
     """Return models [S, L, P] and measured animals [S, A, P]."""
 
     def rdms(*shape: int) -> Floats:
-        patterns = generator.standard_normal((*shape, design.stimuli, _DIMENSIONS))
-        patterns -= patterns.mean(axis=-1, keepdims=True)
-        patterns /= np.linalg.norm(patterns, axis=-1, keepdims=True)
-        # Correlations of random patterns have mean 0 and variance 1/(D − 1).
-        return -upper(patterns @ patterns.swapaxes(-1, -2)) * math.sqrt(_DIMENSIONS - 1)
+        patterns = generator.standard_normal((*shape, design.stimuli, design.dimensions))
+        products = patterns @ patterns.swapaxes(-1, -2)
+        squares = np.einsum("...kk->...k", products)
+        distances = upper(squares[..., None] + squares[..., None, :] - 2 * products)
+        # Squared distances of Gaussian patterns have mean 2D and variance 8D.
+        return (distances - 2 * design.dimensions) / math.sqrt(8 * design.dimensions)
 
     c, q = design.consistency, design.reliability
     # The three equations of the module's text; weights x and √(1 − x²) keep every RDM at unit variance.
@@ -184,12 +192,13 @@ def simulate_experiments(generator: np.random.Generator, design: ExperimentDesig
     return model, math.sqrt(q) * animals + math.sqrt(1 - q) * rdms(size, design.animals)
 
 
-def _statistics(model: Floats, brain: Floats, pairs: np.ndarray) -> Floats:
+def _statistics(model: Floats, brain: Floats, places: Ints) -> Floats:
     """Return the mean comparison [S, N] under every order, the layer chosen on the other animals each time."""
     # Unit vectors once per RDM; a comparison under an order is then a product of moved entries.
-    left, right = features(model, "pearson"), features(brain, "pearson")
+    left, right = features(model, _COMPARISON), features(brain, _COMPARISON)
     # r is linear in the animals' unit vectors: with one layer they are averaged before the orders are taken.
     if model.shape[1] == 1:
-        return np.einsum("snp,sp->sn", left[:, 0][:, pairs], right.mean(axis=1))
-    r = np.einsum("slnp,sap->snla", left[:, :, pairs], right, optimize=True)
+        return np.einsum("snp,sp->sn", left[:, 0].take(places, axis=1), right.mean(axis=1))
+    r = left.take(places, axis=2).reshape(*left.shape[:2], *places.shape) @ right.swapaxes(-1, -2)[:, None]
+    r = r.swapaxes(1, 2)
     return (held_out(r) if brain.shape[1] > 1 else r.max(axis=2)).mean(axis=-1)

@@ -11,28 +11,21 @@ of classes, so the permutation's mean is the chance level to read.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from brainbench.core.records import Score
-from brainbench.metrics.inference.intervals import t_interval
-from brainbench.metrics.inference.permutation import tail_p
-from brainbench.metrics.measures.animal_patterns import PatternAnimals, subject_scores
+from brainbench.metrics.inference.permutation import label_orders, most_exact, tail_p
 from brainbench.metrics.measures.classifier import Decoder
-from brainbench.metrics.measures.patterns import (
-    PatternMetric,
-    layer_scores,
-    make_score,
-    pattern_orders,
-    undefined,
-)
+from brainbench.metrics.measures.metric import Metric, usable_features
 from brainbench.metrics.rdms.pairs import Floats, Ints
-from brainbench.metrics.score import layer_table
-
-ORDERS = 199
-"""Random orders of the stimuli above six."""
+from brainbench.metrics.reliability.denoising import denoised
+from brainbench.metrics.reliability.subject_rdm import SubjectRDM
 
 
 def label_properties(stimuli: Sequence[str]) -> dict[str, Ints]:
@@ -52,89 +45,131 @@ def label_properties(stimuli: Sequence[str]) -> dict[str, Ints]:
     return found
 
 
-class LabelDecoding(PatternMetric):
+@dataclass(frozen=True)
+class LabelledFeatures:
+    """A layer with the classes of its stimuli."""
+
+    features: Floats
+    """[K, F]"""
+    classes: Mapping[str, Ints]
+    """Property → class of each stimulus [K]."""
+
+    @cached_property
+    def decoder(self) -> Decoder:
+        """The decoder, which remembers what it has decoded."""
+        return Decoder(self.features, np.arange(len(self.features)))
+
+    def right(self, order: Ints) -> Floats:
+        """Return whether each left-out stimulus is decoded rightly [properties, K], its classes in an order [K]."""
+        return np.array([self.decoder(codes[order]) for codes in self.classes.values()])
+
+
+class LabelDecoding(Metric):
     """Accuracy of decoding the labels' properties, leaving one stimulus out."""
 
     name = "decoding"
     title = "accuracy of logistic regression for properties of stimuli left out, mean over properties"
+    orders = 199
+    orders_between = 199
+    of_model_alone = True
+    reasons = ("accuracy of the model alone, no likeness: the animals' own stands beside it",)
 
-    def score_layers(
-        self, layers: Mapping[str, Floats], found: PatternAnimals, about: dict[str, Any], seed: int
-    ) -> Score:
-        """Decode from the features of every layer; the value is that of the best, and so is every permutation's."""
-        stimuli = about["stimuli"]
-        usable = [layer for layer, values in layers.items() if np.isfinite(values).all()]
-        properties = label_properties(stimuli)
-        if not usable or not properties:
-            reason = "activations of every layer are not finite" if properties else _no_property(stimuli)
-            return Score(value=math.nan, status="undefined", reasons=(reason,), **about)
-        orders = _orders(len(stimuli), seed)
-        # [N, L, properties]: every layer meets the same assignments of classes.
-        values = np.stack([_accuracies(layers[layer], properties, orders) for layer in usable], axis=1)
-        # The maximum over layers is taken in every order too, so p accounts for it.
-        means = values.mean(axis=-1)
-        best = int(np.argmax(means[0]))
-        optimistic = "largest over layers (optimistic; the permutation takes the same maximum)"
-        return make_score(
-            about,
-            means.max(axis=1),
-            seed,
-            {
-                "layer_tests": layer_table(usable, means),
-                "decoding": _by_property(properties, values[:, best]),
-            },
-            smallest=_smallest_p(properties, orders),
-            status="ok",
-            reasons=("accuracy of the model alone, no likeness: the animals' own stands beside it", *found.reasons),
-            layer=usable[best],
-            layer_rule="only layer" if len(usable) == 1 else optimistic,
-            layers=layer_scores(layers, dict(zip(usable, means[0].tolist(), strict=True))),
+    def known(self, layer: Any) -> np.ndarray:
+        """Return where [K] a layer has a value."""
+        return np.isfinite(layer.features).all(axis=1)
+
+    def varies(self, layer: Any) -> bool:
+        """Return whether classes can be learnt: each has two stimuli that the layer has a value for."""
+        return all(np.bincount(codes)[np.unique(codes)].min() > 1 for codes in layer.classes.values())
+
+    def take(self, layer: Any, stimuli: Ints) -> Any:
+        """Return a layer with some stimuli, in this order."""
+        classes = {name: np.unique(codes[stimuli], return_inverse=True)[1] for name, codes in layer.classes.items()}
+        return LabelledFeatures(layer.features[stimuli], classes)
+
+    def compare_layers(
+        self, layers: Sequence[Any], animals: Sequence[SubjectRDM], chunks: Iterable[Ints], device: Any = None
+    ) -> Iterator[Floats]:
+        """Yield accuracies [N, L, A], the same for all animals."""
+        for orders in chunks:
+            # Classes are permuted over stimuli; the folds of patterns stay and are prepared once.
+            values = np.array([[layer.right(order).mean() for layer in layers] for order in orders])
+            yield np.repeat(values[..., None], len(animals), axis=-1)
+
+    def compare_without(self, layers: Sequence[Any], animals: Sequence[SubjectRDM]) -> Floats:
+        """Return accuracies [K, L, A] over the other stimuli left out."""
+        found = []
+        for layer in layers:
+            right = layer.right(np.arange(len(layer.features))).mean(axis=0)
+            found.append((right.sum() - right) / (len(right) - 1))
+        return np.repeat(np.stack(found, axis=1)[..., None], len(animals), axis=-1)
+
+    def statistics(self, layer: Any, animals: Sequence[SubjectRDM], seed: int) -> dict[str, Any]:
+        """Return the accuracy of every property."""
+        if not self.known(layer).all():
+            return {}
+        exact = most_exact(self.orders)
+        orders = np.concatenate(list(label_orders(len(layer.features), seed, exact=exact, draws=self.orders)))
+        values = np.stack([layer.right(order).mean(axis=1) for order in orders])
+        return {"decoding": _by_property(layer.classes, values)}
+
+    def score(self, features: Mapping[str, ArrayLike], animals: Sequence[SubjectRDM], **options: Any) -> Score:
+        """Score a model by the features [K, F] of its layers; options are those of :meth:`Metric.score`."""
+        properties = self._properties(options["stimuli"])
+        if isinstance(properties, Score):
+            return replace(properties, name=options["name"])
+        bound = _BoundDecoding(properties)
+        return Metric.score(bound, features, animals, **options)
+
+    def score_animals(self, animals: Sequence[SubjectRDM], **options: Any) -> Score:
+        """Return the accuracy of each animal's own mean responses."""
+        properties = self._properties(options["stimuli"])
+        if isinstance(properties, Score):
+            return replace(properties, name="animal-to-animal")
+        bound = _BoundDecoding(properties)
+        return Metric.score_animals(bound, animals, **options)
+
+    def _properties(self, stimuli: Sequence[str]) -> dict[str, Ints] | Score:
+        """Return the properties that labels name, or an undefined score that says why there are none."""
+        found = label_properties(stimuli)
+        if found:
+            return found
+        reason = (
+            "the labels name no property that at least two stimuli of each class share, as 'convex-far' and "
+            f"'convex-close' do: {', '.join(map(str, stimuli[:4]))}"
         )
-
-    def score_agreement(self, found: PatternAnimals, about: dict[str, Any], seed: int) -> Score:
-        """Decode from the mean responses of each animal."""
-        stimuli = about["stimuli"]
-        about["layer_rule"] = "no layers: each animal by itself"
-        scored, properties = [found.animals[i] for i in found.scored], label_properties(stimuli)
-        if not scored or not properties:
-            return undefined(about, "no animal can be used" if properties else _no_property(stimuli), found)
-        orders = _orders(len(stimuli), seed)
-        values = np.stack([_accuracies(animal.patterns, properties, orders) for animal in scored], axis=1)
-        each = values.mean(axis=-1)
-        by_subject: dict[str, tuple[float, str | None]] = {
-            animal.subject: (value, None) for animal, value in zip(scored, each[0].tolist(), strict=True)
-        }
-        return make_score(
-            about,
-            values.mean(axis=(1, 2)),
-            seed,
-            {"decoding": _by_property(properties, values.mean(axis=1))},
-            smallest=_smallest_p(properties, orders),
-            status="ok",
-            reasons=("each animal's own accuracy, from its mean responses", *found.reasons),
-            reliability=float(np.mean([animal.reliability for animal in scored])),
-            interval=t_interval(each[0]) if len(scored) > 2 else None,
-            subjects=subject_scores(found, by_subject),
-        )
+        about = {"metric": self.describe(()), "stimuli": tuple(map(str, stimuli))}
+        return Score("", math.nan, "undefined", (reason,), **about)
 
 
-def _orders(stimuli: int, seed: int) -> Ints:
-    # Every order is a decoder of its own above six stimuli, where few orders share a partition.
-    return pattern_orders(stimuli, seed, ORDERS - 1)
+class _BoundDecoding(LabelDecoding):
+    """Decoding of given properties."""
 
+    def __init__(self, properties: Mapping[str, Ints]) -> None:
+        self._classes = properties
 
-def _accuracies(patterns: Floats, properties: Mapping[str, Ints], orders: Ints) -> Floats:
-    """Return accuracies [N, properties] with the classes given to the stimuli in each order [N, K]."""
-    # Classes are permuted over stimuli; the folds of patterns stay and are prepared once.
-    decoder = Decoder(patterns, np.arange(len(patterns)))
-    return np.array([[float(np.mean(decoder(codes[order]))) for codes in properties.values()] for order in orders])
+    def layer(self, features: ArrayLike) -> Any:
+        return LabelledFeatures(usable_features(features), self._classes)
 
+    def attainable(self, animals: Sequence[SubjectRDM], seed: int) -> Floats:
+        """Return the accuracy [A] of each animal's responses without their noise."""
+        layers = [LabelledFeatures(denoised(animal.patterns, animal.noise), self._classes) for animal in animals]
+        order = [np.arange(len(layers[0].features))[None]]
+        return next(self.compare_layers(layers, animals[:1], order))[0, :, 0]
 
-def _smallest_p(properties: Mapping[str, Ints], orders: Ints) -> float:
-    """Return the share of orders that leave together what is together, which no test can tell apart."""
-    # Orders that give the same partition of the stimuli into classes give the same accuracy.
-    same = [(codes[orders][:, :, None] == codes[orders][:, None]) for codes in properties.values()]
-    return float(np.mean([all((part[index] == part[0]).all() for part in same) for index in range(len(orders))]))
+    def partner(self, animal: SubjectRDM, others: Sequence[SubjectRDM]) -> Any:
+        """Return the animal's own mean responses, whose accuracy needs no others."""
+        return LabelledFeatures(animal.patterns, self._classes)
+
+    def agreement_null(self, animals: Sequence[SubjectRDM], factors: Floats, orders: Ints) -> Floats:
+        """Return the mean accuracy [N] with the classes of every animal's stimuli in another order."""
+        found = []
+        for animal, given in zip(animals, orders.swapaxes(0, 1), strict=True):
+            layer = LabelledFeatures(animal.patterns, self._classes)
+            # Orders are relative to the first, which is that of the data.
+            moved = given[:, np.argsort(given[0])]
+            found.append([layer.right(order).mean() for order in moved])
+        return np.mean(found, axis=0)
 
 
 def _by_property(properties: Mapping[str, Ints], values: Floats) -> list[dict[str, Any]]:
@@ -149,10 +184,3 @@ def _by_property(properties: Mapping[str, Ints], values: Floats) -> list[dict[st
         }
         for (name, codes), column in zip(properties.items(), values.T, strict=True)
     ]
-
-
-def _no_property(stimuli: Sequence[str]) -> str:
-    return (
-        "the labels name no property that at least two stimuli of each class share, as 'convex-far' and 'convex-close' "
-        f"do: {', '.join(map(str, stimuli[:4]))}"
-    )

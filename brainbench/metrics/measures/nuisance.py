@@ -19,10 +19,10 @@ from numpy.typing import ArrayLike
 from brainbench.core.errors import DataError, UsageError
 from brainbench.core.trials import Trials
 from brainbench.metrics.inference.permutation import SMALLEST_STIMULI, canonical_order, label_orders, tail_p
-from brainbench.metrics.measures.animal_patterns import AnimalPatterns
 from brainbench.metrics.measures.patterns import PatternMetric
 from brainbench.metrics.rdms.dissimilarity import rdm
 from brainbench.metrics.rdms.pairs import Floats, Ints, permuted_pairs, rdm_stack, stimulus_count, upper
+from brainbench.metrics.reliability.subject_rdm import SubjectRDM
 from brainbench.metrics.stimulus_labels import stimulus_codes, stimulus_means
 
 
@@ -183,15 +183,19 @@ class PartialRSA(PatternMetric):
     name = "rsa-partial"
     title = "correlation between RDMs without what contacts, licks and choices explain"
 
-    def prepare(self, animal: AnimalPatterns, blocks: Sequence[Trials]) -> AnimalPatterns:
+    brain_method = "correlation"
+    comparison = "pearson"
+
+    def animal(self, subject: str, blocks: Sequence[Trials], n_stimuli: int, **options: Any) -> SubjectRDM:
         """Return the animal with its nuisance RDMs; without any it cannot be used."""
-        nuisances, lacking = _nuisances(blocks, len(animal.patterns))
+        animal = super().animal(subject, blocks, n_stimuli, **options)
+        nuisances, lacking = _nuisances(blocks, n_stimuli)
         if animal.problem is None and not nuisances:
             told = f" ({', '.join(lacking)} do not)" if lacking else ""
             return replace(animal, problem=f"no contacts, licks or choices that differ between stimuli{told}")
         return replace(animal, nuisances=nuisances)
 
-    def compare_orders(self, model: Floats, animals: Sequence[AnimalPatterns], orders: Ints) -> Floats:
+    def compare_orders(self, model: Floats, animals: Sequence[SubjectRDM], orders: Ints) -> Floats:
         """Return values [N, A] with the model's stimuli in each order [N, K]."""
         permuted = rdm(model)[permuted_pairs(orders)]
         values = np.full((len(orders), len(animals)), np.nan)
@@ -202,10 +206,12 @@ class PartialRSA(PatternMetric):
                 values[:, column] = partial_correlations(permuted, np.stack(list(animal.nuisances.values())), brain)
         return values
 
-    def statistics(self, model: Floats, animals: Sequence[Any], seed: int) -> dict[str, Any]:
+    def statistics(self, layer: Floats, animals: Sequence[SubjectRDM], seed: int) -> dict[str, Any]:
         """Return the shares of variance of the chosen layer, averaged over animals."""
+        if not np.isfinite(layer).all():
+            return {}
         parts = [
-            variance_partition(rdm(model), animal.nuisances, rdm(animal.patterns), seed=seed) for animal in animals
+            variance_partition(rdm(layer), animal.nuisances, rdm(animal.patterns), seed=seed) for animal in animals
         ]
         names = ("total", "unique_model", "unique_nuisance", "shared", "chance")
         nuisances = sorted({name for part in parts for name in part.nuisances})

@@ -15,9 +15,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from brainbench.core.errors import UsageError
-from brainbench.metrics.measures.animal_patterns import AnimalPatterns
-from brainbench.metrics.measures.patterns import PatternMetric
+from brainbench.metrics.measures.patterns import PatternMetric, centred_products
 from brainbench.metrics.rdms.pairs import Floats, Ints
+from brainbench.metrics.reliability.subject_rdm import SubjectRDM
 from brainbench.metrics.stimulus_labels import response_matrix
 
 
@@ -26,6 +26,7 @@ class Procrustes(PatternMetric):
 
     name = "procrustes"
     title = "cosine of the angular Procrustes distance between mean patterns"
+    orders = 199
 
     def similarity(self, model: Floats, brain: Floats) -> float:
         """Return ‖XᵀY‖∗ of centred, scaled patterns."""
@@ -33,7 +34,7 @@ class Procrustes(PatternMetric):
             return math.nan
         return float(_similarities(_unit(model), _unit(brain)[None])[0])
 
-    def compare_orders(self, model: Floats, animals: Sequence[AnimalPatterns], orders: Ints) -> Floats:
+    def compare_orders(self, model: Floats, animals: Sequence[SubjectRDM], orders: Ints) -> Floats:
         """Return values [N, A] with the model's stimuli in each order [N, K]."""
         # Moving the model's stimuli is moving the animals' products [K, K] by the inverse order.
         place = np.argsort(orders, axis=1)
@@ -63,8 +64,7 @@ def procrustes_distance(a: ArrayLike, b: ArrayLike) -> float:
 
 def _unit(patterns: Floats) -> Floats:
     """Return the products [K, K] of centred patterns of unit size; NaN for constant ones."""
-    centred = patterns - patterns.mean(axis=0)
-    products = centred @ centred.T
+    products = centred_products(patterns)
     size = float(np.trace(products))
     return products / size if size > 0 else np.full(products.shape, np.nan)
 

@@ -8,62 +8,11 @@ them. A new one needs a single file: subclass :class:`brainbench.metrics.measure
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Any, Protocol
-
-from numpy.typing import ArrayLike
+from typing import Any
 
 from brainbench.core.errors import UsageError, unknown_name
 from brainbench.core.plugins import load_object
-from brainbench.core.records import Score
-from brainbench.core.trials import Trials
-
-
-class Metric(Protocol):
-    """A way to compare a model's activations with animals' trials."""
-
-    @property
-    def name(self) -> str:
-        """Name on the command line."""
-        ...
-
-    @property
-    def title(self) -> str:
-        """One line on what is compared, how, and what corrects it for noise."""
-        ...
-
-    def animal(
-        self,
-        subject: str,
-        blocks: Sequence[Trials],
-        n_stimuli: int,
-        *,
-        stimuli: Sequence[str] | None = None,
-        seed: int = 0,
-        draws: int = 0,
-    ) -> Any:
-        """Prepare one animal from the trials of its sessions; what cannot be used says so in the score."""
-        ...
-
-    def score(
-        self,
-        features: Mapping[str, ArrayLike],
-        animals: Sequence[Any],
-        *,
-        name: str,
-        stimuli: Sequence[str],
-        estimator: str = "default",
-        seed: int = 0,
-    ) -> Score:
-        """Score a model by the features [K, F] of its layers."""
-        ...
-
-    def score_animals(
-        self, animals: Sequence[Any], *, stimuli: Sequence[str], estimator: str = "default", seed: int = 0
-    ) -> Score:
-        """Score the animals against one another, by the same estimator."""
-        ...
-
+from brainbench.metrics.measures.metric import Metric
 
 _METRICS: dict[str, Metric] = {}
 

@@ -1,14 +1,15 @@
 """Ridge encoding: how much of the responses to a stimulus a model predicts from the other stimuli.
 
-Every stimulus (or tenth of them) is left out in turn; responses of all units are predicted by ridge
-regression on the model's features, with the penalty chosen by a second cross-validation inside the
-training stimuli. The value is the share of explainable variance
+A tenth of the stimuli (at least one) is left out in turn; responses of all units are predicted by ridge
+regression on the model's features, with the penalty chosen by leaving each training stimulus out. The raw value is
+the share of variance that is predicted,
 
-    1 − (Σ (y − ŷ)² − N) / (Σ (y − ȳ)² − N)
+    1 − Σ (y − ŷ)² / Σ (y − ȳ)²
 
-over left-out stimuli and units, where ȳ is the training mean and N the noise of the left-out means
-estimated from trials: 1 for a perfect model, 0 for one that predicts no better than the training mean,
-negative for a worse one. Nothing is clamped.
+over left-out stimuli and units, where ȳ is the training mean. Noise N of the left-out means, estimated from trials,
+stands in both sums; the corrected value takes it out of both: 0 for a model that predicts no better than the training
+mean, negative for a worse one. Nothing is clamped. No model of few stimuli reaches 1, since what is special to a
+stimulus cannot be predicted from others: ``attainable`` is what an animal's own noiseless responses reach.
 
 Residuals are combinations of the responses, so their squares are linear in the K × K products of the
 responses: units are never touched again, and all orders of the stimuli cost one matrix product.
@@ -20,9 +21,11 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from brainbench.metrics.measures.animal_patterns import AnimalPatterns
-from brainbench.metrics.measures.patterns import PatternMetric
+from brainbench.metrics.animals import gated
+from brainbench.metrics.measures.patterns import PatternMetric, centred_products
 from brainbench.metrics.rdms.pairs import Floats, Ints
+from brainbench.metrics.reliability.noise_correction import Corrected
+from brainbench.metrics.reliability.subject_rdm import SubjectRDM
 
 PENALTIES = tuple(10.0**power for power in range(-3, 4))
 """Ridge penalties, relative to the mean square of the centred training features."""
@@ -36,39 +39,91 @@ class RidgeEncoding(PatternMetric):
     name = "ridge"
     title = "share of explainable variance that ridge regression predicts for stimuli left out"
     corrected = True
+    reasons = ()
+    orders_between = 39
 
-    def compare(self, model: Floats, brain: AnimalPatterns) -> float:
-        """Return the share of explainable variance that features [K, F] predict."""
+    def compare(self, model: Floats, brain: SubjectRDM) -> float:
+        """Return the share of variance that features [K, F] predict, raw."""
         return float(self.compare_orders(model, [brain], np.arange(len(model))[None])[0, 0])
 
-    def compare_orders(self, model: Floats, animals: Sequence[AnimalPatterns], orders: Ints) -> Floats:
-        """Return values [N, A] with the model's stimuli in each order [N, K]."""
-        count = len(model)
-        folds = np.arange(count) * min(count, FOLDS) // count
-        centred = model - model.mean(axis=0)
-        kernel = centred @ centred.T
-        # Brain stimulus i stands at the model's stimulus order[i]: products are moved to the model's places.
-        place = np.argsort(orders, axis=1)
-        products = np.stack([animal.patterns @ animal.patterns.T for animal in animals])
-        noise = np.stack([animal.noise.sum(axis=1) for animal in animals])
-        moved = products[:, place[:, :, None], place[:, None, :]].reshape(len(animals) * len(orders), -1)
-        error = np.zeros(len(moved))
-        base = np.zeros(len(moved))
-        for fold in np.unique(folds):
-            test, train = np.flatnonzero(folds == fold), np.flatnonzero(folds != fold)
-            # Nested cross-validation: each training stimulus is left out in turn, and the penalty with the least
-            # squared error over them serves the outer fold, chosen anew for every order.
-            inner = np.stack([_squares(kernel, np.delete(train, t), train[t : t + 1]) for t in range(len(train))])
-            chosen = np.argmin(moved @ inner.sum(axis=0).reshape(len(PENALTIES), -1).T, axis=1)
-            outer = _squares(kernel, train, test).reshape(len(PENALTIES), -1)
-            error += (moved @ outer.T)[np.arange(len(moved)), chosen]
-            base += moved @ _residual_squares(_means(count, train, test)).ravel()
-        total_noise = np.repeat(noise.sum(axis=1), len(orders))
-        # The equation of the module's text; there is no value where noise explains all.
-        with np.errstate(invalid="ignore", divide="ignore"):
-            explainable = base - total_noise
-            value = 1 - (error - total_noise) / np.where(explainable > 0, explainable, np.nan)
-        return value.reshape(len(animals), len(orders)).T
+    def correction(self, animal: SubjectRDM, estimator: str) -> Corrected:
+        """Return the ratio of all variance to that without noise."""
+        base = float(_base(animal).sum())
+        explainable = base - float(animal.noise.sum())
+        if explainable <= 0:
+            reason = "the variance between stimuli is no larger than trial noise explains"
+            return Corrected(np.nan, "undefined", reason, reliability=animal.reliability)
+        return gated(base / explainable, animal.reliability)
+
+    def compare_orders(self, model: Floats, animals: Sequence[SubjectRDM], orders: Ints) -> Floats:
+        """Return raw values [N, A] with the model's stimuli in each order [N, K]."""
+        error, base = _errors(model, animals, orders)
+        return _share(error.sum(axis=-1), base.sum(axis=-1), animals)
+
+    def compare_without(self, layers: Sequence[Floats], animals: Sequence[SubjectRDM]) -> Floats:
+        """Return raw values [K, L, A] without the predictions of each stimulus in turn."""
+        # A stimulus is taken out of the sums of squares and stays in the training of the others: its part in the
+        # variance of a prediction is of the order of 1/K of that in the sums.
+        found = []
+        noise = np.stack([animal.noise.sum(axis=1) for animal in animals], axis=1)
+        for layer in layers:
+            error, base = (sums[0].T for sums in _errors(layer, animals, np.arange(len(layer))[None]))
+            without = [part.sum(axis=0) - part for part in (error, base, noise)]
+            found.append(_share(without[0], without[1], animals, noise=without[2]))
+        return np.stack(found, axis=1)
+
+
+def _share(error: Floats, base: Floats, animals: Sequence[SubjectRDM], noise: Floats | None = None) -> Floats:
+    """Return the share [..., A] of the explainable variance that is predicted, over each animal's correction."""
+    total = np.array([animal.noise.sum() for animal in animals])
+    own = np.array([_base(animal).sum() for animal in animals])
+    noise = total if noise is None else noise
+    # Under an order of the stimuli, folds and so the training means differ: the correction belongs to the given order.
+    with np.errstate(invalid="ignore", divide="ignore"):
+        explainable = base - noise
+        value = 1 - (error - noise) / np.where(explainable > 0, explainable, np.nan)
+        return value * (own - total) / own
+
+
+def _folds(count: int) -> Ints:
+    """Return the fold [K] of each stimulus: every tenth in the order that the animals give the stimuli."""
+    return np.arange(count) % min(count, FOLDS)
+
+
+def _base(animal: SubjectRDM) -> Floats:
+    """Return the squares [K] of what is left of each stimulus' responses without the training mean."""
+    folds, products = _folds(len(animal.patterns)), centred_products(animal.patterns)
+    found = np.empty(len(folds))
+    for fold in np.unique(folds):
+        test, train = np.flatnonzero(folds == fold), np.flatnonzero(folds != fold)
+        found[test] = _squares(_means(len(folds), train, test), products)
+    return found
+
+
+def _errors(model: Floats, animals: Sequence[SubjectRDM], orders: Ints) -> tuple[Floats, Floats]:
+    """Return squared errors of the prediction and of the training mean [N, A, K], by the stimulus of the model."""
+    count = len(model)
+    folds, kernel = _folds(count), centred_products(model)
+    # Brain stimulus i stands at the model's stimulus order[i]: products are moved to the model's places.
+    place = np.argsort(orders, axis=1)
+    products = np.stack([centred_products(animal.patterns) for animal in animals])
+    moved = products[:, place[:, :, None], place[:, None, :]].swapaxes(0, 1)
+    flat = moved.reshape(-1, count * count)
+    error, base = np.empty((len(flat), count)), np.empty((len(flat), count))
+    for fold in np.unique(folds):
+        test, train = np.flatnonzero(folds == fold), np.flatnonzero(folds != fold)
+        inner, combinations = _fits(kernel, train, test)
+        # The penalty with the least squared error over left-out training stimuli serves the fold, chosen anew for
+        # every order.
+        chosen = np.argmin(flat @ inner.reshape(len(PENALTIES), -1).T, axis=1)
+        for index in np.unique(chosen):
+            rows = np.flatnonzero(chosen == index)
+            outer = np.einsum("ti,tj->tij", combinations[index], combinations[index]).reshape(len(test), -1)
+            error[np.ix_(rows, test)] = flat[rows] @ outer.T
+        means = _means(count, train, test)
+        base[:, test] = flat @ np.einsum("ti,tj->tij", means, means).reshape(len(test), -1).T
+    shape = (len(orders), len(animals), count)
+    return error.reshape(shape), base.reshape(shape)
 
 
 def _means(count: int, train: Ints, test: Ints) -> Floats:
@@ -79,8 +134,16 @@ def _means(count: int, train: Ints, test: Ints) -> Floats:
     return combination
 
 
-def _squares(kernel: Floats, train: Ints, test: Ints) -> Floats:
-    """Return, per penalty, the matrix [Λ, K, K] whose product with Y Yᵀ is the squared error on ``test``."""
+def _squares(combinations: Floats, products: Floats) -> Floats:
+    """Return the squares [T] of combinations [T, K] of patterns with products [K, K]."""
+    return np.einsum("ti,ij,tj->t", combinations, products, combinations, optimize=True)
+
+
+def _fits(kernel: Floats, train: Ints, test: Ints) -> tuple[Floats, Floats]:
+    """Return, per penalty, what gives the training error [Λ, K, K] and the combinations [Λ, test, K] of residuals.
+
+    The product of the first with Y Yᵀ is the squared error over the training stimuli, each predicted from the others.
+    """
     count, size = len(kernel), len(train)
     # Centring by the training mean is the intercept, which is not penalised.
     centre = np.eye(size) - 1 / size
@@ -88,15 +151,15 @@ def _squares(kernel: Floats, train: Ints, test: Ints) -> Floats:
     across = (kernel[np.ix_(test, train)] - kernel[np.ix_(train, train)].mean(axis=0)) @ centre
     # ŷ = k (K + λ·1)⁻¹ y: one eigendecomposition of the kernel serves all penalties.
     values, vectors = np.linalg.eigh(inside)
+    values = np.maximum(values, 0)
     scale = max(float(np.trace(inside)) / size, np.finfo(float).tiny)
-    found = np.empty((len(PENALTIES), count, count))
+    inner, outer = np.zeros((len(PENALTIES), count, count)), np.empty((len(PENALTIES), len(test), count))
     for index, penalty in enumerate(PENALTIES):
-        weight = across @ (vectors / (np.maximum(values, 0) + penalty * scale)) @ vectors.T @ centre
-        combination = _means(count, train, test)
-        combination[:, train] -= weight
-        found[index] = _residual_squares(combination)
-    return found
-
-
-def _residual_squares(combination: Floats) -> Floats:
-    return combination.T @ combination
+        # Leaving one training stimulus out: its residual is that of the whole fit over 1 − its leverage.
+        hat = (vectors * (values / (values + penalty * scale))) @ vectors.T + 1 / size
+        residual = (np.eye(size) - hat) / (1 - np.diag(hat))[:, None]
+        inner[index][np.ix_(train, train)] = residual.T @ residual
+        weight = across @ (vectors / (values + penalty * scale)) @ vectors.T @ centre
+        outer[index] = _means(count, train, test)
+        outer[index][:, train] -= weight
+    return inner, outer

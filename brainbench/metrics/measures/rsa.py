@@ -1,42 +1,205 @@
-"""Representational similarity analysis as a metric, and linear CKA as a case of it."""
+"""Representational similarity analysis (RSA) as a metric."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+import math
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
+import numpy as np
 from numpy.typing import ArrayLike
 
+from brainbench.core.errors import UsageError
 from brainbench.core.records import Score
-from brainbench.core.trials import Trials
-from brainbench.metrics.animal_to_animal import score_animals
+from brainbench.metrics.animal_to_animal import score_agreement
+from brainbench.metrics.measures.metric import Metric, usable_features
+from brainbench.metrics.rdms.comparison import check_comparison, permuted_comparisons
+from brainbench.metrics.rdms.comparison import compare as compare_rdms
 from brainbench.metrics.rdms.dissimilarity import rdm
-from brainbench.metrics.reliability.subject_rdm import SubjectRDM, subject_rdm
-from brainbench.metrics.score import score_rdms
+from brainbench.metrics.rdms.pairs import Floats, Ints, permuted_pairs, rdm_stack, square, stimulus_count
+from brainbench.metrics.reliability.noise_correction import ESTIMATORS, Corrected, noise_corrected
+from brainbench.metrics.reliability.subject_rdm import SubjectRDM, is_flat
+from brainbench.metrics.score import score_layers
+
+_CHUNK_ELEMENTS = 1 << 22
 
 
 @dataclass(frozen=True)
-class RSA:
-    """Compare RDMs; corrected by the split-half reliability of each animal's RDM."""
+class RSA(Metric):
+    """Compare RDMs; corrected by the split-half reliability of each animal's RDM.
 
-    name: str
-    title: str
-    brain_method: str = "correlation"
-    """RDM method of the animals, see :func:`brainbench.metrics.subject_rdm`."""
-    model_method: str = "correlation"
+    A layer is its RDM [P], NaN in the pairs of a stimulus that it has no value for.
+    """
+
+    name: str = "rsa"
+    title: str = ""
+    brain_method: str = "crossnobis"
+    noise: str = "none"
+    model_method: str = "sqeuclidean"
     """RDM method of the activations, which have no trial noise."""
-    comparison: str = "pearson"
+    comparison: str = "whitened-cosine"
 
-    def animal(self, subject: str, blocks: Sequence[Trials], n_stimuli: int, **options: Any) -> SubjectRDM:
-        """Return the animal's RDM with its split halves and draws; options are those of :func:`subject_rdm`."""
-        return subject_rdm(subject, blocks, n_stimuli, method=self.brain_method, comparison=self.comparison, **options)
+    corrected = True
+    of_rdms = True
+    orders = 1999
+    orders_between = 999
+    fewest = 3
+    estimators = ESTIMATORS
 
-    def score(self, features: Mapping[str, ArrayLike], animals: Sequence[SubjectRDM], **options: Any) -> Score:
-        """Score the RDMs of the layers' features [K, F]; options are those of :func:`score_rdms`."""
-        rdms = {layer: rdm(values, method=self.model_method) for layer, values in features.items()}
-        return score_rdms(rdms, animals, compare=self.comparison, **options)
+    def layer(self, features: ArrayLike) -> Floats:
+        """Return the RDM [P] of a layer's features [K, F]."""
+        return rdm(usable_features(features), method=self.model_method)
 
-    def score_animals(self, animals: Sequence[SubjectRDM], **options: Any) -> Score:
-        """Score the animals against one another; options are those of :func:`brainbench.metrics.score_animals`."""
-        return score_animals(animals, compare=self.comparison, **options)
+    def known(self, layer: Floats) -> np.ndarray:
+        """Return where [K] a stimulus has any distance."""
+        count = stimulus_count(len(layer))
+        return ~np.isnan(square(layer) + np.diag(np.full(count, np.nan))).all(axis=1)
+
+    def varies(self, layer: Floats) -> bool:
+        """Return whether every pair has a distance and they differ."""
+        return not bool(is_flat(layer))
+
+    def take(self, layer: Floats, stimuli: Ints) -> Floats:
+        """Return the RDM of some stimuli, in this order."""
+        return layer[permuted_pairs(np.asarray(stimuli)[None], stimulus_count(len(layer)))[0]]
+
+    def compare_layers(
+        self, layers: Sequence[Floats], animals: Sequence[SubjectRDM], chunks: Iterable[Ints], device: Any = None
+    ) -> Iterator[Floats]:
+        """Yield raw comparisons [N, L, A] under the orders of each chunk."""
+        brain = np.stack([animal.rdm for animal in animals])
+        return permuted_comparisons(np.stack(layers), brain, iter(chunks), self.comparison, device=device)
+
+    def correction(self, animal: SubjectRDM, estimator: str) -> Corrected:
+        """Return the factor of the estimator; it is linear in the comparison, so that of a comparison of 1."""
+        return noise_corrected(1.0, animal.split_half_by(self.comparison), estimator=estimator)
+
+    def attainable(self, animals: Sequence[SubjectRDM], seed: int) -> Floats:
+        """Return the raw comparison [A] that is corrected to 1."""
+        return np.array([1 / self.correction(animal, "default").value for animal in animals])
+
+    def halves(self, animal: SubjectRDM, order: Ints) -> tuple[list[SubjectRDM], float]:
+        """Return the halves of the animal's splits; their reliability is the raw split-half comparison."""
+        # A half in which a stimulus met silent units has no RDM; such splits say nothing.
+        kept = animal.halves[~is_flat(animal.halves).any(axis=1)]
+        pairs = permuted_pairs(order[None])[0]
+        agreement = animal.split_half_by(self.comparison)
+        factor = 1 / math.sqrt(float(agreement[np.isfinite(agreement)].mean()))
+        return [
+            replace(animal, rdm=half, halves=half[:0]) for half in kept.reshape(-1, kept.shape[-1])[:, pairs]
+        ], factor
+
+    def partner(self, animal: SubjectRDM, others: Sequence[SubjectRDM]) -> Floats:
+        """Return the mean RDM of the other animals."""
+        return np.mean([other.rdm for other in others], axis=0)
+
+    def agreement(self, animal: SubjectRDM, others: Sequence[SubjectRDM], estimator: str) -> Corrected:
+        """Return the factor for both sides (thesis, equation 3.4): the others' mean RDM is noisy too."""
+        # Halves are averaged split by split, so every animal must have them.
+        splits = min(len(one.halves) for one in others)
+        halves = np.mean([one.halves[:splits] for one in others], axis=0)
+        return noise_corrected(
+            1.0,
+            animal.split_half_by(self.comparison)[:splits],
+            estimator=estimator,
+            other_split_half_r=compare_rdms(halves[:, 0], halves[:, 1], method=self.comparison),
+        )
+
+    def agreement_null(self, animals: Sequence[SubjectRDM], factors: Floats, orders: Ints) -> Floats:
+        """Return the mean corrected agreement [N] with every animal's stimuli in an order of its own [N, A, K]."""
+        rdms = np.stack([animal.rdm for animal in animals])
+        step, found = max(1, _CHUNK_ELEMENTS // rdms.size), []
+        for start in range(0, len(orders), step):
+            moved = np.take_along_axis(rdms[None], permuted_pairs(orders[start : start + step]), axis=-1)
+            # All leave-one-out means from one sum over animals.
+            others = (moved.sum(axis=1, keepdims=True) - moved) / (len(rdms) - 1)
+            found.append(compare_rdms(moved, others, method=self.comparison) @ factors / len(factors))
+        return np.concatenate(found)
+
+    def describe(self, animals: Sequence[SubjectRDM]) -> str:
+        """Name the RDMs and their comparison."""
+        methods = sorted({animal.method for animal in animals})
+        return f"RSA: {'/'.join(methods)} RDM, {self.comparison} comparison"
+
+
+def score_rdms(
+    layer_rdms: Mapping[str, ArrayLike],
+    subjects: Sequence[SubjectRDM],
+    *,
+    name: str,
+    stimuli: Sequence[str],
+    estimator: str = "default",
+    compare: str = "pearson",
+    seed: int = 0,
+    device: Any = None,
+) -> Score:
+    """Score a model by the RDMs of its layers against animals.
+
+    ``default``: each reliable animal is compared with the layer that compares best with the *other*
+    reliable animals, the comparison is corrected for the animal's noise, and the score is the mean over
+    animals. The permutation p-value repeats the choice of layer in every permutation. A single animal
+    chooses on one half of its trials and is scored on the other. ``thesis`` and ``thesis-input`` are
+    the published estimators with their maximum over layers, which is optimistic and says so.
+
+    Args:
+        layer_rdms: RDM [P] of each layer, in network order.
+        subjects: From :func:`subject_rdm`, for the same stimuli in the same order.
+        name: Name of the model.
+        stimuli: Names of the K stimuli, in the order of the RDMs.
+        estimator: See :func:`noise_corrected`.
+        compare: Comparison of RDMs, see :func:`brainbench.metrics.compare`.
+        seed: Seed of random permutations (more than 8 stimuli).
+        device: Torch device for the permutations, which pays from some hundred stimuli on; numpy by default.
+
+    Raises:
+        UsageError: no layers or animals, RDMs that do not fit the stimuli, unknown estimator or comparison.
+    """
+    check_comparison(compare)
+    rdms = check_layers(layer_rdms, stimuli)
+    options = {"name": name, "stimuli": stimuli, "estimator": estimator, "seed": seed, "device": device}
+    return score_layers(RSA(comparison=compare), rdms, subjects, **options)[0]
+
+
+def score_animals(
+    subjects: Sequence[SubjectRDM],
+    *,
+    stimuli: Sequence[str] | None = None,
+    estimator: str = "default",
+    compare: str = "pearson",
+    seed: int = 0,
+) -> Score:
+    """Score each reliable animal against the mean RDM of the others, both sides corrected for noise.
+
+    Args:
+        subjects: From :func:`subject_rdm`, for the same stimuli in the same order.
+        stimuli: Names of the K stimuli; numbers by default.
+        estimator: See :func:`noise_corrected`.
+        compare: Comparison of RDMs.
+        seed: Seed of the permutations.
+
+    Raises:
+        UsageError: no animals, RDMs that do not fit, unknown estimator or comparison.
+    """
+    check_comparison(compare)
+    if stimuli is None:
+        stimuli = [str(number) for number in range(subjects[0].count if subjects else 0)]
+    return score_agreement(RSA(comparison=compare), subjects, stimuli=stimuli, estimator=estimator, seed=seed)
+
+
+def check_layers(layer_rdms: Mapping[str, ArrayLike], stimuli: Sequence[str]) -> dict[str, Floats]:
+    """Return the layers' RDMs [P] by name.
+
+    Raises:
+        UsageError: no layers, or RDMs of another number of stimuli.
+    """
+    if not layer_rdms:
+        raise UsageError("There are no layers to score; give the RDM of at least one layer.")
+    rdms = {str(layer): rdm_stack(values, f"The RDM of layer {layer!r}") for layer, values in layer_rdms.items()}
+    pairs = len(stimuli) * (len(stimuli) - 1) // 2
+    for layer, values in rdms.items():
+        if values.shape != (pairs,):
+            raise UsageError(
+                f"The RDM of layer {layer!r} has shape {values.shape}; {len(stimuli)} stimuli have {pairs} pairs."
+            )
+    return rdms

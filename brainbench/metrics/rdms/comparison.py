@@ -113,7 +113,9 @@ def permuted_comparisons(
         else:
             # A square matrix read row by row: the entry (i, j) comes from (order[i], order[j]).
             places = (moved[:, :, None] * count + moved[:, None, :]).reshape(len(moved), -1)
-        yield fetch((left[:, places] @ right).swapaxes(0, 1))
+        # Plain indexing leaves the pairs in a slow axis, where the product cannot use BLAS: 10 times slower.
+        permuted = left[:, places] if is_tensor(left) else left.take(places, axis=1)
+        yield fetch((permuted @ right).swapaxes(0, 1))
 
 
 def features(rdms: Floats, method: str) -> Floats:

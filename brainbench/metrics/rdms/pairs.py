@@ -59,14 +59,20 @@ def square(rdm: ArrayLike) -> Floats:
     return matrix
 
 
-def permuted_pairs(orders: Any) -> Any:
-    """Return indices [N, P] such that ``rdm[indices[n]]`` is the RDM of stimuli in ``orders[n]`` [N, K]."""
-    xp, count = library(orders), orders.shape[-1]
+def permuted_pairs(orders: Any, count: int | None = None) -> Any:
+    """Return indices [N, P] such that ``rdm[indices[n]]`` is the RDM of stimuli in ``orders[n]`` [N, K].
+
+    Orders may name some of ``count`` stimuli only.
+    """
+    xp, size = library(orders), orders.shape[-1]
+    count = size if count is None else count
     rows, cols = _pair_indices(count, orders)
     where = {"device": orders.device} if is_tensor(orders) else {}
     # table[i, j] is the place of the pair {i, j}: permuting an RDM is one look-up, without square matrices.
     table = xp.zeros((count, count), dtype=xp.int64, **where)
     table[rows, cols] = table[cols, rows] = xp.arange(len(rows), **where)
+    if size != count:
+        rows, cols = _pair_indices(size, orders)
     # Pair (i, j) of the permuted RDM is the pair (order[i], order[j]) of the given one.
     return table[orders[..., rows], orders[..., cols]]
 

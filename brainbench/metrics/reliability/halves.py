@@ -39,14 +39,10 @@ class WeightedRDMs:
         weights: [N, R] of each session; N may be 1 where only the halves differ.
         count: K.
         method: RDM method.
-        copies: [N, J] how often the units of each session count; once by default.
     """
 
-    def __init__(
-        self, sessions: list[SortedTrials], weights: list[Floats], count: int, method: str, copies: Ints | None = None
-    ) -> None:
+    def __init__(self, sessions: list[SortedTrials], weights: list[Floats], count: int, method: str) -> None:
         self._sessions, self._weights, self._count, self._method = sessions, weights, count, method
-        self._copies = np.ones((len(weights[0]), len(sessions)), dtype=np.int64) if copies is None else copies
         by_products = method in BY_PRODUCTS and all(session.complete for session in sessions)
         self._sums = [_Sums(*each, count) for each in zip(sessions, weights, strict=True)] if by_products else None
 
@@ -70,7 +66,7 @@ class WeightedRDMs:
     def _from_products(self, sums: list[_Sums]) -> Floats | None:
         """Return RDMs from summed trials, NaN where a stimulus has none left; None where that would lose digits."""
         gram, total = np.zeros_like(sums[0].gram), np.zeros_like(sums[0].units)
-        units = (self._copies @ np.array([s.responses.shape[1] for s in self._sessions])).astype(np.float64)
+        units = float(sum(session.responses.shape[1] for session in self._sessions))
         with np.errstate(invalid="ignore", divide="ignore"):
             for index, part in enumerate(sums):
                 number = np.where(part.number > 0, part.number, np.nan)
@@ -82,38 +78,24 @@ class WeightedRDMs:
                     free = (np.einsum("nii->ni", part.gram) - part.squares) / np.where(pairs > 0, pairs, np.nan)
                     diagonal = np.einsum("nii->ni", own)
                     diagonal[...] = diagonal - self._sessions[index].inflation * (diagonal - free)
-                copies = self._copies[:, index].astype(np.float64)[:, None]
-                gram += np.where(copies[..., None] > 0, copies[..., None] * own, 0.0)
-                total += np.where(copies > 0, copies * part.units / number, 0.0)
+                gram += own
+                total += part.units / number
         if self._method != "correlation":
-            return products_from_gram(gram, 1) / units[:, None]
+            return products_from_gram(gram, 1) / units
         # Correlation takes each pattern's mean over all units, which spans the sessions.
-        centred = gram - total[:, :, None] * total[:, None, :] / units[:, None, None]
+        centred = gram - total[:, :, None] * total[:, None, :] / units
         if (np.einsum("nii->ni", centred) <= _COMMON * np.einsum("nii->ni", gram)).any():
             return None
         return correlation_from_gram(centred, np.zeros(gram.shape[:2]))
 
     def _from_patterns(self, weights: list[Floats]) -> Floats:
         """Return RDMs from mean patterns: any method, missing entries, large common offsets."""
-        number = max(map(len, weights))
-        rdms = np.empty((number, self._count * (self._count - 1) // 2))
-        copies = np.broadcast_to(self._copies, (number, len(self._sessions)))
-        for repeats in np.unique(copies, axis=0):
-            rows = (copies == repeats).all(axis=1)
-            some = [np.broadcast_to(weight, (number, weight.shape[1]))[rows] for weight in weights]
-            rdms[rows] = self._pattern_rdms(some, repeats)
-        return rdms
-
-    def _pattern_rdms(self, weights: list[Floats], repeats: Ints) -> Floats:
         unbiased = self._method == "crossnobis"
         found = [
             weighted_patterns(session, weight, self._count, variances=unbiased)
             for session, weight in zip(self._sessions, weights, strict=True)
         ]
-        patterns, variances = (
-            np.concatenate([found[index][part] for index in np.repeat(np.arange(len(found)), repeats)], axis=-1)
-            for part in (0, 1)
-        )
+        patterns, variances = (np.concatenate([item[part] for item in found], axis=-1) for part in (0, 1))
         if unbiased:
             return _unbiased_distances(patterns, variances)
         if self._method == "correlation":

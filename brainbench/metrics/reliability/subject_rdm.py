@@ -1,4 +1,4 @@
-"""One animal's RDM with what is needed to correct scores for its noise: split-half reliability and draws.
+"""One animal as metrics see it: its RDM with split-half reliability, its mean responses and their noise.
 
 An animal is a sequence of sessions (:class:`Trials`) with different units. Units of all sessions are joined after
 averaging trials, so an RDM spans them all. What cannot be split is left out by the rules of
@@ -12,7 +12,7 @@ numbers of trials leave it unbiased.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -22,12 +22,12 @@ from brainbench.core.errors import DataError, UsageError, unknown_name
 from brainbench.core.records import Interval
 from brainbench.core.trials import Trials
 from brainbench.metrics.rdms.comparison import check_comparison, compare
-from brainbench.metrics.rdms.pairs import Floats
+from brainbench.metrics.rdms.pairs import Floats, Ints, permuted_pairs, stimulus_count
 from brainbench.metrics.reliability.halves import WeightedRDMs, half_rdms
-from brainbench.metrics.reliability.noise_correction import finite_mean, spearman_brown
-from brainbench.metrics.reliability.resampling import resample
+from brainbench.metrics.reliability.noise_correction import spearman_brown
 from brainbench.metrics.reliability.sessions import SortedTrials, shifted_sessions, usable_sessions
 from brainbench.metrics.reliability.whitening import whitened_sessions
+from brainbench.metrics.stimulus_labels import membership, stimulus_means
 
 SPLITS = 1000
 """Random split halves per animal."""
@@ -35,17 +35,13 @@ SPLITS = 1000
 SUBJECT_METHODS = ("correlation", "sqeuclidean", "mahalanobis", "crossnobis", "poisson")
 """RDM methods of an animal."""
 
-DRAW_SPLITS = 20
-"""Split halves in each bootstrap draw; more change its interval by less than the draws themselves do."""
-
 _CHUNK_BYTES = 1 << 24
 _HALVES_BYTES = 1 << 26
-_DRAWS_BYTES = 1 << 28
 
 
 @dataclass(frozen=True)
 class SubjectRDM:
-    """An animal's RDM, ready to be compared with any number of models."""
+    """An animal, ready to be compared with any number of models."""
 
     subject: str
     rdm: Floats = field(repr=False)
@@ -68,15 +64,35 @@ class SubjectRDM:
     """Percentiles of single splits' Spearman-Brown values: how much one split would have misled, not a
     confidence interval of the reliability."""
     seed: int = 0
-    """Seed of splits and draws."""
+    """Seed of the splits."""
     problem: str | None = None
     """Reason for having no usable RDM, in words; None otherwise."""
     notes: tuple[str, ...] = ()
     """Sessions and units that were left out, in words."""
-    draws: Floats = field(default_factory=lambda: np.empty((0, 0)), repr=False)
-    """[D, P] RDMs of bootstrap draws of the animal's sessions and trials; empty without any."""
-    draws_r: Floats = field(default_factory=lambda: np.empty(0), repr=False)
-    """[D] mean split-half comparison (by ``comparison``) within each draw."""
+    patterns: Floats = field(default_factory=lambda: np.empty((0, 0)), repr=False)
+    """[K, U] mean responses over trials, units of all sessions joined; empty where only the RDM is known."""
+    noise: Floats = field(default_factory=lambda: np.empty((0, 0)), repr=False)
+    """[K, U] variance of those means, from the spread over trials."""
+    nuisances: Mapping[str, Floats] = field(default_factory=dict, repr=False)
+    """Name → RDM [P] of what else was measured in the trials; see :mod:`brainbench.metrics.measures.nuisance`."""
+
+    def take(self, stimuli: Ints) -> SubjectRDM:
+        """Return the animal with some stimuli [K'], in this order; the split halves' comparisons stay as they are."""
+        pairs = permuted_pairs(np.asarray(stimuli)[None], self.count)[0]
+        known = len(self.patterns) > 0
+        return replace(
+            self,
+            rdm=self.rdm[pairs],
+            halves=self.halves[:0],
+            patterns=self.patterns[stimuli] if known else self.patterns,
+            noise=self.noise[stimuli] if known else self.noise,
+            nuisances={name: values[pairs] for name, values in self.nuisances.items()},
+        )
+
+    @property
+    def count(self) -> int:
+        """Number of stimuli."""
+        return stimulus_count(len(self.rdm))
 
     def split_half_by(self, comparison: str) -> Floats:
         """Return the split-half comparisons [S] by any comparison (from the stored halves if need be)."""
@@ -96,8 +112,6 @@ def subject_rdm(
     splits: int = SPLITS,
     seed: int = 0,
     noise: str = "diag",
-    draws: int = 0,
-    draw_splits: int = DRAW_SPLITS,
 ) -> SubjectRDM:
     """Return an animal's RDM and its split halves from the trials of its sessions.
 
@@ -115,13 +129,10 @@ def subject_rdm(
         method: RDM method: ``correlation``, ``sqeuclidean``, ``mahalanobis``, ``crossnobis`` or ``poisson``.
         comparison: Comparison of RDMs, see :func:`brainbench.metrics.compare`.
         splits: Number of random split halves.
-        seed: Seed of the splits and draws.
+        seed: Seed of the splits.
         noise: Noise covariance for ``mahalanobis`` and ``crossnobis``: ``diag``, ``none`` or another of
             :func:`brainbench.metrics.noise_precision`. ``diag``, ``none`` and ``full`` leave crossnobis
             unbiased; shrinkage leaves a bias of up to .01 per unit (docs/statistics.md).
-        draws: Bootstrap draws of sessions and trials, for intervals; fewer where their RDMs would not fit in 256 MiB.
-            See :mod:`brainbench.metrics.inference.bootstrap`.
-        draw_splits: Split halves within each draw.
 
     Raises:
         UsageError: unknown method, bad shapes or labels, repeated trial keys, no positive ``splits``.
@@ -130,11 +141,8 @@ def subject_rdm(
     if method not in SUBJECT_METHODS:
         raise unknown_name("RDM method of an animal", method, SUBJECT_METHODS)
     check_comparison(comparison)
-    if min(splits, draw_splits) < 1 or draws < 0 or n_stimuli < 2:
-        raise UsageError(
-            "Split halves need splits ≥ 1, draw_splits ≥ 1, draws ≥ 0 and 2 or more stimuli; received "
-            f"{splits}, {draw_splits}, {draws} and {n_stimuli}."
-        )
+    if splits < 1 or n_stimuli < 2:
+        raise UsageError(f"Split halves need splits ≥ 1 and 2 or more stimuli; received {splits} and {n_stimuli}.")
     names = [str(name) for name in (range(n_stimuli) if stimuli is None else stimuli)]
     if len(names) != n_stimuli:
         raise UsageError(f"There are {n_stimuli} stimuli but {len(names)} names.")
@@ -161,12 +169,13 @@ def subject_rdm(
         raise DataError("method='poisson' needs rates or counts, which are never negative; some responses are.")
     # Trials without noise covariance left make squared distances Mahalanobis distances.
     distance = "sqeuclidean" if method == "mahalanobis" else method
+    patterns, variances = _mean_responses(sessions, n_stimuli)
     if distance != "poisson":
         sessions = shifted_sessions(sessions, n_stimuli, by_unit=distance != "correlation")
     every = WeightedRDMs(sessions, [np.ones((1, len(session.labels))) for session in sessions], n_stimuli, distance)
-    # Sums over all trials are made once; halves and draws are weightings of the same sorted trials.
+    # Sums over all trials are made once; halves are weightings of the same sorted trials.
     rdm, halves, r = every.whole()[0], *_split_halves(sessions, n_stimuli, distance, comparison, splits, seed)
-    found = replace(empty, rdm=rdm, split_half_r=r, halves=halves)
+    found = replace(empty, rdm=rdm, split_half_r=r, halves=halves, patterns=patterns, noise=variances)
     finite = r[np.isfinite(r)]
     if not np.isfinite(rdm).all() or not finite.size:
         flat = np.isnan(rdm).any()
@@ -176,13 +185,21 @@ def subject_rdm(
     low, high = np.percentile(spearman_brown(finite), [2.5, 97.5]) if (finite > -1).all() else (math.nan, math.nan)
     spread = Interval(float(low), float(high), 0.95, "percentiles over random splits; not a confidence interval")
     # Correlations are averaged before the formula, which is not linear.
-    found = replace(found, reliability=float(spearman_brown(finite.mean())), spread=spread)
-    # The draws are made here, once for all models, and must fit in memory.
-    number = min(draws, _DRAWS_BYTES // (8 * pairs))
-    if not number:
-        return replace(found, draws=np.empty((0, pairs)))
-    drawn, agreement = resample(sessions, n_stimuli, distance, comparison, draws=number, splits=draw_splits, seed=seed)
-    return replace(found, draws=drawn, draws_r=finite_mean(agreement))
+    return replace(found, reliability=float(spearman_brown(finite.mean())), spread=spread)
+
+
+def _mean_responses(sessions: list[SortedTrials], count: int) -> tuple[Floats, Floats]:
+    """Return mean responses [K, U] over trials, units of all sessions joined, and the variance of those means."""
+    means, noise = [], []
+    for session in sessions:
+        mean = stimulus_means(session.responses, session.labels, count)
+        square = stimulus_means((session.responses - mean[session.labels]) ** 2, session.labels, count)
+        # Trials counted by unit, since a unit may be missing in some of them.
+        number = membership(session.labels, count) @ np.isfinite(session.responses)
+        means.append(mean)
+        # Mean square deviation × n/(n − 1) is the variance over trials; over n, that of their mean.
+        noise.append(square / (number - 1))
+    return np.concatenate(means, axis=1), np.concatenate(noise, axis=1)
 
 
 def _split_halves(

@@ -15,18 +15,18 @@ from hypothesis import strategies as st
 from scipy import stats
 
 from brainbench.core.records import GraphEdge, GraphNode, Interval, ModelGraph
-from leaderboards.entries import entries_of
+from leaderboards.boards import rank
 from leaderboards.figures import plots, svg
 from leaderboards.figures.architecture import diagram
-from leaderboards.figures.charts import board_figures, layers_of
+from leaderboards.figures.charts import board_figures
 from leaderboards.figures.plots import regression
+from leaderboards.figures.record import layers
 from leaderboards.figures.svg import STYLE, Drawing, Scale, scale_of, standalone
-from leaderboards.ranking import rank
 
 
 def _figures(*records):
     (board,) = rank(records)
-    return {figure.key: figure for figure in board_figures(board, entries_of(board))}
+    return {figure.key: figure for figure in board_figures(board)}
 
 
 def _trained(record, objective="supervised", augmentation=None, masking=0.0, top1=0.4, **changes):
@@ -101,9 +101,7 @@ def test_a_variable_whose_variance_vanishes_has_no_regression():
 
 
 def test_layers_stand_at_their_scores(make_record):
-    (board,) = rank([make_record("net")])
-    (entry,) = entries_of(board)
-    drawing = layers_of(entry)
+    drawing = layers([make_record("net")])
     assert drawing is not None
     texts = _texts(drawing)
     assert any(text.startswith("conv4: 0.688") for text in texts)

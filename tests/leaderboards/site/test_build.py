@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import math
 import shutil
 import zipfile
 from dataclasses import replace
@@ -14,8 +15,10 @@ import pytest
 
 from brainbench.core.errors import DataError, UsageError
 from leaderboards import build_leaderboard, read_records, write_record
-from leaderboards.site.table import COLUMNS
+from leaderboards.boards import rank
+from leaderboards.site.table import COLUMNS, FIELDS
 from tests.factories.html_page import HOSTILE, Page, poisoned
+from tests.factories.records import draw_board
 
 CHROMIUM = shutil.which("chromium")
 browser = pytest.mark.skipif(CHROMIUM is None, reason="needs the chromium browser")
@@ -34,24 +37,27 @@ def columns(board: dict[str, Any], *names: str) -> list[tuple[Any, ...]]:
     return list(zip(*(board["data"][name] for name in names), strict=True))
 
 
-def _seeded(record, seed: int, value: float):
+def _seeded(record, seed: int, by: float):
     card = replace(record.card, seed=seed, objective="untrained", weights=f"w{seed}")
-    shift = value - record.score.value
-    subjects = tuple(replace(item, value=item.value + shift) for item in record.score.subjects)
-    return replace(record, card=card, score=replace(record.score, value=value, subjects=subjects))
+    subjects = tuple(replace(item, value=item.value + by) for item in record.score.subjects)
+    left_out = tuple(value + by for value in record.score.without_stimulus)
+    score = replace(record.score, value=record.score.value + by, subjects=subjects, without_stimulus=left_out)
+    return replace(record, card=card, score=score)
 
 
-def test_every_row_says_rank_value_and_interval_and_baselines_follow(make_record, tmp_path):
-    (board,) = data(build([make_record("low", 0.1), make_record("a", 0.8), make_record("b", 0.75)], tmp_path))["boards"]
-    assert columns(board, "name", "first", "last", "score", "low", "high", "kind") == [
-        ("a", 1, 2, 0.8, 0.7, 0.9, "model"),
-        ("b", 1, 2, 0.75, 0.65, 0.85, "model"),
-        ("low", 3, 3, 0.1, 0.0, 0.2, "model"),
-        ("animal-to-animal", None, None, 0.712, 0.612, 0.812, "animals"),
-        ("raw input", None, None, 0.223, 0.123, 0.323, "baseline"),
-        ("random features", None, None, 0.487, 0.387, 0.587, "baseline"),
-    ]
-    assert board["band"] == [pytest.approx(0.612), pytest.approx(0.812)]
+def test_every_row_says_rank_score_and_interval_and_baselines_follow(tmp_path):
+    records = draw_board({"low": 0.0, "a": 0.9, "b": 0.85}, spread=0.1)
+    (board,) = data(build(records, tmp_path))["boards"]
+    (found,) = rank(records)
+    shown = columns(board, "name", "rank_first", "rank_last", "score", "score_low", "score_high", "kind")
+    for entry, row in zip(found.entries, shown, strict=False):
+        ends = [pytest.approx(value, abs=1e-5) for value in (entry.scaled, entry.interval.low, entry.interval.high)]
+        assert row == (entry.name, entry.first, entry.last, *ends, "model")
+    assert [row[0] for row in shown[3:]] == ["animal-to-animal", "raw input", "random features"]
+    assert [row[-1] for row in shown[3:]] == ["animals", "baseline", "baseline"]
+    assert [row[1:3] for row in shown] == [(1, 2), (1, 2), (3, 3), (None, None), (None, None), (None, None)]
+    assert board["ranked"]
+    assert len(board["band"]) == 2
 
 
 def test_every_column_has_its_data(make_record, tmp_path):
@@ -60,13 +66,52 @@ def test_every_column_has_its_data(make_record, tmp_path):
     assert keys <= set(board["data"])
 
 
-def test_seeds_are_folded_into_one_row_with_their_spread(make_record, tmp_path):
-    records = [_seeded(make_record("net"), seed, value) for seed, value in enumerate((0.4, 0.5, 0.6))]
-    site = build([*records, make_record("other", 0.2)], tmp_path)
+def test_page_csv_and_json_agree(tmp_path):
+    records = draw_board({"low": 0.0, "a": 0.9, "b": 0.85, "c": 0.3})
+    records[1] = replace(records[1], card=replace(records[1].card, family="user module"))
+    site = build(records, tmp_path)
+    plain = json.loads((site / "data" / "leaderboard.json").read_text())
+    written = list(csv.DictReader((site / "data" / "leaderboard.csv").read_text().splitlines()))
+    assert [list(row) for row in written] == [list(FIELDS)] * len(plain)
+    (board,) = data(site)["boards"]
+    assert len(plain) == len(written) == len(board["data"]["name"]) == 7
+    for index, (row, cells) in enumerate(zip(plain, written, strict=True)):
+        for name, value in row.items():
+            assert cells[name] == ("" if value is None else str(value))
+            if name in board["data"]:
+                shown = board["data"][name][index]
+                assert shown == (pytest.approx(value, abs=1e-6) if isinstance(value, float) else value)
+        assert board["data"]["score"][index] == pytest.approx(row["scaled"], abs=1e-6)
+
+
+def test_the_page_says_what_the_board_lets_conclude_and_how_to_get_a_model(tmp_path):
+    site = build(draw_board({"s4-small": 0.9, "weak": 0.3}, spread=0.1, truth="s4-small"), tmp_path)
+    page, (board,) = Page(site / "index.html"), data(site)["boards"]
+    for sentence in board["conclusions"]:
+        assert sentence in page.text
+    assert "hidden network was found" in page.text
+    assert columns(board, "get")[0] == ('brainbench score s4-small; brainbench.load_model("s4-small")',)
+    model = Page(next((site / "models").glob("s4-small--*")))
+    assert "brainbench score s4-small" in model.text
+    assert "rank 1" in model.text
+
+
+def test_a_board_whose_records_state_no_chance_shows_their_own_values(make_record, tmp_path):
+    records = [make_record("a", 0.4, chance=math.nan), make_record("b", 0.6, chance=math.nan)]
+    records = [replace(record, baselines={}, animal_to_animal=None) for record in records]
+    (board,) = data(build(records, tmp_path))["boards"]
+    assert not board["scaled"]
+    assert columns(board, "name", "score", "scaled") == [("b", 0.6, None), ("a", 0.4, None)]
+
+
+def test_seeds_are_folded_into_one_row_with_their_spread(tmp_path):
+    record, other = draw_board({"net": 0.5, "other": 0.2})
+    site = build([*(_seeded(record, seed, by) for seed, by in enumerate((-0.1, 0.0, 0.1))), other], tmp_path)
     (board,) = data(site)["boards"]
     rows = {name: row for name, *row in columns(board, "name", "score", "spread", "seeds", "runs")}
-    assert rows["net"][:3] == [0.5, 0.1, 3]
-    assert [run[:2] for run in rows["net"][3]] == [[0, 0.4], [1, 0.5], [2, 0.6]]
+    middle = record.score.scaled
+    assert rows["net"][:3] == [pytest.approx(middle, abs=1e-5), pytest.approx(0.1), 3]
+    assert rows["net"][3] == [pytest.approx(middle + by, abs=1e-5) for by in (-0.1, 0.0, 0.1)]
     assert rows["other"][2:] == [1, None]
     assert len(list((site / "models").iterdir())) == 2
     assert len(list((site / "records").iterdir())) == 4
@@ -94,37 +139,31 @@ def test_bad_files_are_listed_and_left_out(make_record, tmp_path):
 def test_conflicts_and_stale_records_are_said_in_the_row_and_on_the_page(make_record, tmp_path):
     site = build([make_record("a", 0.5), make_record("a", 0.6)], tmp_path)
     (board,) = data(site)["boards"]
-    assert all(any("conflict:" in note for note in notes) for notes in board["data"]["notes"][:2])
+    assert all("conflict:" in notes for notes in board["data"]["notes"][:2])
     assert "the same computation gave" in Page(next((site / "models").iterdir())).text
 
 
 def test_downloads_hold_the_records_and_the_table(make_record, tmp_path):
-    parquet = pytest.importorskip("pyarrow.parquet")
-
     records = [make_record("=HYPERLINK(1)", 0.3), make_record("b", 0.8), make_record("c", status="undefined")]
     site = build(records, tmp_path)
     rows = list(csv.DictReader((site / "data" / "leaderboard.csv").read_text().splitlines()))
-    models = [(row["name"], row["value"], row["rank_first"]) for row in rows if row["row"] == "model"]
-    assert models == [("b", "0.8", "1"), ("'=HYPERLINK(1)", "0.3", "2"), ("c", "", "")]
-    table = parquet.read_table(site / "data" / "leaderboard.parquet").to_pylist()
-    plain = json.loads((site / "data" / "leaderboard.json").read_text())
-    assert table == plain
-    assert [row["value"] for row in table[:3]] == [0.8, 0.3, None]
+    models = [(row["name"], row["value"], row["scaled"]) for row in rows if row["kind"] == "model"]
+    assert models == [("b", "0.8", "0.8"), ("'=HYPERLINK(1)", "0.3", "0.3"), ("c", "", "")]
     zipfile.ZipFile(site / "data" / "records.zip").extractall(tmp_path / "unpacked")
     identities = {record.identity for record in records}
     for folder in (tmp_path / "unpacked", site / "records"):
         assert {item.record.identity for item in read_records(folder) if item.record} == identities
     links = {link["href"] for link in Page(site / "index.html").all("a") if "download" in link}
     assert all((site / link).is_file() for link in links)
-    assert len(links) == 5
+    assert len(links) == 4
 
 
 def test_equal_records_give_equal_sites_in_any_order_and_a_rebuild_leaves_nothing_old(make_record, tmp_path):
     records = [make_record(name, 0.5) for name in "abcd"]
     (tmp_path / "x").mkdir()
     one, other = build(records, tmp_path), build(records[::-1], tmp_path / "x")
-    names = sorted(path.relative_to(one) for path in one.rglob("*.*") if path.suffix != ".parquet")
-    assert names == sorted(path.relative_to(other) for path in other.rglob("*.*") if path.suffix != ".parquet")
+    names = sorted(path.relative_to(one) for path in one.rglob("*.*"))
+    assert names == sorted(path.relative_to(other) for path in other.rglob("*.*"))
     assert all((one / name).read_bytes() == (other / name).read_bytes() for name in names)
     build(records[:1], tmp_path)
     assert len(list((one / "models").iterdir())) == len(list((one / "records").iterdir())) == 1
@@ -172,7 +211,7 @@ def test_nothing_hostile_runs_in_a_browser_and_our_script_does(make_record, tmp_
     page.goto((site / "index.html").as_uri())
     for place in range(page.locator("#recordings option").count()):
         page.select_option("#recordings", index=place)
-        assert page.locator("#ranking tbody tr.model").count() == 1
+        assert page.locator("table.ranking tbody tr.model").count() == 1
         assert page.title() == "calm"
 
 
@@ -185,7 +224,7 @@ def test_filters_sorting_columns_and_seeds_are_kept_in_the_address(make_record, 
 
     twin = named("twin", 0.5, "zhuang", 2_000_000)
     records = [named("big", 0.9, "zhuang", 40_000_000), named("small", 0.3, "s4", 300_000)]
-    records += [_seeded(twin, seed, 0.4 + 0.1 * seed) for seed in range(3)]
+    records += [_seeded(twin, seed, 0.1 * seed) for seed in range(3)]
     site = build(records, tmp_path)
     page = chromium.new_page()
     page.goto((site / "index.html").as_uri())
@@ -197,10 +236,8 @@ def test_filters_sorting_columns_and_seeds_are_kept_in_the_address(make_record, 
     assert names() == ["big", "twin", "small"]
     page.select_option("#encoder", "zhuang")
     assert names() == ["big", "twin"]
-    page.get_by_label("Fold seeds").uncheck()
-    assert names() == ["big", "twin", "twin", "twin"]
-    page.locator("th button", has_text="score").click()
-    assert names()[-1] == "big"
+    page.locator("#ranking th button", has_text="score").click()
+    assert names() == ["twin", "big"]
     page.locator("summary", has_text="Columns").click()
     page.get_by_role("checkbox", name="layer").uncheck()
     assert page.locator("#ranking thead th").all_inner_texts().count("layer") == 0

@@ -13,8 +13,10 @@ import pytest
 
 from brainbench.core.records import ResultRecord
 from leaderboards import build_leaderboard, write_report
+from leaderboards import text as words
+from leaderboards.ranking import compare
 from tests.factories.html_page import HOSTILE, Page, poisoned
-from tests.factories.records import make_record
+from tests.factories.records import draw_board, make_record
 
 
 def report(record: ResultRecord, folder: Path) -> Page:
@@ -81,10 +83,18 @@ def test_report_shows_animals_methods_provenance_and_command(make_record, tmp_pa
     ):
         assert text in page.text
     assert "brainbench score zhuang-ln" in page.text
-    assert "was compared with demo (2 animals, 6 stimuli) by representational similarity analysis" in page.text
-    assert "Above raw input (0.223): the intervals do not overlap." in page.text
-    assert "Not told apart from random features (0.487): the intervals overlap." in page.text
-    assert "With fewer than 5 animals in common no paired test is trusted." in page.text
+    assert "was compared with demo (2 animals, 6 stimuli) by correlation distance" in page.text
+    assert "Not compared with raw input, random features, animal-to-animal: this needs at least 4 animals" in page.text
+
+
+def test_a_report_compares_with_baselines_by_paired_differences(tmp_path):
+    (record,) = draw_board({"net": 0.8}, raw=0.2)
+    page = report(record, tmp_path)
+    found = compare(record.score, record.baselines["raw input"])
+    assert f"Above raw input: difference {words.number(found.difference)} {words.span(found.interval)}" in page.text
+    assert "above raw input" in page.text
+    (weak,) = draw_board({"net": 0.2}, raw=0.2)
+    assert "Not told apart from raw input" in report(weak, tmp_path).text
 
 
 def test_synthetic_recordings_are_announced_and_real_ones_are_not(make_record, tmp_path):
@@ -116,7 +126,7 @@ def test_a_bare_record_still_makes_every_page(tmp_path):
     record = ResultRecord(Score("bare", 0.5, "ok"))
     for page in (report(record, tmp_path), model(record, tmp_path)):
         assert "holds no RDM" in page.text
-    assert "not ranked (no interval)" in model(record, tmp_path).text
+    assert "not ranked (not repeatable here" in model(record, tmp_path).text
     assert "Not drawn yet" in figures(record, tmp_path).text
 
 
@@ -192,7 +202,6 @@ def test_a_trusted_score_keeps_its_caveats(make_record, tmp_path):
     record = make_record(reasons=("one animal: no confidence interval",), interval=None)
     for page in (report(record, tmp_path), model(record, tmp_path)):
         assert "one animal: no confidence interval" in page.text
-    assert "not ranked (no interval)" in model(record, tmp_path).text
 
 
 def test_numbers_that_do_not_exist_are_never_drawn(make_record, make_score, tmp_path):

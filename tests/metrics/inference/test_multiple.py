@@ -10,9 +10,9 @@ from scipy import stats
 
 from brainbench.core.errors import UsageError
 from brainbench.metrics import compare, compare_models, permutation_test
-from brainbench.metrics.inference.multiple import adjust, layer_tests, sign_flip_p, step_down
+from brainbench.metrics.inference.multiple import adjust, compare_scores, layer_tests, step_down
 from brainbench.metrics.inference.permutation import permuted_values
-from brainbench.metrics.score import score_rdms
+from brainbench.metrics.measures.rsa import score_rdms
 from tests.factories.animals import STIMULI, make_rdm, make_subject
 
 
@@ -27,23 +27,6 @@ def test_holm_and_benjamini_hochberg_equal_the_published_examples():
     np.testing.assert_allclose(adjust(p, "holm"), [0.04, 0.06, 0.06, 0.025, 0.5])
     np.testing.assert_allclose(adjust(p, "none"), p)
     np.testing.assert_array_equal(adjust([0.01, np.nan, 0.04], "holm"), [0.02, np.nan, 0.04])
-
-
-def test_sign_flips_equal_scipy_and_have_a_smallest_p():
-    rng = np.random.default_rng(0)
-    d = rng.normal(0.3, size=9)
-    found = stats.permutation_test(
-        (d,),
-        lambda x, axis: np.abs(x.mean(axis=axis)),
-        permutation_type="samples",
-        alternative="greater",
-        n_resamples=np.inf,
-    )
-    assert sign_flip_p(d) == pytest.approx(found.pvalue)
-    assert sign_flip_p(np.arange(1.0, 12)) == pytest.approx(2 / 2**11)
-    assert sign_flip_p(d[::-1]) == sign_flip_p(d)
-    many = rng.normal(0.2, size=30)
-    assert sign_flip_p(many) == pytest.approx(stats.ttest_1samp(many, 0).pvalue, abs=0.03)
 
 
 def test_the_step_down_maximum_equals_counting_by_hand():
@@ -77,31 +60,61 @@ def test_a_true_model_stands_out_among_sixty_and_luck_does_not():
     assert by_name["true"].score == score_rdms(models["true"], animals, name="true", stimuli=STIMULI)
 
 
-def test_pairs_compare_models_on_the_same_animals():
+def test_pairs_are_compared_on_the_same_animals_and_stimuli():
     rng = np.random.default_rng(3)
-    shared = make_rdm(rng)
-    animals = _make_animals(rng, shared, 8)
-    models = {"true": {"a": shared}, "near": {"a": shared + 0.05 * rng.normal(size=15)}, "luck": {"a": make_rdm(rng)}}
-    found = compare_models(models, animals, stimuli=STIMULI, correction="holm")
+    shared, stimuli = make_rdm(rng, 12), [f"s{k}" for k in range(12)]
+    animals = [make_subject(f"m{i}", shared + 0.05 * rng.normal(size=66), seed=i) for i in range(8)]
+    models = {
+        "true": {"a": shared},
+        "near": {"a": shared + 0.05 * rng.normal(size=66)},
+        "luck": {"a": make_rdm(rng, 12)},
+    }
+    found = compare_models(models, animals, stimuli=stimuli, correction="holm")
     assert [(pair.first, pair.second) for pair in found.pairs] == [("true", "near"), ("true", "luck"), ("near", "luck")]
-    values = {m.score.name: np.array([subject.value for subject in m.score.subjects]) for m in found.models}
+    scores = {m.score.name: m.score for m in found.models}
     for pair in found.pairs:
-        d = values[pair.first] - values[pair.second]
-        assert pair.difference == pytest.approx(d.mean())
-        assert pair.p == sign_flip_p(d)
+        one, two = scores[pair.first], scores[pair.second]
+        each = [a.value - b.value for a, b in zip(one.subjects, two.subjects, strict=True)]
+        without = np.subtract(one.without_stimulus, two.without_stimulus)
+        over_animals = np.var(each, ddof=1) / 8
+        over_stimuli = 11 / 12 * ((without - without.mean()) ** 2).sum()
+        # The scale of both differs by their chance alone, which is near zero for correlations.
+        assert pair.difference == pytest.approx(np.mean(each), abs=0.02)
+        error = np.sqrt(over_animals + over_stimuli)
+        freedom = error**4 / (over_animals**2 / 7 + over_stimuli**2 / 11)
+        assert pair.p == pytest.approx(2 * stats.t.sf(abs(np.mean(each)) / error, freedom), rel=0.3, abs=1e-6)
         assert pair.interval.low < pair.difference < pair.interval.high
     np.testing.assert_allclose([pair.p_corrected for pair in found.pairs], adjust([p.p for p in found.pairs], "holm"))
-    assert found.pairs[1].p == pytest.approx(2 / 2**8)
+    assert found.pairs[1].p < 0.01
 
 
-def test_one_animal_has_no_paired_test_and_says_why():
+def test_too_few_animals_or_stimuli_have_no_paired_test_and_say_what_is_needed():
     rng = np.random.default_rng(4)
     shared = make_rdm(rng)
-    found = compare_models(
-        {"a": {"x": shared}, "b": {"x": make_rdm(rng)}}, _make_animals(rng, shared, 1), stimuli=STIMULI
+    models = {"a": {"x": shared}, "b": {"x": make_rdm(rng)}}
+    alone = compare_models(models, _make_animals(rng, shared, 1), stimuli=STIMULI).pairs[0]
+    assert np.isnan(alone.p)
+    assert alone.reason == "fewer than two animals have a value for both models"
+    few = compare_models(models, _make_animals(rng, shared, 6), stimuli=STIMULI).pairs[0]
+    assert np.isnan(few.p)
+    assert few.reason == "6 animals and 6 stimuli; at least 4 and 10 are needed"
+    assert few.interval.low < few.difference < few.interval.high
+
+
+def test_scores_of_two_metrics_are_compared_on_their_common_scale():
+    rng = np.random.default_rng(8)
+    shared, stimuli = make_rdm(rng, 12), [f"s{k}" for k in range(12)]
+    animals = [make_subject(f"m{i}", shared + 0.05 * rng.normal(size=66), seed=i) for i in range(6)]
+    score = score_rdms({"a": shared}, animals, name="x", stimuli=stimuli)
+    # The same score in a metric whose chance is .5 and whose best is 3.
+    moved = dataclasses.replace(
+        score,
+        chance=0.5,
+        attainable=3.0,
+        subjects=tuple(dataclasses.replace(s, value=0.5 + 2.5 * score.on_scale(s.value)) for s in score.subjects),
+        without_stimulus=tuple(0.5 + 2.5 * score.on_scale(value) for value in score.without_stimulus),
     )
-    assert np.isnan(found.pairs[0].p)
-    assert found.pairs[0].reason == "fewer than two animals have a value for both models"
+    assert compare_scores(score, moved).difference == pytest.approx(0, abs=1e-12)
 
 
 def test_layers_are_corrected_by_their_largest():

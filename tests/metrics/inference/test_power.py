@@ -6,8 +6,14 @@ import numpy as np
 import pytest
 
 from brainbench.core.errors import UsageError
+from brainbench.core.trials import Trials
+from brainbench.metrics import compare
+from brainbench.metrics.inference.dimension import signal_dimensions
+from brainbench.metrics.inference.permutation import label_orders, tail_p
 from brainbench.metrics.inference.power import ExperimentDesign, needed, power, simulate_experiments
-from brainbench.metrics.score import score_rdms
+from brainbench.metrics.measures.rsa import score_rdms
+from brainbench.metrics.rdms.comparison import compare_all, permuted_comparisons
+from brainbench.metrics.rdms.dissimilarity import rdm
 from tests.factories.animals import STIMULI, make_subject
 
 
@@ -16,7 +22,7 @@ def test_the_simulated_rdms_have_the_stated_correlations():
     model, brain = simulate_experiments(np.random.default_rng(0), design, 60)
 
     def r(a, b):
-        return np.mean([np.corrcoef(x, y)[0, 1] for x, y in zip(a, b, strict=True)])
+        return compare(a, b, method="whitened-pearson").mean()
 
     assert r(model[:, 0], brain[:, 0]) == pytest.approx(0.5 * np.sqrt(0.6), abs=0.02)
     assert r(brain[:, 0], brain[:, 1]) == pytest.approx(0.7 * 0.6, abs=0.02)
@@ -26,7 +32,7 @@ def test_the_simulated_rdms_have_the_stated_correlations():
 
 @pytest.mark.parametrize("layers", [1, 8])
 def test_without_an_effect_the_power_is_the_level(layers):
-    found = power(ExperimentDesign(effect=0.0, animals=4, layers=layers), simulations=600)
+    found = power(ExperimentDesign(effect=0.0, animals=4, layers=layers), simulations=600, seed=1)
     assert found.interval.low <= 0.05 <= found.interval.high
 
 
@@ -69,10 +75,61 @@ def test_power_is_that_of_the_scores_own_test():
     found = 0
     for layers, animals in zip(model, brain, strict=True):
         subjects = [make_subject(f"m{i}", animal, seed=i) for i, animal in enumerate(animals)]
-        score = score_rdms({str(i): layer for i, layer in enumerate(layers)}, subjects, name="x", stimuli=STIMULI)
+        score = score_rdms(
+            {str(i): layer for i, layer in enumerate(layers)},
+            subjects,
+            name="x",
+            stimuli=STIMULI,
+            compare="whitened-pearson",
+        )
         found += score.p <= 0.05
     expected = power(design, simulations=2000)
     assert found / 400 == pytest.approx(expected.power, abs=0.06)
+
+
+@pytest.mark.parametrize("dimensions", [2, 10])
+def test_the_power_predicted_from_a_pilot_is_that_of_new_experiments(dimensions):
+    """Trials of 60 neurons and whole experiments on them; everything that the prediction takes is measured on them."""
+    stimuli, animals, units, studies = 10, 8, 60, 150
+    rng = np.random.default_rng(dimensions)
+    found, effects, consistencies, halves, pilots = 0, [], [], [], []
+    for _ in range(studies):
+        shared, other = rng.normal(size=(2, stimuli, dimensions))
+        own = rng.normal(size=(animals, stimuli, dimensions))
+        weights = rng.normal(size=(2, animals, dimensions, units))
+        means = np.sqrt(0.8) * shared @ weights[0] + np.sqrt(0.2) * own @ weights[1]
+        mixed = rng.normal(size=(2, dimensions, 300))
+        model = rdm(np.sqrt(0.3) * shared @ mixed[0] + np.sqrt(0.7) * other @ mixed[1], method="sqeuclidean")
+        noisy = means + 0.7 * np.sqrt(dimensions) * rng.normal(size=(2, *means.shape))
+        brain = np.stack([rdm(mean, method="sqeuclidean") for mean in noisy.mean(axis=0)])
+        orders = label_orders(stimuli, 0, draws=199)
+        null = permuted_comparisons(model[None], brain, orders, "whitened-cosine")
+        found += tail_p(np.concatenate([r.mean(axis=(1, 2)) for r in null])) <= 0.05
+        true = np.stack([rdm(mean, method="sqeuclidean") for mean in means])
+        effects.append(compare(model, true, method="whitened-pearson").mean())
+        consistencies.append(compare_all(true, true, method="whitened-pearson")[np.triu_indices(animals, 1)].mean())
+        first, second = (np.stack([rdm(mean, method="sqeuclidean") for mean in half]) for half in noisy)
+        halves.append(compare(first, second, method="whitened-pearson").mean())
+        if len(pilots) < 20:
+            labels = np.repeat(np.arange(stimuli), 8)
+            sessions = [[Trials(mean[labels] + rng.normal(size=(len(labels), units)), labels)] for mean in means]
+            pilots.append(signal_dimensions(sessions, stimuli))
+    half = np.mean(halves)
+    design = ExperimentDesign(
+        stimuli=stimuli,
+        animals=animals,
+        effect=float(np.mean(effects)),
+        consistency=float(np.mean(consistencies)),
+        reliability=float(2 * half / (1 + half)),
+        dimensions=round(float(np.median(pilots))),
+    )
+    assert design.dimensions == pytest.approx(dimensions, rel=0.25)
+    assert power(design, simulations=600).power == pytest.approx(found / studies, abs=0.09)
+
+
+def test_fewer_dimensions_hide_an_effect():
+    narrow, wide = (ExperimentDesign(stimuli=10, animals=8, effect=0.4, dimensions=d) for d in (2, 10))
+    assert power(narrow, simulations=500).power < power(wide, simulations=500).power - 0.05
 
 
 @pytest.mark.parametrize(
@@ -81,6 +138,7 @@ def test_power_is_that_of_the_scores_own_test():
         ({"stimuli": 1}, "at least 2 stimuli"),
         ({"reliability": 1.2}, "reliability lies between 0 and 1; received 1.2"),
         ({"alpha": 0}, "alpha lies between"),
+        ({"dimensions": 0}, "at least 1 dimension; received 0"),
         ({"effect": 0.95, "consistency": 0.5}, "bounds it by √consistency = 0.707"),
     ],
 )

@@ -11,9 +11,9 @@ from scipy.linalg import orthogonal_procrustes
 from brainbench.core.errors import DataError, DataFileNotFoundError, UsageError
 from brainbench.core.trials import Trials
 from brainbench.metrics import PatternMetric, compare, get_metric, list_metrics, rdm, register_metric
-from brainbench.metrics.measures.animal_patterns import animal_patterns
 from brainbench.metrics.measures.procrustes import Procrustes, procrustes_distance
 from brainbench.metrics.measures.ridge import PENALTIES, RidgeEncoding
+from brainbench.metrics.reliability.subject_rdm import subject_rdm
 from tests.factories.animals import STIMULI, make_block, make_latent
 
 OTHERS = [name for name in ("cka", "procrustes", "ridge", "rsa", "rsa-crossnobis")]
@@ -101,7 +101,7 @@ def test_ridge_is_nested_cross_validation_done_by_hand(count):
     x = rng.normal(size=(count, 9))
     labels = np.repeat(np.arange(count), 5)
     responses = (x @ rng.normal(size=(9, 7)))[labels] + rng.normal(size=(len(labels), 7))
-    animal = animal_patterns("a", [Trials(responses, labels)], count)
+    animal = subject_rdm("a", [Trials(responses, labels)], count)
 
     def predict(train, test, penalty):
         a, mean = x[train] - x[train].mean(axis=0), animal.patterns[train].mean(axis=0)
@@ -128,7 +128,7 @@ def test_the_noise_of_the_means_is_that_of_trials():
     rng = np.random.default_rng(7)
     labels = np.repeat(np.arange(6), 400)
     block = Trials(rng.normal(size=(2400, 3)) * [1.0, 2.0, 3.0], labels)
-    animal = animal_patterns("a", [block], 6)
+    animal = subject_rdm("a", [block], 6)
     np.testing.assert_allclose(animal.noise.mean(axis=0), np.array([1, 4, 9]) / 400, rtol=0.1)
     expected = np.stack([block.responses[labels == k].var(axis=0, ddof=1) / 400 for k in range(6)])
     np.testing.assert_allclose(animal.noise, expected)
@@ -141,7 +141,7 @@ def test_a_perfect_encoder_of_noisy_trials_is_worth_one_and_raw_variance_is_not(
     values, raw = [], []
     for _ in range(8):
         responses = (latent @ rng.normal(size=(2, 30)))[labels] + 2.5 * rng.normal(size=(120, 30))
-        animal = animal_patterns("a", [Trials(responses, labels)], 20)
+        animal = subject_rdm("a", [Trials(responses, labels)], 20)
         values.append(RidgeEncoding().compare(latent, animal))
         raw.append(RidgeEncoding().compare(latent, dataclasses.replace(animal, noise=0 * animal.noise)))
     assert np.mean(values) == pytest.approx(1, abs=0.15)

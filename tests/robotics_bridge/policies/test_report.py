@@ -199,8 +199,8 @@ def test_records_make_a_board_of_the_leaderboard(tmp_path) -> None:
     stored = [read_record(write_record(record, tmp_path / "records")) for record in found]
     (board,) = rank(stored)
     assert board.recordings == "in_palm_rotate on xhand1 (default)"
-    assert "force_torque" in board.rows[0].record.score.name
-    assert board.rows[0].first == 1
+    assert "force_torque" in board.entries[0].name
+    assert "stimuli" in board.entries[0].unranked_because
 
 
 def test_a_record_says_how_to_make_its_student(tmp_path) -> None:

@@ -1,8 +1,3 @@
-import json
-import multiprocessing
-import os
-import shutil
-
 import h5py
 import numpy as np
 import pytest
@@ -10,7 +5,7 @@ import pytest
 from brainbench.core.errors import DataError, UsageError
 from brainbench.core.files import file_hash
 from brainbench.datasets import inspect, open_recordings
-from brainbench.datasets.synthetic import demo, read_truth
+from brainbench.datasets.synthetic import ensure_rodgers_demo, make_rodgers_demo, read_truth
 from brainbench.datasets.trials.session_trials import trials_by_subject
 from tests.factories.recordings import LABELS, make_stimuli
 
@@ -18,7 +13,7 @@ from tests.factories.recordings import LABELS, make_stimuli
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     folder = tmp_path_factory.mktemp("demo")
-    demo.make_demo(folder, make_stimuli())
+    make_rodgers_demo(folder, make_stimuli())
     return folder
 
 
@@ -130,21 +125,21 @@ def test_animals_are_reliable_except_the_one_made_hard_to_read(dataset):
 
 
 def test_the_same_stimuli_give_the_same_files(folder, tmp_path):
-    for path in demo.make_demo(tmp_path, make_stimuli()):
+    for path in make_rodgers_demo(tmp_path, make_stimuli()):
         assert file_hash(path) == file_hash(folder / path.name)
-    other = demo.make_demo(tmp_path / "other", make_stimuli(), seed=1, animals=1)
+    other = make_rodgers_demo(tmp_path / "other", make_stimuli(), seed=1, animals=1)
     assert file_hash(other[0]) != file_hash(folder / other[0].name)
 
 
 def test_the_order_of_the_stimuli_does_not_matter(folder, tmp_path):
     turned = make_stimuli().isel(stimulus=[3, 1, 5, 0, 4, 2])
-    for path in demo.make_demo(tmp_path, turned, animals=1):
+    for path in make_rodgers_demo(tmp_path, turned, animals=1):
         assert file_hash(path) == file_hash(folder / path.name)
 
 
 def test_it_is_small_and_tells_its_progress(tmp_path):
     calls = []
-    paths = demo.make_demo(tmp_path, make_stimuli(), progress=lambda *state: calls.append(state))
+    paths = make_rodgers_demo(tmp_path, make_stimuli(), progress=lambda *state: calls.append(state))
     assert sum(path.stat().st_size for path in paths) < 15e6
     assert calls[-1][:2] == (len(paths), len(paths))
 
@@ -170,93 +165,23 @@ def test_files_are_valid_for_pynwb_and_free_of_critical_findings(folder):
         assert units["spike_times"].map(len).min() > 0
 
 
-def test_the_cache_makes_them_once(monkeypatch, tmp_path):
-    monkeypatch.setenv("BRAINBENCH_CACHE", str(tmp_path))
-    stimuli = make_stimuli()
-    made = demo.ensure_demo(stimuli, animals=1)
-    stamp = made.stat().st_mtime_ns
-    assert made == demo.demo_folder("fake-0-30", animals=1)
-    assert demo.ensure_demo(lambda: pytest.fail("not needed"), key="fake-0-30", animals=1) == made
-    assert made.stat().st_mtime_ns == stamp
-    assert [item.name for item in made.parent.iterdir()] == [made.name]
-
-
-def test_a_damaged_cache_is_made_again(monkeypatch, tmp_path, caplog):
-    monkeypatch.setenv("BRAINBENCH_CACHE", str(tmp_path))
-    made = demo.ensure_demo(make_stimuli(), animals=1)
-    file = next(made.glob("*.nwb"))
-    before = file_hash(file)
-    file.write_bytes(b"")
-    demo.ensure_demo(make_stimuli(), animals=1)
-    assert file_hash(file) == before
-    assert "damaged" in caplog.text
-    (made / demo.TRUTH).unlink()
-    demo.ensure_demo(make_stimuli(), animals=1)
-    assert json.loads((made / demo.TRUTH).read_text())["synthetic"] is True
-
-
-def test_what_a_killed_process_left_is_completed_and_removed_when_old(monkeypatch, folder, tmp_path):
-    monkeypatch.setenv("BRAINBENCH_CACHE", str(tmp_path))
-    half = demo.demo_folder("fake-0-30", animals=1)
-    half.mkdir()
-    first = sorted(folder.glob("*.nwb"))[0]
-    shutil.copy(first, half)
-    old, young = half / ".sub-old.nwb", half / ".sub-young.nwb"
-    old.touch()
-    young.touch()
-    os.utime(old, (0, 0))
-    assert demo.ensure_demo(make_stimuli(), animals=1) == half
-    assert not old.exists()
-    assert young.exists()
-    assert open_recordings(half).attrs["sessions"][1]["session"] == "02"
-    assert file_hash(half / first.name) == file_hash(first)
-
-
-def _ensure(queue):
-    queue.put(str(demo.ensure_demo(make_stimuli(), animals=1)))
-
-
-def test_two_processes_may_make_them_at_once(monkeypatch, tmp_path):
-    monkeypatch.setenv("BRAINBENCH_CACHE", str(tmp_path))
-    context = multiprocessing.get_context("spawn")
-    queue = context.Queue()
-    workers = [context.Process(target=_ensure, args=(queue,)) for _ in range(2)]
-    for worker in workers:
-        worker.start()
-    paths = {queue.get(timeout=60) for _ in workers}
-    for worker in workers:
-        worker.join()
-        assert worker.exitcode == 0
-    assert len(paths) == 1
-    assert open_recordings(paths.pop()).attrs["synthetic"] is True
-    assert not list((tmp_path / "recordings").glob("*/.*"))
-
-
 def test_unsuitable_stimuli_are_refused(monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
     stimuli = make_stimuli()
     with pytest.raises(DataError, match="'convex-close'"):
-        demo.make_demo("unused", stimuli.isel(stimulus=slice(5)))
+        make_rodgers_demo("unused", stimuli.isel(stimulus=slice(5)))
     with pytest.raises(DataError, match="these have none"):
-        demo.make_demo("unused", stimuli.drop_vars("contact"))
+        make_rodgers_demo("unused", stimuli.drop_vars("contact"))
     with pytest.raises(DataError, match="'C0', 'C1', 'C2', 'C3'"):
-        demo.make_demo("unused", stimuli.isel(whisker=slice(10)))
+        make_rodgers_demo("unused", stimuli.isel(whisker=slice(10)))
     with pytest.raises(DataError, match="wrench for 'A3'"):
-        demo.make_demo("unused", stimuli.assign(wrench=stimuli["wrench"].where(stimuli["whisker"] != "A3")))
+        make_rodgers_demo("unused", stimuli.assign(wrench=stimuli["wrench"].where(stimuli["whisker"] != "A3")))
     with pytest.raises(DataError, match="exert no force"):
-        demo.make_demo("unused", stimuli.assign(wrench=stimuli["wrench"] * 0))
+        make_rodgers_demo("unused", stimuli.assign(wrench=stimuli["wrench"] * 0))
     with pytest.raises(DataError, match="'concave-far' touches"):
-        demo.make_demo("unused", stimuli.assign(contact=stimuli["contact"] & (stimuli["stimulus"] != "concave-far")))
+        make_rodgers_demo("unused", stimuli.assign(contact=stimuli["contact"] & (stimuli["stimulus"] != "concave-far")))
     with pytest.raises(UsageError, match="at least one animal"):
-        demo.make_demo("unused", stimuli, animals=0)
+        make_rodgers_demo("unused", stimuli, animals=0)
     assert list(tmp_path.iterdir()) == []
     with pytest.raises(UsageError, match="needs a key"):
-        demo.ensure_demo(make_stimuli)
-
-
-def test_no_folder_is_left_after_a_failure(monkeypatch, tmp_path):
-    monkeypatch.setenv("BRAINBENCH_CACHE", str(tmp_path))
-    with pytest.raises(DataError):
-        demo.ensure_demo(make_stimuli().drop_vars("contact"))
-    assert list((tmp_path / "recordings").iterdir()) == []
-    shutil.rmtree(tmp_path)
+        ensure_rodgers_demo(make_stimuli)

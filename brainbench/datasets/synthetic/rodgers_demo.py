@@ -6,10 +6,7 @@ files). Everything is labelled synthetic; **ranks of models on them say nothing 
 
 from __future__ import annotations
 
-import contextlib
-import logging
 import os
-import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import partial
@@ -21,12 +18,11 @@ from numpy.typing import NDArray
 
 from brainbench.core.contracts import check_stimulus_set
 from brainbench.core.errors import DataError, UsageError, listing
-from brainbench.core.files import cache_dir, content_hash, read_json
 from brainbench.core.progress import Progress
 from brainbench.datasets.layouts import rodgers
-from brainbench.datasets.nwb_writer import write_nwb
+from brainbench.datasets.synthetic.cache import ensure_recordings
 from brainbench.datasets.synthetic.rodgers_task import CHOICE, COLUMNS, SessionPlan, draw_session, tracked_contacts
-from brainbench.datasets.synthetic.truth import TRUTH, SyntheticSession, correlation_rdm, write_with_truth
+from brainbench.datasets.synthetic.truth import SyntheticSession, correlation_rdm, write_synthetic_nwb, write_with_truth
 from brainbench.datasets.synthetic.wrench_encoding import Afferents, draw_population, make_afferents, window_rates
 
 if TYPE_CHECKING:
@@ -46,32 +42,10 @@ _INDIVIDUAL = 0.4
 """Standard deviation over animals of the logarithm of an afferent's weight."""
 _MANY = 4000
 """Units that stand for the shared geometry in the truth."""
-_ABANDONED = 24 * 3600.0
 _SUFFIX = "_behavior+ecephys.nwb"
 
-_WRITE = partial(
-    write_nwb,
-    description="simulated contacts encoded by simulated neurons, made by brainbench.",
-    general={
-        "experimenter": ["Simulation, A"],
-        "institution": "none (synthetic data)",
-        "lab": "none (synthetic data)",
-        "experiment_description": "SYNTHETIC demo recordings; ranks on them say nothing about brains.",
-        "keywords": ["synthetic", "whisker", "barrel cortex", "demo"],
-    },
-    subject={
-        "species": "Mus musculus",
-        "sex": "U",
-        "age": "P90D",
-        "description": "SYNTHETIC subject: no animal was recorded.",
-    },
-    columns=COLUMNS,
-)
 
-_log = logging.getLogger(__name__)
-
-
-def make_demo(
+def make_rodgers_demo(
     folder: str | os.PathLike[str],
     stimuli: xr.Dataset,
     *,
@@ -133,8 +107,9 @@ def make_demo(
     return write_with_truth(
         folder,
         draw(),
-        write=_WRITE,
+        write=partial(write_synthetic_nwb, columns=COLUMNS),
         suffix=_SUFFIX,
+        distance=correlation_rdm,
         version=VERSION,
         seed=seed,
         stimuli=str(stimuli.attrs["content_hash"]),
@@ -143,12 +118,7 @@ def make_demo(
     )
 
 
-def demo_folder(stimuli: str, *, seed: int = 0, animals: int = 4) -> Path:
-    """Return where the cache keeps the demo made from the stimuli of that content hash."""
-    return cache_dir("recordings") / f"demo-{content_hash(stimuli, seed, animals, VERSION)}"
-
-
-def ensure_demo(
+def ensure_rodgers_demo(
     stimuli: xr.Dataset | Callable[[], xr.Dataset],
     *,
     key: str | None = None,
@@ -164,29 +134,24 @@ def ensure_demo(
     Args:
         stimuli: the stimulus set, or a function that makes it and is called only if needed.
         key: name of the stimuli (such as a hash of what they were made from), needed with a function.
-        seed: as in :func:`make_demo`.
-        animals: as in :func:`make_demo`.
-        progress: as in :func:`make_demo`.
+        seed: as in :func:`make_rodgers_demo`.
+        animals: as in :func:`make_rodgers_demo`.
+        progress: as in :func:`make_rodgers_demo`.
 
     Raises:
         UsageError: a function without a ``key``.
-        DataError: as in :func:`make_demo`.
+        DataError: as in :func:`make_rodgers_demo`.
     """
     if key is None:
         if callable(stimuli):
-            raise UsageError("ensure_demo needs a key beside a function that makes the stimuli; pass key='…'.")
+            raise UsageError("ensure_rodgers_demo needs a key beside a function that makes the stimuli; pass key='…'.")
         key = str(check_stimulus_set(stimuli).attrs["content_hash"])
-    target = demo_folder(key, seed=seed, animals=animals)
-    if not _complete(target):
-        if (target / TRUTH).exists():
-            _log.warning("The demo recordings in %s are damaged and are replaced.", target)
-        make_demo(target, stimuli() if callable(stimuli) else stimuli, seed=seed, animals=animals, progress=progress)
-        # What a killed process left; a younger file may be one that is being written.
-        for item in target.glob(".*"):
-            with contextlib.suppress(OSError):
-                if time.time() - item.stat().st_mtime > _ABANDONED:
-                    item.unlink()
-    return target
+
+    def make(folder: Path) -> None:
+        made = stimuli() if callable(stimuli) else stimuli
+        make_rodgers_demo(folder, made, seed=seed, animals=animals, progress=progress)
+
+    return ensure_recordings("demo-rodgers", key, seed, animals, VERSION, make=make)
 
 
 def _in_vocabulary_order(stimuli: xr.Dataset) -> xr.Dataset:
@@ -220,11 +185,3 @@ def _shared(afferents: Afferents, first: NDArray[np.float64], seed: int) -> NDAr
     # In portions: the rates of all units at once would take a gigabyte.
     portions = [draw_population(random, afferents, _MANY // 8, plain) for _ in range(8)]
     return correlation_rdm(np.concatenate([_expected(item.rates(afferents), afferents, first) for item in portions], 1))
-
-
-def _complete(folder: Path) -> bool:
-    try:
-        files = read_json(folder / TRUTH)["files"]
-        return all((folder / name).stat().st_size == item["bytes"] for name, item in files.items())
-    except (DataError, OSError, KeyError, TypeError, AttributeError):
-        return False

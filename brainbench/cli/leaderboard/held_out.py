@@ -1,0 +1,119 @@
+"""``brainbench leaderboard hold-out``: keep animals or stimuli of recordings back, and score submissions on them."""
+
+from __future__ import annotations
+
+import math
+import secrets
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from brainbench.cli.output import JsonOption, emit
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+    from brainbench.core.records import ResultRecord, Score
+
+FEWEST = {"animals": 2, "stimuli": 3}
+"""Fewest on either side: less has no score."""
+
+
+def hold_out(
+    recordings: Annotated[str, typer.Argument(help="An NWB or HDF5 file, a folder, a glob, or 'demo'.")],
+    animals: Annotated[int, typer.Option(help="Number of animals to hold back.")] = 0,
+    stimuli: Annotated[int, typer.Option(help="Number of stimuli to hold back.")] = 0,
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder of what is published.")] = Path("board"),
+    secret: Annotated[Path, typer.Option(help="Folder of what is kept back; never publish it.")] = Path(
+        "held-out-secret"
+    ),
+    conditions: Annotated[str | None, typer.Option(help="As in brainbench score.")] = None,
+    select: Annotated[str | None, typer.Option(help="As in brainbench score.")] = None,
+    window: Annotated[str | None, typer.Option(help="As in brainbench score.")] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Split recordings into a public part and a held-out part, drawn at random, and publish a hash of the latter.
+
+    Anybody can score models on the public part; ``leaderboard verify --held-out`` scores a submission on the rest.
+    """
+    from brainbench.core.errors import UsageError
+    from brainbench.core.files import write_json
+    from brainbench.datasets import write_recordings
+    from brainbench.scoring.neural_responses import open_neural_responses
+    from leaderboards.held_out import DATA, Commitment, digest, new_salt
+
+    if (animals > 0) == (stimuli > 0):
+        raise UsageError(f"Hold back either --animals or --stimuli; received {animals} and {stimuli}.")
+    if secret.exists():
+        raise UsageError(f"The folder {str(secret)!r} exists; name a new one, so that no earlier secret is lost.")
+    kind = "animals" if animals else "stimuli"
+    chosen = {"conditions": conditions, "select": select, "window": window}
+    whole = open_neural_responses(recordings, progress=None, **chosen).dataset
+    names = list(whole.attrs["vocabulary"]) if stimuli else sorted(set(map(str, whole["subject"].values)))
+    held_count = animals or stimuli
+    if min(held_count, len(names) - held_count) < FEWEST[kind]:
+        raise UsageError(
+            f"Of {len(names)} {kind} {FEWEST[kind]} to {len(names) - FEWEST[kind]} can be held back; "
+            f"received {held_count}."
+        )
+    drawn = set(secrets.SystemRandom().sample(names, held_count))
+    held, public = (split(whole, kind, [n for n in names if (n in drawn) is kept]) for kept in (True, False))
+    data = write_recordings(secret / DATA, held)
+    commitment = Commitment(
+        kind, held_count, len(names) - held_count, str(whole.attrs["content_hash"]), digest(data, new_salt(secret))
+    )
+    files = [
+        write_recordings(out / "public.h5", public),
+        # Stimuli without recordings are left out only where the pairs are named.
+        write_json(out / "match.json", {name: name for name in public.attrs["vocabulary"]}),
+        commitment.write(out / "held-out.json"),
+    ]
+    text = f"published  {out}: {', '.join(path.name for path in files)}\nkept back  {secret}: {held_count} {kind}"
+    emit({"published": files, "secret": secret, "commitment": commitment}, text, as_json=as_json)
+
+
+def split(whole: xr.Dataset, kind: str, names: list[str]) -> xr.Dataset:
+    """Return the trials, and of animals also the units, of some animals or stimuli of a recordings data set."""
+    from brainbench.core.files import content_hash
+
+    if kind == "animals":
+        part = whole.isel(trial=whole["subject"].isin(names).values, unit=whole["unit_subject"].isin(names).values)
+    else:
+        part = whole.isel(trial=whole["stimulus"].isin(names).values)
+    labels = [label for label in whole.attrs["vocabulary"] if kind == "animals" or label in names]
+    part.attrs |= {"vocabulary": labels, "content_hash": content_hash(whole.attrs["content_hash"], kind, names)}
+    return part
+
+
+def score_held_out(record: ResultRecord, commitment: Path, secret: Path) -> dict[str, Any]:
+    """Score the model of a record on held-out recordings, with the options that the record states.
+
+    The answer is rounded to two digits: many submissions shall learn little of the held-out part.
+
+    Raises:
+        DataError: the secret is not what was committed to.
+    """
+    from brainbench.datasets import open_recordings
+    from brainbench.scoring.options import ScoreOptions
+    from brainbench.scoring.scores import score_record
+    from leaderboards.held_out import Commitment
+
+    told = Commitment.read(commitment)
+    held = open_recordings(told.open(secret))
+    pairs = record.score.provenance.pairs
+    match = {label: pairs.get(label, label) for label in held.attrs["vocabulary"]}
+    settings = {**record.score.provenance.settings, "conditions": None, "select": None, "window": None, "bin": None}
+    options = ScoreOptions.stated_in(settings, recordings=held, match=match)
+    found = score_record(str(settings["model"]), options).score
+    return {"held_out": f"{told.held} {told.kind}", "on_public": _rounded(record.score), "on_held_out": _rounded(found)}
+
+
+def _rounded(score: Score) -> dict[str, Any]:
+    from leaderboards.entries import standing_of
+
+    span = score.scaled_interval
+    values = {"score": score.scaled, "low": span.low if span else math.nan, "high": span.high if span else math.nan}
+    return {name: round(value, 2) if math.isfinite(value) else None for name, value in values.items()} | {
+        "standing": standing_of(score, above_raw=False)
+    }

@@ -1,0 +1,214 @@
+"""The base of all metrics: what one says of a layer and an animal. The engine (:mod:`brainbench.metrics.score`) does
+the rest: the choice of layer, permutations, the interval over animals and stimuli, chance and what is attainable.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from brainbench.core.errors import UsageError
+from brainbench.core.records import Score
+from brainbench.core.trials import Trials
+from brainbench.metrics.animal_to_animal import score_agreement
+from brainbench.metrics.animals import gated
+from brainbench.metrics.arrays import fetch
+from brainbench.metrics.inference.permutation import SMALLEST_STIMULI
+from brainbench.metrics.rdms.pairs import Floats, Ints
+from brainbench.metrics.reliability.denoising import simulated_animals
+from brainbench.metrics.reliability.noise_correction import Corrected
+from brainbench.metrics.reliability.subject_rdm import SubjectRDM, subject_rdm
+from brainbench.metrics.score import score_layers
+from brainbench.metrics.stimulus_labels import response_matrix
+
+_SAFE_EXPONENT = 64
+"""Features whose largest value lies outside 2^±64 are rescaled, so that no square overflows or vanishes."""
+
+
+class Metric:
+    """A way to compare a model's features with animals. Subclasses set ``name``, ``title`` and compare.
+
+    A layer is whatever :meth:`layer` makes of its features; animals are :class:`SubjectRDM`, prepared once for all
+    models.
+    """
+
+    name = ""
+    """Name on the command line."""
+    title = ""
+    """What is compared, how, and what corrects it for noise, in one line."""
+    corrected = False
+    """True when values are corrected for noise."""
+    comparison = "whitened-cosine"
+    """Comparison of RDMs on which an animal's reliability rests."""
+    brain_method = "crossnobis"
+    """RDM method of the animals."""
+    noise = "none"
+    """Noise covariance that their RDMs are divided by."""
+    orders = 999
+    """Random orders of the stimuli in a permutation test; all orders are taken where they are at most five times as
+    many."""
+    orders_between = 99
+    """The same between animals, where every order may be slow."""
+    fewest = SMALLEST_STIMULI
+    """Fewest stimuli with a value."""
+    estimators: tuple[str, ...] = ("default",)
+    """Names that ``estimator`` takes."""
+    of_rdms = False
+    """True when layers and animals are compared by RDMs [P], which a record then shows."""
+    of_model_alone = False
+    """True when a comparison says nothing of the animal."""
+    reasons: tuple[str, ...] = ()
+    """What a reader of every score must know, in words."""
+
+    def animal(
+        self,
+        subject: str,
+        blocks: Sequence[Trials],
+        n_stimuli: int,
+        **options: Any,
+    ) -> SubjectRDM:
+        """Prepare one animal from the trials of its sessions; what cannot be used says so in the score.
+
+        Options are ``stimuli``, ``seed`` and ``splits`` of :func:`subject_rdm`.
+        """
+        how = {"method": self.brain_method, "comparison": self.comparison, "noise": self.noise}
+        return subject_rdm(subject, blocks, n_stimuli, **how, **options)
+
+    def layer(self, features: ArrayLike) -> Floats:
+        """Return what is compared of a layer's features [K, F]; a stimulus with a value that is not finite is NaN."""
+        return usable_features(features)
+
+    def known(self, layer: Floats) -> np.ndarray:
+        """Return where [K] a layer has a value."""
+        return np.isfinite(layer).all(axis=1)
+
+    def varies(self, layer: Floats) -> bool:
+        """Return whether a layer, without the stimuli that it has no value for, tells any stimuli apart."""
+        return bool(np.ptp(layer, axis=0).any())
+
+    def take(self, layer: Floats, stimuli: Ints) -> Floats:
+        """Return a layer with some stimuli, in this order."""
+        return layer[stimuli]
+
+    def compare_layers(
+        self, layers: Sequence[Floats], animals: Sequence[SubjectRDM], chunks: Iterable[Ints], device: Any = None
+    ) -> Iterator[Floats]:
+        """Yield raw comparisons [N, L, A] with the stimuli of the layers in each order of a chunk [N, K]."""
+        raise UsageError(f"The metric {self.name or type(self).__name__!r} does not define a comparison.")
+
+    def compare_without(self, layers: Sequence[Floats], animals: Sequence[SubjectRDM]) -> Floats:
+        """Return raw comparisons [K, L, A] without each stimulus in turn."""
+        count = animals[0].count
+        found = np.full((count, len(layers), len(animals)), np.nan)
+        if count <= 3:
+            return found
+        for stimulus in range(count):
+            kept = np.delete(np.arange(count), stimulus)
+            parts = [self.take(layer, kept) for layer in layers], [one.take(kept) for one in animals]
+            found[stimulus] = next(iter(self.compare_layers(*parts, [np.arange(count - 1)[None]])))[0]
+        return found
+
+    def correction(self, animal: SubjectRDM, estimator: str) -> Corrected:
+        """Return the factor that corrects a comparison for an animal's noise, and whether the animal is reliable."""
+        return gated(1.0, animal.reliability)
+
+    def attainable(self, animals: Sequence[SubjectRDM], seed: int) -> Floats:
+        """Return the raw value [A] of a model that has each animal's own responses without their noise."""
+        found = []
+        for animal in animals:
+            truth, noisy = simulated_animals(animal, seed)
+            values = next(iter(self.compare_layers([truth], noisy, [np.arange(len(truth))[None]])))
+            found.append(float(np.nanmean(values)) if np.isfinite(values).any() else np.nan)
+        return np.array(found)
+
+    def halves(self, animal: SubjectRDM, order: Ints) -> tuple[list[SubjectRDM], float] | None:
+        """Return an animal's halves (both of each split) as animals, stimuli in an order, and their correction.
+
+        None where the metric does not compare halves.
+        """
+        return None
+
+    def partner(self, animal: SubjectRDM, others: Sequence[SubjectRDM]) -> Any:
+        """Return the layer that an animal is compared with: the others' units side by side, as if they were one."""
+        return np.concatenate([other.patterns for other in others], axis=1)
+
+    def agreement(self, animal: SubjectRDM, others: Sequence[SubjectRDM], estimator: str) -> Corrected:
+        """Return the factor that corrects the comparison of an animal with others."""
+        return self.correction(animal, estimator)
+
+    def agreement_null(self, animals: Sequence[SubjectRDM], factors: Floats, orders: Ints) -> Floats:
+        """Return the mean corrected agreement [N] with every animal's stimuli in an order of its own [N, A, K]."""
+        found = np.empty(len(orders))
+        for index, each in enumerate(orders):
+            moved = [animal.take(order) for animal, order in zip(animals, each, strict=True)]
+            values = []
+            for animal in moved:
+                partner = self.partner(animal, [other for other in moved if other is not animal])
+                identity = [np.arange(animal.count)[None]]
+                values.append(next(iter(self.compare_layers([partner], [animal], identity)))[0, 0, 0])
+            found[index] = np.mean(np.array(values) * factors)
+        return found
+
+    def statistics(self, layer: Floats, animals: Sequence[SubjectRDM], seed: int) -> dict[str, Any]:
+        """Return what else a record keeps of the chosen layer; nothing unless overridden."""
+        return {}
+
+    def describe(self, animals: Sequence[SubjectRDM]) -> str:
+        """Name the metric in words, for the record."""
+        return f"{self.name}: {self.title}"
+
+    def score(
+        self,
+        features: Mapping[str, ArrayLike],
+        animals: Sequence[SubjectRDM],
+        *,
+        name: str,
+        stimuli: Sequence[str],
+        estimator: str = "default",
+        seed: int = 0,
+        layer: str | None = None,
+    ) -> Score:
+        """Score a model by the features [K, F] of its layers; ``layer`` is one committed to beforehand.
+
+        Raises:
+            UsageError: no layers or animals, features of another number of stimuli, an unknown layer or estimator.
+        """
+        check_features(features, stimuli)
+        layers = {label: self.layer(values) for label, values in features.items()}
+        options = {"name": name, "stimuli": stimuli, "estimator": estimator, "seed": seed, "committed": layer}
+        return score_layers(self, layers, animals, **options)[0]
+
+    def score_animals(
+        self, animals: Sequence[SubjectRDM], *, stimuli: Sequence[str], estimator: str = "default", seed: int = 0
+    ) -> Score:
+        """Score the animals against one another, by the same estimator."""
+        return score_agreement(self, animals, stimuli=stimuli, estimator=estimator, seed=seed)
+
+
+def check_features(features: Mapping[str, Any], stimuli: Sequence[str]) -> None:
+    """Raise UsageError for no layers, or features of another number of stimuli."""
+    if not features:
+        raise UsageError("There are no layers to score; give the features of at least one layer.")
+    for layer, values in features.items():
+        if len(values) != len(stimuli):
+            raise UsageError(
+                f"The features of layer {layer!r} have {len(values)} rows; {len(stimuli)} stimuli are scored."
+            )
+
+
+def usable_features(features: ArrayLike) -> Floats:
+    """Return features [K, F] in float64, rescaled by a power of two where squares would leave the range of numbers.
+
+    A stimulus with a value that is not finite is NaN throughout.
+    """
+    array = np.asarray(fetch(response_matrix(features, "stimuli")), dtype=np.float64)
+    broken = ~np.isfinite(array).all(axis=1)
+    largest = float(np.abs(array[~broken]).max(initial=0.0))
+    exponent = int(np.frexp(largest)[1]) if largest > 0 else 0
+    if abs(exponent) > _SAFE_EXPONENT:
+        # A power of two changes no digit.
+        array = np.ldexp(array, -exponent)
+    return np.where(broken[:, None], np.nan, array) if broken.any() else array

@@ -1,0 +1,310 @@
+"""The score at each time, and the latency of each layer.
+
+The layer and the lag for an animal are those that suit the *other* animals best over all times; at each time the
+animal's comparison with that layer is corrected for the animal's noise in that bin. All of it is repeated under
+permuted stimuli, and a time counts as significant where its standardised mean comparison exceeds the largest over all
+times of the permutations (maximum statistic, Nichols & Holmes 2002, doi:10.1002/hbm.1058).
+
+A layer's latency is the lag at which its mean comparison over times and animals, less chance, is highest. Its error is
+a jackknife over animals and stimuli (Miller, Patterson & Ulrich 1998, doi:10.1111/1469-8986.3510099, for animals).
+
+Letters: N permutation, L layer, G lag, T time bin, A animal, K stimulus, P RDM pair.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from brainbench.core.errors import UsageError
+from brainbench.core.records import Interval
+from brainbench.core.statistics import FEWEST_ANIMALS, FEWEST_STIMULI, LEVEL, two_factor_error
+from brainbench.metrics.inference.permutation import tail_p
+from brainbench.metrics.layers import most_chosen
+from brainbench.metrics.rdms.comparison import check_comparison
+from brainbench.metrics.rdms.pairs import Floats, rdm_stack
+from brainbench.metrics.reliability.noise_correction import RELIABILITY_GATE
+from brainbench.metrics.time.lags import LaggedRDMs, held_out_course, peak_lag, profile, votes
+from brainbench.metrics.time.movies import AnimalMovie
+
+PERMUTATIONS = 1000
+"""Random orders of the stimuli, above six stimuli; all orders up to six."""
+ALPHA = 0.05
+"""Level at which a layer's latency is given."""
+_FARTHEST = 0.4
+"""Largest lag, as a share of the recorded time."""
+
+
+@dataclass(frozen=True)
+class TimePoint:
+    """The score in one bin of time."""
+
+    time: float
+    """Middle of the bin, seconds after the window's begin."""
+    value: float
+    """Mean noise-corrected comparison of the animals that are reliable in this bin; NaN without any."""
+    r: float
+    """Mean raw comparison of all animals."""
+    chance: float
+    """Mean of ``value`` under permuted stimuli, layer and lag chosen anew."""
+    reliability: float
+    """Mean over animals."""
+    animals: int
+    """Animals that are reliable in this bin."""
+    p: float
+    """Permutation p, corrected for the number of times."""
+    interval: Interval | None = None
+    """Interval of ``value`` over animals and stimuli."""
+
+
+@dataclass(frozen=True)
+class LayerLatency:
+    """How far the animals lag behind one layer."""
+
+    layer: str
+    latency: float
+    """Lag of the best match, seconds; positive where neurons follow the model. NaN where ``reason`` says why."""
+    value: float
+    """Mean raw comparison at the best lag, less chance."""
+    p: float
+    """Permutation p of the best match over lags, corrected for the number of layers and lags."""
+    interval: Interval | None = None
+    """Interval of ``latency`` over animals and stimuli."""
+    reason: str = ""
+    """Reason for having no latency."""
+
+
+@dataclass(frozen=True)
+class TimeCourse:
+    """A model's score over time."""
+
+    points: tuple[TimePoint, ...]
+    latencies: tuple[LayerLatency, ...]
+    p: float
+    """Permutation p of the best time, corrected for all times."""
+    layer: str
+    """The layer chosen most often when each animal in turn is held out."""
+    bin: float
+    """Width of a bin, seconds."""
+    largest_lag: float
+    """Largest lag that was tried in both directions, seconds."""
+    permutations: int
+    """Orders of the stimuli, the given one included."""
+    reasons: tuple[str, ...] = ()
+    """What a reader must know, in words."""
+
+
+def score_over_time(
+    layers: Mapping[str, ArrayLike],
+    animals: Sequence[AnimalMovie],
+    *,
+    width: float,
+    comparison: str = "whitened-cosine",
+    permutations: int = PERMUTATIONS,
+    seed: int = 0,
+) -> TimeCourse:
+    """Score the RDMs of a model's layers against animals at each time.
+
+    Args:
+        layers: RDMs [T', P] of each layer in bins of ``width``, from :func:`layer_movie`; bin 0 begins when the
+            animals' first bin does.
+        animals: From :func:`animal_movie`, for the same stimuli and bins.
+        width: Width of a bin, seconds.
+        comparison: Comparison of RDMs, see :func:`brainbench.metrics.compare`.
+        permutations: Random orders of the stimuli above six stimuli.
+        seed: Seed of the orders.
+
+    Raises:
+        UsageError: no layers or animals, fewer than 4 stimuli or 3 bins, RDMs that do not fit one another, or an
+            unknown comparison.
+    """
+    check_comparison(comparison)
+    movies = _checked(layers, animals, width)
+    bins = len(animals[0].rdms)
+    largest = max(1, math.floor(_FARTHEST * bins))
+    joined = LaggedRDMs.join(movies, [item.rdms for item in animals], largest=largest, comparison=comparison)
+    reliability = np.stack([item.reliability for item in animals], axis=1)
+    factors = _factors(reliability)
+    courses, values, matches, chosen, expected = [], [], [], None, 0.0
+    for r in joined.permuted(permutations, seed):
+        expected = expected + r.sum(axis=0)
+        course, picked = held_out_course(r)
+        chosen = picked[0] if chosen is None else chosen
+        courses.append(_mean(course))
+        values.append(_mean(course * factors))
+        matches.append(_mean(votes(r)))
+    assert chosen is not None
+    # The first order is the given one.
+    course, value, match = (np.concatenate(parts) for parts in (courses, values, matches))
+    p, over_all = _largest_p(course)
+    observed = joined.compared()
+    own = held_out_course(observed)[0][0] * factors
+    left_out = [joined.without_stimulus(stimulus) for stimulus in range(joined.stimuli)]
+    intervals = _intervals(own, np.stack([_mean(held_out_course(item)[0][0] * factors) for item in left_out], axis=-1))
+    points = tuple(
+        TimePoint(
+            time=(index + 0.5) * width,
+            value=float(value[0, index]),
+            r=float(course[0, index]),
+            chance=float(_mean(value[:, index])),
+            reliability=float(_mean(reliability[index])),
+            animals=int(np.isfinite(own[index]).sum()),
+            p=float(p[index]),
+            interval=intervals[index],
+        )
+        for index in range(bins)
+    )
+    names, chance = tuple(layers), expected / len(course)
+    excess, without = observed[0] - chance, [item[0] - chance for item in left_out]
+    latencies = _latencies(names, joined.lags * width, excess, without, match)
+    return TimeCourse(
+        points=points,
+        latencies=latencies,
+        p=over_all,
+        layer=names[most_chosen(chosen // len(joined.lags))],
+        bin=width,
+        largest_lag=largest * width,
+        permutations=len(course),
+        reasons=_reasons(animals, points, joined.stimuli),
+    )
+
+
+def _checked(layers: Mapping[str, ArrayLike], animals: Sequence[AnimalMovie], width: float) -> list[Floats]:
+    if not layers or not animals:
+        raise UsageError("Scores over time need at least one layer and one animal.")
+    if not width > 0:
+        raise UsageError(f"The bins of a score over time have a positive width; received {width} s.")
+    movies = [np.atleast_2d(rdm_stack(movie, f"The RDMs of layer {name!r}")) for name, movie in layers.items()]
+    bins, pairs = animals[0].rdms.shape
+    for name, movie in zip(layers, movies, strict=True):
+        if movie.ndim != 2 or movie.shape[1] != pairs:
+            raise UsageError(f"The RDMs of layer {name!r} have shape {movie.shape}; expected [time, {pairs} pairs].")
+    for item in animals:
+        if item.rdms.shape != (bins, pairs):
+            raise UsageError(
+                f"The RDMs of {item.subject!r} have shape {item.rdms.shape}; those of {animals[0].subject!r} "
+                f"{(bins, pairs)}."
+            )
+    if bins < 3 or pairs < 6:
+        raise UsageError(
+            f"Scores over time need at least 3 bins and 4 stimuli; received {bins} and {pairs} pairs of stimuli; "
+            "choose smaller bins (--bin) or a longer window."
+        )
+    return movies
+
+
+def _factors(reliability: Floats) -> Floats:
+    """Return what a raw comparison is multiplied by [T, A]; NaN where a bin is not reliable."""
+    trusted = reliability >= RELIABILITY_GATE
+    return np.where(trusted, 1 / np.sqrt(np.where(trusted, reliability, 1.0)), np.nan)
+
+
+def _mean(values: Floats) -> NDArray[np.float64]:
+    """Return the mean over the finite entries of the last axis; NaN without any."""
+    present = np.isfinite(values)
+    number = present.sum(axis=-1)
+    total = np.where(present, values, 0.0).sum(axis=-1)
+    return np.divide(total, number, out=np.full(total.shape, np.nan), where=number > 0)
+
+
+def _standardised(null: Floats) -> Floats:
+    """Return statistics [N, ...] in standard deviations from their mean over permutations; −∞ where undefined."""
+    # Chance differs between times and lags: by an early bin's few spikes, by the bins that overlap.
+    with np.errstate(invalid="ignore", divide="ignore"):
+        mean = _mean(np.moveaxis(null, 0, -1))
+        spread = np.sqrt(_mean(np.moveaxis((null - mean) ** 2, 0, -1)))
+        z = (null - mean) / spread
+    return np.where(np.isfinite(z), z, -np.inf)
+
+
+def _largest_p(null: Floats) -> tuple[Floats, float]:
+    """Return p of every entry of statistics [N, M], corrected by the largest in each permutation, and of the best."""
+    z = _standardised(null)
+    largest = z.max(axis=1)
+    p = np.where(np.isfinite(null[0]), tail_p(largest[:, None], z[0]), np.nan)
+    return p, float(tail_p(largest))
+
+
+def _intervals(animals: Floats, left_out: Floats) -> list[Interval | None]:
+    """Return the interval of the mean of values [T, A] whose means without each stimulus are [T, K]."""
+    return [_interval(float(mean), *item) for mean, *item in zip(_mean(animals), animals, left_out, strict=True)]
+
+
+def _interval(middle: float, animals: Floats, left_out: Floats) -> Interval | None:
+    from scipy.special import stdtrit
+
+    error, freedom = (float(item) for item in two_factor_error(animals, left_out))
+    if not (math.isfinite(middle) and math.isfinite(error)):
+        return None
+    half = float(stdtrit(freedom, (1 + LEVEL) / 2)) * error if error else 0.0
+    return Interval(middle - half, middle + half, LEVEL, "t over animals and stimuli, jackknife")
+
+
+def _latencies(
+    names: tuple[str, ...], lags: Floats, excess: Floats, left_out: list[Floats], match: Floats
+) -> tuple[LayerLatency, ...]:
+    """Return every layer's latency.
+
+    Args:
+        names: Layers.
+        lags: [G] seconds.
+        excess: Comparisons less chance [L, G, T, A].
+        left_out: The same without each stimulus in turn.
+        match: Mean comparison under permutations [N, L, G], the given order first.
+    """
+    z = _standardised(match)
+    p = tail_p(z.reshape(len(z), -1).max(axis=1)[:, None], z[0].max(axis=-1))
+    animals, step = excess.shape[-1], lags[1] - lags[0]
+
+    def latency(values: Floats) -> Floats:
+        return lags[0] + step * peak_lag(profile(values))
+
+    best = latency(excess)
+    # Pseudo-values, whose variance over animals is that of the jackknife.
+    singles = np.stack([latency(np.delete(excess, index, axis=-1)) for index in range(animals)], axis=-1)
+    pseudo = animals * best[:, None] - (animals - 1) * singles
+    without = np.stack([latency(item) for item in left_out], axis=-1)
+    reached = _mean(votes(excess[None])[0])
+    found = []
+    for index, name in enumerate(names):
+        tried, reason = int(np.isfinite(reached[index]).sum()), ""
+        if tried < 3:
+            reason = "the layer has no time" if tried == 1 else "too few lags have a comparison"
+        elif p[index] > ALPHA:
+            reason = "no lag matches better than permuted stimuli"
+        elif not math.isfinite(best[index]):
+            reason = f"the best match lies at the end of the lags tried, {lags[0]:g} to {lags[-1]:g} s"
+        # One replicate without a peak would make the error too small.
+        steady = bool(np.isfinite(pseudo[index]).all() and np.isfinite(without[index]).all()) and animals > 1
+        found.append(
+            LayerLatency(
+                layer=name,
+                latency=math.nan if reason else float(best[index]),
+                value=float(np.nanmax(reached[index])) if tried else math.nan,
+                p=float(p[index]) if tried else math.nan,
+                interval=_interval(float(best[index]), pseudo[index], without[index])
+                if steady and not reason
+                else None,
+                reason=reason,
+            )
+        )
+    return tuple(found)
+
+
+def _reasons(animals: Sequence[AnimalMovie], points: tuple[TimePoint, ...], stimuli: int) -> tuple[str, ...]:
+    reasons = []
+    if len(animals) < FEWEST_ANIMALS or stimuli < FEWEST_STIMULI:
+        reasons.append(
+            f"intervals need {FEWEST_ANIMALS} animals and {FEWEST_STIMULI} stimuli; there are {len(animals)} and "
+            f"{stimuli}"
+        )
+    blind = sum(point.animals == 0 for point in points)
+    if blind:
+        reasons.append(f"no animal is reliable in {blind} of {len(points)} bins, which have no corrected value")
+    broken = {item.subject: next(filter(None, item.problems)) for item in animals if any(item.problems)}
+    reasons += [f"{subject} has no RDM in some bins: {problem}" for subject, problem in broken.items()]
+    return tuple(reasons)

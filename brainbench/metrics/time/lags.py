@@ -1,0 +1,169 @@
+"""Layers against animals at every lag between the model's time and the neurons'.
+
+A lag is positive where neurons follow the model: the animals' bin t is compared with the model's bin t − lag.
+Letters: N permutation, L layer, G lag, T bin of the recordings, A animal, P RDM pair.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from brainbench.metrics.inference.permutation import canonical_order, label_orders
+from brainbench.metrics.layers import choose_on_others
+from brainbench.metrics.rdms.comparison import compare_all, permuted_comparisons
+from brainbench.metrics.rdms.pairs import Floats, Ints, permuted_pairs, stimulus_count
+from brainbench.metrics.reliability.subject_rdm import is_flat
+
+_NEVER = -2.0
+"""Vote of a layer and lag that cannot be chosen; comparisons are at least −1."""
+_CHUNK_ELEMENTS = 1 << 22
+_EXACT_STIMULI = 6
+"""Up to this many stimuli all orders are taken (6! = 720)."""
+
+
+@dataclass(frozen=True)
+class LaggedRDMs:
+    """RDMs of layers and animals over time, and which of their bins are compared at which lag."""
+
+    layers: Floats
+    """[M, P] RDMs of all layers and bins in a row."""
+    animals: Floats
+    """[T·A, P], animals fastest."""
+    place: Ints
+    """[L, G, T] row of ``layers`` compared with bin t; −1 for none."""
+    usable: NDArray[np.bool_]
+    """[L, G, T, A] True where both have an RDM."""
+    lags: Ints
+    """[G] in bins."""
+    comparison: str
+
+    @classmethod
+    def join(cls, movies: Sequence[Floats], animals: Sequence[Floats], *, largest: int, comparison: str) -> LaggedRDMs:
+        """Join movies [T', P] of layers and [T, P] of animals.
+
+        Args:
+            movies: One per layer; of a single RDM for a layer without time, which is compared at lag 0 alone.
+            animals: One per animal, all of T bins.
+            largest: Largest lag tried in both directions, bins.
+            comparison: Comparison of RDMs.
+        """
+        bins, lags = len(animals[0]), np.arange(-largest, largest + 1)
+        place = np.full((len(movies), len(lags), bins), -1, dtype=np.int64)
+        start = 0
+        for index, movie in enumerate(movies):
+            if len(movie) == 1:
+                place[index, largest] = start
+            else:
+                at = np.arange(bins) - lags[:, None]
+                inside = (at >= 0) & (at < len(movie))
+                # A lag at which most of the recordings meet no model time would be chosen by luck.
+                inside &= 2 * inside.sum(axis=1, keepdims=True) >= min(bins, len(movie))
+                place[index] = np.where(inside, start + at, -1)
+            start += len(movie)
+        rows, brain = np.concatenate(movies), np.stack(animals, axis=1)
+        known_rows, known_brain = ~is_flat(rows), ~is_flat(brain)
+        usable = (place[..., None] >= 0) & known_rows[place][..., None] & known_brain
+        # What stands for a missing RDM is never looked at, but must be a number for the matrix products.
+        dummy = np.arange(rows.shape[1], dtype=np.float64)
+        rows = np.where(known_rows[:, None], rows, dummy)
+        brain = np.where(known_brain[..., None], brain, dummy).reshape(-1, rows.shape[1])
+        return cls(rows, brain, place, usable, lags, comparison)
+
+    @property
+    def stimuli(self) -> int:
+        """K."""
+        return stimulus_count(self.layers.shape[1])
+
+    def compared(self) -> Floats:
+        """Return comparisons [1, L, G, T, A]."""
+        return self._arranged(compare_all(self.layers, self.animals, method=self.comparison)[None])
+
+    def permuted(self, draws: int, seed: int) -> Iterator[Floats]:
+        """Yield comparisons [N, L, G, T, A] under orders of the stimuli, the given order first of all."""
+        # Stimuli are sorted by the animals' RDMs, so that random orders do not depend on how they were listed.
+        pairs = permuted_pairs(canonical_order(self.animals)[None])[0]
+        step = max(1, _CHUNK_ELEMENTS // max(self.layers.size, len(self.layers) * len(self.animals)))
+        orders = label_orders(self.stimuli, seed, exact=_EXACT_STIMULI, draws=draws, step=step)
+        layers, animals = self.layers[:, pairs], self.animals[:, pairs]
+        for r in permuted_comparisons(layers, animals, orders, self.comparison):
+            yield self._arranged(r)
+
+    def without_stimulus(self, stimulus: int) -> Floats:
+        """Return comparisons [1, L, G, T, A] without one stimulus."""
+        rows, cols = np.triu_indices(self.stimuli, k=1)
+        kept = (rows != stimulus) & (cols != stimulus)
+        r = compare_all(self.layers[:, kept], self.animals[:, kept], method=self.comparison)
+        return self._arranged(r[None])
+
+    def _arranged(self, r: Floats) -> Floats:
+        """Return comparisons [N, M, T·A] as [N, L, G, T, A]; NaN where nothing is compared."""
+        _, _, bins, animals = self.usable.shape
+        every = r.reshape(*r.shape[:2], bins, animals)
+        found = every[:, self.place, np.arange(bins)]
+        return np.where(self.usable, found, np.nan)
+
+
+def votes(r: Floats) -> Floats:
+    """Return the mean over time [N, L, G, A] of comparisons [N, L, G, T, A]; NaN where there are none."""
+    present = np.isfinite(r)
+    number = present.sum(axis=-2)
+    total = np.where(present, r, 0.0).sum(axis=-2)
+    return np.divide(total, number, out=np.full(total.shape, np.nan), where=number > 0)
+
+
+def held_out_course(r: Floats) -> tuple[Floats, Ints]:
+    """Return comparisons over time [N, T, A] at the layer and lag that suit the *other* animals best.
+
+    A single animal has no others; its own best is taken, and the permutations repeat that.
+
+    Args:
+        r: [N, L, G, T, A].
+
+    Returns:
+        The comparisons, and the chosen candidates [N, A], counted through layers and lags.
+    """
+    number, layers, lags, bins, animals = r.shape
+    vote = np.nan_to_num(votes(r), nan=_NEVER).reshape(number, layers * lags, animals)
+    chosen = choose_on_others(vote) if animals > 1 else vote.argmax(axis=1)
+    every = r.reshape(number, layers * lags, bins, animals)
+    return np.take_along_axis(every, chosen[:, None, None, :], axis=1)[:, 0], chosen
+
+
+def profile(excess: Floats) -> Floats:
+    """Return how well layers match at each lag [L, G], up to a constant per layer, from comparisons [L, G, T, A].
+
+    Lags differ in the bins that have a model time, and bins differ in how well they match at any lag (before the
+    response nothing does). So neighbouring lags are compared over the bins that both have, and the differences added
+    up. NaN where a lag has no comparison.
+    """
+    steps = _mean_over_bins(excess[:, 1:] - excess[:, :-1])
+    total = np.cumsum(np.nan_to_num(steps), axis=-1)
+    found = np.concatenate([np.zeros((len(excess), 1)), total], axis=-1)
+    return np.where(np.isfinite(excess).any(axis=(-2, -1)), found, np.nan)
+
+
+def _mean_over_bins(values: Floats) -> Floats:
+    """Return the mean [L, G] over the finite entries of values [L, G, T, A]."""
+    present = np.isfinite(values)
+    number = present.sum(axis=(-2, -1))
+    total = np.where(present, values, 0.0).sum(axis=(-2, -1))
+    return np.divide(total, number, out=np.full(total.shape, np.nan), where=number > 0)
+
+
+def peak_lag(profiles: Floats) -> Floats:
+    """Return where each of profiles [..., G] is highest, in steps from its first entry; between steps by a parabola.
+
+    NaN where the profile has no value, or its highest entry has a missing neighbour or lies at an end.
+    """
+    filled = np.where(np.isfinite(profiles), profiles, -np.inf)
+    top = filled.argmax(axis=-1)
+    inside = (top > 0) & (top < profiles.shape[-1] - 1)
+    at = np.clip(top, 1, profiles.shape[-1] - 2)
+    before, here, after = (np.take_along_axis(profiles, (at + d)[..., None], axis=-1)[..., 0] for d in (-1, 0, 1))
+    with np.errstate(invalid="ignore", divide="ignore"):
+        shift = 0.5 * (before - after) / (before - 2 * here + after)
+    return np.where(inside & np.isfinite(shift), at + shift, np.nan)

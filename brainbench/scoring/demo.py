@@ -1,0 +1,67 @@
+"""Demo recordings by name: synthetic animals that felt simulated stimuli, made once per machine.
+
+``demo``: ten animals whose neurons mix the units of one layer of a hidden network, one of the shipped trained models
+(:data:`HIDDEN_NETWORK`), on the recipe ``objects``. A board on them has a known right answer.
+``demo-rodgers``: four animals in the task and files of Rodgers (2022), on the recipe ``rodgers``; six stimuli are too
+few to tell models apart.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from brainbench.core.files import file_hash
+from brainbench.core.progress import Progress
+
+DEMOS = {"demo": "objects", "demo-rodgers": "rodgers"}
+"""Names of the demo recordings, each with the recipe of its stimuli."""
+HIDDEN_NETWORK, HIDDEN_LAYER = "resnet18-small+gpt.simclr", "attender.lm_head"
+"""The network whose units the neurons of ``demo`` mix, and the layer, averaged over time."""
+VERSION = 3
+"""Raised when the same stimuli and network give other spikes in ``demo``, so that old caches are not reused."""
+_SEED = 18
+
+
+def demo_recordings(name: str = "demo", *, progress: Progress | None = None) -> Path:
+    """Return the folder of demo recordings, one of :data:`DEMOS`, made on first use.
+
+    ``truth.json`` beside the files says what their neurons encode.
+    """
+    from brainbench.datasets.synthetic.cache import ensure_recordings
+    from brainbench.datasets.synthetic.rodgers_demo import ensure_rodgers_demo
+    from brainbench.models.registry import locate_model
+    from brainbench.stimuli import load_stimuli
+
+    stimuli = load_stimuli(DEMOS[name], progress=progress)
+    if name == "demo-rodgers":
+        return ensure_rodgers_demo(stimuli.dataset, progress=progress)
+    weights = locate_model(HIDDEN_NETWORK).weights
+    told = {"stimuli_hash": stimuli.content_hash, "weights": file_hash(weights) if weights else None}
+
+    def make(folder: Path) -> None:
+        from brainbench.datasets.synthetic import PopulationDesign, ResponseGeometry, write_files
+        from brainbench.datasets.synthetic.truth import squared_euclidean_rdm
+        from brainbench.models.activations import extract
+
+        network = locate_model(HIDDEN_NETWORK).build(_SEED)
+        activations = extract(network, stimuli.input, layers=(HIDDEN_LAYER,))[HIDDEN_LAYER].mean(axis=1)
+        # Processors differ in the last digits of a network's output; rounded, the counts drawn from it are equal.
+        features = np.round(activations.astype(np.float64), 5)
+        write_files(
+            folder,
+            ResponseGeometry.from_activations(features, stimuli.labels),
+            PopulationDesign(),
+            seed=_SEED,
+            stimuli=DEMOS[name],
+            distance=squared_euclidean_rdm,
+            progress=progress,
+            network=HIDDEN_NETWORK,
+            layer=HIDDEN_LAYER,
+            distances="squared Euclidean",
+            version=VERSION,
+            **told,
+        )
+
+    return ensure_recordings(name, told, HIDDEN_NETWORK, HIDDEN_LAYER, VERSION, _SEED, make=make)

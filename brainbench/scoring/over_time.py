@@ -1,0 +1,78 @@
+"""Scores over time: the animals' bins and the model's steps brought to one clock and compared."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from brainbench.core.errors import DataError, UsageError
+from brainbench.core.progress import Progress
+from brainbench.metrics.measures.registry import get_metric, list_metrics
+from brainbench.metrics.measures.rsa import RSA
+from brainbench.metrics.time import TimeCourse, animal_movie, layer_movie, score_over_time
+
+if TYPE_CHECKING:
+    from brainbench.scoring.model_responses import ModelResponses
+    from brainbench.scoring.neural_responses import NeuralResponses
+
+
+def check_metric(metric: Any) -> None:
+    """Raise UsageError unless a metric compares RDMs, which can be made at each time."""
+    if not isinstance(metric, RSA):
+        known = [name for name in list_metrics() if isinstance(get_metric(name), RSA)]
+        raise UsageError(f"Scores over time compare RDMs; the metric {metric.name!r} has none; choose from {known}.")
+
+
+def time_course(
+    brain: NeuralResponses,
+    network: ModelResponses,
+    metric: RSA,
+    kept: tuple[str, ...],
+    rows: list[int],
+    *,
+    seed: int = 0,
+    progress: Progress | None = None,
+) -> TimeCourse:
+    """Return the score over time of a model against recordings in bins.
+
+    The window of the recordings begins when the stimuli do. Where the stimuli do not state their duration, they last as
+    long as the window.
+
+    Args:
+        brain: Recordings in bins of one width.
+        network: Activations of the model.
+        metric: How RDMs are made and compared.
+        kept: Labels that are scored, in order.
+        rows: Rows of the activations for these labels.
+        seed: Seed of split halves and permutations.
+        progress: Called with (done, total, what).
+
+    Raises:
+        DataError: the recordings have no bins of time.
+        UsageError: fewer than 3 bins or 4 stimuli.
+    """
+    if "time" not in brain.dataset.coords or brain.dataset.sizes["time"] < 3:
+        raise DataError(
+            "Scores over time need recordings in at least 3 bins of time; give a smaller bin (--bin, seconds) or a "
+            "longer window."
+        )
+    begins = brain.dataset["time"].values.astype(np.float64)
+    width = float(np.median(np.diff(begins)))
+    seconds = width * len(begins) if network.seconds is None else network.seconds
+    sessions = brain.trials(kept)
+    how = {"method": metric.brain_method, "noise": metric.noise, "comparison": metric.comparison}
+    total, animals, layers = len(sessions) + len(network.activations), [], {}
+    for subject, blocks in sessions.items():
+        _tell(progress, len(animals), total)
+        animals.append(animal_movie(subject, blocks, len(kept), stimuli=kept, seed=seed, **how))
+    for name, values in network.activations.items():
+        _tell(progress, len(animals) + len(layers), total)
+        layers[name] = layer_movie(values[rows], seconds / values.shape[1], width, method=metric.model_method)
+    _tell(progress, total, total)
+    return score_over_time(layers, animals, width=width, comparison=metric.comparison, seed=seed)
+
+
+def _tell(progress: Progress | None, done: int, total: int) -> None:
+    if progress is not None:
+        progress(done, total, "RDMs over time")

@@ -1,0 +1,183 @@
+"""Boards of comparable scores, each with its entries in the order in which people read them.
+
+Scores are comparable only within a **board**: same recordings, same stimuli, same estimator, same metric, same use of
+the time axis. Models that are not told apart (:mod:`leaderboards.ranking`) are tied, so a rank is a range. Not ranked
+are scores that are not reliable, models that nobody here can run again, and whole boards with too few animals or
+stimuli.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter, defaultdict
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+from brainbench.core.records import ResultRecord, Score
+from leaderboards.entries import Entry, fold_seeds, same_computation
+from leaderboards.ranking import Sample, lacking, rank_ranges, told_apart
+
+RAW_INPUT = "raw input"
+"""Name of the baseline that a model must be told apart from."""
+NO_SCALE = "its record states neither chance nor the scores without single stimuli; score the model again"
+
+
+@dataclass(frozen=True)
+class Baseline:
+    """A baseline of a board, taken from the records in it."""
+
+    name: str
+    score: Score
+    kind: str
+    """``baseline`` or ``animals`` (animal-to-animal)."""
+    notes: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Board:
+    """The records that may be compared with one another, best first."""
+
+    recordings: str
+    recordings_hash: str | None
+    stimuli: str
+    stimuli_hash: str | None
+    """None when the features were computed elsewhere, from stimuli that the record cannot name."""
+    conditions: tuple[str, ...]
+    """Labels that were compared, in the order of the RDMs."""
+    time: str
+    """Rule by which the time axis entered the RDMs; empty when not stated."""
+    estimator: str
+    metric: str
+    synthetic: bool
+    truth: str
+    """Name of the network that made synthetic recordings; empty where none is stated."""
+    entries: tuple[Entry, ...]
+    baselines: tuple[Baseline, ...] = field(default=())
+    lacks: str = ""
+    """What it lacks for ranks, in words; empty when models can be told apart."""
+
+    @property
+    def ranked(self) -> tuple[Entry, ...]:
+        """Entries with a rank; none where no two models are told apart."""
+        return tuple(entry for entry in self.entries if entry.first is not None)
+
+    @property
+    def leader(self) -> Entry | None:
+        """The entry with the highest score among those above chance that can be computed again."""
+        able = [entry for entry in self.entries if entry.above_chance and not entry.unranked_because]
+        return max(able, key=lambda entry: entry.scaled, default=None)
+
+
+def rank(records: Iterable[ResultRecord], remarks: Mapping[str, Sequence[str]] | None = None) -> list[Board]:
+    """Sort records into boards and rank the entries of each; the largest board comes first.
+
+    Args:
+        records: Records of any boards.
+        remarks: Doubts about records by identity (:func:`leaderboards.audit.remarks`), kept as notes of entries.
+    """
+    groups: dict[tuple[Any, ...], list[ResultRecord]] = defaultdict(list)
+    for record in records:
+        score = record.score
+        brain, shown = score.provenance.recordings_hash, score.provenance.stimuli_hash
+        groups[brain, shown, score.stimuli, score.provenance.time_rule, score.estimator, score.metric].append(record)
+    boards = [_board(key, group, remarks or {}) for key, group in groups.items()]
+    return sorted(boards, key=lambda board: (-len(board.entries), board.recordings, board.estimator, board.metric))
+
+
+def _board(key: tuple[Any, ...], records: list[ResultRecord], remarks: Mapping[str, Sequence[str]]) -> Board:
+    recordings_hash, stimuli_hash, conditions, time, estimator, metric = key
+    baselines = tuple(_baselines(records))
+    animals = max((len(record.score.subjects) for record in records), default=0)
+    lacks = "records that say which recordings they used" if recordings_hash is None else ""
+    lacks = lacks or lacking(animals, len(conditions))
+    entries = _rank(fold_seeds(records, key, remarks), baselines, lacks)
+    truths = [record.score.provenance.recordings.get("truth") for record in records]
+    return Board(
+        recordings=_most_common(record.score.provenance.recordings_name for record in records),
+        recordings_hash=recordings_hash,
+        stimuli=_most_common(record.score.provenance.stimuli_name for record in records),
+        stimuli_hash=stimuli_hash,
+        conditions=conditions,
+        time=time,
+        estimator=estimator,
+        metric=metric,
+        synthetic=any(record.synthetic for record in records),
+        truth=next((truth for truth in truths if isinstance(truth, str)), ""),
+        entries=tuple(sorted(entries, key=lambda entry: entry.order)),
+        baselines=baselines,
+        lacks=lacks,
+    )
+
+
+def _rank(entries: list[Entry], baselines: Sequence[Baseline], lacks: str) -> list[Entry]:
+    """Return the entries with their ranks, those of one computation with one rank."""
+    found = [replace(entry, unranked_because=_unranked(entry, lacks)) for entry in entries]
+    able = [entry for entry in found if not entry.unranked_because]
+    groups: list[list[Entry]] = []
+    # The shortest name stands for a computation: an encoder before its variants with an attender.
+    for entry in sorted(able, key=lambda entry: (len(entry.name), entry.name)):
+        close = (group for group in groups if math.isclose(group[0].value, entry.value, abs_tol=1e-5))
+        same = next((group for group in close if same_computation(group[0], entry)), None)
+        groups.append([entry]) if same is None else same.append(entry)
+    samples = [group[0].sample for group in groups]
+    raw = next((item.score for item in baselines if item.name == RAW_INPUT and math.isfinite(item.score.scaled)), None)
+    above = told_apart([*samples, *([Sample.of([raw])] if raw is not None else [])])
+    for place, group in enumerate(groups):
+        above[:, place] &= group[0].above_chance
+    count = len(groups)
+    models = above[:count, :count]
+    ranges: list[Any] = rank_ranges(models) if models.any() else [(None, None)] * count
+    best = max(range(count), key=lambda i: (groups[i][0].above_chance, samples[i].value), default=0)
+    ranked = [entry for entry in found if entry.unranked_because]
+    for place, (group, (first, last)) in enumerate(zip(groups, ranges, strict=True)):
+        told = {"above_raw": raw is not None and bool(above[count, place]), "below_leader": bool(models[place, best])}
+        for entry in group:
+            copied = "" if entry is group[0] else group[0].name
+            ranked.append(replace(entry, first=first, last=last, same_as=copied, **told))
+    return ranked
+
+
+def _unranked(entry: Entry, lacks: str) -> str:
+    """Return why an entry cannot be ranked, empty when it can."""
+    if reason := entry.not_repeatable:
+        return f"not repeatable here: {reason}"
+    if entry.standing in ("unreliable", "undefined"):
+        return entry.standing
+    if lacks:
+        return f"ranks need {lacks}"
+    return "" if math.isfinite(entry.scaled) and len(entry.sample.without_stimulus) else NO_SCALE
+
+
+def _outcome(score: Score) -> tuple[str, float | None]:
+    """Status and value to nine digits: sums on other machines, or by more threads, end in other last digits."""
+    return score.status, None if math.isnan(score.value) else round(score.value, 9)
+
+
+def _baselines(records: list[ResultRecord]) -> list[Baseline]:
+    """Take each baseline once; records of one board should agree on it, and a note says when they do not."""
+    found: dict[tuple[str, str], list[Score]] = defaultdict(list)
+    for record in records:
+        if record.animal_to_animal is not None:
+            found["animals", "animal-to-animal"].append(record.animal_to_animal)
+        for name, score in record.baselines.items():
+            found["baseline", name].append(score)
+    baselines = []
+    for (kind, name), scores in found.items():
+        counts = Counter(map(_outcome, scores))
+        usual = counts.most_common(1)[0][0]
+        score = next(score for score in scores if _outcome(score) == usual)
+        notes: tuple[str, ...] = ()
+        if len(counts) > 1:
+            values = [value for _, value in counts if value is not None]
+            notes = (
+                f"the records disagree: {len(counts)} different values"
+                + (f" from {min(values):.3f} to {max(values):.3f}" if values else "")
+                + f"; shown is that of {counts[usual]} of {len(scores)} records",
+            )
+        baselines.append(Baseline(name, score, kind, notes))
+    return baselines
+
+
+def _most_common(names: Iterable[str]) -> str:
+    return Counter(names).most_common(1)[0][0]

@@ -1,0 +1,101 @@
+"""Pictures of representational dissimilarity matrices: one pixel per cell, in colours that colour-blind readers see."""
+
+from __future__ import annotations
+
+import base64
+import math
+import struct
+import zlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from html import escape
+from itertools import combinations
+
+from leaderboards.figures.svg import Drawing
+
+# Nine equidistant colours of viridis (van der Walt & Smith 2015), perceptually uniform and safe for
+# colour-blind readers.
+_VIRIDIS = ("440154", "472d7b", "3b528b", "2c728e", "21918c", "28ae80", "5ec962", "addc30", "fde725")
+_LEVELS = 254
+
+
+@dataclass(frozen=True)
+class RdmPicture:
+    """An RDM as a PNG of one pixel per cell, with what a reader needs beside it."""
+
+    source: str
+    """``data:`` address of the image; the diagonal is transparent, pairs without a value are grey."""
+    labels: tuple[str, ...]
+    low: float
+    high: float
+    description: str
+    """The picture in words, for readers who do not see it."""
+
+
+def rdm_picture(pairs: Sequence[float], labels: Sequence[str]) -> RdmPicture | None:
+    """Draw an RDM given as its upper triangle [P], row by row; None when there are no pairs to draw.
+
+    The colours span this RDM's own range, because comparisons by correlation ignore scale.
+    """
+    size = len(labels)
+    if size < 2 or len(pairs) != size * (size - 1) // 2:
+        return None
+    places = list(combinations(range(size), 2))
+    finite = [(value, place) for value, place in zip(pairs, places, strict=True) if math.isfinite(value)]
+    if not finite:
+        return None
+    (low, alike), (high, apart) = min(finite), max(finite)
+    scale = (_LEVELS - 1) / (high - low) if high > low else 0.0
+    cells: list[list[int | None]] = [[None] * size for _ in range(size)]
+    for value, (i, j) in zip(pairs, places, strict=True):
+        cells[i][j] = cells[j][i] = round((value - low) * scale) if math.isfinite(value) else _LEVELS
+    description = (
+        f"{size} by {size} matrix of dissimilarities from {low:.3g} to {high:.3g}; most alike are "
+        f"{labels[alike[0]]} and {labels[alike[1]]}, most different {labels[apart[0]]} and {labels[apart[1]]}."
+    )
+    if len(finite) < len(pairs):
+        description += f" Undefined pairs: {len(pairs) - len(finite)}."
+    return RdmPicture(_png(cells), tuple(labels), low, high, description)
+
+
+def colour_stops() -> tuple[tuple[float, str], ...]:
+    """Return (offset in percent, colour) for the legend's gradient."""
+    return tuple((100 * i / (len(_VIRIDIS) - 1), f"#{colour}") for i, colour in enumerate(_VIRIDIS))
+
+
+def draw_rdm(drawing: Drawing, x: float, y: float, side: float, picture: RdmPicture) -> None:
+    """Put the picture of an RDM into a drawing, its pixels unblurred."""
+    place = f'x="{x:.1f}" y="{y:.1f}" width="{side:.1f}" height="{side:.1f}"'
+    drawing.rect(x, y, side, side, "box")
+    drawing.parts.append(
+        f'<image {place} image-rendering="pixelated" href="{picture.source}">'
+        f"<title>{escape(picture.description)}</title></image>"
+    )
+
+
+def _png(cells: list[list[int | None]]) -> str:
+    """Encode colour levels (None: transparent) as an indexed PNG (W3C recommendation, third edition).
+
+    The palette holds only the colours in use: most RDMs are small, and a page holds hundreds.
+    """
+    used = sorted({level for row in cells for level in row if level is not None})
+    index = {None: 0} | {level: i for i, level in enumerate(used, start=1)}
+    data = b"\x89PNG\r\n\x1a\n"
+    for kind, body in (
+        (b"IHDR", struct.pack(">IIBBBBB", len(cells), len(cells), 8, 3, 0, 0, 0)),
+        (b"PLTE", bytes(3) + b"".join(map(_colour, used))),
+        (b"tRNS", b"\x00"),
+        (b"IDAT", zlib.compress(b"".join(b"\x00" + bytes(index[level] for level in row) for row in cells), 9)),
+        (b"IEND", b""),
+    ):
+        data += struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body))
+    return "data:image/png;base64," + base64.b64encode(data).decode()
+
+
+def _colour(level: int) -> bytes:
+    if level >= _LEVELS:
+        return b"\x80\x80\x80"
+    place = level / (_LEVELS - 1) * (len(_VIRIDIS) - 1)
+    index = min(int(place), len(_VIRIDIS) - 2)
+    first, second = bytes.fromhex(_VIRIDIS[index]), bytes.fromhex(_VIRIDIS[index + 1])
+    return bytes(round(a + (b - a) * (place - index)) for a, b in zip(first, second, strict=True))

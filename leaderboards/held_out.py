@@ -1,0 +1,81 @@
+"""Recordings that a board holds back: a published commitment now, the data later.
+
+Whoever keeps a board publishes the salted hash of the file of held-out animals or stimuli. Nobody can learn the data
+from it, and nobody can exchange them afterwards: when file and salt are shown, everybody can compute the hash again.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import secrets
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import msgspec
+
+from brainbench.core.errors import DataError
+from brainbench.core.files import file_hash, read_json, write_json, write_text
+
+DATA, SALT = "held-out.h5", "salt.txt"
+"""Files of the secret folder."""
+
+
+@dataclass(frozen=True)
+class Commitment:
+    """The public part of held-out recordings."""
+
+    kind: Literal["animals", "stimuli"]
+    """What was held back."""
+    held: int
+    """How many of them."""
+    kept: int
+    """How many are public."""
+    recordings: str
+    """Content hash of the recordings before they were split."""
+    digest: str
+    """SHA-256 of salt and file."""
+
+    @classmethod
+    def read(cls, path: str | os.PathLike[str]) -> Commitment:
+        """Read a published commitment.
+
+        Raises:
+            DataError: the file is missing or is no commitment.
+        """
+        try:
+            return msgspec.convert(read_json(path), cls)
+        except msgspec.ValidationError as error:
+            raise DataError(f"{os.fspath(path)!r} is no commitment to held-out recordings ({error}).") from error
+
+    def write(self, path: str | os.PathLike[str]) -> Path:
+        """Write it as JSON, to be published."""
+        return write_json(path, self)
+
+    def open(self, secret: str | os.PathLike[str]) -> Path:
+        """Return the held-out file of a secret folder, after checking that it is the one committed to.
+
+        Raises:
+            DataError: a part of the folder is missing, or it is not what was committed to.
+        """
+        data, salt = Path(secret) / DATA, Path(secret) / SALT
+        if not data.is_file() or not salt.is_file():
+            raise DataError(f"The secret folder {os.fspath(secret)!r} lacks {DATA!r} or {SALT!r}.")
+        if digest(data, salt.read_text(encoding="utf-8").strip()) != self.digest:
+            raise DataError(
+                f"{os.fspath(data)!r} is not the file that the published hash {self.digest[:12]}… commits to."
+            )
+        return data
+
+
+def digest(data: Path, salt: str) -> str:
+    """Return the salted hash of a file."""
+    return hashlib.sha256(f"{salt}:{file_hash(data, length=64)}".encode()).hexdigest()
+
+
+def new_salt(secret: str | os.PathLike[str]) -> str:
+    """Write a salt that nobody can guess into a secret folder and return it."""
+    salt = secrets.token_hex(32)
+    write_text(Path(secret) / SALT, salt + "\n")
+    return salt
