@@ -408,12 +408,12 @@ def equivalence(simulations: int) -> Result:
 
 
 def faults(simulations: int) -> Result:
-    from brainbench.datasets.synthetic import Design as Recordings
-    from brainbench.datasets.synthetic import ResponseGeometry, simulate
+    from brainbench.datasets.synthetic import PopulationDesign, ResponseGeometry, simulate
 
     rows = []
-    for imbalance in (0.0, 0.5):
-        design = Recordings(animals=11, sessions=3, units=20, imbalance=imbalance)
+    quiet = {"rate": 8.0, "window": 1.0, "modulation": 0.3, "emphasis": 0.0, "dispersion": 0.0, "shared_gain": 0.0}
+    for trials in ((20, 20), (8, 32)):
+        design = PopulationDesign(animals=11, sessions=3, units=20, trials=trials, **quiet)
         for given in ((), ("zero-fill",), ("first-appearance",), ("first-appearance", "zero-fill")):
             values, reliable = [], []
             for study in range(simulations):
@@ -425,11 +425,11 @@ def faults(simulations: int) -> Result:
                 reliable.append(score.reliability)
             known = np.array(values)[np.isfinite(values)]
             spread = f"{known.mean():.3f} ± {known.std() / math.sqrt(len(known)):.3f}"
-            rows.append([f"{imbalance:g}", " + ".join(given) or "none", spread, f"{np.mean(reliable):.2f}"])
+            rows.append(["{} to {}".format(*trials), " + ".join(given) or "none", spread, f"{np.mean(reliable):.2f}"])
     title = (
         f"Animal-to-animal score of 11 animals of one geometry, with the released faults ({simulations:,} studies each)"
     )
-    return Result(title, ["imbalance of trials", "fault", "score", "reliability"], rows)
+    return Result(title, ["trials of a stimulus", "fault", "score", "reliability"], rows)
 
 
 JOBS: dict[str, Callable[[int], Result]] = {
