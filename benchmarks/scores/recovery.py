@@ -23,12 +23,13 @@ from brainbench.core.statistics import wilson_interval
 from brainbench.datasets.synthetic import PopulationDesign, ResponseGeometry, draw_animals
 from brainbench.metrics.inference.permutation import label_orders, tail_p
 from brainbench.metrics.layers import held_out
+from brainbench.metrics.measures.rsa import RSA
 from brainbench.metrics.rdms.comparison import compare_all, permuted_comparisons
+from brainbench.metrics.rdms.pairs import permuted_pairs
 from brainbench.metrics.reliability.subject_rdm import subject_rdm
 from brainbench.models.training.checkpoints import shipped
 from brainbench.scoring.options import ScoreOptions
 from brainbench.scoring.recovery import Candidate, RecoveryDesign, open_candidates, plot_confusion, recover
-from brainbench.scoring.recovery.boards import pairs_of
 from brainbench.scoring.recovery.selection import keep_stimuli, select_stimuli
 
 DISTANCES = ("sqeuclidean", "correlation", "mahalanobis", "crossnobis")
@@ -66,9 +67,10 @@ def drawn_rdms(
 
 def layer_rdms(candidates: Sequence[Candidate], method: str, rows: np.ndarray) -> list[np.ndarray]:
     """Return the RDMs [L, P] of every candidate."""
-    pairs = pairs_of(rows, len(candidates[0].stimuli))
+    pairs = permuted_pairs(rows[None], len(candidates[0].stimuli))[0]
     kind = "correlation" if method == "correlation" else "sqeuclidean"
-    return [item.rdms(kind)[:, pairs] for item in candidates]
+    metric = RSA(model_method=kind)
+    return [np.stack(list(item.layers(metric).values()))[:, pairs] for item in candidates]
 
 
 def mean_chosen(r: np.ndarray) -> np.ndarray:
@@ -146,7 +148,7 @@ def null_p(candidates: Sequence[Candidate], boards: int, comparison: str, job: t
 def null(candidates: Sequence[Candidate], boards: int) -> str:
     """Return the shares of small p where nothing is alike."""
     lines = [
-        f"{boards} boards a row: animals of a random geometry, scored by one shipped network after another; 199 orders.",
+        f"{boards} boards a row: animals of a random geometry, one shipped network after another; 199 orders.",
         "",
         "| distance | comparison | stimuli | p ≤ .05 | p ≤ .2 | p ≤ .5 |",
         "|---|---|---|---|---|---|",
@@ -165,7 +167,7 @@ def null(candidates: Sequence[Candidate], boards: int) -> str:
 
 def matrix(candidates: Sequence[Candidate], boards: int) -> str:
     """Return the confusion matrix of the default design, and draw it."""
-    start, used = time.perf_counter(), time.process_time()
+    start = time.perf_counter()
     found = recover(candidates, RecoveryDesign(), boards=boards)
     seconds = time.perf_counter() - start
     plot_confusion(found, PICTURE)

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
     from brainbench.scoring.recovery import Candidate, Recovery, RecoveryDesign
 
-POPULATION = "brainbench.datasets.synthetic.populations:PopulationDesign"
+POPULATION = "brainbench.datasets.synthetic.design:PopulationDesign"
 _NOISE = ("animals", "units", "rate", "window", "modulation", "individual", "emphasis", "dispersion", "shared_gain")
 _DESIGN = "brainbench.scoring.recovery.design:RecoveryDesign"
 
@@ -45,7 +45,7 @@ def recovery(
     trials: Annotated[str, typer.Option(help="Trials of each stimulus: 18, or the fewest and the most.")] = "16-20",
     metric: Annotated[str, option(SCORE, "metric")] = "rsa",
     layer: Annotated[str, option(_DESIGN, "layer")] = "any",
-    boards: Annotated[int, typer.Option(help="Boards of each network.")] = 20,
+    boards: Annotated[int, typer.Option(help="Boards of each network.")] = 10,
     want: Annotated[
         float | None,
         typer.Option(help="Also name the cheapest design whose true network comes first this often, such as 0.8."),

@@ -15,7 +15,7 @@ def networks(tmp_path):
     names = [f"s{index}" for index in range(14)]
     paths = [tmp_path / "one.h5", tmp_path / "other.h5"]
     for path in paths:
-        write_features(path, {"x": random.standard_normal((14, 5))}, names)
+        write_features(path, names, {"x": random.standard_normal((14, 5))})
     return [str(path) for path in paths]
 
 
@@ -63,5 +63,5 @@ def test_what_cannot_be_asked_is_one_sentence(run, networks, arguments, culprit)
 def test_one_network_is_too_few(run, networks):
     found = run("recovery", networks[0])
     assert (found.status, "at least two" in found.err) == (2, True)
-    found = run("recovery", "zhuang-smal.simclr")
+    found = run("recovery", "zhuang-smal.simclr", "zhuang-small.simclr")
     assert (found.status, "'zhuang-small" in found.err) == (2, True)

@@ -15,7 +15,6 @@ from brainbench.metrics.measures.rsa import score_animals, score_rdms
 from brainbench.metrics.reliability.subject_rdm import subject_rdm
 from tests.factories.animals import STIMULI, make_block, make_latent
 
-
 SAME = np.full(12, 0.0)
 """Left-out stimuli that change nothing."""
 
@@ -74,8 +73,7 @@ def test_a_model_at_the_margin_passes_no_more_often_than_the_level():
     rng = np.random.default_rng(1)
     passed = np.mean(
         [
-            equivalence_test(0.1 + 0.05 * rng.normal(size=11), SAME, margin=0.1).verdict
-            == "equivalent"
+            equivalence_test(0.1 + 0.05 * rng.normal(size=11), SAME, margin=0.1).verdict == "equivalent"
             for _ in range(4000)
         ]
     )

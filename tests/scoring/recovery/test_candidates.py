@@ -35,7 +35,7 @@ def test_an_unknown_layer_names_the_nearest():
 
 
 def _features(path, names, seed):
-    write_features(path, {"x": np.random.default_rng(seed).standard_normal((len(names), 4))}, names)
+    write_features(path, names, {"x": np.random.default_rng(seed).standard_normal((len(names), 4))})
     return str(path)
 
 

@@ -14,7 +14,7 @@ def small(monkeypatch):
 
 def test_the_cheapest_design_that_suffices_is_named(small):
     candidates = make_candidates(14)
-    best, tried = find_cheapest(candidates, DESIGN, 0.7, boards=6, workers=1)
+    best, tried = find_cheapest(candidates, DESIGN, 0.7, boards=3, workers=1)
     assert best is not None
     assert best.win_rate >= 0.7
     assert best == tried[-1]
@@ -25,7 +25,7 @@ def test_none_is_named_where_none_suffices(small):
     # Twins cannot be told apart, whatever is measured.
     (one,) = make_candidates(14, names=("a",))
     (twin,) = make_candidates(14, names=("b",))
-    best, tried = find_cheapest((one, twin), DESIGN, 0.9, boards=8, workers=1)
+    best, tried = find_cheapest((one, twin), DESIGN, 0.9, boards=4, workers=1)
     assert best is None
     assert tried
 

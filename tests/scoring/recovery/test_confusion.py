@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 
 from brainbench.scoring.recovery import Recovery
-from brainbench.scoring.recovery.boards import Board
+from brainbench.scoring.recovery.boards import RecoveryBoard
 from tests.factories.candidates import DESIGN
 
 
 def _board(true, number, scaled, told=(0, 0)):
-    return Board(true, number, "layer1", scaled, told, 0.5)
+    return RecoveryBoard(true, number, "layer1", scaled, told, 0.5)
 
 
 def test_boards_are_counted_by_who_made_them_and_who_came_first():
