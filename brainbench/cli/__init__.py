@@ -21,6 +21,7 @@ from brainbench.cli import (
     policy,
     power,
     recordings,
+    recovery,
     score,
     stimuli,
     tactile,
@@ -39,6 +40,7 @@ app = typer.Typer(
 )
 app.command("score")(score.score)
 app.command("power")(power.power)
+app.command("recovery")(recovery.recovery)
 app.command("train")(train.train)
 app.command("export")(models.export)
 app.command("doctor")(doctor.doctor)

@@ -109,9 +109,10 @@ def run_on_cluster(
             try:
                 result = future.result()
             except KilledWorker as error:
+                name = names[place] if names else f"job {place}"
                 raise DataError(
-                    f"Several workers died of {names[place] if names else f'job {place}'}, perhaps for want of memory; what is "
-                    "finished is kept: run the same command again with more memory per worker."
+                    f"Several workers died of {name}, perhaps for want of memory; what is finished is kept: run the "
+                    "same command again with more memory per worker."
                 ) from error
             yield place, result
             submit()

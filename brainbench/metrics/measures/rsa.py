@@ -14,7 +14,7 @@ from brainbench.core.errors import UsageError
 from brainbench.core.records import Score
 from brainbench.metrics.animal_to_animal import score_agreement
 from brainbench.metrics.measures.metric import Metric, usable_features
-from brainbench.metrics.rdms.comparison import check_comparison, permuted_comparisons
+from brainbench.metrics.rdms.comparison import check_comparison, compare_all, permuted_comparisons
 from brainbench.metrics.rdms.comparison import compare as compare_rdms
 from brainbench.metrics.rdms.dissimilarity import rdm
 from brainbench.metrics.rdms.pairs import Floats, Ints, permuted_pairs, rdm_stack, square, stimulus_count
@@ -70,6 +70,20 @@ class RSA(Metric):
         """Yield raw comparisons [N, L, A] under the orders of each chunk."""
         brain = np.stack([animal.rdm for animal in animals])
         return permuted_comparisons(np.stack(layers), brain, iter(chunks), self.comparison, device=device)
+
+    def compare_without(self, layers: Sequence[Floats], animals: Sequence[SubjectRDM]) -> Floats:
+        """Return raw comparisons [K, L, A] without each stimulus in turn, of parts of the same RDMs."""
+        count = animals[0].count
+        if count <= 3:
+            return np.full((count, len(layers), len(animals)), np.nan)
+        rdms, brain = np.stack(layers), np.stack([animal.rdm for animal in animals])
+        kept = np.array([np.delete(np.arange(count), stimulus) for stimulus in range(count)])
+        return np.stack(
+            [
+                compare_all(rdms[:, pairs], brain[:, pairs], method=self.comparison)
+                for pairs in permuted_pairs(kept, count)
+            ]
+        )
 
     def correction(self, animal: SubjectRDM, estimator: str) -> Corrected:
         """Return the factor of the estimator; it is linear in the comparison, so that of a comparison of 1."""

@@ -21,6 +21,17 @@ if TYPE_CHECKING:
     from brainbench.scoring.recovery.selection import select_stimuli
     from brainbench.scoring.recovery.study import recover
 
+__all__ = [
+    "Candidate",
+    "Recovery",
+    "RecoveryDesign",
+    "find_cheapest",
+    "open_candidates",
+    "plot_confusion",
+    "recover",
+    "select_stimuli",
+]
+
 _MODULES = {
     ".candidates": ("Candidate", "open_candidates"),
     ".cheapest": ("find_cheapest",),
@@ -30,5 +41,4 @@ _MODULES = {
     ".selection": ("select_stimuli",),
     ".study": ("recover",),
 }
-__all__ = [name for names in _MODULES.values() for name in names]
 __getattr__, __dir__ = lazy_exports(__name__, {name: module for module, names in _MODULES.items() for name in names})

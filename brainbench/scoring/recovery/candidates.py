@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -18,6 +18,9 @@ from brainbench.core.files import content_hash
 from brainbench.core.progress import Progress
 from brainbench.datasets.synthetic.geometry import ResponseGeometry
 from brainbench.scoring.options import ScoreOptions
+
+if TYPE_CHECKING:
+    from brainbench.metrics.measures.metric import Metric
 
 
 @dataclass(frozen=True)
@@ -55,7 +58,11 @@ class Candidate:
         return cls(name, tuple(stimuli), usable, weights)
 
     def choose(self, layer: str, random: np.random.Generator) -> str:
-        """Return the layer that ``any``, ``last`` or a name means; a name of no layer falls to the nearest error."""
+        """Return the layer that ``any``, ``last`` or a name means.
+
+        Raises:
+            UsageError: there is no such layer.
+        """
         names = list(self.features)
         if layer in names:
             return layer
@@ -74,16 +81,15 @@ class Candidate:
         size = np.sqrt((directions**2).sum() / len(rows))
         return ResponseGeometry(directions / (size or 1.0), tuple(self.stimuli[row] for row in rows))
 
-    def rdms(self, method: str) -> NDArray[np.float64]:
-        """Return the RDM [L, P] of every layer, computed once."""
-        from brainbench.metrics import rdm
-
-        if method not in self._rdms:
-            self._rdms[method] = np.stack([rdm(values, method=method) for values in self.features.values()])
-        return self._rdms[method]
+    def layers(self, metric: Metric) -> dict[str, NDArray[np.float64]]:
+        """Return what a metric compares of every layer, computed once."""
+        key = (metric.name, str(metric))
+        if key not in self._layers:
+            self._layers[key] = {name: metric.layer(values) for name, values in self.features.items()}
+        return self._layers[key]
 
     @cached_property
-    def _rdms(self) -> dict[str, NDArray[np.float64]]:
+    def _layers(self) -> dict[tuple[str, str], dict[str, NDArray[np.float64]]]:
         return {}
 
     @cached_property

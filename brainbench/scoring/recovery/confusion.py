@@ -10,7 +10,7 @@ import numpy as np
 from brainbench.core.records import Interval
 from brainbench.core.statistics import FEWEST_ANIMALS, FEWEST_STIMULI, wilson_interval
 from brainbench.metrics.rdms.pairs import Floats, Ints
-from brainbench.scoring.recovery.boards import Board
+from brainbench.scoring.recovery.boards import RecoveryBoard
 from brainbench.scoring.recovery.design import RecoveryDesign
 
 WANTED = 0.8
@@ -26,7 +26,7 @@ class Recovery:
     design: RecoveryDesign
     stimuli: int
     """Stimuli of one board."""
-    boards: tuple[Board, ...]
+    boards: tuple[RecoveryBoard, ...]
 
     @cached_property
     def firsts(self) -> Ints:

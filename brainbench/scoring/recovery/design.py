@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from brainbench.core.errors import UsageError
-from brainbench.datasets.synthetic.populations import PopulationDesign
+from brainbench.datasets.synthetic.design import PopulationDesign
 
 FEWEST_STIMULI = 4
 """Fewest stimuli whose RDMs can be compared after one is left out."""
@@ -29,15 +29,16 @@ class RecoveryDesign:
     """Layer whose units the animals mix: any (drawn anew for each board), last, or the name of one."""
     splits: int = 100
     """Split halves that tell the reliability of an animal's RDM."""
-    orders: int = 20
-    """Random orders of the stimuli that tell the score expected by chance."""
+    orders: int = 50
+    """Random orders of the stimuli that tell the score expected by chance; the observed score counts among them, so
+    with fewer than about 40 it looks like chance."""
     seed: int = 0
     """Seed of the animals."""
 
     def __post_init__(self) -> None:
-        for name in ("splits", "orders"):
-            if getattr(self, name) < 1:
-                raise UsageError(f"A recovery needs at least one of {name}; received {getattr(self, name)}.")
+        for name, fewest in (("splits", 1), ("orders", 40)):
+            if getattr(self, name) < fewest:
+                raise UsageError(f"A recovery needs at least {fewest} {name}; received {getattr(self, name)}.")
         if self.stimuli is not None and self.stimuli < FEWEST_STIMULI:
             raise UsageError(f"A recovery needs at least {FEWEST_STIMULI} stimuli; received {self.stimuli}.")
 

@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -18,12 +19,14 @@ from brainbench.core.errors import UsageError
 from brainbench.core.progress import Progress
 from brainbench.metrics.layers import held_out
 from brainbench.metrics.measures.registry import get_metric
-from brainbench.metrics.measures.rsa import RSA
 from brainbench.metrics.rdms.comparison import compare_all
-from brainbench.metrics.rdms.pairs import Floats, Ints
-from brainbench.scoring.recovery.boards import draw_board, pairs_of
+from brainbench.metrics.rdms.pairs import Floats, Ints, permuted_pairs
+from brainbench.scoring.recovery.boards import draw_board
 from brainbench.scoring.recovery.candidates import Candidate
 from brainbench.scoring.recovery.design import FEWEST_STIMULI, RecoveryDesign
+
+if TYPE_CHECKING:
+    from brainbench.metrics.measures.metric import Metric
 
 BOARDS = 4
 """Boards of each candidate on which stimuli are chosen."""
@@ -34,7 +37,7 @@ EXCHANGES = 1500
 
 
 @dataclass(frozen=True)
-class Selection:
+class StimulusSelection:
     """Stimuli that were picked."""
 
     stimuli: tuple[str, ...]
@@ -53,7 +56,7 @@ def select_stimuli(
     boards: int = BOARDS,
     exchanges: int = EXCHANGES,
     progress: Progress | None = None,
-) -> Selection:
+) -> StimulusSelection:
     """Pick the stimuli of the pool that separate the candidates best.
 
     Args:
@@ -72,7 +75,7 @@ def select_stimuli(
     if not FEWEST_STIMULI <= keep <= pool:
         raise UsageError(f"The pool has {pool} stimuli; {keep} cannot be kept, only {FEWEST_STIMULI} to {pool}.")
     metric = get_metric(design.metric)
-    if not isinstance(metric, RSA):
+    if not metric.of_rdms:
         raise UsageError(f"Stimuli are chosen by RDMs; the metric {metric.name!r} does not compare any, 'rsa' does.")
     margins = _Margins(candidates, design, metric, boards)
     random = np.random.default_rng([design.seed, FIRST_BOARD])
@@ -96,7 +99,7 @@ def select_stimuli(
             progress(tried + 1, exchanges, "exchanging stimuli")
     rows = np.sort(kept)
     gain = float(margins(rows).mean() - first.mean())
-    return Selection(tuple(candidates[0].stimuli[row] for row in rows), tuple(rows.tolist()), gain)
+    return StimulusSelection(tuple(candidates[0].stimuli[row] for row in rows), tuple(rows.tolist()), gain)
 
 
 def keep_stimuli(candidates: Sequence[Candidate], rows: Sequence[int]) -> tuple[Candidate, ...]:
@@ -117,10 +120,10 @@ def _worth(margins: Floats, scale: float) -> float:
 class _Margins:
     """Leads [boards] of the true candidates over the best of the others, for any set of stimuli."""
 
-    def __init__(self, candidates: Sequence[Candidate], design: RecoveryDesign, metric: RSA, boards: int) -> None:
+    def __init__(self, candidates: Sequence[Candidate], design: RecoveryDesign, metric: Metric, boards: int) -> None:
         self.comparison = metric.comparison
         self.pool = len(candidates[0].stimuli)
-        rdms = [item.rdms(metric.model_method) for item in candidates]
+        rdms = [np.stack(list(item.layers(metric).values())) for item in candidates]
         self.layers, self.ends = np.concatenate(rdms), np.cumsum([0, *map(len, rdms)])
         drawn = []
         self.true = np.repeat(np.arange(len(candidates)), boards)
@@ -131,7 +134,7 @@ class _Margins:
         self.brain = np.stack(drawn)
 
     def __call__(self, rows: Ints) -> Floats:
-        pairs = pairs_of(np.sort(rows), self.pool)
+        pairs = permuted_pairs(np.sort(rows)[None], self.pool)[0]
         boards, animals = self.brain.shape[:2]
         brain = self.brain[..., pairs].reshape(boards * animals, -1)
         r = np.nan_to_num(compare_all(self.layers[:, pairs], brain, method=self.comparison), nan=-1.0)

@@ -13,12 +13,12 @@ from brainbench.core.files import content_hash, read_json, to_plain, write_json
 from brainbench.core.jobs import run_jobs
 from brainbench.core.progress import Progress
 from brainbench.metrics.measures.registry import get_metric
-from brainbench.scoring.recovery.boards import Board, make_board
+from brainbench.scoring.recovery.boards import RecoveryBoard, make_board
 from brainbench.scoring.recovery.candidates import Candidate
 from brainbench.scoring.recovery.confusion import Recovery
 from brainbench.scoring.recovery.design import RecoveryDesign
 
-BOARDS = 20
+BOARDS = 10
 """Boards of each candidate."""
 _TOGETHER = 5
 """Boards that one job makes and one file keeps."""
@@ -74,12 +74,12 @@ def recover(
         for start in range(first, first + boards, _TOGETHER)
         for true in range(len(candidates))
     ]
-    found: dict[_Job, list[Board]] = {}
+    found: dict[_Job, list[RecoveryBoard]] = {}
     if folder is not None:
         _begin(folder, {"candidates": [item.identity for item in candidates], "design": to_plain(design)})
         for job in jobs:
             if (folder / job.file).is_file():
-                kept = [Board.of(item) for item in read_json(folder / job.file)]
+                kept = [RecoveryBoard.of(item) for item in read_json(folder / job.file)]
                 if [item.number for item in kept] == list(job.numbers):
                     found[job] = kept
     missing = [job for job in jobs if job not in found]
@@ -99,7 +99,7 @@ def recover(
     return Recovery(tuple(item.name for item in candidates), design, _shown(candidates, design), tuple(every))
 
 
-def _make_boards(candidates: tuple[Candidate, ...], design: RecoveryDesign, job: _Job) -> list[Board]:
+def _make_boards(candidates: tuple[Candidate, ...], design: RecoveryDesign, job: _Job) -> list[RecoveryBoard]:
     return [make_board(candidates, design, job.true, number) for number in job.numbers]
 
 

@@ -1,0 +1,221 @@
+"""``brainbench recovery``: could a design tell these networks apart?"""
+
+from __future__ import annotations
+
+import shlex
+import sys
+import time
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from brainbench.cli.options import SCORE, option, with_options
+from brainbench.cli.output import JsonOption, emit, progress_bar, table
+from brainbench.core.errors import UsageError
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from brainbench.scoring.recovery import Candidate, Recovery, RecoveryDesign
+
+POPULATION = "brainbench.datasets.synthetic.design:PopulationDesign"
+_NOISE = ("animals", "units", "rate", "window", "modulation", "individual", "emphasis", "dispersion", "shared_gain")
+_DESIGN = "brainbench.scoring.recovery.design:RecoveryDesign"
+
+
+@with_options(POPULATION, _NOISE, build=False)
+def recovery(
+    options: dict[str, Any],
+    models: Annotated[
+        list[str] | None,
+        typer.Argument(
+            help="Registry names or patterns, FILE.py:FUNCTION, or HDF5 files of activations. [default: all shipped "
+            "trained networks]",
+            show_default=False,
+        ),
+    ] = None,
+    stimuli: Annotated[
+        str, typer.Option("--stimuli", "-s", help="A recipe, a scene file, a stimulus-set file, or an HDF5 array.")
+    ] = "objects",
+    show: Annotated[
+        int | None, typer.Option(help="Stimuli of one board, drawn anew for each. [default: all]", show_default=False)
+    ] = None,
+    trials: Annotated[str, typer.Option(help="Trials of each stimulus: 18, or the fewest and the most.")] = "16-20",
+    metric: Annotated[str, option(SCORE, "metric")] = "rsa",
+    layer: Annotated[str, option(_DESIGN, "layer")] = "any",
+    boards: Annotated[int, typer.Option(help="Boards of each network.")] = 10,
+    want: Annotated[
+        float | None,
+        typer.Option(help="Also name the cheapest design whose true network comes first this often, such as 0.8."),
+    ] = None,
+    pool: Annotated[
+        str | None, typer.Option(help="Stimuli to choose from, in place of --stimuli; with --keep.")
+    ] = None,
+    keep: Annotated[int | None, typer.Option(help="Pick this many stimuli that separate the networks best.")] = None,
+    whiskers: Annotated[str, option(SCORE, "whiskers")] = "all",
+    fidelity: Annotated[str, option(SCORE, "fidelity")] = "balanced",
+    seed: Annotated[int, typer.Option(help="Seed of the animals, and of untrained weights.")] = 0,
+    out: Annotated[
+        Path | None,
+        typer.Option("--out", "-o", help="Folder for result and picture, and for going on after an interruption."),
+    ] = None,
+    workers: Annotated[
+        int | None, typer.Option(min=1, help="Processes. [default: as many as there are processors]")
+    ] = None,
+    scheduler: Annotated[
+        str | None, typer.Option(help="Let the workers of this Dask scheduler (tcp://host:8786) do it.")
+    ] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Say whether an experiment could tell networks apart: animals are drawn from each, and all are scored on them.
+
+    Run again with the same --out, an interrupted recovery goes on where it stopped.
+    """
+    from brainbench.core.files import provenance, to_plain
+    from brainbench.datasets.synthetic import PopulationDesign
+    from brainbench.scoring.options import ScoreOptions
+    from brainbench.scoring.recovery import RecoveryDesign, find_cheapest, open_candidates, recover
+    from brainbench.scoring.recovery.design import parse_trials
+
+    if (pool is None) is not (keep is None):
+        raise UsageError("Stimuli are picked with both --pool STIMULI and --keep NUMBER; received one of them.")
+    if want is not None and not 0 < want < 1:
+        raise UsageError(f"A wanted rate lies between 0 and 1; received {want}.")
+    started = time.perf_counter()
+    design = RecoveryDesign(
+        PopulationDesign(**options, trials=parse_trials(trials)), show, metric=metric, layer=layer, seed=seed
+    )
+    chosen = ScoreOptions(stimuli=pool or stimuli, whiskers=whiskers, fidelity=fidelity, metric=metric, seed=seed)
+    where: dict[str, Any] = {"workers": workers, "scheduler": scheduler}
+    with progress_bar() as progress:
+        candidates, origin = open_candidates(_find(models), chosen, progress=progress)
+        data: dict[str, Any] = {}
+        told = ""
+        if keep is not None:
+            told, data["selection"], picked = _pick(candidates, keep, design, boards, where | {"progress": progress})
+            candidates, design = picked, replace(design, stimuli=None)
+        folder = None if out is None else out / "boards"
+        found = recover(candidates, design, boards=boards, folder=folder, **where, progress=progress)
+        if want is not None:
+            best, tried = find_cheapest(candidates, design, want, **where, progress=progress)
+            data["cheapest"] = {"wanted": want, "design": best, "tried": tried}
+    data |= _facts(found, want)
+    data["provenance"] = provenance(
+        stimuli=origin,
+        weights={item.name: item.weights for item in candidates},
+        settings={"design": to_plain(design), "boards": boards, **chosen.settings},
+        command=shlex.join(["brainbench", *sys.argv[1:]]),
+        seconds=round(time.perf_counter() - started, 1),
+    )
+    text = f"{_text(found, want, data.get('cheapest'))}{told}"
+    if out is not None:
+        text += f"\n\n{_write(found, data, out)}"
+    emit(data, text, as_json=as_json)
+
+
+def _find(patterns: Sequence[str] | None) -> list[str]:
+    """Return the models that names and patterns mean; the shipped ones without any."""
+    from brainbench.cli.leaderboard.scoring import find_models
+    from brainbench.models.training.checkpoints import shipped
+
+    if not patterns:
+        return list(shipped())
+    found: dict[str, None] = {}
+    for pattern in patterns:
+        file = Path(pattern).suffix.lower() in (".h5", ".hdf5")
+        found |= dict.fromkeys([pattern] if file else find_models([pattern]))
+    return list(found)
+
+
+def _pick(
+    candidates: tuple[Candidate, ...], keep: int, design: RecoveryDesign, boards: int, where: dict[str, Any]
+) -> tuple[str, dict[str, Any], tuple[Candidate, ...]]:
+    """Choose stimuli, and measure random choices of as many and of twice as many beside them on other boards."""
+    from brainbench.scoring.recovery import recover, select_stimuli
+    from brainbench.scoring.recovery.selection import keep_stimuli
+
+    chosen = select_stimuli(candidates, keep, design, progress=where["progress"])
+    pool = len(candidates[0].stimuli)
+    rates = {}
+    for size in (keep, 2 * keep):
+        if size <= pool:
+            random = recover(candidates, replace(design, stimuli=size), boards=boards, **where)
+            rates[size] = {"win_rate": random.win_rate, "interval": random.wins()}
+    said = "; ".join(f"{size} at random {item['win_rate']:.0%}" for size, item in rates.items())
+    text = f"\n\nPicked {keep} of {pool} stimuli ({said}):\n{', '.join(chosen.stimuli)}"
+    return text, {**asdict(chosen), "random": rates}, keep_stimuli(candidates, chosen.rows)
+
+
+def _facts(found: Recovery, want: float | None) -> dict[str, Any]:
+    """Return what --json and the file say of a recovery."""
+    return {
+        "answer": found.answer(*([] if want is None else [want])),
+        "win_rate": found.win_rate,
+        "interval": found.wins(),
+        "outcomes": found.outcomes,
+        "reliability": found.reliability,
+        "stimuli": found.stimuli,
+        "names": found.names,
+        "made": found.made,
+        "firsts": found.firsts,
+        "told_apart": found.told,
+        "lost": found.lost,
+        "intervals": {name: found.wins(place) for place, name in enumerate(found.names)},
+        "hardest": found.hardest(10),
+        "notes": found.notes,
+        "boards": found.boards,
+    }
+
+
+def _text(found: Recovery, want: float | None, cheapest: dict[str, Any] | None) -> str:
+    """Return what people read, the answer first."""
+    lines = [found.answer(*([] if want is None else [want]))]
+    if cheapest is not None:
+        best = cheapest["design"]
+        lines.append(
+            f"No design of the {len(cheapest['tried'])} that were tried reaches {want:.0%}."
+            if best is None
+            else f"Cheapest design that reaches {want:.0%}: {best.animals} animals of {best.units} units, "
+            f"{best.stimuli} stimuli, {best.trials} trials of each ({best.win_rate:.0%} of its boards "
+            f"[{best.interval.low:.0%}, {best.interval.high:.0%}])."
+        )
+    population = found.design.population
+    low, high = population.trial_range
+    lines.append(
+        f"Design: {found.stimuli} stimuli, {population.animals} animals of {population.units} units, "
+        f"{low if low == high else f'{low}–{high}'} trials; reliability {found.reliability:.2f}; metric "
+        f"{found.design.metric}."
+    )
+    shares = found.outcomes
+    lines.append(
+        f"Pairs with the true network, tested over animals and stimuli: {shares['win']:.0%} won, {shares['tie']:.0%} "
+        f"tied, {shares['loss']:.0%} lost."
+    )
+    lines += found.notes
+    rows = []
+    for place, name in enumerate(found.names):
+        interval = found.wins(place)
+        others = [
+            (int(count), other) for other, count in zip(found.names, found.firsts[place], strict=True) if other != name
+        ]
+        count, mistaken = max(others)
+        rows.append(
+            [
+                name,
+                f"{found.firsts[place, place]} of {found.made[place]}",
+                f"[{interval.low:.0%}, {interval.high:.0%}]",
+                f"{mistaken} ({count})" if count else "",
+            ]
+        )
+    return "\n".join(lines) + "\n\n" + table("", ["true network", "first", "interval", "most often mistaken for"], rows)
+
+
+def _write(found: Recovery, data: dict[str, Any], out: Path) -> str:
+    """Write the result and the picture."""
+    from brainbench.core.files import write_json
+    from brainbench.scoring.recovery import plot_confusion
+
+    result = write_json(out / "recovery.json", data)
+    return f"result   {result}\npicture  {plot_confusion(found, out / 'recovery.png')}"

@@ -1,0 +1,68 @@
+from dataclasses import replace
+
+import pytest
+
+from brainbench.core.errors import UsageError
+from brainbench.scoring.recovery import recover, study
+from tests.factories.candidates import DESIGN, make_candidates
+
+
+def test_processes_change_nothing():
+    candidates = make_candidates(8)
+    here = recover(candidates, DESIGN, boards=2, workers=1)
+    assert recover(candidates, DESIGN, boards=2, workers=2) == here
+    assert [(one.true, one.number) for one in here.boards] == [(t, n) for t in range(3) for n in range(2)]
+
+
+def test_a_cluster_changes_nothing():
+    distributed = pytest.importorskip("distributed")
+    candidates = make_candidates(8)
+    with distributed.LocalCluster(
+        n_workers=1, threads_per_worker=1, processes=False, dashboard_address=None, protocol="tcp", host="127.0.0.1"
+    ) as running:
+        found = recover(candidates, DESIGN, boards=1, scheduler=running.scheduler_address)
+    assert found == recover(candidates, DESIGN, boards=1, workers=1)
+
+
+def test_an_interrupted_recovery_goes_on(tmp_path, monkeypatch):
+    candidates = make_candidates(8)
+    whole = recover(candidates, DESIGN, boards=1, workers=1, folder=tmp_path)
+    (tmp_path / "boards-001-00000.json").unlink()
+    made = []
+
+    def counted(*arguments):
+        made.append(arguments[2:])
+        return original(*arguments)
+
+    original = study.make_board
+    monkeypatch.setattr(study, "make_board", counted)
+    told = []
+    again = recover(
+        candidates, DESIGN, boards=1, workers=1, folder=tmp_path, progress=lambda *state: told.append(state)
+    )
+    assert again == whole
+    assert made == [(1, 0)]
+    assert told == [(3, 3, "scoring boards")]
+
+
+def test_a_folder_of_another_recovery_is_refused(tmp_path):
+    candidates = make_candidates(8)
+    recover(candidates, DESIGN, boards=1, workers=1, folder=tmp_path)
+    with pytest.raises(UsageError, match="begun with other"):
+        recover(candidates, replace(DESIGN, seed=1), boards=1, workers=1, folder=tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("candidates", "changes", "boards", "culprit"),
+    [
+        (make_candidates(names=("a",)), {}, 1, "at least two"),
+        (make_candidates(8), {"stimuli": 9}, 1, "9 stimuli .* the pool has 8"),
+        (make_candidates(8), {"metric": "rsaa"}, 1, "'rsa'"),
+        (make_candidates(8), {"layer": "layr1"}, 1, "'layer1'"),
+        (make_candidates(8), {}, 0, "received 0"),
+        ((*make_candidates(8), *make_candidates(9, names=("d",))), {}, 1, "different stimuli"),
+    ],
+)
+def test_what_cannot_be_run_is_refused_before_it_starts(candidates, changes, boards, culprit):
+    with pytest.raises(UsageError, match=culprit):
+        recover(candidates, replace(DESIGN, **changes), boards=boards, workers=1)
