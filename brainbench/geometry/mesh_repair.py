@@ -36,10 +36,9 @@ class Repair:
 def repair(mesh: Mesh) -> Repair:
     """Remove broken triangles, close cracks and turn every surface outward; nothing is invented.
 
-    Triangles that name a vertex twice and copies of a triangle are removed; on an open mesh, vertices
-    within :data:`MERGE` of the diagonal are merged and tiny cracks of three or four edges are closed;
-    neighbours are made to agree on the outside; closed bodies that are inside out are turned. Larger
-    holes stay: their shape is unknown.
+    Triangles that name a vertex twice and copies of a triangle are removed; on an open mesh, vertices within
+    :data:`MERGE` of the diagonal are merged and tiny cracks of three or four edges are closed; neighbours are made to
+    agree on the outside; closed bodies that are inside out are turned. Larger holes stay: their shape is unknown.
 
     Raises:
         DataError: no triangle is left.

@@ -4,14 +4,10 @@ Files as WHISKiT Physics reads them: one line per whisker, comma separated, thre
 sample, rad/s in the axes of the array (head), 1000 samples per second. Such a file carries no names; its
 *layout* says which line is which whisker.
 
-Whiskers are matched by side and name, never by line number. (The released mouse simulation plays a rat's file by
-line number, which moves the mouse's E0–E5 as the rat's E1–E6.) A whisker of the array that the file lacks moves
+Whiskers are matched by side and name, never by line number. A whisker of the array that the file lacks moves
 as the nearest whisker of its row: E0 of the mouse as E1 of a rat file. Lines without counterpart, such as B5,
-are not used.
-
-The published sample (62 lines, 8 Hz, 45° peak to peak) was itself made with a table of fewer whiskers, so that some of
-its lines were computed for another whisker than they stand for; E3–E6 even for whiskers of the left side,
-and played on the right side they protract by up to 70°. It is played as it is.
+are not used. The published sample (62 lines, 8 Hz, 45° peak to peak) is played as it is: some of its lines were
+computed for another whisker than they stand for.
 
 Letters: W whisker, n sample.
 """

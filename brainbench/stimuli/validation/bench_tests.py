@@ -194,9 +194,9 @@ def slip_off(
     """Raise a frictionless round peg at distance ``at`` (m) from the base until the whisker slips off it.
 
     The peg moves slowly and straight towards +y from touching the undeformed whisker; no gravity. It carries a
-    flange on either side, as a pulley does, which keeps the whisker in the plane of the elastica. Bent round a bare
-    rod by 90° at the contact, a whisker may turn about the axis of its base at no cost of energy; beyond 90°, as
-    before most slip-offs at small ``at``, that pays, and any disturbance makes it swing out sideways.
+    flange on either side, as a pulley does, which keeps the whisker in the plane of the elastica: bent by more than 90°
+        at
+    the contact, as before most slip-offs at small ``at``, it would swing out sideways.
 
     Raises:
         UsageError: the whisker is curved, or ``at`` lies beyond it.
@@ -236,15 +236,13 @@ def ringdown(
 ) -> Ringdown:
     """Let a bent whisker go and fit its lowest modes.
 
-    First mode, with the whisker's damping and the fidelity's time step: a tip load bends it by ``deflection``
-    (fraction of the arc length, small), settles, and vanishes; a decaying sinusoid is fitted to the base moment
-    after the higher modes have died. Modes 2 … ``modes`` would not ring with the whisker's own damping, which is
-    proportional to stiffness, and the presets' steps are not made for them. Each is rung alone, by loads
-    that bend the chain in its shape, with damping ratio .05 and at most 1/100 of its period per step, and read
-    at the tip: these frequencies test the chain of links, not the time step. With ``own_step`` the higher modes keep
-    the fidelity's step too, and what rings then shows what that step makes of them; a mode of fewer than six steps per
-    period is damped away within one of them and counts as NaN. (A backward Euler step h turns an undamped mode ω
-    into one of frequency |ln(1 + i ω h)|/h, damped by the ratio ln(1 + ω² h²)/(2 |ln(1 + i ω h)|).)
+    First mode, with the whisker's damping and the fidelity's time step: a tip load bends it by ``deflection`` (fraction
+    of the arc length, small), settles, and vanishes; a decaying sinusoid is fitted to the base moment after the higher
+    modes have died. Modes 2 … ``modes`` would not ring with the whisker's own damping. Each is rung alone, by loads
+    that bend the chain in its shape, with damping ratio .05 and at most 1/100 of its period per step, and read at the
+    tip: these frequencies test the chain of links, not the time step. With ``own_step`` they keep the fidelity's step
+    too, and show what it makes of them: a backward Euler step h turns an undamped mode ω into one of frequency |ln(1 +
+    i ω h)|/h with damping ratio ln(1 + ω² h²)/(2 |ln(1 + i ω h)|). A mode of fewer than six steps counts as NaN.
 
     Raises:
         UsageError: the whisker is curved, its damping ratio is not between 0 and 1, so nothing rings, or ``modes``
