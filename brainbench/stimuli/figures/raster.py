@@ -53,14 +53,13 @@ class Triangles:
             done.append(rest._take(shown & ~large))
             # What reaches from before to behind the camera is cut until the rest behind it is negligible.
             partly = np.any(before, axis=1) & ~np.all(before, axis=1)
-            rest = rest._take((shown & large) | partly)._quartered()
+            rest = rest._take((shown & large) | partly)
+            quarters = (_quarter(rest.corners), _quarter(rest.normals), np.tile(rest.colors, (4, 1)))
+            rest = Triangles(*quarters)
         return Triangles.joined(done)
 
     def _take(self, chosen: NDArray[np.bool_]) -> Triangles:
         return Triangles(*(getattr(self, name)[chosen] for name in _FIELDS))
-
-    def _quartered(self) -> Triangles:
-        return Triangles(_quarter(self.corners), _quarter(self.normals), np.tile(self.colors, (4, 1)))
 
 
 @dataclass(frozen=True, eq=False)

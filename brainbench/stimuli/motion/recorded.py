@@ -70,12 +70,7 @@ class Trajectory:
 
     def __post_init__(self) -> None:
         velocity = np.array(self.velocity, dtype=float)
-        if (
-            velocity.ndim != 3
-            or velocity.shape[0] != len(self.names)
-            or velocity.shape[2] != 3
-            or velocity.shape[1] < 2
-        ):
+        if velocity.shape[::2] != (len(self.names), 3) or velocity.ndim != 3 or velocity.shape[1] < 2:
             raise DataError(
                 f"A trajectory of {len(self.names)} whiskers needs velocities [{len(self.names)}, n, 3] with at least "
                 f"two samples; received an array of shape {velocity.shape}."
@@ -231,7 +226,7 @@ def load_trajectory(path: str | os.PathLike[str], *, layout: str | None = None, 
         UsageError: the layout is unknown, or must be given because the lines could be a rat's or a mouse's.
         DataError: the file is missing, or its lines are not whiskers of equally many velocities.
     """
-    table = _read_table(path)
+    table = read_numbers(path)
     if table.shape[1] % 3:
         raise DataError(
             f"{os.fspath(path)!r} has {table.shape[1]} numbers per line; velocities come in threes (ωx, ωy, ωz)."
@@ -246,7 +241,7 @@ def load_initial_angles(path: str | os.PathLike[str], *, layout: str | None = No
     Raises:
         UsageError, DataError: as :func:`load_trajectory`.
     """
-    table = _read_table(path)
+    table = read_numbers(path)
     if table.shape[1] != 3:
         raise DataError(
             f"{os.fspath(path)!r} has {table.shape[1]} numbers per line; starting angles are three (θ, φ, ζ)."
@@ -272,18 +267,14 @@ def _names(path: str | os.PathLike[str], lines: int, layout: str | None) -> tupl
     return LAYOUTS[layout]
 
 
-def _read_table(path: str | os.PathLike[str]) -> NDArray[np.float64]:
-    if not Path(path).is_file():
-        raise DataFileNotFoundError(f"There is no file {os.fspath(path)!r}.")
-    return read_numbers(path)
-
-
 def read_numbers(path: str | os.PathLike[str]) -> NDArray[np.float64]:
     """Return the numbers [line, column] of a comma-separated file; lines may end with a comma.
 
     Raises:
-        DataError: something is no number, or lines differ in length.
+        DataError: there is no such file, something is no number, or lines differ in length.
     """
+    if not Path(path).is_file():
+        raise DataFileNotFoundError(f"There is no file {os.fspath(path)!r}.")
     try:
         lines = Path(path).read_text(encoding="utf-8").split("\n")
         rows = [[float(cell) for cell in line.rstrip(",\r ").split(",")] for line in lines if line.strip()]

@@ -207,15 +207,11 @@ class WhiskerSolver:
             crowded=counts["crowded"],
             steps=counts["steps"],
         )
+        depth, seconds = table(numbers["depth"].astype(float)) / MILLI, np.diff(clock).tolist()
+        seconds = dict(zip(("upload", "kernel"), seconds, strict=True))
+        retried = np.zeros(size, dtype=bool)
         result = LaunchResult(
-            wrench,
-            out.contact.numpy(),
-            counts,
-            table(numbers["depth"].astype(float)) / MILLI,
-            missed,
-            judge(facts),
-            np.zeros(size, dtype=bool),
-            seconds=dict(zip(("upload", "kernel"), np.diff(clock).tolist(), strict=True)),
+            wrench, out.contact.numpy(), counts, depth, missed, judge(facts), retried, seconds=seconds
         )
         if record_shape:
             result.points = np.moveaxis(out.points.numpy().astype(float) / MILLI, 2, 0)
