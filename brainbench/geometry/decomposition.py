@@ -41,11 +41,7 @@ _VERSION = 1
 
 @dataclass(frozen=True)
 class DecompositionSettings:
-    """Method and limits by which a mesh is cut into convex pieces.
-
-    Raises:
-        UsageError: a value lies outside its range.
-    """
+    """Method and limits by which a mesh is cut; a value outside its range is a :class:`UsageError`."""
 
     method: Literal["coacd", "vhacd"] = "coacd"
     """``coacd`` (Wei et al. 2022) or ``vhacd`` (Mamou 2016, as PyBullet carries it; what the thesis used)."""

@@ -9,12 +9,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 from brainbench.core.errors import DataError, DataFileNotFoundError, UsageError, unknown_name
 
 if TYPE_CHECKING:
     import trimesh
-    from numpy.typing import ArrayLike, NDArray
 
 UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "in": 0.0254}
 """Length units of mesh files in metres."""
@@ -168,11 +168,7 @@ class Mesh:
 
 
 def convex_hull(points: NDArray[np.float64], name: str = "mesh") -> Mesh:
-    """Return the convex hull of points [n, 3] as a closed outward mesh.
-
-    Raises:
-        DataError: the points lie in a plane.
-    """
+    """Return the convex hull of points [n, 3] as a closed outward mesh; points in a plane are a :class:`DataError`."""
     # The third singular value of centred points is their extent across the plane that fits them best.
     spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
     if spread[2] < 1e-9 * spread[0]:
@@ -234,8 +230,7 @@ def load_mesh(path: str | os.PathLike[str], *, unit: str) -> Mesh:
 def save_mesh(path: str | os.PathLike[str], mesh: Mesh, *, unit: str) -> Path:
     """Write a mesh file in the format that its suffix names, so that readers see all of it or nothing.
 
-    Raises:
-        UsageError: the unit or the format is unknown.
+    An unknown unit or format is a :class:`UsageError`.
     """
     from brainbench.core.files import atomic_path
 

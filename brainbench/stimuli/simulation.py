@@ -8,9 +8,11 @@ import math
 import threading
 import time
 from collections.abc import Iterable, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from brainbench import __version__
 from brainbench.core.contracts import CHANNELS, check_stimulus_set
@@ -20,6 +22,7 @@ from brainbench.core.progress import Progress
 from brainbench.stimuli.engines import DEFAULT_ENGINE, PHYSICS_VERSION, get_engine
 from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.engines.job_schedule import plan
+from brainbench.stimuli.engines.protocol import Trace, WhiskerEngine
 from brainbench.stimuli.explain import ATTRIBUTE, SECONDS, explain
 from brainbench.stimuli.readout import ORIENTATION, turn
 from brainbench.stimuli.scenes.frames import clip_wrenches
@@ -27,12 +30,7 @@ from brainbench.stimuli.scenes.scene import Scene
 from brainbench.stimuli.stimulus_set import hash_stimulus_set, read_stimulus_set, write_stimulus_set
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     import xarray as xr
-    from numpy.typing import NDArray
-
-    from brainbench.stimuli.engines.protocol import Trace, WhiskerEngine
 
 _LOG = logging.getLogger(__name__)
 

@@ -258,11 +258,7 @@ def _collision(text: str) -> tuple[str, DecompositionSettings | None]:
 
 
 def _into_hollow(setting: SimulationSetting) -> tuple[Trace, int]:
-    """Run C2 whisking into the hollow of the Rodgers solid; return the trace and of how much the solid consists.
-
-    Raises:
-        DataError: it was unstable.
-    """
+    """Run C2 whisking into the hollow of the Rodgers solid; return the trace and of how much the solid consists."""
     kind, settings = _collision(setting.collision or "exact")
     solid = rodgers_solid(0.03)
     if kind != "exact" and solid.mesh is not None:
@@ -300,11 +296,7 @@ class _Whisk:
 
 
 def _whisking(setting: SimulationSetting) -> list[Trace]:
-    """Run smooth, sliding and flicking contact.
-
-    Raises:
-        DataError: one of them was unstable.
-    """
+    """Run smooth, sliding and flicking contact; an unstable one is a :class:`DataError`."""
     whisker = _straight("C2")
     jobs = []
     for friction, degrees in ((0.0, 12), (0.48, 12), (0.48, 25)):

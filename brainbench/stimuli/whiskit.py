@@ -23,6 +23,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 from brainbench.core.contracts import CHANNELS, check_stimulus_set
 from brainbench.core.errors import DataError, DataFileNotFoundError, UsageError, unknown_name
@@ -33,7 +34,6 @@ from brainbench.stimuli.whiskers.selection import ROWS
 
 if TYPE_CHECKING:
     import xarray as xr
-    from numpy.typing import ArrayLike, NDArray
 
 BENDS = 20
 """Links in WHISKiT's table of bends."""

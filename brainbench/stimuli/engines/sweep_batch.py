@@ -13,11 +13,7 @@ from brainbench.core.errors import UsageError
 
 @dataclass(frozen=True, eq=False)
 class SweepBatch:
-    """Wrenches and contacts of some sweeps, in the order in which they were asked for.
-
-    Raises:
-        UsageError: the arrays do not fit together.
-    """
+    """Wrenches and contacts of some sweeps, in the order in which they were asked for."""
 
     wrench: NDArray[np.float32]
     """[sweep, frame, whisker, 6] N and N·m, in the axes that the frames of the grid name; NaN where unstable."""

@@ -2,30 +2,24 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from brainbench.stimuli.figures import canvas
 from brainbench.stimuli.figures.canvas import DOTS_PER_INCH, INK, PALE
 from brainbench.stimuli.whiskers.selection import ROWS
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
-    from numpy.typing import NDArray
-
     from brainbench.stimuli.figures.scenes import Picture
 
 AXES = ("right", "rostral", "dorsal")
 
 
 class Annotation:
-    """A figure that shows one instant of a picture after the other, with text.
-
-    Raises:
-        MissingDependencyError: matplotlib is not installed.
-    """
+    """A matplotlib figure that shows one instant of a picture after the other, with text."""
 
     def __init__(self, picture: Picture) -> None:
         self.picture = picture

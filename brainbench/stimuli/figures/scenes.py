@@ -43,11 +43,7 @@ _SINKS = 0.004
 
 @dataclass(frozen=True)
 class Style:
-    """Colours, size and quality of a picture of a scene.
-
-    Raises:
-        UsageError: a colouring is unknown, or a number lies outside its range.
-    """
+    """Colours, size and quality of a picture of a scene; what is out of range is a :class:`UsageError`."""
 
     color: Literal["row", "moment"] = "row"
     """Whiskers by row, or by their local elastic bending moment."""

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from brainbench.core.contracts import CHANNELS, GRID_SHAPE, check_stimulus_set
 from brainbench.core.errors import UsageError, unknown_name
@@ -19,7 +20,6 @@ if TYPE_CHECKING:
     import xarray as xr
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
-    from numpy.typing import NDArray
 
 FORMATS = (".png", ".svg", ".pdf")
 QUANTITIES = {

@@ -165,11 +165,7 @@ class Recorded:
     """Starting angles (θ, φ, ζ) [rad] by side and name (``RC2``), as :func:`load_initial_angles` reads them."""
 
     def line(self, mount: MountedWhisker) -> str:
-        """Return the name of the line that moves ``mount``; see the module for the rule.
-
-        Raises:
-            UsageError: the trajectory has no whisker of this row and side.
-        """
+        """Return the name of the line that moves ``mount`` (see the module); none is a :class:`UsageError`."""
         name = mount.full_name
         if name in self.trajectory.names:
             return name
@@ -238,8 +234,7 @@ def load_trajectory(path: str | os.PathLike[str], *, layout: str | None = None, 
 def load_initial_angles(path: str | os.PathLike[str], *, layout: str | None = None) -> dict[str, Vector]:
     """Read starting angles (θ, φ, ζ) [rad] by whisker (``RC2``), as in WHISKiT's ``whisking_init_angle.csv``.
 
-    Raises:
-        UsageError, DataError: as :func:`load_trajectory`.
+    Errors are those of :func:`load_trajectory`.
     """
     table = read_numbers(path)
     if table.shape[1] != 3:

@@ -375,11 +375,7 @@ def _run(backend: str, job: Job, fidelity: Fidelity | str) -> Trace:
 def run_stable(
     engine: WhiskerEngine, jobs: Sequence[Job], fidelity: Fidelity, *, record_shape: bool = False
 ) -> list[Trace]:
-    """Simulate jobs on one thread.
-
-    Raises:
-        DataError: one of them was unstable.
-    """
+    """Simulate jobs on one thread; an unstable one is a :class:`DataError`."""
     traces = engine.run(jobs, fidelity, workers=1, record_shape=record_shape)
     for trace in traces:
         if trace.status != "ok":

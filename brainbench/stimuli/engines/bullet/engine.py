@@ -39,11 +39,7 @@ SEARCH = 0.02
 
 @dataclass(frozen=True)
 class BulletEngine(SteppedEngine):
-    """Runs whisker jobs in PyBullet, one after the other: PyBullet holds Python's interpreter lock.
-
-    Raises:
-        UsageError: a whisker has more links than PyBullet can move.
-    """
+    """Runs whisker jobs, of at most 60 links, in PyBullet one after the other: it holds Python's interpreter lock."""
 
     name = "bullet"
     package = "pybullet"

@@ -35,11 +35,7 @@ _STILL = (0.0, 0.0, 0.0, 1.0)
 
 
 def engine() -> Any:
-    """Return the ``pybullet`` module.
-
-    Raises:
-        MissingDependencyError: PyBullet is not installed.
-    """
+    """Return the ``pybullet`` module, or raise a :class:`MissingDependencyError`."""
     try:
         return import_module("pybullet")
     except ImportError as error:
@@ -53,11 +49,7 @@ def engine() -> Any:
 
 @dataclass(eq=False)
 class BulletWorld:
-    """A Bullet world with one whisker and its obstacles; a context manager that removes it.
-
-    Raises:
-        UsageError: more links than PyBullet can move.
-    """
+    """A Bullet world with one whisker of at most :data:`MOST_LINKS`, and its obstacles; a context manager ends it."""
 
     chain: Chain
     obstacles: Sequence[Obstacle]

@@ -72,8 +72,7 @@ class WhiskerModel:
 def engine() -> Any:
     """Return the ``mujoco`` module, untyped because its symbols live in compiled extensions.
 
-    Raises:
-        MissingDependencyError: MuJoCo is missing or older than its ``discrete`` integrator.
+    Missing, or older than the ``discrete`` integrator, it is a :class:`MissingDependencyError`.
     """
     try:
         module = import_module("mujoco")

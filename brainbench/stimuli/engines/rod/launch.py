@@ -207,12 +207,9 @@ class WhiskerSolver:
             crowded=counts["crowded"],
             steps=counts["steps"],
         )
-        depth, seconds = table(numbers["depth"].astype(float)) / MILLI, np.diff(clock).tolist()
-        seconds = dict(zip(("upload", "kernel"), seconds, strict=True))
-        retried = np.zeros(size, dtype=bool)
-        result = LaunchResult(
-            wrench, out.contact.numpy(), counts, depth, missed, judge(facts), retried, seconds=seconds
-        )
+        contact, depth = out.contact.numpy(), table(numbers["depth"].astype(float)) / MILLI
+        result = LaunchResult(wrench, contact, counts, depth, missed, judge(facts), np.zeros(size, dtype=bool))
+        result.seconds = dict(zip(("upload", "kernel"), np.diff(clock).tolist(), strict=True))
         if record_shape:
             result.points = np.moveaxis(out.points.numpy().astype(float) / MILLI, 2, 0)
             forces = out.contact_wrench.numpy().astype(float)

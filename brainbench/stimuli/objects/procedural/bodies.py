@@ -12,12 +12,12 @@ from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 from brainbench.core.rotations import euler_matrix
 
 if TYPE_CHECKING:
     from manifold3d import Manifold
-    from numpy.typing import ArrayLike, NDArray
 
 WEDGES = 24
 """Wedges around the axis that stand for a hollow turned wall: convex pieces within 1 % of its radius."""
