@@ -139,10 +139,6 @@ class Mesh:
             raise UsageError(f"A mesh is scaled by a positive factor; received {factor!r}.")
         return Mesh(self.vertices * factor, self.faces, self.name)
 
-    def to_diagonal(self, diagonal: float) -> Mesh:
-        """Return the mesh scaled about its origin to a bounding-box diagonal [m]."""
-        return self.scaled(diagonal / self.diagonal)
-
     def transformed(self, rotation: ArrayLike, translation: ArrayLike = (0.0, 0.0, 0.0)) -> Mesh:
         """Return the mesh rotated by a matrix [3, 3] and then moved by ``translation`` [3] (m)."""
         return Mesh(self.vertices @ np.asarray(rotation).T + np.asarray(translation), self.faces, self.name)

@@ -27,11 +27,6 @@ class Repair:
     remaining: tuple[str, ...]
     """Faults that are left."""
 
-    @property
-    def notes(self) -> tuple[str, ...]:
-        """Repairs and remaining faults."""
-        return (*self.done, *self.remaining)
-
 
 def repair(mesh: Mesh) -> Repair:
     """Remove broken triangles, close cracks and turn every surface outward; nothing is invented.

@@ -4,15 +4,13 @@
 ``param_name`` (``RC2``), ``param_side_row_col`` (1 right or 0 left; 1–5 for A–E; column from 0), ``param_s_a``
 (arc length in mm, curvature A of y = A x² in 1/mm), ``param_bp_pos`` (base point in mm), ``param_bp_angles``
 (θ, φ, ζ in rad) and ``param_angles`` (bend of each of 20 links against the one before, rad; the first is 0, so the
-second holds the direction of the second link). They hold no diameters and no material: those come from the
-published rules, as in WHISKiT.
+second holds the direction of the second link). They hold no diameters and no material.
 
 **Results.** One folder per run: ``whisker_ID.csv`` (one name per line); ``dynamics/Fx.csv`` … ``Mz.csv`` (line: time,
 column: whisker); ``kinematics/x|y|z/RC2.csv`` (line: time, columns: base point, then the centre of each link) and
-``kinematics/c/RC2.csv`` (0 or 1 per link: whether it touches). Units there are mN, µN·m and mm. Signs are ours and
-WHISKiT's alike: the action of the whisker on its base, about the base point, in world axes. Time is not written:
-lines follow the frames of the stimulus set. SeNSE-lab's programs end each line with a comma, and its readers drop
-what follows; the thesis's programs write and expect none.
+``kinematics/c/RC2.csv`` (0 or 1 per link: whether it touches). Units there are mN, µN·m and mm; signs and axes are ours
+and WHISKiT's alike. Time is not written: lines follow the frames of the stimulus set. SeNSE-lab's programs end each
+line with a comma; the thesis's programs write and expect none.
 """
 
 from __future__ import annotations

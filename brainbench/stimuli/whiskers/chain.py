@@ -1,11 +1,9 @@
 """A whisker as a chain of rigid tapered links joined by pairs of elastic hinges.
 
-Joint i stands at arc length i L/N for the bending of the cell around it, half a cell at the base, so
-its compliance is about 1/k = ∫ ds/(E I) over that cell. (Lumping the compliance at one end of each
-link, or locking the base joint, changes the stiffness by up to a quarter.) The virtual work of bending
-is ∫ M²/(E I) ds; interpolating M² by a parabola through three joints instead of a constant per cell
-shifts a little compliance between neighbours and makes ten links as good as thirty. Joints lie on the
-rest curve, so the whole intrinsic curvature survives any number of links. Letters: N link, 0 = base.
+Joint i stands at arc length i L/N for the bending of the cell around it, half a cell at the base, so its compliance is
+about 1/k = ∫ ds/(E I) over that cell. The virtual work of bending is ∫ M²/(E I) ds; interpolating M² by a parabola
+through three joints instead of a constant per cell makes ten links as good as thirty. Joints lie on the rest curve, so
+the whole intrinsic curvature survives any number of links. Letters: N link, 0 = base.
 """
 
 from __future__ import annotations
