@@ -47,15 +47,15 @@ class Diagnosis:
         return self.open_edges == 0
 
     def __str__(self) -> str:
-        faults = [
-            f"{self.open_edges} open edges (not watertight)" if self.open_edges else "",
-            f"{self.degenerate_faces} triangles without area" if self.degenerate_faces else "",
-            f"{self.bodies} separate pieces" if self.bodies > 1 else "",
-            f"{self.duplicate_faces} duplicate triangles" if self.duplicate_faces else "",
-            "triangles that disagree on inside and outside" if self.inconsistent else "",
-            "a surface that is inside out" if self.inside_out else "",
-        ]
-        return ", ".join(fault for fault in faults if fault) or "watertight"
+        faults = {
+            f"{self.open_edges} open edges (not watertight)": self.open_edges,
+            f"{self.degenerate_faces} triangles without area": self.degenerate_faces,
+            f"{self.bodies} separate pieces": self.bodies > 1,
+            f"{self.duplicate_faces} duplicate triangles": self.duplicate_faces,
+            "triangles that disagree on inside and outside": self.inconsistent,
+            "a surface that is inside out": self.inside_out,
+        }
+        return ", ".join(text for text, found in faults.items() if found) or "watertight"
 
 
 @dataclass(frozen=True, eq=False)

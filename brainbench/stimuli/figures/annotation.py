@@ -93,15 +93,11 @@ class Annotation:
         flat = (self.picture.lens.axes[:2] * [[1.0], [-1.0]]).T
         # The origin lies so far from the corner that every arrow and its name stay in the picture.
         right, low = self.width - self._edge - 100 * self._unit, self.height - self._edge - 66 * self._unit
+        arrow = {"arrowstyle": "-|>", "color": PALE, "lw": 1.6 * self._unit, "shrinkA": 0, "shrinkB": 0}
         for (x, y), name in zip(flat, AXES, strict=True):
             if np.hypot(x, y) < 0.25:
                 continue
-            self.axes.annotate(
-                "",
-                (right + reach * x, low + reach * y),
-                (right, low),
-                arrowprops={"arrowstyle": "-|>", "color": PALE, "lw": 1.6 * self._unit, "shrinkA": 0, "shrinkB": 0},
-            )
+            self.axes.annotate("", (right + reach * x, low + reach * y), (right, low), arrowprops=arrow)
             side = "center" if abs(x) < 0.3 else "left" if x > 0 else "right"
             height = "center" if abs(x) >= 0.3 else "bottom" if y < 0 else "top"
             place = right + 1.12 * reach * x, low + 1.12 * reach * y

@@ -169,7 +169,8 @@ def _legend(figure: Figure, label: str, channel: str, axes: str, points: float) 
     kind = "force" if channel[0] == "F" else "moment"
     unit = _UNITS[channel[0]][0]
     what = f"|{channel}|" if channel in _UNITS else ", ".join(QUANTITIES[channel])
-    about, usual = f"{kind} of the whisker on its base, {what} ({unit}), {axes} axes", {"fontsize": 16 * points}
+    about = f"{kind} of the whisker on its base, {what} ({unit}), {axes} axes"
+    usual: dict[str, Any] = {"fontsize": 16 * points}
     figure.text(0.02, 0.965, label, fontsize=26 * points, fontweight="bold", color=INK, va="center")
     figure.text(0.02, 0.92, about, color=PALE, va="center", **usual)
     figure.text(0.52, 0.018, "time (ms)", color=INK, ha="center", va="center", **usual)

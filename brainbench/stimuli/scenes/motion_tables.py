@@ -85,11 +85,8 @@ def _recorded(table: TomlTable, folder: Path, rotations: Rotations) -> Recorded:
 
     layout = table.take("layout", text, None)
     initial = table.take("initial_path", text, None)
+    angles = {} if initial is None else load_initial_angles(folder / initial, layout=layout)
     file: Keys = {"path": ("path", lambda name: folder / text(name)), "rate": ("rate_hz", number())}
-    return table.build(
-        Recorded,
-        {"start": ("start_deg", number(DEGREE))},
-        trajectory=table.build(load_trajectory, file, layout=layout),
-        rotations=rotations,
-        initial={} if initial is None else load_initial_angles(folder / initial, layout=layout),
-    )
+    played = table.build(load_trajectory, file, layout=layout)
+    start: Keys = {"start": ("start_deg", number(DEGREE))}
+    return table.build(Recorded, start, trajectory=played, rotations=rotations, initial=angles)

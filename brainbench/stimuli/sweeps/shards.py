@@ -83,7 +83,7 @@ def simulate_shard(task: ShardTask, prepared: PreparedShard, workers: int | None
     contact = np.zeros((len(task), whiskers), dtype=np.float32)
     status = np.full((len(task), whiskers), UNUSABLE, dtype=np.uint8)
     reasons = [prepared.reasons[owner] for owner in task.owner.tolist()]
-    counts = dict.fromkeys(("steps", "steps_in_full", "retried"), 0)
+    counts: dict[str, int] = dict.fromkeys(("steps", "steps_in_full", "retried"), 0)
     wrench = np.empty((0, *shape[1:]), dtype=np.float32)
     if len(chosen):
         named = {task.objects[owner].name: solid for owner in place if (solid := prepared.solids[owner])}

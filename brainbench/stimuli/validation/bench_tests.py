@@ -270,7 +270,8 @@ def ringdown(
     kept = times > 1 / expected
     fits = [_fit_decay(times[kept], trace.wrench[kept, 5], expected, whisker.damping_ratio)]
     fits += [_ring_mode(whisker, mode, references_hz, backend, fidelity, own_step) for mode in range(1, modes)]
-    return Ringdown(*np.array(fits).T, references_hz, times, trace.wrench)
+    frequencies, ratios = np.array(fits).T
+    return Ringdown(frequencies, ratios, references_hz, times, trace.wrench)
 
 
 def _ring_mode(

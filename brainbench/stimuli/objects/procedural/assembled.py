@@ -100,7 +100,8 @@ def cone(draw: ShapeSampler, detail: int) -> Body:
 
 def cylinder(draw: ShapeSampler, detail: int) -> Body:
     """Cylinder, from a disc to a pole."""
-    return rod(*draw(radius=(0.15, 0.6), height=(0.5, 1.4)), 2 * around(detail))
+    radius, height = draw(radius=(0.15, 0.6), height=(0.5, 1.4))
+    return rod(radius, height, 2 * around(detail))
 
 
 def brick(draw: ShapeSampler, detail: int) -> Body:
