@@ -41,11 +41,7 @@ _VERSION = 1
 
 @dataclass(frozen=True)
 class DecompositionSettings:
-    """Method and limits by which a mesh is cut into convex pieces.
-
-    Raises:
-        UsageError: a value lies outside its range.
-    """
+    """Method and limits by which a mesh is cut; a value outside its range is a :class:`UsageError`."""
 
     method: Literal["coacd", "vhacd"] = "coacd"
     """``coacd`` (Wei et al. 2022) or ``vhacd`` (Mamou 2016, as PyBullet carries it; what the thesis used)."""
@@ -114,8 +110,7 @@ def decompose(mesh: Mesh, settings: DecompositionSettings | None = None, *, cach
         DataError: the limit of time or memory was passed, or the method failed; the message says what to do.
     """
     settings = settings or DecompositionSettings()
-    diagonal = mesh.diagonal
-    centre = mesh.bounds.mean(axis=0)
+    diagonal, centre = mesh.diagonal, mesh.bounds.mean(axis=0)
     # Rounded, so that one shape at two sizes has one name in the cache.
     unit = Mesh(np.round((mesh.vertices - centre) / diagonal, 9), mesh.faces, mesh.name)
     key = _key(unit, settings)
@@ -186,30 +181,26 @@ def _run(mesh: Mesh, settings: DecompositionSettings) -> list[np.ndarray]:
                 check=False,
             )
         except subprocess.TimeoutExpired:
-            raise DataError(
-                f"The decomposition of {mesh.name!r} ({len(mesh.faces):,} triangles) took longer than"
-                f" {settings.seconds:g} s and was stopped; {_advice(settings)}."
-            ) from None
+            raise _failed(mesh, settings, f"took longer than {settings.seconds:g} s and was stopped") from None
         if done.returncode or not target.exists():
-            raise DataError(_failure(mesh, settings, done.returncode, done.stderr.decode(errors="replace")))
+            errors = done.stderr.decode(errors="replace")
+            last = (errors.strip().splitlines() or ["no message"])[-1]
+            fault = f"by {settings.method} failed with exit status {done.returncode} ({last[:200]})"
+            if any(word in errors for word in _OUT_OF_MEMORY):
+                fault = f"needed more than {settings.memory / 1e9:.3g} GB of memory and was stopped"
+            raise _failed(mesh, settings, fault)
         _LOG.info("%s decomposed in %.1f s", mesh.name, time.monotonic() - started)
         with np.load(target, allow_pickle=False) as stored:
             ends = np.cumsum(stored["sizes"])[:-1]
             return np.split(stored["points"], ends)
 
 
-def _failure(mesh: Mesh, settings: DecompositionSettings, status: int, errors: str) -> str:
-    what = f"The decomposition of {mesh.name!r} ({len(mesh.faces):,} triangles)"
-    if any(word in errors for word in _OUT_OF_MEMORY):
-        return f"{what} needed more than {settings.memory / 1e9:.3g} GB of memory and was stopped; {_advice(settings)}."
-    last = (errors.strip().splitlines() or ["no message"])[-1]
-    return f"{what} by {settings.method} failed with exit status {status} ({last[:200]}); {_advice(settings)}."
-
-
-def _advice(settings: DecompositionSettings) -> str:
-    return (
-        f"raise the threshold ({settings.threshold:g}), lower most_faces ({settings.most_faces:,}), raise the limit,"
-        " or use collision = 'hull'"
+def _failed(mesh: Mesh, settings: DecompositionSettings, fault: str) -> DataError:
+    """Return the error of a decomposition that ended with a fault, with what to do about it."""
+    return DataError(
+        f"The decomposition of {mesh.name!r} ({len(mesh.faces):,} triangles) {fault}; raise the threshold "
+        f"({settings.threshold:g}), lower most_faces ({settings.most_faces:,}), raise the limit, or use collision = "
+        "'hull'."
     )
 
 

@@ -53,20 +53,20 @@ def deviation(
     shares = np.maximum(8, np.ceil(samples * areas / areas.sum())).astype(int)
     points = []
     for piece, share in zip(pieces, shares, strict=True):
-        surface = sample_surface(piece, share, rng)
+        surface = sample_surface(piece, share, rng)[0]
         some = surface[: max(4, share // 4)]
         # A chord between two points of a convex piece lies inside it, so it finds a hollow that the piece fills.
         chords = some - rng.random((len(some), 1)) * (some - rng.permutation(surface)[: len(some)])
         points += [surface, chords, piece.vertices]
     outward = _farthest_outside(solid, inside or solid, np.concatenate(points), rng)
-    return Deviation(outward, _farthest_from(pieces, sample_surface(solid, samples, rng)), samples)
+    return Deviation(outward, _farthest_from(pieces, sample_surface(solid, samples, rng)[0]), samples)
 
 
 def hausdorff(first: Mesh, second: Mesh, *, samples: int = 4000, seed: int = 0) -> float:
     """Return the sampled two-sided distance [m] between two surfaces (not the bodies inside them)."""
     rng = np.random.default_rng(seed)
-    there = _Surface(second, rng).distance(sample_surface(first, samples, rng))
-    back = _Surface(first, rng).distance(sample_surface(second, samples, rng))
+    there = _Surface(second, rng).distance(sample_surface(first, samples, rng)[0])
+    back = _Surface(first, rng).distance(sample_surface(second, samples, rng)[0])
     return float(max(there.max(), back.max()))
 
 
@@ -91,11 +91,6 @@ def winding_number(mesh: Mesh, points: ArrayLike) -> NDArray[np.float64]:
     return total / (2 * np.pi)
 
 
-def sample_surface(mesh: Mesh, count: int, rng: np.random.Generator) -> NDArray[np.float64]:
-    """Return ``count`` points [count, 3] spread evenly by area over a surface."""
-    return _sample(mesh, count, rng)[0]
-
-
 class _Surface:
     """Distances to a surface: near samples choose candidate triangles, whose distance is exact."""
 
@@ -103,7 +98,7 @@ class _Surface:
         from scipy.spatial import KDTree
 
         self._triangles = mesh.vertices[mesh.faces]
-        points, owner = _sample(mesh, spots, rng)
+        points, owner = sample_surface(mesh, spots, rng)
         # Centres as well, so that no small triangle is out of every list.
         self._tree = KDTree(np.concatenate([points, self._triangles.mean(axis=1)]))
         self._owner = np.concatenate([owner, np.arange(len(mesh.faces))])
@@ -176,8 +171,8 @@ def _areas(mesh: Mesh) -> NDArray[np.float64]:
     return area(mesh.vertices[mesh.faces])
 
 
-def _sample(mesh: Mesh, count: int, rng: np.random.Generator) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Return points [count, 3] and the faces [count] they lie on."""
+def sample_surface(mesh: Mesh, count: int, rng: np.random.Generator) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Return points [count, 3] spread evenly by area over a surface, and the faces [count] they lie on."""
     # Faces are drawn by area; (1 − √u, √u (1 − v), √u v) is then uniform on a triangle.
     ends = np.cumsum(_areas(mesh))
     face = np.minimum(np.searchsorted(ends, rng.random(count) * ends[-1]), len(ends) - 1)

@@ -9,12 +9,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 from brainbench.core.errors import DataError, DataFileNotFoundError, UsageError, unknown_name
 
 if TYPE_CHECKING:
     import trimesh
-    from numpy.typing import ArrayLike, NDArray
 
 UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "in": 0.0254}
 """Length units of mesh files in metres."""
@@ -47,15 +47,15 @@ class Diagnosis:
         return self.open_edges == 0
 
     def __str__(self) -> str:
-        faults = [
-            f"{self.open_edges} open edges (not watertight)" if self.open_edges else "",
-            f"{self.degenerate_faces} triangles without area" if self.degenerate_faces else "",
-            f"{self.bodies} separate pieces" if self.bodies > 1 else "",
-            f"{self.duplicate_faces} duplicate triangles" if self.duplicate_faces else "",
-            "triangles that disagree on inside and outside" if self.inconsistent else "",
-            "a surface that is inside out" if self.inside_out else "",
-        ]
-        return ", ".join(fault for fault in faults if fault) or "watertight"
+        faults = {
+            f"{self.open_edges} open edges (not watertight)": self.open_edges,
+            f"{self.degenerate_faces} triangles without area": self.degenerate_faces,
+            f"{self.bodies} separate pieces": self.bodies > 1,
+            f"{self.duplicate_faces} duplicate triangles": self.duplicate_faces,
+            "triangles that disagree on inside and outside": self.inconsistent,
+            "a surface that is inside out": self.inside_out,
+        }
+        return ", ".join(text for text, found in faults.items() if found) or "watertight"
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,10 +139,6 @@ class Mesh:
             raise UsageError(f"A mesh is scaled by a positive factor; received {factor!r}.")
         return Mesh(self.vertices * factor, self.faces, self.name)
 
-    def to_diagonal(self, diagonal: float) -> Mesh:
-        """Return the mesh scaled about its origin to a bounding-box diagonal [m]."""
-        return self.scaled(diagonal / self.diagonal)
-
     def transformed(self, rotation: ArrayLike, translation: ArrayLike = (0.0, 0.0, 0.0)) -> Mesh:
         """Return the mesh rotated by a matrix [3, 3] and then moved by ``translation`` [3] (m)."""
         return Mesh(self.vertices @ np.asarray(rotation).T + np.asarray(translation), self.faces, self.name)
@@ -168,11 +164,7 @@ class Mesh:
 
 
 def convex_hull(points: NDArray[np.float64], name: str = "mesh") -> Mesh:
-    """Return the convex hull of points [n, 3] as a closed outward mesh.
-
-    Raises:
-        DataError: the points lie in a plane.
-    """
+    """Return the convex hull of points [n, 3] as a closed outward mesh; points in a plane are a :class:`DataError`."""
     # The third singular value of centred points is their extent across the plane that fits them best.
     spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
     if spread[2] < 1e-9 * spread[0]:
@@ -234,8 +226,7 @@ def load_mesh(path: str | os.PathLike[str], *, unit: str) -> Mesh:
 def save_mesh(path: str | os.PathLike[str], mesh: Mesh, *, unit: str) -> Path:
     """Write a mesh file in the format that its suffix names, so that readers see all of it or nothing.
 
-    Raises:
-        UsageError: the unit or the format is unknown.
+    An unknown unit or format is a :class:`UsageError`.
     """
     from brainbench.core.files import atomic_path
 

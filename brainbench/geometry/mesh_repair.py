@@ -27,19 +27,13 @@ class Repair:
     remaining: tuple[str, ...]
     """Faults that are left."""
 
-    @property
-    def notes(self) -> tuple[str, ...]:
-        """Repairs and remaining faults."""
-        return (*self.done, *self.remaining)
-
 
 def repair(mesh: Mesh) -> Repair:
     """Remove broken triangles, close cracks and turn every surface outward; nothing is invented.
 
-    Triangles that name a vertex twice and copies of a triangle are removed; on an open mesh, vertices
-    within :data:`MERGE` of the diagonal are merged and tiny cracks of three or four edges are closed;
-    neighbours are made to agree on the outside; closed bodies that are inside out are turned. Larger
-    holes stay: their shape is unknown.
+    Triangles that name a vertex twice and copies of a triangle are removed; on an open mesh, vertices within
+    :data:`MERGE` of the diagonal are merged and tiny cracks of three or four edges are closed; neighbours are made to
+    agree on the outside; closed bodies that are inside out are turned. Larger holes stay: their shape is unknown.
 
     Raises:
         DataError: no triangle is left.

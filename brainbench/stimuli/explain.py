@@ -15,15 +15,14 @@ from typing import TYPE_CHECKING
 import msgspec
 
 from brainbench.core.errors import DataError, UsageError
+from brainbench.stimuli.engines.fidelity import Fidelity
+from brainbench.stimuli.engines.job_schedule import JobSchedule
+from brainbench.stimuli.engines.protocol import Trace
+from brainbench.stimuli.objects.solid import Solid
+from brainbench.stimuli.scenes.scene import Scene
 
 if TYPE_CHECKING:
     import xarray as xr
-
-    from brainbench.stimuli.engines.fidelity import Fidelity
-    from brainbench.stimuli.engines.job_schedule import JobSchedule
-    from brainbench.stimuli.engines.protocol import Trace
-    from brainbench.stimuli.objects.solid import Solid
-    from brainbench.stimuli.scenes.scene import Scene
 
 ATTRIBUTE = "explanation"
 """Attribute of a stimulus set that holds the explanation as JSON."""

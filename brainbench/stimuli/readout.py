@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Literal, get_args
 
 import numpy as np
+from numpy.typing import NDArray
 
 from brainbench.core.contracts import GRID_SHAPE, check_stimulus_set
 from brainbench.core.errors import DataError, UsageError, listing, unknown_name
@@ -14,7 +15,6 @@ from brainbench.stimuli.stimulus_set import hash_stimulus_set
 
 if TYPE_CHECKING:
     import xarray as xr
-    from numpy.typing import NDArray
 
 ORIENTATION = "orientation"
 """Variable [stimulus, time, whisker, 3, 3] with the rotations from the follicle's axes to the world."""

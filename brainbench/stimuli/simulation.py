@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import logging
 import math
 import threading
 import time
 from collections.abc import Iterable, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from brainbench import __version__
 from brainbench.core.contracts import CHANNELS, check_stimulus_set
@@ -20,6 +23,7 @@ from brainbench.core.progress import Progress
 from brainbench.stimuli.engines import DEFAULT_ENGINE, PHYSICS_VERSION, get_engine
 from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.engines.job_schedule import plan
+from brainbench.stimuli.engines.protocol import Trace, WhiskerEngine
 from brainbench.stimuli.explain import ATTRIBUTE, SECONDS, explain
 from brainbench.stimuli.readout import ORIENTATION, turn
 from brainbench.stimuli.scenes.frames import clip_wrenches
@@ -27,12 +31,7 @@ from brainbench.stimuli.scenes.scene import Scene
 from brainbench.stimuli.stimulus_set import hash_stimulus_set, read_stimulus_set, write_stimulus_set
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     import xarray as xr
-    from numpy.typing import NDArray
-
-    from brainbench.stimuli.engines.protocol import Trace, WhiskerEngine
 
 _LOG = logging.getLogger(__name__)
 
@@ -175,9 +174,9 @@ def _assemble(
 ) -> xr.Dataset:
     import xarray as xr
 
-    names, mounts = scenes[0].names, scenes[0].mounts
-    grid = ("stimulus", "whisker")
-    frames = scenes[0].frames
+    names, mounts, array, frames = scenes[0].names, scenes[0].mounts, scenes[0].array, scenes[0].frames
+    grid, over_time = ("stimulus", "whisker"), ("stimulus", "time", "whisker")
+    text = functools.partial(to_json, indent=None)
     wrench = np.stack([_to_world(scene, row) for scene, row in zip(scenes, traces, strict=True)])
     orientation = None
     if frames.axes == "follicle":
@@ -194,26 +193,22 @@ def _assemble(
         return np.stack([frames.split(np.stack([getattr(trace, name) for trace in row], axis=1)) for row in traces])
 
     touched = [[frames.readings[trace.contact] for trace in row] for row in traces]
-
+    first = np.array([[times[0] if len(times) else math.nan for times in row] for row in touched])
+    arc = _mean_of_known(readings("contact_arc")).astype(np.float32)
+    # Scenes may differ in material; the hash beside this covers every number of every scene's array.
+    about = {"species": array.species, "side": array.side, "whiskers": list(names), "citation": array.citation}
+    told = {
+        "contact_arc": {"units": "m", "long_name": "arc length of the force-weighted contact point"},
+        "first_contact": {"units": "s", "long_name": "time of the first reading with contact"},
+        "penetration": {"units": "m", "long_name": "deepest overlap of whisker and object"},
+    }
     dataset = xr.Dataset(
         {
-            "wrench": (("stimulus", "time", "whisker", "channel"), wrench, {"units": "N (F), N m (M)"}),
-            "contact": (("stimulus", "time", "whisker"), readings("contact").any(axis=2)),
-            "contact_arc": (
-                ("stimulus", "time", "whisker"),
-                _mean_of_known(readings("contact_arc")).astype(np.float32),
-                {"units": "m", "long_name": "arc length of the force-weighted contact point"},
-            ),
-            "first_contact": (
-                grid,
-                np.array([[times[0] if len(times) else math.nan for times in row] for row in touched]),
-                {"units": "s", "long_name": "time of the first reading with contact"},
-            ),
-            "penetration": (
-                grid,
-                of("penetration", np.float32),
-                {"units": "m", "long_name": "deepest overlap of whisker and object"},
-            ),
+            "wrench": ((*over_time, "channel"), wrench, {"units": "N (F), N m (M)"}),
+            "contact": (over_time, readings("contact").any(axis=2)),
+            "contact_arc": (over_time, arc, told["contact_arc"]),
+            "first_contact": (grid, first, told["first_contact"]),
+            "penetration": (grid, of("penetration", np.float32), told["penetration"]),
             "status": (grid, of("status")),
             "reason": (grid, of("reason")),
         },
@@ -227,19 +222,9 @@ def _assemble(
             "channel": np.array(CHANNELS, dtype=object),
         },
         attrs={
-            "array": to_json(
-                {
-                    "species": scenes[0].array.species,
-                    "side": scenes[0].array.side,
-                    "whiskers": list(names),
-                    "citation": scenes[0].array.citation,
-                    # Scenes may differ in material; the hash covers every number of every scene's array.
-                    "hash": content_hash([scene.mounts for scene in scenes]),
-                },
-                indent=None,
-            ),
-            "scene": to_json([scene.config() for scene in scenes], indent=None),
-            "fidelity": to_json(fidelity, indent=None),
+            "array": text({**about, "hash": content_hash([scene.mounts for scene in scenes])}),
+            "scene": text([scene.config() for scene in scenes]),
+            "fidelity": text(fidelity),
             # The simulation draws no random number; the contract asks for the field.
             "seed": 0,
             "backend": backend,

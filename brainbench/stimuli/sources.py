@@ -9,10 +9,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from brainbench.core.contracts import check_stimulus_set
 from brainbench.core.errors import BrainbenchError, DataError, DataFileNotFoundError, UsageError, listing, unknown_name
 from brainbench.core.files import content_hash
+from brainbench.core.progress import Progress
 from brainbench.stimuli.engines import DEFAULT_ENGINE
 from brainbench.stimuli.readout import to_grid
 from brainbench.stimuli.scenes.recipes import get_recipe, is_recipe, list_recipes
@@ -21,9 +23,7 @@ from brainbench.stimuli.whiskers.selection import match_whiskers
 
 if TYPE_CHECKING:
     import xarray as xr
-    from numpy.typing import NDArray
 
-    from brainbench.core.progress import Progress
     from brainbench.stimuli.engines.fidelity import Fidelity
     from brainbench.stimuli.engines.protocol import WhiskerEngine
     from brainbench.stimuli.scenes.scene_files import Recipe

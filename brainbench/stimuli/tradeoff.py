@@ -3,21 +3,17 @@
 Subject: mouse whisker C2, straightened; for the ring-down also the stiffest mouse whisker, E5. Per setting:
 
 - ``static_error``: worst of base-moment and base-force errors against the elastica over five frictionless pegs;
-- ``ring_error``: worst error of first frequency and damping ratio of C2 and E5 against what was asked for;
+- ``ring_error``: worst error of first frequency and damping ratio of C2 and E5; null for ``quasistatic``;
 - ``dynamic_error``: base moment while whisking at 20 Hz against a frictionless post: root-mean-square difference
   from a converged simulation (:data:`REFERENCE`) over its root mean square, read every ms;
-- ``sliding_error``: the same with friction .48;
-- ``flick_error``: the same with friction while the whisker sweeps past the post and springs free in every whisk;
-- ``error``: the worst of these five; null when a run failed, with the reason in ``note``;
-  with ``solver`` ``quasistatic``, where nothing rings, ``ring_error`` is null and the worst of the other four counts;
+- ``sliding_error``, ``flick_error``: the same with friction .48, also past the post so that it springs free each whisk;
+- ``error``: the worst of these; null when a run failed, with the reason in ``note``;
 - ``cost``: processor seconds per simulated second of one whisker in contact, over the three whisking runs.
 
-Points with a ``collision`` measure instead what the collision geometry of a concave object costs and does: C2 whisks
-without friction into the hollow of the Rodgers solid (30 mm), which is touched exactly, cut into convex pieces at a
-threshold, or as its hull:
-
-- ``concave_error``, which is also ``error``: base moment as above, against the exact solid in the converged simulation;
-- ``cost``: the same over this run; ``pieces``: convex parts or triangles that stand for the solid.
+Points with a ``collision`` measure instead the collision geometry of a concave object: C2 whisks without friction into
+the hollow of the Rodgers solid (30 mm), touched exactly, cut into convex pieces at a threshold, or as its hull.
+``concave_error``, also ``error``, is that of the base moment against the exact solid in the converged simulation,
+``pieces`` the convex parts or triangles that stand for the solid.
 
 A table is a JSON file; points that it holds already are kept, so an interrupted run goes on where it stopped.
 """
@@ -262,11 +258,7 @@ def _collision(text: str) -> tuple[str, DecompositionSettings | None]:
 
 
 def _into_hollow(setting: SimulationSetting) -> tuple[Trace, int]:
-    """Run C2 whisking into the hollow of the Rodgers solid; return the trace and of how much the solid consists.
-
-    Raises:
-        DataError: it was unstable.
-    """
+    """Run C2 whisking into the hollow of the Rodgers solid; return the trace and of how much the solid consists."""
     kind, settings = _collision(setting.collision or "exact")
     solid = rodgers_solid(0.03)
     if kind != "exact" and solid.mesh is not None:
@@ -304,11 +296,7 @@ class _Whisk:
 
 
 def _whisking(setting: SimulationSetting) -> list[Trace]:
-    """Run smooth, sliding and flicking contact.
-
-    Raises:
-        DataError: one of them was unstable.
-    """
+    """Run smooth, sliding and flicking contact; an unstable one is a :class:`DataError`."""
     whisker = _straight("C2")
     jobs = []
     for friction, degrees in ((0.0, 12), (0.48, 12), (0.48, 25)):

@@ -4,15 +4,13 @@
 ``param_name`` (``RC2``), ``param_side_row_col`` (1 right or 0 left; 1–5 for A–E; column from 0), ``param_s_a``
 (arc length in mm, curvature A of y = A x² in 1/mm), ``param_bp_pos`` (base point in mm), ``param_bp_angles``
 (θ, φ, ζ in rad) and ``param_angles`` (bend of each of 20 links against the one before, rad; the first is 0, so the
-second holds the direction of the second link). They hold no diameters and no material: those come from the
-published rules, as in WHISKiT.
+second holds the direction of the second link). They hold no diameters and no material.
 
 **Results.** One folder per run: ``whisker_ID.csv`` (one name per line); ``dynamics/Fx.csv`` … ``Mz.csv`` (line: time,
 column: whisker); ``kinematics/x|y|z/RC2.csv`` (line: time, columns: base point, then the centre of each link) and
-``kinematics/c/RC2.csv`` (0 or 1 per link: whether it touches). Units there are mN, µN·m and mm. Signs are ours and
-WHISKiT's alike: the action of the whisker on its base, about the base point, in world axes. Time is not written:
-lines follow the frames of the stimulus set. SeNSE-lab's programs end each line with a comma, and its readers drop
-what follows; the thesis's programs write and expect none.
+``kinematics/c/RC2.csv`` (0 or 1 per link: whether it touches). Units there are mN, µN·m and mm; signs and axes are ours
+and WHISKiT's alike. Time is not written: lines follow the frames of the stimulus set. SeNSE-lab's programs end each
+line with a comma; the thesis's programs write and expect none.
 """
 
 from __future__ import annotations
@@ -23,8 +21,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
-from brainbench.core.contracts import CHANNELS
+from brainbench.core.contracts import CHANNELS, check_stimulus_set
 from brainbench.core.errors import DataError, DataFileNotFoundError, UsageError, unknown_name
 from brainbench.core.files import write_text
 from brainbench.stimuli.motion.recorded import read_numbers
@@ -33,7 +32,6 @@ from brainbench.stimuli.whiskers.selection import ROWS
 
 if TYPE_CHECKING:
     import xarray as xr
-    from numpy.typing import ArrayLike, NDArray
 
 BENDS = 20
 """Links in WHISKiT's table of bends."""
@@ -54,14 +52,11 @@ def load_parameters(folder: str | os.PathLike[str], *, species: str = "whiskit")
     """
     root = Path(folder)
     names = _names(root)
-    grid = _table(root, "param_side_row_col", len(names), 3)
-    shape = _table(root, "param_s_a", len(names), 2)
-    position = _table(root, "param_bp_pos", len(names), 3)
-    angles = _table(root, "param_bp_angles", len(names), 3)
+    columns = {"side_row_col": 3, "s_a": 2, "bp_pos": 3, "bp_angles": 3}
+    tables = [_table(root, f"param_{name}", len(names), count).tolist() for name, count in columns.items()]
     mounts = []
-    for name, (side, row, col), (length, curvature), place, turn in zip(
-        names, grid.astype(int), shape, position, angles, strict=True
-    ):
+    for name, place, (length, curvature), (x, y, z), (theta, phi, zeta) in zip(names, *tables, strict=True):
+        side, row, col = map(int, place)
         expected = f"{'R' if side == 1 else 'L'}{ROWS[row - 1] if 1 <= row <= len(ROWS) else '?'}{col}"
         if name != expected:
             raise DataError(
@@ -72,11 +67,11 @@ def load_parameters(folder: str | os.PathLike[str], *, species: str = "whiskit")
             MountedWhisker(
                 name=name[1:],
                 side="right" if side == 1 else "left",
-                row=int(row) - 1,
-                col=int(col),
-                position=_triple(place * 1e-3),
-                angles=_triple(turn),
-                whisker=published_whisker(float(length), float(curvature), int(row) - 1, int(col)),
+                row=row - 1,
+                col=col,
+                position=(x * 1e-3, y * 1e-3, z * 1e-3),
+                angles=(theta, phi, zeta),
+                whisker=published_whisker(length, curvature, row - 1, col),
             )
         )
     return WhiskerArray(species, tuple(mounts), f"WHISKiT parameter folder {root.name}")
@@ -118,18 +113,17 @@ def save_parameters(
             f"The bends of {len(array)} whiskers have shape [{len(array)}, links]; received {table.shape}."
         )
     root = Path(folder)
-    mounts = array.mounts
     rows: dict[str, list[Any]] = {
-        "param_name": [[mount.full_name] for mount in mounts],
-        "param_side_row_col": [[int(m.side == "right"), m.row + 1, m.col] for m in mounts],
-        "param_s_a": [[m.whisker.arc_length * _MILLI, -m.whisker.curvature / _MILLI] for m in mounts],
-        "param_bp_pos": [[value * _MILLI for value in m.position] for m in mounts],
-        "param_bp_angles": [m.angles for m in mounts],
-        "param_angles": table.tolist(),
+        "name": [[mount.full_name] for mount in array],
+        "side_row_col": [[int(m.side == "right"), m.row + 1, m.col] for m in array],
+        "s_a": [[m.whisker.arc_length * _MILLI, -m.whisker.curvature / _MILLI] for m in array],
+        "bp_pos": [[value * _MILLI for value in m.position] for m in array],
+        "bp_angles": [m.angles for m in array],
+        "angles": table.tolist(),
     }
     for name, lines in rows.items():
         # Enough digits for any published table, and none that only changing the unit brought in.
-        _write(root / f"{name}.csv", lines, digits=12)
+        _write(root / f"param_{name}.csv", lines, digits=12)
     return root
 
 
@@ -154,8 +148,6 @@ def save_run(
     Raises:
         UsageError: the stimulus is unknown or not said, whiskers lack a side, or the shapes do not fit.
     """
-    from brainbench.core.contracts import check_stimulus_set
-
     check_stimulus_set(dataset)
     if dialect not in DIALECTS:
         raise unknown_name("dialect", dialect, DIALECTS)
@@ -220,31 +212,22 @@ def _write(path: Path, lines: Iterable[Iterable[float | str]], end: str = "\n", 
 
 
 def _names(root: Path) -> list[str]:
-    path = _existing(root, "param_name")
+    path = root / "param_name.csv"
     try:
         text = path.read_text(encoding="utf-8")
+    except FileNotFoundError as error:
+        message = f"There is no file {os.fspath(path)!r}; a WHISKiT parameter folder has one."
+        raise DataFileNotFoundError(message) from error
     except UnicodeDecodeError as error:
         raise DataError(f"{os.fspath(path)!r} is not a text file ({error}).") from error
     return [line.strip().rstrip(",") for line in text.splitlines() if line.strip()]
 
 
 def _table(root: Path, name: str, lines: int, columns: int | None) -> NDArray[np.float64]:
-    path = _existing(root, name)
+    path = root / f"{name}.csv"
     table = read_numbers(path)
     if len(table) != lines or (columns is not None and table.shape[1] != columns):
         raise DataError(
             f"{os.fspath(path)!r} has shape {list(table.shape)}; {lines} names need [{lines}, {columns or 'links'}]."
         )
     return table
-
-
-def _existing(root: Path, name: str) -> Path:
-    path = root / f"{name}.csv"
-    if not path.is_file():
-        raise DataFileNotFoundError(f"There is no file {os.fspath(path)!r}; a WHISKiT parameter folder has one.")
-    return path
-
-
-def _triple(values: NDArray[np.float64]) -> tuple[float, float, float]:
-    x, y, z = map(float, values)
-    return x, y, z

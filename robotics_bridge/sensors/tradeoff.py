@@ -40,6 +40,8 @@ from robotics_bridge.sensors.taxels.sensors import KinematicTaxel, ProximityTaxe
 RESOLUTIONS = (16, 32, 64, 128)
 POINTS = (250, 500, 1000, 2000, 4000, 16_000)
 TAXELS = (5, 10, 20, 40, 80)
+HEIGHTS = {"mesh": 0.010, "primitive": 0.017}
+"""Height (m) above the pad at which the torus and the sphere touch it."""
 _POSES = 12
 _CYLINDER = Geometry(name="o", link="object", kind="cylinder", size=(0.008, 0.012))
 _PAD = Geometry(name="pad", link="hand", kind="box", size=(0.03, 0.03, 0.005))
@@ -128,7 +130,7 @@ def _torus() -> Geometry:
 @cache
 def _exact_field(part: str) -> NDArray[np.float64]:
     """Return the forces [n, 400, 3] of the taxels in double precision."""
-    grid, places = _grid(), _mesh_places(part)
+    grid, places = _grid(), _places(HEIGHTS[part])
     exact = np.zeros((len(places), len(grid), 3))
     for row, place in zip(exact, places, strict=True):
         local = np.array(grid.position) - place
@@ -147,14 +149,10 @@ def _exact_field(part: str) -> NDArray[np.float64]:
     return exact
 
 
-def _mesh_places(part: str) -> NDArray[np.float64]:
-    return _places(0.010 if part == "mesh" else 0.017)
-
-
 def _mesh_point(part: str, query: str, resolution: int | None) -> dict[str, Any]:
     solid = _torus() if part == "mesh" else Geometry(name="o", link="object", kind="sphere", size=(0.012,))
     taxel = KinematicTaxel(link="hand", probes=_grid(), query=query)  # type: ignore[arg-type]
-    read, cost = _run(solid, taxel, _mesh_places(part), resolution or 64)
+    read, cost = _run(solid, taxel, _places(HEIGHTS[part]), resolution or 64)
     exact = _exact_field(part)
     error = _error(read[..., :3].reshape(exact.shape), exact)
     return {"part": part, "query": query, "resolution": resolution, "error": error, "cost": cost}

@@ -66,7 +66,7 @@ def test_equal_meshes_have_equal_hashes_and_a_moved_vertex_changes_it():
 
 def test_scaling_to_a_diagonal_keeps_the_proportions():
     mesh = Mesh(trimesh.creation.box(extents=(1, 2, 3)).vertices, trimesh.creation.box().faces)
-    small = mesh.to_diagonal(0.055)
+    small = mesh.scaled(0.055 / mesh.diagonal)
     assert small.diagonal == pytest.approx(0.055)
     np.testing.assert_allclose(small.vertices / mesh.vertices, 0.055 / np.sqrt(14))
 

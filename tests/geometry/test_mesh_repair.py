@@ -27,7 +27,7 @@ def test_a_sound_mesh_is_left_alone():
     mesh = _ball()
     result = repair(mesh)
     assert result.mesh is mesh
-    assert result.notes == ()
+    assert (result.done, result.remaining) == ((), ())
 
 
 def test_an_inside_out_mesh_is_diagnosed_and_turned():

@@ -9,14 +9,8 @@ import typer
 
 from brainbench.cli.options import numbers
 from brainbench.cli.output import JsonOption, emit, progress_bar
-from brainbench.cli.stimuli.scenes import (
-    BackendOption,
-    FidelityOption,
-    StimulusOption,
-    WhiskersOption,
-    choose_scene,
-    open_recipe,
-)
+from brainbench.cli.stimuli import scenes
+from brainbench.cli.stimuli.scenes import BackendOption, FidelityOption, StimulusOption, WhiskersOption
 from brainbench.core.errors import UsageError
 from brainbench.stimuli.engines import DEFAULT_ENGINE
 
@@ -56,7 +50,7 @@ def render(
     from brainbench.stimuli.figures.canvas import check_format
 
     suffix = check_format(out, drawing.FORMATS)
-    scene = choose_scene(open_recipe(source, whiskers), stimulus)
+    scene = scenes.choose_scene(scenes.open_recipe(source, whiskers), stimulus)
     if suffix == ".png":
         times = [drawing.still_time(scene) if at is None else at * 1e-3]
     elif at is not None:
@@ -80,24 +74,12 @@ def render(
         size=(pixels[0], pixels[1]),
         frames_per_second=fps,
     )
+    how = {"times": times, "camera": camera, "style": style}
     with progress_bar() as progress:
-        path = drawing.render(
-            scene,
-            out,
-            times=times,
-            camera=camera,
-            style=style,
-            fidelity=fidelity,
-            backend=backend,
-            progress=progress,
-        )
+        path = drawing.render(scene, out, **how, fidelity=fidelity, backend=backend, progress=progress)
     data = {"path": path, "stimulus": scene.label, "times_s": times, "camera": camera, "style": style}
-    what = (
-        f"{times[0] * 1e3:g} ms"
-        if len(times) == 1
-        else f"{len(times)} frames, {times[0] * 1e3:g}–{times[-1] * 1e3:g} ms"
-    )
-    emit(data, f"{scene.label} ({what})  {path}", as_json=as_json)
+    what = f"{times[0] * 1e3:g}" if len(times) == 1 else f"{len(times)} frames, {times[0] * 1e3:g}–{times[-1] * 1e3:g}"
+    emit(data, f"{scene.label} ({what} ms)  {path}", as_json=as_json)
 
 
 def plot(
@@ -108,9 +90,7 @@ def plot(
     channel: Annotated[
         str, typer.Option(help="Fxyz, Mxyz (three components), F, M (magnitude), Fx, Fy, Fz, Mx, My or Mz.")
     ] = "Fxyz",
-    stimulus: Annotated[
-        str | None, typer.Option("--stimulus", "-s", help="Draw only the stimulus of this label.")
-    ] = None,
+    stimulus: Annotated[str | None, typer.Option("--stimulus", "-s", help="Draw only this stimulus.")] = None,
     start: Annotated[float | None, typer.Option(help="First time shown, ms.")] = None,
     stop: Annotated[float | None, typer.Option(help="Last time shown, ms.")] = None,
     size: Annotated[str, typer.Option(help="Pixels.")] = "1600x960",
@@ -135,13 +115,7 @@ def plot(
         raise UsageError(f"{source!r} holds arrays, not forces of whiskers; there is nothing to plot.")
     low = -math.inf if start is None else start * 1e-3
     high = math.inf if stop is None else stop * 1e-3
-    pixels = numbers(size, "--size", count=2)
-    paths = draw(
-        stimuli.dataset,
-        out,
-        channel=channel,
-        stimulus=stimulus,
-        window=(low, high),
-        size=(pixels[0], pixels[1]),
-    )
+    width, height = numbers(size, "--size", count=2)
+    chosen = {"channel": channel, "stimulus": stimulus, "window": (low, high)}
+    paths = draw(stimuli.dataset, out, **chosen, size=(width, height))
     emit({"paths": paths, "channel": channel}, "\n".join(map(str, paths)), as_json=as_json)

@@ -75,9 +75,8 @@ def hand(
         for label, felt in zip(found.labels, force, strict=True)
     ]
     silent = [item["stimulus"] for item in data if not item["sites_touched"]]
-    title = (
-        f"{found.hand}, {placement}, {resolution}; one unit = {calibration.force:.3g} N, {calibration.moment:.3g} N·m"
-    )
+    unit_of = f"one unit = {calibration.force:.3g} N, {calibration.moment:.3g} N·m"
+    title = f"{found.hand}, {placement}, {resolution}; {unit_of}"
     columns = {
         "stimulus": "{0[stimulus]}",
         ">sites touched": lambda item: f"{item['sites_touched']} of {sites}",
@@ -86,12 +85,8 @@ def hand(
     text = table_of(title, data, columns)
     if silent:
         text += f"\n\n{len(silent)} never touch a taxel: {', '.join(silent)}."
-    result: dict[str, Any] = {
-        "stimuli": data,
-        "calibration": calibration,
-        "content_hash": dataset.attrs["content_hash"],
-    }
-    emit({**result, "path": out}, text + ("" if out is None else f"\n\nstimuli  {out}"), as_json=as_json)
+    result = {"stimuli": data, "calibration": calibration, "content_hash": dataset.attrs["content_hash"], "path": out}
+    emit(result, text + ("" if out is None else f"\n\nstimuli  {out}"), as_json=as_json)
 
 
 def objects_of(text: str, diagonal: float, unit: str | None = None) -> list[Explored]:
@@ -101,6 +96,9 @@ def objects_of(text: str, diagonal: float, unit: str | None = None) -> list[Expl
     """
     import math
 
+    import numpy as np
+
+    from brainbench.geometry import Mesh
     from brainbench.stimuli.objects.collections import resolve_objects
     from brainbench.stimuli.objects.primitives import rodgers_solid
     from brainbench.stimuli.scenes.recipes import get_recipe
@@ -113,12 +111,8 @@ def objects_of(text: str, diagonal: float, unit: str | None = None) -> list[Expl
             "ellipsoid": (0.02, 0.035, 0.015),
         }  # fmt: skip
         lying = {"capsule": (0.7071068, 0.7071068, 0.0, 0.0)}
-        return [
-            Explored(
-                kind, Geometry(name=kind, link=kind, kind=kind, size=size), quaternion=lying.get(kind, (1, 0, 0, 0))
-            )
-            for kind, size in sizes.items()
-        ]
+        shapes = {kind: Geometry(name=kind, link=kind, kind=kind, size=size) for kind, size in sizes.items()}
+        return [Explored(kind, one, quaternion=lying.get(kind, (1, 0, 0, 0))) for kind, one in shapes.items()]
     if text == RODGERS:
         mesh, found = _surface(rodgers_solid(diagonal)), []
         for scene in get_recipe(RODGERS).scenes:
@@ -129,25 +123,18 @@ def objects_of(text: str, diagonal: float, unit: str | None = None) -> list[Expl
             turn = (c * cz, s * cz, -s * sz, c * sz)
             found.append(Explored(scene.label, mesh=mesh, quaternion=turn, retreat=_DISTANCES[distance]))
         return found
-    named = resolve_objects([text], unit=unit, surfaces=True)
-    return [Explored(name, mesh=_sized(_surface(item.load()), diagonal)) for name, item in named.items()]
+    found = []
+    for name, item in resolve_objects([text], unit=unit, surfaces=True).items():
+        mesh = _surface(item.load())
+        # Centred, and scaled to the diagonal of its box.
+        low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
+        scale = diagonal / float(np.linalg.norm(high - low))
+        found.append(Explored(name, mesh=Mesh((mesh.vertices - (low + high) / 2) * scale, mesh.faces)))
+    return found
 
 
 def _surface(solid: Any) -> Any:
     """Return the mesh of a solid."""
     from brainbench.geometry import Mesh
 
-    if solid.surface is not None:
-        return Mesh(solid.surface.vertices, solid.surface.faces)
-    return solid.mesh
-
-
-def _sized(mesh: Any, diagonal: float) -> Any:
-    """Return a mesh centred and scaled to the diagonal of its box."""
-    import numpy as np
-
-    from brainbench.geometry import Mesh
-
-    low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
-    scale = diagonal / float(np.linalg.norm(high - low))
-    return Mesh((mesh.vertices - (low + high) / 2) * scale, mesh.faces)
+    return solid.mesh if solid.surface is None else Mesh(solid.surface.vertices, solid.surface.faces)

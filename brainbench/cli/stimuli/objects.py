@@ -41,7 +41,7 @@ def objects(
 ) -> None:
     """List the shape families, or describe one object: its size, its faults, and what whiskers touch of it."""
     from brainbench.core.errors import UsageError
-    from brainbench.geometry import DecompositionSettings
+    from brainbench.geometry import DecompositionSettings, save_mesh
 
     settings = DecompositionSettings(method=method, threshold=threshold)  # type: ignore[arg-type]
     diagonal = None if diagonal_mm is None else diagonal_mm / _MILLI
@@ -55,11 +55,8 @@ def objects(
         data, solid = _file(source, unit, diagonal, collision or "hull", settings)
     else:
         data, solid = _member(source, seed, detail, diagonal, collision, settings)
-    mesh = solid.mesh
-    if export is not None and mesh is not None:
-        from brainbench.geometry import save_mesh
-
-        data["export"] = save_mesh(export, mesh, unit="mm")
+    if export is not None and solid.mesh is not None:
+        data["export"] = save_mesh(export, solid.mesh, unit="mm")
     emit(data, _text(data), as_json=as_json)
 
 
@@ -83,12 +80,7 @@ def _folder(source: str, ids: Path | None, categories: Path | None) -> tuple[dic
 
 
 def _member(
-    name: str,
-    seed: int,
-    detail: int,
-    diagonal: float | None,
-    collision: str | None,
-    settings: DecompositionSettings,
+    name: str, seed: int, detail: int, diagonal: float | None, collision: str | None, settings: DecompositionSettings
 ) -> tuple[dict[str, Any], Solid]:
     from brainbench.core.errors import unknown_name
     from brainbench.stimuli.objects import procedural
@@ -137,6 +129,9 @@ def _measures(mesh: Mesh, solid: Solid) -> dict[str, Any]:
 def _text(data: dict[str, Any]) -> str:
     size = " × ".join(f"{value:.4g}" for value in data["size_mm"])
     volume = "unknown: not closed" if data["volume_mm3"] is None else f"{data['volume_mm3']:.4g} mm³"
+    touched = "the triangles of its surface (engine rod; for others choose --collision decomposition)"
+    if parts := data["convex_parts"]:
+        touched = f"{parts} convex part{'' if parts == 1 else 's'}"
     rows = {"object": f"{data['name']}: {data['description']}" if "description" in data else data["name"]}
     if "parameters" in data:
         drawn = data["parameters"].items()
@@ -147,7 +142,7 @@ def _text(data: dict[str, Any]) -> str:
         "surface": f"{data['diagnosis']}, {data['triangles']:,} triangles",
         "size": f"{size} mm, diagonal {data['diagonal_mm']:.4g} mm",
         "volume": volume,
-        "touched": _touched(data["convex_parts"]),
+        "touched": touched,
     }
     if data["notes"]:
         rows["note"] = "\n".join(data["notes"])
@@ -155,9 +150,3 @@ def _text(data: dict[str, Any]) -> str:
     if "export" in data:
         rows["written"] = f"{data['export']} (mm)"
     return facts(rows)
-
-
-def _touched(parts: int) -> str:
-    if not parts:
-        return "the triangles of its surface (engine rod; for others choose --collision decomposition)"
-    return f"{parts} convex part{'' if parts == 1 else 's'}"

@@ -174,12 +174,10 @@ def _rows(scene: dict[str, Any]) -> list[list[str]]:
         rows.append(["", f"whiskers of {other['animal']}", "", "", _motion(other["whisking"]), ""])
     for item in scene["objects"]:
         solid, friction = item["solid"], item["friction"]
-        size = solid.get("size")
-        what = (
-            f"{' × '.join(_milli(value) for value in size)} mm" if size else f"diagonal {_milli(solid['diagonal'])} mm"
-        )
+        size = " × ".join(map(_milli, solid.get("size", ()))) or f"diagonal {_milli(solid['diagonal'])}"
         count = solid["parts"]
-        notes = [f"{count} convex part{'s' if count > 1 else ''}" if count else "the triangles of its surface", what]
+        touched = f"{count} convex part{'s' if count > 1 else ''}" if count else "the triangles of its surface"
+        notes = [touched, f"{size} mm"]
         notes += [] if friction is None else [f"friction {friction:g}"]
         notes += solid["notes"]
         place = _point(item["position"]), _angles(item["rotation"])

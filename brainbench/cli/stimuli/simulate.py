@@ -93,16 +93,9 @@ def separability(
     from brainbench.datasets.whisking.separability import separability as measure
 
     data = WhiskingDataset(folder, split=split, view="raw")
-    names = None if classes is None else items(classes)
+    chosen = {"classes": None if classes is None else items(classes), "counts": numbers(counts, "--counts")}
     with progress_bar() as progress:
-        found = measure(
-            data,
-            classes=names,
-            counts=numbers(counts, "--counts"),
-            sweeps_per_class=sweeps_per_class,
-            seed=seed,
-            progress=progress,
-        )
+        found = measure(data, **chosen, sweeps_per_class=sweeps_per_class, seed=seed, progress=progress)
     used = dict.fromkeys(name for item in found for choice in item.choices for name in choice)
     title = f"{', '.join(used)}: {found[0].objects} objects, {found[0].sweeps} sweeps"
     columns = {

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections import Counter
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -99,14 +100,12 @@ def sweep(
 
 def _describe(plan: GenerationPlan) -> str:
     """Return how many sweeps and shards a data set would have, by split."""
-    sizes: dict[str, int] = {}
+    sizes = Counter({task.split: 0 for task in plan.shards})
     for task in plan.shards:
-        sizes[task.split] = sizes.get(task.split, 0) + len(task)
+        sizes[task.split] += len(task)
     parts = ", ".join(f"{split} {size:,}" for split, size in sizes.items())
-    size = sum(task.bytes for task in plan.shards)
-    return (
-        f"{plan.sweeps:,} sweeps in {len(plan.shards)} shards, {size / 1e6:.3g} MB: {parts} (by {plan.settings.split})"
-    )
+    shards = f"{len(plan.shards)} shards, {sum(task.bytes for task in plan.shards) / 1e6:.3g} MB"
+    return f"{plan.sweeps:,} sweeps in {shards}: {parts} (by {plan.settings.split})"
 
 
 def _generate(

@@ -21,11 +21,7 @@ from brainbench.stimuli.whiskers.whisker import Whisker
 
 @dataclass(frozen=True)
 class Fidelity:
-    """Accuracy knobs of a whisker simulation.
-
-    Raises:
-        UsageError: a value lies outside its range.
-    """
+    """Accuracy knobs of a whisker simulation; a value outside its range is a :class:`UsageError`."""
 
     links: int = 10
     """Links per whisker; the smallest number when ``links_per_mm`` is given."""
@@ -122,11 +118,7 @@ class Fidelity:
         return min(self.time_step, 1 / (self.steps_per_period * frequency))
 
     def link_count(self, arc_length: float) -> int:
-        """Return the number of links of a whisker of this arc length [m].
-
-        Raises:
-            UsageError: it would take more links than can be simulated sensibly.
-        """
+        """Return the number of links of a whisker of this arc length [m]; too many are a :class:`UsageError`."""
         if self.links_per_mm is None:
             return self.links
         count = max(self.links, math.ceil(arc_length * 1e3 * self.links_per_mm))
@@ -173,8 +165,7 @@ def list_presets() -> tuple[str, ...]:
 def measured(backend: str = DEFAULT_ENGINE) -> tuple[TradeoffPoint, ...]:
     """Return the measured settings of a backend: error as the table states, cost in processor s per whisker-second.
 
-    Raises:
-        UsageError: the backend was not measured.
+    A backend that was not measured is a :class:`UsageError`.
     """
     import json
 

@@ -12,18 +12,17 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar, Literal, Protocol
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 from brainbench.core.errors import UsageError
+from brainbench.core.progress import Progress as NamedProgress
+from brainbench.stimuli.engines.fidelity import Fidelity
+from brainbench.stimuli.engines.sweep_batch import SweepBatch
+from brainbench.stimuli.objects.obstacle import Obstacle
+from brainbench.stimuli.whiskers.whisker import Whisker
 
 if TYPE_CHECKING:
-    from numpy.typing import ArrayLike, NDArray
-
-    from brainbench.core.progress import Progress as NamedProgress
-    from brainbench.stimuli.engines.fidelity import Fidelity
-    from brainbench.stimuli.engines.sweep_batch import SweepBatch
-    from brainbench.stimuli.objects.obstacle import Obstacle
     from brainbench.stimuli.sweeps.sweep_scenes import SweepScenes
-    from brainbench.stimuli.whiskers.whisker import Whisker
 
 Progress = Callable[[int, int], None]
 """Called as ``progress(done, total)`` when a job is finished."""

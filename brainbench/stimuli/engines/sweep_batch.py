@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,11 +14,7 @@ from brainbench.core.errors import UsageError
 
 @dataclass(frozen=True, eq=False)
 class SweepBatch:
-    """Wrenches and contacts of some sweeps, in the order in which they were asked for.
-
-    Raises:
-        UsageError: the arrays do not fit together.
-    """
+    """Wrenches and contacts of some sweeps, in the order in which they were asked for."""
 
     wrench: NDArray[np.float32]
     """[sweep, frame, whisker, 6] N and N·m, in the axes that the frames of the grid name; NaN where unstable."""
@@ -64,8 +61,7 @@ def join_batches(parts: Sequence[SweepBatch]) -> SweepBatch:
     """Return several batches as one."""
     if len(parts) == 1:
         return parts[0]
-    arrays = {
-        name: np.concatenate([getattr(part, name) for part in parts]) for name in ("wrench", "contact", "unstable")
-    }
-    counts = {name: sum(getattr(part, name) for part in parts) for name in ("steps", "steps_in_full", "retried")}
+    names = ("wrench", "contact", "unstable"), ("steps", "steps_in_full", "retried")
+    arrays: dict[str, Any] = {name: np.concatenate([getattr(part, name) for part in parts]) for name in names[0]}
+    counts: dict[str, Any] = {name: sum(getattr(part, name) for part in parts) for name in names[1]}
     return SweepBatch(**arrays, reasons=tuple(reason for part in parts for reason in part.reasons), **counts)

@@ -111,23 +111,17 @@ def judge(facts: RunFacts) -> Verdict:
     blame(strong, lambda i: f"at {facts.strong_at[i]:.6g} s {too_strong(facts.strength[i], facts.strongest[i])}")
     fast = facts.fast_at < until
     until = np.where(fast, facts.fast_at, until)
-    blame(
-        fast,
-        lambda i: (
-            f"an object moves by {facts.travel[i] * MILLI:.3g} mm against the whisker in the shortest step at "
-            f"{facts.fast_at[i]:.6g} s, further than contacts are looked for; choose a smaller time step"
-        ),
-    )
     unsolved = (until == np.inf) & ~(facts.residual <= LARGEST_RESIDUAL)
-    blame(
-        unsolved,
-        lambda i: f"contact forces missed by {facts.residual[i]:.0%} (root mean square); choose a smaller time step",
-    )
     crowded = (until == np.inf) & ~unsolved & (facts.crowded > LARGEST_CROWDED_SHARE * facts.steps)
-    blame(
-        crowded,
-        lambda i: f"more contacts than can be solved together in {facts.crowded[i]} of {facts.steps[i]} steps",
+    moved = (
+        "an object moves by {:.3g} mm against the whisker in the shortest step at {:.6g} s, further than contacts are "
+        "looked for; choose a smaller time step"
     )
+    missed = "contact forces missed by {:.0%} (root mean square); choose a smaller time step"
+    many = "more contacts than can be solved together in {} of {} steps"
+    blame(fast, lambda i: moved.format(facts.travel[i] * MILLI, facts.fast_at[i]))
+    blame(unsolved, lambda i: missed.format(facts.residual[i]))
+    blame(crowded, lambda i: many.format(facts.crowded[i], facts.steps[i]))
     return Verdict(np.where(unsolved | crowded, -np.inf, until), (retryable & ~fast) | unsolved | crowded, reasons)
 
 
@@ -200,7 +194,7 @@ def step_travel(
     if obstacle.motion is None:
         return own
     places, quaternions = (np.asarray(values, dtype=float) for values in obstacle.motion(times))
-    size = float(np.linalg.norm(_bounds(obstacle), axis=1).max())
+    size = float(np.linalg.norm(obstacle.bounds, axis=1).max())
     chord = np.linalg.norm(np.diff(quaternions, axis=0), axis=1)
     return own + np.linalg.norm(np.diff(places, axis=0), axis=1) + 2 * chord * size
 
@@ -213,14 +207,13 @@ def passed_unseen(job: Job, reach: Reach, position: NDArray, euler: NDArray, tim
     """
     first, reason = len(times) - 1, ""
     for obstacle in reach.obstacles:
-        bounds = _bounds(obstacle)
+        bounds = obstacle.bounds
         thickness = float((bounds[1] - bounds[0]).min()) + 2 * job.whisker.base_radius
         travel = step_travel(job.whisker, position, euler, obstacle, times)
-        passing = travel > thickness
-        if not passing.any():
+        if not (travel > thickness).any():
             continue
         near = distances(obstacle, bounds, position, times)[:-1] <= job.whisker.arc_length + travel
-        found = np.flatnonzero(passing & near)
+        found = np.flatnonzero((travel > thickness) & near)
         if len(found) and found[0] < first:
             first = int(found[0])
             reason = (
@@ -231,19 +224,8 @@ def passed_unseen(job: Job, reach: Reach, position: NDArray, euler: NDArray, tim
     return first, reason
 
 
-def _bounds(obstacle: Obstacle) -> NDArray[np.float64]:
-    """Return the lowest and highest corner [2, 3] (m) of what is touched, in the frame of the obstacle."""
-    bodies = obstacle.parts if obstacle.surface is None else (obstacle.surface,)
-    corners = np.stack([body.bounds() for body in bodies])
-    return np.stack([corners[:, 0].min(axis=0), corners[:, 1].max(axis=0)])
-
-
 def check_jobs(engine: WhiskerEngine, jobs: Sequence[Job], fidelity: Fidelity, workers: int | None) -> None:
-    """Refuse what an engine cannot run, and say aloud what damps whiskers more than they are.
-
-    Raises:
-        UsageError: the engine lacks the solver or collides convex bodies only, or there are no workers.
-    """
+    """Refuse jobs, solvers and workers that an engine cannot run, and warn of steps that damp whiskers too much."""
     if workers is not None and workers < 1:
         raise UsageError(f"workers must be at least 1; received {workers}.")
     if fidelity.solver not in engine.solvers:

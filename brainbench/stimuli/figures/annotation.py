@@ -2,43 +2,29 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from brainbench.stimuli.figures.canvas import (
-    DOTS_PER_INCH,
-    INK,
-    MOMENT_MAP,
-    PALE,
-    ROW_COLORS,
-    new_figure,
-    round_length,
-    save_figure,
-)
+from brainbench.stimuli.figures import canvas
+from brainbench.stimuli.figures.canvas import DOTS_PER_INCH, INK, PALE
 from brainbench.stimuli.whiskers.selection import ROWS
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
-    from numpy.typing import NDArray
-
     from brainbench.stimuli.figures.scenes import Picture
 
 AXES = ("right", "rostral", "dorsal")
 
 
 class Annotation:
-    """A figure that shows one instant of a picture after the other, with text.
-
-    Raises:
-        MissingDependencyError: matplotlib is not installed.
-    """
+    """A matplotlib figure that shows one instant of a picture after the other, with text."""
 
     def __init__(self, picture: Picture) -> None:
         self.picture = picture
         self.width, self.height = picture.style.size
-        self.figure = new_figure(self.width, self.height)
+        self.figure = canvas.new_figure(self.width, self.height)
         self.axes = self.figure.add_axes((0, 0, 1, 1))
         self.axes.set(xlim=(0, self.width), ylim=(self.height, 0))
         self.axes.axis("off")
@@ -64,14 +50,14 @@ class Annotation:
     def frame(self, index: int) -> NDArray[np.uint8]:
         """Return the annotated picture [H, W, 3] at one instant."""
         self._show(index)
-        canvas: Any = self.figure.canvas
-        canvas.draw()
-        return np.asarray(canvas.buffer_rgba())[..., :3].copy()
+        drawn: Any = self.figure.canvas
+        drawn.draw()
+        return np.asarray(drawn.buffer_rgba())[..., :3].copy()
 
     def save(self, path: Path, index: int = 0) -> Path:
         """Write the annotated picture at one instant."""
         self._show(index)
-        return save_figure(self.figure, path, dpi=DOTS_PER_INCH)
+        return canvas.save_figure(self.figure, path, dpi=DOTS_PER_INCH)
 
     def _show(self, index: int) -> None:
         self._image.set_data(self.picture.frame(index))
@@ -95,7 +81,7 @@ class Annotation:
 
     def _scale_bar(self) -> None:
         lens = self.picture.lens
-        length = round_length(0.2 * lens.width)
+        length = canvas.round_length(0.2 * lens.width)
         left, low = self._edge, self.height - self._edge
         self._line([left, left + length * lens.scale], [low, low], width=5)
         label = f"{length * 1e3:g} mm" + ("" if lens.distance is None else " at the centre")
@@ -107,15 +93,11 @@ class Annotation:
         flat = (self.picture.lens.axes[:2] * [[1.0], [-1.0]]).T
         # The origin lies so far from the corner that every arrow and its name stay in the picture.
         right, low = self.width - self._edge - 100 * self._unit, self.height - self._edge - 66 * self._unit
+        arrow = {"arrowstyle": "-|>", "color": PALE, "lw": 1.6 * self._unit, "shrinkA": 0, "shrinkB": 0}
         for (x, y), name in zip(flat, AXES, strict=True):
             if np.hypot(x, y) < 0.25:
                 continue
-            self.axes.annotate(
-                "",
-                (right + reach * x, low + reach * y),
-                (right, low),
-                arrowprops={"arrowstyle": "-|>", "color": PALE, "lw": 1.6 * self._unit, "shrinkA": 0, "shrinkB": 0},
-            )
+            self.axes.annotate("", (right + reach * x, low + reach * y), (right, low), arrowprops=arrow)
             side = "center" if abs(x) < 0.3 else "left" if x > 0 else "right"
             height = "center" if abs(x) >= 0.3 else "bottom" if y < 0 else "top"
             place = right + 1.12 * reach * x, low + 1.12 * reach * y
@@ -126,14 +108,13 @@ class Annotation:
         top = self._edge + 84 * self._unit
         for place, row in enumerate(rows):
             y = top + 26 * self._unit * place
-            self._line([self._edge, self._edge + 30 * self._unit], [y, y], ROW_COLORS[row], 4)
+            self._line([self._edge, self._edge + 30 * self._unit], [y, y], canvas.ROW_COLORS[row], 4)
             self._text(self._edge + 40 * self._unit, y, f"row {ROWS[row]}", size=15, va="center_baseline")
 
     def _moment_bar(self) -> None:
-
         left, top, long, wide = self._edge, self._edge + 84 * self._unit, 220 * self._unit, 16 * self._unit
         ramp = np.linspace(0, 1, 256)[None]
-        self.axes.imshow(ramp, cmap=MOMENT_MAP, extent=(left, left + long, top + wide, top), aspect="auto")
+        self.axes.imshow(ramp, cmap=canvas.MOMENT_MAP, extent=(left, left + long, top + wide, top), aspect="auto")
         limit = self.picture.moment_limit * 1e6
         for share in (0.0, 0.5, 1.0):
             side = ("left", "center", "right")[round(2 * share)]

@@ -8,7 +8,7 @@ minus the distance otherwise.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -35,11 +35,7 @@ PROJECTIONS = ("perspective", "orthographic")
 
 @dataclass(frozen=True)
 class Camera:
-    """Viewpoint, projection and frame of a picture.
-
-    Raises:
-        UsageError: a view or projection is unknown, or a number lies outside its range.
-    """
+    """Viewpoint, projection and frame of a picture; what is unknown or out of range is a :class:`UsageError`."""
 
     view: str | Vector = "oblique"
     """A name of :data:`VIEWS`, or the direction from the target to the camera (world)."""
@@ -56,12 +52,12 @@ class Camera:
             raise unknown_name("view", self.view, VIEWS)
         if self.projection not in PROJECTIONS:
             raise unknown_name("projection", self.projection, PROJECTIONS)
-        if not isinstance(self.view, str):
-            _check_vector("view", self.view)
-            if not any(self.view):
-                raise UsageError("The view of a camera is a direction; (0, 0, 0) is none.")
-        if self.target is not None:
-            _check_vector("target", self.target)
+        for name, value in {"view": self.view, "target": self.target}.items():
+            given = None if isinstance(value, str) else value
+            if given is not None and (len(given) != 3 or not all(map(math.isfinite, given))):
+                raise UsageError(f"The {name} of a camera is a name or three finite numbers; received {value!r}.")
+        if not any(self.view):
+            raise UsageError("The view of a camera is a direction; (0, 0, 0) is none.")
         if self.width is not None and not (math.isfinite(self.width) and self.width > 0):
             raise UsageError(f"The width of a picture must be positive (m); received {self.width!r}.")
         if not 0 < self.field_of_view < math.pi:
@@ -163,9 +159,4 @@ class Lens:
 
     def supersampled(self, factor: int) -> Lens:
         """Return the lens for a picture with ``factor`` times as many pixels each way."""
-        return Lens(self.axes, self.target, self.width, (self.size[0] * factor, self.size[1] * factor), self.distance)
-
-
-def _check_vector(name: str, value: Vector) -> None:
-    if len(value) != 3 or not all(math.isfinite(item) for item in value):
-        raise UsageError(f"The {name} of a camera is a name or three finite numbers; received {value!r}.")
+        return replace(self, size=(self.size[0] * factor, self.size[1] * factor))

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from brainbench.core.errors import UsageError, listing, missing_dependency, nearest
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
-
     from matplotlib.figure import Figure
 
 ROW_COLORS = ("#3466ac", "#1b9aa0", "#d1495b", "#7b4fa3", "#e08e1b")
@@ -24,8 +23,7 @@ DOTS_PER_INCH = 100
 def new_figure(width: int, height: int) -> Figure:
     """Return an empty white figure of this size in pixels, bound to no display and no global state.
 
-    Raises:
-        MissingDependencyError: matplotlib is not installed.
+    Without matplotlib it is a :class:`MissingDependencyError`.
     """
     try:
         from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -52,11 +50,7 @@ def save_figure(figure: Figure, path: Path, **options: Any) -> Path:
 
 
 def check_format(path: Path, allowed: Iterable[str]) -> str:
-    """Return the lower-case suffix of ``path``.
-
-    Raises:
-        UsageError: it is none of ``allowed``.
-    """
+    """Return the lower-case suffix of ``path``; one that is not ``allowed`` is a :class:`UsageError`."""
     choices = list(allowed)
     suffix = path.suffix.lower()
     if suffix not in choices:

@@ -8,14 +8,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from brainbench.core.errors import DataError, missing_dependency
 from brainbench.core.files import atomic_path
+from brainbench.core.progress import Progress
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from brainbench.core.progress import Progress
     from brainbench.stimuli.figures.scenes import Style
 
 
@@ -71,7 +70,12 @@ def _counted(frames: Iterable[Any], count: int, progress: Progress | None) -> It
 def _write_gif(path: Path, frames: Iterable[NDArray[np.uint8]], style: Style, palette_from: Sequence[Any]) -> None:
     from PIL import GifImagePlugin, Image
 
-    palette = Image.fromarray(_sampled_colors(palette_from)).quantize(_UNCHANGED, kmeans=1, dither=Image.Dither.NONE)
+    # Half by area, half every distinct colour once: by area alone the palette would have no room for the colours of
+    # thin whiskers, without it objects change hue.
+    pixels = np.concatenate([frame.reshape(-1, 3) for frame in palette_from])
+    distinct = np.unique(pixels, axis=0)
+    sample = np.concatenate([distinct, pixels[:: max(1, len(pixels) // len(distinct))]])[None]
+    palette = Image.fromarray(sample).quantize(_UNCHANGED, kmeans=1, dither=Image.Dither.NONE)
     # A GIF counts hundredths of a second, and viewers slow down anything shorter than two.
     duration = 10 * max(2, round(100 / style.frames_per_second))
     before = None
@@ -87,16 +91,6 @@ def _write_gif(path: Path, frames: Iterable[NDArray[np.uint8]], style: Style, pa
             file.writelines(GifImagePlugin.getdata(image, duration=duration, transparency=_UNCHANGED, disposal=1))
             before = now
         file.write(b";")
-
-
-def _sampled_colors(frames: Sequence[NDArray[np.uint8]]) -> NDArray[np.uint8]:
-    """Return an image [1, n, 3] of the colours in some frames: half by area, half every distinct colour once.
-
-    By area alone the palette would have no room for the colours of thin whiskers, without it objects change hue.
-    """
-    pixels = np.concatenate([frame.reshape(-1, 3) for frame in frames])
-    distinct = np.unique(pixels, axis=0)
-    return np.concatenate([distinct, pixels[:: max(1, len(pixels) // len(distinct))]])[None]
 
 
 def _write_mp4(path: Path, frames: Iterable[NDArray[np.uint8]], style: Style, palette_from: Sequence[Any]) -> None:

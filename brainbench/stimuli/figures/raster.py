@@ -1,10 +1,8 @@
-"""A depth-buffered triangle rasteriser in NumPy.
+"""A depth-buffered triangle rasteriser in NumPy: triangles are tested against the pixels of their bounding boxes.
 
-Pictures are wanted on machines that have Python packages only. Every 3-D package on PyPI that shades and
-hides surfaces draws through OpenGL or Vulkan drivers of the system (MuJoCo's renderer, VTK, pyrender,
-pygfx), and matplotlib's 3-D axes sort whole polygons instead of pixels, so that thin whiskers show through
-objects. Deciding visibility per pixel takes one page: triangles of a few pixels are tested against the
-pixels of their bounding boxes, all triangles of one size at once. Letters: F triangle, H×W pixels.
+Pictures are wanted on machines that have Python packages only. 3-D packages draw through OpenGL or Vulkan drivers of
+the system, and matplotlib sorts whole polygons instead of pixels, so that thin whiskers show through objects.
+Letters: F triangle, H×W pixels.
 """
 
 from __future__ import annotations
@@ -55,14 +53,13 @@ class Triangles:
             done.append(rest._take(shown & ~large))
             # What reaches from before to behind the camera is cut until the rest behind it is negligible.
             partly = np.any(before, axis=1) & ~np.all(before, axis=1)
-            rest = rest._take((shown & large) | partly)._quartered()
+            rest = rest._take((shown & large) | partly)
+            quarters = (_quarter(rest.corners), _quarter(rest.normals), np.tile(rest.colors, (4, 1)))
+            rest = Triangles(*quarters)
         return Triangles.joined(done)
 
     def _take(self, chosen: NDArray[np.bool_]) -> Triangles:
         return Triangles(*(getattr(self, name)[chosen] for name in _FIELDS))
-
-    def _quartered(self) -> Triangles:
-        return Triangles(_quarter(self.corners), _quarter(self.normals), np.tile(self.colors, (4, 1)))
 
 
 @dataclass(frozen=True, eq=False)

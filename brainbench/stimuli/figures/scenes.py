@@ -43,11 +43,7 @@ _SINKS = 0.004
 
 @dataclass(frozen=True)
 class Style:
-    """Colours, size and quality of a picture of a scene.
-
-    Raises:
-        UsageError: a colouring is unknown, or a number lies outside its range.
-    """
+    """Colours, size and quality of a picture of a scene; what is out of range is a :class:`UsageError`."""
 
     color: Literal["row", "moment"] = "row"
     """Whiskers by row, or by their local elastic bending moment."""
@@ -139,13 +135,15 @@ class Picture:
         return self._cached
 
     def _whiskers(self, index: int, lens: Lens) -> Triangles:
+        from matplotlib.colors import to_rgb
+
         found = []
         recording = self.recording
         for mount, joints, moments in zip(recording.scene.mounts, recording.joints, recording.moments, strict=True):
             points = joints[index]
             if not np.isfinite(points).all():
                 continue
-            row = _rgb(ROW_COLORS[mount.row])
+            row = np.array(to_rgb(ROW_COLORS[mount.row]))
             along = np.column_stack([points, np.linspace(0.0, 1.0, len(points)), moments[index]])
             *line, share, bending = smoothed(along, _PER_LINK).T
             line = np.stack(line, axis=-1)
@@ -271,8 +269,3 @@ def film_times(scene: Scene, start: float = 0.0, stop: float | None = None, step
     if count > 10_000:
         raise UsageError(f"A film of {count:,} frames is refused (at most 10,000); choose longer steps.")
     return [start + step * index for index in range(count)]
-
-
-def _rgb(color: str) -> NDArray[np.float64]:
-    """Return the red, green and blue from 0 to 1 of a colour written #rrggbb."""
-    return np.array([int(color[at : at + 2], 16) for at in (1, 3, 5)]) / 255

@@ -139,9 +139,7 @@ def ball(centre: ArrayLike, radius: float, color: ArrayLike) -> Triangles:
 
     unit = creation.icosphere(subdivisions=2)
     normals = np.asarray(unit.vertices)[np.asarray(unit.faces)]
-    return Triangles(
-        radius * normals + np.asarray(centre), normals, np.broadcast_to(np.asarray(color), (len(normals), 3))
-    )
+    return Triangles(radius * normals + np.asarray(centre), normals, np.broadcast_to(color, (len(normals), 3)))
 
 
 def smoothed(values: NDArray[np.float64], per_link: int) -> NDArray[np.float64]:

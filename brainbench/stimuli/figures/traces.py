@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from brainbench.core.contracts import CHANNELS, GRID_SHAPE, check_stimulus_set
 from brainbench.core.errors import UsageError, unknown_name
@@ -19,7 +20,6 @@ if TYPE_CHECKING:
     import xarray as xr
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
-    from numpy.typing import NDArray
 
 FORMATS = (".png", ".svg", ".pdf")
 QUANTITIES = {
@@ -73,16 +73,15 @@ def plot(
     if stimulus is not None and stimulus not in labels:
         raise unknown_name("stimulus", stimulus, labels)
     dataset = _within(dataset, window)
-    limit = _limit(dataset, channel)
+    largest = float(np.nanmax(np.abs(_values(dataset, channel)), initial=0.0))
+    limit = round_up(largest) if largest else 1.0
     chosen = labels if stimulus is None else [stimulus]
     several = len(chosen) > 1
-    return tuple(
-        save_figure(
-            _figure(dataset.isel(stimulus=labels.index(label)), label, channel, limit, size),
-            path.with_name(f"{path.stem}-{_file_part(label)}{path.suffix}") if several else path,
-        )
-        for label in chosen
-    )
+    names = [re.sub(r"[^\w.+-]+", "_", label) for label in chosen]
+    paths = [path.with_name(f"{path.stem}-{name}{path.suffix}") if several else path for name in names]
+    for label, one in zip(chosen, paths, strict=True):
+        save_figure(_figure(dataset.isel(stimulus=labels.index(label)), label, channel, limit, size), one)
+    return tuple(paths)
 
 
 def check_channel(channel: str) -> None:
@@ -111,41 +110,23 @@ def _values(dataset: xr.Dataset, channel: str) -> NDArray[np.float64]:
     return np.linalg.norm(values, axis=-1, keepdims=True) if channel in _UNITS else values
 
 
-def _limit(dataset: xr.Dataset, channel: str) -> float:
-    values = np.abs(_values(dataset, channel))
-    largest = float(np.nanmax(values, initial=0.0))
-    return round_up(largest) if largest else 1.0
-
-
 def _figure(stimulus: xr.Dataset, label: str, channel: str, limit: float, size: tuple[int, int]) -> Figure:
     figure = new_figure(*size)
     rows, cols = GRID_SHAPE
     unit = size[0] / 1600
     points = 0.72 * unit
-    left, right, top, bottom = 0.055, 0.99, 0.885, 0.075
-    panels: Any = figure.subplots(
-        rows,
-        cols,
-        sharex=True,
-        sharey=True,
-        gridspec_kw={"left": left, "right": right, "top": top, "bottom": bottom, "wspace": 0.08, "hspace": 0.16},
-    )
-    cells = {
-        (int(row), int(col)): index
-        for index, (row, col) in enumerate(zip(stimulus["row"].values, stimulus["col"].values, strict=True))
-    }
+    room = {"left": 0.055, "right": 0.99, "top": 0.885, "bottom": 0.075, "wspace": 0.08, "hspace": 0.16}
+    panels: Any = figure.subplots(rows, cols, sharex=True, sharey=True, gridspec_kw=room)
+    cells = list(zip(stimulus["row"].values.tolist(), stimulus["col"].values.tolist(), strict=True))
     values = _values(stimulus, channel)
-    for row in range(rows):
-        for col in range(cols):
-            panel = panels[row, col]
-            if (row, col) not in cells:
-                panel.axis("off")
-                continue
-            _panel(
-                panel, stimulus.isel(whisker=cells[row, col]), values[:, cells[row, col]], f"{ROWS[row]}{col}", points
-            )
-            # Only panels at an edge of the layout carry numbers.
-            panel.tick_params(labelleft=(row, col - 1) not in cells, labelbottom=(row + 1, col) not in cells)
+    for (row, col), panel in np.ndenumerate(panels):
+        if (row, col) not in cells:
+            panel.axis("off")
+            continue
+        index = cells.index((row, col))
+        _panel(panel, stimulus.isel(whisker=index), values[:, index], f"{ROWS[row]}{col}", points)
+        # Only panels at an edge of the layout carry numbers.
+        panel.tick_params(labelleft=(row, col - 1) not in cells, labelbottom=(row + 1, col) not in cells)
     times = stimulus["time"].values * 1e3
     lower = 0.0 if channel in _UNITS else -limit
     panels[0, 0].set(xlim=(times[0], times[-1]), ylim=(lower - 0.04 * limit, 1.04 * limit))
@@ -188,17 +169,12 @@ def _legend(figure: Figure, label: str, channel: str, axes: str, points: float) 
     kind = "force" if channel[0] == "F" else "moment"
     unit = _UNITS[channel[0]][0]
     what = f"|{channel}|" if channel in _UNITS else ", ".join(QUANTITIES[channel])
+    about = f"{kind} of the whisker on its base, {what} ({unit}), {axes} axes"
+    usual: dict[str, Any] = {"fontsize": 16 * points}
     figure.text(0.02, 0.965, label, fontsize=26 * points, fontweight="bold", color=INK, va="center")
-    figure.text(
-        0.02,
-        0.92,
-        f"{kind} of the whisker on its base, {what} ({unit}), {axes} axes",
-        fontsize=16 * points,
-        color=PALE,
-        va="center",
-    )
-    figure.text(0.52, 0.018, "time (ms)", fontsize=16 * points, color=INK, ha="center", va="center")
-    figure.text(0.014, 0.48, f"{kind} ({unit})", fontsize=16 * points, color=INK, rotation=90, va="center", ha="center")
+    figure.text(0.02, 0.92, about, color=PALE, va="center", **usual)
+    figure.text(0.52, 0.018, "time (ms)", color=INK, ha="center", va="center", **usual)
+    figure.text(0.014, 0.48, f"{kind} ({unit})", color=INK, rotation=90, va="center", ha="center", **usual)
     colors = LINE_COLORS if channel.endswith("xyz") else (INK,)
     names: Sequence[str] = QUANTITIES[channel] if channel.endswith("xyz") else (what,)
     handles: list[Any] = [
@@ -208,8 +184,3 @@ def _legend(figure: Figure, label: str, channel: str, axes: str, points: float) 
     figure.legend(
         handles=handles, loc="upper right", bbox_to_anchor=(0.99, 0.99), ncols=4, fontsize=16 * points, frameon=False
     )
-
-
-def _file_part(label: str) -> str:
-    """Return a label as part of a file's name."""
-    return re.sub(r"[^\w.+-]+", "_", label)

@@ -15,9 +15,6 @@ def plot_tradeoff(points: Iterable[dict[str, Any]], path: str | os.PathLike[str]
     """Draw error against cost, with the front of each backend and the presets, to an image whose suffix is the format.
 
     A second panel has the collision geometries of a concave object, where the table has any.
-
-    Raises:
-        MissingDependencyError: matplotlib is not installed (extra ``report``).
     """
     measured = [{"solver": "dynamic", **point} for point in points if point["error"] is not None]
     hollow, bench = collision_points(measured), [point for point in measured if not point.get("collision")]

@@ -4,14 +4,10 @@ Files as WHISKiT Physics reads them: one line per whisker, comma separated, thre
 sample, rad/s in the axes of the array (head), 1000 samples per second. Such a file carries no names; its
 *layout* says which line is which whisker.
 
-Whiskers are matched by side and name, never by line number. (The released mouse simulation plays a rat's file by
-line number, which moves the mouse's E0–E5 as the rat's E1–E6.) A whisker of the array that the file lacks moves
+Whiskers are matched by side and name, never by line number. A whisker of the array that the file lacks moves
 as the nearest whisker of its row: E0 of the mouse as E1 of a rat file. Lines without counterpart, such as B5,
-are not used.
-
-The published sample (62 lines, 8 Hz, 45° peak to peak) was itself made with a table of fewer whiskers, so that some of
-its lines were computed for another whisker than they stand for; E3–E6 even for whiskers of the left side,
-and played on the right side they protract by up to 70°. It is played as it is.
+are not used. The published sample (62 lines, 8 Hz, 45° peak to peak) is played as it is: some of its lines were
+computed for another whisker than they stand for.
 
 Letters: W whisker, n sample.
 """
@@ -74,12 +70,7 @@ class Trajectory:
 
     def __post_init__(self) -> None:
         velocity = np.array(self.velocity, dtype=float)
-        if (
-            velocity.ndim != 3
-            or velocity.shape[0] != len(self.names)
-            or velocity.shape[2] != 3
-            or velocity.shape[1] < 2
-        ):
+        if velocity.shape[::2] != (len(self.names), 3) or velocity.ndim != 3 or velocity.shape[1] < 2:
             raise DataError(
                 f"A trajectory of {len(self.names)} whiskers needs velocities [{len(self.names)}, n, 3] with at least "
                 f"two samples; received an array of shape {velocity.shape}."
@@ -174,11 +165,7 @@ class Recorded:
     """Starting angles (θ, φ, ζ) [rad] by side and name (``RC2``), as :func:`load_initial_angles` reads them."""
 
     def line(self, mount: MountedWhisker) -> str:
-        """Return the name of the line that moves ``mount``; see the module for the rule.
-
-        Raises:
-            UsageError: the trajectory has no whisker of this row and side.
-        """
+        """Return the name of the line that moves ``mount`` (see the module); none is a :class:`UsageError`."""
         name = mount.full_name
         if name in self.trajectory.names:
             return name
@@ -235,7 +222,7 @@ def load_trajectory(path: str | os.PathLike[str], *, layout: str | None = None, 
         UsageError: the layout is unknown, or must be given because the lines could be a rat's or a mouse's.
         DataError: the file is missing, or its lines are not whiskers of equally many velocities.
     """
-    table = _read_table(path)
+    table = read_numbers(path)
     if table.shape[1] % 3:
         raise DataError(
             f"{os.fspath(path)!r} has {table.shape[1]} numbers per line; velocities come in threes (ωx, ωy, ωz)."
@@ -247,10 +234,9 @@ def load_trajectory(path: str | os.PathLike[str], *, layout: str | None = None, 
 def load_initial_angles(path: str | os.PathLike[str], *, layout: str | None = None) -> dict[str, Vector]:
     """Read starting angles (θ, φ, ζ) [rad] by whisker (``RC2``), as in WHISKiT's ``whisking_init_angle.csv``.
 
-    Raises:
-        UsageError, DataError: as :func:`load_trajectory`.
+    Errors are those of :func:`load_trajectory`.
     """
-    table = _read_table(path)
+    table = read_numbers(path)
     if table.shape[1] != 3:
         raise DataError(
             f"{os.fspath(path)!r} has {table.shape[1]} numbers per line; starting angles are three (θ, φ, ζ)."
@@ -276,18 +262,14 @@ def _names(path: str | os.PathLike[str], lines: int, layout: str | None) -> tupl
     return LAYOUTS[layout]
 
 
-def _read_table(path: str | os.PathLike[str]) -> NDArray[np.float64]:
-    if not Path(path).is_file():
-        raise DataFileNotFoundError(f"There is no file {os.fspath(path)!r}.")
-    return read_numbers(path)
-
-
 def read_numbers(path: str | os.PathLike[str]) -> NDArray[np.float64]:
     """Return the numbers [line, column] of a comma-separated file; lines may end with a comma.
 
     Raises:
-        DataError: something is no number, or lines differ in length.
+        DataError: there is no such file, something is no number, or lines differ in length.
     """
+    if not Path(path).is_file():
+        raise DataFileNotFoundError(f"There is no file {os.fspath(path)!r}.")
     try:
         lines = Path(path).read_text(encoding="utf-8").split("\n")
         rows = [[float(cell) for cell in line.rstrip(",\r ").split(",")] for line in lines if line.strip()]

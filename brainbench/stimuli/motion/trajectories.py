@@ -8,14 +8,15 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from brainbench.core.errors import UsageError
+from brainbench.stimuli.engines.protocol import base_rotation
+from brainbench.stimuli.motion.hinge_angles import follow_angles
+from brainbench.stimuli.whiskers.array import MountedWhisker
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
     from brainbench.stimuli.motion.recorded import Recorded
-    from brainbench.stimuli.whiskers.array import MountedWhisker
 
 Vector = tuple[float, float, float]
 
@@ -56,10 +57,6 @@ class _Motion:
 @dataclass(frozen=True)
 class Still(_Motion):
     """Nothing moves."""
-
-    def azimuth(self, times: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return zeros [n]."""
-        return np.zeros(len(times))
 
     def angles(self, mount: MountedWhisker, times: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the rest angles (θ, φ, ζ) [n, 3] of one whisker."""
@@ -204,21 +201,13 @@ class Path(_Motion):
         object.__setattr__(self, "times", tuple(times.tolist()))
 
     def displacement(self, times: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return how far the origin has moved, [n, 3] (m, world).
-
-        Raises:
-            UsageError: a time lies beyond the last keyframe.
-        """
+        """Return how far the origin has moved, [n, 3] (m, world); no time may lie beyond the last keyframe."""
         from scipy.interpolate import CubicSpline
 
         return CubicSpline(self.times, self.displacements, bc_type="natural")(self._within(times))
 
     def turn(self, times: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return how far the body has turned, rotation matrices [n, 3, 3] in world axes.
-
-        Raises:
-            UsageError: a time lies beyond the last keyframe.
-        """
+        """Return how far the body has turned, rotation matrices [n, 3, 3] in world axes; times as above."""
         from scipy.spatial.transform import Rotation, RotationSpline
 
         spline = RotationSpline(self.times, Rotation.from_euler("xyz", self.rotations))
@@ -249,29 +238,21 @@ class ArrayFollicle:
     def pose(self, times: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return positions [n, 3] (m) and Euler angles (θ, φ, ζ) [n, 3] (rad).
 
-        Raises:
-            UsageError: the head turns a whisker upright, where these angles lose their meaning.
+        A head that turns a whisker upright, where these angles lose their meaning, is a :class:`UsageError`.
         """
         times = np.asarray(times, dtype=float)
         position = np.tile(np.array(self.mount.position), (len(times), 1))
         angles = self.whisking.angles(self.mount, times)
         if self.turn is not None:
-            position = self.turn(times) @ np.array(self.mount.position)
-            angles = self._turned(self.turn, times)
+            turn, whisking = self.turn, self.whisking
+            position = turn(times) @ np.array(self.mount.position)
+            first = whisking.angles(self.mount, np.zeros(1))[0]
+            angles = follow_angles(
+                lambda t: turn(t) @ base_rotation(whisking.angles(self.mount, t)), times, first, self.mount.name
+            )
         if self.travel is not None:
             position = position + self.travel(times)
         return position, angles
-
-    def _turned(
-        self, turn: Callable[[NDArray[np.float64]], NDArray[np.float64]], times: NDArray[np.float64]
-    ) -> NDArray[np.float64]:
-        from brainbench.stimuli.engines.protocol import base_rotation
-        from brainbench.stimuli.motion.hinge_angles import follow_angles
-
-        first = self.whisking.angles(self.mount, np.zeros(1))[0]
-        return follow_angles(
-            lambda t: turn(t) @ base_rotation(self.whisking.angles(self.mount, t)), times, first, self.mount.name
-        )
 
 
 def smooth_step(times: NDArray[np.float64], duration: float) -> NDArray[np.float64]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import ClassVar, Self
@@ -211,6 +211,12 @@ class Box(_Primitive):
 Part = ConvexPart | Sphere | Capsule | Cylinder | Box
 
 
+def bounds_of(bodies: Iterable[Part | TriangleMesh]) -> NDArray[np.float64]:
+    """Return the lowest and highest corner [2, 3] (m) of some bodies."""
+    corners = np.stack([body.bounds() for body in bodies])
+    return np.stack([corners[:, 0].min(axis=0), corners[:, 1].max(axis=0)])
+
+
 @dataclass(frozen=True)
 class Obstacle:
     """A rigid body made of parts that a whisker may touch.
@@ -240,3 +246,8 @@ class Obstacle:
             raise UsageError("An obstacle needs at least one part or a surface.")
         if self.friction is not None and not (math.isfinite(self.friction) and self.friction >= 0):
             raise UsageError(f"friction of an obstacle must be zero or more; received {self.friction!r}.")
+
+    @property
+    def bounds(self) -> NDArray[np.float64]:
+        """Lowest and highest corner [2, 3] (m) of what is touched, in the frame of the obstacle."""
+        return bounds_of(self.parts if self.surface is None else (self.surface,))

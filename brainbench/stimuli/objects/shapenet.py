@@ -1,9 +1,7 @@
 """Objects from a local ShapeNet tree: ``<synset>/<model>/models/model_normalized.obj`` under one folder.
 
-ShapeNet itself must be obtained from its makers (https://shapenet.org); nothing of it is shipped here. Its
-meshes carry no unit and many are open or inside out: each is repaired as far as possible when it is loaded,
-and scaled to the diagonal that is asked for. Without it, :mod:`brainbench.stimuli.objects.procedural` makes labelled
-shapes.
+ShapeNet itself must be obtained from its makers (https://shapenet.org). Its meshes carry no unit and many are open or
+inside out: each is repaired as far as possible when it is loaded, and scaled to the diagonal that is asked for.
 """
 
 from __future__ import annotations

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from brainbench.core.errors import UsageError
 from brainbench.core.files import content_hash, to_plain
 from brainbench.geometry import Mesh
-from brainbench.stimuli.objects.obstacle import ConvexPart, Part, TriangleMesh
+from brainbench.stimuli.objects.obstacle import ConvexPart, Part, TriangleMesh, bounds_of
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,9 +39,7 @@ class Solid:
         """Lowest and highest corner [2, 3] (m)."""
         if self.mesh is not None:
             return self.mesh.bounds
-        bodies = self.parts if self.surface is None else (self.surface,)
-        corners = np.stack([body.bounds() for body in bodies])
-        return np.stack([corners[:, 0].min(axis=0), corners[:, 1].max(axis=0)])
+        return bounds_of(self.parts if self.surface is None else (self.surface,))
 
     @property
     def diagonal(self) -> float:

@@ -28,11 +28,10 @@ _ORDER = 4
 class Frames:
     """Times at which forces are read, and the rule that makes a frame of readings.
 
-    The default reads 110 instantaneous frames, 9 ms apart, the first at 1 ms, as the published pipeline
-    does (every ninth sample of a 1 kHz simulation). Whatever vibrates above 1/(2·interval) = 56 Hz then
-    aliases, and a sliding tip does: the RDM of the six Rodgers stimuli at the presets ``balanced`` and
-    ``accurate`` correlates by .90. With ``average`` = 18, each frame the mean of 18 readings, by .995. A mean
-    still lets some aliases through; ``lowpass`` stops them with a Butterworth filter.
+    The default reads 110 instantaneous frames, 9 ms apart, the first at 1 ms, as the published pipeline does. Whatever
+    vibrates above 1/(2·interval) = 56 Hz then aliases, and a sliding tip does: the RDM of the six Rodgers stimuli at
+    the presets ``balanced`` and ``accurate`` correlates by .90, with ``average`` = 18 by .995. A mean still lets some
+    aliases through; ``lowpass`` stops them with a Butterworth filter.
 
     Raises:
         UsageError: a value is outside its range; the filter's cut-off lies above half the frame rate, where it

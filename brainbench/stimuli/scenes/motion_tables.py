@@ -37,20 +37,12 @@ _SINUSOID: Keys = {
 
 
 def read_head_motion(table: TomlTable) -> Still | Translation | trajectories.Path:
-    """Return how a head moves: a velocity, keyframes, or not at all.
-
-    Raises:
-        UsageError: there are keyframes and a velocity, or keyframes without times.
-    """
+    """Return how a head moves: a velocity, keyframes, or not at all; both are a :class:`UsageError`."""
     return _only(table, "a velocity or keyframes", _smooth(table, Translation, _TRANSLATION), _keyframes(table))
 
 
 def read_object_motion(table: TomlTable) -> Still | Translation | Spin | trajectories.Path:
-    """Return how an object moves: a velocity, a spin, keyframes, or not at all.
-
-    Raises:
-        UsageError: there are several of these, or keyframes without times.
-    """
+    """Return how an object moves: a velocity, a spin, keyframes, or not at all; several are a :class:`UsageError`."""
     steady = _smooth(table, Translation, _TRANSLATION), _smooth(table, Spin, _SPIN)
     return _only(table, "a velocity, a spin or keyframes", *steady, _keyframes(table))
 
@@ -93,11 +85,8 @@ def _recorded(table: TomlTable, folder: Path, rotations: Rotations) -> Recorded:
 
     layout = table.take("layout", text, None)
     initial = table.take("initial_path", text, None)
+    angles = {} if initial is None else load_initial_angles(folder / initial, layout=layout)
     file: Keys = {"path": ("path", lambda name: folder / text(name)), "rate": ("rate_hz", number())}
-    return table.build(
-        Recorded,
-        {"start": ("start_deg", number(DEGREE))},
-        trajectory=table.build(load_trajectory, file, layout=layout),
-        rotations=rotations,
-        initial={} if initial is None else load_initial_angles(folder / initial, layout=layout),
-    )
+    played = table.build(load_trajectory, file, layout=layout)
+    start: Keys = {"start": ("start_deg", number(DEGREE))}
+    return table.build(Recorded, start, trajectory=played, rotations=rotations, initial=angles)

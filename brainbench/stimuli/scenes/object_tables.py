@@ -41,12 +41,8 @@ def read_object(table: TomlTable, folder: Path) -> PlacedObject:
         UsageError: a key is unknown, missing or of the wrong kind, or the shape is unknown.
         DataError: a mesh file is missing or unreadable.
     """
-    placed = table.build(
-        PlacedObject,
-        {**PLACE, "friction": ("friction", number())},
-        solid=_solid(table, folder),
-        motion=read_object_motion(table),
-    )
+    made = {"solid": _solid(table, folder), "motion": read_object_motion(table)}
+    placed = table.build(PlacedObject, {**PLACE, "friction": ("friction", number())}, **made)
     table.finish()
     return placed
 

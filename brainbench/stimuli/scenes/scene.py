@@ -40,11 +40,7 @@ class Head:
 
     def config(self) -> dict[str, Any]:
         """Return plain values that determine the physics."""
-        return {
-            "position": list(self.position),
-            "rotation": list(self.rotation),
-            "motion": self.motion.config(),
-        }
+        return {"position": list(self.position), "rotation": list(self.rotation), "motion": self.motion.config()}
 
 
 @dataclass(frozen=True, eq=False)

@@ -77,11 +77,28 @@ class TomlTable:
             raise unknown_name(f"key of {self.name}", key, sorted(self._known))
 
 
-def text(value: Any) -> str:
-    """Return a text."""
-    if not isinstance(value, str):
-        raise TypeError("a text")
-    return value
+def _converter(kind: str, fits: Callable[[Any], bool], convert: Callable[[Any], Any] = lambda value: value) -> Convert:
+    """Return a converter of values that fit; for others it raises a TypeError that says what they must be."""
+
+    def checked(value: Any) -> Any:
+        if not fits(value):
+            raise TypeError(kind)
+        return convert(value)
+
+    return checked
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
+
+
+text = _converter("a text", lambda value: isinstance(value, str))
+whole = _converter("a whole number", lambda value: isinstance(value, int) and not isinstance(value, bool))
+mapping = _converter("a table", lambda value: isinstance(value, dict))
+tables = _converter(
+    "a list of tables in double brackets",
+    lambda value: isinstance(value, list) and all(isinstance(item, dict) for item in value),
+)
 
 
 def choice(kind: str, options: Collection[str]) -> Convert:
@@ -95,56 +112,18 @@ def choice(kind: str, options: Collection[str]) -> Convert:
     return convert
 
 
-def whole(value: Any) -> int:
-    """Return a whole number."""
-    if not isinstance(value, int) or isinstance(value, bool):
-        raise TypeError("a whole number")
-    return value
-
-
-def number(factor: float = 1.0) -> Callable[[Any], float]:
+def number(factor: float = 1.0) -> Convert:
     """Return a converter of finite numbers, which multiplies by ``factor``."""
-
-    def convert(value: Any) -> float:
-        if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
-            raise TypeError("a finite number")
-        return value * factor
-
-    return convert
+    return _converter("a finite number", _is_number, lambda value: value * factor)
 
 
-def listed(item: Convert) -> Callable[[Any], tuple[Any, ...]]:
+def listed(item: Convert) -> Convert:
     """Return a converter of lists of ``item``."""
-
-    def convert(value: Any) -> tuple[Any, ...]:
-        if not isinstance(value, list):
-            raise TypeError("a list")
-        return tuple(map(item, value))
-
-    return convert
+    return _converter("a list", lambda value: isinstance(value, list), lambda value: tuple(map(item, value)))
 
 
-def vector(factor: float) -> Callable[[Any], tuple[float, float, float]]:
+def vector(factor: float) -> Convert:
     """Return a converter of three numbers, which multiplies by ``factor``."""
-
-    def convert(value: Any) -> tuple[float, float, float]:
-        if not isinstance(value, list) or len(value) != 3:
-            raise TypeError("three numbers in brackets")
-        x, y, z = map(number(factor), value)
-        return x, y, z
-
-    return convert
-
-
-def mapping(value: Any) -> Mapping[str, Any]:
-    """Return a table."""
-    if not isinstance(value, dict):
-        raise TypeError("a table")
-    return value
-
-
-def tables(value: Any) -> list[Mapping[str, Any]]:
-    """Return a list of tables."""
-    if not isinstance(value, list) or not all(isinstance(item, dict) for item in value):
-        raise TypeError("a list of tables in double brackets")
-    return value
+    three = "three numbers in brackets"
+    fits = _converter(three, lambda value: isinstance(value, list) and len(value) == 3, tuple)
+    return lambda value: tuple(map(number(factor), fits(value)))

@@ -19,6 +19,7 @@ from brainbench.core.errors import UsageError, unknown_name
 from brainbench.core.files import content_hash
 from brainbench.core.rotations import euler_matrix
 from brainbench.stimuli.motion.trajectories import Still, Translation
+from brainbench.stimuli.objects.obstacle import bounds_of
 from brainbench.stimuli.objects.placed_object import PlacedObject
 from brainbench.stimuli.objects.solid import Solid
 from brainbench.stimuli.scenes.frames import Frames
@@ -77,14 +78,9 @@ class Sweep:
     @property
     def label(self) -> str:
         """Conditions in mm, degrees and mm/s, in the manner of the released folders: ``n0_h-5_d5_t30_v30_s40``."""
-        values = {
-            "h": self.height * 1e3,
-            "d": self.distance * 1e3,
-            "t": math.degrees(self.rotation),
-            "v": self.speed * 1e3,
-            "s": self.size * 1e3,
-        }
-        return "_".join([f"n{self.draw}", *(f"{key}{round(value, 6) + 0.0:g}" for key, value in values.items())])
+        lengths = {"h": self.height, "d": self.distance, "v": self.speed, "s": self.size}
+        values = {key: value * 1e3 for key, value in lengths.items()} | {"t": math.degrees(self.rotation)}
+        return "_".join([f"n{self.draw}", *(f"{key}{round(values[key], 6) + 0.0:g}" for key in "hdtvs")])
 
 
 @dataclass(frozen=True)
@@ -220,7 +216,5 @@ def _turned_bounds(solid: Solid, rotation: NDArray[np.float64]) -> NDArray[np.fl
     """Return lowest and highest corner [2, 3] (m) of the solid turned about its origin."""
     if solid.mesh is not None:
         return solid.mesh.transformed(rotation).bounds
-    if solid.surface is not None:
-        return solid.surface.moved(rotation, np.zeros(3)).bounds()
-    corners = np.stack([part.moved(rotation, np.zeros(3)).bounds() for part in solid.parts])
-    return np.stack([corners[:, 0].min(axis=0), corners[:, 1].max(axis=0)])
+    bodies = solid.parts if solid.surface is None else (solid.surface,)
+    return bounds_of(body.moved(rotation, np.zeros(3)) for body in bodies)

@@ -22,11 +22,7 @@ _COUNTS = ("steps", "steps_in_full", "retried", "unstable", "unusable")
 
 
 def is_complete(path: Path, task: ShardTask) -> bool:
-    """Return whether the file of a shard is there and complete.
-
-    Raises:
-        DataError: it is a shard of another data set.
-    """
+    """Return whether the file of a shard is there and complete; a shard of another data set is a :class:`DataError`."""
     import h5py
 
     if not path.is_file():

@@ -31,11 +31,7 @@ GPU_SHARD = 2048
 
 @dataclass(frozen=True)
 class GenerationSettings:
-    """Options of a data set of sweeps.
-
-    Raises:
-        UsageError: a value lies outside its range.
-    """
+    """Options of a data set of sweeps; a value outside its range is a :class:`UsageError`."""
 
     fidelity: Fidelity
     backend: str = DEFAULT_ENGINE
@@ -111,11 +107,7 @@ class ShardTask:
 
 @dataclass(frozen=True, eq=False)
 class GenerationPlan:
-    """The shards of a data set.
-
-    Raises:
-        UsageError: there is no object, or the whisker selection names none.
-    """
+    """The shards of a data set, which needs an object."""
 
     recipe: str
     """Name of the grid, for people."""

@@ -28,8 +28,7 @@ AHEAD = 4
 def run_here(tasks: Sequence[ShardTask], folder: Path, workers: int | None, done: Done) -> None:
     """Make shards on a pool of processes, or one after the other through a GPU; call ``done`` after each.
 
-    Raises:
-        DataError: a process died.
+    A process that died is a :class:`DataError`.
     """
     count = workers or usable_processors()
     try:

@@ -62,17 +62,15 @@ def make_shard(task: ShardTask, folder: str, workers: int | None = None) -> int:
 
 def prepare_shard(task: ShardTask) -> PreparedShard:
     """Build the objects of a shard and list its sweeps."""
-    solids: list[Solid | None] = []
-    reasons = []
+    built: list[tuple[Solid | None, str]] = []
     for item in task.objects:
         try:
-            solids.append(item.load())
-            reasons.append("")
+            built.append((item.load(), ""))
         except (DataError, UsageError) as error:
-            solids.append(None)
-            reasons.append(str(error) or type(error).__name__)
+            built.append((None, str(error) or type(error).__name__))
+    solids, reasons = zip(*built, strict=True)
     hashes = ["" if solid is None else _hash_solid(solid) for solid in solids]
-    return PreparedShard(tuple(solids), tuple(reasons), {**_tables(task, hashes), **_conditions(task)})
+    return PreparedShard(solids, reasons, {**_tables(task, hashes), **_conditions(task)})
 
 
 def simulate_shard(task: ShardTask, prepared: PreparedShard, workers: int | None = None) -> ShardContent:
@@ -85,7 +83,7 @@ def simulate_shard(task: ShardTask, prepared: PreparedShard, workers: int | None
     contact = np.zeros((len(task), whiskers), dtype=np.float32)
     status = np.full((len(task), whiskers), UNUSABLE, dtype=np.uint8)
     reasons = [prepared.reasons[owner] for owner in task.owner.tolist()]
-    steps = steps_in_full = retried = 0
+    counts: dict[str, int] = dict.fromkeys(("steps", "steps_in_full", "retried"), 0)
     wrench = np.empty((0, *shape[1:]), dtype=np.float32)
     if len(chosen):
         named = {task.objects[owner].name: solid for owner in place if (solid := prepared.solids[owner])}
@@ -103,7 +101,7 @@ def simulate_shard(task: ShardTask, prepared: PreparedShard, workers: int | None
         contact[chosen], status[chosen] = batch.contact, np.where(batch.unstable, UNSTABLE, OK)
         for index, reason in zip(chosen.tolist(), batch.reasons, strict=True):
             reasons[index] = reason
-        steps, steps_in_full, retried = batch.steps, batch.steps_in_full, batch.retried
+        counts = {name: getattr(batch, name) for name in counts}
         wrench = batch.wrench
     if len(chosen) < len(task):
         known, wrench = wrench, np.full(shape, np.nan, dtype=np.float32)
@@ -123,9 +121,7 @@ def simulate_shard(task: ShardTask, prepared: PreparedShard, workers: int | None
         # An attribute has room for 64 kB; thousands of classes stand in the table of that name.
         "config": to_json({key: item for key, item in task.config.items() if key != "classes"}, indent=None),
         "config_hash": task.config_hash,
-        "steps": steps,
-        "steps_in_full": steps_in_full,
-        "retried": retried,
+        **counts,
         "unstable": int((status == UNSTABLE).any(axis=1).sum()),
         "unusable": int((status == UNUSABLE).any(axis=1).sum()),
     }

@@ -1,7 +1,7 @@
 """Passive sweeps: objects brush past a still array, or the array past them, over the conditions of a grid.
 
-The two grids of the thesis (chapter 3, table 3.1) are :data:`GRIDS`. Nothing is built or simulated until a
-scene is asked for: 9981 objects × 208 sweeps are a few numbers and a list of names.
+The two grids of the thesis (chapter 3, table 3.1) are :data:`GRIDS`. Nothing is built or simulated until a scene is
+asked for.
 """
 
 from __future__ import annotations
@@ -152,8 +152,6 @@ GRIDS: dict[str, SweepGrid] = {
     ),
 }
 """The published grids, with the released head, start and frame times.
-
-``thesis-low``: 1000 Hz, 30 mm/s, heights −5 and 0 mm, rotations 0, 30, 90, 120°, distances 5 and 8 mm, 40 mm.
 
 ``thesis-high``: 26 draws per object of speed (30–60 mm/s), size (20–60 mm) and rotation (0–89°, in whole mm/s, mm
 and degrees, as the released scripts draw them), each at the four quarter turns and at two of the three heights

@@ -44,12 +44,12 @@ class BenchTest:
     @property
     def force_error(self) -> float:
         """Length of the force difference over the length of the reference force."""
-        return float(np.linalg.norm(self.wrench[:3] - self.reference[:3]) / np.linalg.norm(self.reference[:3]))
+        return _relative(self.wrench[:3], self.reference[:3])
 
     @property
     def moment_error(self) -> float:
         """Length of the moment difference over the length of the reference moment."""
-        return float(np.linalg.norm(self.wrench[3:] - self.reference[3:]) / np.linalg.norm(self.reference[3:]))
+        return _relative(self.wrench[3:], self.reference[3:])
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,16 +66,10 @@ class PointLoad(BenchTest):
 class Ringdown:
     """Free vibration after a small tip load is let go."""
 
-    frequency: float
-    """Measured undamped frequency of the first mode (Hz)."""
-    damping_ratio: float
-    """Measured damping ratio of the first mode."""
-    reference_frequency: float
-    """Euler-Bernoulli frequency of the first mode (Hz)."""
     frequencies: NDArray[np.float64]
-    """[m] measured undamped frequencies of the lowest modes (Hz); the first is :attr:`frequency`."""
+    """[m] measured undamped frequencies of the lowest modes (Hz)."""
     damping_ratios: NDArray[np.float64]
-    """[m] their measured damping ratios; the first is :attr:`damping_ratio`, the others were set to .05."""
+    """[m] their measured damping ratios; those of all but the first were set to .05."""
     reference_frequencies: NDArray[np.float64]
     """[m] Euler-Bernoulli frequencies (Hz)."""
     times: NDArray[np.float64]
@@ -84,8 +78,23 @@ class Ringdown:
     """[n, 6] base wrench during the ring-down; its last row is at rest."""
 
     @property
+    def frequency(self) -> float:
+        """Measured undamped frequency of the first mode (Hz)."""
+        return float(self.frequencies[0])
+
+    @property
+    def damping_ratio(self) -> float:
+        """Measured damping ratio of the first mode."""
+        return float(self.damping_ratios[0])
+
+    @property
+    def reference_frequency(self) -> float:
+        """Euler-Bernoulli frequency of the first mode (Hz)."""
+        return float(self.reference_frequencies[0])
+
+    @property
     def frequency_error(self) -> float:
-        """Relative error of the frequency (signed)."""
+        """Relative error of the first frequency (signed)."""
         return self.frequency / self.reference_frequency - 1
 
     @property
@@ -130,21 +139,14 @@ def point_load(
     if force == 0 or not math.isfinite(force):
         raise UsageError(f"force must be a finite number of newtons other than zero; received {force!r}.")
     expected = references.point_load_deflection(whisker, force, at)
-    fidelity = Fidelity.of(fidelity)
     job = replace(_at_rest(whisker, np.array([_settling_time(whisker)])), loads=(Load(at, (0.0, force, 0.0)),))
     trace = _run(backend, job, fidelity)
     assert trace.link_positions is not None
     links = trace.link_positions.shape[1] - 1
     place = at / whisker.arc_length * links
     deflection = float(np.interp(place, np.arange(links + 1), trace.link_positions[-1, :, 1]))
-    return PointLoad(
-        wrench=trace.wrench[-1],
-        reference=np.array([0.0, force, 0.0, 0.0, 0.0, force * at]),
-        contact_arc=at,
-        trace=trace,
-        deflection=deflection,
-        reference_deflection=expected,
-    )
+    reference = np.array([0.0, force, 0.0, 0.0, 0.0, force * at])
+    return PointLoad(trace.wrench[-1], reference, at, trace, deflection, expected)
 
 
 def peg(
@@ -171,7 +173,6 @@ def peg(
     if offset == 0:
         raise UsageError("The peg test needs an offset other than zero.")
     contact = references.elastica(whisker, at, offset)
-    fidelity = Fidelity.of(fidelity)
     end = np.array(references.peg_centre(whisker, contact, peg_radius))
     # Straight below the end point, touching the undeformed rod.
     start = np.array([end[0], -math.copysign(peg_radius + float(whisker.radius(end[0])), offset)])
@@ -194,16 +195,15 @@ def slip_off(
     """Raise a frictionless round peg at distance ``at`` (m) from the base until the whisker slips off it.
 
     The peg moves slowly and straight towards +y from touching the undeformed whisker; no gravity. It carries a
-    flange on either side, as a pulley does, which keeps the whisker in the plane of the elastica. Bent round a bare
-    rod by 90° at the contact, a whisker may turn about the axis of its base at no cost of energy; beyond 90°, as
-    before most slip-offs at small ``at``, that pays, and any disturbance makes it swing out sideways.
+    flange on either side, as a pulley does, which keeps the whisker in the plane of the elastica: bent by more than 90°
+        at
+    the contact, as before most slip-offs at small ``at``, it would swing out sideways.
 
     Raises:
         UsageError: the whisker is curved, or ``at`` lies beyond it.
         DataError: the simulation was unstable, or the whisker was still held an eighth beyond the reference depth.
     """
     _check_peg(whisker, peg_radius)
-    fidelity = Fidelity.of(fidelity)
     touch = -(peg_radius + float(whisker.radius(at)))
     expected = references.slip_off_offset(whisker, at, peg_radius=peg_radius) - touch
     settling = _settling_time(whisker)
@@ -236,15 +236,13 @@ def ringdown(
 ) -> Ringdown:
     """Let a bent whisker go and fit its lowest modes.
 
-    First mode, with the whisker's damping and the fidelity's time step: a tip load bends it by ``deflection``
-    (fraction of the arc length, small), settles, and vanishes; a decaying sinusoid is fitted to the base moment
-    after the higher modes have died. Modes 2 … ``modes`` would not ring with the whisker's own damping, which is
-    proportional to stiffness, and the presets' steps are not made for them. Each is rung alone, by loads
-    that bend the chain in its shape, with damping ratio .05 and at most 1/100 of its period per step, and read
-    at the tip: these frequencies test the chain of links, not the time step. With ``own_step`` the higher modes keep
-    the fidelity's step too, and what rings then shows what that step makes of them; a mode of fewer than six steps per
-    period is damped away within one of them and counts as NaN. (A backward Euler step h turns an undamped mode ω
-    into one of frequency |ln(1 + i ω h)|/h, damped by the ratio ln(1 + ω² h²)/(2 |ln(1 + i ω h)|).)
+    First mode, with the whisker's damping and the fidelity's time step: a tip load bends it by ``deflection`` (fraction
+    of the arc length, small), settles, and vanishes; a decaying sinusoid is fitted to the base moment after the higher
+    modes have died. Modes 2 … ``modes`` would not ring with the whisker's own damping. Each is rung alone, by loads
+    that bend the chain in its shape, with damping ratio .05 and at most 1/100 of its period per step, and read at the
+    tip: these frequencies test the chain of links, not the time step. With ``own_step`` they keep the fidelity's step
+    too, and show what it makes of them: a backward Euler step h turns an undamped mode ω into one of frequency |ln(1 +
+    i ω h)|/h with damping ratio ln(1 + ω² h²)/(2 |ln(1 + i ω h)|). A mode of fewer than six steps counts as NaN.
 
     Raises:
         UsageError: the whisker is curved, its damping ratio is not between 0 and 1, so nothing rings, or ``modes``
@@ -265,30 +263,15 @@ def ringdown(
     step = fidelity.step(expected)
     release = math.ceil(release / step) * step
     times = release + np.arange(1.0, math.ceil(10 / (whisker.damping_ratio * 2 * math.pi * expected) / step)) * step
-    job = Job(
-        whisker,
-        StillFollicle(),
-        (),
-        times,
-        loads=(Load(whisker.arc_length, (0.0, force, 0.0), stop=release - step / 2),),
-    )
-    trace = _run(backend, job, fidelity)
+    load = Load(whisker.arc_length, (0.0, force, 0.0), stop=release - step / 2)
+    trace = _run(backend, Job(whisker, StillFollicle(), (), times, loads=(load,)), fidelity)
     times = times - release
     # Stiffness-proportional damping kills the second mode much sooner: one period is enough.
     kept = times > 1 / expected
     fits = [_fit_decay(times[kept], trace.wrench[kept, 5], expected, whisker.damping_ratio)]
     fits += [_ring_mode(whisker, mode, references_hz, backend, fidelity, own_step) for mode in range(1, modes)]
     frequencies, ratios = np.array(fits).T
-    return Ringdown(
-        frequency=fits[0][0],
-        damping_ratio=fits[0][1],
-        reference_frequency=expected,
-        frequencies=frequencies,
-        damping_ratios=ratios,
-        reference_frequencies=references_hz,
-        times=times,
-        wrench=trace.wrench,
-    )
+    return Ringdown(frequencies, ratios, references_hz, times, trace.wrench)
 
 
 def _ring_mode(
@@ -320,6 +303,10 @@ def _ring_mode(
     # The mode swings about its static bend under the loads.
     tip = trace.link_positions[:, -1, 1] - float(levers[:, -1] @ bends)
     return _fit_decay(times, tip, 1 / period, ratio)
+
+
+def _relative(measured: NDArray, reference: NDArray) -> float:
+    return float(np.linalg.norm(measured - reference) / np.linalg.norm(reference))
 
 
 def _at_rest(whisker: Whisker, times: NDArray[np.float64], *obstacles: Obstacle) -> Job:
@@ -382,18 +369,14 @@ def _settling_time(whisker: Whisker) -> float:
     return 6.0 / float(references.natural_frequencies(whisker, 1)[0])
 
 
-def _run(backend: str, job: Job, fidelity: Fidelity) -> Trace:
-    return run_stable(get_engine(backend), [job], fidelity, record_shape=True)[0]
+def _run(backend: str, job: Job, fidelity: Fidelity | str) -> Trace:
+    return run_stable(get_engine(backend), [job], Fidelity.of(fidelity), record_shape=True)[0]
 
 
 def run_stable(
     engine: WhiskerEngine, jobs: Sequence[Job], fidelity: Fidelity, *, record_shape: bool = False
 ) -> list[Trace]:
-    """Simulate jobs on one thread.
-
-    Raises:
-        DataError: one of them was unstable.
-    """
+    """Simulate jobs on one thread; an unstable one is a :class:`DataError`."""
     traces = engine.run(jobs, fidelity, workers=1, record_shape=record_shape)
     for trace in traces:
         if trace.status != "ok":

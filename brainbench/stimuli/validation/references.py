@@ -198,23 +198,22 @@ class _Branch:
         points = list(self._walk())
         top = max(range(len(points)), key=lambda k: points[k][2])
         low = points[max(top - 1, 0)]
-        found = minimize_scalar(
-            lambda angle: -self._height_or_nothing(angle, low[1]),
-            bounds=(low[0], points[top][0] + self._STRIDE),
-            method="bounded",
-            options={"xatol": 1e-9},
-        )
-        return self.side * max(points[top][2], -float(found.fun))
 
-    def _height_or_nothing(self, slope: float, guess: NDArray) -> float:
-        solution = self._solve(slope, guess)
-        return self._height(slope, solution) if self._valid(solution) else 0.0
+        def fall(angle: float) -> float:
+            solution = self._solve(angle, low[1])
+            return -self._height(angle, solution) if self._valid(solution) else 0.0
+
+        span = low[0], points[top][0] + self._STRIDE
+        found = minimize_scalar(fall, bounds=span, method="bounded", options={"xatol": 1e-9})
+        return self.side * max(points[top][2], -float(found.fun))
 
     def _walk(self):  # noqa: ANN202
         """Yield (slope, (force, arc), peg offset) from the first touch on, while equilibria exist."""
         rest = math.atan(2 * self.curvature * self.at)
         slope, previous = rest, None
-        guess = np.array([0.0, self._rest_arc()])
+        u = 2 * self.curvature * self.at
+        arc = self.at if abs(u) < 1e-9 else (u * math.sqrt(1 + u * u) + math.asinh(u)) / (4 * self.curvature)
+        guess = np.array([0.0, arc])
         # Near the fold the rod turns back over the peg: slopes beyond 90° are equilibria too.
         while slope < math.pi + rest:
             solution = self._solve(slope, guess)
@@ -227,10 +226,6 @@ class _Branch:
 
     def _valid(self, solution: NDArray) -> bool:
         return bool(np.isfinite(solution).all()) and solution[1] <= self.whisker.arc_length
-
-    def _rest_arc(self) -> float:
-        u = 2 * self.curvature * self.at
-        return self.at if abs(u) < 1e-9 else (u * math.sqrt(1 + u * u) + math.asinh(u)) / (4 * self.curvature)
 
     def _solve(self, slope: float, guess: NDArray) -> NDArray[np.float64]:
         """Return (force, arc) at one contact slope by Newton's method; NaN when it finds none."""
@@ -264,21 +259,17 @@ class _Branch:
         return 0.0 if self.peg_radius is None else self.peg_radius + float(self.whisker.radius(arc))
 
     def _contact(self, slope: float, solution: NDArray) -> Contact:
-        force, arc = map(float, solution)
-        _, x, y, moment = self._integrate(slope, force, arc)
-        return Contact(
-            force=(-force * math.sin(slope), self.side * force * math.cos(slope)),
-            moment=self.side * moment,
-            arc=arc,
-            slope=self.side * slope,
-            point=(x, self.side * y),
-        )
+        size, arc = map(float, solution)
+        _, x, y, moment = self._integrate(slope, size, arc)
+        force = (-size * math.sin(slope), self.side * size * math.cos(slope))
+        return Contact(force, self.side * moment, arc, self.side * slope, (x, self.side * y))
 
     def _integrate(self, slope: float, force: float, arc: float) -> tuple[float, float, float, float]:
         """Return base angle, contact point (x, y) and base moment: Runge-Kutta steps from contact to base."""
         half = np.linspace(arc, 0.0, 2 * _STEPS + 1)
         flexibility = 1 / np.maximum(self.whisker.bending_stiffness(half), 1e-300)
-        rest = self._rest_curvature(half)
+        # Curvature of the rest shape.
+        rest = 2 * self.curvature * np.cos(self.whisker.tangent_angle(np.abs(half))) ** 3
         step = -arc / _STEPS
         angle, moment, x, y = slope, 0.0, 0.0, 0.0
         pairs = list(zip(flexibility.tolist(), rest.tolist(), strict=True))
@@ -296,10 +287,6 @@ class _Branch:
             angle += step / 6 * (a1 + 2 * a2 + 2 * a3 + a4)
             moment += step / 6 * (m1 + 2 * m2 + 2 * m3 + m4)
         return angle, x, y, moment
-
-    def _rest_curvature(self, s: NDArray) -> NDArray[np.float64]:
-        """Return the curvature of the rest shape [1/m]."""
-        return 2 * self.curvature * np.cos(self.whisker.tangent_angle(np.abs(s))) ** 3
 
 
 def _check_at(whisker: Whisker, at: float) -> None:

@@ -123,7 +123,10 @@ class WhiskerArray:
         return len(self.mounts)
 
     def __getitem__(self, name: str) -> MountedWhisker:
-        return self.mounts[self._index(name)]
+        upper = [item.upper() for item in self.names]
+        if name.upper() not in upper:
+            raise unknown_name("whisker", name, self.names)
+        return self.mounts[upper.index(name.upper())]
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -182,12 +185,6 @@ class WhiskerArray:
         )
         return dataclasses.replace(self, mounts=mounts)
 
-    def _index(self, name: str) -> int:
-        upper = [item.upper() for item in self.names]
-        if name.upper() not in upper:
-            raise unknown_name("whisker", name, self.names)
-        return upper.index(name.upper())
-
 
 def published_whisker(arc_length: float, curvature: float, row: int, col: int, *, species: str = "rat") -> Whisker:
     """Return a whisker with the published rules for its diameters and its material, those of one species.
@@ -242,11 +239,7 @@ def _modelled(species: str) -> WhiskerArray:
         mounts.append(
             dataclasses.replace(
                 average,
-                position=(
-                    radius * math.cos(azimuth),
-                    radius * math.sin(azimuth),
-                    radius * math.sin(elevation),
-                ),
+                position=(radius * math.cos(azimuth), radius * math.sin(azimuth), radius * math.sin(elevation)),
                 angles=(theta, phi, zeta),
                 whisker=published_whisker(length, curvature, average.row, average.col, species=species),
             )
@@ -261,16 +254,11 @@ def _evaluate(terms: dict[str, float], known: dict[str, float]) -> float:
 
 
 def _mount(entry: dict[str, Any], species: str) -> MountedWhisker:
-    size = (entry["arc_length_mm"], entry["curvature_per_mm"], entry["row"], entry["column"])
-    return MountedWhisker(
-        name=entry["name"],
-        side="right",
-        row=entry["row"],
-        col=entry["column"],
-        position=(entry["x_mm"] * _MM, entry["y_mm"] * _MM, entry["z_mm"] * _MM),
-        angles=(entry["theta_rad"], entry["phi_rad"], entry["zeta_rad"]),
-        whisker=published_whisker(*size, species=species),
-    )
+    row, col = entry["row"], entry["column"]
+    position = (entry["x_mm"] * _MM, entry["y_mm"] * _MM, entry["z_mm"] * _MM)
+    angles = (entry["theta_rad"], entry["phi_rad"], entry["zeta_rad"])
+    whisker = published_whisker(entry["arc_length_mm"], entry["curvature_per_mm"], row, col, species=species)
+    return MountedWhisker(entry["name"], "right", row, col, position, angles, whisker)
 
 
 def _radii(arc_length: float, row: int, col: int, rule: dict[str, Any]) -> tuple[float, float]:

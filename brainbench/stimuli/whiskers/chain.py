@@ -1,11 +1,9 @@
 """A whisker as a chain of rigid tapered links joined by pairs of elastic hinges.
 
-Joint i stands at arc length i L/N for the bending of the cell around it, half a cell at the base, so
-its compliance is about 1/k = ∫ ds/(E I) over that cell. (Lumping the compliance at one end of each
-link, or locking the base joint, changes the stiffness by up to a quarter.) The virtual work of bending
-is ∫ M²/(E I) ds; interpolating M² by a parabola through three joints instead of a constant per cell
-shifts a little compliance between neighbours and makes ten links as good as thirty. Joints lie on the
-rest curve, so the whole intrinsic curvature survives any number of links. Letters: N link, 0 = base.
+Joint i stands at arc length i L/N for the bending of the cell around it, half a cell at the base, so its compliance is
+about 1/k = ∫ ds/(E I) over that cell. The virtual work of bending is ∫ M²/(E I) ds; interpolating M² by a parabola
+through three joints instead of a constant per cell makes ten links as good as thirty. Joints lie on the rest curve, so
+the whole intrinsic curvature survives any number of links. Letters: N link, 0 = base.
 """
 
 from __future__ import annotations
@@ -55,14 +53,9 @@ class Chain:
         """Return the lowest angular frequencies [count] (rad/s) of small planar motion, undamped, base fixed."""
         from scipy.linalg import eigh
 
-        last = min(count, self.links) - 1
+        wanted = [self.links - min(count, self.links), self.links - 1]
         # K a = ω² M a, solved as M a = ω⁻² K a: the wanted modes are then the largest, best-resolved ones.
-        inverse = eigh(
-            self._planar_mass(),
-            np.diag(self.stiffness),
-            eigvals_only=True,
-            subset_by_index=[self.links - 1 - last, self.links - 1],
-        )
+        inverse = eigh(self._planar_mass(), np.diag(self.stiffness), eigvals_only=True, subset_by_index=wanted)
         return 1 / np.sqrt(inverse[::-1])
 
     def mode_shape(self, mode: int) -> NDArray[np.float64]:
@@ -92,17 +85,12 @@ class Chain:
         centres = joints + self.centres
         # arm[i, j]: lever of joint j at the centre of mass of link i, which it moves only when j ≤ i.
         arm = np.tril(centres[:, None] - joints[None, :])
-        return (arm * self.masses[:, None]).T @ arm + np.tril(np.ones_like(arm)).T @ (
-            np.tril(np.ones_like(arm)) * self.inertias[:, 1:]
-        )
+        lower = np.tril(np.ones_like(arm))
+        return (arm * self.masses[:, None]).T @ arm + lower.T @ (lower * self.inertias[:, 1:])
 
 
 def build_chain(whisker: Whisker, links: int) -> Chain:
-    """Cut ``whisker`` into ``links`` links of equal arc length.
-
-    Raises:
-        UsageError: fewer than two links were asked for.
-    """
+    """Cut ``whisker`` into at least two ``links`` of equal arc length."""
     if links < 2:
         raise UsageError(f"A whisker needs at least 2 links to bend along its length; received {links}.")
     nodes = np.linspace(0.0, whisker.arc_length, links + 1)
@@ -110,19 +98,9 @@ def build_chain(whisker: Whisker, links: int) -> Chain:
     chords = np.diff(points, axis=0)
     angles = np.arctan2(chords[:, 1], chords[:, 0])
     lengths = np.linalg.norm(chords, axis=1)
-    masses, centres, inertias = _frusta(whisker, nodes, lengths)
-    return Chain(
-        whisker=whisker,
-        nodes=nodes,
-        points=points,
-        lengths=lengths,
-        rest_angles=np.diff(angles, prepend=0.0),
-        radii=whisker.radius((nodes[:-1] + nodes[1:]) / 2),
-        masses=masses,
-        centres=centres,
-        inertias=inertias,
-        stiffness=1 / _compliance(whisker, links),
-    )
+    rest_angles, radii = np.diff(angles, prepend=0.0), whisker.radius((nodes[:-1] + nodes[1:]) / 2)
+    frusta, stiffness = _frusta(whisker, nodes, lengths), 1 / _compliance(whisker, links)
+    return Chain(whisker, nodes, points, lengths, rest_angles, radii, *frusta, stiffness)
 
 
 def _compliance(whisker: Whisker, links: int) -> NDArray[np.float64]:

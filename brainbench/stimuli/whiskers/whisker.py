@@ -10,6 +10,7 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.polynomial import Polynomial
 from numpy.typing import ArrayLike, NDArray
 
 from brainbench.core.errors import UsageError
@@ -73,10 +74,10 @@ class Whisker:
     @property
     def mass(self) -> float:
         """Mass of the whole whisker [kg], the integral of ρ π r² (exact)."""
-        from numpy.polynomial import polynomial
-
-        shape = polynomial.polyint(polynomial.polymul(self._area_series(), self._density_series()))
-        return float(polynomial.polyval(1.0, shape)) * self.arc_length
+        (low, high), slope = self.densities, self.tip_radius - self.base_radius
+        # In powers of s/L.
+        area = Polynomial([np.pi * self.base_radius**2, 2 * np.pi * self.base_radius * slope, np.pi * slope**2])
+        return float((area * Polynomial([low, high - low])).integ()(1.0)) * self.arc_length
 
     def radius(self, s: ArrayLike) -> NDArray[np.float64]:
         """Return the radius [m] at arc length ``s`` [m]."""
@@ -122,15 +123,6 @@ class Whisker:
 
     def _fraction(self, s: ArrayLike) -> NDArray[np.float64]:
         return np.asarray(s, dtype=float) / self.arc_length
-
-    def _area_series(self) -> list[float]:
-        """Return the coefficients of π r² in powers of s/L."""
-        slope = self.tip_radius - self.base_radius
-        return [np.pi * self.base_radius**2, 2 * np.pi * self.base_radius * slope, np.pi * slope**2]
-
-    def _density_series(self) -> list[float]:
-        base, tip = self.densities
-        return [base, tip - base]
 
 
 def _require(name: str, value: float, *, positive: bool = False) -> None:

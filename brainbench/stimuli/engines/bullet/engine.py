@@ -1,23 +1,15 @@
 """PyBullet as a whisker engine: the lineage of WHISKiT, and an independent check of ``mujoco``.
 
 Bullet holds the whisker as a Featherstone multi-body and the obstacles as its convex shapes; it provides
-kinematics, joint-space inertia M, inverse dynamics and closest points. Its own time step is not used. It takes
-spring torques as constant over a step, which is stable near .1 µs on a mouse whisker; torques that know the
-implicit step but not the contact misstate a peg's load by 6 %, its motors by 8–14 %, and rotary inertia added
-to the links until springs are stable slows the first mode by 21 % at .1 ms and 2.4 % at 10 µs
-(``benchmarks/whiskers/bullet_attempts.py``, tables in benchmarks/RESULTS.md). Instead each step solves springs, dampers
+kinematics, joint-space inertia M, inverse dynamics and closest points. Its own time step, which takes spring torques as
+constant, is not used (benchmarks/RESULTS.md says what it makes of a whisker). Instead each step solves springs, dampers
 and contacts together in M + h d + h² k, the linearly implicit step:
 
     (M + h D + h² K) v⁺ = M v − h (c + K q) + h Jᵀ f,    q⁺ = q + h v⁺,
 
-with c the forces of inverse dynamics for the prescribed motion of the follicle, and f the contact forces
-that leave every gap at the end of the step ≥ 0 and obey Coulomb's law.
-
-Remaining error (``benchmarks/whiskers/bullet_validation.py``): on pegs the base moment of mouse whiskers lies within
-.5 % of
-the elastica and the force within 1.5 % at ``balanced``, .1 % and .5 % at ``accurate``; the step damps, so the first
-mode comes out slow as in ``mujoco``; a tip that flicks further than its thickness in one step may overlap an
-obstacle for that step.
+with c the forces of inverse dynamics for the prescribed motion of the follicle, and f the contact forces that leave
+every gap at the end of the step ≥ 0 and obey Coulomb's law. The step damps, so the first mode comes out slow as in
+``mujoco``; a tip that flicks further than its thickness in one step may overlap an obstacle for that step.
 """
 
 from __future__ import annotations
@@ -47,11 +39,7 @@ SEARCH = 0.02
 
 @dataclass(frozen=True)
 class BulletEngine(SteppedEngine):
-    """Runs whisker jobs in PyBullet, one after the other: PyBullet holds Python's interpreter lock.
-
-    Raises:
-        UsageError: a whisker has more links than PyBullet can move.
-    """
+    """Runs whisker jobs, of at most 60 links, in PyBullet one after the other: it holds Python's interpreter lock."""
 
     name = "bullet"
     package = "pybullet"

@@ -14,7 +14,7 @@ from importlib import import_module
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from brainbench.core.errors import MissingDependencyError, UsageError, missing_dependency
 from brainbench.stimuli.engines.tapered_links import LEAST_TAPER, cone_vertices
@@ -35,11 +35,7 @@ _STILL = (0.0, 0.0, 0.0, 1.0)
 
 
 def engine() -> Any:
-    """Return the ``pybullet`` module.
-
-    Raises:
-        MissingDependencyError: PyBullet is not installed.
-    """
+    """Return the ``pybullet`` module, or raise a :class:`MissingDependencyError`."""
     try:
         return import_module("pybullet")
     except ImportError as error:
@@ -53,11 +49,7 @@ def engine() -> Any:
 
 @dataclass(eq=False)
 class BulletWorld:
-    """A Bullet world with one whisker and its obstacles; a context manager that removes it.
-
-    Raises:
-        UsageError: more links than PyBullet can move.
-    """
+    """A Bullet world with one whisker of at most :data:`MOST_LINKS`, and its obstacles; a context manager ends it."""
 
     chain: Chain
     obstacles: Sequence[Obstacle]
@@ -209,61 +201,40 @@ class BulletWorld:
         core, length = self._cores[link], self.chain.lengths[link] * MILLI
         # A capsule keeps its own radius; a cone is built without the thickness that its margin adds.
         if core == 0:
-            return self._capsule(np.zeros(3), np.array([length, 0, 0]), self.chain.radii[link] * MILLI)
+            ends = np.zeros(3), np.array([length, 0, 0])
+            return self._segment("CAPSULE", *ends, self.chain.radii[link] * MILLI)
         radii = self.chain.whisker.radius(self.chain.nodes[link : link + 2])
         cone = cone_vertices(core, length, narrows=bool(radii[0] > radii[1]))
-        return self.bullet.createCollisionShape(
-            self.bullet.GEOM_MESH, vertices=cone.tolist(), physicsClientId=self.client
-        )
+        return self._collision("MESH", vertices=cone.tolist())
 
     def _add_part(self, part: Part) -> int:
         return self.bullet.createMultiBody(0, self._shape(part), physicsClientId=self.client)
 
     def _shape(self, part: Part) -> int:
-        bullet, client = self.bullet, self.client
         match part:
             case Sphere():
-                return bullet.createCollisionShape(
-                    bullet.GEOM_SPHERE,
-                    radius=part.radius * MILLI,
-                    collisionFramePosition=np.multiply(part.centre, MILLI),
-                    physicsClientId=client,
-                )
+                return self._collision("SPHERE", np.multiply(part.centre, MILLI), radius=part.radius * MILLI)
             case Box():
                 w, x, y, z = part.quaternion
-                return bullet.createCollisionShape(
-                    bullet.GEOM_BOX,
-                    halfExtents=np.multiply(part.half_sizes, MILLI),
-                    collisionFramePosition=np.multiply(part.centre, MILLI),
-                    collisionFrameOrientation=(x, y, z, w),
-                    physicsClientId=client,
-                )
+                centre, halves = np.multiply(part.centre, MILLI), np.multiply(part.half_sizes, MILLI)
+                return self._collision("BOX", centre, halfExtents=halves, collisionFrameOrientation=(x, y, z, w))
             case ConvexPart():
                 # Without faces Bullet takes the convex hull of the vertices.
-                return bullet.createCollisionShape(
-                    bullet.GEOM_MESH, vertices=(part.vertices * MILLI).tolist(), physicsClientId=client
-                )
-            case Capsule():
-                return self._capsule(np.multiply(part.start, MILLI), np.multiply(part.end, MILLI), part.radius * MILLI)
-            case Cylinder():
-                return self._capsule(
-                    np.multiply(part.start, MILLI),
-                    np.multiply(part.end, MILLI),
-                    part.radius * MILLI,
-                    kind=bullet.GEOM_CYLINDER,
-                )
+                return self._collision("MESH", vertices=(part.vertices * MILLI).tolist())
+            case Capsule() | Cylinder():
+                ends = np.multiply(part.start, MILLI), np.multiply(part.end, MILLI)
+                return self._segment(type(part).__name__.upper(), *ends, part.radius * MILLI)
 
-    def _capsule(self, start: NDArray, end: NDArray, radius: float, *, kind: int | None = None) -> int:
-        """Add a capsule, or another shape along its z axis, from ``start`` to ``end`` (mm)."""
+    def _segment(self, kind: str, start: NDArray, end: NDArray, radius: float) -> int:
+        """Add a capsule or a cylinder from ``start`` to ``end`` (mm)."""
         length = float(np.linalg.norm(end - start))
-        return self.bullet.createCollisionShape(
-            self.bullet.GEOM_CAPSULE if kind is None else kind,
-            radius=radius,
-            height=length,
-            collisionFramePosition=(start + end) / 2,
-            collisionFrameOrientation=_turn_from_z((end - start) / length),
-            physicsClientId=self.client,
-        )
+        turn = {"collisionFrameOrientation": _turn_from_z((end - start) / length)}
+        return self._collision(kind, (start + end) / 2, radius=radius, height=length, **turn)
+
+    def _collision(self, kind: str, centre: ArrayLike = (0.0, 0.0, 0.0), **options: Any) -> int:
+        """Add a collision shape around ``centre`` (mm)."""
+        place = {"collisionFramePosition": centre, "physicsClientId": self.client}
+        return self.bullet.createCollisionShape(getattr(self.bullet, f"GEOM_{kind}"), **options, **place)
 
 
 def _turn_from_z(axis: NDArray[np.float64]) -> tuple[float, float, float, float]:

@@ -1,7 +1,6 @@
 """Bodies that follow a prescribed trajectory exactly in MuJoCo's discrete integrator.
 
-A MuJoCo mocap body teleports and has no velocity, so a whisker on it feels no inertia and an obstacle
-on it drags nothing by friction. Instead every moving coordinate is a joint of huge armature B, pushed
+A MuJoCo mocap body teleports and has no velocity. Instead every moving coordinate is a joint of huge armature B, pushed
 by B times the second difference of its trajectory: the integrator then reproduces the trajectory, with
 the right velocity, to rounding. Units here are MuJoCo's (mm, ms). Letters: n time step.
 """

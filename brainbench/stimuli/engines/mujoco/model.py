@@ -72,8 +72,7 @@ class WhiskerModel:
 def engine() -> Any:
     """Return the ``mujoco`` module, untyped because its symbols live in compiled extensions.
 
-    Raises:
-        MissingDependencyError: MuJoCo is missing or older than its ``discrete`` integrator.
+    Missing, or older than the ``discrete`` integrator, it is a :class:`MissingDependencyError`.
     """
     try:
         module = import_module("mujoco")
@@ -166,37 +165,20 @@ def _add_follicle(world: Element, position: NDArray, euler: NDArray) -> tuple[El
 
 
 def _add_links(
-    base: Element,
-    assets: Element,
-    job: Job,
-    chain: Chain,
-    damping: NDArray,
-    nearest: float,
-    cores: list[tuple[float, float]],
+    base: Element, assets: Element, job: Job, chain: Chain, damping: NDArray, nearest: float, cores: list
 ) -> None:
     body, end = base, 0.0
     for i in range(chain.links):
         body = _add(body, "body", pos=(end, 0, 0), quat=_quaternion(chain.rest_angles[i], (0.0, 0.0, 1.0)))
         end = chain.lengths[i] * MILLI
         # Bending about two axes across the link with the chain's lumped stiffness; twist is left out.
+        spring = {"stiffness": chain.stiffness[i] * MICRO, "damping": damping[i] * MICRO * MILLI}
         for axis in ((0, 1, 0), (0, 0, 1)):
-            _add(
-                body,
-                "joint",
-                type="hinge",
-                axis=axis,
-                stiffness=chain.stiffness[i] * MICRO,
-                damping=damping[i] * MICRO * MILLI,
-            )
+            _add(body, "joint", type="hinge", axis=axis, **spring)
         # Twist is rigid, so the minute axial inertia of a tip only has to pass MuJoCo's lower limit.
         axial, transverse = np.maximum(chain.inertias[i] * MICRO * MILLI**2, 1e-14)
-        _add(
-            body,
-            "inertial",
-            pos=(chain.centres[i] * MILLI, 0, 0),
-            mass=chain.masses[i] * MICRO,
-            diaginertia=(axial, transverse, transverse),
-        )
+        inertia = {"mass": chain.masses[i] * MICRO, "diaginertia": (axial, transverse, transverse)}
+        _add(body, "inertial", pos=(chain.centres[i] * MILLI, 0, 0), **inertia)
         thickest = float(chain.whisker.radius(chain.nodes[i : i + 2]).max())
         if chain.nodes[i + 1] + thickest >= nearest:
             _add(body, "geom", **_segment(chain, i, end, assets, cores[i]), contype=1, conaffinity=0)

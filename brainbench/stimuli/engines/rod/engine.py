@@ -64,8 +64,9 @@ class RodEngine(WhiskerEngine):
 
         def load(capacity: int) -> None:
             what = f"compiling the whisker solver for {capacity} links (once; it is kept)"
-            tell = None if progress is None else lambda begins: progress(0 if begins else 1, 1, what)
-            load_kernels(device, real_type(fidelity), capacity, compiling=tell)
+            tell = progress or (lambda done, total, what: None)
+            real = real_type(fidelity)
+            load_kernels(device, real, capacity, compiling=lambda begins: tell(0 if begins else 1, 1, what))
 
         with ThreadPoolExecutor(max_workers=max(1, len(sizes))) as pool:
             list(pool.map(load, sizes))
@@ -182,7 +183,8 @@ def _launch(
     paused = time.thread_time()
     solver = WhiskerSolver(list(chains.values()), fidelity, device, shapes.needs)
     started += time.thread_time() - paused
-    fast = np.array([_too_fast(task, solver.shortest[which]) for task, which in zip(tasks, whisker, strict=True)])
+    shortest = solver.shortest[whisker].tolist()
+    fast = np.array([_too_fast(task, step) for task, step in zip(tasks, shortest, strict=True)])
     result = solver.launch(
         packed,
         motions,

@@ -14,7 +14,7 @@ from brainbench.core.devices import to_struct, warp
 from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.engines.rod.compilation import load_kernels
 from brainbench.stimuli.engines.rod.limits import FINEST, LIGHT
-from brainbench.stimuli.engines.rod.packing import PackedChains, PackedJobs, PackedMotions, capacity_for
+from brainbench.stimuli.engines.rod.packing import PackedJobs, PackedMotions, capacity_for, pack_chains
 from brainbench.stimuli.engines.rod.scheduling import Slices, allocate, make_problems
 from brainbench.stimuli.engines.rod.shapes import PackedShapes
 from brainbench.stimuli.engines.trust import RunFacts, Verdict, judge, residual, strongest_force
@@ -108,8 +108,8 @@ class WhiskerSolver:
         if options:
             options["sliced"] = sliced
         self.kernels = load_kernels(device, self.real, self.capacity, needs, **options)
-        packed = PackedChains(self.capacity, self.chains, self.quasistatic)
-        self.chain_arrays = to_struct(self.kernels.structs.ChainArrays, packed.arrays(), device)
+        packed = pack_chains(self.capacity, self.chains, self.quasistatic)
+        self.chain_arrays = to_struct(self.kernels.structs.ChainArrays, packed, device)
         self.block = {} if block is None else {"block_dim": block}
         self.steps = np.array([fidelity.step_of(chain) * MILLI for chain in self.chains])
         """[whisker] longest time step (ms)."""
@@ -207,16 +207,9 @@ class WhiskerSolver:
             crowded=counts["crowded"],
             steps=counts["steps"],
         )
-        result = LaunchResult(
-            wrench,
-            out.contact.numpy(),
-            counts,
-            table(numbers["depth"].astype(float)) / MILLI,
-            missed,
-            judge(facts),
-            np.zeros(size, dtype=bool),
-            seconds=dict(zip(("upload", "kernel"), np.diff(clock).tolist(), strict=True)),
-        )
+        contact, depth = out.contact.numpy(), table(numbers["depth"].astype(float)) / MILLI
+        result = LaunchResult(wrench, contact, counts, depth, missed, judge(facts), np.zeros(size, dtype=bool))
+        result.seconds = dict(zip(("upload", "kernel"), np.diff(clock).tolist(), strict=True))
         if record_shape:
             result.points = np.moveaxis(out.points.numpy().astype(float) / MILLI, 2, 0)
             forces = out.contact_wrench.numpy().astype(float)

@@ -149,47 +149,35 @@ def _continuous(quaternion: NDArray[np.float64]) -> NDArray[np.float64]:
     return quaternion * np.concatenate([[1.0], flips])[:, None]
 
 
-@dataclass
-class PackedChains:
-    """Whiskers as chains, [whisker, link] with room for ``capacity`` links."""
-
-    capacity: int
-    chains: list[Chain] = field(default_factory=list)
-    quasistatic: bool = False
-
-    def arrays(self) -> dict[str, NDArray]:
-        """Return what the kernel's ``ChainArrays`` hold."""
-        count = len(self.chains)
-        mass = LIGHT if self.quasistatic else 1.0
-        build, inertia, taper = (np.zeros((self.capacity, count, 4)) for _ in range(3))
-        for w, chain in enumerate(self.chains):
-            n = chain.links
-            lengths = chain.lengths * MILLI
-            build[:n, w] = np.stack(
-                [lengths, np.cos(chain.rest_angles), np.sin(chain.rest_angles), chain.masses * (mass * MICRO)],
-                axis=1,
-            )
-            inertia[:n, w] = np.stack(
-                [chain.centres * MILLI, *(chain.inertias.T * (mass * MICRO * MILLI**2)), chain.stiffness * MICRO],
-                axis=1,
-            )
-            radii = chain.whisker.radius(chain.nodes) * MILLI
-            taper[:n, w] = np.stack(
-                [radii[:-1], radii[1:], chain.nodes[:-1] * MILLI, np.diff(chain.nodes) * MILLI], axis=1
-            )
-        # Damping ratio ζ of the first mode ω₁ as stiffness-proportional damping, β = 2 ζ / ω₁.
-        beta = [
-            0 if self.quasistatic else 2 * c.whisker.damping_ratio / c.frequencies()[0] * MILLI for c in self.chains
-        ]
-        return {
-            "links": np.array([c.links for c in self.chains], dtype=np.int32),
-            "beta": np.array(beta),
-            "friction": np.array([c.whisker.friction for c in self.chains]),
-            "length": np.array([c.whisker.arc_length * MILLI for c in self.chains]),
-            "build": build,
-            "inertia": inertia,
-            "taper": taper,
-        }
+def pack_chains(capacity: int, chains: Sequence[Chain], quasistatic: bool) -> dict[str, NDArray]:
+    """Return what the kernel's ``ChainArrays`` hold: whiskers as chains, [link, whisker] of ``capacity`` links."""
+    count = len(chains)
+    mass = LIGHT if quasistatic else 1.0
+    build, inertia, taper = (np.zeros((capacity, count, 4)) for _ in range(3))
+    for w, chain in enumerate(chains):
+        n = chain.links
+        lengths = chain.lengths * MILLI
+        build[:n, w] = np.stack(
+            [lengths, np.cos(chain.rest_angles), np.sin(chain.rest_angles), chain.masses * (mass * MICRO)],
+            axis=1,
+        )
+        inertia[:n, w] = np.stack(
+            [chain.centres * MILLI, *(chain.inertias.T * (mass * MICRO * MILLI**2)), chain.stiffness * MICRO],
+            axis=1,
+        )
+        radii = chain.whisker.radius(chain.nodes) * MILLI
+        taper[:n, w] = np.stack([radii[:-1], radii[1:], chain.nodes[:-1] * MILLI, np.diff(chain.nodes) * MILLI], axis=1)
+    # Damping ratio ζ of the first mode ω₁ as stiffness-proportional damping, β = 2 ζ / ω₁.
+    beta = [0 if quasistatic else 2 * c.whisker.damping_ratio / c.frequencies()[0] * MILLI for c in chains]
+    return {
+        "links": np.array([c.links for c in chains], dtype=np.int32),
+        "beta": np.array(beta),
+        "friction": np.array([c.whisker.friction for c in chains]),
+        "length": np.array([c.whisker.arc_length * MILLI for c in chains]),
+        "build": build,
+        "inertia": inertia,
+        "taper": taper,
+    }
 
 
 @dataclass

@@ -12,14 +12,8 @@ from typing import Any
 import numpy as np
 
 from brainbench.core.devices import warp
-from brainbench.stimuli.engines.rod.limits import (
-    AFTER_OTHERS,
-    CONTACT_BOUNDS,
-    DISTANCE_BOUNDS,
-    SPARE,
-    WARP,
-    contacts_for,
-)
+from brainbench.stimuli.engines.rod import limits
+from brainbench.stimuli.engines.rod.limits import AFTER_OTHERS, WARP, contacts_for
 
 BUDGET = 4
 """Steps of a whisker in one slice."""
@@ -102,11 +96,17 @@ class Slices:
                 many = -(-left * threads // WARP) * WARP
                 if stream is not None:
                     stream.wait_stream(device.stream)
-                wp.launch(kernel, many, [inputs[-1], on], device=device, stream=stream, block_dim=CONTACT_BOUNDS[0])
+                wp.launch(
+                    kernel, many, [inputs[-1], on], device=device, stream=stream, block_dim=limits.CONTACT_BOUNDS[0]
+                )
             many = min(self.queries, self.capacity * left) * kernels.distance_group
             many = min(-(-many // WARP) * WARP, MOST_THREADS)
             wp.launch(
-                kernels.measure_distances, many, [*inputs[:4], on, many], device=device, block_dim=DISTANCE_BOUNDS[0]
+                kernels.measure_distances,
+                many,
+                [*inputs[:4], on, many],
+                device=device,
+                block_dim=limits.DISTANCE_BOUNDS[0],
             )
             for stream in self.streams:
                 if stream is not None:
@@ -123,7 +123,7 @@ def allocate(kind: Any, device: Any, **shapes: int | tuple[int, ...]) -> Any:
 
 def make_problems(kernels: Any, capacity: int, lanes: int, device: Any) -> Any:
     """Return room for the contact problem of each lane."""
-    held, candidates = contacts_for(capacity), contacts_for(capacity) + SPARE
+    held, candidates = contacts_for(capacity), contacts_for(capacity) + limits.SPARE
     return allocate(
         kernels.structs.ContactProblems,
         device,

@@ -11,15 +11,13 @@ from brainbench.stimuli.objects.procedural.bodies import Body, ShapeSampler, aro
 
 def table(draw: ShapeSampler, detail: int) -> Body:
     """Four-legged table."""
-    length, width = draw("length", 0.9, 1.5), draw("width", 0.6, 0.9)
-    height, leg = draw("height", 0.5, 0.9), draw("leg", 0.06, 0.12)
+    length, width, height, leg = draw(length=(0.9, 1.5), width=(0.6, 0.9), height=(0.5, 0.9), leg=(0.06, 0.12))
     return _legs(length, width, height, leg) + block(length, width, 0.1).moved(z=0.05)
 
 
 def chair(draw: ShapeSampler, detail: int) -> Body:
     """Four-legged chair with a back."""
-    seat, height = draw("seat", 0.55, 0.75), draw("height", 0.45, 0.65)
-    leg, back = draw("leg", 0.06, 0.11), draw("back", 0.5, 0.85)
+    seat, height, leg, back = draw(seat=(0.55, 0.75), height=(0.45, 0.65), leg=(0.06, 0.11), back=(0.5, 0.85))
     rest = block(seat, 0.08, back).moved(y=seat / 2 - 0.04, z=back / 2 + 0.05)
     return _legs(seat, seat, height, leg) + block(seat, seat, 0.1).moved(z=0.05) + rest
 
@@ -33,8 +31,8 @@ def _legs(length: float, width: float, height: float, leg: float) -> Body:
 
 def stairs(draw: ShapeSampler, detail: int) -> Body:
     """Flight of three to seven steps."""
-    steps, width = draw.whole("steps", 3, 7), draw("width", 0.4, 1.0)
-    rise, run = draw("rise", 0.7, 1.2), 1.2
+    steps, width = draw(steps=range(3, 8), width=(0.4, 1.0))
+    (rise,), run = draw(rise=(0.7, 1.2)), 1.2
     # Every slab reaches to the back, so that the slabs overlap and their union is one body.
     slabs = []
     for i in range(steps):
@@ -45,8 +43,7 @@ def stairs(draw: ShapeSampler, detail: int) -> Body:
 
 def arch(draw: ShapeSampler, detail: int) -> Body:
     """Round arch on two pillars."""
-    span, pillar = draw("span", 0.35, 0.55), draw("pillar", 0.18, 0.32)
-    height, depth = draw("height", 0.4, 1.0), draw("depth", 0.3, 0.6)
+    span, pillar, height, depth = draw(span=(0.35, 0.55), pillar=(0.18, 0.32), height=(0.4, 1.0), depth=(0.3, 0.6))
     outer = span + pillar
     count = 2 * (around(detail) // 4)
     angle = np.linspace(0, np.pi, count + 1)
@@ -65,8 +62,7 @@ def arch(draw: ShapeSampler, detail: int) -> Body:
 
 def frame(draw: ShapeSampler, detail: int) -> Body:
     """Rectangular window frame."""
-    wide, tall = draw("width", 0.8, 1.6), draw("height", 0.8, 1.2)
-    bar, depth = draw("bar", 0.1, 0.18), draw("depth", 0.15, 0.4)
+    wide, tall, bar, depth = draw(width=(0.8, 1.6), height=(0.8, 1.2), bar=(0.1, 0.18), depth=(0.15, 0.4))
     upright, beam = block(bar, tall, depth), block(wide, bar, depth)
     x, y = (wide - bar) / 2, (tall - bar) / 2
     return upright.moved(x) + upright.moved(-x) + beam.moved(y=y) + beam.moved(y=-y)
@@ -74,10 +70,9 @@ def frame(draw: ShapeSampler, detail: int) -> Body:
 
 def perforated(draw: ShapeSampler, detail: int) -> Body:
     """Box with one to three round holes bored through it."""
-    holes, length = draw.whole("holes", 1, 3), draw("length", 1.2, 1.8)
-    width, thick = draw("width", 0.6, 0.9), draw("thickness", 0.25, 0.6)
-    radius = draw("hole", 0.28, 0.38) * min(width, length / holes)
-    hole = rod(radius, 2.0, around(detail))
+    holes, length, width, thick = draw(holes=range(1, 4), length=(1.2, 1.8), width=(0.6, 0.9), thickness=(0.25, 0.6))
+    (share,) = draw(hole=(0.28, 0.38))
+    hole = rod(share * min(width, length / holes), 2.0, around(detail))
     body = block(length, width, thick)
     for i in range(holes):
         body = body - hole.moved(x=length * ((i + 0.5) / holes - 0.5))
@@ -86,51 +81,51 @@ def perforated(draw: ShapeSampler, detail: int) -> Body:
 
 def pyramid(draw: ShapeSampler, detail: int) -> Body:
     """Pyramid over three to six sides, with a small flat top."""
-    sides, height = draw.whole("sides", 3, 6), draw("height", 0.8, 1.7)
+    sides, height, top = draw(sides=range(3, 7), height=(0.8, 1.7), top=(0.02, 0.15))
     angles = 2 * np.pi * np.arange(sides) / sides
-    return prism(np.column_stack([np.cos(angles), np.sin(angles)]), height, top=draw("top", 0.02, 0.15))
+    return prism(np.column_stack([np.cos(angles), np.sin(angles)]), height, top=top)
 
 
 def wedge(draw: ShapeSampler, detail: int) -> Body:
     """Ramp: a box cut along its diagonal."""
-    height, width, lip = draw("height", 0.35, 0.9), draw("width", 0.4, 1.0), draw("lip", 0.02, 0.1)
+    height, width, lip = draw(height=(0.35, 0.9), width=(0.4, 1.0), lip=(0.02, 0.1))
     return prism([(0, 0), (1.3, 0), (1.3, lip), (0, height)], width).turned(x=90.0)
 
 
 def cone(draw: ShapeSampler, detail: int) -> Body:
     """Cone with a small flat top."""
-    return rod(draw("radius", 0.35, 0.6), draw("height", 0.8, 1.4), around(detail), top=draw("top", 0.01, 0.06))
+    radius, height, top = draw(radius=(0.35, 0.6), height=(0.8, 1.4), top=(0.01, 0.06))
+    return rod(radius, height, around(detail), top=top)
 
 
 def cylinder(draw: ShapeSampler, detail: int) -> Body:
     """Cylinder, from a disc to a pole."""
-    return rod(draw("radius", 0.15, 0.6), draw("height", 0.5, 1.4), 2 * around(detail))
+    radius, height = draw(radius=(0.15, 0.6), height=(0.5, 1.4))
+    return rod(radius, height, 2 * around(detail))
 
 
 def brick(draw: ShapeSampler, detail: int) -> Body:
     """Rectangular block."""
-    return block(1.0, draw("y_over_x", 0.4, 0.9), draw("z_over_x", 0.2, 0.7))
+    return block(1.0, *draw(y_over_x=(0.4, 0.9), z_over_x=(0.2, 0.7)))
 
 
 def hammer(draw: ShapeSampler, detail: int) -> Body:
     """Cylindrical head across the end of a handle."""
-    head, length = draw("head", 0.13, 0.2), draw("head_length", 0.5, 0.8)
-    grip, shaft = draw("grip", 0.05, 0.08), draw("handle", 1.0, 1.5)
+    head, length, grip, shaft = draw(head=(0.13, 0.2), head_length=(0.5, 0.8), grip=(0.05, 0.08), handle=(1.0, 1.5))
     facets = around(detail)
     return rod(head, length, facets).turned(x=90.0).moved(z=shaft / 2) + rod(grip, shaft, facets)
 
 
 def bolt(draw: ShapeSampler, detail: int) -> Body:
     """Hexagonal head on a round shank."""
-    head, thick = draw("head", 0.32, 0.46), draw("head_height", 0.2, 0.32)
-    shank, length = draw("shank", 0.12, 0.22), draw("length", 0.6, 1.6)
+    head, thick, shank, length = draw(head=(0.32, 0.46), head_height=(0.2, 0.32), shank=(0.12, 0.22), length=(0.6, 1.6))
     nut = rod(head, thick, 6)
     return rod(shank, length, around(detail)) + nut.moved(z=(length + thick) / 2 - 0.01)
 
 
 def jack(draw: ShapeSampler, detail: int) -> Body:
     """Three rods crossing at right angles, with thick ends."""
-    bar, knob, arm = draw("bar", 0.08, 0.14), draw("knob", 0.15, 0.22), draw("arm", 0.5, 0.75)
+    bar, knob, arm = draw(bar=(0.08, 0.14), knob=(0.15, 0.22), arm=(0.5, 0.75))
     facets = around(detail)
     end = rod(knob, 0.16, facets)
     one = rod(bar, 2 * arm, facets) + end.moved(z=arm) + end.moved(z=-arm)
@@ -139,8 +134,8 @@ def jack(draw: ShapeSampler, detail: int) -> Body:
 
 def house(draw: ShapeSampler, detail: int) -> Body:
     """Box under a pitched roof with eaves."""
-    wide, deep = draw("width", 0.6, 0.9), draw("depth", 0.7, 1.2)
-    wall, roof, eave = draw("wall", 0.4, 0.7), draw("roof", 0.25, 0.5), draw("eave", 0.05, 0.15)
+    wide, deep, wall, roof = draw(width=(0.6, 0.9), depth=(0.7, 1.2), wall=(0.4, 0.7), roof=(0.25, 0.5))
+    (eave,) = draw(eave=(0.05, 0.15))
     half = wide / 2 + eave
     gable = prism([(-half, 0), (half, 0), (0, roof)], deep + 2 * eave).turned(x=90.0)
     return block(wide, deep, wall + 0.02).moved(z=0.01 - wall / 2) + gable
@@ -148,8 +143,7 @@ def house(draw: ShapeSampler, detail: int) -> Body:
 
 def basket(draw: ShapeSampler, detail: int) -> Body:
     """Open box with an arched handle."""
-    wide, deep = draw("width", 0.8, 1.1), draw("depth", 0.5, 0.75)
-    tall, handle = draw("height", 0.3, 0.5), draw("handle", 0.3, 0.55)
+    wide, deep, tall, handle = draw(width=(0.8, 1.1), depth=(0.5, 0.75), height=(0.3, 0.5), handle=(0.3, 0.55))
     wall = 0.07
     side, end = block(wall, deep, tall), block(wide, wall, tall)
     x, y = (wide - wall) / 2, (deep - wall) / 2

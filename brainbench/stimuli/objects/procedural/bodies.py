@@ -12,12 +12,12 @@ from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 from brainbench.core.rotations import euler_matrix
 
 if TYPE_CHECKING:
     from manifold3d import Manifold
-    from numpy.typing import ArrayLike, NDArray
 
 WEDGES = 24
 """Wedges around the axis that stand for a hollow turned wall: convex pieces within 1 % of its radius."""
@@ -30,25 +30,20 @@ class ShapeSampler:
         self._rng = rng
         self.drawn: dict[str, float | int | str] = {}
 
-    def __call__(self, name: str, low: float, high: float) -> float:
-        """Draw a number evenly between ``low`` and ``high``."""
-        return self._keep(name, float(self._rng.uniform(low, high)))
-
-    def whole(self, name: str, low: int, high: int) -> int:
-        """Draw a whole number from ``low`` to ``high``, both included."""
-        return self._keep(name, int(self._rng.integers(low, high + 1)))
-
-    def choice(self, name: str, options: Sequence[str]) -> str:
-        """Draw one of ``options``."""
-        return self._keep(name, options[int(self._rng.integers(len(options)))])
+    def __call__(self, **ranges: tuple[float, float] | range | list[str]) -> tuple[Any, ...]:
+        """Draw, in this order, numbers evenly between two, whole numbers of a range, or one of some names."""
+        for name, choices in ranges.items():
+            if isinstance(choices, tuple):
+                self.drawn[name] = float(self._rng.uniform(*choices))
+            elif isinstance(choices, range):
+                self.drawn[name] = int(self._rng.integers(choices.start, choices.stop))
+            else:
+                self.drawn[name] = choices[int(self._rng.integers(len(choices)))]
+        return tuple(self.drawn[name] for name in ranges)
 
     def normals(self, *shape: int) -> NDArray[np.float64]:
         """Draw standard normal numbers, too many to be named."""
         return self._rng.normal(size=shape)
-
-    def _keep(self, name: str, value: Any) -> Any:
-        self.drawn[name] = value
-        return value
 
 
 class Body:

@@ -15,16 +15,15 @@ def _polar(radii: np.ndarray, angles: np.ndarray) -> np.ndarray:
 
 def star(draw: ShapeSampler, detail: int) -> Body:
     """Star of four to seven points, thick as a block or tapered."""
-    points, depth = draw.whole("points", 4, 7), draw("notch", 0.4, 0.58)
-    thick, top = draw("thickness", 0.25, 0.6), draw("taper", 0.6, 1.0)
+    points, depth, thick, top = draw(points=range(4, 8), notch=(0.4, 0.58), thickness=(0.25, 0.6), taper=(0.6, 1.0))
     angles = np.pi * np.arange(2 * points) / points
     return prism(_polar(np.where(np.arange(2 * points) % 2, depth, 1.0), angles), thick, top=top)
 
 
 def gear(draw: ShapeSampler, detail: int) -> Body:
     """Spur gear without a bore."""
-    teeth, tooth = draw.whole("teeth", 8, 14), draw("tooth", 0.15, 0.28)
-    thick, width = draw("thickness", 0.25, 0.6), draw("tooth_width", 0.42, 0.58)
+    teeth, tooth, thick = draw(teeth=range(8, 15), tooth=(0.15, 0.28), thickness=(0.25, 0.6))
+    (width,) = draw(tooth_width=(0.42, 0.58))
     start = 2 * np.pi * np.arange(teeth)[:, None] / teeth
     share = np.array([-0.5 * width - 0.12, -0.5 * width, 0.5 * width, 0.5 * width + 0.12])
     angles = (start + 2 * np.pi / teeth * share).ravel()
@@ -33,7 +32,7 @@ def gear(draw: ShapeSampler, detail: int) -> Body:
 
 def flower(draw: ShapeSampler, detail: int) -> Body:
     """Thick disc with a wavy rim of petals."""
-    petals, depth, thick = draw.whole("petals", 4, 8), draw("depth", 0.14, 0.26), draw("thickness", 0.25, 0.6)
+    petals, depth, thick = draw(petals=range(4, 9), depth=(0.14, 0.26), thickness=(0.25, 0.6))
     count = 12 * petals
     angles = 2 * np.pi * np.arange(count) / count
     return prism(_polar(1 + depth * np.cos(petals * angles), angles), thick)
@@ -41,22 +40,21 @@ def flower(draw: ShapeSampler, detail: int) -> Body:
 
 def cross(draw: ShapeSampler, detail: int) -> Body:
     """Flat cross of two bars."""
-    width, thick = draw("width", 0.2, 0.45), draw("thickness", 0.2, 0.5)
-    shift, arm = draw("shift", 0.0, 0.25), draw("arm", 0.65, 1.0)
+    width, thick, shift, arm = draw(width=(0.2, 0.45), thickness=(0.2, 0.5), shift=(0.0, 0.25), arm=(0.65, 1.0))
     return block(width, 2.0, thick) + block(2.0 * arm, width, thick).moved(y=shift)
 
 
 def arrow(draw: ShapeSampler, detail: int) -> Body:
     """Arrow with a broad head."""
-    head, width = draw("head", 0.5, 0.9), draw("head_width", 0.45, 0.75)
-    shaft, thick, sweep = draw("shaft_width", 0.12, 0.24), draw("thickness", 0.2, 0.45), draw("sweep", 0.0, 0.2)
+    head, width, shaft = draw(head=(0.5, 0.9), head_width=(0.45, 0.75), shaft_width=(0.12, 0.24))
+    thick, sweep = draw(thickness=(0.2, 0.45), sweep=(0.0, 0.2))
     outline = [(-1, -shaft), (1 - head, -shaft), (1 - head - sweep, -width), (1, 0)]
     return prism([*outline, (1 - head - sweep, width), (1 - head, shaft), (-1, shaft)], thick)
 
 
 def crescent(draw: ShapeSampler, detail: int) -> Body:
     """Moon-shaped slab."""
-    bite, thick, opening = draw("bite", 0.35, 0.7), draw("thickness", 0.3, 0.7), draw("opening", 0.55, 0.75)
+    bite, thick, opening = draw(bite=(0.35, 0.7), thickness=(0.3, 0.7), opening=(0.55, 0.75))
     angles = np.linspace(-opening * np.pi, opening * np.pi, 49)
     outer = _polar(np.ones(49), angles + np.pi)
     tip = outer[[0, -1]]
@@ -70,8 +68,7 @@ def crescent(draw: ShapeSampler, detail: int) -> Body:
 
 def heart(draw: ShapeSampler, detail: int) -> Body:
     """Heart-shaped slab."""
-    wide, thick = draw("width", 0.85, 1.2), draw("thickness", 0.3, 0.7)
-    tip = draw("tip", 0.9, 1.25)
+    wide, thick, tip = draw(width=(0.85, 1.2), thickness=(0.3, 0.7), tip=(0.9, 1.25))
     t = np.linspace(0, 2 * np.pi, 64, endpoint=False)
     y = (13 * np.cos(t) - 5 * np.cos(2 * t) - 2 * np.cos(3 * t) - np.cos(4 * t)) / 16
     return prism(np.column_stack([wide * np.sin(t) ** 3, np.where(y < 0, tip * y, y)])[::-1], thick)
@@ -90,16 +87,15 @@ _LETTERS = {
 
 def letter(draw: ShapeSampler, detail: int) -> Body:
     """Block letter E, F, H, L, T or U."""
-    bars = _LETTERS[draw.choice("letter", sorted(_LETTERS))]
-    wide, thick = draw("width", 0.8, 1.2), draw("thickness", 0.2, 0.4)
-    blocks = [block(w, h, thick).moved(x + w / 2, y + h / 2) for x, y, w, h in bars]
+    (chosen,) = draw(letter=sorted(_LETTERS))
+    wide, thick = draw(width=(0.8, 1.2), thickness=(0.2, 0.4))
+    blocks = [block(w, h, thick).moved(x + w / 2, y + h / 2) for x, y, w, h in _LETTERS[chosen]]
     return functools.reduce(Body.__add__, blocks).stretched(x=wide)
 
 
 def twist(draw: ShapeSampler, detail: int) -> Body:
     """Bar of three to five sides, twisted about its axis."""
-    sides, turn = draw.whole("sides", 3, 5), draw("turn", 90.0, 240.0)
-    height, top = draw("height", 1.8, 3.0), draw("taper", 0.6, 1.0)
+    sides, turn, height, top = draw(sides=range(3, 6), turn=(90.0, 240.0), height=(1.8, 3.0), taper=(0.6, 1.0))
     angles = 2 * np.pi * np.arange(sides) / sides
     corners = _polar(np.full(sides, 0.6), angles)
     share = np.arange(8)[:, None] / 8
@@ -112,5 +108,5 @@ def twist(draw: ShapeSampler, detail: int) -> Body:
 
 def polygon(draw: ShapeSampler, detail: int) -> Body:
     """Upright prism of three to eight sides."""
-    sides, height = draw.whole("sides", 3, 8), draw("height", 0.8, 2.2)
+    sides, height = draw(sides=range(3, 9), height=(0.8, 2.2))
     return prism(_polar(np.ones(sides), 2 * np.pi * np.arange(sides) / sides), height)

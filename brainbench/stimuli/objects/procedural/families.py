@@ -16,6 +16,7 @@ from types import FunctionType
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from brainbench.core.errors import UsageError, unknown_name
 from brainbench.geometry import Mesh, convex_hull
@@ -24,7 +25,6 @@ from brainbench.stimuli.objects.procedural.bodies import Body, ShapeSampler
 
 if TYPE_CHECKING:
     from manifold3d import Manifold
-    from numpy.typing import NDArray
 
 DETAIL = (2_000, 20_000)
 """Fewest and most triangles of a shape."""
@@ -63,11 +63,7 @@ def list_families() -> tuple[str, ...]:
 
 
 def describe_family(family: str) -> str:
-    """Return one sentence about a family.
-
-    Raises:
-        UsageError: there is no such family.
-    """
+    """Return one sentence about a family; an unknown one is a :class:`UsageError`."""
     return (_family(family).__doc__ or "").strip().splitlines()[0]
 
 

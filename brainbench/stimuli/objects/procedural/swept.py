@@ -17,7 +17,7 @@ def _mesh_of(detail: int, *, sides: int = 0) -> tuple[int, int]:
 
 def torus(draw: ShapeSampler, detail: int) -> Body:
     """Ring of round cross-section."""
-    ratio = draw("tube_over_ring", 0.2, 0.48)
+    (ratio,) = draw(tube_over_ring=(0.2, 0.48))
     sides, steps = _mesh_of(detail, sides=max(16, int(math.sqrt(detail) / 3)))
     angle = 2 * np.pi * np.arange(steps) / steps
     return tube(np.column_stack([np.cos(angle), np.sin(angle), 0 * angle]), ratio, sides, closed=True)
@@ -25,7 +25,7 @@ def torus(draw: ShapeSampler, detail: int) -> Body:
 
 def ring(draw: ShapeSampler, detail: int) -> Body:
     """Flat band, like a finger ring or a section of pipe."""
-    wall, height = draw("wall", 0.06, 0.12), draw("height", 0.3, 0.8)
+    wall, height = draw(wall=(0.06, 0.12), height=(0.3, 0.8))
     steps = max(24, detail // 40)
     angle = 2 * np.pi * np.arange(steps) / steps
     circle = np.column_stack([np.cos(angle), np.sin(angle)])
@@ -41,9 +41,9 @@ def ring(draw: ShapeSampler, detail: int) -> Body:
 
 def knot(draw: ShapeSampler, detail: int) -> Body:
     """Torus knot with two turns through the hole and three or five lobes."""
-    lobes = int(draw.choice("lobes", ["3", "5"]))
-    swing, radius = draw("swing", 0.38, 0.5), draw("tube", 0.12, 0.22)
-    rise = draw("rise", 0.38, 0.5)
+    (drawn,) = draw(lobes=["3", "5"])
+    lobes = int(drawn)
+    swing, radius, rise = draw(swing=(0.38, 0.5), tube=(0.12, 0.22), rise=(0.38, 0.5))
     radius = radius if lobes == 3 else 0.6 * radius
     sides, steps = _mesh_of(detail)
     t = 2 * np.pi * np.arange(steps) / steps
@@ -58,8 +58,7 @@ def knot(draw: ShapeSampler, detail: int) -> Body:
 
 def spring(draw: ShapeSampler, detail: int) -> Body:
     """Helix with open turns."""
-    turns, pitch = draw("turns", 3.0, 5.5), draw("pitch", 0.38, 0.6)
-    wire = draw("wire", 0.08, 0.14)
+    turns, pitch, wire = draw(turns=(3.0, 5.5), pitch=(0.38, 0.6), wire=(0.08, 0.14))
     sides, steps = _mesh_of(detail)
     t = np.linspace(0, 2 * np.pi * turns, steps)
     return tube(np.column_stack([np.cos(t), np.sin(t), pitch * t / (2 * np.pi)]), wire, sides, closed=False)
@@ -67,7 +66,7 @@ def spring(draw: ShapeSampler, detail: int) -> Body:
 
 def horseshoe(draw: ShapeSampler, detail: int) -> Body:
     """Round bar bent to a U."""
-    length, bar = draw("arms", 0.4, 1.2), draw("bar", 0.14, 0.26)
+    length, bar = draw(arms=(0.4, 1.2), bar=(0.14, 0.26))
     sides, steps = _mesh_of(detail)
     angle = np.linspace(0, np.pi, steps // 2)
     bend = np.column_stack([np.cos(angle), np.sin(angle)])
@@ -78,7 +77,7 @@ def horseshoe(draw: ShapeSampler, detail: int) -> Body:
 
 def hook(draw: ShapeSampler, detail: int) -> Body:
     """Draw a walking cane: a straight bar that curls round at one end."""
-    length, bar, curl = draw("shaft", 1.6, 2.8), draw("bar", 0.12, 0.2), draw("curl", 0.8, 1.25)
+    length, bar, curl = draw(shaft=(1.6, 2.8), bar=(0.12, 0.2), curl=(0.8, 1.25))
     sides, steps = _mesh_of(detail)
     angle = np.linspace(0, curl * np.pi, steps // 2)
     bend = np.column_stack([0.6 * np.cos(angle), 0.6 * np.sin(angle)])
@@ -89,7 +88,7 @@ def hook(draw: ShapeSampler, detail: int) -> Body:
 
 def horn(draw: ShapeSampler, detail: int) -> Body:
     """Curved horn that tapers to a blunt tip."""
-    turn, base, rise = draw("turn", 0.55, 0.95), draw("base", 0.24, 0.36), draw("rise", 0.1, 0.5)
+    turn, base, rise = draw(turn=(0.55, 0.95), base=(0.24, 0.36), rise=(0.1, 0.5))
     sides, steps = _mesh_of(detail)
     t = np.linspace(0, 1, steps)
     angle = turn * np.pi * t
@@ -99,6 +98,6 @@ def horn(draw: ShapeSampler, detail: int) -> Body:
 
 def dumbbell(draw: ShapeSampler, detail: int) -> Body:
     """Two balls on a bar."""
-    size, bar, length = draw("ball", 0.2, 0.38), draw("bar", 0.06, 0.13), draw("length", 0.75, 1.3)
+    size, bar, length = draw(ball=(0.2, 0.38), bar=(0.06, 0.13), length=(0.75, 1.3))
     sphere = convex(ball(detail // 3)).stretched(size, size, size)
     return rod(bar, length, 32) + sphere.moved(z=length / 2) + sphere.moved(z=-length / 2)

@@ -21,17 +21,16 @@ def _rings(detail: int) -> int:
 
 def vase(draw: ShapeSampler, detail: int) -> Body:
     """Hollow vase with a belly, a neck and a flared lip."""
-    belly, neck = draw("belly", 0.32, 0.5), draw("neck", 0.12, 0.2)
-    lip, low = draw("lip", 0.22, 0.34), draw("belly_height", 0.3, 0.5)
-    height = draw("height", 1.2, 1.6)
+    belly, neck, lip, low = draw(belly=(0.32, 0.5), neck=(0.12, 0.2), lip=(0.22, 0.34), belly_height=(0.3, 0.5))
+    (height,) = draw(height=(1.2, 1.6))
     line = _outline([0, low * height, 0.8 * height, height], [0.2, belly, neck, lip], _rings(detail))
     return lathe(line, around(detail), wall=0.05, floor=line[1, 1])
 
 
 def bottle(draw: ShapeSampler, detail: int) -> Body:
     """Cylindrical bottle with a shoulder and a narrow neck."""
-    radius, neck = draw("radius", 0.22, 0.32), draw("neck", 0.07, 0.11)
-    shoulder, height = draw("shoulder", 0.5, 0.68), draw("height", 1.3, 1.7)
+    radius, neck, shoulder = draw(radius=(0.22, 0.32), neck=(0.07, 0.11), shoulder=(0.5, 0.68))
+    (height,) = draw(height=(1.3, 1.7))
     z = [0, 0.04, shoulder * height, (shoulder + 0.2) * height, 0.94 * height, height]
     return lathe(
         _outline(z, [0.9 * radius, radius, radius, neck, neck, 1.2 * neck], 2 * _rings(detail)), around(detail)
@@ -40,15 +39,15 @@ def bottle(draw: ShapeSampler, detail: int) -> Body:
 
 def cup(draw: ShapeSampler, detail: int) -> Body:
     """Hollow tumbler that widens upwards, without a handle."""
-    low, high, height = draw("base", 0.22, 0.32), draw("rim", 0.34, 0.46), draw("height", 0.7, 1.0)
+    low, high, height = draw(base=(0.22, 0.32), rim=(0.34, 0.46), height=(0.7, 1.0))
     z = np.linspace(0, height, max(4, _rings(detail) // 2))
     return lathe(np.column_stack([low + (high - low) * z / height, z]), around(detail), wall=0.05, floor=z[1])
 
 
 def mug(draw: ShapeSampler, detail: int) -> Body:
     """Cylindrical cup with a handle."""
-    radius, height = draw("radius", 0.26, 0.42), draw("height", 0.6, 1.0)
-    reach, thick = draw("handle_reach", 0.2, 0.3), draw("handle_thickness", 0.04, 0.06)
+    radius, height, reach = draw(radius=(0.26, 0.42), height=(0.6, 1.0), handle_reach=(0.2, 0.3))
+    (thick,) = draw(handle_thickness=(0.04, 0.06))
     z = np.linspace(0, height, 8)
     body = lathe(np.column_stack([np.full(8, radius), z]), around(detail), wall=0.05, floor=z[1])
     angle = np.linspace(-np.pi / 2, np.pi / 2, max(12, around(detail) // 2))
@@ -60,7 +59,7 @@ def mug(draw: ShapeSampler, detail: int) -> Body:
 
 def bowl(draw: ShapeSampler, detail: int) -> Body:
     """Wide hollow bowl on a small foot."""
-    rim, height, foot = draw("rim", 0.5, 0.65), draw("height", 0.25, 0.42), draw("foot", 0.15, 0.22)
+    rim, height, foot = draw(rim=(0.5, 0.65), height=(0.25, 0.42), foot=(0.15, 0.22))
     count = _rings(detail)
     share = np.linspace(0, 1, count)
     line = np.column_stack([foot + (rim - foot) * np.sin(share * np.pi / 2) ** 0.8, height * (0.1 + 0.9 * share)])
@@ -70,8 +69,8 @@ def bowl(draw: ShapeSampler, detail: int) -> Body:
 
 def goblet(draw: ShapeSampler, detail: int) -> Body:
     """Wine glass: hollow cup on a thin stem with a disc foot."""
-    cup_radius, stem = draw("cup", 0.26, 0.36), draw("stem", 0.035, 0.06)
-    foot, split = draw("foot", 0.24, 0.32), draw("stem_share", 0.45, 0.58)
+    cup_radius, stem, foot = draw(cup=(0.26, 0.36), stem=(0.035, 0.06), foot=(0.24, 0.32))
+    (split,) = draw(stem_share=(0.45, 0.58))
     bottom = np.array([[foot, 0.0], [foot, 0.04], [0.4 * foot, 0.09], [stem, 0.16], [stem, split - 0.05]])
     cup_line = _outline([split, split + 0.15, 1.0, 1.15], [0.1, 0.9 * cup_radius, cup_radius, 0.92 * cup_radius], 12)
     line = np.vstack([bottom, cup_line])
@@ -80,8 +79,8 @@ def goblet(draw: ShapeSampler, detail: int) -> Body:
 
 def spool(draw: ShapeSampler, detail: int) -> Body:
     """Two discs joined by a thick core."""
-    core, flange = draw("core", 0.15, 0.26), draw("flange", 0.4, 0.5)
-    thick, height = draw("flange_thickness", 0.08, 0.14), draw("height", 0.7, 1.1)
+    core, flange, thick = draw(core=(0.15, 0.26), flange=(0.4, 0.5), flange_thickness=(0.08, 0.14))
+    (height,) = draw(height=(0.7, 1.1))
     facets = around(detail)
     disc = rod(flange, thick, facets)
     shaft = rod(core, height, facets)
@@ -90,16 +89,14 @@ def spool(draw: ShapeSampler, detail: int) -> Body:
 
 def hourglass(draw: ShapeSampler, detail: int) -> Body:
     """Two bulbs that meet in a waist."""
-    waist, end = draw("waist", 0.06, 0.14), draw("end", 0.32, 0.46)
-    bulge, height = draw("bulge", 1.0, 1.12), draw("height", 1.0, 1.4)
+    waist, end, bulge, height = draw(waist=(0.06, 0.14), end=(0.32, 0.46), bulge=(1.0, 1.12), height=(1.0, 1.4))
     z = [0, 0.2 * height, 0.5 * height, 0.8 * height, height]
     return lathe(_outline(z, [end, end * bulge, waist, end * bulge, end], 2 * _rings(detail)), around(detail))
 
 
 def mushroom(draw: ShapeSampler, detail: int) -> Body:
     """Domed cap on a stem."""
-    cap, stem = draw("cap", 0.38, 0.5), draw("stem", 0.1, 0.17)
-    length, dome = draw("stem_length", 0.4, 0.65), draw("dome", 0.28, 0.42)
+    cap, stem, length, dome = draw(cap=(0.38, 0.5), stem=(0.1, 0.17), stem_length=(0.4, 0.65), dome=(0.28, 0.42))
     angle = np.linspace(0, np.pi / 2, _rings(detail))
     curve = np.column_stack([cap * np.cos(angle), length + dome * np.sin(angle)])
     curve[-1, 0] = 0
@@ -109,7 +106,7 @@ def mushroom(draw: ShapeSampler, detail: int) -> Body:
 
 def dome(draw: ShapeSampler, detail: int) -> Body:
     """Half an ellipsoid on its flat side."""
-    radius, height = draw("radius", 0.4, 0.55), draw("height", 0.3, 0.6)
+    radius, height = draw(radius=(0.4, 0.55), height=(0.3, 0.6))
     angle = np.linspace(0, np.pi / 2, 2 * _rings(detail))
     curve = np.column_stack([radius * np.cos(angle), height * np.sin(angle)])
     curve[-1, 0] = 0
@@ -118,9 +115,8 @@ def dome(draw: ShapeSampler, detail: int) -> Body:
 
 def top(draw: ShapeSampler, detail: int) -> Body:
     """Spinning top: a cone on its tip, a rim and a handle."""
-    rim, depth = draw("rim", 0.34, 0.58), draw("depth", 0.3, 0.65)
-    pin, length = draw("pin", 0.04, 0.08), draw("pin_length", 0.25, 0.4)
-    shoulder = draw("shoulder", 0.08, 0.2)
+    rim, depth, pin, length = draw(rim=(0.34, 0.58), depth=(0.3, 0.65), pin=(0.04, 0.08), pin_length=(0.25, 0.4))
+    (shoulder,) = draw(shoulder=(0.08, 0.2))
     z = [0, depth, depth + 0.06, depth + 0.06 + shoulder, depth + 0.06 + shoulder + length]
     points = list(zip([0.0, rim, rim, 1.4 * pin, pin], z, strict=True))
     return lathe(np.array(points), around(detail))
@@ -128,8 +124,7 @@ def top(draw: ShapeSampler, detail: int) -> Body:
 
 def bell(draw: ShapeSampler, detail: int) -> Body:
     """Hollow bell, mouth up, with a flaring rim."""
-    rim, crown = draw("rim", 0.42, 0.52), draw("crown", 0.2, 0.28)
-    height, flare = draw("height", 0.7, 0.95), draw("flare", 0.55, 0.75)
+    rim, crown, height, flare = draw(rim=(0.42, 0.52), crown=(0.2, 0.28), height=(0.7, 0.95), flare=(0.55, 0.75))
     waist = crown + 0.25 * (rim - crown)
     line = _outline([0, 0.08, flare * height, height], [0.6 * crown, crown, waist, rim], _rings(detail))
     return lathe(line, around(detail), wall=0.05, floor=line[2, 1])

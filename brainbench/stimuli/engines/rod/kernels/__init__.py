@@ -65,16 +65,14 @@ def build_kernels(
     sliced: bool = False,
     cuda: bool = False,
 ) -> Kernels:
-    """Return the kernels for chains of at most ``capacity`` links in one precision.
+    """Return the kernels for chains of at most ``capacity`` links in one precision; each is compiled by itself.
 
     Args:
-        real: ``warp.float32`` or ``warp.float64``.
-        capacity: links that fit; a module is compiled for each.
+        real, capacity: ``warp.float32`` or ``warp.float64``; links that fit.
         against: what there is to touch, :data:`NOTHING`, :data:`PRIMITIVES` or :data:`MESHES`.
         bounds: threads per block and blocks per multiprocessor that the CUDA compiler aims at.
-        sliced: whether a whisker pauses wherever it needs a distance from a mesh and wherever contact forces must be
-            found, so that both are done for all whiskers by kernels of their own and the threads of a block do alike
-            work; results are the same. One shape a scene.
+        sliced: whether a whisker pauses wherever it needs a distance from a mesh or contact forces, so that both are
+            done for all whiskers by kernels of their own; results are the same. One shape a scene.
         cuda: compile for a GPU: with approximate divisions and roots, and groups of threads that find contact forces.
     """
     most = contacts_for(capacity)

@@ -20,24 +20,11 @@ if group_size == 1:
         return value
 
     @wp.func
-    def group_max(value: real) -> real:
-        return value
-
-    @wp.func
-    def group_min(value: real) -> real:
-        return value
-
-    @wp.func
-    def group_min_int(value: int) -> int:
-        return value
-
-    @wp.func
-    def group_or(bits: int) -> int:
-        return bits
-
-    @wp.func
     def warp_max(value: int) -> int:
         return value
+
+    group_max = group_min = group_sum
+    group_min_int = group_or = warp_max
 
 else:
 
