@@ -121,7 +121,7 @@ def write_lerobot(
         MissingDependencyError: pyarrow is not installed.
     """
     try:
-        import pyarrow  # noqa: F401 - whether it is there, before anything is written
+        import pyarrow
     except ImportError as error:
         raise missing_dependency("pyarrow", extra="board", purpose="Writing a LeRobot data set") from error
     folder = Path(folder)
@@ -142,7 +142,7 @@ def write_lerobot(
         tables.append(table)
         first += length
     _write_frames(folder / _DATA.format(chunk_index=0, file_index=0), tables, shapes)
-    _write_episodes(folder / "meta" / "episodes" / "chunk-000" / "file-000.parquet", rows)
+    _write_table(folder / "meta" / "episodes" / "chunk-000" / "file-000.parquet", pyarrow.Table.from_pylist(rows))
     _write_tasks(folder / "meta" / "tasks.parquet", tasks)
     whole = {name: np.concatenate([table[name] for table in tables]) for name in tables[0]}
     write_json(folder / "meta" / "stats.json", {name: _stats(value) for name, value in whole.items()})
@@ -228,18 +228,16 @@ def _write_frames(path: Path, tables: list[dict[str, NDArray]], shapes: Mapping[
             writer.write_table(pa.Table.from_arrays(columns, schema=schema))
 
 
-def _write_episodes(path: Path, rows: list[dict[str, Any]]) -> None:
-    import pyarrow as pa
+def _write_table(path: Path, table: Any) -> None:
     from pyarrow import parquet
 
     with atomic_path(path) as temporary:
-        parquet.write_table(pa.Table.from_pylist(rows), temporary)
+        parquet.write_table(table, temporary)
 
 
 def _write_tasks(path: Path, tasks: list[str]) -> None:
     """Write the tasks as pandas does that has them as its index, for that is how LeRobot reads them."""
     import pyarrow as pa
-    from pyarrow import parquet
 
     column = {"field_name": "task_index", "name": "task_index", "pandas_type": "int64", "numpy_type": "int64"}
     index = {"field_name": "task", "name": "task", "pandas_type": "unicode", "numpy_type": "object"}
@@ -250,5 +248,4 @@ def _write_tasks(path: Path, tasks: list[str]) -> None:
         "pandas_version": "2.0.0",
     }
     table = pa.table({"task_index": pa.array(range(len(tasks)), pa.int64()), "task": pa.array(tasks, pa.string())})
-    with atomic_path(path) as temporary:
-        parquet.write_table(table.replace_schema_metadata({"pandas": json.dumps(described)}), temporary)
+    _write_table(path, table.replace_schema_metadata({"pandas": json.dumps(described)}))

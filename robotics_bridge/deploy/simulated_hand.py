@@ -10,13 +10,13 @@ import multiprocessing
 import socket
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from brainbench.core.errors import DataError, UsageError, unknown_name
+from brainbench.core.errors import DataError, UsageError
 from robotics_bridge import hands
 from robotics_bridge.deploy.touch import PressureCalibration
 from robotics_bridge.deploy.udp import COMMAND, STATE, STOP, decode, encode
@@ -24,6 +24,7 @@ from robotics_bridge.hands.observations import observation_type, observe, sensor
 from robotics_bridge.hands.scenes import OBJECT, holding
 from robotics_bridge.physics import MujocoEngine
 from robotics_bridge.sensors import SensorSuite
+from robotics_bridge.tasks.overrides import set_field
 
 HOLD_AFTER = 0.25
 """Seconds without a command after which the hand holds by itself."""
@@ -72,19 +73,11 @@ class Faults:
         Raises:
             UsageError: a fault is unknown or its value is no number.
         """
-        known = [item.name.replace("_", "-") for item in fields(cls)]
-        values: dict[str, Any] = {}
+        faults = cls()
         for text in texts:
-            name, equals, value = text.partition("=")
-            if name not in known:
-                raise unknown_name("fault", name, known)
-            try:
-                values[name.replace("-", "_")] = int(value) if name == "seed" else float(value)
-            except ValueError:
-                raise UsageError(f"A fault is given as {name}=NUMBER; received {text!r}.") from None
-            if not equals:
-                raise UsageError(f"A fault is given as {name}=NUMBER; received {text!r}.")
-        return cls(**values)
+            name, _, value = text.partition("=")
+            faults = set_field(faults, [name.replace("-", "_")], value)
+        return faults
 
 
 class SimulatedHand:
