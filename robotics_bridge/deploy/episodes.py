@@ -19,7 +19,9 @@ from numpy.typing import NDArray
 
 from brainbench.core.errors import DataError, UsageError, missing_dependency
 from brainbench.core.files import atomic_path, write_json
-from robotics_bridge.policies.encoders.finger_axes import FingerAxes
+from robotics_bridge import hands
+from robotics_bridge.deploy.driver import HandReading
+from robotics_bridge.policies.encoders.finger_axes import FingerAxes, finger_axes_of
 
 VERSION = "v3.0"
 _DATA = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
@@ -95,6 +97,45 @@ def total_wrench(
         total[:3] += turn @ force
         total[3:] += turn @ torque + np.cross(origin, turn @ force)
     return total
+
+
+class SessionRecorder:
+    """Keeps a session of a deployed policy; touch is one point per finger tip, where the hand senses it.
+
+    Args:
+        hand: Name of the hand.
+        rate: Control steps per second.
+        task: Task that is done, in words.
+    """
+
+    def __init__(self, hand: str, rate: float, task: str) -> None:
+        self.hand, self.rate, self.episode = hands.load(hand), rate, Episode(task)
+        layout = self.hand.layout("med", "tips")
+        self.axes = finger_axes_of(self.hand, self.hand.layout("med", "hand"))
+        fingers = tuple(self.hand.fingers)
+        tips = {chain[-1]: finger for finger, chain in self.hand.fingers.items()}
+        self.rows = [fingers.index(tips[link]) for link in layout]
+        position, normal = (
+            np.stack([getattr(probes, name)[probes.active].mean(axis=0) for probes in layout.values()])
+            for name in ("position", "normal")
+        )
+        self.points = TactilePoints(tuple(layout), np.arange(len(layout)), position, normal)
+
+    def __call__(self, reading: HandReading, obs: Any, action: Any, targets: NDArray[np.floating]) -> None:
+        """Keep a tick, as a :class:`~robotics_bridge.deploy.controller.Controller` reports it."""
+        del obs, action
+        # The maker's pressure is about outward normals with axes z, y, x; a force on the skin points inward.
+        force = -reading.pressure[self.rows][:, ::-1]
+        torque = np.cross(self.points.position, force).astype(float)
+        points = np.concatenate([force, torque], axis=1)
+        wrench = total_wrench(points, self.points.links, self.points.link, self.axes)
+        self.episode.add(reading.position, reading.velocity, targets, points, wrench)
+
+    def write(self, folder: Path, joints: tuple[str, ...]) -> Path:
+        """Write the session as a data set; see :func:`write_lerobot`."""
+        return write_lerobot(
+            folder, [self.episode], fps=self.rate, joints=joints, points=self.points, robot=self.hand.name
+        )
 
 
 def write_lerobot(

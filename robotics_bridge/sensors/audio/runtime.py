@@ -40,7 +40,7 @@ class ContactAudioRuntime(Runtime):
     def __init__(self, sensors: Mapping[str, ContactAudio], context: SuiteContext) -> None:
         self._sensors = dict(sensors)
         first = next(iter(sensors.values()))
-        self.samples, self._quads = first.samples, (len(first.modes.frequency) + 3) // 4
+        self.samples, self._quads = first.samples, first.quads
         super().__init__(sensors, self.samples, context, fusable=False)
         count, envs = len(sensors), context.num_envs
         self._dt = math.nan
