@@ -123,7 +123,7 @@ def _remote(text: str, deployed: DeployedPolicy) -> tuple[tuple[str, int], tuple
 
 
 def _shadow(deployed: DeployedPolicy, joints: tuple[str, ...]) -> Any:
-    from robotics_bridge.deploy.shadow import ShadowTouch
+    from robotics_bridge.deploy.simulated_hand import ShadowTouch
 
     facts = deployed.deployment
     names = (str(facts[key]) for key in ("observe", "placement", "resolution"))
