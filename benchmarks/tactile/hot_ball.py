@@ -132,9 +132,9 @@ def run(envs: int, seconds: float, seed: int) -> list[dict[str, Any]]:
 
 def draw(records: list[dict[str, Any]], step: float) -> None:
     """Draw the warmest cell of the fingers over time, per law."""
-    from brainbench.cli.tactile.figures import pyplot, save
+    from brainbench.cli.tactile.figures import panels, save_figure
 
-    figure, axes = pyplot().subplots(1, 2, figsize=(9, 3.8), sharey=True, layout="constrained")
+    figure, axes = panels(2, (9, 3.8), sharey=True)
     shades = {1.0: "#b9c4d6", 10.0: "#7f9cc4", 100.0: "#3f6ea8", 150.0: "#16365f"}
     for ax, law in zip(axes, ("thesis", "physical"), strict=True):
         for r in records:
@@ -150,7 +150,7 @@ def draw(records: list[dict[str, Any]], step: float) -> None:
     axes[0].annotate("latch", (0.2, 42.6), color="#c0392b", fontsize=8)
     handles, labels = axes[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=4, fontsize=7, frameon=False)
-    save(figure, IMAGE)
+    save_figure(figure, IMAGE, dpi=110)
 
 
 def main() -> None:

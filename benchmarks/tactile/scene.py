@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks.tactile.pyramid import initial_velocities, pyramid
 from brainbench.geometry import Mesh
 from robotics_bridge.physics import (
     Geometry,
@@ -19,8 +20,6 @@ from robotics_bridge.physics import (
     MujocoEngine,
     MujocoWarpEngine,
     TouchScene,
-    initial_velocities,
-    pyramid,
 )
 from robotics_bridge.sensors import (
     ContactAudio,
@@ -96,7 +95,12 @@ def snapshot(state: HandState) -> dict[str, np.ndarray]:
     env = state.contact_env.numpy()[:count]
     order = np.argsort(env, kind="stable")
     kept = {name: getattr(state, f"contact_{name}").numpy()[:count][order] for name in CONTACT}
-    return {"pose": state.get_pose().cpu().numpy(), "velocity": state.velocity.numpy(), "env": env[order], **kept}
+    return {
+        "pose": state.pose_torch[..., [0, 1, 2, 6, 3, 4, 5]].cpu().numpy(),
+        "velocity": state.velocity.numpy(),
+        "env": env[order],
+        **kept,
+    }
 
 
 def restore(found: State, envs: int, device: str, target: HandState | None = None) -> HandState:
@@ -222,7 +226,7 @@ def bumpy_box(edge: float, triangles: int) -> Mesh:
 
 def with_mesh(scene: TouchScene, name: str, triangles: int) -> TouchScene:
     """The scene with one box replaced by triangles."""
-    number = scene.geometry_index(name)
+    (number,) = scene.geometries_of(name)
     old = scene.geometries[number]
     new = Geometry(name=old.name, link=old.link, kind="mesh", mesh=bumpy_box(0.25, triangles))
     return replace(scene, geometries=(*scene.geometries[:number], new, *scene.geometries[number + 1 :]))

@@ -205,8 +205,8 @@ class Controller:
         self._action = action.astype(np.float32)
         targets = self._limit(self.actuation.targets(action), reading)
         self.driver.send(targets)
-        self.latency.add(self.clock() - now)
-        self.processor.add(time.thread_time() - busy)
+        self.latency.append(self.clock() - now)
+        self.processor.append(time.thread_time() - busy)
         self.ticks += 1
         if self.record is not None:
             self.record(reading, obs, action, targets)

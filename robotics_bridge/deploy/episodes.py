@@ -19,7 +19,9 @@ from numpy.typing import NDArray
 
 from brainbench.core.errors import DataError, UsageError, missing_dependency
 from brainbench.core.files import atomic_path, write_json
-from robotics_bridge.policies.encoders.finger_axes import FingerAxes
+from robotics_bridge import hands
+from robotics_bridge.deploy.driver import HandReading
+from robotics_bridge.policies.encoders.finger_axes import FingerAxes, finger_axes_of
 
 VERSION = "v3.0"
 _DATA = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
@@ -97,6 +99,45 @@ def total_wrench(
     return total
 
 
+class SessionRecorder:
+    """Keeps a session of a deployed policy; touch is one point per finger tip, where the hand senses it.
+
+    Args:
+        hand: Name of the hand.
+        rate: Control steps per second.
+        task: Task that is done, in words.
+    """
+
+    def __init__(self, hand: str, rate: float, task: str) -> None:
+        self.hand, self.rate, self.episode = hands.load(hand), rate, Episode(task)
+        layout = self.hand.layout("med", "tips")
+        self.axes = finger_axes_of(self.hand, self.hand.layout("med", "hand"))
+        fingers = tuple(self.hand.fingers)
+        tips = {chain[-1]: finger for finger, chain in self.hand.fingers.items()}
+        self.rows = [fingers.index(tips[link]) for link in layout]
+        position, normal = (
+            np.stack([getattr(probes, name)[probes.active].mean(axis=0) for probes in layout.values()])
+            for name in ("position", "normal")
+        )
+        self.points = TactilePoints(tuple(layout), np.arange(len(layout)), position, normal)
+
+    def __call__(self, reading: HandReading, obs: Any, action: Any, targets: NDArray[np.floating]) -> None:
+        """Keep a tick, as a :class:`~robotics_bridge.deploy.controller.Controller` reports it."""
+        del obs, action
+        # The maker's pressure is about outward normals with axes z, y, x; a force on the skin points inward.
+        force = -reading.pressure[self.rows][:, ::-1]
+        torque = np.cross(self.points.position, force).astype(float)
+        points = np.concatenate([force, torque], axis=1)
+        wrench = total_wrench(points, self.points.links, self.points.link, self.axes)
+        self.episode.add(reading.position, reading.velocity, targets, points, wrench)
+
+    def write(self, folder: Path, joints: tuple[str, ...]) -> Path:
+        """Write the session as a data set; see :func:`write_lerobot`."""
+        return write_lerobot(
+            folder, [self.episode], fps=self.rate, joints=joints, points=self.points, robot=self.hand.name
+        )
+
+
 def write_lerobot(
     folder: str | Path,
     episodes: Sequence[Episode],
@@ -121,7 +162,7 @@ def write_lerobot(
         MissingDependencyError: pyarrow is not installed.
     """
     try:
-        import pyarrow  # noqa: F401 - whether it is there, before anything is written
+        import pyarrow
     except ImportError as error:
         raise missing_dependency("pyarrow", extra="board", purpose="Writing a LeRobot data set") from error
     folder = Path(folder)
@@ -142,7 +183,7 @@ def write_lerobot(
         tables.append(table)
         first += length
     _write_frames(folder / _DATA.format(chunk_index=0, file_index=0), tables, shapes)
-    _write_episodes(folder / "meta" / "episodes" / "chunk-000" / "file-000.parquet", rows)
+    _write_table(folder / "meta" / "episodes" / "chunk-000" / "file-000.parquet", pyarrow.Table.from_pylist(rows))
     _write_tasks(folder / "meta" / "tasks.parquet", tasks)
     whole = {name: np.concatenate([table[name] for table in tables]) for name in tables[0]}
     write_json(folder / "meta" / "stats.json", {name: _stats(value) for name, value in whole.items()})
@@ -228,18 +269,16 @@ def _write_frames(path: Path, tables: list[dict[str, NDArray]], shapes: Mapping[
             writer.write_table(pa.Table.from_arrays(columns, schema=schema))
 
 
-def _write_episodes(path: Path, rows: list[dict[str, Any]]) -> None:
-    import pyarrow as pa
+def _write_table(path: Path, table: Any) -> None:
     from pyarrow import parquet
 
     with atomic_path(path) as temporary:
-        parquet.write_table(pa.Table.from_pylist(rows), temporary)
+        parquet.write_table(table, temporary)
 
 
 def _write_tasks(path: Path, tasks: list[str]) -> None:
     """Write the tasks as pandas does that has them as its index, for that is how LeRobot reads them."""
     import pyarrow as pa
-    from pyarrow import parquet
 
     column = {"field_name": "task_index", "name": "task_index", "pandas_type": "int64", "numpy_type": "int64"}
     index = {"field_name": "task", "name": "task", "pandas_type": "unicode", "numpy_type": "object"}
@@ -250,5 +289,4 @@ def _write_tasks(path: Path, tasks: list[str]) -> None:
         "pandas_version": "2.0.0",
     }
     table = pa.table({"task_index": pa.array(range(len(tasks)), pa.int64()), "task": pa.array(tasks, pa.string())})
-    with atomic_path(path) as temporary:
-        parquet.write_table(table.replace_schema_metadata({"pandas": json.dumps(described)}), temporary)
+    _write_table(path, table.replace_schema_metadata({"pandas": json.dumps(described)}))

@@ -10,20 +10,22 @@ import multiprocessing
 import socket
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from brainbench.core.errors import DataError, UsageError, unknown_name
+from brainbench.core.errors import DataError, UsageError
 from robotics_bridge import hands
+from robotics_bridge.deploy.driver import HandReading
 from robotics_bridge.deploy.touch import PressureCalibration
 from robotics_bridge.deploy.udp import COMMAND, STATE, STOP, decode, encode
 from robotics_bridge.hands.observations import observation_type, observe, sensors_for
 from robotics_bridge.hands.scenes import OBJECT, holding
 from robotics_bridge.physics import MujocoEngine
 from robotics_bridge.sensors import SensorSuite
+from robotics_bridge.tasks.overrides import set_field
 
 HOLD_AFTER = 0.25
 """Seconds without a command after which the hand holds by itself."""
@@ -72,19 +74,11 @@ class Faults:
         Raises:
             UsageError: a fault is unknown or its value is no number.
         """
-        known = [item.name.replace("_", "-") for item in fields(cls)]
-        values: dict[str, Any] = {}
+        faults = cls()
         for text in texts:
-            name, equals, value = text.partition("=")
-            if name not in known:
-                raise unknown_name("fault", name, known)
-            try:
-                values[name.replace("-", "_")] = int(value) if name == "seed" else float(value)
-            except ValueError:
-                raise UsageError(f"A fault is given as {name}=NUMBER; received {text!r}.") from None
-            if not equals:
-                raise UsageError(f"A fault is given as {name}=NUMBER; received {text!r}.")
-        return cls(**values)
+            name, _, value = text.partition("=")
+            faults = set_field(faults, [name.replace("-", "_")], value)
+        return faults
 
 
 class SimulatedHand:
@@ -157,6 +151,47 @@ class SimulatedHand:
         pressure[self._rows] = self.touch()
         raw = self.calibration.pressure(self.fingers, pressure)
         return np.concatenate([self.position, self.engine.data[0].qvel[self._speeds], raw.ravel()])
+
+
+class ShadowTouch:
+    """The tactile group [S, N, C] of a simulated hand that holds a ball and follows the reported joints.
+
+    What lies in the real hand is not known to it: the ball stands for the object, so touch that is not measured is a
+    guess.
+
+    Args:
+        hand: Name of the hand.
+        observe: Observation type of the policy.
+        placement: Of its taxels.
+        resolution: Of its taxels.
+        joints: Names of the joints in the order of the reports.
+        rate: Control steps per second.
+        sub_steps: S.
+    """
+
+    def __init__(
+        self,
+        hand: str,
+        observe: str,
+        placement: str,
+        resolution: str,
+        *,
+        joints: tuple[str, ...],
+        rate: float = 40.0,
+        sub_steps: int = 5,
+    ) -> None:
+        self.sub_steps = sub_steps
+        self.hand = SimulatedHand(hand, rate * sub_steps, observe=observe, placement=placement, resolution=resolution)
+        self._order = [joints.index(name) for name in self.hand.joints]
+
+    def __call__(self, reading: HandReading) -> NDArray[np.float32]:
+        """Advance by one control step towards the reported joints and return what is felt on the way."""
+        self.hand.drive(reading.position[self._order])
+        felt = []
+        for _ in range(self.sub_steps):
+            self.hand.step()
+            felt.append(self.hand.touch().copy())
+        return np.stack(felt)
 
 
 def serve(hand: SimulatedHand, link: socket.socket, faults: Faults, seconds: float = 3600.0) -> None:

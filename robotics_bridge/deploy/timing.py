@@ -48,35 +48,25 @@ def realtime(priority: int = PRIORITY) -> Iterator[None]:
             gc.enable()
 
 
-class LatencyHistogram:
-    """Durations of ticks, counted in logarithmic buckets: 10 per decade from 10 µs to 10 s; percentiles are exact."""
+class LatencyHistogram(list[float]):
+    """Durations of ticks (s) in logarithmic buckets, 10 per decade from 10 µs to 10 s. Percentiles are exact."""
 
     EDGES = np.logspace(-5, 1, 61)
     """[61] (s)."""
 
-    def __init__(self) -> None:
-        self._values: list[float] = []
-
-    def add(self, seconds: float) -> None:
-        """Count a duration."""
-        self._values.append(seconds)
-
-    def __len__(self) -> int:
-        return len(self._values)
-
     @property
     def counts(self) -> NDArray[np.int64]:
         """Durations [62] below each edge, and beyond the last."""
-        return np.bincount(np.searchsorted(self.EDGES, self._values, side="right"), minlength=len(self.EDGES) + 1)
+        return np.bincount(np.searchsorted(self.EDGES, self, side="right"), minlength=len(self.EDGES) + 1)
 
     def percentile(self, share: float) -> float:
         """Return the duration (s) that a share (0 to 100) of ticks stays below; NaN without any."""
-        return float(np.percentile(self._values, share)) if self._values else math.nan
+        return float(np.percentile(self, share)) if self else math.nan
 
     def summary(self) -> dict[str, Any]:
         """Return counts and percentiles in milliseconds."""
         parts = {f"p{share:g}": 1e3 * self.percentile(share) for share in (50, 90, 99, 99.9)}
-        return {"ticks": len(self), **parts, "max": 1e3 * max(self._values, default=math.nan)}
+        return {"ticks": len(self), **parts, "max": 1e3 * max(self, default=math.nan)}
 
     def text(self, width: int = 40) -> str:
         """Return the histogram as lines of text, without empty ends."""

@@ -9,18 +9,6 @@ import torch
 from brainbench.core.devices import warp
 from robotics_bridge.envs.state import EnvState
 
-FORMER_NAMES = {
-    "episode_length_buf": "age", "_steps": "steps", "_return": "returns", "_push_left": "push_left",
-    "_start_joints": "start_joints", "_start_position": "start_position", "_home": "rest_targets",
-    "_sums": "reward_sums", "_totals": "totals",
-    "world": "simulation", "drives": "actuators", "watch": "task_state",
-}  # fmt: skip
-"""Names of tensors and parts in states that were saved before version 0.1."""
-
-
-_LATER = ("goals.turned_held",)
-"""Tensors that states lack which were saved before they were counted."""
-
 
 def save_state(state: EnvState) -> dict[str, torch.Tensor]:
     """Return copies of all memory of an environment batch, but for that of noisy or slow tactile sensors."""
@@ -32,17 +20,13 @@ def save_state(state: EnvState) -> dict[str, torch.Tensor]:
 
 def load_state(state: EnvState, values: Mapping[str, torch.Tensor]) -> None:
     """Put an environment batch where :func:`save_state` found one."""
-    found = {}
-    for key, value in values.items():
-        part, dot, name = key.partition(".")
-        found[f"{FORMER_NAMES.get(part, part)}{dot}{name}"] = value
 
     def under(part: str) -> dict[str, torch.Tensor]:
-        return {name.removeprefix(part): value for name, value in found.items() if name.startswith(part)}
+        return {name.removeprefix(part): value for name, value in values.items() if name.startswith(part)}
 
     for name, value in _memory(state).items():
-        value.copy_(found.get(name, value) if name in _LATER else found[name])
-    state.generator.set_state(found["generator"].cpu())
+        value.copy_(values[name])
+    state.generator.set_state(values["generator"].cpu())
     state.simulation.load_state_dict(under("simulation."))
     if state.task_state is not None:
         state.task_state.restored()

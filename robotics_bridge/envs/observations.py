@@ -61,32 +61,22 @@ def _privileged_joints(state: EnvState) -> torch.Tensor:
     return torch.cat((_joints(state, noisy=False), state.contacts.tip_force.flatten(1)), dim=1)
 
 
-def _tactile(state: EnvState) -> torch.Tensor:
-    assert state.touch is not None
-    return state.touch.reading
-
-
 def _tilt(state: EnvState) -> torch.Tensor:
     quat = state.target_pose[:, 3:]
     axis = constant(state.task.turn_axis or (0.0, 0.0, -1.0), quat)
     return rotate(quat, -axis)[:, 2:].clamp(-1.0, 1.0).acos()
 
 
-def _of_task(state: EnvState, group: str) -> torch.Tensor:
-    assert state.task_state is not None
-    return state.task_state.observe(group)
-
-
 _GROUPS: dict[str, Callable[[EnvState], torch.Tensor]] = {
     "proprio": lambda state: _joints(state, noisy=True),
-    "tactile": _tactile,
+    "tactile": lambda state: state.touch.reading,  # type: ignore[union-attr]
     "link_pose": lambda state: state.link_pose,
     "goal": _goal,
     "priv_proprio": _privileged_joints,
     "priv_obj_state": _object,
     "priv_obj_props": _properties,
-    "thermal": lambda state: _of_task(state, "thermal"),
-    "priv_thermal": lambda state: _of_task(state, "priv_thermal"),
+    "thermal": lambda state: state.task_state.observe("thermal"),  # type: ignore[union-attr]
+    "priv_thermal": lambda state: state.task_state.observe("priv_thermal"),  # type: ignore[union-attr]
     "aux_obj_size": lambda state: state.extent,
     "aux_goal_dist": lambda state: state.goals.angle.unsqueeze(1).clone(),
     "aux_obj_tilt": _tilt,

@@ -121,18 +121,12 @@ def observe(name: str, readings: Mapping[str, torch.Tensor], layout: Layout) -> 
     for link, probes in layout.items():
         if link not in readings:
             raise unknown_name("link among the readings", link, readings)
-        values = _by_taxel(readings[link], len(probes), link)
-        parts.append(_part(name, values, probes))
+        reading, count = readings[link], len(probes)
+        if reading[0].numel() % count:
+            shape = tuple(reading.shape)
+            raise UsageError(f"The reading of link {link!r} has shape {shape}, but the link has {count} probes.")
+        parts.append(_part(name, reading.reshape(reading.shape[0], count, -1), probes))
     return torch.cat(parts, dim=1)
-
-
-def _by_taxel(reading: torch.Tensor, count: int, link: str) -> torch.Tensor:
-    """Return a reading as [B, N, C]."""
-    size = reading[0].numel()
-    if count and size % count:
-        shape = tuple(reading.shape)
-        raise UsageError(f"The reading of link {link!r} has shape {shape}, but the link has {count} probes.")
-    return reading.reshape(reading.shape[0], count, size // count)
 
 
 def _part(name: str, values: torch.Tensor, probes: Any) -> torch.Tensor:

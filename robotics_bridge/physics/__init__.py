@@ -6,7 +6,6 @@ environments differ.
 
 from __future__ import annotations
 
-from robotics_bridge.physics.benchmark_scene import initial_velocities, pyramid
 from robotics_bridge.physics.cpu import MujocoEngine
 from robotics_bridge.physics.gpu import MujocoWarpEngine
 from robotics_bridge.physics.scene import KINDS, Geometry, TouchScene, Variants
@@ -24,6 +23,4 @@ __all__ = [
     "TouchScene",
     "Variants",
     "compile_variants",
-    "initial_velocities",
-    "pyramid",
 ]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -78,16 +79,11 @@ class MujocoWarpEngine:
             self._root = wp.array(np.asarray(self.model.body_rootid, dtype=np.int32), dtype=wp.int32)
         contact = self._d.contact
         blank = HandState.empty(num_envs, self.model.nbody, contact.worldid.shape[0], self._device)
-        self.state: HandState = blank.aliasing(
-            {
-                "contact_geom": contact.geom,
-                "contact_env": contact.worldid,
-                "contact_distance": contact.dist,
-                "contact_position": contact.pos,
-                "contact_count": self._d.nacon,
-                "time": self._d.time,
-            }
-        )
+        # The engine's own arrays serve where they have the form of the state's.
+        self.state: HandState = replace(
+            blank, contact_geom=contact.geom, contact_env=contact.worldid, contact_distance=contact.dist,
+            contact_position=contact.pos, contact_count=self._d.nacon, time=self._d.time,
+        )  # fmt: skip
         self._replay: Callable[[], None] | None = None
         self.forward()
 

@@ -152,10 +152,6 @@ class TouchScene:
         return {name: index for index, name in enumerate(self.links)}
 
     @cached_property
-    def _geometries(self) -> dict[str, int]:
-        return {geometry.name: index for index, geometry in enumerate(self.geometries)}
-
-    @cached_property
     def link_of(self) -> NDArray[np.int32]:
         """Link number [G] of every geometry."""
         return np.array([self._links[geometry.link] for geometry in self.geometries], dtype=np.int32)
@@ -165,12 +161,6 @@ class TouchScene:
         if name not in self._links:
             raise unknown_name("link", name, self.links)
         return self._links[name]
-
-    def geometry_index(self, name: str) -> int:
-        """Return the number of a geometry; an unknown name raises UsageError."""
-        if name not in self._geometries:
-            raise unknown_name("geometry", name, tuple(self._geometries))
-        return self._geometries[name]
 
     def geometries_of(self, link: str) -> tuple[int, ...]:
         """Return the numbers of the geometries that a link carries."""

@@ -6,8 +6,7 @@ whose quaternions are (x, y, z, w): views of them copy nothing.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
@@ -17,7 +16,7 @@ from numpy.typing import ArrayLike
 
 from brainbench.core.devices import pick_device, warp
 from brainbench.core.errors import UsageError
-from robotics_bridge.physics.kernels.state import StateArrays, check_state
+from robotics_bridge.physics.kernels.state import StateArrays
 
 DIVERGED = 1
 """Bit of :attr:`HandState.status`: a pose or velocity of the environment is not a finite number."""
@@ -50,7 +49,7 @@ class HandState:
     time: Any
     """Warp array [B] float32 (s)."""
     status: Any
-    """Warp array [B] int32 of :data:`DIVERGED` and :data:`CROWDED`, as of the last :meth:`check`."""
+    """Warp array [B] int32 of :data:`DIVERGED` and :data:`CROWDED`, as of the last update of a suite."""
 
     @classmethod
     def empty(cls, num_envs: int, num_links: int, contacts: int = 0, device: Any = "cpu") -> HandState:
@@ -131,18 +130,9 @@ class HandState:
         """Times [B] (s), a view of the same memory."""
         return warp().to_torch(self.time)
 
-    @property
-    def status_torch(self) -> torch.Tensor:
-        """Status bits [B], a view of the same memory."""
-        return warp().to_torch(self.status)
-
     def set_pose(self, pose: ArrayLike | torch.Tensor) -> None:
         """Write world poses [B, L, 7] (or one [L, 7] for all) as (x, y, z, qw, qx, qy, qz)."""
         self._write(self.pose_torch, pose, "poses", order=(0, 1, 2, 4, 5, 6, 3))
-
-    def get_pose(self) -> torch.Tensor:
-        """Return the world poses [B, L, 7] as (x, y, z, qw, qx, qy, qz), a copy."""
-        return self.pose_torch[..., [0, 1, 2, 6, 3, 4, 5]]
 
     def set_velocity(self, velocity: ArrayLike | torch.Tensor) -> None:
         """Write velocities [B, L, 6] (or one [L, 6] for all) as (linear of the origin, angular)."""
@@ -178,14 +168,6 @@ class HandState:
             rows = np.asarray(values, dtype=np.int32 if view.dtype.is_floating_point is False else np.float32)
             _copy(view[:count], rows.reshape(tuple(view[:count].shape)))
         self.contact_count.fill_(count)
-
-    def check(self) -> None:
-        """Refresh :attr:`status`: which environments diverged, and whether contacts were lost."""
-        warp().launch(check_state, dim=self.num_envs, inputs=[self.arrays], device=self.device)
-
-    def aliasing(self, buffers: Mapping[str, Any]) -> HandState:
-        """Return a state that uses an engine's own arrays for some of the buffers."""
-        return replace(self, **buffers)
 
     def _write(self, view: torch.Tensor, values: Any, what: str, order: tuple[int, ...] | None = None) -> None:
         shape = tuple(view.shape)

@@ -89,6 +89,34 @@ def mean_of_episodes(values: ArrayLike) -> tuple[float, float]:
     return float(array.mean()), float(_Z * spread / math.sqrt(len(array)))
 
 
+class Policy:
+    """A trained teacher or student as a function of observation groups that may remember; returns actions [B, A].
+
+    Args:
+        actor: Model class of rsl_rl, put into evaluation mode.
+    """
+
+    def __init__(self, actor: torch.nn.Module) -> None:
+        self.actor: Any = actor.eval()
+        self.actor.reset()
+
+    def act(self, observations: Mapping[str, torch.Tensor]) -> torch.Tensor:
+        """Return the mean actions [B, A]."""
+        from tensordict import TensorDict
+
+        if not isinstance(observations, TensorDict):
+            first = next(iter(observations.values()))
+            observations = TensorDict(dict(observations), batch_size=[first.shape[0]])  # type: ignore[arg-type]
+        with torch.inference_mode():
+            return self.actor(observations)
+
+    __call__ = act
+
+    def reset(self, dones: torch.Tensor | None = None) -> None:
+        """Forget the past of all environments, or of those [B] that are done."""
+        self.actor.reset(dones)
+
+
 def agent(name: str, env: Env, *, seed: int = 0) -> Callable[[Mapping[str, torch.Tensor]], torch.Tensor]:
     """Return the agent ``zero`` (rest position) or ``random`` (standard normal actions, as an untrained policy).
 

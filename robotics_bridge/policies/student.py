@@ -116,7 +116,7 @@ class PolicyCore(nn.Module):
         *,
         kept: bool = False,
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return (latents [L, B, D], h_out) of L steps; arguments as of :meth:`forward`, with L in front.
+        """Return (latents [L, B, D], h_out) of L steps.
 
         Args:
             flat: Normalised flat groups [L, B, n].
@@ -144,13 +144,7 @@ class PolicyCore(nn.Module):
     def forward(
         self, flat: Sequence[torch.Tensor], taxels: torch.Tensor | None, h_in: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return (latent [B, D], h_out [B, H]) of one step.
-
-        Args:
-            flat: Normalised flat groups [B, n].
-            taxels: Readings [B, S, N, C].
-            h_in: Memory.
-        """
+        """Return (latent [B, D], h_out [B, H]) of one step; arguments as of :meth:`unroll`, without L."""
         latents, h_out = self.unroll([x[None] for x in flat], None if taxels is None else taxels[None], h_in)
         return latents[0], h_out
 
@@ -221,11 +215,6 @@ class TactilePolicy(MLPModel):
         self._state: torch.Tensor | None = None
 
     @property
-    def touch(self) -> bool:
-        """True if the policy reads touch."""
-        return self.core.tactile is not None
-
-    @property
     def shapes(self) -> dict[str, tuple[int, ...]]:
         """Shape of every group that it reads, per environment."""
         found: dict[str, tuple[int, ...]] = {
@@ -238,12 +227,9 @@ class TactilePolicy(MLPModel):
     def advance(
         self, obs: Any, h_in: torch.Tensor, features: torch.Tensor | None = None
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return (latent [B, D], h_out [B, H]) of one step; nothing is remembered in the model.
+        """Return (latent [B, D], h_out [B, H]) of one step; arguments as of :meth:`unroll`, without L.
 
-        Args:
-            obs: Groups.
-            h_in: Memory [B, H]; zeros before the first step.
-            features: What the frozen encoder gave for this step, instead of its readings.
+        Nothing is remembered in the model.
         """
         read = self.shapes if features is None else self.obs_groups
         kept = None if features is None else features[None]
@@ -261,14 +247,14 @@ class TactilePolicy(MLPModel):
 
         Args:
             obs: Groups [L, B, …].
-            h_in: Memory, as for :meth:`advance`; [B, ``core.kept_size``] with features.
+            h_in: Memory [B, H], zeros before the first step; [B, ``core.kept_size``] with features.
             ended: Where [L, B] an episode ended after a step, so that memory starts anew; None for nowhere.
             features: What the frozen encoder gave [L, B, F], instead of its readings.
         """
         flat = self._normalised(obs)
         if features is not None:
             return self.core.unroll(flat, features, h_in, ended, kept=True)
-        return self.core.unroll(flat, obs[TACTILE] if self.touch else None, h_in, ended)
+        return self.core.unroll(flat, obs[TACTILE] if self.core.tactile is not None else None, h_in, ended)
 
     def _normalised(self, obs: Any) -> list[torch.Tensor]:
         if not self.obs_groups:

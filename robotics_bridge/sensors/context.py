@@ -22,6 +22,14 @@ if TYPE_CHECKING:
     from robotics_bridge.sensors.queries.solids import Solids
 
 
+def fill(kind: Any, source: Any, **own: Any) -> Any:
+    """Return a Warp structure: its fields as given, or as the attributes of a configuration that bear their names."""
+    struct = kind()
+    for name in kind.vars:
+        setattr(struct, name, own[name] if name in own else getattr(source, name))
+    return struct
+
+
 @dataclass(eq=False)
 class UpdateClock:
     """Counters of updates and episodes on the device."""

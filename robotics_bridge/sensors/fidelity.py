@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from functools import cache
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 from brainbench.core.errors import UsageError, unknown_name
 from brainbench.core.files import read_json
@@ -86,10 +86,6 @@ PRESETS: dict[str, SensorFidelity] = {
 
 
 @cache
-def _table() -> dict[str, Any]:
-    return read_json(TABLE)
-
-
 def _points(part: str) -> list[TradeoffPoint]:
-    rows = [row for row in _table()["points"] if row["part"] == part]
+    rows = [row for row in read_json(TABLE)["points"] if row["part"] == part]
     return [TradeoffPoint(row["error"], row["cost"], row) for row in rows]

@@ -53,6 +53,8 @@ class Sensor(abc.ABC):
     units: ClassVar[str] = ""
     knobs: ClassVar[frozenset[str]] = BASE_KNOBS
     """Noise knobs it has (thesis, table 4.2)."""
+    shared: ClassVar[tuple[str, ...]] = ()
+    """Attributes that sensors of its class have in common where one runtime and its kernels serve them."""
     runtime: ClassVar[str] = ""
     """``package.module:Class`` of the runtime that serves it, imported when a suite is built."""
 
@@ -66,8 +68,8 @@ class Sensor(abc.ABC):
         """Return the shape (N,) or (rows, columns) of the reading of one environment, without channels."""
 
     def group(self) -> Hashable:
-        """Return what a sensor shares with others of its class so that one runtime and its kernels serve them."""
-        return ()
+        """Return the values of :attr:`shared`."""
+        return tuple(getattr(self, name) for name in self.shared)
 
     def requirements(self, scene: TouchScene) -> QueryRequirements:
         """Return what must be built for it."""
@@ -97,6 +99,11 @@ class ProbeSensor(Sensor):
         """Return the shape (N,) or (rows, columns) of the reading of one environment, without channels."""
         return self.probes.shape
 
+    @property
+    def followed(self) -> tuple[object, ...]:
+        """Description of the geometries it looks at: equal for sensors that look at the same."""
+        return self.track, "" if self.track else self.link
+
     def tracked(self, scene: TouchScene) -> tuple[int, ...]:
         """Return the numbers of the geometries it looks at."""
         scene.link_index(self.link)
@@ -120,6 +127,8 @@ class QuerySensor(ProbeSensor):
     """``contact``: geometries that the engine reports in contact with the link (published); ``all``: every tracked
     geometry within reach, for engines or links without collision."""
 
+    shared: ClassVar[tuple[str, ...]] = ("query",)
+
     def __post_init__(self) -> None:
         super().__post_init__()
         for name, allowed in (("query", ("sdf", "raycast")), ("pairs", ("contact", "all"))):
@@ -130,10 +139,6 @@ class QuerySensor(ProbeSensor):
     def contact_only(self) -> bool:  # type: ignore[override]
         """True if it meets only geometries that the engine reports in contact with its link."""
         return self.pairs == "contact"
-
-    def group(self) -> Hashable:
-        """Return the way to ask for distances."""
-        return (self.query,)
 
     def requirements(self, scene: TouchScene) -> QueryRequirements:
         """Return the fields or trees of what it tracks."""

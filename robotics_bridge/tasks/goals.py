@@ -59,14 +59,14 @@ class Goal(abc.ABC):
                 f"{self.mastered!r} and {self.narrowing!r}."
             )
 
-    @abc.abstractmethod
     def first(self, quat: torch.Tensor, draw: torch.Tensor) -> torch.Tensor:
-        """Return the goals [B, 4] (w, x, y, z) of new episodes.
+        """Return the goals [B, 4] (w, x, y, z) of new episodes: what follows the object's own orientation.
 
         Args:
             quat: orientation of the object [B, 4].
             draw: uniform random numbers in [0, 1) [B, 2].
         """
+        return self.following(quat, quat, draw)
 
     @abc.abstractmethod
     def following(self, quat: torch.Tensor, goal: torch.Tensor, draw: torch.Tensor) -> torch.Tensor:
@@ -83,10 +83,6 @@ class SteppingRotation(Goal):
     allowed_off_axis: float = math.pi / 6
     """Tilt against the axis up to which rotation counts [rad]."""
     limit: int | None = 15
-
-    def first(self, quat: torch.Tensor, draw: torch.Tensor) -> torch.Tensor:
-        """Return the orientations one step from those of the object."""
-        return self.following(quat, quat, draw)
 
     def following(self, quat: torch.Tensor, goal: torch.Tensor, draw: torch.Tensor) -> torch.Tensor:
         """Return the goals one step further."""
@@ -106,10 +102,6 @@ class TimedRotation(Goal):
     tilt: tuple[float, float] = (-0.7853975, 0.7853975)
     """Range of both angles [rad]."""
     deadline: tuple[float, float] | None = (4.0, 6.0)
-
-    def first(self, quat: torch.Tensor, draw: torch.Tensor) -> torch.Tensor:
-        """Return tilted orientations of the object."""
-        return self.following(quat, quat, draw)
 
     def following(self, quat: torch.Tensor, goal: torch.Tensor, draw: torch.Tensor) -> torch.Tensor:
         """Return tilted orientations of the object."""

@@ -7,7 +7,7 @@ the hand is carried are not published and ours. The hand hangs from slides along
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from brainbench.core.devices import mujoco_module
@@ -22,7 +22,6 @@ if TYPE_CHECKING:
     import torch
 
     from robotics_bridge.tasks.step_context import StepContext
-    from robotics_bridge.tasks.task_state import TaskEnvironment
 
 SIDE, WALL, HEIGHT, TILT = 0.5, 0.0125, 0.25, math.radians(10)
 """Outer edge of the bin, thickness of its walls and floor, its height [m], and how far it leans about y [rad]."""
@@ -50,11 +49,6 @@ def bin_walls(spec: Any) -> None:
         walls.append(((0.0, sign * (edge - half), HEIGHT / 2), (edge, half, HEIGHT / 2)))
     for index, (position, size) in enumerate(walls):
         body.add_geom(name=f"bin_{index}", type=mujoco.mjtGeom.mjGEOM_BOX, pos=position, size=size)
-
-
-def thermometers(thermal: ThermalSettings) -> Callable[[TaskEnvironment], Thermometers]:
-    """Return what makes the thermometers of this material."""
-    return lambda env: Thermometers(env, thermal)
 
 
 def extra(m: StepContext, *, name: str) -> torch.Tensor:
@@ -87,7 +81,7 @@ def with_thermal(thermal: ThermalSettings) -> Task:
         joints={"xhand1": {"right_hand_thumb_bend_joint": 1.5}},
         carriage={axis: (span, 2000.0, 120.0, 100.0) for axis, span in _SPANS.items()},
         furniture=bin_walls,
-        task_state=thermometers(thermal),
+        task_state=partial(Thermometers, thermal=thermal),
         rewards={
             "reach": Reward(1.0, reach, {"sigma": 0.1}),
             "warmth": Reward(5.0, extra, {"name": "progress"}),

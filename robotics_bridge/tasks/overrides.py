@@ -36,9 +36,9 @@ def _one(task: Task, path: list[str], value: str) -> Task:
         if first in terms:
             return replace(task, **{part: {**terms, first: _term(first, terms[first], rest, value)}})
     if first in _names(task.teacher):
-        return replace(task, teacher=_field(task.teacher, path, value))
+        return replace(task, teacher=set_field(task.teacher, path, value))
     if first in _names(task):
-        return _field(task, path, value)
+        return set_field(task, path, value)
     known = (*task.rewards, *task.endings, *_names(task.teacher), *_names(task))
     raise unknown_name(f"number of task {task.name!r}", first, known)
 
@@ -52,7 +52,8 @@ def _term(name: str, term: Any, rest: list[str], value: str) -> Any:
     return replace(term, params={**term.params, key: _read(f"{name}.{key}", value, term.params[key])})
 
 
-def _field(subject: Any, path: list[str], value: str) -> Any:
+def set_field(subject: Any, path: list[str], value: str) -> Any:
+    """Return a frozen dataclass with another value of the field at the end of a path, read as the present one is."""
     first, *rest = path
     if first not in _names(subject):
         raise unknown_name(f"field of {type(subject).__name__}", first, _names(subject))
@@ -60,7 +61,7 @@ def _field(subject: Any, path: list[str], value: str) -> Any:
     if rest:
         if not is_dataclass(present):
             raise UsageError(f"{first!r} has no parts; received {'.'.join(path)!r}.")
-        return replace(subject, **{first: _field(present, rest, value)})
+        return replace(subject, **{first: set_field(present, rest, value)})
     if value == "none" and any(field.name == first and field.default is None for field in fields(subject)):
         return replace(subject, **{first: None})
     return replace(subject, **{first: _read(first, value, present)})

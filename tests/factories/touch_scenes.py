@@ -4,12 +4,31 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import mujoco
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from robotics_bridge.physics import Geometry, HandState, TouchScene
 
+PYRAMID = """<mujoco><option timestep="0.01" tolerance="1e-5"/><worldbody><geom name="floor" type="plane" size="0 0 1"/>
+{boxes}</worldbody></mujoco>"""
 PAD = Geometry(name="pad", link="hand", kind="box", size=(0.02, 0.02, 0.005))
+
+
+def pyramid() -> mujoco.MjModel:
+    """The published pyramid of ten boxes; numbers run up each leaning column."""
+    places = [(column + level / 2, level) for column in range(4) for level in range(4 - column)]
+    boxes = [
+        f'<body name="box{n}" pos="{0.24975 * x} 0 {0.125 + 0.24975 * z}"><freejoint/>'
+        f'<geom name="box{n}" type="box" size=".125 .125 .125" density="1000"/></body>'
+        for n, (x, z) in enumerate(places)
+    ]
+    return mujoco.MjModel.from_xml_string(PYRAMID.format(boxes="".join(boxes)))
+
+
+def falling(num_envs: int, dofs: int) -> np.ndarray:
+    """The published random start velocities [B, nv]."""
+    return 0.04 * np.random.default_rng(0).random((num_envs, dofs))
 
 
 def pad_scene(*objects: Geometry, pad: Geometry = PAD) -> TouchScene:

@@ -65,6 +65,7 @@ def deploy(
     Exit status 1: it was stopped for safety.
     """
     from robotics_bridge.deploy import session
+    from robotics_bridge.deploy.episodes import SessionRecorder
     from robotics_bridge.deploy.simulated_hand import Faults, simulated_hand
     from robotics_bridge.deploy.timing import realtime
     from robotics_bridge.deploy.udp import UdpDriver
@@ -83,17 +84,18 @@ def deploy(
         else:
             address, joints, fingers = _remote(driver, deployed)
         link = stack.enter_context(UdpDriver(address, joints, fingers))
-        tape = _Tape(deployed) if record is not None else None
+        task = str(deployed.deployment.get("task", "deployed policy"))
+        recorder = SessionRecorder(deployed.hand, deployed.rate, task) if record is not None else None
         fallback = _shadow(deployed, joints) if shadow else None
         controller = deployed.controller(
             link, limits={"timeout": timeout, "pressure": pressure}, sources=sources, fallback=fallback,
-            threads=threads, record=tape,
+            threads=threads, record=recorder,
         )  # fmt: skip
         with realtime() if ahead else contextlib.nullcontext():
             report = controller.run(seconds)
     facts: dict[str, Any] = {**vars(report)}
-    if record is not None and tape is not None and tape.episode.state:
-        facts["episode"] = str(tape.write(record, joints))
+    if record is not None and recorder is not None and recorder.episode.state:
+        facts["episode"] = str(recorder.write(record, joints))
     reason = f" ({report.reason})" if report.reason else ""
     latency = report.latency
     text = (
@@ -121,53 +123,8 @@ def _remote(text: str, deployed: DeployedPolicy) -> tuple[tuple[str, int], tuple
 
 
 def _shadow(deployed: DeployedPolicy, joints: tuple[str, ...]) -> Any:
-    from robotics_bridge.deploy.shadow import ShadowTouch
+    from robotics_bridge.deploy.simulated_hand import ShadowTouch
 
     facts = deployed.deployment
     names = (str(facts[key]) for key in ("observe", "placement", "resolution"))
     return ShadowTouch(deployed.hand, *names, joints=joints, rate=deployed.rate, sub_steps=int(facts["sub_steps"]))
-
-
-class _Tape:
-    """Keeps a session for LeRobot; touch is one point per finger tip, where the hand senses it."""
-
-    def __init__(self, deployed: DeployedPolicy) -> None:
-        from robotics_bridge import hands
-        from robotics_bridge.deploy.episodes import Episode, TactilePoints
-        from robotics_bridge.policies.encoders.finger_axes import finger_axes_of
-
-        self.hand, self.rate = hands.load(deployed.hand), deployed.rate
-        layout = self.hand.layout("med", "tips")
-        self.axes = finger_axes_of(self.hand, self.hand.layout("med", "hand"))
-        import numpy as np
-
-        fingers = tuple(self.hand.fingers)
-        tips = {chain[-1]: finger for finger, chain in self.hand.fingers.items()}
-        self.rows = [fingers.index(tips[link]) for link in layout]
-        position, normal = (
-            np.stack([getattr(probes, name)[probes.active].mean(axis=0) for probes in layout.values()])
-            for name in ("position", "normal")
-        )
-        self.points = TactilePoints(tuple(layout), np.arange(len(layout)), position, normal)
-        self.episode = Episode(str(deployed.deployment.get("task", "deployed policy")))
-
-    def __call__(self, reading: Any, obs: Any, action: Any, targets: Any) -> None:
-        import numpy as np
-
-        from robotics_bridge.deploy.episodes import total_wrench
-
-        del obs, action
-        # The maker's pressure is about outward normals with axes z, y, x; a force on the skin points inward.
-        force = -reading.pressure[self.rows][:, ::-1]
-        torque = np.cross(self.points.position, force).astype(float)
-        points = np.concatenate([force, torque], axis=1)
-        wrench = total_wrench(points, self.points.links, self.points.link, self.axes)
-        self.episode.add(reading.position, reading.velocity, targets, points, wrench)
-
-    def write(self, folder: Path, joints: tuple[str, ...]) -> Path:
-        """Write the data set."""
-        from robotics_bridge.deploy.episodes import write_lerobot
-
-        return write_lerobot(
-            folder, [self.episode], fps=self.rate, joints=joints, points=self.points, robot=self.hand.name
-        )

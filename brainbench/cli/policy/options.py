@@ -51,10 +51,10 @@ def agent_of(name: str, env: Env, *, seed: int = 0) -> Any:
     if name not in known and not Path(name).exists():
         raise unknown_name("agent", name, known, hint="Or give the folder of a training run.")
     if _student(name):
-        from robotics_bridge.policies.training.distill import StudentPolicy, load_student
+        from robotics_bridge.policies.training.distill import load_student
 
         student, _ = load_student(name, device=str(env.device))
-        return StudentPolicy(student)
+        return evaluate.Policy(student)
     return teacher.load_teacher(name, env)
 
 

@@ -11,6 +11,7 @@ import numpy as np
 
 from brainbench.cli.tactile import figures
 from brainbench.stimuli.figures.camera import Camera
+from brainbench.stimuli.figures.canvas import save_figure
 from brainbench.stimuli.figures.films import require_writer, write_film
 from brainbench.stimuli.figures.raster import Triangles
 from brainbench.stimuli.figures.scenes import Style
@@ -95,11 +96,9 @@ def write_strip(path: Path, frames: Sequence[NDArray[np.uint8]], times: Sequence
     """Write a PNG of frames side by side, each with its time (s)."""
     height, width = frames[0].shape[:2]
     scale = 2.2
-    figure, axes = figures.pyplot().subplots(
-        1, len(frames), figsize=(scale * len(frames) * width / height, scale), squeeze=False, layout="constrained"
-    )
-    for ax, frame, time in zip(axes[0], frames, times, strict=True):
+    figure, axes = figures.panels(len(frames), (scale * len(frames) * width / height, scale))
+    for ax, frame, time in zip(axes, frames, times, strict=True):
         ax.imshow(frame)
         ax.set_title(f"{time:.1f} s", fontsize=8)
         ax.set_axis_off()
-    figures.save(figure, path)
+    save_figure(figure, path, dpi=110)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -10,6 +11,15 @@ import typer
 
 from brainbench.cli.output import JsonOption, emit, progress_bar, table, table_of
 from brainbench.cli.policy.options import HandOption
+
+
+def _tracked(items: Sequence[Any], what: str) -> Iterator[Any]:
+    """Yield items while a bar shows how many are done."""
+    with progress_bar() as progress:
+        for index, item in enumerate(items):
+            progress(index, len(items), what)
+            yield item
+        progress(len(items), len(items), what)
 
 
 def demo(
@@ -33,12 +43,9 @@ def demo(
         "sound": scenes.sound,
     }
     made: dict[str, Any] = {}
-    with progress_bar() as progress:
-        for index, (name, job) in enumerate(jobs.items()):
-            progress(index, len(jobs), f"drawing {name}")
-            path = out / f"tactile-{name}.png"
-            made[name] = {"picture": path, **job(path)}
-        progress(len(jobs), len(jobs), "drawing")
+    for name, job in _tracked(list(jobs.items()), "drawing"):
+        path = out / f"tactile-{name}.png"
+        made[name] = {"picture": path, **job(path)}
 
     def shown(item: dict[str, Any]) -> str:
         return ", ".join(f"{key} {value:.3g}" for key, value in item.items() if key != "picture")
@@ -105,14 +112,12 @@ def bench(
 
     if envs < 1 or repeats < 1:
         raise UsageError(f"--envs and --repeats are at least 1; received {envs} and {repeats}.")
-    results = []
-    with progress_bar() as progress:
-        grip = scenes.Grip(hand, envs=envs, device=device)
-        grip.run(60)
-        for index, name in enumerate(scenes.CLASSES):
-            progress(index, len(scenes.CLASSES), "timing sensors")
-            results.append(scenes.time_class(grip, name, resolution, placement, noisy=noisy, repeats=repeats))
-        progress(len(scenes.CLASSES), len(scenes.CLASSES), "timing sensors")
+    grip = scenes.Grip(hand, envs=envs, device=device)
+    grip.run(60)
+    results = [
+        scenes.time_class(grip, name, resolution, placement, noisy=noisy, repeats=repeats)
+        for name in _tracked(list(scenes.CLASSES), "timing sensors")
+    ]
     noise = ", published noise" if noisy else ""
     columns = {
         "sensor": "{0[sensor]}",
@@ -134,15 +139,10 @@ def check(
     from robotics_bridge.sensors.checks import CHECKS
 
     results = []
-    with progress_bar() as progress:
-        for index, (name, run) in enumerate(CHECKS.items()):
-            progress(index, len(CHECKS), "checking")
-            found, truth, tolerance = run(device)
-            error = abs(found - truth) / max(abs(truth), 1e-30)
-            results.append(
-                {"check": name, "found": found, "truth": truth, "error": error, "passed": error <= tolerance}
-            )
-        progress(len(CHECKS), len(CHECKS), "checking")
+    for name, run in _tracked(list(CHECKS.items()), "checking"):
+        found, truth, tolerance = run(device)
+        error = abs(found - truth) / max(abs(truth), 1e-30)
+        results.append({"check": name, "found": found, "truth": truth, "error": error, "passed": error <= tolerance})
     columns = {
         "check": "{0[check]}",
         ">found": "{0[found]:.6g}",

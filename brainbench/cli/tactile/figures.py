@@ -11,10 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import spectrogram
 
-from brainbench.core.errors import missing_dependency
-from brainbench.core.files import atomic_path
 from brainbench.core.rotations import to_matrices
 from brainbench.stimuli.figures.camera import Camera, Lens
+from brainbench.stimuli.figures.canvas import new_figure, save_figure
 from brainbench.stimuli.figures.raster import Triangles, draw
 from brainbench.stimuli.figures.shading import lamp, paint, shade
 from brainbench.stimuli.figures.surfaces import ball, corner_normals, tube
@@ -26,27 +25,15 @@ SAMPLES = 2
 """Samples of a pixel along each axis."""
 
 
-def pyplot() -> Any:
-    """Return matplotlib's pyplot, which draws into files alone.
+def panels(count: int, inches: tuple[float, float], **options: Any) -> tuple[Any, Any]:
+    """Return a figure and its axes [count] side by side; further options are matplotlib's ``subplots``.
 
     Raises:
         MissingDependencyError: matplotlib is not installed.
     """
-    try:
-        import matplotlib as mpl
-    except ImportError as error:
-        raise missing_dependency("matplotlib", extra="report", purpose="Pictures") from error
-    mpl.use("Agg")
-    from matplotlib import pyplot as plots
-
-    return plots
-
-
-def save(figure: Any, path: Path) -> None:
-    """Write a figure and forget it."""
-    with atomic_path(path) as temporary:
-        figure.savefig(temporary, dpi=110)
-    pyplot().close(figure)
+    figure = new_figure(round(100 * inches[0]), round(100 * inches[1]))
+    figure.set_layout_engine("constrained")
+    return figure, figure.subplots(1, count, squeeze=False, **options)[0]
 
 
 def link_rotation(pose: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -92,13 +79,16 @@ def draw_forces(
     readings: Mapping[str, NDArray[np.float64]],
 ) -> None:
     """Draw a hand with its taxels coloured by force, and arrows along the force (link frame)."""
-    plots = pyplot()
+    figure = new_figure(*SIZE)
+    from matplotlib import cm, colormaps
+    from matplotlib.colors import ListedColormap, Normalize
+
     peak = max(float(np.linalg.norm(force, axis=1).max()) for force in readings.values()) or 1e-9
     hand, held, marks = [], [], []
     for geometry in scene.geometries:
         kept, color = (held, OBJECT) if geometry.link == "object" else (hand, SKIN)
         kept.append(placed(surface(geometry, color), pose[scene.link_index(geometry.link)]))
-    palette = plots.get_cmap("inferno")
+    palette = colormaps["inferno"]
     for link, item in probes.items():
         where = pose[scene.link_index(link)]
         turn = link_rotation(where)
@@ -127,17 +117,17 @@ def draw_forces(
     flat[veil.pixels[front]] = 0.24 * colors[front] + 0.76 * flat[veil.pixels[front]]
     image = _trimmed(averaged(image))
     inches = image.shape[1] / 110, image.shape[0] / 110 + 0.75
-    figure = plots.figure(figsize=inches)
+    figure.set_size_inches(inches)
     axes = figure.add_axes((0, 0.75 / inches[1], 1, 1 - 0.75 / inches[1]))
     axes.imshow(image)
     axes.set_axis_off()
-    part = plots.matplotlib.colors.ListedColormap(palette(np.linspace(0.15, 0.9, 256)))
-    scale = plots.cm.ScalarMappable(plots.Normalize(0, peak), part)
+    part = ListedColormap(palette(np.linspace(0.15, 0.9, 256)))
+    scale = cm.ScalarMappable(Normalize(0, peak), part)
     bar = figure.colorbar(
         scale, cax=figure.add_axes((0.3, 0.55 / inches[1], 0.4, 0.14 / inches[1])), orientation="horizontal"
     )
     bar.set_label("force on a taxel (N); arrows push on the skin; blue taxels feel nothing", labelpad=2)
-    save(figure, path)
+    save_figure(figure, path, dpi=110)
 
 
 def _trimmed(image: NDArray[np.float64], margin: int = 24) -> NDArray[np.float64]:
@@ -153,8 +143,7 @@ def _trimmed(image: NDArray[np.float64], margin: int = 24) -> NDArray[np.float64
 
 def draw_markers(path: Path, rest: NDArray[np.float64], fields: Mapping[str, NDArray[np.float64]]) -> None:
     """Draw marker displacements [N, 3] (m) from their places at rest [N, 3], one panel per motion."""
-    plots = pyplot()
-    figure, axes = plots.subplots(1, len(fields), figsize=(11, 4.1), layout="constrained")
+    figure, axes = panels(len(fields), (11, 4.1))
     bulge = max(float(np.abs(field[:, 2]).max()) for field in fields.values()) or 1.0
     places = None
     for panel, (name, field) in zip(axes, fields.items(), strict=True):
@@ -169,7 +158,7 @@ def draw_markers(path: Path, rest: NDArray[np.float64], fields: Mapping[str, NDA
         panel.set(title=f"{name}: up to {1e3 * largest:.2g} mm", xlabel="x (mm)", aspect="equal")
     axes[0].set_ylabel("y (mm)")
     figure.colorbar(places, ax=axes, label="bulge (of the largest)", shrink=0.8)
-    save(figure, path)
+    save_figure(figure, path, dpi=110)
 
 
 def draw_temperature(
@@ -180,10 +169,9 @@ def draw_temperature(
     maps: Mapping[str, NDArray[np.float64]],
 ) -> None:
     """Draw the warmest cell over time, and for each material the warmest value along one axis (°C)."""
-    plots = pyplot()
-    figure, axes = plots.subplots(
-        1, 1 + len(maps), figsize=(12, 3.4), layout="constrained", width_ratios=[1.5] + [1] * len(maps)
-    )
+    figure, axes = panels(1 + len(maps), (12, 3.4), width_ratios=[1.5] + [1] * len(maps))
+    from matplotlib.colors import PowerNorm
+
     colors = dict(zip(lines, ("#c1440e", "#2b6cb0", "#4a7c3a"), strict=False))
     for name, line in lines.items():
         axes[0].plot(times, line, color=colors.get(name), linewidth=1.8)
@@ -195,7 +183,7 @@ def draw_temperature(
     top = max(float(field.max()) for field in maps.values())
     bottom = min(float(field.min()) for field in maps.values())
     # The eye has to tell a tenth of a degree under wood from ten degrees under metal.
-    scale = plots.matplotlib.colors.PowerNorm(0.35, bottom, top)
+    scale = PowerNorm(0.35, bottom, top)
     shown = None
     for panel, (name, field) in zip(axes[1:], maps.items(), strict=True):
         seen = field.max(axis=0).T
@@ -206,13 +194,12 @@ def draw_temperature(
     bar = figure.colorbar(shown, ax=axes[1:], label="°C", shrink=0.85)
     bar.set_ticks([bottom, *(bottom + share * (top - bottom) for share in (0.02, 0.1, 0.3, 0.6)), top])
     bar.ax.yaxis.set_major_formatter("{x:.1f}")
-    save(figure, path)
+    save_figure(figure, path, dpi=110)
 
 
 def draw_sound(path: Path, signals: Mapping[str, NDArray[np.float64]], rate: float) -> None:
     """Draw spectrograms of signals [T] at a sample rate (Hz)."""
-    plots = pyplot()
-    figure, axes = plots.subplots(1, len(signals), figsize=(12, 3.8), layout="constrained", sharey=True)
+    figure, axes = panels(len(signals), (12, 3.8), sharey=True)
     shown = None
     for panel, (name, signal) in zip(axes, signals.items(), strict=True):
         frequency, time, power = spectrogram(signal, rate, nperseg=1024, noverlap=896)
@@ -221,4 +208,4 @@ def draw_sound(path: Path, signals: Mapping[str, NDArray[np.float64]], rate: flo
         panel.set(title=f"ball on {name}", xlabel="time (s)")
     axes[0].set_ylabel("frequency (kHz)")
     figure.colorbar(shown, ax=axes, label="dB", shrink=0.9)
-    save(figure, path)
+    save_figure(figure, path, dpi=110)

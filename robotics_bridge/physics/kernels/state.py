@@ -61,13 +61,6 @@ def status_of(state: StateArrays, env: int) -> int:
 
 
 @wp.kernel
-def check_state(state: StateArrays):
-    """Refresh the status. Thread: environment [B]."""
-    env = wp.tid()
-    state.status[env] = status_of(state, env)
-
-
-@wp.kernel
 def fill_links(
     xpos: wp.array2d(dtype=wp.vec3f),
     xquat: wp.array2d(dtype=wp.quatf),

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields
+from functools import partial
 from typing import Any
 
 import torch
@@ -248,12 +249,12 @@ class _Recurrent(_Learned):
 class _Images(_Learned):
     """Base of the convolutional arms: the readings as images, one per link, or one of the whole hand."""
 
-    canvas = False
     index: torch.Tensor
     """Item in every cell of every link's image; N for none."""
 
-    def __init__(self, config: EncoderConfig) -> None:
+    def __init__(self, config: EncoderConfig, *, canvas: bool = False) -> None:
         super().__init__(config)
+        self.canvas = canvas
         slots, items, channels = self.shape
         if self.canvas:
             grid = TaxelGrid(
@@ -303,8 +304,8 @@ class _Images(_Learned):
 class _Convolution(_Images):
     """Two convolutions (published channels 16 and 32, kernel 3) on each link's grid, averaged over it."""
 
-    def __init__(self, config: EncoderConfig) -> None:
-        super().__init__(config)
+    def __init__(self, config: EncoderConfig, *, canvas: bool = False) -> None:
+        super().__init__(config, canvas=canvas)
         first, second = _CHANNELS
         self.net = nn.Sequential(
             nn.Conv2d(self.planes, first, _KERNEL, padding=1), nn.ELU(),
@@ -320,15 +321,11 @@ class _Convolution(_Images):
         return self.head(values.reshape(taxels.shape[0], -1)), h_in
 
 
-class _ConvolutionCanvas(_Convolution):
-    canvas = True
-
-
 class _ConvRecurrent(_Images):
     """A convolutional gated recurrent cell (published: 16 channels, kernel 3, layer norm) on each link's grid."""
 
-    def __init__(self, config: EncoderConfig) -> None:
-        super().__init__(config)
+    def __init__(self, config: EncoderConfig, *, canvas: bool = False) -> None:
+        super().__init__(config, canvas=canvas)
         self.cell = GRU(self.planes, _CHANNELS[0], kernel_size=_KERNEL, layer_norm=True)
         places = self.rows * self.columns if self.canvas else self.images
         self.head = nn.Linear(_CHANNELS[0] * places, self.features)
@@ -365,10 +362,6 @@ class _ConvRecurrent(_Images):
         return self.head((y if self.canvas else y.mean((2, 3))).reshape(batch, -1))
 
 
-class _ConvRecurrentCanvas(_ConvRecurrent):
-    canvas = True
-
-
 class _Network(TactileEncoder):
     """A scored network, normalised features, and a learned linear map to the embedding."""
 
@@ -401,7 +394,7 @@ ARMS: Mapping[str, Callable[[EncoderConfig], TactileEncoder]] = {
     "rnn": _Recurrent,
     "tactile_cnn": _Convolution,
     "tactile_convrnn": _ConvRecurrent,
-    "tactile_canvas_cnn": _ConvolutionCanvas,
-    "tactile_canvas_convrnn": _ConvRecurrentCanvas,
+    "tactile_canvas_cnn": partial(_Convolution, canvas=True),
+    "tactile_canvas_convrnn": partial(_ConvRecurrent, canvas=True),
 }
 """Encoders that are learned with the policy, by their published names. ``canvas``: on the 5 × 7 grid of the hand."""

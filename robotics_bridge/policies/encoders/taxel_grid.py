@@ -143,28 +143,15 @@ def _of_force(points: NDArray[np.float64], force: NDArray[np.float64]) -> NDArra
     return np.concatenate([force, np.stack([_cross(x) @ f for x, f in zip(points, force, strict=True)])], axis=1)
 
 
-def _whole(points: NDArray[np.float64], normals: NDArray[np.float64]) -> NDArray[np.float64]:
-    del normals
-    return np.tile(np.eye(6), (len(points), 1, 1))
-
-
-def _vector(points: NDArray[np.float64], normals: NDArray[np.float64]) -> NDArray[np.float64]:
-    del normals
-    return _of_force(points, np.tile(np.eye(3), (len(points), 1, 1)))
-
-
-def _pushed(points: NDArray[np.float64], normals: NDArray[np.float64]) -> NDArray[np.float64]:
-    return _of_force(points, -normals[:, :, None])
-
-
-def _pressure(points: NDArray[np.float64], normals: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Undo equation 4.29: axes z, y, x, and outward; its scale is left to the calibration."""
-    del normals
-    return _of_force(points, np.tile(-np.eye(3)[::-1], (len(points), 1, 1)))
+def _vector(points: NDArray[np.float64], axes: NDArray[np.float64]) -> NDArray[np.float64]:
+    return _of_force(points, np.tile(axes, (len(points), 1, 1)))
 
 
 _WRENCHES: Mapping[str, Any] = {
-    "force_torque": _whole, "proximity": _whole, "force": _vector, "elastomer": _vector, "bool": _pushed,
-    "depth": _pushed, "agg_bool": _pushed, "agg_force": _pressure,
-}  # fmt: skip
+    **dict.fromkeys(("force_torque", "proximity"), lambda points, normals: np.tile(np.eye(6), (len(points), 1, 1))),
+    **dict.fromkeys(("force", "elastomer"), lambda points, normals: _vector(points, np.eye(3))),
+    **dict.fromkeys(("bool", "depth", "agg_bool"), lambda points, normals: _of_force(points, -normals[:, :, None])),
+    # Undoes equation 4.29: axes z, y, x, and outward; its scale is left to the calibration.
+    "agg_force": lambda points, normals: _vector(points, -np.eye(3)[::-1]),
+}
 """Observation type → the maps [N, 6, C] from its values to wrenches about the link's origin, in its axes."""

@@ -18,7 +18,7 @@ import time
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, Protocol
+from typing import Any, Literal
 
 import torch
 from safetensors import SafetensorError
@@ -31,6 +31,7 @@ from brainbench.core.files import atomic_path, provenance, read_json, to_plain, 
 from brainbench.core.progress import Progress
 from brainbench.models.training.run_folder import RunLog, load_state, save_state
 from robotics_bridge.policies.encoders.arms import perceptron
+from robotics_bridge.policies.evaluate import Policy
 from robotics_bridge.policies.shipped import policy_path
 from robotics_bridge.policies.student import TACTILE, TactilePolicy
 from robotics_bridge.policies.training.cuda_graph_step import ChunkStep
@@ -41,14 +42,6 @@ _log = logging.getLogger(__name__)
 
 CONFIG, MODEL, STATE = "config.json", "model.safetensors", "state.safetensors"
 _LEAST_VARIANCE = 1e-4
-
-
-class Teacher(Protocol):
-    """The policy that is imitated."""
-
-    def act(self, obs: Any, /) -> torch.Tensor:
-        """Return actions [B, A] for observation groups."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -72,7 +65,7 @@ def distill(
     out: str | Path,
     *,
     env: Any,
-    teacher: Teacher,
+    teacher: Policy,
     stop_after: float | None = None,
     stop_at: int | None = None,
     graphs: bool = True,
@@ -132,7 +125,7 @@ class _Learner(nn.Module):
 
 
 class _Run:
-    def __init__(self, config: DistillConfig, out: Path, env: Any, teacher: Teacher, *, graphs: bool = True) -> None:
+    def __init__(self, config: DistillConfig, out: Path, env: Any, teacher: Policy, *, graphs: bool = True) -> None:
         self.config, self.out, self.env, self.teacher = config, out, env, teacher
         self.device = torch.device(env.device)
         read = [name for name in env.task.groups["student"] if name != TACTILE]
@@ -428,22 +421,3 @@ def load_student(folder: str | Path, *, device: str = "cpu") -> tuple[TactilePol
     except (SafetensorError, RuntimeError, json.JSONDecodeError) as error:
         raise DataError(f"The weights in {str(folder)!r} are damaged or of another student ({error}).") from error
     return student.to(device).eval(), described
-
-
-class StudentPolicy:
-    """A student as a function of observations that remembers per environment, for playing and evaluation."""
-
-    def __init__(self, student: TactilePolicy) -> None:
-        self.student = student.eval()
-        self.student.reset()
-
-    def __call__(self, obs: Mapping[str, torch.Tensor]) -> torch.Tensor:
-        """Return actions [B, A]."""
-        with torch.no_grad():
-            return self.student.action_of(self.student.get_latent(obs))
-
-    act = __call__
-
-    def reset(self, mask: torch.Tensor | None = None) -> None:
-        """Forget all environments, or those in a mask [B]."""
-        self.student.reset(mask)

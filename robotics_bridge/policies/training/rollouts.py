@@ -38,8 +38,8 @@ class Rollout:
 
     @classmethod
     def load(cls, path: Path, device: torch.device) -> Rollout:
-        """Read what :meth:`save` wrote; version 0.1 put ``groups.`` before the names of groups."""
-        parts = {name.removeprefix("groups."): value.to(device) for name, value in load_file(path).items()}
+        """Read what :meth:`save` wrote."""
+        parts = {name: value.to(device) for name, value in load_file(path).items()}
         return cls(parts, parts.pop("memory"))
 
 

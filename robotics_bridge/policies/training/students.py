@@ -16,10 +16,10 @@ from robotics_bridge import tasks
 from robotics_bridge.policies.encoders.arms import ARMS
 from robotics_bridge.policies.encoders.calibration import HandCalibration
 from robotics_bridge.policies.encoders.taxel_grid import TaxelGrid
-from robotics_bridge.policies.evaluate import evaluate
+from robotics_bridge.policies.evaluate import Policy, evaluate
 from robotics_bridge.policies.report import EVALUATION, GRADED
 from robotics_bridge.policies.shipped import list_policies
-from robotics_bridge.policies.training.distill import CONFIG, DistillResult, StudentPolicy, distill, load_student
+from robotics_bridge.policies.training.distill import CONFIG, DistillResult, distill, load_student
 from robotics_bridge.policies.training.distill_config import DistillConfig
 from robotics_bridge.policies.training.teacher import load_teacher
 
@@ -129,7 +129,7 @@ def evaluate_student(
     ``dropped`` (:class:`~robotics_bridge.policies.evaluate.Evaluation`), and holds the ``iterations`` learned so far.
     """
     student, _ = load_student(folder, device=str(env.device))
-    policy, found = StudentPolicy(student), []
+    policy, found = Policy(student), []
     for number, seed in enumerate(SEEDS):
         result = evaluate(env, policy, episodes=episodes, seed=seed, name=Path(folder).name)
         found.append(

@@ -22,13 +22,12 @@ import torch
 from brainbench.core.errors import DataError, DataFileNotFoundError, UsageError, missing_dependency
 from brainbench.core.files import file_hash, provenance, read_json, write_json
 from robotics_bridge.envs.rsl_rl import RslRlEnv
+from robotics_bridge.policies.evaluate import Policy
 from robotics_bridge.policies.shipped import policy_path
 from robotics_bridge.policies.training import state_tree
 from robotics_bridge.tasks.settings import TeacherSettings
 
 if TYPE_CHECKING:
-    from tensordict import TensorDict
-
     from robotics_bridge.envs.env import Env
 
 _LOG = logging.getLogger(__name__)
@@ -48,33 +47,6 @@ class TeacherResult:
     """Time of this call (s)."""
     history: tuple[Mapping[str, float], ...]
     """Lines of ``log.jsonl`` written by this call."""
-
-
-class Policy:
-    """A trained actor that acts on observation groups: ``policy(observations) -> [B, A]`` (mean actions).
-
-    Args:
-        actor: Model class of rsl_rl, put into evaluation mode.
-    """
-
-    def __init__(self, actor: torch.nn.Module) -> None:
-        self.actor = actor.eval()
-
-    def act(self, observations: Mapping[str, torch.Tensor] | TensorDict) -> torch.Tensor:
-        """Return the mean actions [B, A]."""
-        from tensordict import TensorDict
-
-        if not isinstance(observations, TensorDict):
-            first = next(iter(observations.values()))
-            observations = TensorDict(dict(observations), batch_size=[first.shape[0]])  # type: ignore[arg-type]
-        with torch.inference_mode():
-            return self.actor(observations)
-
-    __call__ = act
-
-    def reset(self, dones: torch.Tensor | None = None) -> None:
-        """Forget the past of environments [B] that are done; a no-op for this network."""
-        self.actor.reset(dones)  # type: ignore[operator]
 
 
 class Trainer:
@@ -109,14 +81,9 @@ class Trainer:
         _LOG.info("%s", said.getvalue())
         self.iteration = 0
         self._observations = observations
-        self._spread_episodes()
+        # First episodes end at different times, so that no batch holds only beginnings.
+        self.env.episode_length_buf = torch.randint_like(self.env.episode_length_buf, int(env.max_episode_length))
         self.algorithm.train_mode()
-
-    def _spread_episodes(self) -> None:
-        """Let first episodes end at different times, so that no batch holds only beginnings."""
-        self.env.episode_length_buf = torch.randint_like(
-            self.env.episode_length_buf, high=int(self.env.max_episode_length)
-        )
 
     def iterate(self) -> dict[str, float]:
         """Collect steps, learn from them, and return losses, episode means and seconds spent."""

@@ -21,17 +21,17 @@ from robotics_bridge.sensors.audio.kernels.sound import (
     sound_drives,
 )
 from robotics_bridge.sensors.audio.sensors import ActuationAudio, ContactAudio
-from robotics_bridge.sensors.context import SuiteContext
+from robotics_bridge.sensors.context import SuiteContext, fill
 from robotics_bridge.sensors.noise.model import stream_seed
 from robotics_bridge.sensors.runtime import Runtime
 
 wp = warp()
 
 
-def _keyed(item: Any, seed: int, name: str) -> Any:
+def _key(seed: int, name: str) -> dict[str, Any]:
+    """Return both halves of the key of a source's random numbers."""
     key = stream_seed(seed, f"{name}/sound")
-    item.key_low, item.key_high = wp.uint32(key & 0xFFFFFFFF), wp.uint32(key >> 32)
-    return item
+    return {"key_low": wp.uint32(key & 0xFFFFFFFF), "key_high": wp.uint32(key >> 32)}
 
 
 class ContactAudioRuntime(Runtime):
@@ -40,7 +40,7 @@ class ContactAudioRuntime(Runtime):
     def __init__(self, sensors: Mapping[str, ContactAudio], context: SuiteContext) -> None:
         self._sensors = dict(sensors)
         first = next(iter(sensors.values()))
-        self.samples, self._quads = first.samples, (len(first.modes.frequency) + 3) // 4
+        self.samples, self._quads = first.samples, first.quads
         super().__init__(sensors, self.samples, context, fusable=False)
         count, envs = len(sensors), context.num_envs
         self._dt = math.nan
@@ -72,11 +72,9 @@ class ContactAudioRuntime(Runtime):
             # The resonator answers an impulse with sin(kθ) / sin θ; this factor makes it the velocity per impulse.
             poles[2, rows, column] = np.where(heard, gain * np.sin(theta), 0.0)
             poles[:2, rows, column] *= heard
-            item = _keyed(SourceParams(), self.context.seed, name)
-            item.link = self.context.scene.link_index(sensor.link)
-            item.threshold, item.impact, item.scrape = sensor.threshold, sensor.impact, sensor.scrape
-            item.pulse = int(np.clip(round(sensor.contact_time / step), 1, self.samples))
-            sources.append(item)
+            pulse = int(np.clip(round(sensor.contact_time / step), 1, self.samples))
+            link, key = self.context.scene.link_index(sensor.link), _key(self.context.seed, name)
+            sources.append(fill(SourceParams, sensor, link=link, pulse=pulse, **key))
         for array, values in zip((self._own.first, self._own.second, self._own.gain), poles, strict=True):
             # Four modes side by side in one vector: a thread loads them at once.
             quads = values.reshape(self._quads, 4, -1).transpose(0, 2, 1)
@@ -101,12 +99,7 @@ class DriveAudioRuntime(Runtime):
         first = next(iter(sensors.values()))
         self.samples = first.samples
         super().__init__(sensors, self.samples, context, fusable=False)
-        settings = []
-        for name, sensor in sensors.items():
-            item = _keyed(DriveSoundParams(), context.seed, name)
-            for knob in ("load", "power", "pitch", "partials", "rolloff", "friction", "hum", "hum_frequency"):
-                setattr(item, knob, getattr(sensor, knob))
-            settings.append(item)
+        settings = [fill(DriveSoundParams, sensor, **_key(context.seed, name)) for name, sensor in sensors.items()]
         own, shape = DriveSoundArrays(), (context.num_envs, self.count)
         own.settings, own.part, own.number = context.array(settings, DriveSoundParams), self.part, self.probe
         for name in ("effort", "speed", "last_loud", "last_speed", "phase", "hum_phase"):

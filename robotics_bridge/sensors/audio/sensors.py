@@ -7,7 +7,6 @@ surface (m/s) when its modes come from :func:`robotics_bridge.sensors.audio.mode
 from __future__ import annotations
 
 import math
-from collections.abc import Hashable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar, cast
 
@@ -35,6 +34,7 @@ class AudioSensor(Sensor):
     """K: the sample rate is K over the time step."""
 
     units: ClassVar[str] = "m/s"
+    shared: ClassVar[tuple[str, ...]] = ("samples",)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -58,6 +58,7 @@ class ContactAudio(AudioSensor):
         UsageError: a threshold, strength or contact time is negative or no number.
     """
 
+    shared: ClassVar[tuple[str, ...]] = ("samples", "quads")
     runtime: ClassVar[str] = "robotics_bridge.sensors.audio.runtime:ContactAudioRuntime"
 
     modes: Modes
@@ -81,9 +82,10 @@ class ContactAudio(AudioSensor):
         """Return the shape of one emitter."""
         return (1,)
 
-    def group(self) -> Hashable:
-        """Return block length and quads of modes: sensors that share both share one runtime."""
-        return (self.samples, (len(self.modes.frequency) + 3) // 4)
+    @property
+    def quads(self) -> int:
+        """Number of vectors of four that hold its modes."""
+        return (len(self.modes.frequency) + 3) // 4
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -128,10 +130,6 @@ class ActuationAudio(AudioSensor):
     def layout(self) -> tuple[int, ...]:
         """Return the shape of one emitter per joint."""
         return (self.joints,)
-
-    def group(self) -> Hashable:
-        """Return the block length: sensors that share it share one runtime."""
-        return self.samples
 
 
 def joint_drive(suite: SensorSuite, name: str) -> tuple[torch.Tensor, torch.Tensor]:

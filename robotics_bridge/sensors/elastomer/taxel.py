@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Hashable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar, Literal
 
@@ -86,6 +85,7 @@ class ElastomerTaxel(QuerySensor):
     channels: ClassVar[int] = 3
     units: ClassVar[str] = "m"
     knobs: ClassVar[frozenset[str]] = TAXEL_KNOBS
+    shared: ClassVar[tuple[str, ...]] = ("query", "way", "points", "followed")
     runtime: ClassVar[str] = "robotics_bridge.sensors.elastomer.runtime:ElastomerRuntime"
 
     def __post_init__(self) -> None:
@@ -118,10 +118,6 @@ class ElastomerTaxel(QuerySensor):
             return "direct"
         # The factor 1 − κ λ_d r² is no product of two axes, so recoil needs the full convolution.
         return "fft" if self.layer and self.layer.recoil else "separable"
-
-    def group(self) -> Hashable:
-        """Return how distances are asked for and dilation is summed, and the points that are followed."""
-        return (self.query, self.way, self.points, self.track, "" if self.track else self.link)
 
     def own(self, scene: TouchScene) -> tuple[int, ...]:
         """Return the geometries of its own link that can be indented."""

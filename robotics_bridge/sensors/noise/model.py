@@ -120,18 +120,14 @@ class Noise:
 
     def params(self, seed: int) -> Any:
         """Return the Warp structure ``NoiseParams`` for a 64-bit ``seed`` (see :func:`stream_seed`)."""
+        from robotics_bridge.sensors.context import fill
         from robotics_bridge.sensors.noise.kernels.noise import NoiseParams
 
         wp = warp()
-        params = NoiseParams()
-        params.key_low, params.key_high = wp.uint32(seed & 0xFFFFFFFF), wp.uint32((seed >> 32) & 0xFFFFFFFF)
-        params.gain_low, params.gain_high = self.gain
-        params.dead_low, params.dead_high = self.dead_range
-        params.tau = self.hysteresis_tau
-        params.levels = 1.0 / self.quantum if self.quantum else 0.0
-        for name in ("radius", "dead_probability", "hysteresis", "walk", "white", "bias", "quantum"):
-            setattr(params, name, getattr(self, name))
-        return params
+        key = {"key_low": wp.uint32(seed & 0xFFFFFFFF), "key_high": wp.uint32((seed >> 32) & 0xFFFFFFFF)}
+        ranges = dict(zip(("gain_low", "gain_high", "dead_low", "dead_high"), self.gain + self.dead_range, strict=True))
+        levels = 1.0 / self.quantum if self.quantum else 0.0
+        return fill(NoiseParams, self, tau=self.hysteresis_tau, levels=levels, **key, **ranges)
 
     def save(self, path: str | os.PathLike[str], **about: Any) -> None:
         """Write the knobs as a preset (JSON), with what else is worth telling about it."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Hashable
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -29,16 +28,13 @@ class SurfaceDistanceProbe(QuerySensor):
 
     units: ClassVar[str] = "m"
     knobs: ClassVar[frozenset[str]] = PROBE_KNOBS
+    shared: ClassVar[tuple[str, ...]] = ("query", "nearest")
     runtime: ClassVar[str] = "robotics_bridge.sensors.probes.runtime:DistanceRuntime"
 
     def __post_init__(self) -> None:
         super().__post_init__()
         if not self.max_range > 0:
             raise UsageError(f"max_range is a positive distance (m); received {self.max_range!r}.")
-
-    def group(self) -> Hashable:
-        """Return the way to ask for distances, and whether points are kept."""
-        return (self.query, self.nearest)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -9,7 +9,7 @@ import numpy as np
 
 from brainbench.core.devices import warp
 from robotics_bridge.physics.state import HandState
-from robotics_bridge.sensors.context import SuiteContext
+from robotics_bridge.sensors.context import SuiteContext, fill
 from robotics_bridge.sensors.probes.kernels.probe import KinematicParams, kinematic_kernel
 from robotics_bridge.sensors.queries.surface_points import halve, sample_cloud
 from robotics_bridge.sensors.runtime import ProbeRuntime, probe_rows
@@ -31,12 +31,7 @@ class KinematicRuntime(ProbeRuntime):
             self.kinds, first.query == "raycast", first.convention == "physical", self.mode, *self.stores,
             context.device.is_cuda,
         )  # fmt: skip
-        laws = []
-        for sensor in sensors.values():
-            law = KinematicParams()
-            for name in ("stiffness", "damping", "exponent", "shear", "twist"):
-                setattr(law, name, getattr(sensor, name))
-            laws.append(law)
+        laws = [fill(KinematicParams, sensor) for sensor in sensors.values()]
         self._laws = context.array(laws, KinematicParams)
         shape = (len(laws), context.num_envs)
         self._loads: Any = context.zeros(shape, wp.vec3f) if scaled else None
@@ -75,11 +70,9 @@ class ProximityRuntime(ProbeRuntime):
         first = next(iter(sensors.values()))
         tracked, rows = first.tracked(context.scene), context.solids.rows
         self.cloud = sample_cloud(context.scene, tracked, first.points, rows, context.device)
-        laws, densities = [], np.zeros((len(sensors), rows))
+        laws = [fill(ProximityParams, sensor) for sensor in sensors.values()]
+        densities = np.zeros((len(sensors), rows))
         for row, sensor in zip(densities, sensors.values(), strict=True):
-            law = ProximityParams()
-            law.stiffness, law.coupling = sensor.stiffness, sensor.coupling
-            laws.append(law)
             # ρ_b of 4.14, by variant: a body with more points does not push harder.
             row[:] = sensor.density / np.maximum(self.cloud.counts, 1)
         # A processor walks through all probes of an environment anyway, so it may list their points in between.

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Hashable
 from dataclasses import dataclass
 from typing import ClassVar, Literal
 
@@ -52,6 +51,7 @@ class KinematicTaxel(QuerySensor):
     channels: ClassVar[int] = 6
     units: ClassVar[str] = "N, N m"
     knobs: ClassVar[frozenset[str]] = GRID_KNOBS
+    shared: ClassVar[tuple[str, ...]] = ("query", "convention", "total")
     runtime: ClassVar[str] = "robotics_bridge.sensors.taxels.runtime:KinematicRuntime"
 
     def __post_init__(self) -> None:
@@ -61,10 +61,6 @@ class KinematicTaxel(QuerySensor):
             raise unknown_name("total of a force field", self.total, ("law", "engine"))
         if not self.exponent > 0:
             raise UsageError(f"The exponent of a contact law is positive; received {self.exponent!r}.")
-
-    def group(self) -> Hashable:
-        """Return what decides which kernels run."""
-        return (self.query, self.convention, self.total)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -94,6 +90,7 @@ class ProximityTaxel(ProbeSensor):
     channels: ClassVar[int] = 6
     units: ClassVar[str] = "N, N m"
     knobs: ClassVar[frozenset[str]] = TAXEL_KNOBS
+    shared: ClassVar[tuple[str, ...]] = ("convention", "points", "followed")
     runtime: ClassVar[str] = "robotics_bridge.sensors.taxels.runtime:ProximityRuntime"
 
     def __post_init__(self) -> None:
@@ -101,7 +98,3 @@ class ProximityTaxel(ProbeSensor):
         _check_convention(self.convention)
         if self.points < 1:
             raise UsageError(f"A proximity taxel needs at least one surface point; received {self.points}.")
-
-    def group(self) -> Hashable:
-        """Return the convention and the surface points that are shared."""
-        return (self.convention, self.points, self.track, self.link if not self.track else "")

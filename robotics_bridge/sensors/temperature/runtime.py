@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from brainbench.core.devices import warp
 from robotics_bridge.physics.state import HandState
-from robotics_bridge.sensors.context import SuiteContext
+from robotics_bridge.sensors.context import SuiteContext, fill
 from robotics_bridge.sensors.runtime import Runtime
 from robotics_bridge.sensors.temperature.grid import TemperatureGrid
 from robotics_bridge.sensors.temperature.kernels.heat import (
@@ -74,24 +74,17 @@ class TemperatureRuntime(Runtime):
         edges = (high - low) / np.array(sensor.cells)
         self._edges.append(edges)
         own = material(sensor.material)
-        item = ThermalParams()
-        item.link, item.first = self.context.scene.link_index(sensor.link), first
-        item.shape, item.low, item.cell = wp.vec3i(*sensor.cells), wp.vec3f(*low), wp.vec3f(*edges)
-        item.conductivity = own.conductivity
+        contact = sensor.contact_conductance if math.isfinite(sensor.contact_conductance) else 0.0
+        cold, warm = (min(value, 1e9) for value in (sensor.cold_range, sensor.warm_range))
         # C = ρ c_p V of a whole cell; the source is given per volume for the same reason, not per area as in 4.36.
-        item.capacity = own.density * own.specific_heat * edges.prod()
-        item.emissivity = own.emissivity if sensor.radiates else 0.0
-        item.convection, item.ambient, item.base = (
-            sensor.convection,
-            sensor.ambient_temperature,
-            sensor.base_temperature,
-        )
-        item.contact = sensor.contact_conductance if math.isfinite(sensor.contact_conductance) else 0.0
-        item.bluntness, item.depth_weight = sensor.contact_radius, sensor.depth_weight
-        item.published = int(sensor.conduction == "thesis")
-        item.tau = sensor.tau
-        item.cold, item.warm = (min(value, 1e9) for value in (sensor.cold_range, sensor.warm_range))
-        return item
+        capacity = own.density * own.specific_heat * edges.prod()
+        return fill(
+            ThermalParams, sensor, link=self.context.scene.link_index(sensor.link), first=first,
+            shape=wp.vec3i(*sensor.cells), low=wp.vec3f(*low), cell=wp.vec3f(*edges), conductivity=own.conductivity,
+            capacity=capacity, emissivity=own.emissivity if sensor.radiates else 0.0,
+            ambient=sensor.ambient_temperature, base=sensor.base_temperature, contact=contact,
+            bluntness=sensor.contact_radius, published=int(sensor.conduction == "thesis"), cold=cold, warm=warm,
+        )  # fmt: skip
 
     def _set_step(self, dt: float) -> None:
         """Exponentiate the diffusion of every axis for a time step (s)."""

@@ -243,7 +243,7 @@ def test_what_does_not_fit_is_refused_before_anything_moves() -> None:
 def test_histogram_and_rate() -> None:
     histogram = LatencyHistogram()
     for value in np.linspace(0.001, 0.1, 1000):
-        histogram.add(float(value))
+        histogram.append(float(value))
     assert histogram.counts.sum() == 1000
     assert histogram.summary()["p50"] == pytest.approx(50.5, rel=1e-3)
     assert histogram.summary()["max"] == pytest.approx(100.0)

@@ -7,7 +7,9 @@ import numpy as np
 import pytest
 
 from brainbench.core.errors import UsageError
-from robotics_bridge.physics import HandState, MujocoEngine, MujocoWarpEngine, initial_velocities, pyramid
+from robotics_bridge.physics import HandState, MujocoEngine, MujocoWarpEngine, TouchScene
+from robotics_bridge.sensors import SensorSuite
+from tests.factories.touch_scenes import falling, pyramid
 
 TWO = """<mujoco><option timestep="0.005"/><worldbody><geom name="floor" type="plane" size="0 0 1"/>
 <body name="a" pos="0 0 .1"><freejoint/><geom name="a" type="box" size=".1 .1 .1"/></body>
@@ -93,11 +95,12 @@ def test_a_state_tells_which_environments_diverged_and_when_contacts_were_lost()
     velocity = np.zeros((3, 2, 6))
     velocity[1, 1, 4] = np.inf
     state.set_velocity(velocity)
-    state.check()
-    assert state.status_torch.tolist() == [0, 1, 0]
+    suite = SensorSuite(TouchScene(("a", "b")), {}, num_envs=3)
+    suite.update(state)
+    assert state.status.numpy().tolist() == [0, 1, 0]
     state.contact_count.fill_(3)
-    state.check()
-    assert state.status_torch.tolist() == [2, 3, 2]
+    suite.update(state)
+    assert state.status.numpy().tolist() == [2, 3, 2]
 
 
 @pytest.mark.slow
@@ -105,7 +108,7 @@ def test_mujoco_warp_agrees_with_c_mujoco() -> None:
     """The published pyramid, 20 steps; MuJoCo Warp runs on the processor here, in single precision."""
     pytest.importorskip("mujoco_warp")
     model = pyramid()
-    start = initial_velocities(4, model.nv)
+    start = falling(4, model.nv)
     cpu, gpu = MujocoEngine(model, 4), MujocoWarpEngine(model, 4, device="cpu")
     for engine in (cpu, gpu):
         engine.set(qvel=start)

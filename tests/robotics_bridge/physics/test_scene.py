@@ -59,7 +59,7 @@ def test_compiled_variants_differ_where_they_should() -> None:
     mass = [m.body("ball").mass[0] for m in models]
     np.testing.assert_allclose(mass, 500 * 4 / 3 * np.pi * 0.01 * np.array([0.1, 0.2, 0.3]), rtol=1e-6)
     engine = MujocoEngine(models, 5, assignment=[2, 0])
-    geometry = engine.scene.geometry_index("g3")
+    geometry = [item.name for item in engine.scene.geometries].index("g3")
     assert [engine.scene.geometry_in(env, geometry).size[2] for env in range(3)] == [0.3, 0.1, 0.3]
     engine.step(3)
     assert np.isfinite(engine.state.pose.numpy()).all()

@@ -10,8 +10,9 @@ import torch
 from brainbench.core.errors import UsageError
 from brainbench.core.files import read_json
 from robotics_bridge import tasks
+from robotics_bridge.policies.evaluate import Policy
 from robotics_bridge.policies.shipped import FOLDER, list_policies, policy_path
-from robotics_bridge.policies.training.distill import StudentPolicy, load_student
+from robotics_bridge.policies.training.distill import load_student
 from robotics_bridge.policies.training.teacher import Trainer, load_teacher
 
 
@@ -40,7 +41,7 @@ def test_every_student_feels_what_its_task_gives_and_exports(name: str, tmp_path
     assert sum(path.stat().st_size for path in (FOLDER / name).iterdir()) < 1.7e6
     senses = {key: kept[key] for key in ("observe", "placement", "resolution", "noisy")}
     env = tasks.make(kept["task"], num_envs=2, hand=kept["hand"], threads=1, **senses)
-    assert torch.isfinite(StudentPolicy(student)(env.reset())).all()
+    assert torch.isfinite(Policy(student)(env.reset())).all()
     assert export_policy(student, tmp_path / "policy", deployment=facts["deployment"]).difference < 1e-5
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from robotics_bridge.physics import HandState, MujocoWarpEngine, initial_velocities, pyramid
+from robotics_bridge.physics import HandState, MujocoWarpEngine
 from robotics_bridge.sensors import (
     ContactDepthProbe,
     ContactProbe,
@@ -17,6 +17,7 @@ from robotics_bridge.sensors import (
     SensorSuite,
     SurfaceDistanceProbe,
 )
+from tests.factories.touch_scenes import falling, pyramid
 
 pytestmark = pytest.mark.gpu
 GRID = Probes.grid(10, 10, size=(0.2, 0.2), center=(0, 0, 0.125), radius=0.01)
@@ -37,14 +38,14 @@ def test_devices_agree_over_many_updates() -> None:
     }
     model = pyramid()
     engine = MujocoWarpEngine(model, 8, device="cuda", contacts=128)
-    engine.set(qvel=initial_velocities(8, model.nv))
+    engine.set(qvel=falling(8, model.nv))
     engine.step(50)
     suites = [SensorSuite(engine.scene, sensors, num_envs=8, device=device) for device in ("cpu", "cuda")]
     mirror = HandState.empty(8, engine.state.num_links, engine.state.contact_env.shape[0])
     for _ in range(6):
         engine.step()
         count = int(engine.state.contact_count.numpy()[0])
-        mirror.set_pose(engine.state.get_pose())
+        mirror.set_pose(engine.state.pose_torch[..., [0, 1, 2, 6, 3, 4, 5]])
         mirror.set_velocity(engine.state.velocity.numpy())
         mirror.set_contacts(engine.state.contact_env.numpy()[:count], engine.state.contact_geom.numpy()[:count])
         for suite, state in zip(suites, (mirror, engine.state), strict=True):

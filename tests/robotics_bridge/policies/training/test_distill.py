@@ -9,7 +9,8 @@ import pytest
 import torch
 
 from brainbench.core.errors import DataError, UsageError
-from robotics_bridge.policies.training.distill import StudentPolicy, distill, load_student
+from robotics_bridge.policies.evaluate import Policy
+from robotics_bridge.policies.training.distill import distill, load_student
 from robotics_bridge.policies.training.distill_config import DistillConfig
 from tests.factories.task_worlds import Follower, TouchWorld
 
@@ -88,7 +89,7 @@ def test_a_loaded_student_acts_as_the_one_that_was_saved_and_forgets_on_reset(tm
     student, described = load_student(tmp_path)
     assert described["deployment"]["rate"] == 40
     assert described["deployment"]["frozen"] == {"c": 0.5}
-    policy, world = StudentPolicy(student), TouchWorld(3)
+    policy, world = Policy(student), TouchWorld(3)
     first = [policy(world.observations) for _ in range(5)]
     policy.reset(torch.tensor([True, False, False]))
     again = policy(world.observations)

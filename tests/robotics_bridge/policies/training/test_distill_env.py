@@ -7,8 +7,9 @@ import torch
 
 from robotics_bridge import tasks
 from robotics_bridge.deploy.session import read_deployed
+from robotics_bridge.policies.evaluate import Policy
 from robotics_bridge.policies.export import export_policy
-from robotics_bridge.policies.training.distill import StudentPolicy, distill, load_student
+from robotics_bridge.policies.training.distill import distill, load_student
 from robotics_bridge.policies.training.distill_config import DistillConfig
 
 SETTINGS = {"task": "in_palm_rotate", "observe": "agg_force", "placement": "tips"}
@@ -65,7 +66,7 @@ def test_an_exported_student_knows_its_hand(tmp_path) -> None:
     assert (deployed.rate, deployed.hand) == (40, "xhand1")
     assert len(deployed.deployment["links"]) == 5
     env = tasks.make("in_palm_rotate", num_envs=2, observe="agg_force", placement="tips")
-    policy = StudentPolicy(student)
+    policy = Policy(student)
     observations = env.reset()
     for _ in range(3):
         observations, *_ = env.step(policy(observations))

@@ -6,7 +6,7 @@ import numpy as np
 
 from robotics_bridge import hands
 from robotics_bridge.deploy.driver import HandReading
-from robotics_bridge.deploy.shadow import ShadowTouch
+from robotics_bridge.deploy.simulated_hand import ShadowTouch
 from robotics_bridge.deploy.touch import RealTouch
 from robotics_bridge.hands.scenes import closing
 
