@@ -21,7 +21,7 @@ from brainbench.datasets.trials.selection import DEFAULT, EVERYTHING, Selection
 if TYPE_CHECKING:
     import h5py
 
-    from brainbench.datasets.layouts.layout import RecordingLayout
+    from brainbench.datasets.layouts.registry import RecordingLayout
     from brainbench.datasets.sessions import Session
 
 Source = str | os.PathLike[str] | Sequence[str | os.PathLike[str]]

@@ -3,15 +3,8 @@
 A session is matched by the columns of its trials (``registry``) and then adapted by its layout, before it is counted.
 """
 
-from brainbench.datasets.layouts import area2_bump, hires, rodgers, yu
+from brainbench.datasets.layouts import area2_bump, pole, rodgers
 from brainbench.datasets.layouts.registry import register_layout
 
-for _layout in (
-    rodgers.LAYOUT,
-    rodgers.DISCRIMINATION,
-    rodgers.DETECTION,
-    yu.LAYOUT,
-    hires.LAYOUT,
-    area2_bump.LAYOUT,
-):
+for _layout in (rodgers.LAYOUT, rodgers.DISCRIMINATION, rodgers.DETECTION, pole.YU, pole.HIRES, area2_bump.LAYOUT):
     register_layout(_layout)
