@@ -91,9 +91,7 @@ def recorded_runs(stamps: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 _POLE = ("type", "response", "stim_present", "pole_position", "pole_in_time", "pole_out_time")
-_CONDITIONS = (
-    "conditions: Go and Nogo are the two ranges of pole positions; trials:pole_position labels single positions"
-)
+_TYPES = "conditions: Go and Nogo are the two ranges of pole positions; trials:pole_position labels single positions"
 
 HIRES = RecordingLayout(
     name="hires",
