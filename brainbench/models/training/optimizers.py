@@ -22,15 +22,9 @@ WARMUP_RATIO = 1e-4
 class LARS(Optimizer):
     """SGD with momentum whose step in every tensor is scaled to that tensor's norm (You, Gitman & Ginsburg 2017).
 
-    trust = η ‖w‖ / (‖g + λ w‖), v ← m v + trust (g + λ w), w ← w − lr v. Biases and norm parameters (tensors of
-    fewer than two axes) are excluded: they take plain momentum steps without decay, as in SimCLR.
-
-    Args:
-        parameters: As for any optimiser.
-        lr: Learning rate.
-        momentum: m.
-        weight_decay: λ.
-        trust: η.
+    trust = η ‖w‖ / (‖g + λ w‖), v ← m v + trust (g + λ w), w ← w − lr v, with momentum m, weight decay λ and ``trust``
+    η. Biases and norm parameters (tensors of fewer than two axes) are excluded: they take plain momentum steps without
+    decay, as in SimCLR.
 
     Raises:
         UsageError: a number is negative.

@@ -147,12 +147,11 @@ class _Run:
         self.model: nn.Module = self.learner.model
         self.optimizer = make_optimizer(config.optimizer, self.learner.parameters(), config.learning_rate)
         self.gradients = Gradients(
+            self.learner,
             compiled(where.wrap(self.learner), config.compile),
-            [parameter for parameter in self.learner.parameters() if parameter.requires_grad],
             clip=config.clip,
             autocast=self._precision,
             record=config.compile == "graphs" and where.count == 1,
-            module=self.learner,
         )
         self.augmentation = Augmentation(config.augmentation, config.masking)
         batches = self._batches("train", shuffle=True)
@@ -268,7 +267,10 @@ class _Run:
             done = read_json(self.out / RUN).get("evaluation")
             if done is not None:
                 return self._result("finished", "", Evaluation.from_plain(done))
-            self._load_best()
+            # The best weights as they were published, so that what is evaluated is what is shipped.
+            if not (self.out / BEST / WEIGHTS).is_file():
+                self._publish(None)
+            load_weights(self.model, self.out / BEST / WEIGHTS, what=self.config.model)
             if self.config.objective != "supervised" and self.config.probe_epochs:
                 self.progress(self._steps, self._steps, "fitting the linear probe")
                 sweeps, epochs = self._batches("train", shuffle=False, part=False) or (), self.config.probe_epochs
@@ -287,12 +289,6 @@ class _Run:
             mark(self.out, evaluation=asdict(result) if result is not None else None, status="finished")
         self.where.wait()
         return self._result("finished", "", result)
-
-    def _load_best(self) -> None:
-        """Go back to the best weights as they were published, so that what is evaluated is what is shipped."""
-        if not (self.out / BEST / WEIGHTS).is_file():
-            self._publish(None)
-        load_weights(self.model, self.out / BEST / WEIGHTS, what=self.config.model)
 
     def _publish(self, result: Evaluation | None) -> None:
         done = {"epochs_done": self.at.epoch, "best_epoch": self.at.best_epoch, "drawn_biases": self.drawn}
