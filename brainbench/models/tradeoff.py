@@ -27,6 +27,10 @@ PRECISIONS = ("float32", "bf16", "int8")
 computes in float32."""
 
 
+REPEATS = 5
+"""Sweeps that are timed, after one that is not."""
+
+
 @dataclass(frozen=True)
 class ModelSetting:
     """One way to run a network.
@@ -50,12 +54,7 @@ class ModelSetting:
 
 
 class Reduced(nn.Module):
-    """A network run in one setting; it can be scored and extracted from like the network itself.
-
-    Args:
-        name: Of the registry.
-        setting: Way to run it.
-        seed: Of untrained weights.
+    """A network of the registry run in one setting; it can be scored and extracted from like the network itself.
 
     Raises:
         UsageError: the network is no encoder-attender-decoder, or cannot be unrolled that way.
@@ -114,7 +113,7 @@ def settings(
     return [ModelSetting(p, u, s) for p, u, s in product(precisions, unrolls, steps)]  # pyright: ignore[reportArgumentType]
 
 
-def measure(name: str, setting: ModelSetting, sweeps: Any, *, seed: int = 0, repeats: int = 5) -> TradeoffPoint:
+def measure(name: str, setting: ModelSetting, sweeps: Any, *, seed: int = 0) -> TradeoffPoint:
     """Measure one setting on sweeps [K, T, C, H, W] in SI.
 
     Returns:
@@ -133,7 +132,7 @@ def measure(name: str, setting: ModelSetting, sweeps: Any, *, seed: int = 0, rep
         expected = load_model(name, seed=seed)(x)
         found = reduced(x)
         times = []
-        for _ in range(repeats + 1):
+        for _ in range(REPEATS + 1):
             start = time.perf_counter()
             reduced(x[:1])
             times.append((time.perf_counter() - start) * 1e3)
