@@ -156,12 +156,8 @@ def _expand(source: str) -> list[Path]:
                 return found
         raise DataFileNotFoundError(f"The folder {source!r} holds no recordings (*.nwb, *.h5, *.hdf5).")
     if glob.has_magic(source):
-        found = [
-            Path(item)
-            for item in glob.glob(str(path), recursive=True)  # noqa: PTH207 (absolute patterns)
-            if Path(item).is_file()
-        ]
-        if not found:
+        matches = map(Path, glob.glob(str(path), recursive=True))  # noqa: PTH207 (absolute patterns)
+        if not (found := [item for item in matches if item.is_file()]):
             raise DataFileNotFoundError(f"The pattern {source!r} matches no file.")
         return found
     if source == "demo":

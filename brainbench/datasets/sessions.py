@@ -225,8 +225,7 @@ def make_session(
         tables: interval tables, each a mapping of columns with at least ``start_time``.
         unit_columns: columns of the units table, such as ``id``, ``depth`` (µm), ``layer``.
         observed: per unit the recorded spans [n, 2] (s), if known.
-        start: session start, ISO 8601.
-        synthetic: whether the spikes were made by a computer.
+        start, synthetic: as of :class:`Session`.
 
     Raises:
         DataError: columns differ in length or a table has no ``start_time``.
@@ -279,10 +278,10 @@ def as_labels(values: NDArray[Any]) -> NDArray[np.str_]:
     >>> as_labels(np.array([1.0, 2.5, np.nan])).tolist()
     ['1', '2.5', '']
     """
+    if not len(values):
+        return np.zeros(0, "U1")
     unique, inverse = np.unique(values, return_inverse=True)
-    return (
-        np.array([_label(item) for item in unique.tolist()], dtype=str)[inverse] if len(values) else np.zeros(0, "U1")
-    )
+    return np.array([_label(item) for item in unique.tolist()], dtype=str)[inverse]
 
 
 def _label(value: Any) -> str:

@@ -91,24 +91,17 @@ def read_graph(source: Mapping[str, Any] | str | os.PathLike[str]) -> GraphSpec:
     names = [node.name for node in nodes]
     if order is not None and sorted(order) != sorted(names):
         raise DataError(f"'ff_order' {order!r} must list every node once: {names!r}.")
-    if order is None and _acyclic(ends):
-        feedback: set[tuple[str, str]] = set()
-    else:
-        rank = {name: index for index, name in enumerate(order or names)}
-        feedback = {end for end in ends if rank.get(end[0], -1) >= rank.get(end[1], len(rank))}
+    try:
+        if order is None:
+            TopologicalSorter({name: {source for source, target in ends if target == name} for name in names}).prepare()
+            order = ()
+    except CycleError:
+        order = names
+    # Without cycles nothing leads back; else what does not lead to a later node.
+    rank = {name: index for index, name in enumerate(order)}
+    feedback = {end for end in ends if rank and rank.get(end[0], -1) >= rank.get(end[1], len(rank))}
     edges = tuple(Edge(*end, feedback=end in feedback) for end in ends)
     return GraphSpec(nodes, edges, inputs, output, (*shape,))
-
-
-def _acyclic(ends: list[tuple[str, str]]) -> bool:
-    graph: dict[str, set[str]] = {}
-    for source, target in ends:
-        graph.setdefault(target, set()).add(source)
-    try:
-        TopologicalSorter(graph).prepare()
-    except CycleError:
-        return False
-    return True
 
 
 def _node(item: Any) -> Node:

@@ -141,9 +141,7 @@ class TrainingConfig:
 def config_warnings(config: TrainingConfig, model: Any) -> list[str]:
     """Return reasons why a run may teach nothing, each a sentence and what to do instead.
 
-    Args:
-        config: The run.
-        model: Its network, whose ``spec.receptive_field`` is read if there is one.
+    Of its network ``spec.receptive_field`` is read, if there is one.
     """
     found: list[str] = []
     if config.objective not in CONTRASTIVE:

@@ -98,13 +98,9 @@ def make_optimizer(name: str, parameters: Iterable[nn.Parameter], learning_rate:
 
 
 def rate_factor(schedule: str, epoch: float, *, epochs: int, warmup_epochs: int = 0) -> float:
-    """Return the learning rate at a point in training, relative to the initial one.
+    """Return the learning rate after so many epochs of all, relative to the initial one.
 
-    Args:
-        schedule: One of :data:`SCHEDULES`.
-        epoch: Epochs done; fractions count for ``cosine``.
-        epochs: Epochs in all.
-        warmup_epochs: Epochs of linear rise from 1e-4, for ``cosine``.
+    For ``cosine`` fractions of an epoch count, and ``warmup_epochs`` of linear rise from 1e-4.
 
     Raises:
         UsageError: there is no such schedule.
