@@ -21,8 +21,7 @@ import numpy as np
 from brainbench.core.contracts import CHANNELS, GRID_SHAPE
 from brainbench.core.errors import DataError, UsageError, listing, unknown_name
 from brainbench.core.files import cache_dir, content_hash, read_json, write_json
-from brainbench.datasets.whisking.files import open_shard, read_manifest, verify_shard
-from brainbench.datasets.whisking.memory import Buffers, most_open
+from brainbench.datasets.whisking.files import Buffers, most_open, open_shard, read_manifest, verify_shard
 
 if TYPE_CHECKING:
     import torch
