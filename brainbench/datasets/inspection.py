@@ -194,13 +194,21 @@ def _summary(session: Session, usable: bool) -> SessionSummary:
         missing.append("no interval tables: nothing says when which stimulus was presented")
     elif not usable:
         missing.append("no column of the interval tables has 2 to 60 values with at least two trials each")
-    acquired = (
-        AcquiredSummary(item.name, item.kind, tuple(item.data.shape), item.gigabytes)
-        for item in session.series.values()
+    series = session.series.values()
+    return SessionSummary(
+        subject=session.subject,
+        session=session.session,
+        start=session.start,
+        synthetic=session.synthetic,
+        units=units,
+        tables=tables,
+        modules=tuple(session.modules.items()),
+        acquired=tuple(
+            AcquiredSummary(item.name, item.kind, tuple(item.data.shape), item.gigabytes) for item in series
+        ),
+        missing=tuple(missing),
+        notes=session.notes,
     )
-    about = (session.subject, session.session, session.start, session.synthetic)
-    contents = (units, tables, tuple(session.modules.items()), tuple(acquired))
-    return SessionSummary(*about, *contents, tuple(missing), session.notes)
 
 
 def _units(session: Session) -> UnitsSummary | None:
@@ -211,9 +219,17 @@ def _units(session: Session) -> UnitsSummary | None:
         spikes = read_spikes(table, [])
     except DataError as error:
         return UnitsSummary(len(table), len(table.data[SPIKES]), np.nan, np.nan, 0, table.columns, str(error))
-    span, silent = recorded_span(spikes), sum(not len(times) for times in spikes)
-    problem = "" if span else "none of the units has a spike"
-    return UnitsSummary(len(spikes), sum(map(len, spikes)), *(span or (np.nan, np.nan)), silent, table.columns, problem)
+    span = recorded_span(spikes)
+    first, last = span or (np.nan, np.nan)
+    return UnitsSummary(
+        units=len(spikes),
+        spikes=sum(map(len, spikes)),
+        first=first,
+        last=last,
+        silent=sum(not len(times) for times in spikes),
+        columns=table.columns,
+        problem="" if span else "none of the units has a spike",
+    )
 
 
 def _table(table: SessionTable) -> TableSummary:

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from brainbench.core.errors import DataError, unknown_name
+from brainbench.core.errors import DataError, check_name, unknown_name
 
 SPIKES = "spike_times"
 OBSERVED = "obs_intervals"
@@ -196,8 +196,7 @@ class Session:
         Raises:
             UsageError: there is no such table (the nearest is named).
         """
-        if name not in self.tables:
-            raise unknown_name("table", name, self.tables, hint=f"(interval tables of {self.source})")
+        check_name("table", name, self.tables, hint=f"(interval tables of {self.source})")
         return self.tables[name]
 
     def with_table(self, table: SessionTable, *notes: str) -> Session:

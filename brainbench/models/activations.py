@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from brainbench.core.errors import BrainbenchError, UsageError, unknown_name
+from brainbench.core.errors import BrainbenchError, UsageError, check_name
 
 if TYPE_CHECKING:
     import torch
@@ -175,8 +175,7 @@ def _named_reader(model: nn.Module, layers: Collection[str] | None) -> Any:
     if not isinstance(named, tuple) or not all(isinstance(name, str) for name in named) or not callable(read):
         return None
     for name in layers or ():
-        if name not in named:
-            raise unknown_name("layer", name, named)
+        check_name("layer", name, named)
     wanted = named if layers is None else tuple(name for name in named if name in layers)
     return lambda part: read(part, wanted)
 
@@ -189,8 +188,7 @@ def _hooked(model: nn.Module, layers: Collection[str] | None) -> dict[str, nn.Mo
         return leaves | {OUTPUT: model}
     choices = every if OUTPUT in every else {**every, OUTPUT: model}
     for name in layers:
-        if name not in choices:
-            raise unknown_name("layer", name, choices)
+        check_name("layer", name, choices)
     return {name: choices[name] for name in choices if name in layers}
 
 

@@ -12,7 +12,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from brainbench.core.errors import DataError, missing_dependency, unknown_name
+from brainbench.core.errors import DataError, check_name, missing_dependency
 
 if TYPE_CHECKING:
     from torch import nn
@@ -62,8 +62,7 @@ def export_model(model: nn.Module, path: str | Path, *, format: str = "onnx", na
     from brainbench.core.files import atomic_path, content_hash, provenance, write_json
     from brainbench.models.streaming import StreamingStep
 
-    if format not in SUFFIXES:
-        raise unknown_name("export format", format, SUFFIXES)
+    check_name("export format", format, SUFFIXES)
     if format == "onnx":
         require_onnx()
     target = Path(path)

@@ -14,7 +14,7 @@ import torch
 from torch import nn
 
 from brainbench.core.contracts import CHANNELS
-from brainbench.core.errors import UsageError, unknown_name
+from brainbench.core.errors import UsageError, check_name
 from brainbench.models.graph.spec import Unroll, check_unroll
 from brainbench.models.graph.temporal_graph import TemporalGraph
 from brainbench.models.heads.decoders import AllStepsDecoder, linear_decoder
@@ -170,8 +170,7 @@ class EncoderAttenderDecoder(nn.Module):
         """
         wanted = self.layers if layers is None else tuple(layers)
         for name in wanted:
-            if name not in self.layers:
-                raise unknown_name("layer", name, self.layers)
+            check_name("layer", name, self.layers)
         features, found = _named(self.encoder, self._normalise(x), "encoder", wanted, **self._unroll)
         if self.attender is not None and any(not name.startswith("encoder.") for name in wanted):
             features, attended = _named(self.attender, features, "attender", wanted)

@@ -19,7 +19,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from brainbench.core.errors import UsageError, unknown_name
+from brainbench.core.errors import UsageError, check_name, unknown_name
 from brainbench.core.plugins import load_entry_points
 from brainbench.models.architecture import OBJECTIVES, Architecture
 from brainbench.models.training.checkpoints import PREFIXES, WEIGHTS, find_folder, load_weights, read_config, shipped
@@ -193,8 +193,7 @@ def locate_model(name: str, pretrained: str | os.PathLike[str] | None = None) ->
     folder = find_folder(name) if is_path else given or (shipped().get(name) if pretrained is None else None)
     trained = None if folder is None else read_config(folder)
     parts, known = Architecture.parse(trained["architecture"] if is_path and trained else name), _known()
-    if parts.untrained not in known:
-        raise unknown_name("model", parts.untrained, known, hint="See them all with: brainbench models")
+    check_name("model", parts.untrained, known, hint="See them all with: brainbench models")
     if parts.tag is not None and parts.tag not in OBJECTIVES:
         raise unknown_name(f"weights tag of {parts.untrained!r}", parts.tag, OBJECTIVES)
     if parts.tag is None and pretrained is not None:

@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from torch import nn
 
-from brainbench.core.errors import UsageError, unknown_name
+from brainbench.core.errors import UsageError, check_name
 from brainbench.core.tradeoffs import TradeoffPoint
 from brainbench.models.graph.spec import UNROLLS, Unroll
 from brainbench.models.graph.temporal_graph import TemporalGraph
@@ -45,10 +45,8 @@ class ModelSetting:
     """The sweep's last steps that are shown."""
 
     def __post_init__(self) -> None:
-        if self.precision not in PRECISIONS:
-            raise unknown_name("precision", self.precision, PRECISIONS)
-        if self.unroll not in UNROLLS:
-            raise unknown_name("unrolling", self.unroll, UNROLLS)
+        check_name("precision", self.precision, PRECISIONS)
+        check_name("unrolling", self.unroll, UNROLLS)
         if self.steps < 1:
             raise UsageError(f"A sweep has at least 1 step; received {self.steps}.")
 

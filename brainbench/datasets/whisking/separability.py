@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from brainbench.core.errors import DataError, UsageError, missing_dependency, unknown_name
+from brainbench.core.errors import DataError, UsageError, check_name, missing_dependency
 from brainbench.core.progress import Progress
 from brainbench.core.records import Interval, Status
 
@@ -173,8 +173,7 @@ def _choose_classes(
 ) -> tuple[str, ...]:
     if asked is not None:
         for name in asked:
-            if name not in known:
-                raise unknown_name("class", name, known)
+            check_name("class", name, known)
         if len(set(asked)) < most:
             raise UsageError(f"{most} classes at a time need {most} different classes; received {', '.join(asked)}.")
         return tuple(asked)

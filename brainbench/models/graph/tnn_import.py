@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from graphlib import CycleError, TopologicalSorter
 from typing import Any
 
-from brainbench.core.errors import DataError, listing, unknown_name
+from brainbench.core.errors import DataError, check_name, listing, unknown_name
 from brainbench.core.files import read_json
 from brainbench.models.graph.spec import Convolution, Dense, Edge, GraphSpec, Memory, Node, Pool
 
@@ -40,13 +40,15 @@ class _Section:
             raise DataError(f"The graph configuration lacks {key!r} in {self.where}.")
         return self.data.pop(key, default)
 
-    def only(self, key: str, *allowed: Any) -> None:
-        """Take a key that must be absent or have one of the allowed values."""
-        value = self.data.pop(key, allowed[0])
-        if value not in allowed:
-            raise DataError(
-                f"The graph configuration has {key!r}: {value!r} in {self.where}; only {allowed[0]!r} is supported."
-            )
+    def only(self, **allowed: Any) -> None:
+        """Take keys that must be absent or have the allowed value, or one of a tuple of them."""
+        for key, values in allowed.items():
+            choices = values if isinstance(values, tuple) else (values,)
+            value = self.data.pop(key, choices[0])
+            if value not in choices:
+                raise DataError(
+                    f"The graph configuration has {key!r}: {value!r} in {self.where}; only {choices[0]!r} is supported."
+                )
 
     def size(self, key: str, default: Any = _REQUIRED, *, or_else: tuple[Any, ...] = ()) -> Any:
         """Take a pair of whole numbers (or one for both), or one of other values."""
@@ -108,7 +110,7 @@ def _node(item: Any) -> Node:
     node = _Section(item, "a node")
     name = str(node.take("name"))
     node.where = f"node {name!r}"
-    node.only("residual", None, False)
+    node.only(residual=(None, False))
     channels = node.take("out_channels")
     harbor = _Section(node.take("harbor_policy"), f"the harbor policy of {name!r}")
     policy = harbor.take("name")
@@ -141,16 +143,13 @@ def _operation(part: _Section) -> Convolution | Dense | None:
         "activation": part.take("activation", "ReLU" if kind == "FullyConnected" else None),
         "initialiser": _initialiser(part),
     }
-    part.only("activation_func_kwargs", {}, None)
-    part.only("batchnorm", None)
-    part.only("batchnorm_timevary", False)
+    part.only(activation_func_kwargs=({}, None), batchnorm=None, batchnorm_timevary=False)
     channels = part.take("out_channels")
     if kind == "FullyConnected":
         operation: Convolution | Dense = Dense(channels, **common)
     else:
         padding = part.size("padding", 0, or_else=("same", "valid"))
-        for key, allowed in (("dilation", 1), ("groups", 1), ("padding_mode", "zeros")):
-            part.only(key, allowed)
+        part.only(dilation=1, groups=1, padding_mode="zeros")
         operation = Convolution(channels, part.size("ksize"), part.size("stride", 1), padding, **common)
         if operation.padding == "same" and operation.stride != (1, 1):
             raise DataError(f"Padding 'same' in {part.where} needs stride 1; found {list(operation.stride)}.")
@@ -165,8 +164,7 @@ def _initialiser(part: _Section) -> Mapping[str, Any] | None:
     if options is None:
         return None
     method = _Section(options, f"'init_dict' of {part.where}").take("method")
-    if method not in INITIALISERS:
-        raise unknown_name(f"initialiser in {part.where}", method, INITIALISERS)
+    check_name(f"initialiser in {part.where}", method, INITIALISERS)
     return dict(options)
 
 
@@ -177,18 +175,15 @@ def _memory(part: _Section) -> Memory | None:
         return None
     if kind not in _MEMORIES:
         raise unknown_name(f"cell in {part.where}", kind, ("IdentityCell", *_MEMORIES))
-    part.only("init_dict", None)
+    part.only(init_dict=None)
     if kind == "TimeDecayRecurrentCell":
-        part.only("trainable", True)
+        part.only(trainable=True)
         memory = Memory("time-decay", tau=part.take("tau", 0.0))
     else:
-        for key, allowed in (
-            ("stride", 1), ("padding", "same"), ("dilation", 1), ("groups", 1), ("padding_mode", "zeros"),
-            ("use_bias", True), ("forget_bias", 1.0), ("activation", "Tanh"), ("activation_func_kwargs", {}),
-        ):  # fmt: skip
-            part.only(key, allowed)
+        part.only(stride=1, padding="same", dilation=1, groups=1, padding_mode="zeros")
+        part.only(use_bias=True, forget_bias=1.0, activation="Tanh", activation_func_kwargs={})
         # Only the initial value of a bias that load_tnn_state or training replaces.
-        part.only("bias", None, 0, 0.0)
+        part.only(bias=(None, 0, 0.0))
         memory = Memory(_MEMORIES[kind], part.size("ksize"), bool(part.take("layernorm", False)))
     part.done(*_OVERWRITTEN, "out_channels")
     return memory
@@ -199,11 +194,10 @@ def _after(part: _Section) -> tuple[str | None, Pool | None]:
     activation, pool = None, None
     if kind == "ActivationLayer":
         activation = part.take("activation", "ReLU")
-        part.only("activation_func_kwargs", {}, None)
+        part.only(activation_func_kwargs=({}, None))
     elif kind == "MaxPool":
         size, stride = part.size("ksize"), part.size("stride", None, or_else=(None,))
-        part.only("dilation", 1)
-        part.only("return_indices", False)
+        part.only(dilation=1, return_indices=False)
         pool = Pool("max", size, stride, part.size("padding", 0), bool(part.take("ceil_mode", False)))
     elif kind == "AdaptiveAvgPool":
         pool = Pool("average", part.size("output_size", 6), flatten=bool(part.take("flatten", False)))

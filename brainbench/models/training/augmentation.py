@@ -22,7 +22,7 @@ import torch
 from torch.nn import functional
 
 from brainbench.core.contracts import CHANNELS, GRID_SHAPE
-from brainbench.core.errors import UsageError, unknown_name
+from brainbench.core.errors import UsageError, check_name
 from brainbench.models.normaliser import Normaliser
 
 LAST_COLUMNS = (4, 4, 6, 6, 5)
@@ -45,8 +45,7 @@ class Augmentation:
     """Share of the time steps that are set to zero (temporal masking; published with 0.75)."""
 
     def __post_init__(self) -> None:
-        if self.kind not in KINDS:
-            raise unknown_name("augmentation", self.kind, KINDS)
+        check_name("augmentation", self.kind, KINDS)
         if not 0.0 <= self.masking < 1.0:
             raise UsageError(
                 f"The share of masked time steps lies between 0 and 1, 1 excluded; received {self.masking!r}."
@@ -95,8 +94,7 @@ def flip(x: torch.Tensor, direction: str) -> torch.Tensor:
     Raises:
         UsageError: there is no such direction, or ``x`` is not [B, T, S·6, 5, 7].
     """
-    if direction not in _MIRRORED:
-        raise unknown_name("direction of a flip", direction, _MIRRORED)
+    check_name("direction of a flip", direction, _MIRRORED)
     if x.ndim != 5 or x.shape[2] % len(CHANNELS) or tuple(x.shape[3:]) != GRID_SHAPE:
         raise UsageError(
             f"A physical flip needs sweeps [batch, time, sub-steps × {len(CHANNELS)}, {GRID_SHAPE[0]}, "

@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from brainbench.core.errors import DataError, DataFileNotFoundError, UsageError, missing_dependency, unknown_name
+from brainbench.core.errors import DataError, DataFileNotFoundError, UsageError, check_name, missing_dependency
 
 if TYPE_CHECKING:
     import torch
@@ -55,8 +55,7 @@ def save_checkpoint(
 
     from brainbench.core.files import atomic_path, write_json, write_text
 
-    if dtype not in DTYPES:
-        raise unknown_name("precision of weights", dtype, DTYPES)
+    check_name("precision of weights", dtype, DTYPES)
     kind = getattr(torch, dtype)
     parameters = {name for name, _ in model.named_parameters()}
     state = {}

@@ -121,8 +121,17 @@ def evaluate(model: nn.Module, batches: Iterable[tuple[Any, Any]], *, device: An
         mean, square = moments / seen
         spread = float((square - mean.square()).clamp_min(0).sqrt().mean() * math.sqrt(len(mean)))
     reason = collapse(len(predictions), len(labelled), spread)
-    found = (first / seen, five / seen, wilson_interval(first, seen, over="sweeps"), seen, len(predictions), spread)
-    return Evaluation(*found, collapsed=bool(reason), reason=reason, data=digest.hexdigest()[:16])
+    return Evaluation(
+        top1=first / seen,
+        top5=five / seen,
+        interval=wilson_interval(first, seen, over="sweeps"),
+        count=seen,
+        predicted=len(predictions),
+        spread=spread,
+        collapsed=bool(reason),
+        reason=reason,
+        data=digest.hexdigest()[:16],
+    )
 
 
 def fit_probe(

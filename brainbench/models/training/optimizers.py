@@ -10,7 +10,7 @@ import torch
 from torch import nn
 from torch.optim import Optimizer
 
-from brainbench.core.errors import UsageError, unknown_name
+from brainbench.core.errors import UsageError, check_name, unknown_name
 
 MOMENTUM = 0.9
 WEIGHT_DECAY = 1e-4
@@ -90,8 +90,7 @@ def make_optimizer(name: str, parameters: Iterable[nn.Parameter], learning_rate:
     Raises:
         UsageError: there is no such optimiser, or the rate is not a positive number.
     """
-    if name not in OPTIMIZERS:
-        raise unknown_name("optimizer", name, OPTIMIZERS)
+    check_name("optimizer", name, OPTIMIZERS)
     if not (math.isfinite(learning_rate) and learning_rate > 0):
         raise UsageError(f"A learning rate must be a positive number; received {learning_rate!r}.")
     return OPTIMIZERS[name]([p for p in parameters if p.requires_grad], learning_rate)

@@ -273,9 +273,14 @@ class _Run:
             load_weights(self.model, self.out / BEST / WEIGHTS, what=self.config.model)
             if self.config.objective != "supervised" and self.config.probe_epochs:
                 self.progress(self._steps, self._steps, "fitting the linear probe")
-                sweeps, epochs = self._batches("train", shuffle=False, part=False) or (), self.config.probe_epochs
-                how = {"classes": len(self.data.classes), "epochs": epochs, "seed": self.config.seed}
-                fit_probe(self.model, sweeps, **how, device=self.where.device)
+                fit_probe(
+                    self.model,
+                    self._batches("train", shuffle=False, part=False) or (),
+                    classes=len(self.data.classes),
+                    epochs=self.config.probe_epochs,
+                    seed=self.config.seed,
+                    device=self.where.device,
+                )
             for split in ("test", "validation", "train"):
                 batches = self._batches(split, shuffle=False, part=False)
                 if batches is not None:
@@ -291,10 +296,23 @@ class _Run:
         return self._result("finished", "", result)
 
     def _publish(self, result: Evaluation | None) -> None:
-        done = {"epochs_done": self.at.epoch, "best_epoch": self.at.best_epoch, "drawn_biases": self.drawn}
-        info = checkpoint_info(self.config, self.data.classes, evaluation=result, **done)
-        told = {"info": info, "card": model_card(self.config, info), "dtype": self.config.stored_dtype}
-        save_checkpoint(self.out / BEST, self.model, architecture=self.config.model, options=self.options, **told)
+        info = checkpoint_info(
+            self.config,
+            self.data.classes,
+            epochs_done=self.at.epoch,
+            best_epoch=self.at.best_epoch,
+            evaluation=result,
+            drawn_biases=self.drawn,
+        )
+        save_checkpoint(
+            self.out / BEST,
+            self.model,
+            architecture=self.config.model,
+            options=self.options,
+            info=info,
+            card=model_card(self.config, info),
+            dtype=self.config.stored_dtype,
+        )
 
     def _save(self) -> None:
         self.saved = time.monotonic()
@@ -329,10 +347,9 @@ class _Run:
         return reason
 
     def _result(self, status: Any, reason: str, evaluation: Evaluation | None = None) -> TrainingResult:
-        where = (self.at.step, self.at.epoch, self.at.best_epoch)
-        return TrainingResult(
-            status, reason, self.out / BEST, *where, evaluation, round(time.monotonic() - self.started, 3)
-        )
+        seconds = round(time.monotonic() - self.started, 3)
+        at = self.at
+        return TrainingResult(status, reason, self.out / BEST, at.step, at.epoch, at.best_epoch, evaluation, seconds)
 
     def _batches(self, split: str, *, shuffle: bool, part: bool = True) -> Batches | None:
         mine = self.where.part if part else (0, 1)
