@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from itertools import product
 from typing import Any
 
-from brainbench.core.errors import UsageError, unknown_name
+from brainbench.core.errors import UsageError, check_name
 from brainbench.core.plugins import load_entry_points, load_module
 from brainbench.datasets.sessions import Session
 from brainbench.datasets.trials.conditions import Conditions
@@ -110,8 +110,7 @@ def get_layout(name: str) -> RecordingLayout:
     Raises:
         UsageError: there is no such layout (the nearest is named).
     """
-    if name not in _known():
-        raise unknown_name("recording layout", name, _LAYOUTS)
+    check_name("recording layout", name, _known())
     return _LAYOUTS[name]
 
 

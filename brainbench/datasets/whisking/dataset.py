@@ -19,7 +19,7 @@ import msgspec
 import numpy as np
 
 from brainbench.core.contracts import CHANNELS, GRID_SHAPE
-from brainbench.core.errors import DataError, UsageError, listing, unknown_name
+from brainbench.core.errors import DataError, UsageError, check_name, listing
 from brainbench.core.files import cache_dir, content_hash, read_json, write_json
 from brainbench.datasets.whisking.files import Buffers, most_open, open_shard, read_manifest, verify_shard
 
@@ -107,8 +107,7 @@ class WhiskingDataset:
             ("view", view, get_args(View)),
             ("treatment of unstable sweeps", unstable, get_args(Unstable)),
         ):
-            if value not in allowed:
-                raise unknown_name(kind, str(value), allowed)
+            check_name(kind, value, allowed)
         if batch_size < 1 or not 0 <= part[0] < part[1]:
             raise UsageError(
                 f"A batch has at least one sweep and a part is (rank, number) with 0 ≤ rank < number; received "

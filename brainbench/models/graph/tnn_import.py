@@ -114,8 +114,7 @@ def _node(item: Any) -> Node:
     channels = node.take("out_channels")
     harbor = _Section(node.take("harbor_policy"), f"the harbor policy of {name!r}")
     policy = harbor.take("name")
-    if policy not in ("ResizeConcat", "Identity"):
-        raise unknown_name(f"harbor policy of node {name!r}", policy, ("ResizeConcat", "Identity"))
+    check_name(f"harbor policy of node {name!r}", policy, ("ResizeConcat", "Identity"))
     harbor.done(*_OVERWRITTEN)
     operation = _operation(_Section(node.take("pre_memory"), f"the pre-memory of {name!r}"))
     memory = _memory(_Section(node.take("recurrent_cell"), f"the recurrent cell of {name!r}"))
@@ -133,8 +132,7 @@ def _operation(part: _Section) -> Convolution | Dense | None:
     if kind == "Identity":
         part.done(*_OVERWRITTEN)
         return None
-    if kind not in ("Conv2dCell", "FullyConnected"):
-        raise unknown_name(f"module in {part.where}", kind, ("Conv2dCell", "FullyConnected", "Identity"))
+    check_name(f"module in {part.where}", kind, ("Conv2dCell", "FullyConnected", "Identity"))
     common = {
         "use_bias": part.take("use_bias", True),
         "bias": part.take("bias", None),
@@ -173,8 +171,7 @@ def _memory(part: _Section) -> Memory | None:
     if kind == "IdentityCell":
         part.done(*_OVERWRITTEN, "out_channels")
         return None
-    if kind not in _MEMORIES:
-        raise unknown_name(f"cell in {part.where}", kind, ("IdentityCell", *_MEMORIES))
+    check_name(f"cell in {part.where}", kind, ("IdentityCell", *_MEMORIES))
     part.only(init_dict=None)
     if kind == "TimeDecayRecurrentCell":
         part.only(trainable=True)
@@ -191,6 +188,7 @@ def _memory(part: _Section) -> Memory | None:
 
 def _after(part: _Section) -> tuple[str | None, Pool | None]:
     kind = part.take("name")
+    check_name(f"module in {part.where}", kind, ("ActivationLayer", "MaxPool", "AdaptiveAvgPool", "Identity"))
     activation, pool = None, None
     if kind == "ActivationLayer":
         activation = part.take("activation", "ReLU")
@@ -201,9 +199,5 @@ def _after(part: _Section) -> tuple[str | None, Pool | None]:
         pool = Pool("max", size, stride, part.size("padding", 0), bool(part.take("ceil_mode", False)))
     elif kind == "AdaptiveAvgPool":
         pool = Pool("average", part.size("output_size", 6), flatten=bool(part.take("flatten", False)))
-    elif kind != "Identity":
-        raise unknown_name(
-            f"module in {part.where}", kind, ("ActivationLayer", "MaxPool", "AdaptiveAvgPool", "Identity")
-        )
     part.done(*_OVERWRITTEN)
     return activation, pool

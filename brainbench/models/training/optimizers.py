@@ -10,7 +10,7 @@ import torch
 from torch import nn
 from torch.optim import Optimizer
 
-from brainbench.core.errors import UsageError, check_name, unknown_name
+from brainbench.core.errors import UsageError, check_name
 
 MOMENTUM = 0.9
 WEIGHT_DECAY = 1e-4
@@ -104,13 +104,12 @@ def rate_factor(schedule: str, epoch: float, *, epochs: int, warmup_epochs: int 
     Raises:
         UsageError: there is no such schedule.
     """
+    check_name("schedule", schedule, SCHEDULES)
     if schedule == "constant":
         return 1.0
     if schedule == "step":
         # StepLR (thesis, table 3.2): a tenth every 30 epochs, constant within them.
         return STEP_FACTOR ** (int(epoch) // STEP_EPOCHS)
-    if schedule != "cosine":
-        raise unknown_name("schedule", schedule, SCHEDULES)
     # A run shorter than the published one keeps the share of its warm-up below half.
     warmup = min(warmup_epochs, epochs / 2)
     # Linear rise from the warm-up ratio of table 3.2: steps stay small while gradients are still large.
