@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import platform
 from importlib import metadata
 from typing import Any
 
@@ -48,15 +46,13 @@ def doctor(as_json: JsonOption = False) -> None:
 
 def diagnose() -> dict[str, Any]:
     """Collect what :func:`doctor` shows."""
-    from brainbench import __version__
-    from brainbench.core.files import cache_dir
+    from brainbench.core.devices import usable_processors
+    from brainbench.core.files import cache_dir, provenance
 
-    cache = cache_dir()
+    cache, made = cache_dir(), provenance()
     return {
-        "version": __version__,
-        "python": platform.python_version(),
-        "machine": f"{platform.system()} {platform.machine()}",
-        "processors": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
+        **{name: made[name] for name in ("version", "python", "machine")},
+        "processors": usable_processors(),
         "cuda": _cuda(),
         "cache": str(cache),
         "cache_bytes": sum(item.stat().st_size for item in cache.rglob("*") if item.is_file()),

@@ -161,15 +161,14 @@ def numbers(text: str, what: str, kind: Callable[[str], Any] = int, *, count: in
     Raises:
         UsageError: it is something else.
     """
+    fault = None
     try:
         values = tuple(kind(item) for item in (items(text) if count is None else re.split(r"[,x×]", text)))
     except ValueError as error:
-        values, cause = None, error
-    else:
-        cause = None
-    if values is None or (count is not None and len(values) != count):
+        values, fault = (), error
+    if fault is not None or count not in (None, len(values)):
         of = f"{count} numbers" if count is not None else "whole numbers" if kind is int else "numbers"
-        raise UsageError(f"{what} takes {of} joined by commas; received {text!r}.") from cause
+        raise UsageError(f"{what} takes {of} joined by commas; received {text!r}.") from fault
     return values
 
 

@@ -11,7 +11,7 @@ NaN means "not recorded". :func:`check_stimulus_set` and :func:`check_recordings
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from brainbench.core.errors import DataError
 
@@ -41,15 +41,12 @@ def check_stimulus_set(dataset: xr.Dataset) -> xr.Dataset:
     Raises:
         DataError: something of this is missing.
     """
-    _check_variable(dataset, "wrench", ("stimulus", "time", "whisker", "channel"), "stimulus set")
-    _check_present(
-        dataset.coords, ("stimulus", "time", "whisker", "row", "col", "channel"), "stimulus set", "coordinate"
-    )
-    _check_present(
-        dataset.attrs,
-        ("array", "scene", "fidelity", "seed", "backend", "version", "content_hash"),
+    _check(
+        dataset,
         "stimulus set",
-        "attribute",
+        ("wrench", ("stimulus", "time", "whisker", "channel")),
+        coordinates=("stimulus", "time", "whisker", "row", "col", "channel"),
+        attributes=("array", "scene", "fidelity", "seed", "backend", "version", "content_hash"),
     )
     if tuple(str(name) for name in dataset["channel"].values) != CHANNELS:
         raise DataError(f"The stimulus set has channels {list(dataset['channel'].values)}; expected {list(CHANNELS)}.")
@@ -68,31 +65,24 @@ def check_recordings(dataset: xr.Dataset) -> xr.Dataset:
     Raises:
         DataError: something of this is missing.
     """
-    _check_variable(dataset, "counts", ("trial", "time", "unit"), "recordings data set")
-    _check_present(dataset.variables, ("duration",), "recordings data set", "variable")
-    _check_present(
-        dataset.coords,
-        ("stimulus", "subject", "session", "trial_id", "unit_subject", "unit_session", "unit_id"),
+    _check(
+        dataset,
         "recordings data set",
-        "coordinate",
-    )
-    _check_present(
-        dataset.attrs,
-        ("vocabulary", "window", "selection", "removed", "source", "synthetic", "content_hash"),
-        "recordings data set",
-        "attribute",
+        ("counts", ("trial", "time", "unit")),
+        variables=("duration",),
+        coordinates=("stimulus", "subject", "session", "trial_id", "unit_subject", "unit_session", "unit_id"),
+        attributes=("vocabulary", "window", "selection", "removed", "source", "synthetic", "content_hash"),
     )
     return dataset
 
 
-def _check_variable(dataset: xr.Dataset, name: str, dims: tuple[str, ...], what: str) -> None:
+def _check(dataset: xr.Dataset, what: str, main: tuple[str, tuple[str, ...]], **needed: tuple[str, ...]) -> None:
+    name, dims = main
     if name not in dataset:
         raise DataError(f"A {what} needs the variable {name!r}; this one has {sorted(map(str, dataset))}.")
     if dataset[name].dims != dims:
         raise DataError(f"{name!r} of a {what} has dimensions {dims}; this one has {dataset[name].dims}.")
-
-
-def _check_present(container: Any, names: tuple[str, ...], what: str, kind: str) -> None:
-    missing = [name for name in names if name not in container]
-    if missing:
-        raise DataError(f"This {what} lacks the {kind} {', '.join(map(repr, missing))}.")
+    places = {"coordinates": dataset.coords, "attributes": dataset.attrs, "variables": dataset.variables}
+    for kind, names in needed.items():
+        if missing := [item for item in names if item not in places[kind]]:
+            raise DataError(f"This {what} lacks the {kind[:-1]} {', '.join(map(repr, missing))}.")

@@ -78,6 +78,12 @@ def unknown_name(kind: str, name: str, options: Iterable[str], *, hint: str = ""
     return UsageError(f"{text} {hint}".rstrip())
 
 
+def check_name(kind: str, name: str, options: Iterable[str], *, hint: str = "") -> None:
+    """Raise the error of :func:`unknown_name` unless a name is among the options."""
+    if name not in (choices := list(options)):
+        raise unknown_name(kind, name, choices, hint=hint)
+
+
 def missing_dependency(package: str, *, extra: str, purpose: str) -> MissingDependencyError:
     """Build the error for an optional package, naming the extra that installs it."""
     return MissingDependencyError(

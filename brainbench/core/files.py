@@ -156,11 +156,8 @@ def content_hash(*values: Any, length: int = 16) -> str:
 
 def file_hash(path: str | os.PathLike[str], *, length: int = 16) -> str:
     """Hash a file's bytes in bounded memory."""
-    digest = hashlib.sha256()
     with Path(path).open("rb") as stream:
-        while block := stream.read(1 << 20):
-            digest.update(block)
-    return digest.hexdigest()[:length]
+        return hashlib.file_digest(stream, "sha256").hexdigest()[:length]
 
 
 def hash_arrays(arrays: Mapping[str, Any]) -> str:

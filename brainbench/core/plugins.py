@@ -18,13 +18,12 @@ from brainbench.core.errors import BrainbenchError, DataError, DataFileNotFoundE
 _LOG = logging.getLogger(__name__)
 
 
-def load_object(target: str, kind: str, *, offers: Callable[[Any], bool] = callable) -> Any:
+def load_object(target: str, kind: str) -> Any:
     """Return the object NAME of ``path/to/FILE.py:NAME`` or ``package.module:NAME``; the file or module is run.
 
     Args:
         target: as above. The file's own folder can be imported from while it loads.
         kind: what is loaded, for messages: ``model``, ``metric``, ``layout``.
-        offers: which objects of the file a message about an unknown name lists.
 
     Raises:
         UsageError: the target has another form, or there is no such name.
@@ -38,7 +37,7 @@ def load_object(target: str, kind: str, *, offers: Callable[[Any], bool] = calla
         )
     module = load_module(path)
     if not hasattr(module, name):
-        choices = [key for key, value in vars(module).items() if not key.startswith("_") and offers(value)]
+        choices = [key for key, value in vars(module).items() if not key.startswith("_") and callable(value)]
         raise unknown_name(f"{kind} in {path!r}", name, choices)
     return getattr(module, name)
 

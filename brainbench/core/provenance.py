@@ -40,9 +40,8 @@ class Provenance(Mapping[str, Any]):
     @classmethod
     def of(cls, stated: Mapping[str, Any]) -> Provenance:
         """Return the provenance that a mapping states; as a mapping it is equal to that."""
-        kinds: dict[str, Any] = dict.fromkeys(("version", "time", "machine", "python", "command"), str)
-        kinds |= dict.fromkeys(("packages", "recordings", "stimuli", "pairs", "settings", "statistics"), Mapping)
-        kinds["seconds"] = (int, float)
+        kinds = {item.name: {"str": str, "float": (int, float)}.get(str(item.type), Mapping) for item in fields(cls)}
+        del kinds["more"]
         typed: dict[str, Any] = {
             name: value for name, value in stated.items() if value and isinstance(value, kinds.get(name, ()))
         }

@@ -12,7 +12,7 @@ import unicodedata
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, is_dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Self, get_args
 
 import msgspec
 
@@ -109,6 +109,31 @@ class LayerScore(_NullIsNaN):
     """Interval of ``value``, over animals."""
 
 
+class _Document:
+    """Base of what a file holds: to and from JSON."""
+
+    def to_json(self) -> str:
+        """Serialise deterministically; NaN becomes null."""
+        return to_json(self)
+
+    @classmethod
+    def from_json(cls, source: str | Mapping[str, Any]) -> Self:
+        """Rebuild it from :meth:`to_json` or from the mapping inside it, of this schema version or an earlier one.
+
+        Raises:
+            DataError: a field is missing, unknown or of the wrong kind, or the schema version is not read here.
+        """
+        try:
+            data = json.loads(source) if isinstance(source, str) else source
+        except json.JSONDecodeError as error:
+            raise DataError(f"This is not valid JSON ({error}).") from error
+        return _convert(cls, cls._migrated(data))
+
+    @classmethod
+    def _migrated(cls, data: Any) -> Any:
+        return data
+
+
 if TYPE_CHECKING:
     _StatedProvenance = Provenance
 else:
@@ -116,7 +141,7 @@ else:
 
 
 @dataclass(frozen=True)
-class Score(_NullIsNaN):
+class Score(_NullIsNaN, _Document):
     """One model's match to one set of recordings, with its statistics.
 
     Everything printed or published comes from this object. ``value`` is NaN exactly when
@@ -204,19 +229,6 @@ class Score(_NullIsNaN):
             return None
         low, high = self.on_scale(self.interval.low), self.on_scale(self.interval.high)
         return Interval(low, high, self.interval.level, self.interval.method)
-
-    def to_json(self) -> str:
-        """Serialise deterministically; NaN becomes null."""
-        return to_json(self)
-
-    @classmethod
-    def from_json(cls, source: str | Mapping[str, Any]) -> Score:
-        """Rebuild a score from :meth:`to_json` or from the mapping inside it.
-
-        Raises:
-            DataError: a field is missing, unknown or of the wrong kind.
-        """
-        return _convert(cls, _parsed(source))
 
     def summary(self) -> str:
         """Return one line a person reads: value, interval, p and status."""
@@ -330,7 +342,7 @@ class ModelCard:
 
 
 @dataclass(frozen=True)
-class ResultRecord:
+class ResultRecord(_Document):
     """A score with what is needed to judge it: animals, baselines and the model card."""
 
     score: Score
@@ -341,18 +353,9 @@ class ResultRecord:
     """True when the recordings are synthetic: ranks then say nothing about brains."""
     schema: Literal[2] = RECORD_SCHEMA
 
-    def to_json(self) -> str:
-        """Serialise deterministically; NaN becomes null."""
-        return to_json(self)
-
     @classmethod
-    def from_json(cls, source: str | Mapping[str, Any]) -> ResultRecord:
-        """Rebuild a record; one of an earlier schema version is brought to this one (:func:`migrate_record`).
-
-        Raises:
-            DataError: it is not a record of a schema version this package reads.
-        """
-        return _convert(cls, migrate_record(_parsed(source)))
+    def _migrated(cls, data: Any) -> Any:
+        return migrate_record(data)
 
     @cached_property
     def identity(self) -> str:
@@ -432,15 +435,6 @@ def _span(interval: Interval | Ceiling) -> str:
     return f"[{_number(low)}, {_number(high)}]"
 
 
-def _parsed(source: str | Mapping[str, Any]) -> Any:
-    if not isinstance(source, str):
-        return source
-    try:
-        return json.loads(source)
-    except json.JSONDecodeError as error:
-        raise DataError(f"This is not valid JSON ({error}).") from error
-
-
 def _convert(kind: type, data: Any) -> Any:
     """Make a dataclass from parsed JSON.
 
@@ -473,10 +467,8 @@ def _check_rest(data: Any, built: Any, place: str) -> None:
             _check_rest(data[name], made, f"{place}.{name}")
 
 
-_WORDS = {"float": "a number", "int": "an integer", "str": "text", "bool": "true or false", "null": "null"} | {
-    "object": "an object",
-    "array": "a list",
-}
+_WORDS = {"float": "a number", "int": "an integer", "str": "text", "bool": "true or false", "null": "null"}
+_WORDS |= {"object": "an object", "array": "a list"}
 
 
 def _in_words(fault: str, data: Any) -> str:

@@ -59,16 +59,13 @@ def from_z_axis(direction: ArrayLike) -> NDArray[np.float64]:
     return q / np.linalg.norm(q)
 
 
-def constant(values: float | Sequence[float], like: torch.Tensor, dtype: torch.dtype | None = None) -> torch.Tensor:
-    """Return numbers as a tensor on the device of another: made once, so that later calls copy nothing to the device.
+def constant(values: float | Sequence[float], like: torch.Tensor) -> torch.Tensor:
+    """Return numbers [] or [n] as a tensor of the kind of another, on its device; do not write to it.
 
-    Args:
-        values: a number or some numbers [n]; do not write to the result.
-        like: tensor whose device is taken.
-        dtype: of the result; that of ``like`` by default.
+    It is made once, so that later calls copy nothing to the device.
     """
     own = tuple(values) if isinstance(values, Sequence) else values
-    return _constant(own, like.device, dtype or like.dtype)
+    return _constant(own, like.device, like.dtype)
 
 
 @cache

@@ -13,8 +13,7 @@ from brainbench.datasets.exports import export
 from brainbench.datasets.fetching import fetch
 from brainbench.datasets.hdf5 import write_recordings
 from brainbench.datasets.inspection import inspect
-from brainbench.datasets.layouts.layout import RecordingLayout
-from brainbench.datasets.layouts.registry import register_layout
+from brainbench.datasets.layouts.registry import RecordingLayout, register_layout
 from brainbench.datasets.recordings import open_recordings
 from brainbench.datasets.trials.conditions import Conditions
 from brainbench.datasets.trials.selection import Rule, Selection

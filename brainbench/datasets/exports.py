@@ -105,19 +105,15 @@ def _plain(table: SessionTable, rows: NDArray[np.bool_]) -> dict[str, NDArray[An
     """Return the columns that mean something outside their file, of the rows kept; references do not."""
     made: dict[str, NDArray[Any]] = {"id": table.ids()[rows]}
     for name in table.columns:
-        if name == SPIKES or name.endswith("_index"):
-            continue
         raw = table.data[name]
-        kind = decode(getattr(raw, "attrs", {}).get("neurodata_type", "")).tolist()
-        if kind == "DynamicTableRegion":
-            continue
-        nested = f"{name}_index" in table.data
-        if (raw.ndim > 1 and name != OBSERVED) or f"{name}_index_index" in table.data:
+        region = decode(getattr(raw, "attrs", {}).get("neurodata_type", "")).tolist() == "DynamicTableRegion"
+        deeper = (raw.ndim > 1 and name != OBSERVED) or f"{name}_index_index" in table.data
+        if name == SPIKES or name.endswith("_index") or region or deeper:
             continue
         values = decode(raw[...])
         if values.dtype.kind not in "biufU":
             continue
-        if not nested:
+        if f"{name}_index" not in table.data:
             made[name] = table.column(name)[rows]
             continue
         parts = np.split(values, table.ends(name)[:-1]) if len(table) else []

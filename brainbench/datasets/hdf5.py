@@ -105,19 +105,17 @@ def read_sessions(file: h5py.File, path: Path) -> list[Session]:
     """
     sessions = []
     for name, group in _need(file, "sessions", path).items():
-        tables = {
-            key: SessionTable(key, dict(table.items()), f"{path}:{name}")
-            for key, table in _need(group, "tables", path).items()
-        }
-        units = SessionTable("units", dict(_need(group, "units", path).items()), f"{path}:{name}")
+        source, tables = f"{path}:{name}", _need(group, "tables", path).items()
+        units = SessionTable("units", dict(_need(group, "units", path).items()), source)
+        stated = {key: text(group.attrs.get(key, "")) for key in ("subject", "session", "start")}
         sessions.append(
             Session(
-                subject=text(group.attrs.get("subject", "")) or name,
-                session=text(group.attrs.get("session", "")) or name,
+                subject=stated["subject"] or name,
+                session=stated["session"] or name,
                 units=units if SPIKES in units else None,
-                tables=tables,
-                source=f"{path}:{name}",
-                start=text(group.attrs.get("start", "")),
+                tables={key: SessionTable(key, dict(table.items()), source) for key, table in tables},
+                source=source,
+                start=stated["start"],
                 format=f"{FORMAT} {VERSION}",
                 synthetic=bool(group.attrs.get("synthetic", False)),
                 stimuli=text(group.attrs.get("stimuli", "")),
@@ -140,14 +138,9 @@ def read_counts(file: h5py.File, path: Path) -> xr.Dataset:
             coordinates[name] = (dimension, decode(values[...]))
     try:
         attributes = json.loads(text(_need(file, "attributes", path)[()]))
-        dataset = xr.Dataset(
-            {
-                "counts": (("trial", "time", "unit"), _need(file, "counts", path)[...]),
-                "duration": (("trial", "time"), _need(file, "duration", path)[...]),
-            },
-            coordinates,
-            attributes,
-        )
+        dims = {"counts": ("trial", "time", "unit"), "duration": ("trial", "time")}
+        variables = {name: (own, _need(file, name, path)[...]) for name, own in dims.items()}
+        dataset = xr.Dataset(variables, coordinates, attributes)
     except ValueError as error:
         raise DataError(f"{path} does not hold a consistent recordings data set ({error}).") from error
     return check_recordings(dataset)
@@ -175,10 +168,8 @@ def _write_sessions(file: h5py.File, sessions: list[Session]) -> None:
         if session.units is None:
             raise DataError(f"Session {name!r} has no units table; there are no spikes to write.")
         group = root.create_group(name)
-        group.attrs.update(
-            {"subject": session.subject, "session": session.session, "start": session.start}
-            | {"synthetic": session.synthetic, "stimuli": session.stimuli}
-        )
+        for key in ("subject", "session", "start", "synthetic", "stimuli"):
+            group.attrs[key] = getattr(session, key)
         _write_table(group.create_group("units"), session.units)
         group.create_group("tables")
         for key, table in session.tables.items():

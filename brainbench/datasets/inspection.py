@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from brainbench.core.errors import DataError
 from brainbench.core.files import to_json
 from brainbench.datasets import hdf5
-from brainbench.datasets.layouts.layout import RecordingLayout
+from brainbench.datasets.layouts.registry import RecordingLayout
 from brainbench.datasets.reading import each_session, find_files, open_file
 from brainbench.datasets.sessions import SPIKES, Session, SessionTable, as_labels, natural_key
 from brainbench.datasets.trials.conditions import natural_vocabulary
@@ -168,27 +168,19 @@ def inspect(path: str | os.PathLike[str]) -> Inspection:
                 own = propose(session, found)
                 summaries.append(_summary(session, bool(own)))
                 proposals += own
-    return Inspection(
-        path=os.fspath(path),
-        format=", ".join(formats),
-        layout=layouts.pop() if len(layouts) == 1 else None,
-        sessions=tuple(summaries),
-        proposals=_merged(proposals),
-    )
+    layout = layouts.pop() if len(layouts) == 1 else None
+    return Inspection(os.fspath(path), ", ".join(formats), layout, tuple(summaries), _merged(proposals))
 
 
 def _merged(proposals: list[Proposal]) -> tuple[Proposal, ...]:
     """Join equal proposals of several files: all labels, the fewest trials."""
     merged: dict[str, Proposal] = {}
     for item in proposals:
-        known = merged.get(item.conditions)
-        if known is None:
-            merged[item.conditions] = item
-        else:
-            labels = known.labels
-            if more := set(item.labels).difference(labels):
-                labels = tuple(sorted({*labels, *more}, key=natural_key))
-            merged[item.conditions] = Proposal(item.conditions, labels, min(known.fewest, item.fewest))
+        known = merged.get(item.conditions, item)
+        labels = known.labels
+        if more := set(item.labels).difference(labels):
+            labels = tuple(sorted({*labels, *more}, key=natural_key))
+        merged[item.conditions] = Proposal(item.conditions, labels, min(known.fewest, item.fewest))
     return tuple(merged.values())
 
 
@@ -202,6 +194,7 @@ def _summary(session: Session, usable: bool) -> SessionSummary:
         missing.append("no interval tables: nothing says when which stimulus was presented")
     elif not usable:
         missing.append("no column of the interval tables has 2 to 60 values with at least two trials each")
+    series = session.series.values()
     return SessionSummary(
         subject=session.subject,
         session=session.session,
@@ -211,8 +204,7 @@ def _summary(session: Session, usable: bool) -> SessionSummary:
         tables=tables,
         modules=tuple(session.modules.items()),
         acquired=tuple(
-            AcquiredSummary(item.name, item.kind, tuple(item.data.shape), item.gigabytes)
-            for item in session.series.values()
+            AcquiredSummary(item.name, item.kind, tuple(item.data.shape), item.gigabytes) for item in series
         ),
         missing=tuple(missing),
         notes=session.notes,

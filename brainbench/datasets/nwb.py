@@ -54,6 +54,9 @@ def read_nwb(file: h5py.File, path: Path) -> Session:
     session = _string(file, "general/session_id") or _entity(path, "ses")
     description = _string(file, "session_description")
     keywords, units = file.get("general/keywords"), file.get("units")
+    # Licks are processed data with their own times.
+    processed = (item for _, module in _groups(file.get("processing")) for item in _series(module))
+    licks = [item for item in processed if item[0].rpartition("/")[2] == LICKS]
     return Session(
         subject=subject,
         session=session,
@@ -67,7 +70,7 @@ def read_nwb(file: h5py.File, path: Path) -> Session:
         intracellular=_intracellular(file),
         modules={name: tuple(module) for name, module in _groups(file.get("processing"))},
         notes=tuple(notes),
-        series=dict([*_series(file.get("acquisition")), *_licks(file)]),
+        series=dict([*_series(file.get("acquisition")), *licks]),
         stimuli=_recipe(_string(file, "general/stimulus")),
     )
 
@@ -114,12 +117,6 @@ def _series(parent: Any) -> Iterator[tuple[str, Series]]:
         if isinstance(begin, h5py.Dataset) and begin.shape == ():
             start, rate = float(begin[()]), float(begin.attrs.get("rate", math.nan))
         yield path, Series(path, _type(group), data, stamps, start, rate)
-
-
-def _licks(file: h5py.File) -> Iterator[tuple[str, Series]]:
-    """Yield licks, which are processed data with their own times."""
-    for _, module in _groups(file.get("processing")):
-        yield from (item for item in _series(module) if item[0].rpartition("/")[2] == LICKS)
 
 
 def _groups(parent: Any) -> list[tuple[str, h5py.Group]]:

@@ -53,13 +53,8 @@ def write_nwb(
 ) -> Path:
     """Write one session as NWB 2.x, atomically: units, interval tables, and signals that have timestamps.
 
-    Args:
-        path: file to write.
-        session: what to write; that it is synthetic is said in the descriptions and keywords.
-        description: what the session is.
-        general: further texts under ``/general``.
-        subject: further texts under ``/general/subject``.
-        columns: what columns mean, by name.
+    That it is synthetic is said in the descriptions and keywords. ``general`` and ``subject`` are further texts under
+    ``/general`` and ``/general/subject``; ``columns`` says what columns mean, by name.
 
     Raises:
         DataError: ids are no integers or a table has no ``stop_time``, which NWB needs.
@@ -117,13 +112,8 @@ def _ids(table: SessionTable) -> NDArray[np.int64]:
 class NwbWriter:
     """Fills an open, empty HDF5 file with one NWB session.
 
-    Args:
-        file: file opened for writing.
-        identifier: name of the session, unique among files.
-        description: session description.
-        start: session start, ISO 8601 with time zone.
-        general: texts (or lists of texts) under ``/general``, such as experimenter, lab, keywords.
-        subject: texts under ``/general/subject``.
+    ``identifier`` is unique among files and ``start`` is ISO 8601 with time zone; ``general`` and ``subject`` are texts
+    (or lists of texts) under ``/general`` and ``/general/subject``, such as experimenter, lab, keywords.
     """
 
     def __init__(
@@ -141,16 +131,11 @@ class NwbWriter:
         file.attrs["nwb_version"] = NWB_VERSION
         for name in ("acquisition", "analysis", "processing", "stimulus/presentation", "stimulus/templates"):
             file.create_group(name)
-        self._texts("file_create_date", [start])
-        for name, value in (
-            ("identifier", identifier),
-            ("session_description", description),
-            ("session_start_time", start),
-            ("timestamps_reference_time", start),
-        ):
+        texts: dict[str, Any] = {"file_create_date": [start], "identifier": identifier}
+        texts |= {"session_description": description, "session_start_time": start, "timestamps_reference_time": start}
+        texts |= {f"general/{name}": value for name, value in general.items()}
+        for name, value in texts.items():
             self._texts(name, value)
-        for name, value in general.items():
-            self._texts(f"general/{name}", value)
         self._describe(file.create_group("general/subject"), "core", "Subject")
         for name, value in subject.items():
             self._texts(f"general/subject/{name}", value)
@@ -158,26 +143,25 @@ class NwbWriter:
     def table(self, path: str, kind: str, description: str, ids: NDArray[np.int64], columns: Columns) -> None:
         """Add a table, such as ``Units`` or ``TimeIntervals``."""
         group = self._group(path)
-        self._describe(group, "core", kind)
-        group.attrs["description"] = description
+        self._describe(group, "core", kind, description)
         group.attrs.create("colnames", list(columns), dtype=_text_type())
         self._describe(group.create_dataset("id", data=ids), "hdmf-common", "ElementIdentifiers")
         for name, (meaning, values) in columns.items():
             ragged = isinstance(values, list)
             dataset = self._array(f"{path}/{name}", np.concatenate(values) if ragged else values)
-            self._column(dataset, "VectorData", meaning)
+            self._describe(dataset, "hdmf-common", "VectorData", meaning)
             if ragged:
                 # The schema asks for unsigned row ends.
                 ends = np.cumsum([len(row) for row in values], dtype=np.uint32)
                 index = group.create_dataset(f"{name}_index", data=ends)
-                self._column(index, "VectorIndex", f"Index for VectorData '{name}'")
+                self._describe(index, "hdmf-common", "VectorIndex", f"Index for VectorData '{name}'")
                 index.attrs["target"] = dataset.ref
 
     def events(self, path: str, description: str, times: NDArray[np.float64], values: NDArray[Any]) -> None:
         """Add a time series of coded events at ``times`` (s)."""
         group = self._group(path)
-        self._describe(group, "core", "TimeSeries")
-        group.attrs.update({"description": description, "comments": "no comments"})
+        self._describe(group, "core", "TimeSeries", description)
+        group.attrs["comments"] = "no comments"
         data = group.create_dataset("data", data=values)
         data.attrs.update({"conversion": np.float32(1), "resolution": np.float32(-1), "unit": "code"})
         stamps = self._array(f"{path}/timestamps", times)
@@ -189,8 +173,7 @@ class NwbWriter:
         module = rest.partition("/")[0]
         if root == "processing" and f"{root}/{module}" not in self.file:
             made = self.file.create_group(f"{root}/{module}")
-            self._describe(made, "core", "ProcessingModule")
-            made.attrs["description"] = f"Module {module}."
+            self._describe(made, "core", "ProcessingModule", f"Module {module}.")
         return self.file.create_group(path)
 
     def _array(self, path: str, values: NDArray[Any]) -> h5py.Dataset:
@@ -199,13 +182,11 @@ class NwbWriter:
         packed = {"compression": "gzip", "compression_opts": 4, "shuffle": True} if values.size > 1000 else {}
         return self.file.create_dataset(path, data=values, **packed)
 
-    def _column(self, dataset: h5py.Dataset, kind: str, description: str) -> None:
-        self._describe(dataset, "hdmf-common", kind)
-        dataset.attrs["description"] = description
-
-    def _describe(self, item: h5py.Group | h5py.Dataset, namespace: str, kind: str) -> None:
+    def _describe(self, item: h5py.Group | h5py.Dataset, namespace: str, kind: str, description: str = "") -> None:
         item.attrs.update({"namespace": namespace, "neurodata_type": kind})
         item.attrs["object_id"] = str(uuid.uuid5(_SPACE, f"{self.identifier}{item.name}"))
+        if description:
+            item.attrs["description"] = description
 
     def _texts(self, path: str, value: str | Sequence[str]) -> None:
         self.file.create_dataset(path, data=value if isinstance(value, str) else list(value), dtype=_text_type())

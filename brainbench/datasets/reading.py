@@ -21,7 +21,7 @@ from brainbench.datasets.trials.selection import DEFAULT, EVERYTHING, Selection
 if TYPE_CHECKING:
     import h5py
 
-    from brainbench.datasets.layouts.layout import RecordingLayout
+    from brainbench.datasets.layouts.registry import RecordingLayout
     from brainbench.datasets.sessions import Session
 
 Source = str | os.PathLike[str] | Sequence[str | os.PathLike[str]]
@@ -156,12 +156,8 @@ def _expand(source: str) -> list[Path]:
                 return found
         raise DataFileNotFoundError(f"The folder {source!r} holds no recordings (*.nwb, *.h5, *.hdf5).")
     if glob.has_magic(source):
-        found = [
-            Path(item)
-            for item in glob.glob(str(path), recursive=True)  # noqa: PTH207 (absolute patterns)
-            if Path(item).is_file()
-        ]
-        if not found:
+        matches = map(Path, glob.glob(str(path), recursive=True))  # noqa: PTH207 (absolute patterns)
+        if not (found := [item for item in matches if item.is_file()]):
             raise DataFileNotFoundError(f"The pattern {source!r} matches no file.")
         return found
     if source in ("demo", "demo-rodgers"):

@@ -15,8 +15,7 @@ from brainbench.core.contracts import check_recordings
 from brainbench.core.errors import DataError, UsageError, listing, unknown_name
 from brainbench.datasets import hdf5
 from brainbench.datasets.inspection import propose
-from brainbench.datasets.layouts.layout import RecordingLayout
-from brainbench.datasets.layouts.registry import list_layouts
+from brainbench.datasets.layouts.registry import RecordingLayout, list_layouts
 from brainbench.datasets.reading import Source, each_session, find_recordings, open_file, resolve_selection
 from brainbench.datasets.sessions import Session
 from brainbench.datasets.trials.conditions import Conditions

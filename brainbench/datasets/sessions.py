@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from brainbench.core.errors import DataError, unknown_name
+from brainbench.core.errors import DataError, check_name, unknown_name
 
 SPIKES = "spike_times"
 OBSERVED = "obs_intervals"
@@ -198,8 +198,7 @@ class Session:
         Raises:
             UsageError: there is no such table (the nearest is named).
         """
-        if name not in self.tables:
-            raise unknown_name("table", name, self.tables, hint=f"(interval tables of {self.source})")
+        check_name("table", name, self.tables, hint=f"(interval tables of {self.source})")
         return self.tables[name]
 
     def with_table(self, table: SessionTable, *notes: str) -> Session:
@@ -228,9 +227,7 @@ def make_session(
         tables: interval tables, each a mapping of columns with at least ``start_time``.
         unit_columns: columns of the units table, such as ``id``, ``depth`` (µm), ``layer``.
         observed: per unit the recorded spans [n, 2] (s), if known.
-        start: session start, ISO 8601.
-        synthetic: whether the spikes were made by a computer.
-        stimuli: recipe of the stimuli, such as ``rodgers``, if there is one.
+        start, synthetic, stimuli: as of :class:`Session`.
 
     Raises:
         DataError: columns differ in length or a table has no ``start_time``.
@@ -284,10 +281,10 @@ def as_labels(values: NDArray[Any]) -> NDArray[np.str_]:
     >>> as_labels(np.array([1.0, 2.5, np.nan])).tolist()
     ['1', '2.5', '']
     """
+    if not len(values):
+        return np.zeros(0, "U1")
     unique, inverse = np.unique(values, return_inverse=True)
-    return (
-        np.array([_label(item) for item in unique.tolist()], dtype=str)[inverse] if len(values) else np.zeros(0, "U1")
-    )
+    return np.array([_label(item) for item in unique.tolist()], dtype=str)[inverse]
 
 
 def _label(value: Any) -> str:

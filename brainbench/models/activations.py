@@ -8,14 +8,14 @@ from __future__ import annotations
 import logging
 import os
 from collections.abc import Collection, Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass
+from contextlib import ExitStack, contextmanager
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from brainbench.core.errors import BrainbenchError, UsageError, unknown_name
+from brainbench.core.errors import BrainbenchError, UsageError, check_name
 
 if TYPE_CHECKING:
     import torch
@@ -78,7 +78,7 @@ def extract(
             f"{list(values.shape)} and chunk {chunk}."
         )
     like = next((p for p in model.parameters() if p.is_floating_point()), torch.zeros(()))
-    reader = _named_reader(model, layers) or _HookReader(model, _hooked(model, layers), layers is not None)
+    reader = _named_reader(model, layers) or partial(_hooked_run, model, _hooked(model, layers), layers is not None)
     result = Activations()
     with evaluating(model), torch.no_grad():
         for start, stop in _chunks(len(values), chunk, avoid=values.shape[1]):
@@ -101,8 +101,7 @@ def extract(
     for name, activity in result.items():
         if isinstance(activity, np.memmap):
             activity.flush()
-        count = sum(part.size - int(np.isfinite(part).sum()) for part in np.array_split(activity, len(activity)))
-        if count:
+        if count := sum(int((~np.isfinite(row)).sum()) for row in activity):
             result.nonfinite[name] = count
             _log.warning("%d of %d activations of layer %r are not finite.", count, activity.size, name)
     return result
@@ -172,15 +171,11 @@ class _LayerError(UsageError):
 
 def _named_reader(model: nn.Module, layers: Collection[str] | None) -> Any:
     """Return a function from stimuli to activations if the model names its layers itself."""
-    named = getattr(model, "layers", None)
-    if not isinstance(named, tuple) or not all(isinstance(name, str) for name in named):
-        return None
-    read = getattr(model, "activations", None)
-    if not callable(read):
+    named, read = getattr(model, "layers", None), getattr(model, "activations", None)
+    if not isinstance(named, tuple) or not all(isinstance(name, str) for name in named) or not callable(read):
         return None
     for name in layers or ():
-        if name not in named:
-            raise unknown_name("layer", name, named)
+        check_name("layer", name, named)
     wanted = named if layers is None else tuple(name for name in named if name in layers)
     return lambda part: read(part, wanted)
 
@@ -193,52 +188,37 @@ def _hooked(model: nn.Module, layers: Collection[str] | None) -> dict[str, nn.Mo
         return leaves | {OUTPUT: model}
     choices = every if OUTPUT in every else {**every, OUTPUT: model}
     for name in layers:
-        if name not in choices:
-            raise unknown_name("layer", name, choices)
+        check_name("layer", name, choices)
     return {name: choices[name] for name in choices if name in layers}
 
 
-@dataclass(frozen=True)
-class _HookReader:
-    """Reads submodules of any module by forward hooks."""
+def _hooked_run(
+    model: nn.Module, modules: dict[str, nn.Module], strict: bool, part: torch.Tensor
+) -> dict[str, torch.Tensor]:
+    """Run any module and return what submodules gave, read by forward hooks; if strict, each must give something."""
+    calls: dict[str, list[torch.Tensor]] = {name: [] for name in modules}
 
-    model: nn.Module
-    modules: dict[str, nn.Module]
-    strict: bool
-    """Layers were asked for by name, so one that gives nothing per stimulus is an error."""
-
-    def __call__(self, part: torch.Tensor) -> dict[str, torch.Tensor]:
-        calls: dict[str, list[torch.Tensor]] = {name: [] for name in self.modules}
-        handles = []
-        try:
-            for name, module in self.modules.items():
-                handles.append(module.register_forward_hook(_recorder(calls[name])))
-            self.model(part)
-        finally:
-            for handle in handles:
-                handle.remove()
-        batch, steps = part.shape[:2]
-        found = {}
-        for name, outputs in calls.items():
-            activity = _over_calls(name, outputs, batch, steps)
-            if not activity and self.strict:
-                seen = [list(output.shape) for output in outputs] or "nothing"
-                raise _LayerError(
-                    f"Layer {name!r} gave {seen} for {batch} stimuli of {steps} steps: no activation per stimulus."
-                )
-            found |= activity
-        return found
-
-
-def _recorder(calls: list[torch.Tensor]) -> Any:
-    def record(module: nn.Module, inputs: Any, output: Any) -> None:
-        del module, inputs
-        tensor = _first_tensor(output)
-        if tensor is not None:
+    def record(name: str, output: Any) -> None:
+        if (tensor := _first_tensor(output)) is not None:
             # A later in-place operation must not change what was recorded.
-            calls.append(tensor.detach().clone())
+            calls[name].append(tensor.detach().clone())
 
-    return record
+    with ExitStack() as handles:
+        for name, module in modules.items():
+            handle = module.register_forward_hook(lambda _, inputs, output, name=name: record(name, output))
+            handles.callback(handle.remove)
+        model(part)
+    batch, steps = part.shape[:2]
+    found = {}
+    for name, outputs in calls.items():
+        activity = _over_calls(name, outputs, batch, steps)
+        if not activity and strict:
+            seen = [list(output.shape) for output in outputs] or "nothing"
+            raise _LayerError(
+                f"Layer {name!r} gave {seen} for {batch} stimuli of {steps} steps: no activation per stimulus."
+            )
+        found |= activity
+    return found
 
 
 def _first_tensor(value: Any) -> torch.Tensor | None:

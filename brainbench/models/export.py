@@ -12,7 +12,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from brainbench.core.errors import DataError, missing_dependency, unknown_name
+from brainbench.core.errors import DataError, check_name, missing_dependency
 
 if TYPE_CHECKING:
     from torch import nn
@@ -20,6 +20,8 @@ if TYPE_CHECKING:
 SUFFIXES = {"onnx": ".onnx", "torch": ".pt2"}
 """Formats and their suffixes: ONNX, and an exported PyTorch program."""
 INPUTS, OUTPUTS = ("obs", "h_in"), ("features", "h_out")
+OPSET = 18
+"""ONNX operator set."""
 TOLERANCE = 1e-4
 """Largest difference between the file and the network, relative to the largest feature."""
 _STEPS = 8
@@ -41,17 +43,14 @@ class Export:
     """Largest difference between the file's features and the network's on a random stream, relative to the largest."""
 
 
-def export_model(
-    model: nn.Module, path: str | Path, *, format: str = "onnx", name: str = "", opset: int = 18
-) -> Export:
-    """Export a network's streaming step and check the exported file against the network.
+def export_model(model: nn.Module, path: str | Path, *, format: str = "onnx", name: str = "") -> Export:
+    """Export the streaming step of an encoder-attender-decoder network and check the file against the network.
 
     Args:
-        model: A :class:`~brainbench.models.network.EncoderAttenderDecoder`; exported in evaluation mode, on the CPU.
+        model: The network; exported in evaluation mode, on the CPU.
         path: File to write; the suffix of the format is added when there is none.
         format: ``onnx`` or ``torch``.
         name: What the contract calls the network.
-        opset: ONNX operator set.
 
     Raises:
         UsageError: there is no such format, or the network cannot be streamed.
@@ -63,15 +62,14 @@ def export_model(
     from brainbench.core.files import atomic_path, content_hash, provenance, write_json
     from brainbench.models.streaming import StreamingStep
 
-    if format not in SUFFIXES:
-        raise unknown_name("export format", format, SUFFIXES)
+    check_name("export format", format, SUFFIXES)
     if format == "onnx":
         require_onnx()
     target = Path(path)
     target = target if target.suffix else target.with_suffix(SUFFIXES[format])
     step = StreamingStep(copy.deepcopy(model).cpu().float().eval()).eval()
     with atomic_path(target) as temporary:
-        _write(step, temporary, format, opset)
+        _write(step, temporary, format)
         difference = _difference(step, READERS[format](temporary))
         if not difference <= TOLERANCE:
             raise DataError(
@@ -109,7 +107,7 @@ def require_onnx() -> None:
             raise missing_dependency(package, extra="export", purpose="Exporting to ONNX") from error
 
 
-def _write(step: Any, path: Path, format: str, opset: int) -> None:
+def _write(step: Any, path: Path, format: str) -> None:
     import torch
 
     example = torch.zeros(2, *step.model.spec.input_shape), step.init_state(2)
@@ -122,7 +120,7 @@ def _write(step: Any, path: Path, format: str, opset: int) -> None:
             torch.export.save(torch.export.export(step, example, **shapes), path)
             return
         names: dict[str, Any] = {"input_names": list(INPUTS), "output_names": list(OUTPUTS)}
-        program = torch.onnx.export(step, example, dynamo=True, opset_version=opset, verbose=False, **names, **shapes)
+        program = torch.onnx.export(step, example, dynamo=True, opset_version=OPSET, verbose=False, **names, **shapes)
     if program is None:
         raise DataError("PyTorch gave no ONNX program for this network.")
     program.save(str(path), external_data=False)
@@ -142,17 +140,10 @@ def onnx_session(path: str | Path, threads: int | None = None) -> Any:
 def read_onnx(path: str | Path, *, threads: int | None = None) -> Callable[[Any, Any], tuple[Any, Any]]:
     """Return the step of an exported ONNX file as a function of NumPy arrays (obs, h_in) → (features, h_out).
 
-    Args:
-        path: The file.
-        threads: Threads that ONNX Runtime computes with; its own choice if None.
+    ``threads`` are those that ONNX Runtime computes with; its own choice if None.
     """
     session = onnx_session(path, threads)
-
-    def run(obs: Any, h_in: Any) -> tuple[Any, Any]:
-        features, h_out = session.run(list(OUTPUTS), dict(zip(INPUTS, (obs, h_in), strict=True)))
-        return features, h_out
-
-    return run
+    return lambda obs, h_in: session.run(list(OUTPUTS), dict(zip(INPUTS, (obs, h_in), strict=True)))
 
 
 def read_torch(path: str | Path) -> Callable[[Any, Any], tuple[Any, Any]]:

@@ -6,15 +6,15 @@ last step to [B, classes]. Everything is causal: :meth:`EncoderAttenderDecoder.s
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
-from dataclasses import dataclass
+from collections.abc import Collection
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
 from torch import nn
 
 from brainbench.core.contracts import CHANNELS
-from brainbench.core.errors import UsageError, unknown_name
+from brainbench.core.errors import UsageError, check_name
 from brainbench.models.graph.spec import Unroll, check_unroll
 from brainbench.models.graph.temporal_graph import TemporalGraph
 from brainbench.models.heads.decoders import AllStepsDecoder, linear_decoder
@@ -90,14 +90,22 @@ class EncoderAttenderDecoder(nn.Module):
     ) -> None:
         super().__init__()
         check_unroll(unroll)
-        graph = encoder if isinstance(encoder, TemporalGraph) else None
-        if graph is None and unroll != "biological":
+        field, latency = encoder.receptive_field, encoder.latency
+        self._unroll: dict[str, Any] = {}
+        if isinstance(encoder, TemporalGraph):
+            self._unroll = {"unroll": unroll}
+            field, latency = (
+                encoder.spec.receptive_field(unroll),
+                encoder.spec.first_response(unroll)[encoder.spec.output],
+            )
+        elif unroll != "biological":
             raise UsageError(f"Only temporal graphs can be unrolled otherwise; {type(encoder).__name__} cannot.")
-        self._unroll: dict[str, Any] = {"unroll": unroll} if graph is not None else {}
         self.normaliser = normaliser or Normaliser.physical(SUB_STEPS)
         self.encoder = encoder
         self.attender = attender
         self.decoder = decoder or linear_decoder(self.features)
+        every = isinstance(self.decoder, AllStepsDecoder)
+        limits = [attender.max_steps if attender is not None else None, self.decoder.steps if every else None]
         self.spec = ModelSpec(
             input_shape=encoder.input_shape,
             channels=tuple(f"{sub_step}.{name}" for sub_step in range(SUB_STEPS) for name in CHANNELS),
@@ -106,9 +114,9 @@ class EncoderAttenderDecoder(nn.Module):
             sample_rate=1.0 / (SUB_STEPS * SUB_STEP_SECONDS),
             sub_steps=SUB_STEPS,
             causal=True,
-            receptive_field=self._receptive_field(),
-            latency=encoder.latency if graph is None else graph.spec.first_response(unroll)[graph.spec.output],
-            max_steps=min(limits) if (limits := self._limits()) else None,
+            receptive_field=None if attender is not None or every else field,
+            latency=latency,
+            max_steps=min((limit for limit in limits if limit is not None), default=None),
             outputs=_outputs(self.decoder),
         )
         attended = [f"attender.{name}" for name in attender.layers] if attender is not None else []
@@ -124,25 +132,10 @@ class EncoderAttenderDecoder(nn.Module):
         """Unrolling of the encoder's graph."""
         return self._unroll.get("unroll", "biological")
 
-    def _receptive_field(self) -> int | None:
-        if self.attender is not None or isinstance(self.decoder, AllStepsDecoder):
-            return None
-        if isinstance(self.encoder, TemporalGraph):
-            return self.encoder.spec.receptive_field(self.unroll)
-        return self.encoder.receptive_field
-
-    def _limits(self) -> list[int]:
-        limits = [self.attender.max_steps] if self.attender is not None else []
-        if isinstance(self.decoder, AllStepsDecoder):
-            limits.append(self.decoder.steps)
-        return [limit for limit in limits if limit is not None]
-
     def encode(self, x: torch.Tensor, *, last: bool = False) -> torch.Tensor:
-        """Return the features [B, T, F] that the decoder or the head of another objective reads.
+        """Return the features [B, T, F] of sweeps in SI, which the decoder or the head of another objective reads.
 
-        Args:
-            x: Sweeps in SI.
-            last: Return only those of the last step [B, F], which spares what no later step reads.
+        With ``last`` those of the last step [B, F] alone, which spares what no later step reads.
 
         Raises:
             UsageError: as for :meth:`forward`.
@@ -152,9 +145,10 @@ class EncoderAttenderDecoder(nn.Module):
             raise UsageError(
                 f"The model remembers at most {self.spec.max_steps} steps; received {x.shape[1]:,}. Shorten the sweep."
             )
+        x = self._normalise(x)
         if last and self.attender is None and isinstance(self.encoder, TemporalGraph):
-            return self.encoder(self._normalise(x), **self._unroll, last=True)
-        features = self.encoder(self._normalise(x), **self._unroll)
+            return self.encoder(x, **self._unroll, last=True)
+        features = self.encoder(x, **self._unroll)
         features = features if self.attender is None else self.attender(features)
         return features[:, -1] if last else features
 
@@ -176,17 +170,14 @@ class EncoderAttenderDecoder(nn.Module):
         """
         wanted = self.layers if layers is None else tuple(layers)
         for name in wanted:
-            if name not in self.layers:
-                raise unknown_name("layer", name, self.layers)
+            check_name("layer", name, self.layers)
         features, found = _named(self.encoder, self._normalise(x), "encoder", wanted, **self._unroll)
         if self.attender is not None and any(not name.startswith("encoder.") for name in wanted):
             features, attended = _named(self.attender, features, "attender", wanted)
             found |= attended
         if "decoder" in wanted:
-            decoder = self.decoder
-            found["decoder"] = (
-                decoder.every_step(features) if isinstance(decoder, AllStepsDecoder) else decoder(features)
-            )
+            answer = self.decoder.every_step if isinstance(self.decoder, AllStepsDecoder) else self.decoder
+            found["decoder"] = answer(features)
         return {name: found[name] for name in self.layers if name in wanted}
 
     def multiply_adds(self) -> int:
@@ -212,25 +203,21 @@ class EncoderAttenderDecoder(nn.Module):
 
         After t steps the output equals :meth:`forward` of the sweep's first t steps.
         """
-        features, encoder, attender = self._stream(x, state)
+        features, state = self.encode_step(x, state)
         if isinstance(self.decoder, AllStepsDecoder):
             y, decoder = self.decoder.step(features, state.decoder)
-            return y, NetworkState(encoder, attender, decoder)
-        return self.decoder(features), NetworkState(encoder, attender)
+            return y, replace(state, decoder=decoder)
+        return self.decoder(features), state
 
     def encode_step(self, x: torch.Tensor, state: NetworkState) -> tuple[torch.Tensor, NetworkState]:
         """Advance as :meth:`step` does, without the decoder; return the features [B, F] and the state."""
-        features, encoder, attender = self._stream(x, state)
-        return features, NetworkState(encoder, attender, state.decoder)
-
-    def _stream(self, x: torch.Tensor, state: NetworkState) -> tuple[torch.Tensor, Any, Any]:
         if x.ndim != 4 or tuple(x.shape[1:]) != self.spec.input_shape:
             raise UsageError(f"A step expects {self._expected('batch')}; received {list(x.shape)}.")
         features, encoder = self.encoder.step(self.normaliser(x), state.encoder, **self._unroll)
         attender = state.attender
         if self.attender is not None and attender is not None:
             features, attender = self.attender.step(features, attender)
-        return features, encoder, attender
+        return features, NetworkState(encoder, attender, state.decoder)
 
     def _normalise(self, x: torch.Tensor) -> torch.Tensor:
         if x.ndim != 5 or tuple(x.shape[2:]) != self.spec.input_shape or x.shape[1] < 1:
@@ -263,7 +250,5 @@ def _named(
     module: Encoder | Attender, x: torch.Tensor, prefix: str, wanted: Collection[str], **options: Any
 ) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
     inner = [name.removeprefix(f"{prefix}.") for name in wanted if name.startswith(f"{prefix}.")]
-    result: Any = module(x, return_activations=inner, **options) if inner else (module(x, **options), {})
-    features, found = result
-    activations: Mapping[str, torch.Tensor] = found
-    return features, {f"{prefix}.{name}": value for name, value in activations.items()}
+    features, found = module(x, return_activations=inner, **options) if inner else (module(x, **options), {})
+    return features, {f"{prefix}.{name}": value for name, value in found.items()}

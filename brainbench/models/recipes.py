@@ -14,7 +14,7 @@ from fnmatch import fnmatchcase
 from functools import cache
 from itertools import product
 
-from brainbench.core.errors import unknown_name
+from brainbench.core.errors import check_name
 from brainbench.models.architecture import Architecture
 
 SOURCE = "thesis, tables 3.2-3.5"
@@ -86,8 +86,7 @@ def find_recipe(name: str) -> PublishedTraining:
     Raises:
         UsageError: nobody published one of this name; the message names the nearest.
     """
-    if name not in _recipes():
-        raise unknown_name("recipe", name, _recipes(), hint="See them all with: brainbench models recipes")
+    check_name("recipe", name, _recipes(), hint="See them all with: brainbench models recipes")
     return _recipes()[name]
 
 
@@ -104,8 +103,7 @@ def recipe_for(architecture: str, objective: str) -> PublishedTraining:
     if (name := f"{full}.{objective}") in known:
         return replace(known[name], architecture=architecture)
     objectives = tuple(dict.fromkeys(recipe.objective for recipe in known.values()))
-    if objective not in objectives:
-        raise unknown_name("objective", objective, objectives)
+    check_name("objective", objective, objectives)
     relative = f"zhuang{'+' + full.attender if full.attender in ('gpt', 'mamba') else ''}.{objective}"
     if full.layer_norm and not full.attender and objective == "supervised":
         relative = "zhuang-intersection-ln.supervised"

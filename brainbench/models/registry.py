@@ -13,13 +13,13 @@ import inspect
 import os
 import re
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from fnmatch import fnmatchcase
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from brainbench.core.errors import UsageError, unknown_name
+from brainbench.core.errors import UsageError, check_name, unknown_name
 from brainbench.core.plugins import load_entry_points
 from brainbench.models.architecture import OBJECTIVES, Architecture
 from brainbench.models.training.checkpoints import PREFIXES, WEIGHTS, find_folder, load_weights, read_config, shipped
@@ -33,16 +33,22 @@ _NAME = re.compile(r"[a-z0-9]+([-+][a-z0-9]+)*")
 
 
 @dataclass(frozen=True)
-class ModelRecord:
-    """One architecture of the registry."""
+class ModelFacts:
+    """What is stated of an architecture when it is registered."""
 
     name: str
-    build: Callable[..., nn.Module]
-    """Builds the model with new random weights; takes no argument that is required."""
     family: str
     description: str
     citation: str
     licence: str
+
+
+@dataclass(frozen=True)
+class ModelRecord(ModelFacts):
+    """One architecture of the registry."""
+
+    build: Callable[..., nn.Module]
+    """Builds the model with new random weights; takes no argument that is required."""
 
     @property
     def source(self) -> str:
@@ -52,14 +58,9 @@ class ModelRecord:
 
 
 @dataclass(frozen=True)
-class ModelDescription:
+class ModelDescription(ModelFacts):
     """Record of an architecture with its size and cost, known without building its weights."""
 
-    name: str
-    family: str
-    description: str
-    citation: str
-    licence: str
     source: str
     """Top-level package that the code comes from."""
     parameters: int
@@ -116,7 +117,7 @@ def register_model(
         if name in _records:
             owner = _records[name].build
             raise UsageError(f"A model named {name!r} is already registered by {owner!r}; choose another name.")
-        _records[name] = ModelRecord(name, build, family, description, citation, licence)
+        _records[name] = ModelRecord(name, family, description, citation, licence, build)
         return build
 
     return decorate
@@ -184,18 +185,7 @@ class LocatedModel:
 
 
 def locate_model(name: str, pretrained: str | os.PathLike[str] | None = None) -> LocatedModel:
-    """Find what a name stands for, without building anything.
-
-    Args:
-        name: ``architecture`` (untrained), ``architecture.tag`` (trained with that objective), or a folder of
-            trained weights as ``local-dir:PATH`` or ``hf-hub:OWNER/NAME[@REVISION]``.
-        pretrained: Folder of a checkpoint, or safetensors file, with the weights of a tagged name.
-
-    Raises:
-        UsageError: no such model or tag, or weights given for a name that takes none.
-        DataError: the folder of weights is missing or damaged.
-        MissingDependencyError: a hub was named and its client is not installed.
-    """
+    """Find what a name stands for, without building anything; arguments and errors are those of :func:`load_model`."""
     is_path = name.startswith(PREFIXES)
     if is_path and pretrained is not None:
         raise UsageError(f"{name!r} already names trained weights; pretrained is for registry names with a tag.")
@@ -203,8 +193,7 @@ def locate_model(name: str, pretrained: str | os.PathLike[str] | None = None) ->
     folder = find_folder(name) if is_path else given or (shipped().get(name) if pretrained is None else None)
     trained = None if folder is None else read_config(folder)
     parts, known = Architecture.parse(trained["architecture"] if is_path and trained else name), _known()
-    if parts.untrained not in known:
-        raise unknown_name("model", parts.untrained, known, hint="See them all with: brainbench models")
+    check_name("model", parts.untrained, known, hint="See them all with: brainbench models")
     if parts.tag is not None and parts.tag not in OBJECTIVES:
         raise unknown_name(f"weights tag of {parts.untrained!r}", parts.tag, OBJECTIVES)
     if parts.tag is None and pretrained is not None:
@@ -247,13 +236,10 @@ def describe_model(name: str) -> ModelDescription:
     found = locate_model(name)
     record, model = found.record, found.outline()
     count: Callable[[], int] | None = getattr(model, "multiply_adds", None)
+    shown = record.name if found.trained is None else name
     return ModelDescription(
-        record.name if found.trained is None else name,
-        record.family,
-        record.description,
-        record.citation,
-        record.licence,
-        record.source,
+        **{item.name: getattr(record, item.name) for item in fields(ModelFacts)} | {"name": shown},
+        source=record.source,
         parameters=sum(parameter.numel() for parameter in model.parameters()),
         multiply_adds=count() if count is not None else None,
         layers=tuple(getattr(model, "layers", ())),

@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from torch import nn
 
-from brainbench.core.errors import UsageError, unknown_name
+from brainbench.core.errors import UsageError, check_name
 from brainbench.core.tradeoffs import TradeoffPoint
 from brainbench.models.graph.spec import UNROLLS, Unroll
 from brainbench.models.graph.temporal_graph import TemporalGraph
@@ -25,6 +25,10 @@ from brainbench.models.registry import load_model
 PRECISIONS = ("float32", "bf16", "int8")
 """``bf16`` computes in mixed precision; ``int8`` stores weights in 8 bits, with one scale per output channel, and
 computes in float32."""
+
+
+REPEATS = 5
+"""Sweeps that are timed, after one that is not."""
 
 
 @dataclass(frozen=True)
@@ -41,10 +45,8 @@ class ModelSetting:
     """The sweep's last steps that are shown."""
 
     def __post_init__(self) -> None:
-        if self.precision not in PRECISIONS:
-            raise unknown_name("precision", self.precision, PRECISIONS)
-        if self.unroll not in UNROLLS:
-            raise unknown_name("unrolling", self.unroll, UNROLLS)
+        check_name("precision", self.precision, PRECISIONS)
+        check_name("unrolling", self.unroll, UNROLLS)
         if self.steps < 1:
             raise UsageError(f"A sweep has at least 1 step; received {self.steps}.")
 
@@ -109,7 +111,7 @@ def settings(
     return [ModelSetting(p, u, s) for p, u, s in product(precisions, unrolls, steps)]  # pyright: ignore[reportArgumentType]
 
 
-def measure(name: str, setting: ModelSetting, sweeps: Any, *, seed: int = 0, repeats: int = 5) -> TradeoffPoint:
+def measure(name: str, setting: ModelSetting, sweeps: Any, *, seed: int = 0) -> TradeoffPoint:
     """Measure one setting on sweeps [K, T, C, H, W] in SI.
 
     ``error`` is the relative difference of the answers from those of the reference setting on all steps, ``cost`` the
@@ -126,7 +128,7 @@ def measure(name: str, setting: ModelSetting, sweeps: Any, *, seed: int = 0, rep
         expected = load_model(name, seed=seed)(x)
         found = reduced(x)
         times = []
-        for _ in range(repeats + 1):
+        for _ in range(REPEATS + 1):
             start = time.perf_counter()
             reduced(x[:1])
             times.append((time.perf_counter() - start) * 1e3)

@@ -98,12 +98,12 @@ def _encoder(item: Architecture) -> Encoder:
         from brainbench.models.encoders.s4 import S4Encoder
 
         return S4Encoder(small=item.small)
-    from brainbench.models.encoders.zhuang import ZhuangEncoder
+    from brainbench.models.encoders.zhuang import zhuang_graph
     from brainbench.models.graph.temporal_graph import TemporalGraph
 
     feedforward = item.cell == "feedforward"
     cell = "time-decay" if feedforward else CELLS[item.cell][0]
-    return TemporalGraph(ZhuangEncoder(cell, item.layer_norm, item.small, feedforward=feedforward).spec())
+    return TemporalGraph(zhuang_graph(cell, item.layer_norm, item.small, feedforward=feedforward))
 
 
 def _attender(item: Architecture, features: int) -> Attender | None:

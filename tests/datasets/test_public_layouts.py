@@ -16,7 +16,7 @@ from brainbench.datasets import (
     register_layout,
     write_recordings,
 )
-from brainbench.datasets.layouts.hires import recorded_runs
+from brainbench.datasets.layouts.pole import recorded_runs
 from brainbench.datasets.layouts.registry import get_layout, list_layouts
 from brainbench.datasets.sessions import Series
 from brainbench.datasets.trials.conditions import Conditions

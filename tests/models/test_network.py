@@ -6,7 +6,7 @@ import torch
 from brainbench.core.contracts import CHANNELS, GRID_SHAPE
 from brainbench.core.errors import UsageError
 from brainbench.models.attenders.gpt import GPTAttender
-from brainbench.models.encoders.zhuang import ZhuangEncoder
+from brainbench.models.encoders.zhuang import zhuang_graph
 from brainbench.models.graph.temporal_graph import TemporalGraph
 from brainbench.models.heads.decoders import mlp_decoder
 from brainbench.models.network import EncoderAttenderDecoder
@@ -14,7 +14,7 @@ from tests.factories.training_sweeps import SCALE, random_sweeps
 
 
 def _network(*, gpt=False, **options):
-    encoder = TemporalGraph(ZhuangEncoder("intersection", layer_norm=True, small=True).spec())
+    encoder = TemporalGraph(zhuang_graph("intersection", layer_norm=True, small=True))
     return EncoderAttenderDecoder(encoder, GPTAttender(96, 32, blocks=2) if gpt else None, **options).eval()
 
 

@@ -61,16 +61,11 @@ def check_clock(
         yield Finding("warning", "clock", message)
         return
     lags, response, size = response_by_lag(every, times)
-    at_touch = float(size[np.abs(lags) <= TOLERANCE].max())
+    near = np.abs(lags) <= TOLERANCE
+    at_touch = float(size[near].max())
     lag, elsewhere = _other_lag(lags, size, at_touch)
-    values = {
-        "event": event,
-        "touches": len(times),
-        "response_hz": float(response[np.abs(lags) <= TOLERANCE].max()),
-        "sd_at_touch": at_touch,
-        "lag": lag,
-        "sd_at_lag": elsewhere,
-    }
+    values = {"event": event, "touches": len(times), "response_hz": float(response[near].max())}
+    values |= {"sd_at_touch": at_touch, "lag": lag, "sd_at_lag": elsewhere}
     if lag:
         message = (
             f"spikes follow touch ({event}) by about {_seconds(lag)} s instead of 5 to 30 ms (response "

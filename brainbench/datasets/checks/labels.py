@@ -52,22 +52,19 @@ def _spelling(counts: Counter[str]) -> Iterator[Finding]:
     folded: dict[str, list[str]] = {}
     for label in counts:
         folded.setdefault("".join(label.lower().split()), []).append(label)
-    for twins in folded.values():
-        if len(twins) > 1:
-            message = f"labels differ only in case or blanks: {', '.join(map(repr, sorted(twins)))}"
-            yield Finding("warning", "labels", message, "They count as different stimuli: make them one.")
+    for twins in (found for found in folded.values() if len(found) > 1):
+        message = f"labels differ only in case or blanks: {', '.join(map(repr, sorted(twins)))}"
+        yield Finding("warning", "labels", message, "They count as different stimuli: make them one.")
 
 
 def _strangers(counts: Counter[str], vocabulary: tuple[str, ...], layout: RecordingLayout | None) -> Iterator[Finding]:
     # What the layout refuses by rule (such as "nothing") is known and no misspelling.
     refused = {value for rule in layout.selection.trials for value in rule.refuse} if layout else set()
-    for label, number in sorted(counts.items()):
-        if label in vocabulary or refused & set(label.split("-")):
-            continue
+    for label in sorted(label for label in counts if label not in vocabulary and not refused & set(label.split("-"))):
         guess = nearest(label, vocabulary)
         meant = f"; did they mean {guess!r}?" if guess else ""
-        message = f"{number} trials are labelled {label!r}, which is no stimulus of this experiment{meant}"
-        yield Finding("warning", "labels", message, "They are left out.", {"label": label, "trials": number})
+        message = f"{counts[label]} trials are labelled {label!r}, which is no stimulus of this experiment{meant}"
+        yield Finding("warning", "labels", message, "They are left out.", {"label": label, "trials": counts[label]})
 
 
 def _balance(counts: Counter[str], vocabulary: tuple[str, ...] | None) -> Iterator[Finding]:

@@ -42,13 +42,9 @@ def _silent(spikes: Spikes, names: list[str]) -> Iterator[Finding]:
     silent = [name for name, times in zip(names, spikes, strict=True) if not len(times)]
     if silent:
         message = f"{share(len(silent), len(names))} units have no spike ({some(silent)})"
-        yield Finding(
-            "error" if len(silent) == len(names) else "note",
-            "silent",
-            message,
-            "They are left out unless the selection says otherwise.",
-            {"silent": len(silent), "units": len(names)},
-        )
+        advice, values = "They are left out unless the selection says otherwise.", {"silent": len(silent)}
+        severity: Severity = "error" if len(silent) == len(names) else "note"
+        yield Finding(severity, "silent", message, advice, {**values, "units": len(names)})
 
 
 def _impossible(spikes: Spikes, names: list[str]) -> Iterator[Finding]:

@@ -3,15 +3,15 @@
 A session is matched by the columns of its trials (``registry``) and then adapted by its layout, before it is counted.
 """
 
-from brainbench.datasets.layouts import area2_bump, hires, rodgers, synthetic, yu
+from brainbench.datasets.layouts import area2_bump, pole, rodgers, synthetic
 from brainbench.datasets.layouts.registry import register_layout
 
 for _layout in (
     rodgers.LAYOUT,
     rodgers.DISCRIMINATION,
     rodgers.DETECTION,
-    yu.LAYOUT,
-    hires.LAYOUT,
+    pole.YU,
+    pole.HIRES,
     area2_bump.LAYOUT,
     synthetic.LAYOUT,
 ):

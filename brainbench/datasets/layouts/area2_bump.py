@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from brainbench.datasets.layouts.layout import RecordingLayout
+from brainbench.datasets.layouts.registry import RecordingLayout
 from brainbench.datasets.sessions import Session, as_labels
 from brainbench.datasets.trials.conditions import Conditions
 from brainbench.datasets.trials.selection import Rule, Selection

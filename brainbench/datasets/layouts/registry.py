@@ -1,4 +1,4 @@
-"""The registry of recording layouts: named ways to read a data set.
+"""Recording layouts, named ways to read a data set, and their registry.
 
 Other packages add theirs through the entry point group ``brainbench.recordings``: an entry point names a
 :class:`~brainbench.datasets.RecordingLayout`, or a module whose import runs :func:`register_layout`.
@@ -6,14 +6,85 @@ Other packages add theirs through the entry point group ``brainbench.recordings`
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, replace
+from itertools import product
 from typing import Any
 
-from brainbench.core.errors import UsageError, unknown_name
+from brainbench.core.errors import UsageError, check_name
 from brainbench.core.plugins import load_entry_points, load_module
-from brainbench.datasets.layouts.layout import RecordingLayout
 from brainbench.datasets.sessions import Session
+from brainbench.datasets.trials.conditions import Conditions
+from brainbench.datasets.trials.selection import Selection
+from brainbench.datasets.trials.windows import FIRST_CONTACT, Window
 
 ENTRY_POINTS = "brainbench.recordings"
+
+
+@dataclass(frozen=True)
+class RecordingLayout:
+    """The way one published data set is read; an argument of ``open_recordings`` overrides any part."""
+
+    name: str
+    title: str
+    citation: str
+    conditions: Conditions
+    orders: Mapping[str, tuple[str, ...]]
+    """Column → its values in fixed order; other values are not part of the experiment."""
+    selection: Selection
+    window: Window
+    columns: tuple[str, ...]
+    """Columns of the condition table by which a file of this data set is recognised; empty: never, the
+    layout has to be named."""
+    remarks: tuple[str, ...] = ()
+    adapt: Callable[[Session], Session] | None = None
+    """Turns the file's own layout into units and interval tables; must leave alone what is already
+    adapted (an export keeps what it made)."""
+    touch: str = FIRST_CONTACT
+    """Event that neurons answer within 5 to 30 ms, an anchor of :class:`Window`: it tells whether
+    spikes and behaviour share a clock."""
+    dandiset: str = ""
+    """Number on the DANDI archive."""
+    assets: str = ""
+    """Glob of the archive's files that hold units; all of them if empty."""
+    stimuli: str = ""
+    """Recipe of the stimuli that the animals felt, if there is one."""
+    synthetic: bool = False
+    """Layout of files that a program made; no others are recognised by it."""
+
+    def matches(self, session: Session) -> bool:
+        """Return whether a session's condition table has the columns of this data set."""
+        table = session.tables.get(self.conditions.table)
+        known = table is not None and all(column in table for column in self.columns)
+        return bool(self.columns) and known and (session.synthetic or not self.synthetic)
+
+    def adapted(self, session: Session) -> Session:
+        """Return the session with the units and tables that this data set stores in its own way."""
+        named = session if session.stimuli else replace(session, stimuli=self.stimuli)
+        return named if self.adapt is None else self.adapt(named)
+
+    def vocabulary(self, conditions: Conditions) -> tuple[str, ...] | None:
+        """Return the fixed labels, or None if a column's values are not declared here."""
+        if conditions.table != self.conditions.table or any(name not in self.orders for name in conditions.columns):
+            return None
+        return tuple("-".join(values) for values in product(*(self.orders[name] for name in conditions.columns)))
+
+    def describe(self) -> str:
+        """Return every rule of the layout, one per line."""
+        return "\n".join(self._lines())
+
+    def _lines(self) -> Iterator[str]:
+        yield f"{self.name}: {self.title}"
+        yield f"citation: {self.citation}"
+        yield f"conditions: {self.conditions}"
+        vocabulary = self.vocabulary(self.conditions)
+        yield f"vocabulary: {', '.join(vocabulary) if vocabulary else 'the values found, sorted naturally'}"
+        yield f"window: {self.window}"
+        if self.window.fallback is not None:
+            yield f"window of sessions without contact tables: {self.window.fallback}"
+        yield from self.selection.lines()
+        yield from self.remarks
+
 
 _LAYOUTS: dict[str, RecordingLayout] = {}
 _loaded: list[str] = []
@@ -45,8 +116,7 @@ def get_layout(name: str) -> RecordingLayout:
     Raises:
         UsageError: there is no such layout (the nearest is named).
     """
-    if name not in _known():
-        raise unknown_name("recording layout", name, _LAYOUTS)
+    check_name("recording layout", name, _known())
     return _LAYOUTS[name]
 
 

@@ -13,7 +13,7 @@ from dataclasses import replace
 import numpy as np
 
 from brainbench.core.errors import listing
-from brainbench.datasets.layouts.layout import RecordingLayout
+from brainbench.datasets.layouts.registry import RecordingLayout
 from brainbench.datasets.sessions import Session, as_labels
 from brainbench.datasets.trials.conditions import Conditions, joined_labels
 from brainbench.datasets.trials.selection import Rule, Selection

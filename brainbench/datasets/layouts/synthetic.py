@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from brainbench.datasets.layouts.layout import RecordingLayout
+from brainbench.datasets.layouts.registry import RecordingLayout
 from brainbench.datasets.trials.conditions import Conditions
 from brainbench.datasets.trials.selection import DEFAULT
 from brainbench.datasets.trials.windows import FIRST_CONTACT, Window

@@ -30,7 +30,7 @@ def join_sessions(
         options: how the sessions were read.
         source: what the user asked for.
         layout: name of the layout, with how it was chosen, or "".
-        notes: what was noted before the sessions were read.
+        notes: what was noted before.
 
     Raises:
         DataError: no trial, no unit or only one condition remains.
@@ -42,7 +42,9 @@ def join_sessions(
     for part in parts:
         removed.update(part.tally.removed)
     everything, parts = parts, [part for part in parts if part.labels] or parts
-    notes = [*notes, *(_left_out(part) for part in everything if not part.labels)]
+    empty = [part for part in everything if not part.labels]
+    lost = "no trial is left, so its {} units are left out"
+    notes = [*notes, *(f"{part.source}: {lost.format(len(part.unit_ids))}" for part in empty)]
     trials, units = sum(len(part.labels) for part in parts), sum(len(part.unit_ids) for part in parts)
     if not trials or not units:
         what = "trial" if not trials else "unit"
@@ -110,10 +112,6 @@ def _one_recipe(parts: list[SessionCounts]) -> str:
 def _covariate(parts: list[SessionCounts], name: str) -> NDArray[np.float64]:
     """Return one covariate of all trials; NaN in sessions that do not tell it."""
     return np.concatenate([part.covariates.get(name, np.full(len(part.labels), np.nan)) for part in parts])
-
-
-def _left_out(part: SessionCounts) -> str:
-    return f"{part.source}: no trial is left, so its {len(part.unit_ids)} units are left out"
 
 
 def _content(part: SessionCounts) -> tuple[Any, ...]:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from brainbench.core.contracts import check_recordings
-from brainbench.core.errors import unknown_name
+from brainbench.core.errors import check_name
 from brainbench.core.files import content_hash
 from brainbench.core.trials import Trials
 from brainbench.datasets.trials.covariates import COVARIATES
@@ -35,8 +35,7 @@ def pooled(dataset: xr.Dataset, by: str = "subject") -> xr.Dataset:
         DataError: ``dataset`` is not a recordings data set.
     """
     check_recordings(dataset)
-    if by not in POOLS:
-        raise unknown_name("pool", by, POOLS)
+    check_name("pool", by, POOLS)
     if by == "subject":
         return dataset
     changed = {}

@@ -15,13 +15,13 @@ from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args
 
+import msgspec
 import numpy as np
 
 from brainbench.core.contracts import CHANNELS, GRID_SHAPE
-from brainbench.core.errors import DataError, UsageError, listing, unknown_name
+from brainbench.core.errors import DataError, UsageError, check_name, listing
 from brainbench.core.files import cache_dir, content_hash, read_json, write_json
-from brainbench.datasets.whisking.files import open_shard, read_manifest, verify_shard
-from brainbench.datasets.whisking.memory import Buffers, most_open
+from brainbench.datasets.whisking.files import Buffers, most_open, open_shard, read_manifest, verify_shard
 
 if TYPE_CHECKING:
     import torch
@@ -107,8 +107,7 @@ class WhiskingDataset:
             ("view", view, get_args(View)),
             ("treatment of unstable sweeps", unstable, get_args(Unstable)),
         ):
-            if value not in allowed:
-                raise unknown_name(kind, str(value), allowed)
+            check_name(kind, value, allowed)
         if batch_size < 1 or not 0 <= part[0] < part[1]:
             raise UsageError(
                 f"A batch has at least one sweep and a part is (rank, number) with 0 ≤ rank < number; received "
@@ -148,10 +147,8 @@ class WhiskingDataset:
                 f"{count} sweeps of {str(self.folder)!r} have unstable whiskers (status in the shards says which): "
                 "leave them out with unstable='skip', or simulate with a finer fidelity."
             )
-        kept = [
-            np.flatnonzero(~shard.empty & (~shard.broken if self.unstable == "skip" else True))
-            for shard in self._shards
-        ]
+        left_out = [shard.empty | shard.broken if self.unstable == "skip" else shard.empty for shard in self._shards]
+        kept = [np.flatnonzero(~rows) for rows in left_out]
         self._where = np.concatenate([np.full(len(rows), i) for i, rows in enumerate(kept)])
         self._row = np.concatenate(kept)
         self.skipped = sum(shard.sweeps for shard in self._shards) - len(self._row)
@@ -238,17 +235,11 @@ class WhiskingDataset:
     def read(
         self, sweeps: Sequence[int] | NDArray[np.integer], *, out: NDArray[np.float32] | None = None
     ) -> NDArray[np.float32]:
-        """Return the forces of chosen sweeps, numbers from 0 to N − 1: [n, frame, W, C] (N, N·m).
-
-        Args:
-            sweeps: which.
-            out: array to fill, of that shape.
-        """
+        """Return the forces of sweeps, numbers from 0 to N − 1, in ``out`` if given: [n, frame, W, C] (N, N·m)."""
         sweeps = np.asarray(sweeps)
         result = np.empty((len(sweeps), *self._shards[0].shape), np.float32) if out is None else out
-        for place, (shard, row) in enumerate(
-            zip(self._where[sweeps].tolist(), self._row[sweeps].tolist(), strict=True)
-        ):
+        places = zip(self._where[sweeps].tolist(), self._row[sweeps].tolist(), strict=True)
+        for place, (shard, row) in enumerate(places):
             np.copyto(result[place], self._forces(shard)[row])
         if self.unstable == "zero":
             np.nan_to_num(result, copy=False, nan=0.0)
@@ -288,9 +279,7 @@ class WhiskingDataset:
         key = content_hash([self.manifest["content_hash"], self.split, self.unstable], length=24)
         path = cache_dir("whisking") / f"{key}.json"
         if path.exists():
-            stored = read_json(path)
-            mean, std, largest = (tuple(stored[name]) for name in ("mean", "std", "largest"))
-            return ChannelStatistics(mean, std, largest, stored["values"])
+            return msgspec.convert(read_json(path), ChannelStatistics)
         channels = len(CHANNELS)
         total, squares, largest, values = np.zeros(channels), np.zeros(channels), np.zeros(channels), 0
         for first in range(0, self.sweeps, _BLOCK):
@@ -306,16 +295,9 @@ class WhiskingDataset:
         return found
 
     def _identity(self) -> dict[str, Any]:
-        return {
-            "content_hash": self.manifest["content_hash"],
-            "split": self.split,
-            "unstable": self.unstable,
-            "seed": self.seed,
-            "shuffle": self.shuffle,
-            "batch_size": self.batch_size,
-            "drop_last": self.drop_last,
-            "part": list(self.part),
-        }
+        options = ("split", "unstable", "seed", "shuffle", "batch_size", "drop_last")
+        own = {name: getattr(self, name) for name in options}
+        return {"content_hash": self.manifest["content_hash"], **own, "part": list(self.part)}
 
     def _gathered(self, columns: list[NDArray[Any]]) -> NDArray[Any]:
         """Put per-shard columns together for the sweeps that can be used."""

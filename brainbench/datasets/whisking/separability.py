@@ -7,13 +7,14 @@ is telling a new chair from a new mug, not recognising a chair that was met befo
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections import defaultdict
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from brainbench.core.errors import DataError, UsageError, missing_dependency, unknown_name
+from brainbench.core.errors import DataError, UsageError, check_name, missing_dependency
 from brainbench.core.progress import Progress
 from brainbench.core.records import Interval, Status
 
@@ -88,17 +89,15 @@ def separability(
     objects = data.objects
     chosen = _choose_classes(data.classes, data.labels, objects, classes, max(counts))
     generator = np.random.default_rng(seed)
-    rows = [_draw(np.flatnonzero(data.labels == data.classes.index(name)), objects, sweeps_per_class, generator)
-            for name in chosen]  # fmt: skip
+    owned = (np.flatnonzero(data.labels == data.classes.index(name)) for name in chosen)
+    rows = [_draw(mine, objects, sweeps_per_class, generator) for mine in owned]
     where = np.concatenate(rows)
     labels = np.repeat(np.arange(len(chosen)), [len(part) for part in rows])
-    features = _features(data, where, progress)
-    told = progress and (lambda done, total: progress(done, total, "training support vector machines"))
-    found = []
+    told = progress or (lambda done, total, what: None)
+    features, found = _features(data, where, told), []
     for count in counts:
         found.append(separate(features, labels, objects[where], count=count, names=chosen, seed=seed))
-        if told is not None:
-            told(len(found), len(counts))
+        told(len(found), len(counts), "training support vector machines")
     return tuple(found)
 
 
@@ -151,8 +150,8 @@ def separate(
     accuracies = tuple(
         float(np.mean([rows[:, 0].sum() / rows[:, 1].sum() for rows in tally.values()])) for tally in tallies
     )
-    few = fewest < FEW_OBJECTS
-    return Separability(
+    reason = f"a class has only {fewest} objects; {FEW_OBJECTS} are the least to trust an interval"
+    found = Separability(
         count=count,
         accuracy=float(np.mean(accuracies)),
         interval=_interval(tallies, [len(found) for found in members], seed),
@@ -161,9 +160,8 @@ def separate(
         accuracies=accuracies,
         sweeps=len(labels),
         objects=sum(map(len, members)),
-        status="unreliable" if few else "ok",
-        reason=f"a class has only {fewest} objects; {FEW_OBJECTS} are the least to trust an interval" if few else "",
     )
+    return replace(found, status="unreliable", reason=reason) if fewest < FEW_OBJECTS else found
 
 
 def _choose_classes(
@@ -175,8 +173,7 @@ def _choose_classes(
 ) -> tuple[str, ...]:
     if asked is not None:
         for name in asked:
-            if name not in known:
-                raise unknown_name("class", name, known)
+            check_name("class", name, known)
         if len(set(asked)) < most:
             raise UsageError(f"{most} classes at a time need {most} different classes; received {', '.join(asked)}.")
         return tuple(asked)
@@ -192,15 +189,12 @@ def _draw(
 ) -> NDArray[np.intp]:
     """Draw sweeps of one class, as evenly from its objects as they allow."""
     shuffled = generator.permutation(mine)
-    turn: dict[str, int] = {}
-    ranks = []
-    for name in objects[shuffled].tolist():
-        turn[name] = turn.get(name, -1) + 1
-        ranks.append(turn[name])
+    turns: defaultdict[str, Iterator[int]] = defaultdict(itertools.count)
+    ranks = [next(turns[name]) for name in objects[shuffled].tolist()]
     return np.sort(shuffled[np.argsort(ranks, kind="stable")[:count]])
 
 
-def _features(data: WhiskingDataset, where: NDArray[np.intp], progress: Progress | None) -> NDArray[np.float32]:
+def _features(data: WhiskingDataset, where: NDArray[np.intp], progress: Progress) -> NDArray[np.float32]:
     """Return [n, F]: steps of five frames, channels of unit root mean square."""
     parts = []
     for first in range(0, len(where), 64):
@@ -209,8 +203,7 @@ def _features(data: WhiskingDataset, where: NDArray[np.intp], progress: Progress
         steps = max(1, frames // 5)
         cut = raw[:, : frames // steps * steps].reshape(count, steps, -1, whiskers, channels)
         parts.append(cut.mean(axis=2))
-        if progress is not None:
-            progress(min(first + 64, len(where)), len(where), "reading sweeps")
+        progress(min(first + 64, len(where)), len(where), "reading sweeps")
     steps = np.concatenate(parts)
     scale = np.sqrt(np.mean(np.square(steps, dtype=np.float64), axis=(0, 1, 2)))
     return (steps / np.where(scale > 0, scale, 1.0)).astype(np.float32).reshape(len(where), -1)
@@ -225,10 +218,8 @@ def _by_object(objects: NDArray[np.str_], hit: NDArray[np.bool_]) -> NDArray[np.
 def _interval(tallies: Sequence[Mapping[int, NDArray[np.float64]]], sizes: Sequence[int], seed: int) -> Interval:
     """Resample the objects of each class, the same ones in every choice, and take the middle 95 %.
 
-    Args:
-        tallies: of each choice, class → right and all sweeps of its objects [object, 2].
-        sizes: number of objects of each class.
-        seed: of the resampling.
+    ``tallies`` has for each choice: class → right and all sweeps of its objects [object, 2]; ``sizes`` the number of
+    objects of each class.
     """
     generator = np.random.default_rng([seed, 1])
     drawn = [generator.integers(size, size=(RESAMPLES, size)) for size in sizes]

@@ -79,8 +79,7 @@ class MambaBlock(nn.Module):
         if (scan := dispatch.selective_scan(u)) is not None:
             return self._scanned(scan, x, u, gate)
         decay, drive, readout = self._selected(u)
-        h = linear_scan(decay, drive)
-        return self._out(x, (h * readout[..., None, :]).sum(-1), u, gate)
+        return self._out(x, linear_scan(decay, drive), readout, u, gate)
 
     def step(self, x: torch.Tensor, memory: MambaMemory) -> tuple[torch.Tensor, MambaMemory]:
         """Advance by one step [B, width]; return the answer and the next memory."""
@@ -91,7 +90,7 @@ class MambaBlock(nn.Module):
         u = functional.silu((window * weight).sum(-1) + bias)
         decay, drive, readout = self._selected(u)
         h = decay * memory.state + drive
-        return self._out(x, (h * readout[..., None, :]).sum(-1), u, gate), MambaMemory(window[..., 1:], h)
+        return self._out(x, h, readout, u, gate), MambaMemory(window[..., 1:], h)
 
     def _selected(self, u: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         """Return exp(Δ A) and Δ B u [..., inner, states], and C [..., states], in single precision or better."""
@@ -106,32 +105,23 @@ class MambaBlock(nn.Module):
     def _scanned(self, scan: Any, x: torch.Tensor, u: torch.Tensor, gate: torch.Tensor) -> torch.Tensor:
         """Answer by a kernel that scans, reads out and gates in one pass; it takes [B, channel, T]."""
         size, drive, readout = self.select(u).split((self.rank, self.states, self.states), -1)
-        y = scan(
-            u.transpose(1, 2).contiguous(),
-            (size @ self.step_size.weight.to(size.dtype).T).transpose(1, 2).contiguous(),
-            -torch.exp(self.log_decay.float()),
-            drive.transpose(1, 2).contiguous(),
-            readout.transpose(1, 2).contiguous(),
-            self.skip.float(),
-            z=gate.transpose(1, 2).contiguous(),
-            delta_bias=self.step_size.bias.float(),
-            delta_softplus=True,
-        )
+        size = size @ self.step_size.weight.to(size.dtype).T
+        u, size, drive, readout, gate = (part.transpose(1, 2).contiguous() for part in (u, size, drive, readout, gate))
+        decay, bias = -torch.exp(self.log_decay.float()), self.step_size.bias.float()
+        y = scan(u, size, decay, drive, readout, self.skip.float(), z=gate, delta_bias=bias, delta_softplus=True)
         return x + self.project(y.transpose(1, 2)).to(x.dtype)
 
-    def _out(self, x: torch.Tensor, y: torch.Tensor, u: torch.Tensor, gate: torch.Tensor) -> torch.Tensor:
-        return x + self.project((y.to(u.dtype) + self.skip * u) * functional.silu(gate)).to(x.dtype)
+    def _out(self, x: torch.Tensor, h: torch.Tensor, readout: torch.Tensor, u: torch.Tensor, gate: torch.Tensor) -> Any:
+        """Read the states h [..., inner, states] out, gate them and add them to the stream."""
+        y = (h * readout[..., None, :]).sum(-1).to(u.dtype) + self.skip * u
+        return x + self.project(y * functional.silu(gate)).to(x.dtype)
 
 
 class MambaAttender(nn.Module):
     """Map features [B, T, F] to [B, T, F], causally and for any number of steps.
 
-    Args:
-        features: F, the width of the blocks; the inner width is ``expansion`` times it.
-        blocks: Number of blocks.
-        expansion: Inner width per width.
-        states: States per inner channel.
-        convolution: Steps that the short convolution sees.
+    The inner width of a block is ``expansion`` times F, with ``states`` per inner channel; the short convolution sees
+    ``convolution`` steps.
 
     Raises:
         UsageError: a size is not positive.
@@ -143,17 +133,13 @@ class MambaAttender(nn.Module):
         self, features: int, *, blocks: int = 4, expansion: int = 2, states: int = 16, convolution: int = 4
     ) -> None:
         super().__init__()
-        if min(features, blocks, expansion, states, convolution) < 1:
-            raise UsageError(
-                "A Mamba attender needs positive sizes; received "
-                f"features {features}, blocks {blocks}, expansion {expansion}, states {states}, "
-                f"convolution {convolution}."
-            )
+        sizes = {"expansion": expansion, "states": states, "convolution": convolution}
+        given = {"features": features, "blocks": blocks, **sizes}
+        if min(given.values()) < 1:
+            told = ", ".join(f"{name} {value}" for name, value in given.items())
+            raise UsageError(f"A Mamba attender needs positive sizes; received {told}.")
         self.features = features
-        self.blocks: Any = nn.ModuleList(
-            MambaBlock(features, expansion=expansion, states=states, convolution=convolution, depth=blocks)
-            for _ in range(blocks)
-        )
+        self.blocks: Any = nn.ModuleList(MambaBlock(features, depth=blocks, **sizes) for _ in range(blocks))
         self.norm = nn.LayerNorm(features)
         self.layers: tuple[str, ...] = (*(f"block{index}" for index in range(1, blocks + 1)), "norm")
 

@@ -17,6 +17,9 @@ FORGET_BIAS = 1.0
 Projected = tuple[torch.Tensor, ...]
 """One step of the result of :meth:`Cell.project`."""
 
+CellStep = tuple[torch.Tensor, torch.Tensor]
+"""An output y [B, out, H, W] and the next state [B, state channels, H, W]."""
+
 
 class ChannelNorm(nn.LayerNorm):
     """LayerNorm over the channels of [B, C, ...], separately at every place."""
@@ -119,9 +122,7 @@ class TimeDecay(Cell):
         self.tau = nn.Parameter(torch.tensor(float(tau)))
         self.norm = ChannelNorm(out_channels) if layer_norm else nn.Identity()
 
-    def forward(
-        self, x: torch.Tensor, state: torch.Tensor | None = None, projected: Projected = ()
-    ) -> tuple[torch.Tensor, torch.Tensor]:
+    def forward(self, x: torch.Tensor, state: torch.Tensor | None = None, projected: Projected = ()) -> CellStep:
         """Return (y, state), both [B, C, ...]."""
         del projected
         # s_t = x_t + τ s_{t−1}: linear, so the trace of one input decays as τ to the power of the steps since.

@@ -8,12 +8,14 @@ from typing import TYPE_CHECKING, ClassVar, cast
 import torch
 from torch import nn
 
-from brainbench.models.cells.cell import FORGET_BIAS, Cell, ChannelNorm, Projected
+from brainbench.models.cells.cell import FORGET_BIAS, Cell, CellStep, ChannelNorm, Projected
 from brainbench.models.ops import dispatch
 from brainbench.models.ops.layers import Conv2d, pair
 
 if TYPE_CHECKING:
     from brainbench.models.ops.gates import DeferredNormGrad
+
+Pair = int | tuple[int, int]
 
 
 class GatedCell(Cell):
@@ -31,15 +33,13 @@ class GatedCell(Cell):
     """Names of the norms beside those of the gates."""
     fused_parts: ClassVar[tuple[str, ...]] = ("apply_gates",)
 
-    def __init__(
-        self, in_channels: int, out_channels: int, *, kernel_size: int | tuple[int, int], layer_norm: bool = False
-    ) -> None:
+    def __init__(self, in_channels: int, out_channels: int, *, kernel_size: Pair, layer_norm: bool = False) -> None:
         super().__init__(in_channels, out_channels)
         self.conv = self._convolution(len(self.gates), kernel_size)
         normalised = (*self.gates, *self.other_norms) if layer_norm else ()
         self.norms = nn.ModuleDict({name: ChannelNorm(out_channels) for name in normalised})
 
-    def _convolution(self, gates: int, kernel_size: int | tuple[int, int]) -> Conv2d:
+    def _convolution(self, gates: int, kernel_size: Pair) -> Conv2d:
         size = pair(kernel_size, "kernel size of a cell")
         return Conv2d(self.in_channels + self.out_channels, gates * self.out_channels, kernel_size=size, gain=1.0)
 
@@ -58,17 +58,13 @@ class GatedCell(Cell):
             return ()
         return tuple(conv.conv_slice(x, 0, use_bias=True) for conv in self.convolutions)
 
-    def forward(
-        self, x: torch.Tensor, state: torch.Tensor | None = None, projected: Projected = ()
-    ) -> tuple[torch.Tensor, torch.Tensor]:
+    def forward(self, x: torch.Tensor, state: torch.Tensor | None = None, projected: Projected = ()) -> CellStep:
         """Return (y [B, out, H, W], state [B, state channels, H, W])."""
         state = self._check(x, state)
         # The gates read what the cell last answered, which is the last part of its state.
         return self.apply_gates(self._fused(self.conv, x, state.chunk(self.state_factor, 1)[-1], projected), x, state)
 
-    def apply_gates(
-        self, fused: torch.Tensor, x: torch.Tensor, state: torch.Tensor
-    ) -> tuple[torch.Tensor, torch.Tensor]:
+    def apply_gates(self, fused: torch.Tensor, x: torch.Tensor, state: torch.Tensor) -> CellStep:
         """Return (y, state) from the gates' pre-activations [B, gates × out, H, W]: all that follows the convolution.
 
         It reads every number a few times and computes little, so one fused kernel does it best: :meth:`fuse`.
@@ -102,9 +98,7 @@ class UGRNN(GatedCell):
     gates = ("g", "c")
     tnn_names: ClassVar[Mapping[str, str]] = {"conv": "conv", "norms.g": "ln_g_act", "norms.c": "ln_c_act"}
 
-    def apply_gates(
-        self, fused: torch.Tensor, x: torch.Tensor, state: torch.Tensor
-    ) -> tuple[torch.Tensor, torch.Tensor]:
+    def apply_gates(self, fused: torch.Tensor, x: torch.Tensor, state: torch.Tensor) -> CellStep:
         """Return (y, state), both [B, out, H, W], from the gates' pre-activations."""
         # Thesis, equation 3.1 and the text after it; the +1 favours keeping the state early in training.
         keep, candidate = self._normalised(fused, self.gates)
@@ -128,9 +122,7 @@ class IntersectionRNN(GatedCell):
     deferred: DeferredNormGrad | None = None
     """Place for the gradients of the norms of each step; None outside of a deferring pass."""
 
-    def forward(
-        self, x: torch.Tensor, state: torch.Tensor | None = None, projected: Projected = ()
-    ) -> tuple[torch.Tensor, torch.Tensor]:
+    def forward(self, x: torch.Tensor, state: torch.Tensor | None = None, projected: Projected = ()) -> CellStep:
         """Return (y, state), both [B, out, H, W]."""
         state = self._check(x, state)
         fused = self._fused(self.conv, x, state, projected)
@@ -140,9 +132,7 @@ class IntersectionRNN(GatedCell):
         """Return the norm of a gate."""
         return cast(ChannelNorm, self.norms[gate])
 
-    def apply_gates(
-        self, fused: torch.Tensor, x: torch.Tensor, state: torch.Tensor
-    ) -> tuple[torch.Tensor, torch.Tensor]:
+    def apply_gates(self, fused: torch.Tensor, x: torch.Tensor, state: torch.Tensor) -> CellStep:
         """Return (y, state), both [B, out, H, W], from the gates' pre-activations."""
         keep, candidate, through, output = self._normalised(fused, self.gates)
         keep = torch.sigmoid(keep + FORGET_BIAS)
@@ -167,9 +157,7 @@ class GRU(GatedCell):
         f"norms.{name}": f"ln_{name}_pre" for name in "ruc"
     }
 
-    def __init__(
-        self, in_channels: int, out_channels: int, *, kernel_size: int | tuple[int, int], layer_norm: bool = False
-    ) -> None:
+    def __init__(self, in_channels: int, out_channels: int, *, kernel_size: Pair, layer_norm: bool = False) -> None:
         super().__init__(in_channels, out_channels, kernel_size=kernel_size, layer_norm=layer_norm)
         self.candidate = self._convolution(1, kernel_size)
 
@@ -178,9 +166,7 @@ class GRU(GatedCell):
         """Convolutions of the gates and of the candidate."""
         return self.conv, self.candidate
 
-    def forward(
-        self, x: torch.Tensor, state: torch.Tensor | None = None, projected: Projected = ()
-    ) -> tuple[torch.Tensor, torch.Tensor]:
+    def forward(self, x: torch.Tensor, state: torch.Tensor | None = None, projected: Projected = ()) -> CellStep:
         """Return (y, state), both [B, out, H, W]."""
         state = self._check(x, state)
         remembered, keep = self.reset(self._fused(self.conv, x, state, projected[:1]), state)
@@ -218,9 +204,7 @@ class LSTM(GatedCell):
         "norms.c": "ln_state",
     }
 
-    def apply_gates(
-        self, fused: torch.Tensor, x: torch.Tensor, state: torch.Tensor
-    ) -> tuple[torch.Tensor, torch.Tensor]:
+    def apply_gates(self, fused: torch.Tensor, x: torch.Tensor, state: torch.Tensor) -> CellStep:
         """Return (y [B, out, H, W], state [B, 2 out, H, W]) from the gates' pre-activations."""
         del x
         memory = state.chunk(2, 1)[0]

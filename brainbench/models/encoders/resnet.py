@@ -103,5 +103,5 @@ class ResNet18Encoder(nn.Module):
 
 
 def _convolution(in_channels: int, out_channels: int, size: int, stride: int) -> Conv2d:
-    shape = {"kernel_size": (size, size), "stride": (stride, stride), "padding": (size // 2, size // 2)}
+    shape: dict[str, Any] = {"kernel_size": (size, size), "stride": (stride, stride), "padding": (size // 2, size // 2)}
     return Conv2d(in_channels, out_channels, **shape, use_bias=False, gain=RECTIFIER_GAIN)

@@ -8,7 +8,6 @@ feedforward control keeps nodes, skips and timing and drops feedback and memory.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from itertools import pairwise
 
 from brainbench.models.graph.spec import Convolution, Dense, Edge, GraphSpec, Memory, Node
@@ -25,47 +24,30 @@ def small_width(full: int) -> int:
     return full * 3 // 16
 
 
-@dataclass(frozen=True)
-class ZhuangEncoder:
-    """Choices of the encoder; :meth:`spec` is its graph.
+def zhuang_graph(
+    cell: str = "time-decay", layer_norm: bool = False, small: bool = False, *, feedforward: bool = False
+) -> GraphSpec:
+    """Return the encoder's graph with a cell of :mod:`brainbench.models.cells`.
 
-    Features: 512, or 96 when ``small`` (every width × 3/16, about 1.3 M parameters with the largest cell).
+    It has 512 features, or 96 when ``small`` (every width × 3/16, about 1.3 M parameters with the largest cell).
+    ``feedforward`` leaves out memory and feedback; cell and layer norm then have no meaning.
+
+    Raises:
+        UsageError: there is no such cell.
     """
-
-    cell: str = "time-decay"
-    """``time-decay``, ``ugrnn``, ``intersection``, ``gru`` or ``lstm``."""
-    layer_norm: bool = False
-    small: bool = False
-    input_shape: tuple[int, int, int] = INPUT_SHAPE
-    feedforward: bool = False
-    """Neither memory nor feedback; ``cell`` and ``layer_norm`` then have no meaning."""
-
-    def _width(self, full: int) -> int:
-        return small_width(full) if self.small else full
-
-    @property
-    def features(self) -> int:
-        """Number of output features."""
-        return self._width(512)
-
-    def spec(self) -> GraphSpec:
-        """Return the graph's description.
-
-        Raises:
-            UsageError: there is no such cell.
-        """
-        memory = None if self.feedforward else Memory(self.cell, layer_norm=self.layer_norm)
-        names = [f"conv{index}" for index in range(1, 7)]
-        nodes = [
-            Node(name, Convolution(self._width(width), padding="valid" if name == "conv1" else "same"), memory)
-            for name, width in zip(names, _FULL, strict=True)
-        ]
-        # Gated memories are convolutional and need a grid, which dense layers lack; a trace needs none.
-        dense = Memory() if self.cell == "time-decay" and not self.feedforward else None
-        nodes += [Node("fc7", Dense(self._width(1024)), dense), Node("fc8", Dense(self.features), dense)]
-        # Skips bring early responses to the dense layers before the last convolution has answered.
-        forward = [*pairwise(names), ("conv2", "fc7"), ("conv4", "fc7"), ("conv6", "fc7")]
-        edges = [Edge(*ends) for ends in (*forward, ("fc7", "fc8"))]
-        if not self.feedforward:
-            edges += [Edge(f"conv{source}", f"conv{target}", feedback=True) for source, target in _FEEDBACK]
-        return GraphSpec(tuple(nodes), tuple(edges), ("conv1",), "fc8", self.input_shape)
+    scaled = small_width if small else int
+    memory = None if feedforward else Memory(cell, layer_norm=layer_norm)
+    names = [f"conv{index}" for index in range(1, 7)]
+    nodes = [
+        Node(name, Convolution(scaled(width), padding="valid" if name == "conv1" else "same"), memory)
+        for name, width in zip(names, _FULL, strict=True)
+    ]
+    # Gated memories are convolutional and need a grid, which dense layers lack; a trace needs none.
+    dense = Memory() if cell == "time-decay" and not feedforward else None
+    nodes += [Node("fc7", Dense(scaled(1024)), dense), Node("fc8", Dense(scaled(512)), dense)]
+    # Skips bring early responses to the dense layers before the last convolution has answered.
+    forward = [*pairwise(names), ("conv2", "fc7"), ("conv4", "fc7"), ("conv6", "fc7")]
+    edges = [Edge(*ends) for ends in (*forward, ("fc7", "fc8"))]
+    if not feedforward:
+        edges += [Edge(f"conv{source}", f"conv{target}", feedback=True) for source, target in _FEEDBACK]
+    return GraphSpec(tuple(nodes), tuple(edges), ("conv1",), "fc8", INPUT_SHAPE)

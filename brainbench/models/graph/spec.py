@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, Literal
 
-from brainbench.core.errors import UsageError, listing, unknown_name
+from brainbench.core.errors import UsageError, check_name, listing
 
 Shape = tuple[int, ...]
 Unroll = Literal["biological", "full"]
@@ -90,8 +90,7 @@ class Memory:
     """Initial time decay; other kinds ignore it."""
 
     def __post_init__(self) -> None:
-        if self.kind not in MEMORIES:
-            raise unknown_name("memory", self.kind, MEMORIES)
+        check_name("memory", self.kind, MEMORIES)
 
 
 @dataclass(frozen=True)
@@ -188,8 +187,7 @@ class GraphSpec:
         referenced += [(end, "node of an edge") for edge in self.edges for end in (edge.source, edge.target)]
         referenced += [(node.shape_from, "shape_from node") for node in self.nodes if node.shape_from is not None]
         for name, kind in referenced:
-            if name not in names:
-                raise unknown_name(kind, name, names)
+            check_name(kind, name, names)
         ends = [(edge.source, edge.target) for edge in self.edges]
         for end in ends:
             if ends.count(end) > 1:
@@ -346,5 +344,4 @@ class GraphSpec:
 
 def check_unroll(unroll: str) -> None:
     """Raise :class:`UsageError` unless ``unroll`` is one of :data:`UNROLLS`."""
-    if unroll not in UNROLLS:
-        raise unknown_name("unrolling", unroll, UNROLLS)
+    check_name("unrolling", unroll, UNROLLS)

@@ -12,7 +12,7 @@ from __future__ import annotations
 import logging
 import math
 import os
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Any, cast
 
@@ -130,21 +130,24 @@ class TemporalGraph(nn.Module):
     def _resized_by(self, state: Mapping[str, Any]) -> dict[str, tuple[int, ...]]:
         """Return the weights in ``state`` that differ from ours only as another stimulus shape would make them."""
         resized = {}
-        for name, node in self.named_nodes():
-            key = f"{_tnn_owner(name, node)}.weight"
-            follows = isinstance(node.operation, Linear) or name in self.spec.inputs
-            if key in state and follows and isinstance(node.operation, (Conv2d, Linear)):
-                new, old = tuple(state[key].shape), tuple(node.operation.weight.shape)
+        for name, key, operation in self._weighted():
+            if key in state and (isinstance(operation, Linear) or name in self.spec.inputs):
+                new, old = tuple(state[key].shape), tuple(operation.weight.shape)
                 if new != old and len(new) == len(old) and new[:1] + new[2:] == old[:1] + old[2:]:
                     resized[key] = new
         return resized
 
-    def _resize_operations(self, resized: Mapping[str, tuple[int, ...]]) -> None:
+    def _weighted(self) -> Iterator[tuple[str, str, Conv2d | Linear]]:
+        """Yield the name of each node with weights, PyTorchTNN's name of them, and their layer."""
         for name, node in self.named_nodes():
-            shape = resized.get(f"{_tnn_owner(name, node)}.weight")
-            if shape is not None and isinstance(node.operation, (Conv2d, Linear)):
-                node.operation.weight = nn.Parameter(node.operation.weight.new_empty(shape))
-                setattr(node.operation, "in_features" if len(shape) == 2 else "in_channels", shape[1])
+            if isinstance(node.operation, (Conv2d, Linear)):
+                yield name, f"{_tnn_owner(name, node)}.weight", node.operation
+
+    def _resize_operations(self, resized: Mapping[str, tuple[int, ...]]) -> None:
+        for _, key, operation in self._weighted():
+            if shape := resized.get(key):
+                operation.weight = nn.Parameter(operation.weight.new_empty(shape))
+                setattr(operation, "in_features" if len(shape) == 2 else "in_channels", shape[1])
         # The grid shows in the weights only as a product, so it stays open until a stimulus arrives.
         self._open_grid = True
 
@@ -159,15 +162,14 @@ class TemporalGraph(nn.Module):
             return
         spec = replace(self.spec, input_shape=shape)
         inputs, outputs = spec.shapes()
+        for name, _, operation in self._weighted():
+            needed = math.prod(inputs[name]) if isinstance(operation, Linear) else inputs[name][0]
+            if needed != operation.weight.shape[1]:
+                raise UsageError(
+                    f"The loaded weights do not fit steps of shape {list(shape)}: node {name!r} would receive "
+                    f"{needed} values and has weights for {operation.weight.shape[1]}."
+                )
         for name, node in self.named_nodes():
-            if isinstance(node.operation, (Conv2d, Linear)):
-                dense = isinstance(node.operation, Linear)
-                needed = math.prod(inputs[name]) if dense else inputs[name][0]
-                if needed != node.operation.weight.shape[1]:
-                    raise UsageError(
-                        f"The loaded weights do not fit steps of shape {list(shape)}: node {name!r} would receive "
-                        f"{needed} values and has weights for {node.operation.weight.shape[1]}."
-                    )
             node.grid = inputs[name][1:]
         self.spec, self.shapes, self._open_grid = spec, outputs, False
 

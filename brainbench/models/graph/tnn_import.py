@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from graphlib import CycleError, TopologicalSorter
 from typing import Any
 
-from brainbench.core.errors import DataError, listing, unknown_name
+from brainbench.core.errors import DataError, check_name, listing, unknown_name
 from brainbench.core.files import read_json
 from brainbench.models.graph.spec import Convolution, Dense, Edge, GraphSpec, Memory, Node, Pool
 
@@ -40,13 +40,15 @@ class _Section:
             raise DataError(f"The graph configuration lacks {key!r} in {self.where}.")
         return self.data.pop(key, default)
 
-    def only(self, key: str, *allowed: Any) -> None:
-        """Take a key that must be absent or have one of the allowed values."""
-        value = self.data.pop(key, allowed[0])
-        if value not in allowed:
-            raise DataError(
-                f"The graph configuration has {key!r}: {value!r} in {self.where}; only {allowed[0]!r} is supported."
-            )
+    def only(self, **allowed: Any) -> None:
+        """Take keys that must be absent or have the allowed value, or one of a tuple of them."""
+        for key, values in allowed.items():
+            choices = values if isinstance(values, tuple) else (values,)
+            value = self.data.pop(key, choices[0])
+            if value not in choices:
+                raise DataError(
+                    f"The graph configuration has {key!r}: {value!r} in {self.where}; only {choices[0]!r} is supported."
+                )
 
     def size(self, key: str, default: Any = _REQUIRED, *, or_else: tuple[Any, ...] = ()) -> Any:
         """Take a pair of whole numbers (or one for both), or one of other values."""
@@ -91,36 +93,28 @@ def read_graph(source: Mapping[str, Any] | str | os.PathLike[str]) -> GraphSpec:
     names = [node.name for node in nodes]
     if order is not None and sorted(order) != sorted(names):
         raise DataError(f"'ff_order' {order!r} must list every node once: {names!r}.")
-    if order is None and _acyclic(ends):
-        feedback: set[tuple[str, str]] = set()
-    else:
-        rank = {name: index for index, name in enumerate(order or names)}
-        feedback = {end for end in ends if rank.get(end[0], -1) >= rank.get(end[1], len(rank))}
+    try:
+        if order is None:
+            TopologicalSorter({name: {source for source, target in ends if target == name} for name in names}).prepare()
+            order = ()
+    except CycleError:
+        order = names
+    # Without cycles nothing leads back; else what does not lead to a later node.
+    rank = {name: index for index, name in enumerate(order)}
+    feedback = {end for end in ends if rank and rank.get(end[0], -1) >= rank.get(end[1], len(rank))}
     edges = tuple(Edge(*end, feedback=end in feedback) for end in ends)
     return GraphSpec(nodes, edges, inputs, output, (*shape,))
-
-
-def _acyclic(ends: list[tuple[str, str]]) -> bool:
-    graph: dict[str, set[str]] = {}
-    for source, target in ends:
-        graph.setdefault(target, set()).add(source)
-    try:
-        TopologicalSorter(graph).prepare()
-    except CycleError:
-        return False
-    return True
 
 
 def _node(item: Any) -> Node:
     node = _Section(item, "a node")
     name = str(node.take("name"))
     node.where = f"node {name!r}"
-    node.only("residual", None, False)
+    node.only(residual=(None, False))
     channels = node.take("out_channels")
     harbor = _Section(node.take("harbor_policy"), f"the harbor policy of {name!r}")
     policy = harbor.take("name")
-    if policy not in ("ResizeConcat", "Identity"):
-        raise unknown_name(f"harbor policy of node {name!r}", policy, ("ResizeConcat", "Identity"))
+    check_name(f"harbor policy of node {name!r}", policy, ("ResizeConcat", "Identity"))
     harbor.done(*_OVERWRITTEN)
     operation = _operation(_Section(node.take("pre_memory"), f"the pre-memory of {name!r}"))
     memory = _memory(_Section(node.take("recurrent_cell"), f"the recurrent cell of {name!r}"))
@@ -138,8 +132,7 @@ def _operation(part: _Section) -> Convolution | Dense | None:
     if kind == "Identity":
         part.done(*_OVERWRITTEN)
         return None
-    if kind not in ("Conv2dCell", "FullyConnected"):
-        raise unknown_name(f"module in {part.where}", kind, ("Conv2dCell", "FullyConnected", "Identity"))
+    check_name(f"module in {part.where}", kind, ("Conv2dCell", "FullyConnected", "Identity"))
     common = {
         "use_bias": part.take("use_bias", True),
         "bias": part.take("bias", None),
@@ -148,16 +141,13 @@ def _operation(part: _Section) -> Convolution | Dense | None:
         "activation": part.take("activation", "ReLU" if kind == "FullyConnected" else None),
         "initialiser": _initialiser(part),
     }
-    part.only("activation_func_kwargs", {}, None)
-    part.only("batchnorm", None)
-    part.only("batchnorm_timevary", False)
+    part.only(activation_func_kwargs=({}, None), batchnorm=None, batchnorm_timevary=False)
     channels = part.take("out_channels")
     if kind == "FullyConnected":
         operation: Convolution | Dense = Dense(channels, **common)
     else:
         padding = part.size("padding", 0, or_else=("same", "valid"))
-        for key, allowed in (("dilation", 1), ("groups", 1), ("padding_mode", "zeros")):
-            part.only(key, allowed)
+        part.only(dilation=1, groups=1, padding_mode="zeros")
         operation = Convolution(channels, part.size("ksize"), part.size("stride", 1), padding, **common)
         if operation.padding == "same" and operation.stride != (1, 1):
             raise DataError(f"Padding 'same' in {part.where} needs stride 1; found {list(operation.stride)}.")
@@ -172,8 +162,7 @@ def _initialiser(part: _Section) -> Mapping[str, Any] | None:
     if options is None:
         return None
     method = _Section(options, f"'init_dict' of {part.where}").take("method")
-    if method not in INITIALISERS:
-        raise unknown_name(f"initialiser in {part.where}", method, INITIALISERS)
+    check_name(f"initialiser in {part.where}", method, INITIALISERS)
     return dict(options)
 
 
@@ -182,20 +171,16 @@ def _memory(part: _Section) -> Memory | None:
     if kind == "IdentityCell":
         part.done(*_OVERWRITTEN, "out_channels")
         return None
-    if kind not in _MEMORIES:
-        raise unknown_name(f"cell in {part.where}", kind, ("IdentityCell", *_MEMORIES))
-    part.only("init_dict", None)
+    check_name(f"cell in {part.where}", kind, ("IdentityCell", *_MEMORIES))
+    part.only(init_dict=None)
     if kind == "TimeDecayRecurrentCell":
-        part.only("trainable", True)
+        part.only(trainable=True)
         memory = Memory("time-decay", tau=part.take("tau", 0.0))
     else:
-        for key, allowed in (
-            ("stride", 1), ("padding", "same"), ("dilation", 1), ("groups", 1), ("padding_mode", "zeros"),
-            ("use_bias", True), ("forget_bias", 1.0), ("activation", "Tanh"), ("activation_func_kwargs", {}),
-        ):  # fmt: skip
-            part.only(key, allowed)
+        part.only(stride=1, padding="same", dilation=1, groups=1, padding_mode="zeros")
+        part.only(use_bias=True, forget_bias=1.0, activation="Tanh", activation_func_kwargs={})
         # Only the initial value of a bias that load_tnn_state or training replaces.
-        part.only("bias", None, 0, 0.0)
+        part.only(bias=(None, 0, 0.0))
         memory = Memory(_MEMORIES[kind], part.size("ksize"), bool(part.take("layernorm", False)))
     part.done(*_OVERWRITTEN, "out_channels")
     return memory
@@ -203,20 +188,16 @@ def _memory(part: _Section) -> Memory | None:
 
 def _after(part: _Section) -> tuple[str | None, Pool | None]:
     kind = part.take("name")
+    check_name(f"module in {part.where}", kind, ("ActivationLayer", "MaxPool", "AdaptiveAvgPool", "Identity"))
     activation, pool = None, None
     if kind == "ActivationLayer":
         activation = part.take("activation", "ReLU")
-        part.only("activation_func_kwargs", {}, None)
+        part.only(activation_func_kwargs=({}, None))
     elif kind == "MaxPool":
         size, stride = part.size("ksize"), part.size("stride", None, or_else=(None,))
-        part.only("dilation", 1)
-        part.only("return_indices", False)
+        part.only(dilation=1, return_indices=False)
         pool = Pool("max", size, stride, part.size("padding", 0), bool(part.take("ceil_mode", False)))
     elif kind == "AdaptiveAvgPool":
         pool = Pool("average", part.size("output_size", 6), flatten=bool(part.take("flatten", False)))
-    elif kind != "Identity":
-        raise unknown_name(
-            f"module in {part.where}", kind, ("ActivationLayer", "MaxPool", "AdaptiveAvgPool", "Identity")
-        )
     part.done(*_OVERWRITTEN)
     return activation, pool

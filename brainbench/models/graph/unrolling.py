@@ -27,16 +27,10 @@ if TYPE_CHECKING:
 def needed_steps(
     spec: GraphSpec, unroll: Unroll, steps: int, *, whole: Collection[str], last: Collection[str]
 ) -> dict[str, tuple[int, int]]:
-    """Return for every node the steps (first, stop) to compute; stop 0 if none.
+    """Return for every node the steps (first, stop) of a sweep of ``steps`` to compute; stop 0 if none.
 
-    Args:
-        spec: The graph.
-        unroll: How it is unrolled.
-        steps: Length of the sweep.
-        whole: Nodes of which every step is wanted.
-        last: Nodes of which the last step is wanted.
-
-    A node that remembers, or feeds back on itself, is computed from the first step on.
+    Of the nodes in ``whole`` every step is wanted, of those in ``last`` the last one. A node that remembers, or feeds
+    back on itself, is computed from the first step on.
     """
     delay = spec.delays(unroll)
     first = {node.name: steps for node in spec.nodes}

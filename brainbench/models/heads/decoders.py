@@ -8,7 +8,7 @@ import torch
 from torch import nn
 from torch.nn import functional
 
-from brainbench.core.errors import UsageError, unknown_name
+from brainbench.core.errors import UsageError, check_name
 from brainbench.models.ops.layers import RECTIFIER_GAIN, Linear, perceptron
 
 CLASSES = 117
@@ -91,8 +91,7 @@ def make_decoder(name: str, features: int, classes: int = CLASSES) -> nn.Module:
     Raises:
         UsageError: there is none of this name, or fewer than two classes.
     """
-    if name not in DECODERS:
-        raise unknown_name("decoder", name, DECODERS)
+    check_name("decoder", name, DECODERS)
     if classes < 2:
         raise UsageError(f"A decoder needs at least 2 classes; received {classes}.")
     return DECODERS[name](features, classes)

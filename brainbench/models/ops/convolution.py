@@ -89,10 +89,7 @@ def _maps(rows: torch.Tensor, geometry: ConvolutionShape) -> torch.Tensor:
 class DeferredWeightGrad:
     """Both factors of the weight gradient of one convolution, kept for all steps of one pass.
 
-    Args:
-        conv: The convolution.
-        grid: (H, W) of its inputs.
-        stimuli: Inputs [1, ΣC, H, W] of the whole pass, at most.
+    Its inputs lie on a grid (H, W); the whole pass has at most ``stimuli`` of them [1, ΣC, H, W].
     """
 
     def __init__(self, conv: Conv2d, grid: Sequence[int], stimuli: int) -> None:

@@ -14,7 +14,7 @@ from brainbench.models.ops.convolution import HALF, DeferredWeightGrad
 
 if TYPE_CHECKING:
     from brainbench.models.cells import IntersectionRNN
-    from brainbench.models.cells.cell import ChannelNorm
+    from brainbench.models.cells.cell import CellStep, ChannelNorm
 
 
 class DeferredNormGrad:
@@ -49,9 +49,7 @@ class _NormWeights(torch.autograd.Function):
         return None, *(row.to(kind) for row, kind in zip(sums, ctx.kinds, strict=True))
 
 
-def apply_gates(
-    cell: IntersectionRNN, fused: torch.Tensor, x: torch.Tensor, state: torch.Tensor
-) -> tuple[torch.Tensor, torch.Tensor]:
+def apply_gates(cell: IntersectionRNN, fused: torch.Tensor, x: torch.Tensor, state: torch.Tensor) -> CellStep:
     """Return what ``cell.apply_gates`` returns, by fused kernels: (y, state), both [B, C, H, W].
 
     In mixed precision the new state is single, otherwise of the precision of the old one.

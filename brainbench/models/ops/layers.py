@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import nn
@@ -82,12 +82,11 @@ def initialise(
     else:
         options = dict(method)
         getattr(nn.init, options.pop("method"))(layer.weight, **options)
-    if layer.bias is not None:
-        if bias is None:
-            bound = 1.0 / math.sqrt(fan_in)
-            layer.bias.uniform_(-bound, bound)
-        else:
-            layer.bias.fill_(bias)
+    if layer.bias is not None and bias is not None:
+        layer.bias.fill_(bias)
+    elif layer.bias is not None:
+        bound = 1.0 / math.sqrt(fan_in)
+        layer.bias.uniform_(-bound, bound)
 
 
 class PackedMatrix:
@@ -96,19 +95,19 @@ class PackedMatrix:
     def __init__(self, weight: torch.Tensor, bias: torch.Tensor | None, dtype: torch.dtype) -> None:
         self.dtype = dtype
         self.bias = None if bias is None else bias.detach()
-        weight = weight.to(dtype).contiguous()
         reorder = getattr(torch.ops.mkldnn, "_reorder_linear_weight", None)
-        self.plain = weight if reorder is None else None
-        self.ordered = None if reorder is None else reorder(weight, None)
+        self.ordered, self.weight = reorder is not None, weight.to(dtype).contiguous()
+        if reorder is not None:
+            self.weight = reorder(self.weight, None)
 
     def __call__(self, x: torch.Tensor) -> torch.Tensor:
         """Return x [..., in] times the matrix, plus the bias, in the precision of ``x``."""
         # A product with few rows is bound by reading the weights: half precision halves that, single keeps the digits.
         rounded = x.to(self.dtype)
-        if self.ordered is None:
-            y = functional.linear(rounded, cast(torch.Tensor, self.plain))
+        if self.ordered:
+            y = torch.ops.mkldnn._linear_pointwise(rounded, self.weight, None, "none", [], "")
         else:
-            y = torch.ops.mkldnn._linear_pointwise(rounded, self.ordered, None, "none", [], "")
+            y = functional.linear(rounded, self.weight)
         y = y.to(x.dtype)
         return y if self.bias is None else y + self.bias
 
@@ -184,19 +183,17 @@ class Conv2d(nn.Conv2d):
         size = self.output_grid(*input.shape[2:])
         (rows, columns), (down, aside), (_, width, channels) = self.kernel_size, _two(self.stride), padded.shape
         # Channels innermost, the columns of a window lie side by side.
-        windows = padded.as_strided(
-            (*size, rows, columns * channels),
-            (down * width * channels, aside * channels, width * channels, 1),
-        )
+        strides = (down * width * channels, aside * channels, width * channels, 1)
+        windows = padded.as_strided((*size, rows, columns * channels), strides)
         y = packed(windows.reshape(size[0] * size[1], -1))
         return y.T.reshape(1, -1, *size)
 
     def _convolve(self, input: torch.Tensor, weight: torch.Tensor, bias: torch.Tensor | None) -> torch.Tensor:
         padded = input if self._extra is None else functional.pad(input, self._extra)
         # Asked first: an exported program must not depend on the size of its example's batch.
-        if weight.numel() < _MANY_WEIGHTS or torch.compiler.is_exporting() or torch.compiler.is_compiling():
-            return self._conv_forward(padded, weight, bias)
-        if len(input) > 1 or input.is_cuda or torch.is_grad_enabled():
+        traced = torch.compiler.is_exporting() or torch.compiler.is_compiling()
+        few = weight.numel() < _MANY_WEIGHTS
+        if few or traced or len(input) > 1 or input.is_cuda or torch.is_grad_enabled():
             return self._conv_forward(padded, weight, bias)
         # The convolutions of CPUs rearrange their weights at every call, which for one stimulus takes longest.
         columns = functional.unfold(padded, self.kernel_size, padding=_two(self.padding), stride=_two(self.stride))

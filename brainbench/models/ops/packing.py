@@ -9,7 +9,7 @@ from __future__ import annotations
 import copy
 from typing import TYPE_CHECKING
 
-from brainbench.core.errors import UsageError, unknown_name
+from brainbench.core.errors import UsageError, check_name
 
 if TYPE_CHECKING:
     from torch import nn
@@ -35,8 +35,7 @@ def packed(model: nn.Module, *, precision: str = "float32") -> nn.Module:
 
     from brainbench.models.ops.layers import Conv2d, Linear
 
-    if precision not in PRECISIONS:
-        raise unknown_name("precision of packed weights", precision, PRECISIONS)
+    check_name("precision of packed weights", precision, PRECISIONS)
     if any(parameter.device.type != "cpu" for parameter in model.parameters()):
         raise UsageError("Only networks on the CPU are packed; call .cpu() first.")
     faster = copy.deepcopy(model).eval().requires_grad_(False)

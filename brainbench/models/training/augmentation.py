@@ -22,7 +22,7 @@ import torch
 from torch.nn import functional
 
 from brainbench.core.contracts import CHANNELS, GRID_SHAPE
-from brainbench.core.errors import UsageError, unknown_name
+from brainbench.core.errors import UsageError, check_name
 from brainbench.models.normaliser import Normaliser
 
 LAST_COLUMNS = (4, 4, 6, 6, 5)
@@ -45,8 +45,7 @@ class Augmentation:
     """Share of the time steps that are set to zero (temporal masking; published with 0.75)."""
 
     def __post_init__(self) -> None:
-        if self.kind not in KINDS:
-            raise unknown_name("augmentation", self.kind, KINDS)
+        check_name("augmentation", self.kind, KINDS)
         if not 0.0 <= self.masking < 1.0:
             raise UsageError(
                 f"The share of masked time steps lies between 0 and 1, 1 excluded; received {self.masking!r}."
@@ -56,14 +55,11 @@ class Augmentation:
         return self.kind + (f" + {self.masking:.0%} masking" if self.masking else "")
 
     def __call__(self, x: torch.Tensor, generator: torch.Generator, *, part: tuple[int, int] = (0, 1)) -> torch.Tensor:
-        """Return an augmented copy of sweeps [B, T, S·C, 5, 7].
+        """Return an augmented copy of sweeps [B, T, S·C, 5, 7] in SI.
 
-        Args:
-            x: Sweeps in SI; unchanged.
-            generator: On the CPU, equal states give equal results on every device. On the device of ``x`` nothing is
-                moved, and the whole can be part of a CUDA graph.
-            part: (rank, number) when ``x`` holds every number-th sweep of a larger batch, from rank on; each sweep is
-                then treated as it would be in the whole batch.
+        With a generator on the CPU, equal states give equal results on every device. With one on the device of ``x``
+        nothing is moved, and the whole can be part of a CUDA graph. ``part`` is (rank, number) when ``x`` holds every
+        number-th sweep of a larger batch, from rank on; each sweep is then treated as it would be in the whole batch.
         """
         draw = SampledAugmentation(generator, *part)
         y = KINDS[self.kind](x, draw)
@@ -78,20 +74,14 @@ class SampledAugmentation:
     rank: int = 0
     parts: int = 1
 
-    def uniform(self, count: int, *shape: int) -> torch.Tensor:
-        """Return numbers in [0, 1) [count, *shape]."""
-        return self._every(torch.rand, count * self.parts, *shape)[self.rank :: self.parts]
-
-    def normal(self, count: int, *shape: int) -> torch.Tensor:
-        """Return standard normal numbers [count, *shape]."""
-        return self._every(torch.randn, count * self.parts, *shape)[self.rank :: self.parts]
+    def uniform(self, count: int, *shape: int, draw: Callable[..., torch.Tensor] = torch.rand) -> torch.Tensor:
+        """Return numbers in [0, 1) [count, *shape], or those of another of torch's generators."""
+        every = draw(count * self.parts, *shape, generator=self.generator, device=self.generator.device)
+        return every[self.rank :: self.parts]
 
     def for_all(self, count: int, device: torch.device) -> torch.Tensor:
         """Return numbers in [0, 1) [count] that are the same for the whole batch."""
-        return self._every(torch.rand, count).to(device)
-
-    def _every(self, draw: Callable[..., torch.Tensor], *shape: int) -> torch.Tensor:
-        return draw(*shape, generator=self.generator, device=self.generator.device)
+        return torch.rand(count, generator=self.generator, device=self.generator.device).to(device)
 
     def coins(self, x: torch.Tensor, probability: float = 0.5) -> torch.Tensor:
         """Return one truth value per sweep of ``x``, shaped to broadcast against it."""
@@ -104,8 +94,7 @@ def flip(x: torch.Tensor, direction: str) -> torch.Tensor:
     Raises:
         UsageError: there is no such direction, or ``x`` is not [B, T, S·6, 5, 7].
     """
-    if direction not in _MIRRORED:
-        raise unknown_name("direction of a flip", direction, _MIRRORED)
+    check_name("direction of a flip", direction, _MIRRORED)
     if x.ndim != 5 or x.shape[2] % len(CHANNELS) or tuple(x.shape[3:]) != GRID_SHAPE:
         raise UsageError(
             f"A physical flip needs sweeps [batch, time, sub-steps × {len(CHANNELS)}, {GRID_SHAPE[0]}, "
@@ -145,15 +134,11 @@ def _constant(values: tuple[float, ...], device: torch.device) -> torch.Tensor:
 def _places(direction: str) -> tuple[int, ...]:
     """Return for every cell of the grid the cell whose whisker comes to it: the order of a row or column reversed."""
     rows, columns = GRID_SHAPE
-    lines = (
-        [[row * columns + column for column in range(LAST_COLUMNS[row] + 1)] for row in range(rows)]
-        if direction == "horizontal"
-        else [
-            [row * columns + column for row in range(rows) if column <= LAST_COLUMNS[row]] for column in range(columns)
-        ]
-    )
     places = list(range(rows * columns))
-    for line in lines:
+    held = [(row, column) for row in range(rows) for column in range(LAST_COLUMNS[row] + 1)]
+    along = 0 if direction == "horizontal" else 1
+    for which in range(GRID_SHAPE[along]):
+        line = [row * columns + column for row, column in held if (row, column)[along] == which]
         for cell, source in zip(line, reversed(line), strict=True):
             places[cell] = source
     return tuple(places)
@@ -212,18 +197,13 @@ def _image(x: torch.Tensor, draw: SampledAugmentation) -> torch.Tensor:
     kernel = (kernel[:, None] * kernel / 16.0).expand(x.shape[2], 1, 3, 3)
     blurred = functional.conv2d(y.flatten(0, 1), kernel, padding=1, groups=x.shape[2]).unflatten(0, x.shape[:2])
     y = torch.where(draw.coins(x), blurred, y)
-    noise = draw.normal(*x.shape).to(device=x.device, dtype=x.dtype)
+    noise = draw.uniform(*x.shape, draw=torch.randn).to(device=x.device, dtype=x.dtype)
     y = torch.where(draw.coins(x), y + 0.1 * spread * noise, y)
     return y * scale
 
 
-def _none(x: torch.Tensor, draw: SampledAugmentation) -> torch.Tensor:
-    del draw
-    return x
-
-
 KINDS: Mapping[str, Callable[[torch.Tensor, SampledAugmentation], torch.Tensor]] = {
-    "none": _none,
+    "none": lambda x, draw: x,
     "physical": _physical,
     "thesis": _thesis,
     "image": _image,

@@ -11,7 +11,7 @@ from brainbench.models.registry import describe_model
 from brainbench.models.training.config import TrainingConfig
 from brainbench.models.training.evaluation import Evaluation
 
-_START = "| start | biases drawn as PyTorch does: layer norm of silence has a slope of 316, step after step |"
+_START = "biases drawn as PyTorch does: layer norm of silence has a slope of 316, step after step"
 
 
 def checkpoint_info(
@@ -47,52 +47,39 @@ def checkpoint_info(
 def model_card(config: TrainingConfig, info: Mapping[str, Any]) -> str:
     """Return the text of the model card (Mitchell et al. 2019), in Markdown."""
     known = describe_model(config.model)
-    found = info["evaluation"]
-    lines = [
-        f"# {config.model}.{config.objective}",
-        "",
-        f"{known.description}, trained with brainbench: {config.objective}.",
-        "",
-        "| | |",
-        "|---|---|",
-        f"| architecture | {config.model} ({known.citation}) |",
-        f"| parameters | {known.parameters:,} with 117 classes; {len(info['classes'])} classes here |",
-        "| input | sweeps [B, T, 30, 5, 7] in N and N·m; normalised inside |",
-        *_data(info.get("data")),
-        f"| epochs | {info['epochs']} (published: {info['published_epochs']}); best: {info['best_epoch']} |",
-        f"| optimiser | {config.optimizer}, {config.schedule}, learning rate {config.learning_rate:g}, batch "
-        f"{config.batch_size}, gradients clipped to a norm of {config.clip:g}, {config.precision} |",
-        *([_START] if info.get("drawn_biases") else []),
-        f"| augmentation | {info['augmentation']} |",
-        f"| seed | {config.seed} |",
-    ]
+    found, data = info["evaluation"], info.get("data")
+    rows = {
+        "architecture": f"{config.model} ({known.citation})",
+        "parameters": f"{known.parameters:,} with 117 classes; {len(info['classes'])} classes here",
+        "input": "sweeps [B, T, 30, 5, 7] in N and N·m; normalised inside",
+        "data": data
+        and f"{data['hash']}: {data['train']:,} sweeps to train, {data['validation']:,} to validate, "
+        f"{data['test']:,} of other objects to test; {data['left_out']:,} left out as unstable",
+        "epochs": f"{info['epochs']} (published: {info['published_epochs']}); best: {info['best_epoch']}",
+        "optimiser": f"{config.optimizer}, {config.schedule}, learning rate {config.learning_rate:g}, batch "
+        f"{config.batch_size}, gradients clipped to a norm of {config.clip:g}, {config.precision}",
+        "start": info.get("drawn_biases") and _START,
+        "augmentation": info["augmentation"],
+        "seed": str(config.seed),
+    }
     if found is not None:
         low, high = found["interval"]["low"], found["interval"]["high"]
         read = "linear probe on the frozen network" if config.objective != "supervised" else "its own decoder"
         read += ", fitted anew to the trained features" if info.get("refit_decoder") else ""
-        lines += [
-            f"| top-1 | {found['top1']:.3f} [{low:.3f}, {high:.3f}] on {found['count']} sweeps ({read}) |",
-            f"| top-5 | {found['top5']:.3f} |",
-            f"| test data | {found['data']} |",
-            f"| collapsed | {'yes: ' + found['reason'] if found['collapsed'] else 'no'} |",
-        ]
-    lines += [
-        f"| untrained twin | {info['twin']}{_beside(found, info.get('twin_evaluation'))} |",
-        f"| licence | {info['licence']} |",
-        "",
-        "Trained on simulated touch alone; what it says about brains is what `brainbench score` measures.",
-        "",
-    ]
-    return "\n".join(lines)
-
-
-def _data(data: Mapping[str, Any] | None) -> list[str]:
-    if not data:
-        return []
-    return [
-        f"| data | {data['hash']}: {data['train']:,} sweeps to train, {data['validation']:,} to validate, "
-        f"{data['test']:,} of other objects to test; {data['left_out']:,} left out as unstable |"
-    ]
+        rows |= {
+            "top-1": f"{found['top1']:.3f} [{low:.3f}, {high:.3f}] on {found['count']} sweeps ({read})",
+            "top-5": f"{found['top5']:.3f}",
+            "test data": found["data"],
+            "collapsed": f"yes: {found['reason']}" if found["collapsed"] else "no",
+        }
+    rows["untrained twin"] = f"{info['twin']}{_beside(found, info.get('twin_evaluation'))}"
+    rows["licence"] = info["licence"]
+    table = "".join(f"| {name} | {told} |\n" for name, told in rows.items() if told)
+    return (
+        f"# {config.model}.{config.objective}\n\n{known.description}, trained with brainbench: {config.objective}.\n\n"
+        f"| | |\n|---|---|\n{table}\n"
+        "Trained on simulated touch alone; what it says about brains is what `brainbench score` measures.\n"
+    )
 
 
 def _beside(found: Mapping[str, Any] | None, twin: Mapping[str, Any] | None) -> str:

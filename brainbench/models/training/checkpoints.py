@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from brainbench.core.errors import DataError, DataFileNotFoundError, UsageError, missing_dependency, unknown_name
+from brainbench.core.errors import DataError, DataFileNotFoundError, UsageError, check_name, missing_dependency
 
 if TYPE_CHECKING:
     import torch
@@ -35,10 +35,10 @@ def save_checkpoint(
     card: str = "",
     dtype: str = "float32",
 ) -> Path:
-    """Write a model's folder; each file appears whole or not at all, the weights first.
+    """Write a model's folder; each file appears whole or not at all, the weights first, and replaces an earlier one.
 
     Args:
-        folder: Folder to write; files of an earlier checkpoint in it are replaced.
+        folder: Folder to write.
         model: The model.
         architecture: Registry name without a tag.
         options: Keyword arguments that the architecture was built with.
@@ -55,8 +55,7 @@ def save_checkpoint(
 
     from brainbench.core.files import atomic_path, write_json, write_text
 
-    if dtype not in DTYPES:
-        raise unknown_name("precision of weights", dtype, DTYPES)
+    check_name("precision of weights", dtype, DTYPES)
     kind = getattr(torch, dtype)
     parameters = {name for name, _ in model.named_parameters()}
     state = {}
@@ -70,16 +69,8 @@ def save_checkpoint(
         save_file(state, temporary, metadata={"format": "pt"})
     if card:
         write_text(folder / CARD, card)
-    write_json(
-        folder / CONFIG,
-        {
-            **(info or {}),
-            "brainbench_model": FORMAT,
-            "architecture": architecture,
-            "options": dict(options),
-            "dtype": dtype,
-        },
-    )
+    stated = {"brainbench_model": FORMAT, "architecture": architecture, "options": dict(options), "dtype": dtype}
+    write_json(folder / CONFIG, {**(info or {}), **stated})
     return folder
 
 
@@ -90,7 +81,7 @@ def read_config(folder: str | os.PathLike[str]) -> dict[str, Any]:
         DataFileNotFoundError: there is no such folder, or no configuration in it.
         DataError: the configuration is of another kind.
     """
-    from brainbench.core.files import read_json
+    from brainbench.core.files import read_mapping
 
     path = Path(folder) / CONFIG
     if not path.is_file():
@@ -98,9 +89,8 @@ def read_config(folder: str | os.PathLike[str]) -> dict[str, Any]:
             f"There is no {CONFIG} in {os.fspath(folder)!r}; a model's folder has {CONFIG} and {WEIGHTS}, as "
             "brainbench train writes them."
         )
-    config = read_json(path)
-    if not isinstance(config, dict) or config.get("brainbench_model") != FORMAT:
-        found = config.get("brainbench_model") if isinstance(config, dict) else type(config).__name__
+    config = read_mapping(path)
+    if (found := config.get("brainbench_model")) != FORMAT:
         raise DataError(
             f"{os.fspath(path)!r} is not the configuration of a brainbench model (format {found!r}, expected {FORMAT})."
         )

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields, replace
 from typing import Any
 
-from brainbench.core.errors import UsageError, unknown_name
+from brainbench.core.errors import UsageError, check_name, unknown_name
 from brainbench.models.architecture import OBJECTIVES
 from brainbench.models.recipes import BATCH_SIZE, EPOCHS, recipe_for
 from brainbench.models.training.checkpoints import DTYPES
@@ -76,8 +76,7 @@ class TrainingConfig:
             ("precision of weights", self.weights_dtype, ("auto", *DTYPES)),
             ("augmentation", self.augmentation, AUGMENTATIONS),
         ):
-            if value not in allowed:
-                raise unknown_name(kind, value, allowed)
+            check_name(kind, value, allowed)
         for name, smallest in (("epochs", 1), ("batch_size", 2), ("probe_epochs", 0), ("warmup_epochs", 0)):
             if getattr(self, name) < smallest:
                 raise UsageError(f"{name} must be at least {smallest}; received {getattr(self, name)!r}.")
@@ -115,8 +114,7 @@ class TrainingConfig:
         """
         known = {field.name: str(field.type) for field in fields(cls)}
         for name, value in values.items():
-            if name not in known:
-                raise unknown_name("training option", name, known)
+            check_name("training option", name, known)
             kinds = {"str": str, "int": int, "float": (int, float)}[known[name]]
             if not isinstance(value, kinds) or isinstance(value, bool):
                 raise UsageError(f"The training option {name!r} is a {known[name]}; received {value!r}.")
@@ -141,9 +139,7 @@ class TrainingConfig:
 def config_warnings(config: TrainingConfig, model: Any) -> list[str]:
     """Return reasons why a run may teach nothing, each a sentence and what to do instead.
 
-    Args:
-        config: The run.
-        model: Its network, whose ``spec.receptive_field`` is read if there is one.
+    Of its network ``spec.receptive_field`` is read, if there is one.
     """
     found: list[str] = []
     if config.objective not in CONTRASTIVE:

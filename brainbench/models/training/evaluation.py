@@ -89,7 +89,7 @@ def evaluate(model: nn.Module, batches: Iterable[tuple[Any, Any]], *, device: An
     decoder: Any = getattr(model, "decoder", None)
     digest, seen, first, five = hashlib.sha256(), 0, 0, 0
     predictions, labelled = set(), set()
-    moments: list[torch.Tensor] = []
+    moments: torch.Tensor | None = None
     with evaluating(model), torch.no_grad():
         for x, labels in batches:
             digest.update(x.contiguous().cpu().numpy().tobytes() + labels.cpu().long().numpy().tobytes())
@@ -112,13 +112,13 @@ def evaluate(model: nn.Module, batches: Iterable[tuple[Any, Any]], *, device: An
             if features is not None:
                 unit = functional.normalize(features[:, -1].double(), dim=1)
                 sums = torch.stack((unit.sum(0), unit.square().sum(0)))
-                moments = [sums if not moments else moments[0] + sums]
+                moments = sums if moments is None else moments + sums
     if not seen:
         raise DataError("There is nothing to evaluate on: the data set gave no batch.")
     spread = math.nan
-    if moments:
+    if moments is not None:
         # A coordinate of a random unit vector in F dimensions has standard deviation 1/√F, so × √F makes it 1.
-        mean, square = moments[0] / seen
+        mean, square = moments / seen
         spread = float((square - mean.square()).clamp_min(0).sqrt().mean() * math.sqrt(len(mean)))
     reason = collapse(len(predictions), len(labelled), spread)
     return Evaluation(
@@ -145,13 +145,8 @@ def fit_probe(
 ) -> nn.Linear:
     """Fit a linear layer [F] → [classes] to the last step's features and put it in place as ``model.decoder``.
 
-    Args:
-        model: A network with ``encode`` and ``features``; its weights stay as they are.
-        batches: One pass over labelled training sweeps.
-        classes: Number of classes.
-        epochs: Passes over the features.
-        seed: Of the layer's first weights and of the order.
-        device: Where the network is.
+    The network, on ``device``, has ``encode`` and ``features``; its weights stay as they are. ``batches`` are one pass
+    over labelled training sweeps, ``epochs`` passes over their features.
 
     Raises:
         DataError: there are no batches, or the features are not finite.

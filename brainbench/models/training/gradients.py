@@ -6,7 +6,7 @@ takes longest; a recorded step is launched by one call and reads its inputs from
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any
 
 import torch
@@ -60,29 +60,27 @@ def copy_state(module: nn.Module, state: dict[str, torch.Tensor]) -> None:
 
 
 class Gradients:
-    """The loss of a batch, its clipped gradients in the parameters, and their norm.
+    """The loss of a batch, its clipped gradients in the parameters of a module, and their norm.
 
     Args:
-        forward: Maps (views, labels) to the loss.
-        parameters: What is trained.
+        module: What is trained; what a pass does to its buffers is undone after the runs that precede a recording.
+        forward: The module as it is computed, compiled or wrapped: maps (views, labels) to the loss.
         clip: Largest norm; 0 leaves it alone.
         autocast: Makes the context of the forward pass.
         record: Record the pass for the shape that comes first, and replay it whenever that shape comes again.
-        module: Whose buffers a pass changes, put back after the runs that precede a recording.
     """
 
     def __init__(
         self,
+        module: nn.Module,
         forward: Callable[..., Any],
-        parameters: Sequence[nn.Parameter],
         *,
         clip: float,
         autocast: Callable[[], Any],
         record: bool = False,
-        module: nn.Module | None = None,
     ) -> None:
-        self.forward, self.parameters, self.clip, self.autocast = forward, tuple(parameters), clip, autocast
-        self.record, self.module = record, module
+        self.module, self.forward, self.clip, self.autocast, self.record = module, forward, clip, autocast, record
+        self.parameters = [parameter for parameter in module.parameters() if parameter.requires_grad]
         self._inputs: tuple[torch.Tensor, ...] = ()
         self._kept: list[torch.Tensor | None] = []
         self._found = (torch.empty(()), torch.empty(()))
@@ -118,7 +116,7 @@ class Gradients:
         device = given[0].device
         self._inputs = tuple(item.clone() for item in given)
         # The runs before a recording draw random numbers and move averages of batch norm; both are put back after it.
-        buffers = {name: value.clone() for name, value in self.module.named_buffers()} if self.module else {}
+        buffers = {name: value.clone() for name, value in self.module.named_buffers()}
         random = torch.cuda.get_rng_state(device) if device.type == "cuda" else torch.get_rng_state()
 
         def work() -> None:
@@ -130,5 +128,4 @@ class Gradients:
             torch.cuda.set_rng_state(random, device)
         else:
             torch.set_rng_state(random)
-        if self.module is not None:
-            copy_state(self.module, buffers)
+        copy_state(self.module, buffers)

@@ -12,7 +12,7 @@ import torch
 from torch import nn
 from torch.nn import functional
 
-from brainbench.core.errors import UsageError, unknown_name
+from brainbench.core.errors import UsageError, check_name
 from brainbench.models.heads.self_supervised import AutoencoderHead, SimCLRHead, SimSiamHead
 
 TEMPERATURE = 0.1
@@ -163,8 +163,7 @@ def make_learner(objective: str, model: nn.Module) -> Learner:
     Raises:
         UsageError: there is no such objective, or the network does not offer what it needs.
     """
-    if objective not in LEARNERS:
-        raise unknown_name("objective", objective, LEARNERS)
+    check_name("objective", objective, LEARNERS)
     return LEARNERS[objective](model)
 
 

@@ -10,7 +10,7 @@ import torch
 from torch import nn
 from torch.optim import Optimizer
 
-from brainbench.core.errors import UsageError, unknown_name
+from brainbench.core.errors import UsageError, check_name
 
 MOMENTUM = 0.9
 WEIGHT_DECAY = 1e-4
@@ -22,15 +22,9 @@ WARMUP_RATIO = 1e-4
 class LARS(Optimizer):
     """SGD with momentum whose step in every tensor is scaled to that tensor's norm (You, Gitman & Ginsburg 2017).
 
-    trust = η ‖w‖ / (‖g + λ w‖), v ← m v + trust (g + λ w), w ← w − lr v. Biases and norm parameters (tensors of
-    fewer than two axes) are excluded: they take plain momentum steps without decay, as in SimCLR.
-
-    Args:
-        parameters: As for any optimiser.
-        lr: Learning rate.
-        momentum: m.
-        weight_decay: λ.
-        trust: η.
+    trust = η ‖w‖ / (‖g + λ w‖), v ← m v + trust (g + λ w), w ← w − lr v, with momentum m, weight decay λ and ``trust``
+    η. Biases and norm parameters (tensors of fewer than two axes) are excluded: they take plain momentum steps without
+    decay, as in SimCLR.
 
     Raises:
         UsageError: a number is negative.
@@ -96,32 +90,26 @@ def make_optimizer(name: str, parameters: Iterable[nn.Parameter], learning_rate:
     Raises:
         UsageError: there is no such optimiser, or the rate is not a positive number.
     """
-    if name not in OPTIMIZERS:
-        raise unknown_name("optimizer", name, OPTIMIZERS)
+    check_name("optimizer", name, OPTIMIZERS)
     if not (math.isfinite(learning_rate) and learning_rate > 0):
         raise UsageError(f"A learning rate must be a positive number; received {learning_rate!r}.")
     return OPTIMIZERS[name]([p for p in parameters if p.requires_grad], learning_rate)
 
 
 def rate_factor(schedule: str, epoch: float, *, epochs: int, warmup_epochs: int = 0) -> float:
-    """Return the learning rate at a point in training, relative to the initial one.
+    """Return the learning rate after so many epochs of all, relative to the initial one.
 
-    Args:
-        schedule: One of :data:`SCHEDULES`.
-        epoch: Epochs done; fractions count for ``cosine``.
-        epochs: Epochs in all.
-        warmup_epochs: Epochs of linear rise from 1e-4, for ``cosine``.
+    For ``cosine`` fractions of an epoch count, and ``warmup_epochs`` of linear rise from 1e-4.
 
     Raises:
         UsageError: there is no such schedule.
     """
+    check_name("schedule", schedule, SCHEDULES)
     if schedule == "constant":
         return 1.0
     if schedule == "step":
         # StepLR (thesis, table 3.2): a tenth every 30 epochs, constant within them.
         return STEP_FACTOR ** (int(epoch) // STEP_EPOCHS)
-    if schedule != "cosine":
-        raise unknown_name("schedule", schedule, SCHEDULES)
     # A run shorter than the published one keeps the share of its warm-up below half.
     warmup = min(warmup_epochs, epochs / 2)
     # Linear rise from the warm-up ratio of table 3.2: steps stay small while gradients are still large.

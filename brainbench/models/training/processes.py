@@ -74,10 +74,7 @@ class Processes:
 
 @contextmanager
 def processes(device: str | None = None) -> Iterator[Processes]:
-    """Join the processes that torchrun started, or be the only one.
-
-    Args:
-        device: ``cpu``, ``cuda`` or ``cuda:N``; None takes CUDA when there is one.
+    """Join the processes that torchrun started, or be the only one; without a device's name CUDA when there is one.
 
     Raises:
         UsageError: the device does not exist.

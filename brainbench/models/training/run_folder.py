@@ -27,12 +27,9 @@ RUN, STATE, LOG, BEST, FAILED = "run.json", "state.safetensors", "log.jsonl", "b
 
 
 def claim(folder: Path, identity: Mapping[str, Any], *, write: bool) -> None:
-    """Enter a run into its folder, or find it there.
+    """Enter a run into its folder, or find it there: a run is resumed if its identity is equal.
 
-    Args:
-        folder: The run's folder.
-        identity: What must be equal for a run to be resumed.
-        write: Enter it if the folder holds none; other processes only look.
+    Where ``write`` is off, as in all processes but one, a folder without a run stays so.
 
     Raises:
         UsageError: the folder holds another run.
@@ -73,12 +70,9 @@ def save_state(path: Path, learner: nn.Module, optimizer: torch.optim.Optimizer,
     if torch.cuda.is_available():
         tensors["random.cuda"] = torch.cuda.get_rng_state()
     header = {"groups": packed["param_groups"], "scalars": scalars, "plain": dict(plain)}
+    stored = {name: value.detach().cpu().contiguous().clone() for name, value in tensors.items()}
     with atomic_path(path) as temporary:
-        save_file(
-            {name: value.detach().cpu().contiguous().clone() for name, value in tensors.items()},
-            temporary,
-            metadata={"state": json.dumps(header)},
-        )
+        save_file(stored, temporary, metadata={"state": json.dumps(header)})
 
 
 def load_state(path: Path, learner: nn.Module, optimizer: torch.optim.Optimizer) -> dict[str, Any]:
@@ -97,16 +91,19 @@ def load_state(path: Path, learner: nn.Module, optimizer: torch.optim.Optimizer)
         raise DataError(
             f"{str(path)!r} is not a readable training state ({error}); delete it to start anew."
         ) from error
-    weights = {name.removeprefix("learner."): value for name, value in tensors.items() if name.startswith("learner.")}
+    weights: dict[str, torch.Tensor] = {}
+    entries: dict[int, dict[str, Any]] = {int(key): dict(value) for key, value in header["scalars"].items()}
+    for name, value in tensors.items():
+        owner, _, rest = name.partition(".")
+        if owner == "learner":
+            weights[rest] = value
+        elif owner == "optimizer":
+            index, _, key = rest.partition(".")
+            entries.setdefault(int(index), {})[key] = value
     try:
         learner.load_state_dict(weights)
     except RuntimeError as error:
         raise DataError(f"{str(path)!r} belongs to another network: {error}") from error
-    entries: dict[int, dict[str, Any]] = {int(key): dict(value) for key, value in header["scalars"].items()}
-    for name, value in tensors.items():
-        if name.startswith("optimizer."):
-            _, index, key = name.split(".", 2)
-            entries.setdefault(int(index), {})[key] = value
     optimizer.load_state_dict({"state": entries, "param_groups": header["groups"]})
     torch.set_rng_state(tensors["random.cpu"])
     if torch.cuda.is_available() and "random.cuda" in tensors:
@@ -115,12 +112,9 @@ def load_state(path: Path, learner: nn.Module, optimizer: torch.optim.Optimizer)
 
 
 class RunLog:
-    """Appends to ``log.jsonl`` and to TensorBoard's folder.
+    """Appends to ``log.jsonl`` and to TensorBoard's folder, in the first process of a run alone (``active``).
 
-    Args:
-        folder: The run's folder.
-        step: Optimiser steps done; lines of later steps, written before an interruption, are dropped.
-        active: Only the first process of a run writes.
+    Lines of steps later than ``step``, written before an interruption, are dropped.
     """
 
     def __init__(self, folder: Path, *, step: int, active: bool = True) -> None:

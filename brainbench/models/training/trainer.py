@@ -147,12 +147,11 @@ class _Run:
         self.model: nn.Module = self.learner.model
         self.optimizer = make_optimizer(config.optimizer, self.learner.parameters(), config.learning_rate)
         self.gradients = Gradients(
+            self.learner,
             compiled(where.wrap(self.learner), config.compile),
-            [parameter for parameter in self.learner.parameters() if parameter.requires_grad],
             clip=config.clip,
             autocast=self._precision,
             record=config.compile == "graphs" and where.count == 1,
-            module=self.learner,
         )
         self.augmentation = Augmentation(config.augmentation, config.masking)
         batches = self._batches("train", shuffle=True)
@@ -268,12 +267,20 @@ class _Run:
             done = read_json(self.out / RUN).get("evaluation")
             if done is not None:
                 return self._result("finished", "", Evaluation.from_plain(done))
-            self._load_best()
+            # The best weights as they were published, so that what is evaluated is what is shipped.
+            if not (self.out / BEST / WEIGHTS).is_file():
+                self._publish(None)
+            load_weights(self.model, self.out / BEST / WEIGHTS, what=self.config.model)
             if self.config.objective != "supervised" and self.config.probe_epochs:
                 self.progress(self._steps, self._steps, "fitting the linear probe")
-                sweeps, epochs = self._batches("train", shuffle=False, part=False) or (), self.config.probe_epochs
-                how = {"classes": len(self.data.classes), "epochs": epochs, "seed": self.config.seed}
-                fit_probe(self.model, sweeps, **how, device=self.where.device)
+                fit_probe(
+                    self.model,
+                    self._batches("train", shuffle=False, part=False) or (),
+                    classes=len(self.data.classes),
+                    epochs=self.config.probe_epochs,
+                    seed=self.config.seed,
+                    device=self.where.device,
+                )
             for split in ("test", "validation", "train"):
                 batches = self._batches(split, shuffle=False, part=False)
                 if batches is not None:
@@ -288,17 +295,24 @@ class _Run:
         self.where.wait()
         return self._result("finished", "", result)
 
-    def _load_best(self) -> None:
-        """Go back to the best weights as they were published, so that what is evaluated is what is shipped."""
-        if not (self.out / BEST / WEIGHTS).is_file():
-            self._publish(None)
-        load_weights(self.model, self.out / BEST / WEIGHTS, what=self.config.model)
-
     def _publish(self, result: Evaluation | None) -> None:
-        done = {"epochs_done": self.at.epoch, "best_epoch": self.at.best_epoch, "drawn_biases": self.drawn}
-        info = checkpoint_info(self.config, self.data.classes, evaluation=result, **done)
-        told = {"info": info, "card": model_card(self.config, info), "dtype": self.config.stored_dtype}
-        save_checkpoint(self.out / BEST, self.model, architecture=self.config.model, options=self.options, **told)
+        info = checkpoint_info(
+            self.config,
+            self.data.classes,
+            epochs_done=self.at.epoch,
+            best_epoch=self.at.best_epoch,
+            evaluation=result,
+            drawn_biases=self.drawn,
+        )
+        save_checkpoint(
+            self.out / BEST,
+            self.model,
+            architecture=self.config.model,
+            options=self.options,
+            info=info,
+            card=model_card(self.config, info),
+            dtype=self.config.stored_dtype,
+        )
 
     def _save(self) -> None:
         self.saved = time.monotonic()
@@ -333,10 +347,9 @@ class _Run:
         return reason
 
     def _result(self, status: Any, reason: str, evaluation: Evaluation | None = None) -> TrainingResult:
-        where = (self.at.step, self.at.epoch, self.at.best_epoch)
-        return TrainingResult(
-            status, reason, self.out / BEST, *where, evaluation, round(time.monotonic() - self.started, 3)
-        )
+        seconds = round(time.monotonic() - self.started, 3)
+        at = self.at
+        return TrainingResult(status, reason, self.out / BEST, at.step, at.epoch, at.best_epoch, evaluation, seconds)
 
     def _batches(self, split: str, *, shuffle: bool, part: bool = True) -> Batches | None:
         mine = self.where.part if part else (0, 1)

@@ -9,7 +9,7 @@ import torch
 from torch.nn import functional
 
 from brainbench.core.errors import DataError, UsageError
-from brainbench.models.encoders.zhuang import ZhuangEncoder
+from brainbench.models.encoders.zhuang import zhuang_graph
 from brainbench.models.graph.spec import Convolution, Dense, Edge, GraphSpec, Memory, Node, Pool
 from brainbench.models.graph.temporal_graph import TemporalGraph
 
@@ -92,7 +92,7 @@ def test_parameters_that_do_not_fit_are_named_and_change_nothing(published):
 
 
 def _small(cell="ugrnn", **options):
-    return TemporalGraph(ZhuangEncoder(cell, small=True, **options).spec()).eval()
+    return TemporalGraph(zhuang_graph(cell, small=True, **options)).eval()
 
 
 @pytest.mark.parametrize(
@@ -238,7 +238,7 @@ def test_the_last_answer_alone_equals_the_last_of_all(cell, unroll, steps):
         torch.testing.assert_close(graph(x, unroll=unroll, last=True), every[:, -1], atol=1e-5, rtol=1e-4)
 
 
-@pytest.mark.parametrize("spec", [ZhuangEncoder("lstm", True, True).spec(), _uneven()], ids=["zhuang", "uneven"])
+@pytest.mark.parametrize("spec", [zhuang_graph("lstm", True, True), _uneven()], ids=["zhuang", "uneven"])
 @pytest.mark.parametrize("last", [False, True])
 def test_gradients_are_those_of_streaming_step_by_step(spec, last):
     graph = TemporalGraph(spec).double()
@@ -259,7 +259,7 @@ def test_gradients_are_those_of_streaming_step_by_step(spec, last):
 
 
 def test_a_node_that_draws_random_numbers_draws_them_for_every_stimulus():
-    spec = ZhuangEncoder("ugrnn", small=True).spec()
+    spec = zhuang_graph("ugrnn", small=True)
     nodes = tuple(
         dataclasses.replace(node, operation=dataclasses.replace(node.operation, dropout=0.5)) for node in spec.nodes
     )

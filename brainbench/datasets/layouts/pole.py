@@ -1,17 +1,23 @@
-"""Layout of Hires 2015 (DANDI 000013): single layer 4 neurons while a mouse finds a pole with a whisker.
+"""Layouts of two data sets in which a mouse finds a pole with its whiskers.
 
-One cell per file, and no units table: spikes are a 0/1 signal ``acquisition/SpikeTrain`` with time
-stamps, touches likewise under ``acquisition/behavior``. They become a unit and a contact table here.
+Hires 2015 (DANDI 000013): single layer 4 neurons, one whisker. One cell per file, and no units table: spikes are a 0/1
+signal ``acquisition/SpikeTrain`` with time stamps, touches likewise under ``acquisition/behavior``. They become a unit
+and a contact table here.
+
+Yu 2016 (DANDI 000005): thalamus and layer 4, a few whiskers. Extracellular files have a units table. Touches are 0/1
+signals, one container per whisker under ``acquisition``: ``principal_whisker_c2``, ``whisker_c1``. They become contact
+tables here.
 """
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from brainbench.datasets.layouts.layout import RecordingLayout
+from brainbench.datasets.layouts.registry import RecordingLayout
 from brainbench.datasets.sessions import OBSERVED, SPIKES, Series, Session, SessionTable, ragged
 from brainbench.datasets.trials.conditions import Conditions
 from brainbench.datasets.trials.selection import Rule, Selection
@@ -19,6 +25,7 @@ from brainbench.datasets.trials.windows import Window
 
 TRAIN = "acquisition/SpikeTrain"
 ONSET, OFFSET = "touch_onset", "touch_offset"
+_WHISKER = re.compile(rf"^(?P<prefix>acquisition/(?:principal_)?whisker_(?P<name>\w+)/){ONSET}$")
 WHISKER = "C2"
 """The files do not name the whisker; the paper recorded around the C2 column with one whisker left."""
 
@@ -29,7 +36,7 @@ SELECTION = (
 """Photostimulated trials are not the neuron's own answer to touch."""
 
 
-def adapt(session: Session) -> Session:
+def adapt_hires(session: Session) -> Session:
     """Turn the spike train into a unit and the touches into ``contacts_by_whisker_C2``."""
     made = session
     if session.units is None and TRAIN in session.series:
@@ -37,6 +44,14 @@ def adapt(session: Session) -> Session:
         note = f"{session.source}: the unit was made from the 0/1 signal {TRAIN}"
         made = replace(made, notes=(*made.notes, note))
     return with_contacts(made, "acquisition/behavior/", WHISKER)
+
+
+def adapt_yu(session: Session) -> Session:
+    """Add ``contacts_by_whisker_*`` for every whisker whose touches are stored."""
+    for path in session.series:
+        if match := _WHISKER.match(path):
+            session = with_contacts(session, match["prefix"], match["name"].capitalize())
+    return session
 
 
 def with_contacts(session: Session, prefix: str, whisker: str) -> Session:
@@ -75,7 +90,10 @@ def recorded_runs(stamps: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.stack([stamps[np.append(0, breaks + 1)], stamps[np.append(breaks, len(stamps) - 1)] + step], axis=1)
 
 
-LAYOUT = RecordingLayout(
+_POLE = ("type", "response", "stim_present", "pole_position", "pole_in_time", "pole_out_time")
+_TYPES = "conditions: Go and Nogo are the two ranges of pole positions; trials:pole_position labels single positions"
+
+HIRES = RecordingLayout(
     name="hires",
     title="pole localisation with one whisker, single neurons of layer 4 (DANDI 000013)",
     citation="Hires S. A., Gutnisky D. A. et al., eLife 4:e06619 (2015), doi:10.7554/eLife.06619",
@@ -83,12 +101,29 @@ LAYOUT = RecordingLayout(
     orders={},
     selection=Selection(name="hires", trials=SELECTION),
     window=Window("pole_in_time", stop="pole_out_time"),
-    columns=("type", "response", "stim_present", "pole_position", "pole_in_time", "pole_out_time"),
-    adapt=adapt,
+    columns=_POLE,
+    adapt=adapt_hires,
     dandiset="000013",
     remarks=(
         "units: one per file, from the 0/1 signal acquisition/SpikeTrain",
         "contacts: from the 0/1 signals touch_onset and touch_offset of acquisition/behavior",
-        "conditions: Go and Nogo are the two ranges of pole positions; trials:pole_position labels single positions",
+        _TYPES,
+    ),
+)
+YU = replace(
+    HIRES,
+    name="yu",
+    title="pole localisation with a few whiskers, units of thalamus (VPM) and layer 4 (DANDI 000005)",
+    citation="Yu J., Gutnisky D. A. et al., Nature Neuroscience 19:1647 (2016), doi:10.1038/nn.4412",
+    orders={"type": ("Go", "Nogo")},
+    selection=Selection(name="yu", trials=SELECTION),
+    columns=(*_POLE, "first_touch_time", "photo_stim_mode"),
+    adapt=adapt_yu,
+    touch="first_touch_time",
+    dandiset="000005",
+    remarks=(
+        "contacts: from the 0/1 signals touch_onset and touch_offset of every whisker; files of whole-cell recordings "
+        "have no units and are refused",
+        _TYPES,
     ),
 )
