@@ -12,7 +12,7 @@ import argparse
 import math
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -411,9 +411,9 @@ def faults(simulations: int) -> Result:
     from brainbench.datasets.synthetic import PopulationDesign, ResponseGeometry, simulate
 
     rows = []
-    quiet = {"rate": 8.0, "window": 1.0, "modulation": 0.3, "emphasis": 0.0, "dispersion": 0.0, "shared_gain": 0.0}
     for trials in ((20, 20), (8, 32)):
-        design = PopulationDesign(animals=11, sessions=3, units=20, trials=trials, **quiet)
+        size = PopulationDesign(animals=11, sessions=3, units=20, trials=trials, rate=8.0, window=1.0, modulation=0.3)
+        design = replace(size, emphasis=0.0, dispersion=0.0, shared_gain=0.0)
         for given in ((), ("zero-fill",), ("first-appearance",), ("first-appearance", "zero-fill")):
             values, reliable = [], []
             for study in range(simulations):
