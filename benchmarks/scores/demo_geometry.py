@@ -23,7 +23,7 @@ from brainbench.datasets.trials.session_trials import trials_by_subject
 from brainbench.metrics import rdm
 from brainbench.metrics.measures.rsa import score_animals
 from brainbench.metrics.reliability.subject_rdm import subject_rdm
-from brainbench.stimuli import load_stimuli
+from brainbench.stimuli import get_recipe, load_stimuli, simulate
 
 UNITS = np.array([1e-4] * 3 + [1e-6] * 3)
 """Newton and newton metre that count alike in the raw input."""
@@ -60,7 +60,7 @@ def main() -> None:
     if parser.parse_args().engines:
         compare_engines()
         return
-    stimuli = load_stimuli("rodgers").dataset
+    stimuli = simulate(get_recipe("rodgers").scenes)
     folder = ensure_rodgers_demo(stimuli)
     truth = read_truth(folder)
     order = [list(map(str, stimuli["stimulus"].values)).index(label) for label in truth["labels"]]

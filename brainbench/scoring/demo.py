@@ -32,11 +32,11 @@ def demo_recordings(name: str = "demo", *, progress: Progress | None = None) -> 
     from brainbench.datasets.synthetic.cache import ensure_recordings
     from brainbench.datasets.synthetic.rodgers_demo import ensure_rodgers_demo
     from brainbench.models.registry import locate_model
-    from brainbench.stimuli import load_stimuli
+    from brainbench.stimuli import get_recipe, load_stimuli, simulate
 
-    stimuli = load_stimuli(DEMOS[name], progress=progress)
     if name == "demo-rodgers":
-        return ensure_rodgers_demo(stimuli.dataset, progress=progress)
+        return ensure_rodgers_demo(simulate(get_recipe(DEMOS[name]).scenes, progress=progress), progress=progress)
+    stimuli = load_stimuli(DEMOS[name], progress=progress)
     weights = locate_model(HIDDEN_NETWORK).weights
     told = {"stimuli_hash": stimuli.content_hash, "weights": file_hash(weights) if weights else None}
 

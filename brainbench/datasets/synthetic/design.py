@@ -33,7 +33,7 @@ class PopulationDesign:
     """Standard deviation over animals of the logarithm of the weight of each axis of the geometry."""
     spread: float = 0.4
     """Standard deviation of the logarithm of mean rates over units."""
-    dispersion: float = 0.3
+    dispersion: float = 0.2
     """φ of the negative binomial: variance = mean + φ mean² per unit and trial; 0 is Poisson."""
     shared_gain: float = 0.2
     """Standard deviation of a gain (mean one) that all units of a trial share."""

@@ -8,7 +8,7 @@ near to the raw input tell no network apart from it; what the files are for is t
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -125,34 +125,13 @@ def make_rodgers_demo(
 
 
 def ensure_rodgers_demo(
-    stimuli: xr.Dataset | Callable[[], xr.Dataset],
-    *,
-    key: str | None = None,
-    seed: int = 0,
-    animals: int = 4,
-    progress: Progress | None = None,
+    stimuli: xr.Dataset, *, seed: int = 0, animals: int = 4, progress: Progress | None = None
 ) -> Path:
-    """Return the folder of the recordings, making them if this machine has none.
-
-    Args:
-        stimuli: the stimulus set, or a function that makes it and is called only if needed.
-        key: name of the stimuli (such as a hash of what they were made from), needed with a function.
-        seed: as in :func:`make_rodgers_demo`.
-        animals: as in :func:`make_rodgers_demo`.
-        progress: as in :func:`make_rodgers_demo`.
-
-    Raises:
-        UsageError: a function without a ``key``.
-        DataError: as in :func:`make_rodgers_demo`.
-    """
-    if key is None:
-        if callable(stimuli):
-            raise UsageError("ensure_rodgers_demo needs a key beside a function that makes the stimuli; pass key='…'.")
-        key = str(check_stimulus_set(stimuli).attrs["content_hash"])
+    """Return the folder of the recordings, making them if this machine has none; see :func:`make_rodgers_demo`."""
+    key = str(check_stimulus_set(stimuli).attrs["content_hash"])
 
     def make(folder: Path) -> None:
-        made = stimuli() if callable(stimuli) else stimuli
-        make_rodgers_demo(folder, made, seed=seed, animals=animals, progress=progress)
+        make_rodgers_demo(folder, stimuli, seed=seed, animals=animals, progress=progress)
 
     return ensure_recordings("demo-rodgers", key, seed, animals, VERSION, make=make)
 

@@ -60,12 +60,17 @@ class Solid:
 
     def config(self) -> dict[str, Any]:
         """Return plain values that determine the physics; parts count by a hash of numbers or origin."""
-        parts = [{"kind": type(part).__name__, **to_plain(part)} for part in self.parts]
-        summary = {"name": self.name, "parts": len(parts), "diagonal": self.diagonal, "notes": list(self.notes)}
+        stated = {"name": self.name, "parts": len(self.parts), "diagonal": self.diagonal, "notes": list(self.notes)}
+        return {**stated, "hash": self._hash}
+
+    @cached_property
+    def _hash(self) -> str:
+        """Hash of the parts; kept, because every whisker's job asks for it and a hull has a thousand corners."""
         if self.origin is not None:
-            return {**summary, "hash": content_hash(self.origin, round(self.diagonal, 12))}
+            return content_hash(self.origin, round(self.diagonal, 12))
+        parts = [{"kind": type(part).__name__, **to_plain(part)} for part in self.parts]
         told = () if self.surface is None or _through_corners(self.surface, self.parts) else (self.surface,)
-        return {**summary, "hash": content_hash(parts, *map(to_plain, told))}
+        return content_hash(parts, *map(to_plain, told))
 
 
 def to_surface(mesh: Mesh) -> TriangleMesh:

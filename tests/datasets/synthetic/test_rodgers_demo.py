@@ -183,5 +183,11 @@ def test_unsuitable_stimuli_are_refused(monkeypatch, tmp_path):
     with pytest.raises(UsageError, match="at least one animal"):
         make_rodgers_demo("unused", stimuli, animals=0)
     assert list(tmp_path.iterdir()) == []
-    with pytest.raises(UsageError, match="needs a key"):
-        ensure_rodgers_demo(make_stimuli)
+
+
+def test_the_cache_keeps_them_by_their_stimuli(monkeypatch, tmp_path):
+    monkeypatch.setenv("BRAINBENCH_CACHE", str(tmp_path))
+    made = ensure_rodgers_demo(make_stimuli(), animals=1)
+    assert ensure_rodgers_demo(make_stimuli(), animals=1) == made
+    assert ensure_rodgers_demo(make_stimuli().assign_attrs(content_hash="other"), animals=1) != made
+    assert open_recordings(made).attrs["stimuli"] == "rodgers"
