@@ -22,7 +22,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from brainbench.core.errors import UsageError
 from brainbench.core.records import Interval
-from brainbench.core.statistics import FEWEST_ANIMALS, FEWEST_STIMULI, LEVEL, two_factor_error
+from brainbench.core.statistics import FEWEST_ANIMALS, FEWEST_STIMULI
+from brainbench.metrics.inference.intervals import two_factor_interval
 from brainbench.metrics.inference.permutation import tail_p
 from brainbench.metrics.layers import most_chosen
 from brainbench.metrics.rdms.comparison import check_comparison
@@ -231,17 +232,10 @@ def _largest_p(null: Floats) -> tuple[Floats, float]:
 
 def _intervals(animals: Floats, left_out: Floats) -> list[Interval | None]:
     """Return the interval of the mean of values [T, A] whose means without each stimulus are [T, K]."""
-    return [_interval(float(mean), *item) for mean, *item in zip(_mean(animals), animals, left_out, strict=True)]
-
-
-def _interval(middle: float, animals: Floats, left_out: Floats) -> Interval | None:
-    from scipy.special import stdtrit
-
-    error, freedom = (float(item) for item in two_factor_error(animals, left_out))
-    if not (math.isfinite(middle) and math.isfinite(error)):
-        return None
-    half = float(stdtrit(freedom, (1 + LEVEL) / 2)) * error if error else 0.0
-    return Interval(middle - half, middle + half, LEVEL, "t over animals and stimuli, jackknife")
+    return [
+        two_factor_interval(float(mean), *item) if np.isfinite(mean) else None
+        for mean, *item in zip(_mean(animals), animals, left_out, strict=True)
+    ]
 
 
 def _latencies(
@@ -286,7 +280,7 @@ def _latencies(
                 latency=math.nan if reason else float(best[index]),
                 value=float(np.nanmax(reached[index])) if tried else math.nan,
                 p=float(p[index]) if tried else math.nan,
-                interval=_interval(float(best[index]), pseudo[index], without[index])
+                interval=two_factor_interval(float(best[index]), pseudo[index], without[index])
                 if steady and not reason
                 else None,
                 reason=reason,
