@@ -161,7 +161,7 @@ def score_over_time(
     )
     names, chance = tuple(layers), expected / len(course)
     excess, without = observed[0] - chance, [item[0] - chance for item in left_out]
-    latencies = _latencies(names, joined.lags * width, excess, without, match)
+    latencies = _latencies(names, joined.lags.astype(np.float64) * width, excess, without, match)
     return TimeCourse(
         points=points,
         latencies=latencies,
