@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -162,6 +162,10 @@ def score_over_time(
     names, chance = tuple(layers), expected / len(course)
     excess, without = observed[0] - chance, [item[0] - chance for item in left_out]
     latencies = _latencies(names, joined.lags.astype(np.float64) * width, excess, without, match)
+    if not np.isfinite(factors).any():
+        # What unreliable bins match is noise, or what all bins share, and either has no lag.
+        reason = "no animal is reliable in any bin"
+        latencies = tuple(replace(item, latency=math.nan, interval=None, reason=reason) for item in latencies)
     return TimeCourse(
         points=points,
         latencies=latencies,
