@@ -72,6 +72,7 @@ def score_record(
         The result record; its scores share one brain side.
     """
     from brainbench import metrics
+    from brainbench.metrics.measures.rsa import RSA
     from brainbench.scoring.demo import DEMOS
     from brainbench.scoring.model_responses import resolve_model
     from brainbench.scoring.neural_responses import open_neural_responses
@@ -94,7 +95,7 @@ def score_record(
     if options.explain and metric.name != "rsa-correlation":
         raise UsageError(f"The published estimator is one of RSA; the metric {metric.name!r} has none to explain.")
     if options.over_time:
-        from brainbench.scoring.over_time import check_metric, time_course
+        from brainbench.scoring.over_time import check_metric
 
         check_metric(metric)
     options = replace(options, metric=metric)
@@ -132,7 +133,9 @@ def score_record(
 
         rdms = {layer: metrics.rdm(values) for layer, values in features.items()}
         statistics[0] = {**statistics[0], "estimator_walk": to_plain(explain_score(rdms, animals))}
-    if options.over_time:
+    if options.over_time and isinstance(metric, RSA):
+        from brainbench.scoring.over_time import time_course
+
         course = time_course(brain, network, metric, kept, rows, seed=options.seed, progress=progress)
         statistics[0] = {**statistics[0], "time_course": to_plain(course)}
     first, *others = (
