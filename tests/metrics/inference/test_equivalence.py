@@ -15,7 +15,6 @@ from brainbench.metrics.measures.rsa import score_animals, score_rdms
 from brainbench.metrics.reliability.subject_rdm import subject_rdm
 from tests.factories.animals import make_block, make_latent
 
-
 SAME = np.full(12, 0.0)
 """Left-out stimuli that change nothing."""
 

@@ -207,7 +207,7 @@ def test_what_cannot_be_scored_is_undefined_or_unreliable_in_words():
     noise = [metric.animal(str(i), [block], 6) for i, block in enumerate(silent)]
     unreliable = _score(metric, {"a": latent}, noise)
     assert unreliable.status in ("unreliable", "undefined")
-    with pytest.raises(UsageError, match="'thesis'.*'default'"):
+    with pytest.raises(UsageError, match=r"'thesis'.*'default'"):
         _score(metric, {"a": latent}, animals, estimator="thesis")
     with pytest.raises(UsageError, match="have 5 rows; 6 stimuli"):
         _score(metric, {"a": latent[:5]}, animals)
