@@ -100,7 +100,7 @@ def _text(record: ResultRecord) -> str:
         [
             "value",
             _value(score),
-            f"{score.metric}; chance {_number(score.chance)}, attainable {_number(score.attainable)}",
+            f"{score.metric}; {scale}",
         ],
         [
             "raw r",

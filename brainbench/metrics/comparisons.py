@@ -38,6 +38,10 @@ class LayerComparisons:
         """[L, K] where a layer has a value for a stimulus."""
         return np.stack([self.metric.known(layer) for layer in self.layers])
 
+    def among(self, layers: Sequence[Floats], animals: Sequence[SubjectRDM]) -> LayerComparisons:
+        """Return the comparisons of some layers with some animals."""
+        return LayerComparisons(self.metric, layers, animals, self.device)
+
     def given(self) -> Floats:
         """Return comparisons [L, A] of the stimuli as they are."""
         return next(self.under(lambda: [np.arange(self.known.shape[1])[None]]))[0]

@@ -197,51 +197,35 @@ def _result(
     """Compare, choose layers by the rule and test; also return the layers with a value, and notes."""
     metric, factors = compared.metric, animals.factors(animals.scored)
     given = compared.given()
-    kept = np.isfinite(given).all(axis=1)
-    names = [name for name, keep in zip(names, kept, strict=True) if keep]
+    kept = np.flatnonzero(np.isfinite(given).all(axis=1))
+    names, given = [names[row] for row in kept], given[kept]
     if not names or (committed is not None and committed not in names):
         return None, names, ()
-    layers = [layer for layer, keep in zip(compared.layers, kept, strict=True) if keep]
-    compared = LayerComparisons(metric, layers, compared.animals, compared.device)
-    given = given[kept]
-    rule = layer_rule(
-        names, 1 if metric.of_model_alone else len(factors), committed=committed, estimator=estimator, factors=factors
-    )
-    judged, weights = compared, factors
-    halves = metric.halves(animals.subjects[animals.scored[0]], animals.order) if len(factors) == 1 else None
-    if halves is not None and rule.kind == "maximum" and estimator == "default":
-        if not halves[0]:
-            return None, names, ()
-        rule = HALVES
-        judged = LayerComparisons(metric, layers, halves[0], compared.device)
-        weights = np.full(len(halves[0]), halves[1])
-    r = judged.given() if judged is not compared else given
+    compared = compared.among([compared.layers[row] for row in kept], compared.animals)
+    voters = 1 if metric.of_model_alone else len(factors)
+    rule = layer_rule(names, voters, committed=committed, estimator=estimator, factors=factors)
+    judged, tested, weights = compared, compared, factors
+    if rule.kind == "maximum" and estimator == "default" and len(factors) == 1:
+        halves = metric.halves(animals.subjects[animals.scored[0]], animals.order)
+        if halves is not None:
+            parts, factor = halves
+            if not parts:
+                return None, names, ()
+            # The halves stand for animals; fewer of them serve the permutations.
+            rule, judged = HALVES, compared.among(compared.layers, parts)
+            tested = compared.among(compared.layers, parts[: 2 * _HALVES_IN_PERMUTATIONS])
+            weights = np.full(len(parts), factor)
+    r = given if judged is compared else judged.given()
     chosen = rule.choose(r)
-    held = rule.held(r)
+    held, values = rule.held(r), rule.held(r) * weights
     # The layers of the data serve without a stimulus too: where the choice jumps between layers that are nearly alike,
     # a jackknife that repeats it measures the jumps instead of the stimuli.
     without = take_layers(judged.without_each(), chosen) @ weights / len(weights)
-    if judged is not compared:
-        few = halves[0][: 2 * _HALVES_IN_PERMUTATIONS]
-        judged, weights = LayerComparisons(metric, layers, few, compared.device), weights[: len(few)]
-    test, null = _test(judged, rule, weights, seed)
-    one = rule is HALVES
-    values = np.array([held @ np.full(held.size, halves[1]) / held.size]) if one and halves else held * factors
-    return (
-        _Result(
-            rule,
-            values,
-            np.array([held.mean()]) if one else held,
-            np.array([most_chosen(chosen)]) if one else chosen,
-            given * factors,
-            given,
-            without,
-            test,
-            null,
-        ),
-        names,
-        _partly(compared, names),
-    )
+    test, null = _test(tested, rule, weights[: len(tested.animals)], seed)
+    if rule is HALVES:
+        values, held, chosen = values.mean(keepdims=True), held.mean(keepdims=True), np.array([most_chosen(chosen)])
+    found = _Result(rule, values, held, chosen, given * factors, given, without, test, null)
+    return found, names, _partly(compared, names)
 
 
 def _test(judged: LayerComparisons, rule: LayerRule, weights: Floats, seed: int) -> tuple[PermutationTest, Floats]:

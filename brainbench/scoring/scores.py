@@ -10,7 +10,7 @@ from __future__ import annotations
 import time as clock
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from brainbench.core.errors import UsageError, unknown_name
 from brainbench.core.files import provenance, to_plain
@@ -19,6 +19,9 @@ from brainbench.core.progress import Progress
 from brainbench.core.provenance import Provenance
 from brainbench.core.records import ESTIMATOR_VERSION, ResultRecord, Score
 from brainbench.scoring.options import ScoreOptions
+
+if TYPE_CHECKING:
+    from brainbench.metrics import Metric
 
 
 def score(
@@ -72,6 +75,7 @@ def score_record(
         The result record; its scores share one brain side.
     """
     from brainbench import metrics
+    from brainbench.metrics.measures.rsa import RSA
     from brainbench.scoring.demo import DEMOS
     from brainbench.scoring.model_responses import resolve_model
     from brainbench.scoring.neural_responses import open_neural_responses
@@ -85,18 +89,7 @@ def score_record(
     elif not isinstance(model, Mapping) and options.stimuli is not None:
         prepare_stimuli(options.stimuli, whiskers=options.whiskers, fidelity=options.fidelity, progress=progress)
     # Whatever can be wrong with a name or a file is found before the slow part, the simulation.
-    metric = metrics.get_metric(options.metric)
-    if metric.name == "rsa" and (options.explain or options.estimator != "default"):
-        # The published estimators were those of correlation distances.
-        metric = metrics.get_metric("rsa-correlation")
-    if options.estimator not in metric.estimators:
-        raise unknown_name(f"estimator of the metric {metric.name!r}", options.estimator, metric.estimators)
-    if options.explain and metric.name != "rsa-correlation":
-        raise UsageError(f"The published estimator is one of RSA; the metric {metric.name!r} has none to explain.")
-    if options.over_time:
-        from brainbench.scoring.over_time import check_metric, time_course
-
-        check_metric(metric)
+    metric = _metric(options)
     options = replace(options, metric=metric)
     resolved = resolve_model(model, seed=options.model_seed)
     brain = open_neural_responses(options.recordings, progress=progress, **options.selection)
@@ -132,7 +125,9 @@ def score_record(
 
         rdms = {layer: metrics.rdm(values) for layer, values in features.items()}
         statistics[0] = {**statistics[0], "estimator_walk": to_plain(explain_score(rdms, animals))}
-    if options.over_time:
+    if options.over_time and isinstance(metric, RSA):
+        from brainbench.scoring.over_time import time_course
+
         course = time_course(brain, network, metric, kept, rows, seed=options.seed, progress=progress)
         statistics[0] = {**statistics[0], "time_course": to_plain(course)}
     first, *others = (
@@ -142,3 +137,21 @@ def score_record(
     if between is not None:
         between = replace(between, provenance=replace(origin, statistics=between.provenance.statistics))
     return ResultRecord(first, between, {item.name: item for item in others}, network.card, brain.synthetic)
+
+
+def _metric(options: ScoreOptions) -> Metric:
+    """Return the metric, checked against the other options."""
+    from brainbench.metrics import get_metric
+    from brainbench.scoring.over_time import check_metric
+
+    metric = get_metric(options.metric)
+    if metric.name == "rsa" and (options.explain or options.estimator != "default"):
+        # The published estimators were those of correlation distances.
+        metric = get_metric("rsa-correlation")
+    if options.estimator not in metric.estimators:
+        raise unknown_name(f"estimator of the metric {metric.name!r}", options.estimator, metric.estimators)
+    if options.explain and metric.name != "rsa-correlation":
+        raise UsageError(f"The published estimator is one of RSA; the metric {metric.name!r} has none to explain.")
+    if options.over_time:
+        check_metric(metric)
+    return metric

@@ -83,7 +83,7 @@ class Metric:
 
     def known(self, layer: Floats) -> np.ndarray:
         """Return where [K] a layer has a value."""
-        return np.isfinite(layer).all(axis=1)
+        return np.asarray(np.isfinite(layer).all(axis=1))
 
     def varies(self, layer: Floats) -> bool:
         """Return whether a layer, without the stimuli that it has no value for, tells any stimuli apart."""
@@ -205,7 +205,7 @@ def usable_features(features: ArrayLike) -> Floats:
     A stimulus with a value that is not finite is NaN throughout.
     """
     array = np.asarray(fetch(response_matrix(features, "stimuli")), dtype=np.float64)
-    broken = ~np.isfinite(array).all(axis=1)
+    broken = ~np.asarray(np.isfinite(array).all(axis=1))
     largest = float(np.abs(array[~broken]).max(initial=0.0))
     exponent = int(np.frexp(largest)[1]) if largest > 0 else 0
     if abs(exponent) > _SAFE_EXPONENT:

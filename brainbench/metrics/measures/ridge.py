@@ -1,15 +1,15 @@
 """Ridge encoding: how much of the responses to a stimulus a model predicts from the other stimuli.
 
 A tenth of the stimuli (at least one) is left out in turn; responses of all units are predicted by ridge
-regression on the model's features, with the penalty chosen by leaving each training stimulus out. The raw value is
-the share of variance that is predicted,
+regression on the model's features, with the penalty chosen by leaving each training stimulus out. The corrected value
+is the share of explainable variance
 
-    1 − Σ (y − ŷ)² / Σ (y − ȳ)²
+    1 − (Σ (y − ŷ)² − N) / (Σ (y − ȳ)² − N)
 
-over left-out stimuli and units, where ȳ is the training mean. Noise N of the left-out means, estimated from trials,
-stands in both sums; the corrected value takes it out of both: 0 for a model that predicts no better than the training
-mean, negative for a worse one. Nothing is clamped. No model of few stimuli reaches 1, since what is special to a
-stimulus cannot be predicted from others: ``attainable`` is what an animal's own noiseless responses reach.
+over left-out stimuli and units, where ȳ is the training mean and N the noise of the left-out means estimated from
+trials: 0 for a model that predicts no better than the training mean, negative for a worse one. Nothing is clamped. The
+raw value is that times the explainable share of an animal's variance. No model of few stimuli reaches 1, since what is
+special to a stimulus cannot be predicted from others: ``attainable`` is what an animal's own noiseless responses reach.
 
 Residuals are combinations of the responses, so their squares are linear in the K × K products of the
 responses: units are never touched again, and all orders of the stimuli cost one matrix product.
@@ -48,12 +48,11 @@ class RidgeEncoding(PatternMetric):
 
     def correction(self, animal: SubjectRDM, estimator: str) -> Corrected:
         """Return the ratio of all variance to that without noise."""
-        base = float(_base(animal).sum())
-        explainable = base - float(animal.noise.sum())
-        if explainable <= 0:
+        share = _explainable(animal)
+        if not share > 0:
             reason = "the variance between stimuli is no larger than trial noise explains"
             return Corrected(np.nan, "undefined", reason, reliability=animal.reliability)
-        return gated(base / explainable, animal.reliability)
+        return gated(1 / share, animal.reliability)
 
     def compare_orders(self, model: Floats, animals: Sequence[SubjectRDM], orders: Ints) -> Floats:
         """Return raw values [N, A] with the model's stimuli in each order [N, K]."""
@@ -76,13 +75,11 @@ class RidgeEncoding(PatternMetric):
 def _share(error: Floats, base: Floats, animals: Sequence[SubjectRDM], noise: Floats | None = None) -> Floats:
     """Return the share [..., A] of the explainable variance that is predicted, over each animal's correction."""
     total = np.array([animal.noise.sum() for animal in animals])
-    own = np.array([_base(animal).sum() for animal in animals])
     noise = total if noise is None else noise
-    # Under an order of the stimuli, folds and so the training means differ: the correction belongs to the given order.
     with np.errstate(invalid="ignore", divide="ignore"):
         explainable = base - noise
         value = 1 - (error - noise) / np.where(explainable > 0, explainable, np.nan)
-        return value * (own - total) / own
+        return value * np.array([_explainable(animal) for animal in animals])
 
 
 def _folds(count: int) -> Ints:
@@ -90,14 +87,12 @@ def _folds(count: int) -> Ints:
     return np.arange(count) % min(count, FOLDS)
 
 
-def _base(animal: SubjectRDM) -> Floats:
-    """Return the squares [K] of what is left of each stimulus' responses without the training mean."""
-    folds, products = _folds(len(animal.patterns)), centred_products(animal.patterns)
-    found = np.empty(len(folds))
-    for fold in np.unique(folds):
-        test, train = np.flatnonzero(folds == fold), np.flatnonzero(folds != fold)
-        found[test] = _squares(_means(len(folds), train, test), products)
-    return found
+def _explainable(animal: SubjectRDM) -> float:
+    """Return the share of an animal's variance between stimuli that is not noise, whatever the folds."""
+    # Deviations from the mean of the K − 1 other stimuli are K/(K − 1) of those from the mean of all.
+    count = len(animal.patterns)
+    total = float(np.trace(centred_products(animal.patterns))) * (count / (count - 1)) ** 2
+    return 1 - float(animal.noise.sum()) * count / (count - 1) / total if total > 0 else np.nan
 
 
 def _errors(model: Floats, animals: Sequence[SubjectRDM], orders: Ints) -> tuple[Floats, Floats]:
@@ -132,11 +127,6 @@ def _means(count: int, train: Ints, test: Ints) -> Floats:
     combination[np.arange(len(test)), test] = 1.0
     combination[:, train] -= 1 / len(train)
     return combination
-
-
-def _squares(combinations: Floats, products: Floats) -> Floats:
-    """Return the squares [T] of combinations [T, K] of patterns with products [K, K]."""
-    return np.einsum("ti,ij,tj->t", combinations, products, combinations, optimize=True)
 
 
 def _fits(kernel: Floats, train: Ints, test: Ints) -> tuple[Floats, Floats]:

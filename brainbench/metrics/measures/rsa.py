@@ -54,7 +54,7 @@ class RSA(Metric):
     def known(self, layer: Floats) -> np.ndarray:
         """Return where [K] a stimulus has any distance."""
         count = stimulus_count(len(layer))
-        return ~np.isnan(square(layer) + np.diag(np.full(count, np.nan))).all(axis=1)
+        return np.asarray(np.isfinite(square(layer) + np.diag(np.full(count, np.nan))).any(axis=1))
 
     def varies(self, layer: Floats) -> bool:
         """Return whether every pair has a distance and they differ."""

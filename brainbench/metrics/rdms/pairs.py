@@ -65,13 +65,13 @@ def permuted_pairs(orders: Any, count: int | None = None) -> Any:
     Orders may name some of ``count`` stimuli only.
     """
     xp, size = library(orders), orders.shape[-1]
-    count = size if count is None else count
-    rows, cols = _pair_indices(count, orders)
+    total = size if count is None else count
+    rows, cols = _pair_indices(total, orders)
     where = {"device": orders.device} if is_tensor(orders) else {}
     # table[i, j] is the place of the pair {i, j}: permuting an RDM is one look-up, without square matrices.
-    table = xp.zeros((count, count), dtype=xp.int64, **where)
+    table = xp.zeros((total, total), dtype=xp.int64, **where)
     table[rows, cols] = table[cols, rows] = xp.arange(len(rows), **where)
-    if size != count:
+    if size != total:
         rows, cols = _pair_indices(size, orders)
     # Pair (i, j) of the permuted RDM is the pair (order[i], order[j]) of the given one.
     return table[orders[..., rows], orders[..., cols]]

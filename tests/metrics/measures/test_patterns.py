@@ -124,8 +124,10 @@ def test_ridge_is_nested_cross_validation_done_by_hand(count):
         error += ((animal.patterns[test] - predict(train, test, best, train)) ** 2).sum()
         base += ((animal.patterns[test] - animal.patterns[train].mean(axis=0)) ** 2).sum()
     noise = animal.noise.sum()
-    assert RidgeEncoding().compare(x, animal) == pytest.approx(1 - error / base, rel=1e-8)
-    assert RidgeEncoding().correction(animal, "default").value == pytest.approx(base / (base - noise), rel=1e-8)
+    factor = RidgeEncoding().correction(animal, "default").value
+    assert RidgeEncoding().compare(x, animal) * factor == pytest.approx(1 - (error - noise) / (base - noise), rel=1e-8)
+    total = animal.patterns.var(axis=0).sum() * count
+    assert factor == pytest.approx(total / (total - noise * (count - 1) / count), rel=1e-8)
 
 
 def test_the_noise_of_the_means_is_that_of_trials():
@@ -205,7 +207,7 @@ def test_what_cannot_be_scored_is_undefined_or_unreliable_in_words():
     noise = [metric.animal(str(i), [block], 6) for i, block in enumerate(silent)]
     unreliable = _score(metric, {"a": latent}, noise)
     assert unreliable.status in ("unreliable", "undefined")
-    with pytest.raises(UsageError, match="'thesis'.*'default'"):
+    with pytest.raises(UsageError, match=r"'thesis'.*'default'"):
         _score(metric, {"a": latent}, animals, estimator="thesis")
     with pytest.raises(UsageError, match="have 5 rows; 6 stimuli"):
         _score(metric, {"a": latent[:5]}, animals)
