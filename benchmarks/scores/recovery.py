@@ -43,6 +43,7 @@ SETTINGS = {
     "2–20 trials": {"trials": (2, 20)},
 }
 STIMULI = (6, 20, 40)
+KEPT = (6, 10, 20)
 PICTURE = Path("docs/images/recovery.png")
 
 
@@ -193,7 +194,7 @@ def selection(candidates: Sequence[Candidate], boards: int) -> str:
     """Return the win rates of picked stimuli beside random ones, on boards that did not choose them."""
     lines = ["| stimuli | picked | as many at random | twice as many at random |", "|---|---|---|---|"]
     design = RecoveryDesign()
-    for keep in (6, 8, 10, 15, 20):
+    for keep in KEPT:
         chosen = select_stimuli(candidates, keep, design)
         rates = [recover(keep_stimuli(candidates, chosen.rows), design, boards=boards)]
         rates += [recover(candidates, replace(design, stimuli=size), boards=boards) for size in (keep, 2 * keep)]
