@@ -130,7 +130,8 @@ def score_layers(
     layer, scored = layers[defined[chosen]], [animals.subjects[i] for i in animals.scored]
     attainable, hopeless = _attainable(metric, animals, result, seed)
     if hopeless:
-        about |= {"status": "unreliable", "reasons": (hopeless, *about["reasons"])}
+        told = about["reasons"]
+        about |= {"status": "unreliable", "reasons": (hopeless, *told) if status == "ok" else (*told, hopeless)}
     statistics = {
         "monte_carlo_error": {
             "value": splits_error(result.values, scored, metric.comparison) if metric.of_rdms else 0.0,

@@ -21,7 +21,7 @@ LABELS = np.repeat(np.arange(6), 8)
 
 
 def _animal(responses, labels=LABELS, **options):
-    return subject_rdm("a", [Trials(responses, labels)], 6, stimuli=STIMULI, splits=20, draws=20, **options)
+    return subject_rdm("a", [Trials(responses, labels)], 6, stimuli=STIMULI, splits=20, **options)
 
 
 def _score(*animals, layer=None):
@@ -38,7 +38,7 @@ def test_one_trial_per_stimulus_has_no_reliability_and_so_no_score():
 def test_no_spikes_at_all_have_no_geometry():
     animal = _animal(np.zeros((48, 5)))
     assert animal.problem.startswith("its RDM is undefined: the mean responses to a stimulus are constant")
-    assert _score(animal).reasons[0] == "no animal has a usable RDM"
+    assert _score(animal).reasons[0] == "no animal can be used"
     flat = _animal(np.zeros((48, 5)), method="sqeuclidean")
     assert flat.problem == "its RDM is undefined: all pairs are equal"
 
@@ -56,7 +56,7 @@ def test_negative_and_vanishing_reliability_are_undefined_or_unreliable():
     assert noise_corrected(0.3, [0.0]).status == "undefined"
     score = _score(*(make_subject(f"m{i}", make_rdm(np.random.default_rng(i)), reliability=0.01) for i in range(3)))
     assert score.status == "unreliable"
-    assert score.reasons[0] == "no animal's RDM is reliable"
+    assert score.reasons[0] == "no animal is reliable"
 
 
 def test_activations_that_are_nan_infinite_or_constant_are_never_chosen():
@@ -71,10 +71,7 @@ def test_activations_that_are_nan_infinite_or_constant_are_never_chosen():
     layers = {name: rdm(values) for name, values in broken.items()}
     score = score_rdms(layers, animals, name="x", stimuli=STIMULI)
     assert score.layer == "good"
-    assert (
-        "layers without a usable RDM (constant or NaN activations), never chosen: nan, infinite, constant"
-        in score.reasons
-    )
+    assert "layers without a value (constant or not finite), never chosen: nan, infinite, constant" in score.reasons
     assert rdm_problem(broken["nan"]).startswith("activations that are not finite")
     assert "constant response" in rdm_problem(broken["constant"])
 
@@ -109,16 +106,16 @@ def test_a_hundred_thousand_units_are_an_animal():
     responses = (rng.normal(size=(6, 100_000))[labels] + rng.normal(size=(24, 100_000))).astype(np.float32)
     animal = _animal(responses, labels)
     assert animal.units == 100_000
-    assert animal.draws.shape == (20, 15)
+    assert animal.patterns.shape == (6, 100_000)
     assert math.isfinite(animal.reliability)
 
 
 def test_two_stimuli_are_undefined_in_words():
     latent = make_latent(0, stimuli=2)
-    animals = [subject_rdm(f"m{i}", [make_block(latent, seed=i)], 2, splits=5, draws=5) for i in range(2)]
+    animals = [subject_rdm(f"m{i}", [make_block(latent, seed=i)], 2, splits=5) for i in range(2)]
     score = score_rdms({"a": [0.4]}, animals, name="x", stimuli=["a", "b"])
     assert score.status == score_animals(animals).status == "undefined"
-    assert score.reasons[0].startswith("2 stimuli have one pair")
+    assert score.reasons[0].startswith("2 stimuli are too few")
 
 
 @pytest.mark.slow

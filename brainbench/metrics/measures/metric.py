@@ -50,7 +50,7 @@ class Metric:
     orders = 999
     """Random orders of the stimuli in a permutation test; all orders are taken where they are at most five times as
     many."""
-    orders_between = 99
+    orders_between = 199
     """The same between animals, where every order may be slow."""
     fewest = SMALLEST_STIMULI
     """Fewest stimuli with a value."""

@@ -13,7 +13,7 @@ from brainbench.metrics import rdm
 from brainbench.metrics.inference.equivalence import equivalence_test, turing_test
 from brainbench.metrics.measures.rsa import score_animals, score_rdms
 from brainbench.metrics.reliability.subject_rdm import subject_rdm
-from tests.factories.animals import STIMULI, make_block, make_latent
+from tests.factories.animals import make_block, make_latent
 
 SAME = np.full(12, 0.0)
 """Left-out stimuli that change nothing."""
@@ -53,15 +53,15 @@ def test_few_animals_or_stimuli_are_unreliable_and_one_is_undefined():
 
 
 def test_a_model_of_the_shared_geometry_passes_and_an_unrelated_one_does_not():
-    latent = make_latent(1)
+    latent, stimuli = make_latent(1, stimuli=16), [f"s{k}" for k in range(16)]
     animals = [
-        subject_rdm(f"m{i}", [make_block(latent, seed=i, units=80, repeats=30, noise=2)], 6, splits=100)
+        subject_rdm(f"m{i}", [make_block(latent, seed=i, units=80, repeats=30, noise=2)], 16, splits=100)
         for i in range(8)
     ]
-    between = score_animals(animals, stimuli=STIMULI)
+    between = score_animals(animals, stimuli=stimuli)
     rng = np.random.default_rng(0)
-    true = score_rdms({"a": rdm(latent @ rng.normal(size=(4, 300)))}, animals, name="true", stimuli=STIMULI)
-    luck = score_rdms({"a": rdm(make_latent(99))}, animals, name="luck", stimuli=STIMULI)
+    true = score_rdms({"a": rdm(latent @ rng.normal(size=(4, 300)))}, animals, name="true", stimuli=stimuli)
+    luck = score_rdms({"a": rdm(make_latent(99, stimuli=16))}, animals, name="luck", stimuli=stimuli)
     assert turing_test(true, between, margin=0.15).verdict == "equivalent"
     assert turing_test(luck, between, margin=0.15).verdict == "worse"
     with pytest.raises(UsageError, match="'default' and 'thesis'"):

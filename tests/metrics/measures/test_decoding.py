@@ -63,8 +63,8 @@ def test_animals_are_decoded_each_by_itself():
     assert score.value > 0.9
     assert [subject.subject for subject in score.subjects] == ["m0", "m1", "m2", "m3"]
     assert score.interval.low > 0.7
-    # Twelve of 720 orders only rename shapes and places.
-    assert score.p == pytest.approx(score.p_smallest) == pytest.approx(12 / 720)
+    # Orders are those of each animal by itself, and few of them leave all classes together.
+    assert score.p <= 0.01
 
 
 def test_labels_without_a_shared_property_are_undefined_in_words():
@@ -75,4 +75,4 @@ def test_labels_without_a_shared_property_are_undefined_in_words():
     assert "as 'convex-far' and 'convex-close' do: a, b, c, d" in score.reasons[0]
     assert metric.score_animals(_make_animals(metric), stimuli=stimuli).status == "undefined"
     broken = metric.score({"l": np.full((6, 2), np.nan)}, _make_animals(metric), name="x", stimuli=LABELS)
-    assert broken.reasons[0] == "activations of every layer are not finite"
+    assert broken.reasons[0] == "activations of every layer are constant or not finite"

@@ -124,11 +124,3 @@ def test_crossnobis_needs_four_trials_of_each_stimulus():
     block = make_block(make_latent(), repeats=3)
     found = subject_rdm("a", [block], 6, method="crossnobis")
     assert "fewer than 4 trials of 0 (3)" in found.problem
-
-
-def test_draws_of_many_stimuli_are_as_many_as_fit():
-    latent = make_latent(0, stimuli=4)
-    found = subject_rdm("a", [make_block(latent)], 4, splits=2, draws=7)
-    assert found.draws.shape == (7, 6)
-    assert found.draws_r.shape == (7,)
-    assert subject_rdm("a", [make_block(latent)], 4, splits=2).draws.shape == (0, 6)
