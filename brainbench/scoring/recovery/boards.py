@@ -10,15 +10,15 @@ import copy
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import combinations
 from typing import Any
 
 import numpy as np
 
 from brainbench.core.records import Score
-from brainbench.core.statistics import FEWEST_ANIMALS, FEWEST_STIMULI, two_factor_error
-from brainbench.metrics.inference.multiple import adjust
+from brainbench.metrics.inference.multiple import adjust, compare_scores
 from brainbench.metrics.measures.registry import get_metric
-from brainbench.metrics.rdms.pairs import Floats, Ints
+from brainbench.metrics.rdms.pairs import Ints
 from brainbench.metrics.score import score_layers
 from brainbench.scoring.recovery.candidates import Candidate
 from brainbench.scoring.recovery.design import RecoveryDesign
@@ -111,25 +111,14 @@ def score_board(
 def told_apart(scores: Sequence[Score]) -> Ints:
     """Return [C, C]: 1 where a candidate is told apart above another, −1 below, 0 where they tie.
 
-    Two-factor t tests of the differences of scaled scores, false discovery rate 5 % over all pairs.
+    By the test of a board (:func:`brainbench.metrics.inference.multiple.compare_scores`: differences of scaled scores
+    over animals and stimuli), false discovery rate 5 % over all pairs.
     """
-    from scipy.special import stdtr
-
     result = np.zeros((len(scores), len(scores)), dtype=np.int64)
-    given = [place for place, one in enumerate(scores) if np.isfinite(one.scaled)]
-    if len(given) < 2:
-        return result
-    value = np.array([scores[place].scaled for place in given])
-    animals = np.array([[scores[place].on_scale(part.value) for part in scores[place].subjects] for place in given])
-    without = np.array([[scores[place].on_scale(one) for one in scores[place].without_stimulus] for place in given])
-    if animals.shape[1] < FEWEST_ANIMALS or without.shape[1] < FEWEST_STIMULI:
-        return result
-    first, second = np.triu_indices(len(given), 1)
-    difference: Floats = value[first] - value[second]
-    error, freedom = two_factor_error(animals[first] - animals[second], without[first] - without[second])
-    with np.errstate(invalid="ignore", divide="ignore"):
-        p = 2 * stdtr(freedom, -np.abs(difference) / error)
-    found = (adjust(p, "fdr") <= LEVEL) * np.sign(difference).astype(np.int64)
-    places = np.array(given)
-    result[places[first], places[second]], result[places[second], places[first]] = found, -found
+    places = list(combinations(range(len(scores)), 2))
+    tests = [compare_scores(scores[first], scores[second]) for first, second in places]
+    for (first, second), test, p in zip(places, tests, adjust([test.p for test in tests], "fdr"), strict=True):
+        if p <= LEVEL:
+            result[first, second] = 1 if test.difference > 0 else -1
+            result[second, first] = -result[first, second]
     return result
