@@ -29,6 +29,7 @@ def demo_recordings(name: str = "demo", *, progress: Progress | None = None) -> 
 
     ``truth.json`` beside the files says what their neurons encode.
     """
+    from brainbench.datasets.synthetic import PopulationDesign
     from brainbench.datasets.synthetic.cache import ensure_recordings
     from brainbench.datasets.synthetic.rodgers_demo import ensure_rodgers_demo
     from brainbench.models.registry import locate_model
@@ -37,11 +38,11 @@ def demo_recordings(name: str = "demo", *, progress: Progress | None = None) -> 
     if name == "demo-rodgers":
         return ensure_rodgers_demo(simulate(get_recipe(DEMOS[name]).scenes, progress=progress), progress=progress)
     stimuli = load_stimuli(DEMOS[name], progress=progress)
-    weights = locate_model(HIDDEN_NETWORK).weights
+    weights, design = locate_model(HIDDEN_NETWORK).weights, PopulationDesign()
     told = {"stimuli_hash": stimuli.content_hash, "weights": file_hash(weights) if weights else None}
 
     def make(folder: Path) -> None:
-        from brainbench.datasets.synthetic import PopulationDesign, ResponseGeometry, write_files
+        from brainbench.datasets.synthetic import ResponseGeometry, write_files
         from brainbench.datasets.synthetic.truth import squared_euclidean_rdm
         from brainbench.models.activations import extract
 
@@ -52,7 +53,7 @@ def demo_recordings(name: str = "demo", *, progress: Progress | None = None) -> 
         write_files(
             folder,
             ResponseGeometry.from_activations(features, stimuli.labels),
-            PopulationDesign(),
+            design,
             seed=_SEED,
             stimuli=DEMOS[name],
             distance=squared_euclidean_rdm,
@@ -64,4 +65,4 @@ def demo_recordings(name: str = "demo", *, progress: Progress | None = None) -> 
             **told,
         )
 
-    return ensure_recordings(name, told, HIDDEN_NETWORK, HIDDEN_LAYER, VERSION, _SEED, make=make)
+    return ensure_recordings(name, told, design, HIDDEN_NETWORK, HIDDEN_LAYER, VERSION, _SEED, make=make)
