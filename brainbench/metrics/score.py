@@ -197,7 +197,7 @@ def _result(
     """Compare, choose layers by the rule and test; also return the layers with a value, and notes."""
     metric, factors = compared.metric, animals.factors(animals.scored)
     given = compared.given()
-    kept = np.flatnonzero(np.isfinite(given).all(axis=1))
+    kept = np.flatnonzero(np.isfinite(given).all(axis=1)).tolist()
     names, given = [names[row] for row in kept], given[kept]
     if not names or (committed is not None and committed not in names):
         return None, names, ()

@@ -50,7 +50,7 @@ def test_animals_that_share_a_geometry_agree_fully_after_correction():
     score = score_animals(animals)
     assert score.r < 0.96
     assert score.value == pytest.approx(1.0, abs=0.03)
-    assert score.p == pytest.approx(1 / 1000)
+    assert score.p == pytest.approx(1 / 500)
 
 
 def test_animals_that_share_nothing_do_not_agree():

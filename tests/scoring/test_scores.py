@@ -260,3 +260,27 @@ def test_both_time_rules_agree_when_there_is_one_step(truth: Path, recordings: x
     )
     assert mean.value == pytest.approx(concatenated.value, abs=1e-12)
     assert dataclasses.asdict(mean)["stimuli"] == LABELS
+
+
+def test_a_layer_can_be_committed_to_and_a_typo_is_corrected(truth: Path, recordings: xr.Dataset):
+    record = score_record(str(truth), recordings=recordings, layer="other", baselines=False)
+    assert (record.score.layer, record.score.layer_rule) == ("other", "committed to beforehand")
+    assert record.card is not None
+    assert record.card.layer == record.score.provenance.settings["layer"] == "other"
+    with pytest.raises(UsageError, match="did you mean 'other'"):
+        score_record(str(truth), recordings=recordings, layer="othr")
+
+
+def test_unreliable_units_can_be_left_out_and_are_counted(truth: Path, recordings: xr.Dataset):
+    every = brainbench.score(str(truth), recordings=recordings)
+    some = brainbench.score(str(truth), recordings=recordings, units_reliability=0.9)
+    assert sum(item.units for item in some.subjects) < sum(item.units for item in every.subjects)
+    assert any("reliability of their tuning below 0.9" in reason for reason in some.reasons)
+    with pytest.raises(UsageError, match=r"received 1\.5"):
+        brainbench.score(str(truth), recordings=recordings, units_reliability=1.5)
+
+
+def test_the_published_estimators_use_correlation_distances(truth: Path, recordings: xr.Dataset):
+    assert "correlation RDM, pearson" in brainbench.score(str(truth), recordings=recordings, estimator="thesis").metric
+    with pytest.raises(UsageError, match="'ridge'"):
+        brainbench.score(str(truth), recordings=recordings, estimator="thesis", metric="ridge")

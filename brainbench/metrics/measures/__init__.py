@@ -25,6 +25,7 @@ for metric in (
         "none",
         "correlation",
         "pearson",
+        splits=1000,
     ),
     LinearCKA(),
     LabelDecoding(),

@@ -47,6 +47,8 @@ class Metric:
     """RDM method of the animals."""
     noise = "none"
     """Noise covariance that their RDMs are divided by."""
+    splits = 300
+    """Random split halves of an animal's trials; more change a score by less than .001."""
     orders = 999
     """Random orders of the stimuli in a permutation test; all orders are taken where they are at most five times as
     many."""
@@ -74,8 +76,8 @@ class Metric:
 
         Options are ``stimuli``, ``seed`` and ``splits`` of :func:`subject_rdm`.
         """
-        how = {"method": self.brain_method, "comparison": self.comparison, "noise": self.noise}
-        return subject_rdm(subject, blocks, n_stimuli, **how, **options)
+        how: dict[str, Any] = {"method": self.brain_method, "comparison": self.comparison, "noise": self.noise}
+        return subject_rdm(subject, blocks, n_stimuli, **{"splits": self.splits, **how, **options})
 
     def layer(self, features: ArrayLike) -> Floats:
         """Return what is compared of a layer's features [K, F]; a stimulus with a value that is not finite is NaN."""

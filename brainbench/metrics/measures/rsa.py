@@ -39,11 +39,12 @@ class RSA(Metric):
     model_method: str = "sqeuclidean"
     """RDM method of the activations, which have no trial noise."""
     comparison: str = "whitened-cosine"
+    splits: int = 300
 
     corrected = True
     of_rdms = True
     orders = 1999
-    orders_between = 999
+    orders_between = 499
     fewest = 3
     estimators = ESTIMATORS
 
