@@ -41,7 +41,7 @@ SETTINGS = {
     "standardised features": {},
 }
 STIMULI = (6, 20, 40)
-KEPT = (6, 10, 20)
+KEPT = (6, 10)
 PICTURE = Path("docs/images/recovery.png")
 
 

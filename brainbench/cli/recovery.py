@@ -99,7 +99,9 @@ def recovery(
         folder = None if out is None else out / "boards"
         found = recover(candidates, design, boards=boards, folder=folder, **where, progress=progress)
         if want is not None:
-            best, tried = find_cheapest(candidates, design, want, **where, progress=progress)
+            # About sixty boards of each design, however few the candidates.
+            each = max(5, 60 // len(candidates))
+            best, tried = find_cheapest(candidates, design, want, boards=each, **where, progress=progress)
             data["cheapest"] = {"wanted": want, "design": best, "tried": tried}
     data |= _facts(found, want)
     data["provenance"] = provenance(
