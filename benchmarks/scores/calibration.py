@@ -1,39 +1,43 @@
-"""Are the statistics right? Simulations with a known truth behind every claim of docs/statistics.md.
+"""Are the statistics right? Simulations with a known truth behind every claim of docs/calibration.md.
 
-    python -m benchmarks.scores.calibration [NAME ...] [--simulations 2000] [--write]
+    python -m benchmarks.scores.calibration [NAME ...] [--simulations N] [--workers N] [--seed N] [--write]
 
-Names: p-values, corrections, crossnobis, recovery, coverage, ceiling, equivalence, faults; all by default.
-``--write`` puts the tables into RESULTS.md and the figures into docs/images.
+Names: nulls, coverage, pairs, over-time, dimensions, corrections, crossnobis, recovery, ceiling, faults; all by
+default. ``--write`` puts the tables into RESULTS.md and docs/calibration.md, and the figures into docs/images.
 """
 
 from __future__ import annotations
 
 import argparse
 import math
+import os
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-from brainbench.metrics.inference.bootstrap import animal_counts, ceilings, drawn_scores, noise_factors
 from scipy import stats
 
 from benchmarks.report import table, write_section
+from benchmarks.scores import simulated_boards
+from benchmarks.scores.simulated_boards import BIN, BOARDS, RULES, Study
+from brainbench.core.files import write_text
+from brainbench.core.jobs import run_jobs
 from brainbench.core.trials import Trials
-from brainbench.metrics import compare, rdm
-from brainbench.metrics.inference.equivalence import equivalence_test
-from brainbench.metrics.inference.intervals import bca_interval, percentile_interval, t_interval
-from brainbench.metrics.inference.multiple import sign_flip_p, step_down
+from brainbench.metrics import compare, get_metric, noise_ceiling, rdm
+from brainbench.metrics.inference.dimension import signal_dimensions
+from brainbench.metrics.inference.multiple import step_down
 from brainbench.metrics.inference.permutation import label_orders
-from brainbench.metrics.inference.power import ExperimentDesign, simulate_experiments
-from brainbench.metrics.layers import held_out
-from brainbench.metrics.measures.rsa import score_animals
+from brainbench.metrics.inference.power import ExperimentDesign, power, simulate_experiments
 from brainbench.metrics.rdms.comparison import compare_all, features
 from brainbench.metrics.rdms.pairs import permuted_pairs
 from brainbench.metrics.reliability.subject_rdm import SubjectRDM, subject_rdm
 
-IMAGES = Path(__file__).parents[2] / "docs" / "images"
+DOCS = Path(__file__).parents[2] / "docs"
+IMAGES = DOCS / "images"
 PAIRS = permuted_pairs(np.concatenate(list(label_orders(6, 0))))
 INK, ACCENT, WARN = "#333333", "#1f6f8b", "#c0504d"
 
@@ -53,77 +57,181 @@ def share(hits: np.ndarray) -> str:
     return f"{mean:.3f} ± {math.sqrt(mean * (1 - mean) / len(hits)):.3f}"
 
 
-def null_statistics(simulations: int, layers: int, animals: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """Statistics without an effect, under every order: of the held-out choice [S, 720] and of layers [S, 720, L]."""
-    rng = np.random.default_rng(seed)
-    held, each = [], []
-    for _ in range(0, simulations, 20):
-        model, brain = simulate_experiments(rng, ExperimentDesign(animals=animals, effect=0.0, layers=layers), 20)
-        left, right = features(model, "pearson"), features(brain, "pearson")
-        r = np.einsum("slnp,sap->snla", left[:, :, PAIRS], right, optimize=True)
-        held.append(held_out(r).mean(axis=-1) if layers > 1 else r[:, :, 0].mean(axis=-1))
-        each.append(r.mean(axis=-1))
-    return np.concatenate(held)[:simulations], np.concatenate(each)[:simulations]
+@dataclass(frozen=True)
+class Run:
+    """How many simulations, from which seed, on how many processors."""
+
+    simulations: int
+    seed: int = 0
+    workers: int | None = None
+
+    def seeds(self) -> range:
+        """Return one seed a simulation."""
+        return range(self.seed * 1_000_000, self.seed * 1_000_000 + self.simulations)
+
+    def each(self, function: Callable[[Any], Any], jobs: list[Any]) -> list[Any]:
+        """Return what a function gives for each job, in their order."""
+        found = dict(run_jobs(function, jobs, workers=self.workers))
+        return [found[place] for place in range(len(jobs))]
 
 
-def p_of(statistic: np.ndarray) -> np.ndarray:
-    return (statistic >= statistic[:, :1] - 1e-12).mean(axis=1)
+NULL_METRICS = ("rsa", "rsa-correlation", "rsa-crossnobis", "cka", "procrustes", "ridge")
+"""All but decoding, of which one study takes a minute."""
 
 
-def p_values(simulations: int) -> Result:
-    one, _ = null_statistics(simulations, 1, 11, 1)
-    chosen, each = null_statistics(simulations, 12, 11, 2)
-    best = each[:, 0].argmax(axis=1)
-    naive = p_of(np.take_along_axis(each, best[:, None, None], axis=2)[..., 0])
-    largest = p_of(each.max(axis=2))
-    # The test that resamples animals asks another question, which six stimuli cannot answer.
-    rng = np.random.default_rng(3)
-    resampled = []
-    for _ in range(simulations):
-        model, brain = simulate_experiments(rng, ExperimentDesign(effect=0.0), 1)
-        resampled.append(t_interval(compare(model[0, 0], brain[0]), 0.9).low > 0)
-    found = {
-        "one layer": p_of(one),
-        "12 layers, chosen on the other animals (a score's p)": p_of(chosen),
-        "12 layers, largest of all, corrected (layer_tests)": largest,
-        "12 layers, largest of all, uncorrected (naive)": naive,
-    }
-    rows = [[name, share(p <= 0.05), f"{stats.kstest(p, 'uniform').pvalue:.2g}"] for name, p in found.items()]
-    rows.append(["one layer, one-sided t interval over animals instead", share(np.array(resampled)), ""])
+def nulls(run: Run) -> Result:
+    """Uniform p of models of three layers that know nothing, 12 stimuli and 5 animals."""
+    rows, found = [], {}
+    for name in NULL_METRICS:
+        jobs = [Study(seed, 12, 5, (0.0,), metric=name, quick=False, layers=3) for seed in run.seeds()]
+        p = np.array(run.each(simulated_boards.null_p, jobs))
+        p = found[name] = p[np.isfinite(p)]
+        rows.append([name, str(len(p)), share(p <= 0.05), share(p <= 0.01), f"{stats.kstest(p, 'uniform').pvalue:.2g}"])
 
     def draw() -> None:
-        figure, axes = _figure(1, 2)
-        for name, p, colour in (
-            ("one layer", found["one layer"], INK),
-            ("12 layers, held out", p_of(chosen), ACCENT),
-            ("12 layers, naive maximum", naive, WARN),
-        ):
-            axes[0].plot(np.sort(p), (np.arange(len(p)) + 1) / len(p), color=colour, label=name)
+        figure, axes = _figure(1, 1)
+        for name, p in found.items():
+            axes[0].plot(np.sort(p), (np.arange(len(p)) + 1) / len(p), label=name)
         axes[0].plot([0, 1], [0, 1], ":", color="#999999")
         axes[0].set(xlabel="p", ylabel="share of unrelated models with p or less", xlim=(0, 1), ylim=(0, 1))
-        axes[0].legend(frameon=False)
-        axes[1].hist(
-            [p_of(one), p_of(chosen), naive],
-            bins=20,
-            range=(0, 1),
-            density=True,
-            color=[INK, ACCENT, WARN],
-            histtype="step",
-        )
-        axes[1].axhline(1, ls=":", color="#999999")
-        axes[1].set(xlabel="p", ylabel="density")
+        axes[0].legend(frameon=False, fontsize=7)
         _save(figure, "calibration_p.png")
 
-    return Result(
-        "p-values of models that know nothing (11 animals of one geometry, 6 stimuli)",
-        ["test", "P(p ≤ .05)", "KS p"],
-        rows,
-        "",
-        draw,
+    title = "p of models that know nothing (three layers, 12 stimuli, 5 animals)"
+    return Result(title, ["metric", "studies", "P(p ≤ .05)", "P(p ≤ .01)", "KS p"], rows, picture=draw)
+
+
+SHARES = (0.0, 0.25, 0.5, 0.75, 1.0)
+
+
+def coverage(run: Run) -> Result:
+    """How often 95 % intervals hold the truth when animals and stimuli are drawn anew in every study."""
+    rows, lines = [], {}
+    for stimuli, animals in ((10, 4), (20, 5), (20, 11), (40, 5), (40, 11)):
+        jobs = [Study(seed, stimuli, animals, SHARES) for seed in run.seeds()]
+        found = np.array(run.each(simulated_boards.interval_found, jobs))
+        held = []
+        for index, asked in enumerate(SHARES):
+            value, low, high, scaled, noiseless = found[:, index].T
+            # The truth of a design: the mean noiseless comparison over animals and stimuli of the population.
+            truth, known = noiseless.mean(), np.isfinite(low)
+            inside = (low <= truth) & (truth <= high)
+            held.append(inside[known].mean())
+            rows.append(
+                [
+                    str(stimuli),
+                    str(animals),
+                    f"{asked:g}",
+                    f"{truth:.3f}",
+                    f"{np.nanmean(value):.3f}",
+                    f"{np.nanmean(scaled):.3f}",
+                    share(inside[known]),
+                    f"{np.mean((high - low)[known]):.3f}",
+                ]
+            )
+        lines[f"{stimuli} stimuli, {animals} animals"] = held
+
+    def draw() -> None:
+        figure, axes = _figure(1, 1)
+        axes[0].axhline(0.95, ls=":", color="#999999")
+        for name, held in lines.items():
+            axes[0].plot(SHARES, held, marker=".", label=name)
+        axes[0].set(xlabel="true score between chance and 1", ylabel="coverage of 95 % intervals", ylim=(0.7, 1.01))
+        axes[0].legend(frameon=False, fontsize=7)
+        _save(figure, "calibration_coverage.png")
+
+    columns = ["stimuli", "animals", "share", "true value", "mean value", "mean scaled", "coverage", "width"]
+    return Result("Coverage of 95 % intervals, animals and stimuli drawn anew", columns, rows, picture=draw)
+
+
+def pairs(run: Run) -> Result:
+    """Null pairs told apart, and the power to find a better model, of boards of eight models."""
+    rows = []
+    for stimuli in (6, 20, 40, 60):
+        for animals in (4, 11):
+            jobs = [Study(seed, stimuli, animals) for seed in run.seeds()]
+            found = run.each(simulated_boards.pairs_told_apart, jobs)
+            for rule in RULES:
+                told = {board: np.nanmean([one[board][rule] for one in found], axis=0) for board in BOARDS}
+                nulls = [f"{told[board][place]:.3f}" for board in ("unrelated", "equally good") for place in (0, 1)]
+                rows.append([str(stimuli), str(animals), rule, *nulls, f"{told['one better'][2]:.3f}"])
+    columns = ["stimuli", "animals", "rule", "unrelated: p ≤ .05", "told apart"]
+    columns += ["equally good: p ≤ .05", "told apart", "power, .9 against .4"]
+    return Result("Pairs of models on boards of eight: null pairs told apart, and a better one found", columns, rows)
+
+
+def over_time(run: Run) -> Result:
+    """Level of the scores over time, and coverage of latencies."""
+    found = np.array(run.each(simulated_boards.study_over_time, list(run.seeds())))
+    p, layer_p, latency, low, high = found.T
+    truth, known = 2 * BIN, np.isfinite(low)
+    rows = [
+        ["p of the best time, model unrelated: P(p ≤ .05)", share(p <= 0.05)],
+        ["p of the best of three layers and all lags, unrelated: P(p ≤ .05)", share(layer_p <= 0.05)],
+        ["latency of a related layer given", share(np.isfinite(latency))],
+        ["its mean, ms (true: 100)", f"{1000 * np.nanmean(latency):.1f} ± {1000 * np.nanstd(latency):.1f} (SD)"],
+        ["coverage of its 95 % interval", share(((low <= truth) & (truth <= high))[known])],
+        ["mean width of the interval, ms", f"{1000 * np.mean((high - low)[known]):.1f}"],
+    ]
+    return Result("Scores over time: 16 stimuli, 6 animals, 12 bins of 50 ms, lag 100 ms", ["", "found"], rows)
+
+
+def dimensions(run: Run) -> Result:
+    """Dimensions estimated from trials, and the power they predict beside that of new experiments."""
+    rows = []
+    for stimuli in (6, 10, 20):
+        for true in (2, 5, 10):
+            study = partial(_power_study, stimuli=stimuli, dimensions=true)
+            found = np.array(run.each(study, list(run.seeds())))
+            effect, consistency, half = np.mean(found[:, 1:4], axis=0).tolist()
+            estimate = float(np.median(found[:, 4]))
+            design = ExperimentDesign(
+                stimuli=stimuli, animals=8, effect=effect, consistency=consistency, reliability=2 * half / (1 + half)
+            )
+            predicted = [
+                power(replace(design, dimensions=number), simulations=2000, seed=run.seed).power
+                for number in (round(estimate), 10)
+            ]
+            rows.append(
+                [str(stimuli), str(true), f"{estimate:.1f}", share(found[:, 0]), *(f"{one:.3f}" for one in predicted)]
+            )
+    columns = ["stimuli", "true dimensions", "estimated", "power of experiments", "predicted", "predicted for ten"]
+    return Result("Power predicted with the dimensions of a pilot (8 animals of 60 neurons)", columns, rows)
+
+
+def _power_study(seed: int, *, stimuli: int, dimensions: int) -> tuple[float, float, float, float, float]:
+    """Return p ≤ .05, and the effect, consistency, half reliability and dimensions of one experiment."""
+    rng = np.random.default_rng([13, seed, stimuli, dimensions])
+    animals, units, trials = 8, 60, 8
+    shared = rng.normal(size=(stimuli, dimensions))
+    own = rng.normal(size=(animals, stimuli, dimensions))
+    weights = rng.normal(size=(2, animals, dimensions, units))
+    means = math.sqrt(0.8) * shared @ weights[0] + math.sqrt(0.2) * own @ weights[1]
+    model = rdm(simulated_boards.mixed(shared, 0.5, rng), method="sqeuclidean")
+    labels = np.repeat(np.arange(stimuli), trials)
+    responses = means[:, labels] + 2 * math.sqrt(dimensions) * rng.normal(size=(animals, len(labels), units))
+    halves = [responses.reshape(animals, stimuli, trials, units)[:, :, start::2].mean(axis=2) for start in (0, 1)]
+    first, second, brain, true = (
+        np.stack([rdm(one, method="sqeuclidean") for one in several])
+        for several in (*halves, (halves[0] + halves[1]) / 2, means)
+    )
+    orders = np.concatenate(list(label_orders(stimuli, seed, exact=6, draws=999)))
+    null = compare(model[permuted_pairs(orders)][:, None], brain, method="whitened-cosine").mean(axis=1)
+
+    def alike(one: np.ndarray, two: np.ndarray) -> np.ndarray:
+        return compare(one, two, method="whitened-pearson")
+
+    return (
+        float((null >= null[0] - 1e-12).mean() <= 0.05),
+        float(alike(model, true).mean()),
+        float(alike(true[:, None], true)[np.triu_indices(animals, 1)].mean()),
+        float(alike(first, second).mean()),
+        signal_dimensions([[Trials(one, labels)] for one in responses], stimuli),
     )
 
 
-def corrections(simulations: int) -> Result:
+def corrections(run: Run) -> Result:
+    simulations = run.simulations
     rows = []
     for count in (5, 20, 64):
         rng = np.random.default_rng(count)
@@ -158,7 +266,8 @@ def corrections(simulations: int) -> Result:
     )
 
 
-def crossnobis(simulations: int) -> Result:
+def crossnobis(run: Run) -> Result:
+    simulations = run.simulations
     rows = []
     for units, trials in ((10, (4, 5, 6, 8, 10, 12)), (40, (10,) * 6)):
         rng = np.random.default_rng(4)
@@ -198,7 +307,6 @@ def make_pool(
     repeats: int = 12,
     individual: float = 0.5,
     mix: float = 0.3,
-    draws: int = 0,
     seed: int = 0,
 ) -> Pool:
     """Animals whose own geometry scatters about a shared one; Gaussian trial noise."""
@@ -211,14 +319,15 @@ def make_pool(
         means = (latent + individual * rng.normal(size=latent.shape)) @ rng.normal(size=(4, units))
         responses = means[labels] + noise * rng.normal(size=(len(labels), units))
         block = Trials(responses, labels, [str(trial) for trial in range(len(labels))])
-        subjects.append(subject_rdm(str(index), [block], 6, splits=100, draws=draws, draw_splits=10))
+        subjects.append(subject_rdm(str(index), [block], 6, splits=100))
         truth.append(float(compare(model, rdm(means))))
     # Over many units the correlation distance depends on the latent directions alone.
     shared = rdm(latent @ rng.normal(size=(4, 50_000)))
     return Pool(subjects, model, np.array(truth), shared)
 
 
-def recovery(simulations: int) -> Result:
+def recovery(run: Run) -> Result:
+    simulations = run.simulations
     rows, points = [], []
     for noise in (1.0, 3.0, 5.0, 7.0, 9.0, 12.0, 15.0, 20.0):
         pool = make_pool(simulations, noise, units=200, repeats=20, individual=0.0, mix=0.235, seed=7)
@@ -280,74 +389,8 @@ def recovery(simulations: int) -> Result:
     )
 
 
-def coverage(simulations: int) -> Result:
-    methods = ("t", "percentile, animals", "BCa, animals", "percentile, all levels", "BCa, all levels")
-    rows, lines = [], []
-    draws = 400
-    for noise, word in ((2.0, "little"), (4.5, "much")):
-        pool = make_pool(800, noise, draws=draws, seed=8)
-        usable = [s for s in pool.subjects if s.reliability >= 0.5]
-        rdms = np.stack([s.rdm for s in usable])
-        factors = 1 / np.sqrt(np.array([s.reliability for s in usable]))
-        values = compare_all(pool.model[None], rdms)[0] * factors
-        drawn = np.stack([compare_all(pool.model[None], s.draws)[0] for s in usable], axis=1)
-        drawn_factors = np.stack([noise_factors(s.draws_r) for s in usable], axis=1)
-        reliability = np.mean([s.reliability for s in usable])
-        truth = values.mean()
-        rng = np.random.default_rng(9)
-        for animals in (3, 4, 5, 6, 8, 11, 20):
-            hits = {name: np.zeros(simulations, dtype=bool) for name in methods}
-            for index in range(simulations):
-                pick = rng.choice(len(usable), animals, replace=False)
-                counts = animal_counts(rng, animals, draws)
-                own = values[pick]
-                jackknife = (own.sum() - own) / (animals - 1)
-                top = counts @ own / animals
-                every = drawn_scores(drawn[:, pick][None], drawn_factors[:, pick], counts)
-                intervals = (
-                    t_interval(own, 0.9),
-                    percentile_interval(top, 0.9),
-                    bca_interval(top, own.mean(), jackknife, 0.9),
-                    percentile_interval(every, 0.9),
-                    bca_interval(every, own.mean(), jackknife, 0.9),
-                )
-                for name, interval in zip(methods, intervals, strict=True):
-                    hits[name][index] = interval is not None and interval.low <= truth <= interval.high
-            rows.append([f"{word} ({reliability:.2f})", str(animals), *(share(hits[name]) for name in methods)])
-            lines.append((word, animals, [hits[name].mean() for name in methods]))
-
-    def draw() -> None:
-        figure, axes = _figure(1, 2)
-        for axis, word in zip(axes, ("little", "much"), strict=True):
-            axis.axhspan(0.86, 0.94, color="#eeeeee")
-            axis.axhline(0.9, ls=":", color="#999999")
-            own = [line for line in lines if line[0] == word]
-            for index, (name, colour) in enumerate(
-                zip(methods, (ACCENT, WARN, "#e0a030", INK, "#777777"), strict=True)
-            ):
-                axis.plot(
-                    [line[1] for line in own], [line[2][index] for line in own], color=colour, marker=".", label=name
-                )
-            axis.set(
-                xlabel="animals",
-                ylabel="coverage of 90 % intervals",
-                ylim=(0.55, 1),
-                title=f"{word} trial noise",
-                xticks=(3, 5, 8, 11, 20),
-            )
-        axes[0].legend(frameon=False, fontsize=7)
-        _save(figure, "calibration_coverage.png")
-
-    return Result(
-        "Coverage of 90 % intervals of the mean score",
-        ["trial noise (reliability)", "animals", *methods],
-        rows,
-        "",
-        draw,
-    )
-
-
-def ceiling(simulations: int) -> Result:
+def ceiling(run: Run) -> Result:
+    simulations = run.simulations
     rows = []
     for noise in (1.0, 3.0, 5.0):
         pool = make_pool(800, noise, seed=10)
@@ -359,7 +402,7 @@ def ceiling(simulations: int) -> Result:
             true = np.empty(simulations)
             for index in range(simulations):
                 pick = rng.choice(len(rdms), animals, replace=False)
-                bounds[index] = ceilings(rdms[pick], np.ones((1, animals)), "pearson")[0]
+                bounds[index] = noise_ceiling(rdms[pick])[:2]
                 true[index] = raw[pick].mean()
             expected = bounds.mean(axis=0)
             inside = expected[0] <= raw.mean() <= expected[1]
@@ -378,68 +421,40 @@ def ceiling(simulations: int) -> Result:
     return Result("Noise ceilings and what the shared geometry itself reaches (raw r)", columns, rows)
 
 
-def equivalence(simulations: int) -> Result:
-    rows = []
-    rng = np.random.default_rng(12)
-    for animals in (5, 8, 11):
-        flips, edge, alike = [], [], []
-        for _ in range(simulations):
-            d = 0.1 * rng.normal(size=animals)
-            flips.append(sign_flip_p(d) <= 0.05)
-            consistency = 0.85 + 0.05 * rng.normal(size=animals)
-            edge.append(
-                equivalence_test(consistency - 0.1 + 0.08 * rng.normal(size=animals), consistency).verdict
-                == "equivalent"
-            )
-            alike.append(
-                equivalence_test(consistency + 0.08 * rng.normal(size=animals), consistency).verdict == "equivalent"
-            )
-        rows.append([str(animals), share(np.array(flips)), share(np.array(edge)), share(np.array(alike))])
-    return Result(
-        "Paired tests over animals at α = .05",
-        [
-            "animals",
-            "sign flips, no difference",
-            "equivalence claimed at the margin",
-            "claimed when equal (sd of differences .08)",
-        ],
-        rows,
-    )
+def faults(run: Run) -> Result:
+    from brainbench.datasets.synthetic import PopulationDesign, ResponseGeometry, simulate
 
-
-def faults(simulations: int) -> Result:
-    from brainbench.datasets.synthetic import Design as Recordings
-    from brainbench.datasets.synthetic import ResponseGeometry, simulate
-
-    rows = []
-    for imbalance in (0.0, 0.5):
-        design = Recordings(animals=11, sessions=3, units=20, imbalance=imbalance)
+    rows, metric = [], get_metric("rsa")
+    quiet = {"rate": 8.0, "window": 1.0, "modulation": 0.3, "emphasis": 0.0, "dispersion": 0.0, "shared_gain": 0.0}
+    for trials in ((20, 20), (8, 32)):
+        design = PopulationDesign(animals=11, sessions=3, units=20, trials=trials, **quiet)
         for given in ((), ("zero-fill",), ("first-appearance",), ("first-appearance", "zero-fill")):
             values, reliable = [], []
-            for study in range(simulations):
-                geometry = ResponseGeometry.from_features(np.random.default_rng(study).normal(size=(6, 4)))
+            for study in run.seeds():
+                geometry = ResponseGeometry.from_activations(np.random.default_rng(study).normal(size=(6, 4)))
                 animals = simulate(geometry, design, seed=study, faults=given)
                 blocks = [[Trials(b.responses[:, 0], b.labels, b.keys) for b in a.sessions] for a in animals]
-                score = score_animals([subject_rdm(str(i), block, 6, splits=50) for i, block in enumerate(blocks)])
+                prepared = [metric.animal(str(i), block, 6) for i, block in enumerate(blocks)]
+                score = metric.score_animals(prepared, stimuli=list("abcdef"))
                 values.append(score.value)
                 reliable.append(score.reliability)
             known = np.array(values)[np.isfinite(values)]
             spread = f"{known.mean():.3f} ± {known.std() / math.sqrt(len(known)):.3f}"
-            rows.append([f"{imbalance:g}", " + ".join(given) or "none", spread, f"{np.mean(reliable):.2f}"])
-    title = (
-        f"Animal-to-animal score of 11 animals of one geometry, with the released faults ({simulations:,} studies each)"
-    )
-    return Result(title, ["imbalance of trials", "fault", "score", "reliability"], rows)
+            rows.append(["{} to {}".format(*trials), " + ".join(given) or "none", spread, f"{np.mean(reliable):.2f}"])
+    title = "Animal-to-animal score of 11 animals of one geometry, with the released faults"
+    return Result(title, ["trials of a stimulus", "fault", "score", "reliability"], rows)
 
 
-JOBS: dict[str, Callable[[int], Result]] = {
-    "p-values": p_values,
+JOBS: dict[str, Callable[[Run], Result]] = {
+    "nulls": nulls,
+    "coverage": coverage,
+    "pairs": pairs,
+    "over-time": over_time,
+    "dimensions": dimensions,
     "corrections": corrections,
     "crossnobis": crossnobis,
     "recovery": recovery,
-    "coverage": coverage,
     "ceiling": ceiling,
-    "equivalence": equivalence,
     "faults": faults,
 }
 
@@ -460,26 +475,36 @@ def _save(figure: object, name: str) -> None:
     figure.savefig(IMAGES / name, dpi=150)
 
 
+def write_docs(name: str, body: str) -> None:
+    """Put a table where docs/calibration.md marks its place."""
+    page = DOCS / "calibration.md"
+    begin, end = f"<!-- begin {name} -->", f"<!-- end {name} -->"
+    before, _, rest = page.read_text(encoding="utf-8").partition(begin)
+    write_text(page, f"{before}{begin}\n\n{body}\n\n{end}{rest.partition(end)[2]}")
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("names", nargs="*", choices=[*JOBS, []])
-    parser.add_argument("--simulations", type=int, default=2000)
+    parser.add_argument("--simulations", type=int, default=1000)
+    parser.add_argument("--workers", type=int, default=None, help="processes; all processors by default")
+    parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--write", action="store_true")
     options = parser.parse_args()
+    run = Run(options.simulations, options.seed, options.workers)
+    # Workers inherit this; threads of their own would only be in each other's way.
+    os.environ.update({"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"})
     for name in options.names or JOBS:
         start = time.perf_counter()
-        result = JOBS[name](options.simulations)
+        result = JOBS[name](run)
         seconds = time.perf_counter() - start
-        heading = f"{result.title}; {options.simulations:,} simulations, {seconds:.0f} s."
+        heading = f"{result.title}; {options.simulations:,} simulations, seed {options.seed}, {seconds:.0f} s."
         body = f"{heading}\n\n{table(result.columns, result.rows)}"
         print(f"\n## {name}\n\n{body}", flush=True)
         if options.write:
-            write_section(
-                f"Calibration: {name}",
-                f"python -m benchmarks.scores.calibration {name} --write",
-                body,
-                subject="scores",
-            )
+            command = f"python -m benchmarks.scores.calibration {name} --simulations {options.simulations} --write"
+            write_section(f"Calibration: {name}", command, body, subject="scores")
+            write_docs(name, body)
             if result.picture:
                 result.picture()
 

@@ -1,4 +1,4 @@
-"""What the demo recordings are like: reliability, truth and raw input, animal by animal.
+"""What the recordings ``demo-rodgers`` are like: reliability, truth and raw input, animal by animal.
 
 Run ``python -m benchmarks.scores.demo_geometry`` after changing the stimuli or the demo's neurons. Wanted:
 reliable animals (.8 and more) with one harder to read, animals that agree well but not perfectly, raw
@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from brainbench.core.trials import Trials
 from brainbench.datasets import open_recordings
-from brainbench.datasets.synthetic import ensure_demo, read_truth
+from brainbench.datasets.synthetic import ensure_rodgers_demo, read_truth
 from brainbench.datasets.trials.session_trials import trials_by_subject
 from brainbench.metrics import rdm
 from brainbench.metrics.measures.rsa import score_animals
@@ -61,7 +61,7 @@ def main() -> None:
         compare_engines()
         return
     stimuli = load_stimuli("rodgers").dataset
-    folder = ensure_demo(stimuli)
+    folder = ensure_rodgers_demo(stimuli)
     truth = read_truth(folder)
     order = [list(map(str, stimuli["stimulus"].values)).index(label) for label in truth["labels"]]
     wrench = stimuli["wrench"].values[order].astype(float) / UNITS

@@ -13,7 +13,7 @@ Faults of the published estimator (each a field of :class:`Switches`; True is as
 ``no_gate``          animals are averaged however unreliable they are
 
 Faults that happen before the estimator (other stimuli filled with zeros, stimuli numbered by first
-appearance) are in ``brainbench.datasets.synthetic`` and their damage is in docs/statistics.md.
+appearance) are in ``brainbench.datasets.synthetic`` and their damage is in docs/calibration.md.
 """
 
 from __future__ import annotations

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from brainbench.core.progress import Progress
-from brainbench.scoring.demo import DEMOS, demo_recordings
+from brainbench.scoring.demo import DEMOS, HIDDEN_NETWORK, demo_recordings
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -48,7 +48,9 @@ class NeuralResponses:
     def origin(self) -> dict[str, Any]:
         """Provenance of the recordings."""
         names = ("content_hash", "window", "selection", "removed", "synthetic")
-        return {"source": self.source, **{name: self.dataset.attrs[name] for name in names}}
+        # Boards of the demo say whether the network that made it was found.
+        truth = {"truth": HIDDEN_NETWORK} if self.source == "demo" and self.synthetic else {}
+        return {"source": self.source, **{name: self.dataset.attrs[name] for name in names}, **truth}
 
     def animals(self, kept: tuple[str, ...], metric: Metric, options: ScoreOptions) -> tuple[Any, ...]:
         """Prepare every animal by a metric over the labels ``kept``, in that order."""

@@ -61,7 +61,7 @@ def time_course(
     width = float(np.median(np.diff(begins)))
     seconds = width * len(begins) if network.seconds is None else network.seconds
     sessions = brain.trials(kept)
-    how = {"method": metric.brain_method, "noise": metric.noise, "comparison": metric.comparison}
+    how: dict[str, Any] = {"method": metric.brain_method, "noise": metric.noise, "comparison": metric.comparison}
     total, animals, layers = len(sessions) + len(network.activations), [], {}
     for subject, blocks in sessions.items():
         _tell(progress, len(animals), total)

@@ -176,8 +176,8 @@ write_record(record, "results")
 for name in ("zhuang-small", "s4-small"):
     write_record(score_record(name, seed=0), "results")
 (board,) = rank(stored.record for stored in read_records("results"))
-for row in board.rows:
-    print(row.rank, row.record.score.summary())""",
+for entry in board.entries:
+    print(entry.rank, entry.standing, entry.score.summary())""",
     ),
     (
         "code",

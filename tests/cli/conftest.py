@@ -15,6 +15,7 @@ from brainbench.datasets.sessions import make_session
 from brainbench.models.features import write_features
 
 LABELS = ("a", "b", "c", "d")
+EIGHT = tuple("abcdefgh")
 
 
 @dataclass(frozen=True)
@@ -76,3 +77,30 @@ def files(tmp_path: Path) -> dict[str, str]:
         "model": f"{tmp_path / 'mine.py'}:Mine",
         "out": str(tmp_path / "out"),
     }
+
+
+@pytest.fixture
+def study(tmp_path: Path) -> dict[str, str]:
+    """Four animals and eight stimuli; features and a module for them."""
+    rng = np.random.default_rng(0)
+    for animal in "wxyz":
+        order = np.repeat(np.arange(len(EIGHT)), 8)
+        starts = 1.0 + np.arange(len(order))
+        rates = rng.gamma(2.0, 8.0, size=(len(EIGHT), 12))
+        spikes = [
+            np.sort(
+                np.concatenate(
+                    [s + rng.uniform(0, 0.5, rng.poisson(rates[k, u])) for s, k in zip(starts, order, strict=True)]
+                )
+            )
+            for u in range(12)
+        ]
+        table = {"start_time": starts, "stop_time": starts + 0.5, "texture": [EIGHT[k] for k in order]}
+        session = make_session(animal, "1", spikes, {"trials": table}, observed=[np.array([[0.0, 90.0]])] * 12)
+        write_recordings(tmp_path / "data" / f"{animal}.h5", session)
+    with h5py.File(tmp_path / "eight.h5", "w") as file:
+        file["stimuli"] = rng.normal(size=(len(EIGHT), 3, 2, 2, 2)).astype(np.float32)
+        file["labels"] = np.array(EIGHT, dtype=h5py.string_dtype())
+    features = write_features(tmp_path / "features.h5", EIGHT, {"fc": rng.normal(size=(len(EIGHT), 6))})
+    paths = {"data": "data", "arrays": "eight.h5", "board": "board", "secret": "secret", "out": "out"}
+    return {name: str(tmp_path / path) for name, path in paths.items()} | {"features": str(features)}

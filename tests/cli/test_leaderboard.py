@@ -139,18 +139,15 @@ def test_a_folder_becomes_a_site_and_a_report_and_a_score_its_own(run, scored, f
     assert "--report" not in read_record(record).score.provenance["command"]
 
 
-def test_a_served_leaderboard_prints_its_address_and_ends_quietly(run, scored, monkeypatch):
-    from http.server import ThreadingHTTPServer
-
-    def interrupted(self, poll_interval: float = 0.5) -> None:
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(ThreadingHTTPServer, "serve_forever", interrupted)
+def test_a_site_is_opened_in_a_browser_and_its_place_is_said_where_there_is_none(run, scored, monkeypatch, tmp_path):
+    asked = []
+    monkeypatch.setattr("webbrowser.open", lambda address: bool(asked.append(address)))
     path, _ = scored
-    result = run("leaderboard", "serve", str(path.parent), "--port", "0")
+    result = run("leaderboard", "build", str(path.parent), "--out", str(tmp_path / "site"), "--open")
     assert result.status == 0, result.err
-    assert result.out.startswith("http://127.0.0.1:")
-    assert run("leaderboard", "serve", str(path.parent / "none")).status == 2
+    assert asked == [(tmp_path / "site" / "index.html").as_uri()]
+    assert "No browser" in result.err
+    assert run("leaderboard", "build", str(path.parent / "none")).status == 2
 
 
 def test_nothing_to_add_is_an_error(run):

@@ -56,7 +56,7 @@ def test_the_demo_recordings_can_be_looked_into_and_checked(run):
     assert "trials:stimulus" in run("recordings", "inspect", "demo").out
     result = run("recordings", "check", "demo")
     assert result.status == 0
-    assert "6 sessions, 0 errors" in result.out
+    assert "10 sessions, 0 errors" in result.out
 
 
 def test_fetching_without_the_client_says_how_to_get_it(run, monkeypatch, tmp_path):

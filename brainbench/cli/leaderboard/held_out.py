@@ -82,8 +82,7 @@ def split(whole: xr.Dataset, kind: str, names: list[str]) -> xr.Dataset:
     else:
         part = whole.isel(trial=whole["stimulus"].isin(names).values)
     labels = [label for label in whole.attrs["vocabulary"] if kind == "animals" or label in names]
-    part.attrs |= {"vocabulary": labels, "content_hash": content_hash(whole.attrs["content_hash"], kind, names)}
-    return part
+    return part.assign_attrs(vocabulary=labels, content_hash=content_hash(whole.attrs["content_hash"], kind, names))
 
 
 def score_held_out(record: ResultRecord, commitment: Path, secret: Path) -> dict[str, Any]:

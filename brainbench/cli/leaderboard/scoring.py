@@ -71,8 +71,7 @@ def score_again(
     refuse_foreign_code(record, trusted=trust_code)
     if recordings is None and source not in DEMOS:
         raise UsageError(f"The record was made with the recordings {source!r}; give them with --recordings PATH.")
-    match = origin.pairs if any(label != partner for label, partner in origin.pairs.items()) else None
-    options = ScoreOptions.stated_in(origin.settings, recordings=recordings or source, match=match)
+    options = ScoreOptions.stated_in(origin.settings, recordings=recordings or source, match=origin.pairs or None)
     return score_record(model, options, progress=progress)
 
 

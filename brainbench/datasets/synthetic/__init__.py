@@ -1,8 +1,9 @@
 """Synthetic recordings whose truth is known, as arrays, data sets, sessions of spike times, or files.
 
-Expected rates come from a geometry (``geometry``, ``design``) or from whisker wrenches (``wrench_encoding``). Trials
-and spikes are drawn around them (``sessions``; for the default recordings of ``demo``, ``rodgers_task``), and
-``truth`` writes the files of both.
+A ``geometry`` (from a network's features or an RDM) and a ``design`` give ``populations``: expected rates, trials and
+counts. ``animals`` keeps them as arrays with their truth, ``sessions`` places spikes and writes files, ``truth`` what
+the neurons encode beside them, ``cache`` makes files once per machine. ``rodgers_demo`` puts the same neurons into the
+task and file layout of Rodgers 2022 (``rodgers_task``).
 """
 
 from __future__ import annotations
@@ -13,8 +14,9 @@ from brainbench.core.lazy import lazy_exports
 
 if TYPE_CHECKING:
     from brainbench.datasets.synthetic.animals import FAULTS, SyntheticAnimal, calibrate, measure_ceiling, simulate
+    from brainbench.datasets.synthetic.design import PopulationDesign
     from brainbench.datasets.synthetic.geometry import ResponseGeometry
-    from brainbench.datasets.synthetic.populations import PopulationDesign, draw_animals, stimulus_means
+    from brainbench.datasets.synthetic.populations import draw_animals, stimulus_means
     from brainbench.datasets.synthetic.rodgers_demo import ensure_rodgers_demo, make_rodgers_demo
     from brainbench.datasets.synthetic.sessions import as_recordings, make_sessions, write_files
     from brainbench.datasets.synthetic.truth import read_truth
@@ -40,7 +42,8 @@ __all__ = [
 _MODULES = {
     ".animals": ("FAULTS", "SyntheticAnimal", "calibrate", "measure_ceiling", "simulate"),
     ".rodgers_demo": ("ensure_rodgers_demo", "make_rodgers_demo"),
-    ".populations": ("PopulationDesign", "draw_animals", "stimulus_means"),
+    ".design": ("PopulationDesign",),
+    ".populations": ("draw_animals", "stimulus_means"),
     ".geometry": ("ResponseGeometry",),
     ".sessions": ("as_recordings", "make_sessions", "write_files"),
     ".truth": ("read_truth",),

@@ -1,17 +1,7 @@
-"""Synthetic recordings with a known geometry: the instrument by which statistics are validated.
+"""Animals as arrays with their truth: the instrument by which statistics are validated.
 
-Every unit has a mean rate b (log-normal over units) and a random direction w in tuning space. Its
-expected rate for stimulus k is b · max(0, 1 + m (√(1−ι) x_k·w + √ι y_k·w′)): x_k is the shared
-direction of the stimulus (:class:`ResponseGeometry`), y_k the animal's own random one, m the ``modulation``
-and ι the ``individual`` share. Over many units the correlation distance between stimuli is then
-proportional to 1 − x_k·x_l, so RDMs compared by any correlation have the geometry as their truth
-(rectification touches less than 0.7 % of rates at the largest modulation).
-
-Counts are Poisson around that rate, times a gamma gain per unit and trial (``dispersion`` φ: variance =
-mean + φ mean², the negative binomial), times one gain common to all units of a trial (``shared_gain``).
-
-:func:`simulate` gives arrays; ``as_recordings`` a recordings data set and ``write_files`` real NWB or HDF5 files
-whose counts are the same numbers. Letters: K stimulus, R trial, U unit, P pair.
+:func:`simulate` draws animals and may repeat the faults of the released analysis; :func:`measure_ceiling` and
+:func:`calibrate` relate a design to the noise ceiling that it has. Letters: K stimulus, R trial, U unit, P pair.
 """
 
 from __future__ import annotations
@@ -25,10 +15,9 @@ from numpy.typing import NDArray
 
 from brainbench.core.errors import UsageError, unknown_name
 from brainbench.core.trials import Trials
+from brainbench.datasets.synthetic.design import MODULATION, PopulationDesign
 from brainbench.datasets.synthetic.geometry import ResponseGeometry
 from brainbench.datasets.synthetic.populations import (
-    MODULATION,
-    PopulationDesign,
     draw_sessions,
     entropy,
     stimulus_means,

@@ -23,70 +23,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from brainbench.core.errors import UsageError
 from brainbench.core.trials import Trials
+from brainbench.datasets.synthetic.design import PopulationDesign
 from brainbench.datasets.synthetic.geometry import ResponseGeometry
-
-MODULATION = 0.4
-"""Largest modulation: beyond it too many rates would be cut off at zero for the truth to hold."""
-
-
-@dataclass(frozen=True)
-class PopulationDesign:
-    """Size of synthetic recordings, and how noisy they are; the defaults make RDMs of about half reliability."""
-
-    animals: int = 10
-    sessions: int = 1
-    """Sessions per animal; each has its own units."""
-    units: int = 60
-    """Units per session."""
-    trials: int | tuple[int, int] = (16, 20)
-    """Trials of each stimulus in a session: one number, or the fewest and the most, drawn evenly."""
-    rate: float = 6.0
-    """Mean rate of a unit, Hz."""
-    window: float = 0.5
-    """Duration in which spikes are counted, s."""
-    modulation: float = 0.2
-    """Standard deviation of a unit's rate over stimuli, as a share of its mean; 0 is the null."""
-    individual: float = 0.0
-    """Share of the tuning variance that is an animal's own and not the shared geometry."""
-    emphasis: float = 0.3
-    """Standard deviation over animals of the logarithm of the weight of each axis of the geometry."""
-    spread: float = 0.4
-    """Standard deviation of the logarithm of mean rates over units."""
-    dispersion: float = 0.3
-    """φ of the negative binomial: variance = mean + φ mean² per unit and trial; 0 is Poisson."""
-    shared_gain: float = 0.2
-    """Standard deviation of a gain (mean one) that all units of a trial share."""
-    session_gain: float = 0.0
-    """Standard deviation of the logarithm of each session's overall rate."""
-    drift: float = 0.0
-    """Relative change of all rates from the first trial of a session to the last, above −1."""
-    missing: tuple[tuple[int, int], ...] = ()
-    """Pairs (animal, stimulus) without any trial."""
-
-    def __post_init__(self) -> None:
-        for name in ("animals", "sessions", "units"):
-            if getattr(self, name) < 1:
-                raise UsageError(f"A design needs at least one of {name}; received {getattr(self, name)}.")
-        fewest, most = self.trial_range
-        if not 1 <= fewest <= most:
-            raise UsageError(f"A design needs at least one of trials, fewest before most; received {self.trials}.")
-        for name in ("rate", "window"):
-            if not getattr(self, name) > 0:
-                raise UsageError(f"The {name} of a design is positive; received {getattr(self, name)}.")
-        for name in ("emphasis", "spread", "dispersion", "shared_gain", "session_gain"):
-            if not getattr(self, name) >= 0:
-                raise UsageError(f"The {name} of a design is not negative; received {getattr(self, name)}.")
-        if not 0 <= self.modulation <= MODULATION:
-            raise UsageError(f"The modulation lies between 0 and {MODULATION}; received {self.modulation}.")
-        if not 0 <= self.individual <= 1 or not self.drift > -1:
-            raise UsageError(
-                f"individual lies between 0 and 1 and drift above -1; received {self.individual} and {self.drift}."
-            )
-
-    @property
-    def trial_range(self) -> tuple[int, int]:
-        """Fewest and most trials of a stimulus in a session."""
-        return (self.trials, self.trials) if isinstance(self.trials, int) else self.trials
 
 
 @dataclass(frozen=True)
@@ -190,11 +128,11 @@ def expected_rates(
         random: stream of the session.
     """
     stimuli = len(geometry.labels)
-    # Variances add up to one: 1 − ι of the shared geometry and ι of the animal's own.
     # Log-normal weights of the axes; their mean square is one, so that the depth of tuning does not depend on them.
     weight = np.exp(design.emphasis * own.standard_normal(geometry.directions.shape[1]))
     axes = geometry.directions * weight
     axes *= np.sqrt(np.sum(geometry.directions**2) / np.sum(axes**2))
+    # Variances add up to one: 1 − ι of the shared geometry and ι of the animal's own.
     tuning = np.sqrt(1 - design.individual) * _project(axes, design.units, random)
     if design.individual:
         private = own.standard_normal((stimuli, stimuli + 1))

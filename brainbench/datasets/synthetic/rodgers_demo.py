@@ -1,7 +1,8 @@
-"""Demo recordings: real NWB files with synthetic spikes, made once per machine from simulated stimuli.
+"""Recordings in the task and files of Rodgers (2022), with synthetic spikes: the second demo.
 
-They exist to try the toolkit and to test it: the true geometry is known (``truth.json`` beside the
-files). Everything is labelled synthetic; **ranks of models on them say nothing about brains**.
+Neurons mix what the whiskers feel: forces and moments of every whisker, half-wave rectified in both directions,
+compressed, divided by the mean of the tracked whiskers and averaged until the choice. Six stimuli and features so
+near to the raw input tell no network apart from it; what the files are for is their layout with its quirks.
 """
 
 from __future__ import annotations
@@ -21,28 +22,38 @@ from brainbench.core.errors import DataError, UsageError, listing
 from brainbench.core.progress import Progress
 from brainbench.datasets.layouts import rodgers
 from brainbench.datasets.synthetic.cache import ensure_recordings
-from brainbench.datasets.synthetic.rodgers_task import CHOICE, COLUMNS, SessionPlan, draw_session, tracked_contacts
-from brainbench.datasets.synthetic.truth import SyntheticSession, correlation_rdm, write_synthetic_nwb, write_with_truth
-from brainbench.datasets.synthetic.wrench_encoding import Afferents, draw_population, make_afferents, window_rates
+from brainbench.datasets.synthetic.geometry import ResponseGeometry
+from brainbench.datasets.synthetic.populations import expected_rates
+from brainbench.datasets.synthetic.rodgers_task import (
+    CHOICE,
+    COLUMNS,
+    SessionPlan,
+    draw_session,
+    first_contacts,
+    tracked_contacts,
+)
+from brainbench.datasets.synthetic.truth import (
+    SyntheticSession,
+    correlation_rdm,
+    write_synthetic_nwb,
+    write_with_truth,
+)
 
 if TYPE_CHECKING:
     import xarray as xr
 
-VERSION = 2
+VERSION = 3
 """Raised when the same stimuli give other spikes, so that old caches are not reused."""
 
 _ANIMALS = (
     (SessionPlan("demo01", "01", 34, 170, detection=True), SessionPlan("demo01", "02", 30, 140)),
     (SessionPlan("demo02", "01", 56, 270, lost_whisker="C0"),),
     (SessionPlan("demo03", "01", 30, 140, spans=True), SessionPlan("demo03", "02", 28, 150)),
-    (SessionPlan("demo04", "01", 40, 220, depth=0.36),),
+    (SessionPlan("demo04", "01", 40, 220, modulation=0.12),),
 )
 """The animals; the last is hard to read on purpose."""
-_INDIVIDUAL = 0.4
-"""Standard deviation over animals of the logarithm of an afferent's weight."""
-_MANY = 4000
-"""Units that stand for the shared geometry in the truth."""
-_SUFFIX = "_behavior+ecephys.nwb"
+_COMPRESSION = 1.0
+"""Half-saturation of an afferent, in root mean squares of its channel."""
 
 
 def make_rodgers_demo(
@@ -53,7 +64,7 @@ def make_rodgers_demo(
     animals: int = 4,
     progress: Progress | None = None,
 ) -> list[Path]:
-    """Write the demo recordings and their truth into ``folder``.
+    """Write the recordings and their truth into ``folder``.
 
     Args:
         folder: created if needed; files of the same names are replaced.
@@ -64,8 +75,8 @@ def make_rodgers_demo(
         progress: called as ``progress(done, total, what)`` after each session.
 
     Returns:
-        The NWB files. ``truth.json`` beside them holds, as upper triangles over ``labels``, the
-        noiseless correlation-distance RDM of the shared tuning (``shared``) and of each animal's units.
+        The NWB files. ``truth.json`` beside them holds, over ``labels``, the distances [P] of the geometry that all
+        share (``shared``) and the noiseless correlation-distance RDM of each animal's units.
 
     Raises:
         DataError: the stimuli lack a label or ``contact``, or one never touches a tracked whisker.
@@ -74,32 +85,26 @@ def make_rodgers_demo(
     if animals < 1:
         raise UsageError(f"The demo needs at least one animal; received {animals}.")
     stimuli = _in_vocabulary_order(check_stimulus_set(stimuli))
-    afferents = make_afferents(stimuli)
+    geometry = ResponseGeometry.from_activations(wrench_features(stimuli), rodgers.LABELS)
     contact = stimuli["contact"].transpose("stimulus", "time", "whisker").values.astype(bool)
-    contacts = tracked_contacts(afferents.whiskers, contact, afferents.frame)
+    names = tuple(str(name) for name in stimuli["whisker"].values)
+    contacts = tracked_contacts(names, contact, float(np.median(np.diff(stimuli["time"].values))))
     plans = [
         [replace(plan, subject=f"demo{index + 1:02d}") for plan in _ANIMALS[index % len(_ANIMALS)]]
         for index in range(animals)
     ]
     # Stimuli that do not suit are told before a folder is made.
-    lost = dict.fromkeys([None, *(plan.lost_whisker for own in plans for plan in own)])
-    first = {whisker: _first_contacts(contacts, whisker) for whisker in lost}
+    for plan in (plan for own in plans for plan in own):
+        first_contacts(contacts, rodgers.LABELS, plan.lost_whisker)
 
     def draw() -> Iterator[SyntheticSession]:
         done, total = 0, sum(map(len, plans))
         for index, own in enumerate(plans):
-            random = np.random.default_rng([seed, VERSION, index])
-            # Animals weigh afferents log-normally around the shared tuning, so they agree in part.
-            emphasis = np.exp(_INDIVIDUAL * random.standard_normal(afferents.values.shape[2:]))
             for number, plan in enumerate(own):
                 random = np.random.default_rng([seed, VERSION, index, number])
-                # Units are drawn anew for each session from the animal's own weighting of afferents.
-                population = draw_population(random, afferents, plan.units, emphasis, plan.depth)
-                rates = population.rates(afferents)
-                session = draw_session(
-                    random, plan, rodgers.LABELS, rates, population.baseline, contacts, afferents.frame
-                )
-                yield SyntheticSession(session, _expected(rates, afferents, first[plan.lost_whisker]))
+                animal = np.random.default_rng([seed, VERSION, index])
+                expected = expected_rates(geometry, plan.design, animal, random)
+                yield SyntheticSession(draw_session(random, plan, geometry, expected, contacts), expected)
                 done += 1
                 if progress is not None:
                     progress(done, total, f"demo recordings {plan.subject}")
@@ -108,13 +113,14 @@ def make_rodgers_demo(
         folder,
         draw(),
         write=partial(write_synthetic_nwb, columns=COLUMNS),
-        suffix=_SUFFIX,
+        suffix="_behavior+ecephys.nwb",
         distance=correlation_rdm,
         version=VERSION,
         seed=seed,
-        stimuli=str(stimuli.attrs["content_hash"]),
-        labels=rodgers.LABELS,
-        shared=_shared(afferents, first[None], seed),
+        stimuli="rodgers",
+        stimuli_hash=str(stimuli.attrs["content_hash"]),
+        labels=geometry.labels,
+        shared=geometry.rdm,
     )
 
 
@@ -126,10 +132,7 @@ def ensure_rodgers_demo(
     animals: int = 4,
     progress: Progress | None = None,
 ) -> Path:
-    """Return the folder of the demo recordings, making them if this machine has none.
-
-    Two processes may ask at once and either may be killed: every file is written whole, the truth comes last, and
-    a folder without it, or with files missing or of another size, is made again.
+    """Return the folder of the recordings, making them if this machine has none.
 
     Args:
         stimuli: the stimulus set, or a function that makes it and is called only if needed.
@@ -154,6 +157,34 @@ def ensure_rodgers_demo(
     return ensure_recordings("demo-rodgers", key, seed, animals, VERSION, make=make)
 
 
+def wrench_features(stimuli: xr.Dataset) -> NDArray[np.float64]:
+    """Return what whisker afferents tell of each stimulus [K, F] until the earliest choice.
+
+    Raises:
+        DataError: a wrench is not finite (an unstable simulation), all are zero, or no tracked whisker is there.
+    """
+    names = tuple(str(name) for name in stimuli["whisker"].values)
+    wrench = stimuli["wrench"].transpose("stimulus", "time", "whisker", "channel").values.astype(np.float64)
+    broken = [name for index, name in enumerate(names) if not np.isfinite(wrench[:, :, index]).all()]
+    if broken:
+        raise DataError(f"The stimuli hold no finite wrench for {listing(broken)}: simulate with a finer fidelity.")
+    tracked = [index for index, name in enumerate(names) if name in rodgers.TRACKED]
+    if not tracked:
+        raise DataError(f"The stimuli have none of the tracked whiskers {listing(rodgers.TRACKED)}; simulate them too.")
+    scale = np.sqrt(np.mean(wrench[:, :, tracked] ** 2, axis=(0, 1, 2)))
+    if not np.any(scale > 0):
+        raise DataError("The stimuli exert no force on the whiskers, so there is nothing for neurons to encode.")
+    # An afferent answers to one direction of a channel (half-wave rectification) and saturates as x/(x + 1).
+    signal = wrench / np.where(scale > 0, scale, np.inf)
+    halves = np.concatenate([np.maximum(signal, 0.0), np.maximum(-signal, 0.0)], axis=3)
+    halves = halves / (halves + _COMPRESSION)
+    # Divisive normalisation by all tracked whiskers: contacts are compared instead of forces added up (Rodgers 2021).
+    surround = halves[:, :, tracked].mean(axis=(2, 3), keepdims=True)
+    answer = (halves / (0.3 + surround))[:, stimuli["time"].values < CHOICE[0]]
+    # Rounded, so that machines whose simulations differ in the last bits draw the same spikes.
+    return np.round(answer.mean(axis=1).reshape(len(wrench), -1), 4)
+
+
 def _in_vocabulary_order(stimuli: xr.Dataset) -> xr.Dataset:
     have = [str(label) for label in stimuli["stimulus"].values]
     if sorted(have) != sorted(rodgers.LABELS):
@@ -161,27 +192,3 @@ def _in_vocabulary_order(stimuli: xr.Dataset) -> xr.Dataset:
     if "contact" not in stimuli:
         raise DataError("The demo recordings need the stimuli's contact [stimulus, time, whisker]; these have none.")
     return stimuli.isel(stimulus=[have.index(label) for label in rodgers.LABELS])
-
-
-def _first_contacts(contacts: dict[str, list[NDArray[np.float64]]], lost: str | None) -> NDArray[np.float64]:
-    """Return the first contact [K] (s after onset) of each stimulus with the whiskers whose contacts are known."""
-    known = {name: items for name, items in contacts.items() if name != lost}
-    first = np.full(len(rodgers.LABELS), np.inf)
-    for stimulus, label in enumerate(rodgers.LABELS):
-        first[stimulus] = min((runs[stimulus][0, 0] for runs in known.values() if len(runs[stimulus])), default=np.inf)
-        if first[stimulus] >= CHOICE[0]:
-            raise DataError(f"The stimulus {label!r} touches none of {listing(known)} in time for the demo's choices.")
-    return first
-
-
-def _expected(rates: NDArray[np.float64], afferents: Afferents, first: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the expected response [K, U] in the layout's window, first contact to choice."""
-    return window_rates(rates, afferents.frame, first, np.linspace(*CHOICE, 18))
-
-
-def _shared(afferents: Afferents, first: NDArray[np.float64], seed: int) -> NDArray[np.float64]:
-    plain = np.ones(afferents.values.shape[2:])
-    random = np.random.default_rng([seed, VERSION, 10_000])
-    # In portions: the rates of all units at once would take a gigabyte.
-    portions = [draw_population(random, afferents, _MANY // 8, plain) for _ in range(8)]
-    return correlation_rdm(np.concatenate([_expected(item.rates(afferents), afferents, first) for item in portions], 1))

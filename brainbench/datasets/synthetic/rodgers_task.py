@@ -9,17 +9,19 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from brainbench.core.errors import DataError, listing
 from brainbench.datasets.layouts.rodgers import TRACKED
 from brainbench.datasets.sessions import Series, Session, make_session
-from brainbench.datasets.synthetic.wrench_encoding import LATENCY
+from brainbench.datasets.synthetic.design import PopulationDesign
+from brainbench.datasets.synthetic.geometry import ResponseGeometry
+from brainbench.datasets.synthetic.populations import draw_counts
+from brainbench.datasets.synthetic.sessions import REST, spike_trains
 
 CHOICE = (0.80, 0.97)
 """Earliest and latest choice, s after the shape comes into reach."""
 _REACH = 1.0
 """From trial start to the first frame of the stimulus, s."""
 _LAYERS = ((130, "1"), (450, "2/3"), (600, "4"), (950, "5"), (1300, "6"))
-_CLOCK = 30000.0
-"""Spike times are multiples of one sample of a 30 kHz recording."""
 
 COLUMNS = {
     "direct_delivery": "Water was given regardless of the choice.",
@@ -45,14 +47,20 @@ class SessionPlan:
     session: str
     units: int
     trials: int
-    depth: float = 1.0
-    """Strength of the tuning; below one the animal is hard to read."""
+    modulation: float = 0.3
+    """Depth of the tuning (:class:`PopulationDesign`); a small one makes the animal hard to read."""
     lost_whisker: str | None = None
     """Whisker without a contact table."""
     detection: bool = False
     """Contains trials without a shape."""
     spans: bool = False
     """Carries obs_intervals, and some units were lost before the end."""
+
+    @property
+    def design(self) -> PopulationDesign:
+        """Units, rates and noise of this session."""
+        # Fano factors of about 1.5: windows are longer than in the default design.
+        return PopulationDesign(1, units=self.units, modulation=self.modulation, dispersion=0.1, shared_gain=0.1)
 
 
 @dataclass(frozen=True)
@@ -65,6 +73,8 @@ class Behaviour:
     """Index of the stimulus; −1 for ``nothing``."""
     onset: NDArray[np.float64]
     """First frame of the stimulus."""
+    lick: NDArray[np.float64]
+    """Choice; where the mouse made none, when it would have."""
     recorded: tuple[float, float]
     """Span in which spikes were recorded."""
 
@@ -72,25 +82,32 @@ class Behaviour:
 def draw_session(
     random: np.random.Generator,
     plan: SessionPlan,
-    labels: tuple[str, ...],
-    rates: NDArray[np.float64],
-    rest: NDArray[np.float64],
+    geometry: ResponseGeometry,
+    expected: NDArray[np.float64],
     runs: Mapping[str, list[NDArray[np.float64]]],
-    frame: float,
 ) -> Session:
-    """Draw one session.
+    """Draw one session: neurons answer from the first contact that the files tell to the choice.
 
     Args:
         random: source of the draws.
         plan: what is particular to the session.
-        labels: [K] stimuli.
-        rates: [K, T, U] expected rates during the stimuli, Hz.
-        rest: [U] rate at all other times, Hz.
+        geometry: stimuli [K], whose labels the trials have.
+        expected: [K, U] expected rates in the window, Hz.
         runs: whisker → per stimulus the contacts [n, 2] (s after onset).
-        frame: duration of a frame, s.
+
+    Raises:
+        DataError: a stimulus touches none of the whiskers whose contacts are told, or too late for the choice.
     """
-    behaviour = draw_behaviour(random, plan, labels)
-    spikes = draw_spikes(random, behaviour, rates, rest, frame)
+    behaviour = draw_behaviour(random, plan, geometry.labels)
+    first = first_contacts(runs, geometry.labels, plan.lost_whisker)
+    low, high = behaviour.recorded
+    answered = (behaviour.stimulus >= 0) & (behaviour.onset > low) & (behaviour.lick < high)
+    shown = behaviour.stimulus[answered]
+    begin = behaviour.onset[answered] + first[shown]
+    length = behaviour.lick[answered] - begin
+    counts = draw_counts(random, plan.design, expected[shown], length[:, None])
+    rest = REST * expected.mean(axis=0)
+    spikes = spike_trains(random, counts, begin, length, rest, behaviour.recorded)
     contacts = draw_contacts(random, behaviour, runs)
     number = len(spikes)
     depth = np.round(np.sort(random.uniform(40, 1250, number)), 1)
@@ -143,7 +160,8 @@ def draw_behaviour(random: np.random.Generator, plan: SessionPlan, labels: tuple
     stop = np.append(start[1:], start[-1] + duration[-1])
     onset = start + _REACH
     opened = onset + 0.3
-    choice_time = np.round(onset + random.uniform(*CHOICE, number), 4)
+    lick = np.round(onset + random.uniform(*CHOICE, number), 4)
+    choice_time = lick.copy()
     choice_time[spoiled] = opened[spoiled] + 45.0
     shape, place = zip(*(label.split("-") for label in labels), strict=True)
     side = np.where(np.array([(*shape, "nothing")[index] == "convex" for index in stimulus]), "left", "right")
@@ -169,54 +187,7 @@ def draw_behaviour(random: np.random.Generator, plan: SessionPlan, labels: tuple
         "response_window_open_time": opened,
         "id": ids.astype(np.int64),
     }
-    return Behaviour(columns, stimulus, onset, (float(start[5]) + 0.2, float(stop[-7])))
-
-
-def draw_spikes(
-    random: np.random.Generator,
-    behaviour: Behaviour,
-    rates: NDArray[np.float64],
-    rest: NDArray[np.float64],
-    frame: float,
-) -> list[NDArray[np.float64]]:
-    """Draw the spike times (s) of every unit: gamma-Poisson counts, Fano factor about 1.5 to 2.
-
-    Args:
-        random: source of the draws.
-        behaviour: the trials.
-        rates: [K, T, U] expected rates during the stimuli, Hz.
-        rest: [U] rate at all other times, Hz.
-        frame: duration of a frame, s.
-    """
-    low, high = behaviour.recorded
-    frames, units = rates.shape[1:]
-    first = np.floor((behaviour.onset + LATENCY - low) / frame).astype(int)
-    total = int((high - low) / frame)
-    expected = np.broadcast_to(rest, (total, units)).copy()
-    # Gains of mean one, with variance 1/40 for all units of a trial and 1/9 for each unit, make counts vary more than
-    # Poisson ones.
-    shared = random.gamma(40.0, 1 / 40.0, len(first))
-    own = random.gamma(9.0, 1 / 9.0, (len(first), units))
-    fraction = (behaviour.onset + LATENCY - low) / frame - first
-    for trial, stimulus in enumerate(behaviour.stimulus):
-        begin, end = first[trial], first[trial] + frames + 1
-        if stimulus < 0 or begin < 0 or end > total:
-            continue
-        # The stimulus starts inside a frame of the session's grid; share its rate between neighbours.
-        padded = np.concatenate([rest[None], rates[stimulus], rest[None]])
-        shift = fraction[trial]
-        expected[begin:end] = (1 - shift) * padded[1:] + shift * padded[:-1]
-        expected[begin:end] *= shared[trial] * own[trial]
-    # Poisson counts of each frame, placed evenly within it; spikes within 1 ms of the one before are left out.
-    numbers = random.poisson(expected * frame)
-    spikes = []
-    for unit in range(units):
-        bins = np.repeat(np.arange(total), numbers[:, unit])
-        # Evenly within a frame, then rounded to samples as a spike sorter reports them.
-        times = np.sort(low + (bins + random.random(len(bins))) * frame)
-        times = np.round(times * _CLOCK) / _CLOCK
-        spikes.append(times[np.diff(times, prepend=-1.0) > 0.001])
-    return spikes
+    return Behaviour(columns, stimulus, onset, lick, (float(start[5]) + 0.2, float(stop[-7])))
 
 
 def draw_contacts(
@@ -260,3 +231,18 @@ def tracked_contacts(
                 np.stack([np.flatnonzero(row == 1), np.flatnonzero(row == -1)], axis=1) * frame for row in change
             ]
     return found
+
+
+def first_contacts(
+    runs: Mapping[str, list[NDArray[np.float64]]], labels: tuple[str, ...], lost: str | None
+) -> NDArray[np.float64]:
+    """Return the first contact [K] (s after onset) of each stimulus with the whiskers whose contacts are told."""
+    known = {name: items for name, items in runs.items() if name != lost}
+    first = np.full(len(labels), np.inf)
+    for stimulus, label in enumerate(labels):
+        first[stimulus] = min(
+            (items[stimulus][0, 0] for items in known.values() if len(items[stimulus])), default=np.inf
+        )
+        if first[stimulus] >= CHOICE[0]:
+            raise DataError(f"The stimulus {label!r} touches none of {listing(known)} in time for the demo's choices.")
+    return first

@@ -42,7 +42,7 @@ _ONSET = 0.15
 """Share of the spikes in a window that belong to the onset response."""
 _DEAD = 0.002
 """Refractory time, s."""
-_REST = 0.5
+REST = 0.5
 """Rate between windows, as a share of a unit's mean rate."""
 _TOUCH = 0.05
 """Duration of a contact, s."""
@@ -194,6 +194,38 @@ def place_spikes(
     return begin[which] + position[order] + rank * dead
 
 
+def spike_trains(
+    random: np.random.Generator,
+    counts: NDArray[np.int64],
+    begin: NDArray[np.float64],
+    length: float | NDArray[np.float64],
+    rest: NDArray[np.float64],
+    span: tuple[float, float],
+) -> list[NDArray[np.float64]]:
+    """Place the spikes of a session: counted ones in the trials' windows, and others at a constant rate between them.
+
+    Args:
+        random: source of the draws.
+        counts: [R, U] spikes in each window.
+        begin: [R] begin of the windows, ascending, s.
+        length: length of all windows, or of each [R], s; they do not overlap.
+        rest: [U] rate outside the windows, Hz.
+        span: first and last second of the recording.
+
+    Returns:
+        spike times of each unit [U], s; 15 % of those in a window come about 12 ms after its begin.
+    """
+    # The margins keep the refractory time between the spikes of a window and those around it.
+    opened = np.concatenate([[span[0]], begin + length]) + _DEAD
+    pause = np.concatenate([begin, [span[1]]]) - _DEAD - opened
+    trains = []
+    for unit in range(counts.shape[1]):
+        window = place_spikes(random, counts[:, unit], begin, length, _ONSET)
+        idle = place_spikes(random, random.poisson(rest[unit] * pause), opened, pause, 0.0)
+        trains.append(np.sort(np.concatenate([window, idle])))
+    return trains
+
+
 def _times(drawn: DrawnSession) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the contact and the end of every trial [R], s."""
     pause = np.round(np.random.default_rng([*drawn.stream, 2]).uniform(*_AFTER, len(drawn.labels)), 4)
@@ -205,16 +237,8 @@ def _session(geometry: ResponseGeometry, drawn: DrawnSession) -> Session:
     random = np.random.default_rng([*drawn.stream, 1])
     begin, stop = _times(drawn)
     choice, end = begin + drawn.window, float(stop[-1])
-    # The margins keep the refractory time between the spikes of a window and those around it.
-    opened = np.concatenate([[0.0], choice]) + _DEAD
-    pause = np.concatenate([begin, [end]]) - _DEAD - opened
     # The rate between windows is the same for all stimuli: a reader that mistakes the window loses the geometry.
-    rest = _REST * drawn.expected.mean(axis=0)
-    spikes = []
-    for unit in range(drawn.counts.shape[1]):
-        window = place_spikes(random, drawn.counts[:, unit], begin, drawn.window, _ONSET)
-        idle = place_spikes(random, random.poisson(rest[unit] * pause), opened, pause, 0.0)
-        spikes.append(np.sort(np.concatenate([window, idle])))
+    spikes = spike_trains(random, drawn.counts, begin, drawn.window, REST * drawn.expected.mean(axis=0), (0.0, end))
     tables: dict[str, dict[str, Any]] = {
         "trials": {
             "id": np.arange(len(begin)),

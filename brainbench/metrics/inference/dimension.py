@@ -36,7 +36,7 @@ def pattern_dimensions(patterns: ArrayLike) -> float:
     if array.ndim != 2 or len(array) < 3:
         raise UsageError(f"Dimensions need patterns [stimuli, features] of 3 stimuli; received shape {array.shape}.")
     gram = _products(array, array)
-    return _solved(*_moments(gram, gram), len(array))
+    return _solved(_moments(gram, gram), len(array))
 
 
 def signal_dimensions(animals: Iterable[Sequence[Trials]], n_stimuli: int, *, seed: int = 0) -> float:
@@ -78,11 +78,11 @@ def signal_dimensions(animals: Iterable[Sequence[Trials]], n_stimuli: int, *, se
             products.append(whole)
     if not products:
         raise DataError("Dimensions need a session with 4 trials of every stimulus and 2 units; there is none.")
-    inside = 1 / _solved(*within, n_stimuli)
+    inside = 1 / _solved(within, n_stimuli)
     if len(products) == 1:
         return 1 / inside
     between = sum((_moments(one, two) for one, two in combinations(products, 2)), np.zeros(2))
-    shared = min(inside, 1 / _solved(*between, n_stimuli))
+    shared = min(inside, 1 / _solved(between, n_stimuli))
     return min(MOST, max(1.0, (math.sqrt(shared) + math.sqrt(inside - shared)) ** -2))
 
 
@@ -118,8 +118,9 @@ def _moments(one: Floats, two: Floats) -> Floats:
     return np.array([np.trace(one) * np.trace(two), (one * two).sum()])
 
 
-def _solved(square: float, total: float, stimuli: int) -> float:
+def _solved(moments: Floats, stimuli: int) -> float:
     """Return D from estimates of (tr G)² and tr G² over K stimuli."""
+    square, total = moments.tolist()
     if not (math.isfinite(square) and square > 0 and total > 0):
         raise DataError("The responses to the stimuli do not differ beyond noise, so they have no dimensions.")
     contrasts = stimuli - 1

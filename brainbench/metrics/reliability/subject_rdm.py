@@ -132,7 +132,7 @@ def subject_rdm(
         seed: Seed of the splits.
         noise: Noise covariance for ``mahalanobis`` and ``crossnobis``: ``diag``, ``none`` or another of
             :func:`brainbench.metrics.noise_precision`. ``diag``, ``none`` and ``full`` leave crossnobis
-            unbiased; shrinkage leaves a bias of up to .01 per unit (docs/statistics.md).
+            unbiased; shrinkage leaves a bias of up to .01 per unit (docs/calibration.md).
 
     Raises:
         UsageError: unknown method, bad shapes or labels, repeated trial keys, no positive ``splits``.

@@ -15,20 +15,21 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from brainbench.core.errors import UsageError
 from brainbench.core.records import Interval
-from brainbench.core.statistics import FEWEST_ANIMALS, FEWEST_STIMULI, LEVEL, two_factor_error
+from brainbench.core.statistics import FEWEST_ANIMALS, FEWEST_STIMULI
+from brainbench.metrics.inference.intervals import two_factor_interval
 from brainbench.metrics.inference.permutation import tail_p
 from brainbench.metrics.layers import most_chosen
 from brainbench.metrics.rdms.comparison import check_comparison
 from brainbench.metrics.rdms.pairs import Floats, rdm_stack
 from brainbench.metrics.reliability.noise_correction import RELIABILITY_GATE
-from brainbench.metrics.time.lags import LaggedRDMs, held_out_course, peak_lag, profile, votes
+from brainbench.metrics.time.lags import LaggedRDMs, best_lag, held_out_course, votes
 from brainbench.metrics.time.movies import AnimalMovie
 
 PERMUTATIONS = 1000
@@ -160,7 +161,11 @@ def score_over_time(
     )
     names, chance = tuple(layers), expected / len(course)
     excess, without = observed[0] - chance, [item[0] - chance for item in left_out]
-    latencies = _latencies(names, joined.lags * width, excess, without, match)
+    latencies = _latencies(names, joined.lags.astype(np.float64) * width, excess, without, match)
+    if not np.isfinite(factors).any():
+        # What unreliable bins match is noise, or what all bins share, and either has no lag.
+        reason = "no animal is reliable in any bin"
+        latencies = tuple(replace(item, latency=math.nan, interval=None, reason=reason) for item in latencies)
     return TimeCourse(
         points=points,
         latencies=latencies,
@@ -231,17 +236,10 @@ def _largest_p(null: Floats) -> tuple[Floats, float]:
 
 def _intervals(animals: Floats, left_out: Floats) -> list[Interval | None]:
     """Return the interval of the mean of values [T, A] whose means without each stimulus are [T, K]."""
-    return [_interval(float(mean), *item) for mean, *item in zip(_mean(animals), animals, left_out, strict=True)]
-
-
-def _interval(middle: float, animals: Floats, left_out: Floats) -> Interval | None:
-    from scipy.special import stdtrit
-
-    error, freedom = (float(item) for item in two_factor_error(animals, left_out))
-    if not (math.isfinite(middle) and math.isfinite(error)):
-        return None
-    half = float(stdtrit(freedom, (1 + LEVEL) / 2)) * error if error else 0.0
-    return Interval(middle - half, middle + half, LEVEL, "t over animals and stimuli, jackknife")
+    return [
+        two_factor_interval(float(mean), *item) if np.isfinite(mean) else None
+        for mean, *item in zip(_mean(animals), animals, left_out, strict=True)
+    ]
 
 
 def _latencies(
@@ -261,7 +259,7 @@ def _latencies(
     animals, step = excess.shape[-1], lags[1] - lags[0]
 
     def latency(values: Floats) -> Floats:
-        return lags[0] + step * peak_lag(profile(values))
+        return lags[0] + step * best_lag(values)
 
     best = latency(excess)
     # Pseudo-values, whose variance over animals is that of the jackknife.
@@ -286,7 +284,7 @@ def _latencies(
                 latency=math.nan if reason else float(best[index]),
                 value=float(np.nanmax(reached[index])) if tried else math.nan,
                 p=float(p[index]) if tried else math.nan,
-                interval=_interval(float(best[index]), pseudo[index], without[index])
+                interval=two_factor_interval(float(best[index]), pseudo[index], without[index])
                 if steady and not reason
                 else None,
                 reason=reason,

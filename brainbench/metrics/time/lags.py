@@ -146,24 +146,28 @@ def profile(excess: Floats) -> Floats:
     return np.where(np.isfinite(excess).any(axis=(-2, -1)), found, np.nan)
 
 
+def best_lag(excess: Floats) -> Floats:
+    """Return the lag [L] at which each layer matches best, in steps from the first one, from comparisons [L, G, T, A].
+
+    Between steps a parabola goes through the best lag and its neighbours, over the bins that all three have. NaN where
+    there is no comparison, or the best lag is the first or last of those compared.
+    """
+    height = profile(excess)
+    top = np.where(np.isfinite(height), height, -np.inf).argmax(axis=1)
+    at = np.clip(top, 1, excess.shape[1] - 2)
+    three = np.take_along_axis(excess, (at[:, None] + np.arange(-1, 2))[:, :, None, None], axis=1)
+    shared = np.where(np.isfinite(three).all(axis=1, keepdims=True), three, np.nan)
+    before, here, after = _mean_over_bins(shared).T
+    with np.errstate(invalid="ignore", divide="ignore"):
+        shift = 0.5 * (before - after) / (before - 2 * here + after)
+    # Over fewer bins the peak may move, but not beyond the neighbours.
+    inside = (top == at) & np.isfinite(shift) & (before - 2 * here + after < 0)
+    return np.where(inside, at + np.clip(shift, -1, 1), np.nan)
+
+
 def _mean_over_bins(values: Floats) -> Floats:
     """Return the mean [L, G] over the finite entries of values [L, G, T, A]."""
     present = np.isfinite(values)
     number = present.sum(axis=(-2, -1))
     total = np.where(present, values, 0.0).sum(axis=(-2, -1))
     return np.divide(total, number, out=np.full(total.shape, np.nan), where=number > 0)
-
-
-def peak_lag(profiles: Floats) -> Floats:
-    """Return where each of profiles [..., G] is highest, in steps from its first entry; between steps by a parabola.
-
-    NaN where the profile has no value, or its highest entry has a missing neighbour or lies at an end.
-    """
-    filled = np.where(np.isfinite(profiles), profiles, -np.inf)
-    top = filled.argmax(axis=-1)
-    inside = (top > 0) & (top < profiles.shape[-1] - 1)
-    at = np.clip(top, 1, profiles.shape[-1] - 2)
-    before, here, after = (np.take_along_axis(profiles, (at + d)[..., None], axis=-1)[..., 0] for d in (-1, 0, 1))
-    with np.errstate(invalid="ignore", divide="ignore"):
-        shift = 0.5 * (before - after) / (before - 2 * here + after)
-    return np.where(inside & np.isfinite(shift), at + shift, np.nan)

@@ -376,9 +376,9 @@ def test_real_files_pass_without_false_alarm(reference):
 
 @pytest.fixture(scope="session")
 def demo_files(tmp_path_factory):
-    from brainbench.datasets.synthetic import make_demo
+    from brainbench.datasets.synthetic import make_rodgers_demo
     from tests.factories.recordings import make_stimuli
 
     folder = tmp_path_factory.mktemp("demo-check")
-    make_demo(folder, make_stimuli())
+    make_rodgers_demo(folder, make_stimuli())
     return folder

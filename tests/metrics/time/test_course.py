@@ -101,6 +101,16 @@ def test_few_animals_or_stimuli_are_said():
     assert all(item.interval is None for item in course.latencies)
 
 
+def test_animals_that_are_reliable_at_no_time_give_no_latency():
+    rng = np.random.default_rng(10)
+    path = make_path(rng, 10, 8)
+    animals = [make_movie(rng, path, str(index), reliability=0.3) for index in range(4)]
+    course = score_over_time({"layer": make_layer(rng, path)}, animals, width=BIN, permutations=39)
+    assert math.isnan(course.latencies[0].latency)
+    assert "reliable" in course.latencies[0].reason
+    assert course.p <= 0.05
+
+
 def test_the_order_of_stimuli_does_not_matter():
     layers, animals = _study(np.random.default_rng(6), stimuli=9)
     from dataclasses import replace

@@ -1,0 +1,165 @@
+"""Boards with a known truth: animals that share a geometry, and models that hold a known share of it.
+
+Every job here is one simulated study, with its own seed, drawn by ``datasets.synthetic`` and scored by the metrics as a
+user's would be; :mod:`benchmarks.scores.calibration` runs many of them on all processors.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, fields, replace
+from itertools import combinations
+from typing import Any
+
+import numpy as np
+from scipy import stats
+
+from brainbench.core.records import Score
+from brainbench.core.statistics import two_factor_error
+from brainbench.datasets.synthetic import PopulationDesign, ResponseGeometry
+from brainbench.datasets.synthetic.populations import draw_sessions
+from brainbench.metrics import get_metric, rdm
+from brainbench.metrics.measures.rsa import RSA
+from brainbench.metrics.rdms.comparison import compare_all
+from brainbench.metrics.time import AnimalMovie, score_over_time
+
+DIMENSIONS = 10
+RULES = ("animals alone", "two factors")
+BOARDS = {"unrelated": (0.0,) * 8, "equally good": (0.6,) * 8, "one better": (0.9,) + (0.4,) * 7}
+"""Shares of the models of three boards."""
+BIN = 0.05
+
+
+@dataclass(frozen=True)
+class Study:
+    """One simulated study."""
+
+    seed: int
+    stimuli: int
+    animals: int
+    shares: tuple[float, ...] = ()
+    """Of each model, the correlation of its geometry with the shared one (about its true score on the common scale)."""
+    metric: str = "rsa"
+    quick: bool = True
+    """Chance from 199 orders of the stimuli in place of 1,999; for RSA alone."""
+    layers: int = 1
+    """Layers of each model; the first has the share, the others know nothing."""
+
+
+class FewOrders(RSA):
+    """RSA whose p is coarse, which intervals and comparisons of models do not use."""
+
+    orders = 199
+
+
+def mixed(shared: np.ndarray, share: float, rng: np.random.Generator) -> np.ndarray:
+    """Return features [K, 2D] whose squared distances correlate by ``share`` with those of shared features [K, D]."""
+    # Squared distances add up over features: w of the shared ones and 1 − w of others correlate by
+    # w/√(w² + (1 − w)²) with the shared ones.
+    weight = 1.0 if share >= 1 else 1 / (1 + math.sqrt(1 / share**2 - 1)) if share > 0 else 0.0
+    other = rng.normal(size=shared.shape)
+    return np.concatenate([math.sqrt(weight) * shared, math.sqrt(1 - weight) * other], axis=1)
+
+
+def score_study(study: Study) -> tuple[list[Score], np.ndarray]:
+    """Return the score of every model, and its comparison with the animals' noiseless RDMs, mean over animals."""
+    rng = np.random.default_rng([study.seed, study.stimuli, study.animals])
+    shared = rng.normal(size=(study.stimuli, DIMENSIONS))
+    geometry = ResponseGeometry.from_activations(shared)
+    names = [f"{'ab'[index % 2]}-{index // 2}" for index in range(study.stimuli)]
+    metric: Any = get_metric(study.metric)
+    if study.quick and isinstance(metric, RSA):
+        metric = FewOrders(**{item.name: getattr(metric, item.name) for item in fields(metric)})
+    prepared, noiseless = [], []
+    for drawn in draw_sessions(geometry, PopulationDesign(animals=study.animals), study.seed):
+        block = drawn.trials
+        block = type(block)(block.responses.mean(axis=1), block.labels, block.keys)
+        prepared.append(metric.animal(drawn.subject, [block], study.stimuli, stimuli=names, seed=0))
+        noiseless.append(rdm(drawn.expected, method="sqeuclidean"))
+    scores, truths = [], []
+    for index, share in enumerate(study.shares):
+        layers = {"0": mixed(shared, share, rng)}
+        layers |= {str(layer): rng.normal(size=(study.stimuli, DIMENSIONS)) for layer in range(1, study.layers)}
+        scores.append(metric.score(layers, prepared, name=str(index), stimuli=names, seed=study.seed))
+        own = rdm(layers["0"], method="sqeuclidean")
+        truths.append(compare_all(own[None], np.stack(noiseless), method="whitened-cosine").mean())
+    return scores, np.array(truths)
+
+
+def null_p(study: Study) -> float:
+    """Return p of a model that knows nothing."""
+    return score_study(study)[0][0].p
+
+
+def interval_found(study: Study) -> list[tuple[float, float, float, float, float]]:
+    """Return value, low, high, scaled value and the noiseless comparison of every model."""
+    scores, truths = score_study(study)
+    nothing = float("nan")
+    return [
+        (
+            score.value,
+            score.interval.low if score.interval else nothing,
+            score.interval.high if score.interval else nothing,
+            score.scaled,
+            float(truth),
+        )
+        for score, truth in zip(scores, truths, strict=True)
+    ]
+
+
+def pairs_told_apart(study: Study) -> dict[str, dict[str, tuple[float, float, float]]]:
+    """Return the result of :func:`tested_pairs` for every board of :data:`BOARDS`, all against the same animals."""
+    scores, _ = score_study(replace(study, shares=sum(BOARDS.values(), ())))
+    found, start = {}, 0
+    for board, shares in BOARDS.items():
+        found[board] = tested_pairs(scores[start : start + len(shares)])
+        start += len(shares)
+    return found
+
+
+def tested_pairs(scores: list[Score]) -> dict[str, tuple[float, float, float]]:
+    """Return, for each rule, three shares of pairs of models.
+
+    Pairs with p ≤ .05; pairs told apart at a false discovery rate of 5 % over all pairs of the board; of the pairs
+    with the first model, those told apart with the first one better.
+    """
+    pairs = np.array(list(combinations(range(len(scores)), 2)))
+    animals = np.array([[score.on_scale(one.value) for one in score.subjects] for score in scores])
+    without = np.array([[score.on_scale(value) for value in score.without_stimulus] for score in scores])
+    difference = animals[pairs[:, 0]] - animals[pairs[:, 1]]
+    # An animal that is not reliable has no part in the scores.
+    difference = difference[:, np.isfinite(difference).all(axis=0)]
+    mean, count = difference.mean(axis=1), difference.shape[1]
+    error, freedom = two_factor_error(difference, without[pairs[:, 0]] - without[pairs[:, 1]])
+    alone = difference.std(axis=1, ddof=1) / math.sqrt(count)
+    shares = {}
+    for rule, spread, degrees in (("animals alone", alone, count - 1), ("two factors", error, freedom)):
+        p = 2 * stats.t.sf(np.abs(mean) / spread, degrees)
+        apart = stats.false_discovery_control(p) <= 0.05
+        better = apart & (mean > 0)
+        shares[rule] = (float((p <= 0.05).mean()), float(apart.mean()), float(better[pairs[:, 0] == 0].mean()))
+    return shares
+
+
+def study_over_time(seed: int) -> tuple[float, float, float, float, float]:
+    """Return p of an unrelated model, p of its layers, and latency, low and high of a related one (true: two bins)."""
+    rng = np.random.default_rng([11, seed])
+    stimuli, bins, dimensions, units = 16, 12, 4, 40
+    paths = rng.normal(size=(4, bins + 20, stimuli, dimensions))
+    for step in range(1, bins + 20):
+        paths[:, step] = 0.7 * paths[:, step - 1] + math.sqrt(0.51) * paths[:, step]
+    followed, *others = paths[:, 20:]
+    late = np.zeros_like(followed)
+    late[3:] = followed[1:-2]
+
+    def movie(path: np.ndarray, count: int, noise: float) -> np.ndarray:
+        patterns = path @ rng.normal(size=(dimensions, count)) + noise * rng.normal(size=(bins, stimuli, count))
+        return np.stack([rdm(one, method="sqeuclidean") for one in patterns])
+
+    animals = [AnimalMovie(str(index), movie(late, units, 1.0), np.full(bins, 0.9)) for index in range(6)]
+    layers = {str(index): movie(path, 40, 0.0) for index, path in enumerate(others)}
+    null = score_over_time(layers, animals, width=BIN, permutations=199, seed=seed)
+    related = score_over_time({"followed": movie(followed, 40, 0.0)}, animals, width=BIN, permutations=99, seed=seed)
+    (found,) = related.latencies
+    span = (found.interval.low, found.interval.high) if found.interval else (math.nan, math.nan)
+    return null.p, min(item.p for item in null.latencies), found.latency, *span
