@@ -113,7 +113,8 @@ def choice(candidates: Sequence[Candidate], boards: int) -> str:
         f"{len(candidates)} shipped networks, {boards} boards of each: share of {count} boards in which the true "
         f"network has the highest score (Wilson interval of .50: {interval.low:.2f}–{interval.high:.2f}; chance "
         f"{1 / len(candidates):.2f}). Ten animals of 60 units, 16–20 trials where nothing else is said; a random layer "
-        "and, below 40, random stimuli of the recipe `objects` for each board.",
+        "and, below 40, random stimuli of the recipe `objects` for each board. Mahalanobis and "
+        "crossnobis distances are divided by the noise of each unit.",
     ]
     for setting in SETTINGS:
         lines += ["", f"**{setting}**", "", "| distance | comparison | " + " | ".join(f"{k} stimuli" for k in STIMULI)]
