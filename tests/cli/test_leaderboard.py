@@ -115,7 +115,8 @@ def test_models_are_scored_once_and_the_batch_goes_on_where_it_stopped(run, file
     Path(files["model"].partition(":")[0]).write_text(
         Path(files["model"].partition(":")[0]).read_text().replace("GRU(8, 6", "GRU(8, 5")
     )
-    result = run("leaderboard", "add", "--batch", str(batch), "--to", str(to), "--prune", "--json")
+    result = run("leaderboard", "add", "--batch", str(batch), "--to", str(to), "--prune", "--workers", "2", "--json")
+    assert result.status == 0, result.err
     results = json.loads(result.out)["results"]
     assert [item["state"] for item in results] == ["scored", "scored"]
     assert all("replaces" in item["note"] for item in results)

@@ -39,6 +39,10 @@ def add(
         bool,
         typer.Option("--prune", help="Remove records that a new score of the same model, seed and settings replaces."),
     ] = False,
+    workers: Annotated[int, typer.Option(min=1, help="Processes that score.")] = 1,
+    scheduler: Annotated[
+        str | None, typer.Option(help="Let the workers of this Dask scheduler (tcp://host:8786) score.")
+    ] = None,
     as_json: JsonOption = False,
 ) -> None:
     """Add records to a folder: files that somebody sends, or scores computed now.
@@ -65,7 +69,7 @@ def add(
     if not records and not model and batch is None:
         raise UsageError("Name record files to take in, or models to score with --model or --batch.")
     done = _take_in(_files(records or []), to, keep_both=keep_both)
-    done += _score(jobs, to, prune=prune)
+    done += _score(jobs, to, prune=prune, workers=workers, scheduler=scheduler)
     states = [item["state"] for item in done]
     summary = ", ".join(f"{states.count(state)} {state}" for state in dict.fromkeys(states)) or "nothing to do"
     lines = [f"{item['state']:9} {item['record'] or item['model']}{item['note']}" for item in done]
@@ -140,9 +144,11 @@ def _replaces(new: ResultRecord, old: ResultRecord) -> bool:
     return question(new) == question(old)
 
 
-def _score(jobs: list[ScoringJob], to: Path, *, prune: bool) -> list[dict[str, Any]]:
-    from brainbench.cli.leaderboard.scoring import missing
-    from brainbench.scoring.scores import score_record
+def _score(
+    jobs: list[ScoringJob], to: Path, *, prune: bool, workers: int, scheduler: str | None
+) -> list[dict[str, Any]]:
+    from brainbench.cli.leaderboard.scoring import ScoringJob, missing
+    from brainbench.core.jobs import run_jobs
     from leaderboards.store import write_record
 
     if not jobs:
@@ -156,15 +162,15 @@ def _score(jobs: list[ScoringJob], to: Path, *, prune: bool) -> list[dict[str, A
             for job in jobs
             if job not in open_jobs
         ]
-        for index, job in enumerate(open_jobs):
+        scored = run_jobs(ScoringJob.run, open_jobs, workers=workers, scheduler=scheduler)
+        for index, (place, record) in enumerate(scored, start=1):
             progress(index, len(open_jobs), "models scored")
-            record = score_record(job.model, job.options, command=job.command)
             path = write_record(record, to)
             replaced = [item for item in present if prune and item.path != path and _replaces(record, item.record)]
             for item in replaced:
                 item.path.unlink(missing_ok=True)
             note = "".join(f"\n          replaces {item.path.name}" for item in replaced)
-            done.append({"state": "scored", "record": path.name, "model": job.model, "note": note})
+            done.append({"state": "scored", "record": path.name, "model": open_jobs[place].model, "note": note})
     return done
 
 

@@ -28,6 +28,12 @@ class ScoringJob:
         """Command line that makes this score by itself."""
         return shlex.join(["brainbench", "score", self.model, *as_flags(SCORE, self.options, SCORE_FLAGS)])
 
+    def run(self) -> ResultRecord:
+        """Compute the score."""
+        from brainbench.scoring.scores import score_record
+
+        return score_record(self.model, self.options, command=self.command)
+
 
 def jobs_of(patterns: Sequence[str], seeds: Sequence[int], options: dict[str, Any]) -> list[ScoringJob]:
     """Return the scores of the models that the patterns match, for each seed of untrained weights."""
