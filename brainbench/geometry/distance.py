@@ -116,7 +116,9 @@ def point_triangle_distance(points: NDArray[np.float64], triangles: NDArray[np.f
     """Return the distances [n] of points [n, 3] from one triangle each [n, 3, 3]."""
     from trimesh.triangles import closest_point
 
-    return np.linalg.norm(closest_point(triangles, points) - points, axis=1)
+    nearest = np.linalg.norm(closest_point(triangles, points) - points, axis=1)
+    # Of a triangle without an area, closest_point may return a corner that is not the nearest.
+    return np.minimum(nearest, np.linalg.norm(triangles - points[:, None], axis=2).min(axis=1))
 
 
 def _farthest_outside(solid: Mesh, inside: Mesh, points: NDArray, rng: np.random.Generator) -> float:

@@ -46,6 +46,11 @@ def test_the_distance_from_a_triangle_is_that_of_its_nearest_point(corners):
     assert exact >= sampled - size / 20
 
 
+def test_of_a_triangle_without_an_area_the_nearest_corner_counts():
+    corners = np.array([[5.67037439e-08, 0.0, 0.0], [0.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
+    assert point_triangle_distance(np.zeros((1, 3)), corners[None])[0] == 0.0
+
+
 def test_equal_surfaces_are_no_distance_apart_and_a_shift_is_its_length():
     box = _box(1, 2, 3)
     assert hausdorff(box, box) == pytest.approx(0, abs=1e-12)

@@ -30,7 +30,7 @@ def test_a_current_record_is_left_alone(make_record, tmp_path):
     [
         ({}, 1, "stale: the file has the layout of version 1, now 2"),
         ({"version": "0.0.9"}, 2, "stale: made by brainbench 0.0.9, this is"),
-        ({"settings": {"estimator_version": 0}}, 2, "stale: version 0 of the default estimator, now 1"),
+        ({"settings": {"estimator_version": 0}}, 2, "stale: version 0 of the default estimator, now 2"),
     ],
 )
 def test_what_an_older_toolkit_made_is_stale(make_record, tmp_path, change, schema, sentence):

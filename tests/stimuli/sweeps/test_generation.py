@@ -70,7 +70,7 @@ def test_a_shard_cut_off_by_a_power_cut_is_made_again(plan, unbroken, tmp_path):
 
 
 def test_the_pipeline_behind_a_gpu_writes_the_same_bytes(plan, unbroken, tmp_path, monkeypatch):
-    monkeypatch.setattr(running, "_pool", _threads)
+    monkeypatch.setattr(running, "worker_pool", _threads)
     shutil.copy(unbroken / "config.json", tmp_path)
     done = []
     running.run_pipelined(plan.shards, tmp_path, 2, done.append)
