@@ -130,4 +130,9 @@ def ceiling_of(animals: Animals, comparison: str) -> Ceiling | None:
 
 def mean_rdm(animals: Animals) -> tuple[float, ...]:
     """Return the mean RDM of the scored animals [P]; empty without any."""
-    return tuple(animals.rdms(animals.scored).mean(axis=0).tolist()) if animals.scored else ()
+    return recorded_rdm(animals.rdms(animals.scored).mean(axis=0)) if animals.scored else ()
+
+
+def recorded_rdm(values: Floats) -> tuple[float, ...]:
+    """Return an RDM [P] as records hold it, to show and to compare: seven digits, half the size of all."""
+    return tuple(float(f"{value:.7g}") for value in values.tolist())

@@ -17,7 +17,7 @@ import numpy as np
 from brainbench.core.errors import UsageError, unknown_name
 from brainbench.core.provenance import Provenance
 from brainbench.core.records import LayerScore, Score, Status, SubjectScore
-from brainbench.metrics.animals import Animals, ceiling_of, gather, mean_rdm, mean_reliability
+from brainbench.metrics.animals import Animals, ceiling_of, gather, mean_rdm, mean_reliability, recorded_rdm
 from brainbench.metrics.comparisons import LayerComparisons
 from brainbench.metrics.inference.intervals import interval_reasons, t_interval, two_factor_interval
 from brainbench.metrics.inference.permutation import (
@@ -156,7 +156,7 @@ def score_layers(
         best_layer_value=float(means[best]),
         layers=tuple(_layer_score(label, shown.get(label), result, status) for label in names),
         subjects=_subjects(metric, layers, animals, result, defined),
-        model_rdm=tuple(layer.tolist()) if metric.of_rdms else (),
+        model_rdm=recorded_rdm(layer) if metric.of_rdms else (),
         chance=_mean(result.test.null),
         attainable=attainable,
         without_stimulus=tuple(result.without[np.argsort(animals.order)].tolist()),

@@ -134,8 +134,10 @@ def score_record(
         replace(item, provenance=replace(origin, statistics=found))
         for item, found in zip(scores, statistics, strict=True)
     )
+    # The animals' RDM stands in the record once.
+    others = [replace(item, brain_rdm=()) for item in others]
     if between is not None:
-        between = replace(between, provenance=replace(origin, statistics=between.provenance.statistics))
+        between = replace(between, brain_rdm=(), provenance=replace(origin, statistics=between.provenance.statistics))
     return ResultRecord(first, between, {item.name: item for item in others}, network.card, brain.synthetic)
 
 
