@@ -72,7 +72,7 @@ def test_the_score_is_the_mean_over_animals_of_the_held_out_corrected_comparison
     assert score.p == score.p_smallest == pytest.approx(1 / 720)
     assert score.metric == "RSA: correlation RDM, pearson comparison"
     np.testing.assert_allclose(score.model_rdm, layers[score.layer], rtol=1e-6)
-    np.testing.assert_allclose(score.brain_rdm, np.mean([animal.rdm for animal in animals], axis=0))
+    np.testing.assert_allclose(score.brain_rdm, np.mean([animal.rdm for animal in animals], axis=0), rtol=1e-6)
 
 
 def test_the_optimistic_maximum_stands_beside_the_score():
