@@ -14,7 +14,7 @@ from brainbench.core.provenance import Provenance
 from brainbench.core.records import Interval, Score, Status, SubjectScore
 from brainbench.metrics.animals import Animals, ceiling_of, gather, mean_rdm, mean_reliability
 from brainbench.metrics.comparisons import LayerComparisons
-from brainbench.metrics.inference.intervals import interval_reasons, two_factor_interval
+from brainbench.metrics.inference.intervals import held_to_scale, interval_reasons, two_factor_interval
 from brainbench.metrics.inference.permutation import SMALLEST_STIMULI, TIE, label_orders
 from brainbench.metrics.rdms.pairs import Floats
 from brainbench.metrics.reliability.noise_correction import RELIABILITY_GATE, Corrected
@@ -81,7 +81,7 @@ def score_agreement(
     value = float(parts.mean()) if found else math.nan
     scored = [animals.subjects[i] for i in found]
     attainable = float(np.mean(metric.attainable(scored, seed) * animals.factors(found))) if found else math.nan
-    return Score(
+    made = Score(
         name=name,
         value=value,
         status=status,
@@ -116,6 +116,7 @@ def score_agreement(
         without_stimulus=tuple(without[np.argsort(animals.order)].tolist()) if without.size else (),
         provenance=Provenance.of({"seed": seed, "reliability_gate": RELIABILITY_GATE}),
     )
+    return held_to_scale(made)
 
 
 def _chance(metric: Metric, pairs: Sequence[LayerComparisons], factors: Floats, seed: int) -> float:

@@ -19,7 +19,7 @@ from brainbench.core.provenance import Provenance
 from brainbench.core.records import LayerScore, Score, Status, SubjectScore
 from brainbench.metrics.animals import Animals, ceiling_of, gather, mean_rdm, mean_reliability, recorded_rdm
 from brainbench.metrics.comparisons import LayerComparisons
-from brainbench.metrics.inference.intervals import interval_reasons, t_interval, two_factor_interval
+from brainbench.metrics.inference.intervals import held_to_scale, interval_reasons, t_interval, two_factor_interval
 from brainbench.metrics.inference.permutation import (
     SMALLEST_STIMULI,
     PermutationTest,
@@ -163,7 +163,7 @@ def score_layers(
         provenance=Provenance.of({"statistics": statistics, **stated}),
         **about,
     )
-    return made, result.test
+    return held_to_scale(made), result.test
 
 
 def layer_table(names: Sequence[str], null: Floats) -> list[dict[str, Any]]:

@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from brainbench.core import statistics
-from brainbench.core.records import Interval
+from brainbench.core.records import Interval, Score
 from brainbench.core.statistics import FEWEST_ANIMALS, FEWEST_STIMULI, LEVEL, check_level, two_factor_error
+
+BEYOND = 1.1
+"""Scaled score that no interval should lie above: a tenth of the scale more than all that is reliable."""
 
 
 def t_interval(values: ArrayLike, level: float = LEVEL) -> Interval | None:
@@ -57,3 +61,12 @@ def interval_reasons(animals: int, stimuli: int) -> tuple[str, ...]:
     if stimuli < FEWEST_STIMULI:
         lacking.append(f"{stimuli} stimuli, at least {FEWEST_STIMULI} are needed")
     return (f"too few to tell models apart: {'; '.join(lacking)}",) if lacking else ()
+
+
+def held_to_scale(score: Score) -> Score:
+    """Return the score, unreliable where it lies above what is attainable: nothing can explain more than that."""
+    span = score.scaled_interval
+    if score.status != "ok" or span is None or not span.low > BEYOND:
+        return score
+    reason = f"above all that is reliable (at least {span.low:.2f} of it): the scale of this metric does not hold here"
+    return replace(score, status="unreliable", reasons=(reason, *score.reasons))

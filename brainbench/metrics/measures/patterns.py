@@ -20,8 +20,6 @@ class PatternMetric(Metric):
     :meth:`compare_orders` where all orders can be computed at once.
     """
 
-    reasons = ("not corrected for noise: compare with the animal-to-animal value, not with 1",)
-
     def similarity(self, model: Floats, brain: Floats) -> float:
         """Return how alike features [K, F] and mean responses [K, U] are; larger is more alike.
 

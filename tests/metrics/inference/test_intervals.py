@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from scipy import stats
 
+from brainbench.core.records import Interval, Score
 from brainbench.core.statistics import two_factor_error
-from brainbench.metrics.inference.intervals import interval_reasons, two_factor_interval
+from brainbench.metrics.inference.intervals import held_to_scale, interval_reasons, two_factor_interval
 from brainbench.metrics.rdms.comparison import compare_all
 from brainbench.metrics.rdms.dissimilarity import rdm
 from brainbench.metrics.rdms.pairs import permuted_pairs
@@ -72,3 +74,11 @@ def test_too_few_animals_or_stimuli_say_what_is_needed():
     assert "3 animals" in told
     assert "stimuli" not in told
     assert "6 stimuli" in interval_reasons(8, 6)[0]
+
+
+def test_a_score_above_all_that_is_reliable_is_not_trusted():
+    above = Score("x", 0.9, "ok", interval=Interval(0.88, 0.92), chance=0.5, attainable=0.8)
+    held = held_to_scale(above)
+    assert (held.status, "1.27" in held.reasons[0]) == ("unreliable", True)
+    reaching = replace(above, interval=Interval(0.78, 1.02))
+    assert held_to_scale(reaching) is reaching
