@@ -231,12 +231,16 @@ class Score(_NullIsNaN, _Document):
         return Interval(low, high, self.interval.level, self.interval.method)
 
     def summary(self) -> str:
-        """Return one line a person reads: value, interval, p and status."""
+        """Return one line to read: scaled score (the value where there is no scale), interval, p and status."""
         if self.status == "undefined":
             return f"{self.name}: undefined ({'; '.join(self.reasons)})"
-        text = f"{self.name}: {self.value:.3f}"
-        if self.interval is not None:
-            text += f" [{self.interval.low:.3f}, {self.interval.high:.3f}]"
+        placed = math.isfinite(self.scaled)
+        number, span = (self.scaled, self.scaled_interval) if placed else (self.value, self.interval)
+        text = f"{self.name}: {'' if placed else 'value '}{number:.3f}"
+        if span is not None:
+            text += f" [{span.low:.3f}, {span.high:.3f}]"
+        if placed:
+            text += " from chance (0) to all that is reliable (1)"
         if math.isfinite(self.p):
             text += f", p = {self.p:.2g}"
         return text if self.status == "ok" else f"{text} ({self.status}: {'; '.join(self.reasons)})"
@@ -246,7 +250,8 @@ class Score(_NullIsNaN, _Document):
         from html import escape
 
         rows = [
-            ("score (noise-corrected)", _number(self.value) + (f" {_span(self.interval)}" if self.interval else "")),
+            ("score, from chance (0) to all that is reliable (1)", _with_span(self.scaled, self.scaled_interval)),
+            ("value", f"{_with_span(self.value, self.interval)}; chance {_number(self.chance)}"),
             ("status", ": ".join([self.status, *filter(None, ["; ".join(self.reasons)])])),
             ("raw r", _number(self.r)),
             ("reliability", _number(self.reliability)),
@@ -433,6 +438,10 @@ def _number(value: float) -> str:
 def _span(interval: Interval | Ceiling) -> str:
     low, high = (interval.low, interval.high) if isinstance(interval, Interval) else (interval.lower, interval.upper)
     return f"[{_number(low)}, {_number(high)}]"
+
+
+def _with_span(value: float, interval: Interval | None) -> str:
+    return f"{_number(value)} {_span(interval)}" if interval is not None else _number(value)
 
 
 def _convert(kind: type, data: Any) -> Any:

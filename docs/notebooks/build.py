@@ -93,15 +93,15 @@ plt.show()""",
         "markdown",
         """## 2. A network processes the forces
 
-The recipe `rodgers` is six stimuli: a convex and a concave shape at three distances, as in a published experiment. A model
-maps [B, T, C, H, W] to a class; each of its layers can be compared with the animals.""",
+The recipe `objects` is 40 procedural objects that are swept past twelve whiskers. A model maps [B, T, C, H, W] to a class; each
+of its layers can be compared with the animals.""",
     ),
     (
         "code",
         """from brainbench import extract, load_model
 from brainbench.stimuli import load_stimuli
 
-stimuli = load_stimuli("rodgers")
+stimuli = load_stimuli("objects")
 model = load_model("zhuang-intersection-ln-small", seed=0)
 activations = extract(model, stimuli.input)
 {layer: values.shape for layer, values in activations.items()}""",
@@ -117,8 +117,9 @@ RDM(rdm(values), stimuli.labels, title="encoder.fc7")""",
         "markdown",
         """## 3. The score
 
-Now the model is compared with the animals. For each animal the layer is chosen on the other animals, and the comparison is
-corrected for noise in its recordings. The permutation p repeats the choice of layer for every order of the six stimuli.""",
+Now the model is compared with the animals that felt these objects. For each animal the layer is chosen on the other animals,
+and the comparison is corrected for noise in its recordings. The score lies between chance (0) and all that is reliable (1); its
+interval is over animals and stimuli. The permutation p repeats the choice of layer for every order of the stimuli.""",
     ),
     (
         "code",
@@ -130,15 +131,15 @@ record.score""",
     (
         "code",
         """print(record.score.layer, "was chosen:", record.score.layer_rule)
-for item in record.score.provenance["statistics"]["layer_tests"]:
+for item in record.score.provenance.statistics["layer_tests"]:
     print(f"{item['layer']:15} p = {item['p']:.3f}, of the best layer {item['p_corrected']:.3f}")""",
     ),
     (
         "markdown",
         """## 4. The animals
 
-The demo recordings have the layout of a real experiment. Each animal has an RDM and a reliability: how well random halves
-of its trials agree. Animals with a low reliability are left out.""",
+Each animal has an RDM and a reliability: how well random halves of its trials agree. Animals with a low reliability are left
+out.""",
     ),
     (
         "code",
@@ -151,29 +152,31 @@ RDM(record.score.brain_rdm, record.score.stimuli, title="mean over animals")""",
     (
         "markdown",
         """Is the model as similar to the animals as they are to one another? And how similar is it if the effect of the number of
-contacts is removed?""",
+contacts is removed? The second question needs recordings in which it differs, such as the six stimuli of `demo-rodgers`.""",
     ),
     (
         "code",
         """from brainbench.metrics.inference.equivalence import turing_test
 
 print(turing_test(record.score, record.animal_to_animal).summary())
-beyond = score_record("zhuang-intersection-ln-small", metric="rsa-partial", baselines=False)
+beyond = score_record("zhuang-intersection-ln-small", recordings="demo-rodgers", metric="rsa-partial",
+                      baselines=False)
 print(beyond.score.summary())
-print(beyond.score.provenance["statistics"]["variance_partition"])""",
+print(beyond.score.provenance.statistics["variance_partition"])""",
     ),
     (
         "markdown",
         """## 5. A leaderboard
 
-Each score is saved as a record, one JSON file. A folder of records is a leaderboard.""",
+Each score is saved as a record, one JSON file. A folder of records is a leaderboard. The neurons of `demo` mix the units of
+`resnet18-small+gpt.simclr`, so this network should come first.""",
     ),
     (
         "code",
         """from leaderboards import build_leaderboard, rank, read_records, write_record
 
 write_record(record, "results")
-for name in ("zhuang-small", "s4-small"):
+for name in ("resnet18-small+gpt.simclr", "s4-small"):
     write_record(score_record(name, seed=0), "results")
 (board,) = rank(stored.record for stored in read_records("results"))
 for entry in board.entries:
