@@ -436,12 +436,12 @@ def faults(run: Run) -> Result:
                 blocks = [[Trials(b.responses[:, 0], b.labels, b.keys) for b in a.sessions] for a in animals]
                 prepared = [metric.animal(str(i), block, 6) for i, block in enumerate(blocks)]
                 score = metric.score_animals(prepared, stimuli=list("abcdef"))
-                values.append(score.value)
+                values.append(score.scaled)
                 reliable.append(score.reliability)
             known = np.array(values)[np.isfinite(values)]
             spread = f"{known.mean():.3f} ± {known.std() / math.sqrt(len(known)):.3f}"
             rows.append(["{} to {}".format(*trials), " + ".join(given) or "none", spread, f"{np.mean(reliable):.2f}"])
-    title = "Animal-to-animal score of 11 animals of one geometry, with the released faults"
+    title = "Scaled animal-to-animal score of 11 animals of one geometry, with the released faults"
     return Result(title, ["trials of a stimulus", "fault", "score", "reliability"], rows)
 
 
