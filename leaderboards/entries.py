@@ -113,8 +113,8 @@ class Entry:
 
     @property
     def p(self) -> float:
-        """The largest permutation p over seeds."""
-        return max((p for record in self.records if math.isfinite(p := record.score.p)), default=math.nan)
+        """The largest permutation p over seeds; NaN when a seed states none."""
+        return float(np.max([record.score.p for record in self.records]))
 
     @property
     def above_chance(self) -> bool:

@@ -44,6 +44,7 @@ _CARD_LABELS = {
     "input": "input",
     "encoder": "encoder",
     "attender": "attender",
+    "layer": "layer committed to",
     "citation": "architecture from",
 }
 """Card fields that are a line of text; the training and the graph have their own places."""
@@ -85,14 +86,14 @@ def level(interval: Interval) -> str:
 def p_sentence(score: Score) -> str:
     """Say how the p-value was found and how small it could have been."""
     parts = [score.p_method] if score.p_method else []
-    if math.isfinite(score.p_smallest):
-        least = probability(score.p_smallest)
-        reached = math.isfinite(score.p) and score.p <= score.p_smallest * (1 + 1e-9)
-        parts.append(
-            f"this is the smallest that {len(score.stimuli)} stimuli can give"
-            if reached
-            else f"the smallest possible is {least}"
-        )
+    if score.p <= score.p_smallest * (1 + 1e-9):
+        stimuli = len(score.stimuli)
+        # With many stimuli the number of drawn orders is the limit, not the number of orders that exist.
+        few = stimuli <= 20 and score.p_smallest * math.factorial(stimuli) < 2
+        giver = plural(stimuli, "stimulus", "stimuli") if few else "this number of permutations"
+        parts.append(f"this is the smallest that {giver} can give")
+    elif math.isfinite(score.p_smallest):
+        parts.append(f"the smallest possible is {probability(score.p_smallest)}")
     return "; ".join(parts)
 
 

@@ -25,6 +25,8 @@ OPTIONAL = {
     "onnxruntime": ("export", "the check of exported ONNX files"),
     "huggingface_hub": ("hub", "models by hf-hub:OWNER/NAME"),
     "matplotlib": ("report", "pictures and plots of stimuli (brainbench stimuli render | plot)"),
+    "pyarrow": ("board", "LeRobot data sets of robot episodes"),
+    "weasyprint": ("board", "reports as PDF (brainbench leaderboard report --format pdf)"),
     "imageio-ffmpeg": ("report", "films of stimuli as MP4 (GIF needs matplotlib alone)"),
 }
 

@@ -102,6 +102,8 @@ def _dimensions(asked: str, recordings: str | None, conditions: str | None, mode
     from brainbench.core.errors import UsageError
     from brainbench.metrics.inference.power import DIMENSIONS
 
+    if conditions is not None and recordings is None:
+        raise UsageError("--conditions labels the trials of --recordings; name those too.")
     sources = [name for name, given in (("--recordings", recordings), ("--model", model)) if given is not None]
     if asked != "auto":
         if not asked.isdecimal() or int(asked) < 1:

@@ -81,6 +81,8 @@ def recovery(
 
     if (pool is None) is not (keep is None):
         raise UsageError("Stimuli are picked with both --pool STIMULI and --keep NUMBER; received one of them.")
+    if keep is not None and show is not None:
+        raise UsageError("All stimuli that --keep picks are shown; leave out --show.")
     if want is not None and not 0 < want < 1:
         raise UsageError(f"A wanted rate lies between 0 and 1; received {want}.")
     started = time.perf_counter()

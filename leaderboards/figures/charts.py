@@ -167,7 +167,9 @@ def accuracy(entries: Sequence[Entry]) -> Figure:
     if not stated:
         lacking = "no record states a task accuracy (top1 on its model card); trained models do"
         return Figure(key, title, lacking=lacking)
-    models = [e for e in stated if e.trained][:SHOWN] or stated[:SHOWN]
+    # Untrained networks are drawn as twins; a board of such alone still shows them.
+    stated = [e for e in stated if e.trained] or stated
+    models = stated[:SHOWN]
     untrained = twins(entries)
     found = [_twin_accuracy(entry, untrained) for entry in models]
     colour = colours(map(_objective, models))

@@ -28,6 +28,15 @@ def _entries(*records):
     return board.entries
 
 
+def test_one_seed_without_a_test_leaves_the_entry_untested():
+    (record,) = draw_board({"net": 0.6})
+    untested = replace(record, score=replace(record.score, p=math.nan))
+    (entry,) = _entries(_run(record, 0), _run(untested, 1))
+    assert entry.standing == "not tested"
+    assert math.isnan(entry.p)
+    assert not entry.above_chance
+
+
 def test_seeds_are_one_entry_with_mean_interval_and_spread():
     (record,) = draw_board({"net": 0.6})
     (entry,) = _entries(*(_run(record, seed, by) for seed, by in enumerate((-0.1, 0.0, 0.1))))

@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     import xarray as xr
 
     from brainbench.core.records import ResultRecord, Score
+    from leaderboards.held_out import Commitment
 
 FEWEST = {"animals": 2, "stimuli": 3}
 """Fewest on either side: less has no score."""
@@ -85,7 +86,7 @@ def split(whole: xr.Dataset, kind: str, names: list[str]) -> xr.Dataset:
     return part.assign_attrs(vocabulary=labels, content_hash=content_hash(whole.attrs["content_hash"], kind, names))
 
 
-def score_held_out(record: ResultRecord, commitment: Path, secret: Path) -> dict[str, Any]:
+def score_held_out(record: ResultRecord, told: Commitment, secret: Path) -> dict[str, Any]:
     """Score the model of a record on held-out recordings, with the options that the record states.
 
     The answer is rounded to two digits: many submissions shall learn little of the held-out part.
@@ -96,9 +97,7 @@ def score_held_out(record: ResultRecord, commitment: Path, secret: Path) -> dict
     from brainbench.datasets import open_recordings
     from brainbench.scoring.options import ScoreOptions
     from brainbench.scoring.scores import score_record
-    from leaderboards.held_out import Commitment
 
-    told = Commitment.read(commitment)
     held = open_recordings(told.open(secret))
     pairs = record.score.provenance.pairs
     match = {label: pairs.get(label, label) for label in held.attrs["vocabulary"]}

@@ -27,10 +27,7 @@ def build(
     from leaderboards.site.build import build_leaderboard
     from leaderboards.store import read_records
 
-    sources = records or [RECORDS]
-    for source in sources:
-        _require(source)
-    stored = read_records(sources)
+    stored = read_records(records or [RECORDS])
     page = build_leaderboard(stored, out, title=title)
     good = [item for item in stored if not item.problem]
     bad = _problems(stored)
@@ -56,7 +53,7 @@ def report(
     from leaderboards.changes import open_build
     from leaderboards.report.paper import write_paper
 
-    stored = [item for source in records or [RECORDS] for item in open_build(source)]
+    stored = open_build(*(records or [RECORDS]))
     kind = format or (out.suffix.removeprefix(".") if out is not None and out.suffix else "html")
     files = write_paper(stored, out or Path(f"leaderboard-report.{kind}"), format=kind, title=title)
     problems = _problems(stored)
@@ -88,16 +85,6 @@ def diff(
         text += f"\n{restated} restated: other records with the same inputs and numbers."
     text += "".join(f"\nleft out: {item['path']}: {item['problem']}" for item in problems)
     emit({"changes": changes, "problems": problems}, text, as_json=as_json)
-
-
-def _require(source: Path) -> None:
-    from brainbench.core.errors import DataFileNotFoundError
-
-    if not source.exists():
-        raise DataFileNotFoundError(
-            f"There is no file or folder {str(source)!r} to read result records from; "
-            "make one first, for example with: brainbench score zhuang-intersection-ln"
-        )
 
 
 def _problems(stored: Any) -> list[dict[str, Any]]:

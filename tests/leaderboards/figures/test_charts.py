@@ -77,6 +77,14 @@ def test_the_accuracy_of_a_twin_comes_from_the_trained_record_or_else_from_its_o
     assert "No record states" not in told.caption
 
 
+def test_untrained_networks_do_not_count_among_the_models_cut_from_the_accuracies(make_record):
+    card = replace(make_record().card, objective="untrained", top1=0.1)
+    plain = [replace(make_record(f"net{i}"), card=replace(card, weights=str(i))) for i in range(plots.SHOWN + 1)]
+    figure = _figures(_trained(make_record("net.supervised")), *plain)["accuracy"]
+    assert "Shown are the first" not in figure.caption
+    assert "Shown are the first" in _figures(*plain)["accuracy"].caption
+
+
 @settings(deadline=None)
 @given(st.lists(st.tuples(st.floats(-5, 5), st.floats(-5, 5)), min_size=4, max_size=20))
 def test_regression_agrees_with_scipy(points):
