@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 
+from brainbench.cli.leaderboard.scoring import ScoringJob, full_settings, jobs_of, missing, parse_seeds, read_batch
 from brainbench.cli.options import SCORE, SCORE_FLAGS, with_options
 from brainbench.cli.output import JsonOption, emit, progress_bar
-
-if TYPE_CHECKING:
-    from brainbench.cli.leaderboard.scoring import ScoringJob
-    from brainbench.core.records import ResultRecord
-    from leaderboards.store import StoredRecord
+from brainbench.core.errors import DataFileNotFoundError, UsageError
+from brainbench.core.records import ResultRecord
+from leaderboards.store import StoredRecord, read_records, write_record
 
 OFFERED = (
     "recordings", "conditions", "select", "window", "stimuli", "fidelity", "whiskers", "metric", "estimator", "time"
@@ -54,9 +53,6 @@ def add(
     states other numbers for the same computation. Scores that are there already are not computed again, so an
     interrupted batch goes on where it stopped, and a stale one is renewed.
     """
-    from brainbench.cli.leaderboard.scoring import jobs_of, parse_seeds, read_batch
-    from brainbench.core.errors import UsageError
-
     if not records and not model and batch is None:
         raise UsageError("Name record files to take in, or models to score with --model or --batch.")
     if options and batch is not None:
@@ -84,8 +80,6 @@ def add(
 
 
 def _files(sources: list[Path]) -> list[Path]:
-    from brainbench.core.errors import DataFileNotFoundError
-
     found: list[Path] = []
     for source in sources:
         if not source.exists():
@@ -97,8 +91,6 @@ def _files(sources: list[Path]) -> list[Path]:
 
 def _take_in(paths: list[Path], to: Path, *, keep_both: bool) -> list[dict[str, Any]]:
     """Take in files one after the other; what one brought counts for the next."""
-    from leaderboards.store import read_records
-
     present = {record.identity: record for _, record in _present(to)} if paths else {}
     done = []
     for path in paths:
@@ -111,7 +103,6 @@ def _take_in_one(
     stored: StoredRecord, to: Path, present: dict[str, ResultRecord], *, keep_both: bool
 ) -> dict[str, Any]:
     from leaderboards.audit import conflicting, remarks
-    from leaderboards.store import write_record
 
     record = stored.record
     if record is None:
@@ -132,8 +123,6 @@ def _take_in_one(
 
 
 def _present(to: Path) -> list[tuple[Path, ResultRecord]]:
-    from leaderboards.store import read_records
-
     if not to.is_dir() or not any(to.rglob("*.json")):
         return []
     return [(item.path, item.record) for item in read_records(to) if item.record is not None]
@@ -141,7 +130,6 @@ def _present(to: Path) -> list[tuple[Path, ResultRecord]]:
 
 def _replaces(new: ResultRecord, old: ResultRecord) -> bool:
     """Return whether two records answer the same question, the old one with what has since changed."""
-    from brainbench.cli.leaderboard.scoring import full_settings
 
     def question(record: ResultRecord) -> tuple[Any, ...]:
         origin = record.score.provenance
@@ -153,9 +141,7 @@ def _replaces(new: ResultRecord, old: ResultRecord) -> bool:
 def _score(
     jobs: list[ScoringJob], to: Path, *, prune: bool, workers: int, scheduler: str | None
 ) -> list[dict[str, Any]]:
-    from brainbench.cli.leaderboard.scoring import ScoringJob, missing
     from brainbench.core.jobs import run_jobs
-    from leaderboards.store import write_record
 
     if not jobs:
         return []

@@ -9,18 +9,21 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from brainbench.cli.options import SCORE, with_options
 from brainbench.cli.output import JsonOption, emit
+from brainbench.core.errors import UsageError
+from brainbench.core.files import content_hash, write_json
+from brainbench.core.records import ResultRecord, Score
+from leaderboards.held_out import DATA, Commitment, digest, new_salt
 
 if TYPE_CHECKING:
     import xarray as xr
-
-    from brainbench.core.records import ResultRecord, Score
-    from leaderboards.held_out import Commitment
 
 FEWEST = {"animals": 2, "stimuli": 3}
 """Fewest on either side: less has no score."""
 
 
+@with_options(SCORE, ("conditions", "select", "window"), build=False)
 def hold_out(
     recordings: Annotated[str, typer.Argument(help="An NWB or HDF5 file, a folder, a glob, or 'demo'.")],
     animals: Annotated[int, typer.Option(help="Number of animals to hold back.")] = 0,
@@ -29,28 +32,22 @@ def hold_out(
     secret: Annotated[Path, typer.Option(help="Folder of what is kept back; never publish it.")] = Path(
         "held-out-secret"
     ),
-    conditions: Annotated[str | None, typer.Option(help="As in brainbench score.")] = None,
-    select: Annotated[str | None, typer.Option(help="As in brainbench score.")] = None,
-    window: Annotated[str | None, typer.Option(help="As in brainbench score.")] = None,
+    options: Any = None,
     as_json: JsonOption = False,
 ) -> None:
     """Split recordings into a public part and a held-out part, drawn at random, and publish a hash of the latter.
 
     Anybody can score models on the public part; ``leaderboard verify --held-out`` scores a submission on the rest.
     """
-    from brainbench.core.errors import UsageError
-    from brainbench.core.files import write_json
     from brainbench.datasets import write_recordings
     from brainbench.scoring.neural_responses import open_neural_responses
-    from leaderboards.held_out import DATA, Commitment, digest, new_salt
 
     if (animals > 0) == (stimuli > 0):
         raise UsageError(f"Hold back either --animals or --stimuli; received {animals} and {stimuli}.")
     if secret.exists():
         raise UsageError(f"The folder {str(secret)!r} exists; name a new one, so that no earlier secret is lost.")
     kind = "animals" if animals else "stimuli"
-    chosen = {"conditions": conditions, "select": select, "window": window}
-    whole = open_neural_responses(recordings, progress=None, **chosen).dataset
+    whole = open_neural_responses(recordings, progress=None, **options).dataset
     names = list(whole.attrs["vocabulary"]) if stimuli else sorted(set(map(str, whole["subject"].values)))
     held_count = animals or stimuli
     if min(held_count, len(names) - held_count) < FEWEST[kind]:
@@ -76,8 +73,6 @@ def hold_out(
 
 def split(whole: xr.Dataset, kind: str, names: list[str]) -> xr.Dataset:
     """Return the trials, and of animals also the units, of some animals or stimuli of a recordings data set."""
-    from brainbench.core.files import content_hash
-
     if kind == "animals":
         part = whole.isel(trial=whole["subject"].isin(names).values, unit=whole["unit_subject"].isin(names).values)
     else:
