@@ -15,7 +15,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 from brainbench.core.records import ResultRecord, Score
-from leaderboards.entries import Entry, fold_seeds, same_computation
+from leaderboards.entries import DOUBTFUL, Entry, fold_seeds, same_computation
 from leaderboards.ranking import Sample, lacking, rank_ranges, told_apart
 
 RAW_INPUT = "raw input"
@@ -142,7 +142,7 @@ def _unranked(entry: Entry, lacks: str) -> str:
     """Return why an entry cannot be ranked, empty when it can."""
     if reason := entry.not_repeatable:
         return f"not repeatable here: {reason}"
-    if entry.standing in ("unreliable", "undefined"):
+    if entry.standing in DOUBTFUL:
         return entry.standing
     if lacks:
         return f"ranks need {lacks}"

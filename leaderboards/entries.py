@@ -27,6 +27,8 @@ Standing = Literal[
 ]
 """What can be said of a score, from the most to the least: every page uses these words and no others."""
 STANDINGS: tuple[Standing, ...] = get_args(Standing)
+DOUBTFUL: tuple[Standing, ...] = ("unreliable", "undefined")
+"""Standings of scores that no conclusion is drawn from."""
 
 _SAME = 1e-6
 """Largest difference of values, and of RDMs scaled to length 1, of one computation (float32 sums differ)."""

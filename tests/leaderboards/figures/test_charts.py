@@ -19,8 +19,8 @@ from leaderboards.boards import rank
 from leaderboards.figures import plots, svg
 from leaderboards.figures.architecture import diagram
 from leaderboards.figures.charts import board_figures
-from leaderboards.figures.plots import regression
 from leaderboards.figures.record import layers
+from leaderboards.figures.scatter import regression
 from leaderboards.figures.svg import STYLE, Drawing, Scale, scale_of, standalone
 
 
