@@ -15,8 +15,9 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 from brainbench.core.records import ResultRecord, Score
-from leaderboards.entries import DOUBTFUL, Entry, fold_seeds, same_computation
+from leaderboards.entries import Entry, fold_seeds, same_computation
 from leaderboards.ranking import Sample, lacking, rank_ranges, told_apart
+from leaderboards.standing import DOUBTFUL
 
 RAW_INPUT = "raw input"
 """Name of the baseline that a model must be told apart from."""

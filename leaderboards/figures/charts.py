@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping, Sequence
 
 from brainbench.core.statistics import is_finite
 from leaderboards.boards import Board
-from leaderboards.entries import DOUBTFUL, Entry, twins
+from leaderboards.entries import Entry, twins
 from leaderboards.figures.plots import (
     SHOWN,
     WIDTH,
@@ -30,6 +30,7 @@ from leaderboards.figures.rdms import rdm_panel
 from leaderboards.figures.record import PARTS
 from leaderboards.figures.scatter import accuracy_against_fit, parameters_against_fit
 from leaderboards.figures.svg import Drawing, Scale, scale_of, tick_text
+from leaderboards.standing import DOUBTFUL
 from leaderboards.text import number, span
 
 

@@ -12,9 +12,9 @@ from html import escape
 from itertools import combinations
 
 from leaderboards.boards import RAW_INPUT, Board
-from leaderboards.entries import DOUBTFUL
 from leaderboards.figures.plots import WIDTH, Figure, cut
 from leaderboards.figures.svg import Drawing
+from leaderboards.standing import DOUBTFUL
 from leaderboards.text import number
 
 # Nine equidistant colours of viridis (van der Walt & Smith 2015), perceptually uniform and safe for

@@ -8,9 +8,10 @@ from collections.abc import Sequence
 import numpy as np
 
 from brainbench.core.records import Interval
-from leaderboards.entries import DOUBTFUL, Entry
+from leaderboards.entries import Entry
 from leaderboards.figures.plots import WIDTH, Figure, colours, cut
 from leaderboards.figures.svg import Drawing, Scale, scale_of, tick_text
+from leaderboards.standing import DOUBTFUL
 from leaderboards.text import number, span
 
 _LEAST_VARIANCE = 1e-100

@@ -11,8 +11,9 @@ from typing import Any
 from brainbench.core.records import Interval, Score
 from leaderboards.boards import Baseline, Board
 from leaderboards.conclusions import conclusions
-from leaderboards.entries import Entry, standing_of
+from leaderboards.entries import Entry
 from leaderboards.figures.plots import interval_ends, score_scale
+from leaderboards.standing import standing_of
 from leaderboards.text import ways_to_get
 
 COLUMNS: tuple[dict[str, Any], ...] = (
