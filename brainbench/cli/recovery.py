@@ -76,13 +76,7 @@ def recovery(
     Run again with the same --out, an interrupted recovery goes on where it stopped.
     """
     from brainbench.datasets.synthetic import PopulationDesign
-    from brainbench.scoring.recovery import (
-        RecoveryDesign,
-        find_cheapest,
-        open_candidates,
-        plot_confusion,
-        recover,
-    )  # fmt: skip
+    from brainbench.scoring.recovery import RecoveryDesign, find_cheapest, open_candidates, plot_confusion, recover
     from brainbench.scoring.recovery.design import parse_trials
 
     if (pool is None) is not (keep is None):

@@ -81,31 +81,22 @@ def scatter(
         drawing.text(across.at(tick), bottom + 18, tick_text(tick), "mid quiet")
     drawing.text((left + WIDTH - 190) / 2, height - 8, label, "mid")
     drawing.text(left - 44, 12, "neural fit", "")
-    caption = ""
-    if fit:
-        caption = fitted(drawing, across, up, xs, ys)
+    caption = fitted(drawing, across, up, xs, ys) if fit else ""
     colour = colours(encoder_of(entry) for *_, entry in points)
     for x, y, entry in points:
         kind = colour[encoder_of(entry)]
         shape = _SHAPES.get(entry.card.objective or "", "diamond")
         drawing.mark(across.at(x), up.at(y), shape, kind, f"{entry.name}: {label} {x:g}, fit {number(y)}", 4.5)
-    y = 24.0
-    for name, kind in colour.items():
-        drawing.mark(WIDTH - 172, y - 4, "dot", kind, size=4)
+    objectives = dict.fromkeys(entry.card.objective or "not stated" for *_, entry in points)
+    legend = [(name, "dot", kind) for name, kind in colour.items()]
+    legend += [(name, _SHAPES.get(name, "diamond"), "c0") for name in objectives]
+    for place, (name, shape, kind) in enumerate(legend):
+        y = 24.0 + 17 * place + (8 if place >= len(colour) else 0)
+        drawing.mark(WIDTH - 172, y - 4, shape, kind, size=4)
         drawing.text(WIDTH - 160, y, cut(name, 26), "small")
-        y += 17
-    y += 8
-    for name in dict.fromkeys(entry.card.objective or "not stated" for *_, entry in points):
-        drawing.mark(WIDTH - 172, y - 4, _SHAPES.get(name, "diamond"), "c0", size=4)
-        drawing.text(WIDTH - 160, y, cut(name, 26), "small")
-        y += 17
-    drawing.height = max(height, y + 4)
-    return Figure(
-        key,
-        title,
-        f"{caption}Colours are encoders, shapes are objectives; untrained models are means over their seeds.",
-        drawing,
-    )
+    drawing.height = max(height, 36.0 + 17 * len(legend))
+    caption += "Colours are encoders, shapes are objectives; untrained models are means over their seeds."
+    return Figure(key, title, caption, drawing)
 
 
 def encoder_of(entry: Entry) -> str:
@@ -114,26 +105,22 @@ def encoder_of(entry: Entry) -> str:
 
 
 def fitted(drawing: Drawing, across: Scale, up: Scale, xs: Sequence[float], ys: Sequence[float]) -> str:
-    """Draw the least-squares line with the 95 % band of its mean; return the caption's sentence."""
+    """Draw the least-squares line of three points or more with the 95 % band of its mean; return the caption's part."""
+    from scipy.special import stdtrit
+
     slope, start, r, interval = regression(xs, ys)
     if math.isnan(r):
         return "All accuracies or all scores are equal, so there is no line. "
-    from scipy.special import stdtrit
-
-    n, mx = len(xs), math.fsum(xs) / len(xs)
-    sxx = math.fsum((x - mx) ** 2 for x in xs)
-    rest = math.fsum((y - start - slope * x) ** 2 for x, y in zip(xs, ys, strict=True))
-    places = [min(xs) + (max(xs) - min(xs)) * i / 40 for i in range(41)]
-    if n > 2:
-        t = float(stdtrit(n - 2, 0.975)) * math.sqrt(rest / (n - 2))
-        half = [t * math.sqrt(1 / n + (x - mx) ** 2 / sxx) for x in places]
-        over = [(across.at(x), up.at(start + slope * x + h)) for x, h in zip(places, half, strict=True)]
-        under = [(across.at(x), up.at(start + slope * x - h)) for x, h in zip(places, half, strict=True)]
-        outline = "L".join(f"{x:.1f} {y:.1f}" for x, y in [*over, *under[::-1]])
-        drawing.path(f"M{outline}z", "fitband")
-    ends = (min(xs), max(xs))
-    first, last = ((across.at(x), up.at(start + slope * x)) for x in ends)
-    drawing.line(*first, *last, "fit")
+    n, x, y = len(xs), np.array(xs), np.array(ys)
+    places = np.linspace(x.min(), x.max(), 41)
+    line = start + slope * places
+    error = math.sqrt(np.sum((y - start - slope * x) ** 2) / (n - 2))
+    spread = np.sqrt(1 / n + (places - x.mean()) ** 2 / np.sum((x - x.mean()) ** 2))
+    half = float(stdtrit(n - 2, 0.975)) * error * spread
+    over, under = zip(places, line + half, strict=True), zip(places[::-1], (line - half)[::-1], strict=True)
+    outline = "L".join(f"{across.at(one):.1f} {up.at(other):.1f}" for one, other in (*over, *under))
+    drawing.path(f"M{outline}z", "fitband")
+    drawing.line(across.at(places[0]), up.at(line[0]), across.at(places[-1]), up.at(line[-1]), "fit")
     text = f" {span(interval)}" if interval else ""
     return f"Least-squares line with the 95 % band of its mean over {n} models: r = {number(r, 2)}{text}. "
 
