@@ -20,8 +20,9 @@ from brainbench.scoring.options import ScoreOptions
 
 def _complete_model(incomplete: str) -> list[str]:
     from brainbench.models.registry import list_models
+    from brainbench.models.training.checkpoints import shipped
 
-    return [name for name in list_models() if name.startswith(incomplete)]
+    return [name for name in (*list_models(), *shipped()) if name.startswith(incomplete)]
 
 
 @with_options(SCORE, flags=SCORE_FLAGS)
