@@ -127,6 +127,11 @@ class Entry:
         return next(filter(None, map(not_repeatable, self.records)), "")
 
     @property
+    def layer(self) -> str:
+        """The layers that its seeds were scored at, each named once; empty when none is stated."""
+        return ", ".join(dict.fromkeys(filter(None, (record.score.layer for record in self.records))))
+
+    @property
     def trained(self) -> bool:
         """True for a model whose card names an objective that it was trained with."""
         return self.card.objective not in (None, UNTRAINED)

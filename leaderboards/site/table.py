@@ -147,6 +147,7 @@ def _entry_row(entry: Entry) -> dict[str, Any]:
         "spread": entry.spread,
         "value": entry.value,
         "r": entry.r,
+        "layer": entry.layer or None,
         "seeds": entry.seeds,
         "seed": card.seed if entry.seeds == 1 else None,
         "weights": card.weights if entry.seeds == 1 else None,

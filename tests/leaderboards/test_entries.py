@@ -25,6 +25,13 @@ def _entries(*records):
     return board.entries
 
 
+def test_every_layer_that_a_seed_was_scored_at_is_named():
+    (record,) = draw_board({"net": 0.6})
+    other = replace(record, score=replace(record.score, layer="another"))
+    (entry,) = _entries(_run(record, 0), _run(other, 1), _run(record, 2))
+    assert entry.layer == f"{record.score.layer}, another"
+
+
 def test_one_seed_without_a_test_leaves_the_entry_untested():
     (record,) = draw_board({"net": 0.6})
     untested = replace(record, score=replace(record.score, p=math.nan))
