@@ -176,7 +176,7 @@ def _asked_for(options: ScoreOptions) -> str:
 
 def full_settings(stated: Mapping[str, Any], *, without: Sequence[str] = ()) -> dict[str, Any]:
     """Return the settings of a score as a record states them, with the default of every option that it leaves out."""
-    whole = ScoreOptions().settings | stated
+    whole = {**ScoreOptions().settings, **stated}
     return to_plain({name: whole[name] for name in ScoreOptions().settings if name not in without})
 
 
