@@ -65,10 +65,12 @@ def computation(record: ResultRecord) -> tuple[Any, ...]:
         origin.version,
         *(
             str(origin.settings.get(name))
-            for name in ("time", "seed", "layers", "normalize", "whiskers", "estimator_version")
+            for name in (
+                "time", "seed", "layers", "layer", "units_reliability", "normalize", "whiskers", "estimator_version"
+            )
         ),
         *(str(origin.recordings.get(name)) for name in ("window", "selection")),
-    )
+    )  # fmt: skip
 
 
 def older(version: str, than: str) -> bool:

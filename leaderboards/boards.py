@@ -1,9 +1,9 @@
 """Boards of comparable scores, each with its entries in the order in which people read them.
 
-Scores are comparable only within a **board**: same recordings, same stimuli, same estimator, same metric, same use of
-the time axis. Models that are not told apart (:mod:`leaderboards.ranking`) are tied, so a rank is a range. Not ranked
-are scores that are not reliable, models that nobody here can run again, and whole boards with too few animals or
-stimuli.
+Scores are comparable only within a **board**: same recordings and units, same stimuli, same estimator, same metric,
+same use of the time axis. Models that are not told apart (:mod:`leaderboards.ranking`) are tied, so a rank is a range.
+Not ranked are scores that are not reliable, models that nobody here can run again, and whole boards with too few
+animals or stimuli.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from typing import Any
 from brainbench.core.records import ResultRecord, Score
 from leaderboards.entries import Entry, fold_seeds, same_computation
 from leaderboards.ranking import Sample, lacking, rank_ranges, told_apart
+from leaderboards.standing import DOUBTFUL
 
 RAW_INPUT = "raw input"
 """Name of the baseline that a model must be told apart from."""
@@ -79,8 +80,12 @@ def rank(records: Iterable[ResultRecord], remarks: Mapping[str, Sequence[str]] |
     groups: dict[tuple[Any, ...], list[ResultRecord]] = defaultdict(list)
     for record in records:
         score = record.score
-        brain, shown = score.provenance.recordings_hash, score.provenance.stimuli_hash
-        groups[brain, shown, score.stimuli, score.provenance.time_rule, score.estimator, score.metric].append(record)
+        origin, estimator = score.provenance, score.estimator
+        # Other units make other RDMs of the same recordings.
+        if (least := origin.settings.get("units_reliability")) is not None:
+            estimator += f", units of reliability {least} and more"
+        brain, shown = origin.recordings_hash, origin.stimuli_hash
+        groups[brain, shown, score.stimuli, origin.time_rule, estimator, score.metric].append(record)
     boards = [_board(key, group, remarks or {}) for key, group in groups.items()]
     return sorted(boards, key=lambda board: (-len(board.entries), board.recordings, board.estimator, board.metric))
 
@@ -142,7 +147,7 @@ def _unranked(entry: Entry, lacks: str) -> str:
     """Return why an entry cannot be ranked, empty when it can."""
     if reason := entry.not_repeatable:
         return f"not repeatable here: {reason}"
-    if entry.standing in ("unreliable", "undefined"):
+    if entry.standing in DOUBTFUL:
         return entry.standing
     if lacks:
         return f"ranks need {lacks}"

@@ -29,7 +29,7 @@ class Difference:
     after: Any
 
     def __str__(self) -> str:
-        return f"{self.what}: {_short(self.before)} → {_short(self.after)}"
+        return f"{self.what}: {in_short(self.before)} → {in_short(self.after)}"
 
 
 @dataclass(frozen=True)
@@ -71,14 +71,14 @@ def differences(record: ResultRecord, again: ResultRecord, *, tolerance: float =
     ]
 
 
-def open_build(source: str | os.PathLike[str]) -> list[StoredRecord]:
-    """Read the records of a folder, a file, or a built site (which holds those it was made from).
+def open_build(*sources: str | os.PathLike[str]) -> list[StoredRecord]:
+    """Read the records of folders, files, or built sites (which hold those they were made from), each record once.
 
     Raises:
         DataFileNotFoundError: there is nothing there.
     """
-    records = Path(source) / "records"
-    return read_records(records if records.is_dir() else source)
+    folders = [(source, Path(source) / "records") for source in sources]
+    return read_records([records if records.is_dir() else source for source, records in folders])
 
 
 def compare_builds(before: Iterable[StoredRecord], after: Iterable[StoredRecord]) -> list[Change]:
@@ -148,7 +148,8 @@ def _equal(one: Any, other: Any, tolerance: float) -> bool:
     return abs(one - other) <= tolerance if numbers else one == other
 
 
-def _short(value: Any) -> str:
+def in_short(value: Any) -> str:
+    """Write a statement of a record in few characters."""
     if value is None:
         return "none"
     return f"{value:.5g}" if isinstance(value, float) else str(value)

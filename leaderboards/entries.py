@@ -12,7 +12,6 @@ from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Literal, get_args
 
 import numpy as np
 
@@ -20,14 +19,9 @@ from brainbench.core.files import content_hash
 from brainbench.core.records import Interval, ModelCard, ResultRecord, Score
 from brainbench.core.statistics import is_finite
 from leaderboards.ranking import CHANCE_LEVEL, Sample
+from leaderboards.standing import STANDINGS, Standing, not_repeatable, standing_of
 
 UNTRAINED = "untrained"
-Standing = Literal[
-    "above raw input", "above chance", "not told apart from chance", "not tested", "unreliable", "undefined"
-]
-"""What can be said of a score, from the most to the least: every page uses these words and no others."""
-STANDINGS: tuple[Standing, ...] = get_args(Standing)
-
 _SAME = 1e-6
 """Largest difference of values, and of RDMs scaled to length 1, of one computation (float32 sums differ)."""
 
@@ -113,8 +107,8 @@ class Entry:
 
     @property
     def p(self) -> float:
-        """The largest permutation p over seeds."""
-        return max((p for record in self.records if math.isfinite(p := record.score.p)), default=math.nan)
+        """The largest permutation p over seeds; NaN when a seed states none."""
+        return float(np.max([record.score.p for record in self.records]))
 
     @property
     def above_chance(self) -> bool:
@@ -131,6 +125,11 @@ class Entry:
     def not_repeatable(self) -> str:
         """Reason why nobody here can compute it again; empty when everybody can."""
         return next(filter(None, map(not_repeatable, self.records)), "")
+
+    @property
+    def layer(self) -> str:
+        """The layers that its seeds were scored at, each named once; empty when none is stated."""
+        return ", ".join(dict.fromkeys(filter(None, (record.score.layer for record in self.records))))
 
     @property
     def trained(self) -> bool:
@@ -159,31 +158,6 @@ class Entry:
     def _mean(self, name: str) -> float:
         values = [value for record in self.records if math.isfinite(value := getattr(record.score, name))]
         return math.fsum(values) / len(values) if values else math.nan
-
-
-def standing_of(score: Score, *, above_raw: bool) -> Standing:
-    """Return what can be said of a score, given whether it is told apart above the raw input."""
-    if score.status != "ok":
-        return score.status
-    if math.isnan(score.p):
-        return "not tested"
-    if score.p > CHANCE_LEVEL:
-        return "not told apart from chance"
-    return "above raw input" if above_raw else "above chance"
-
-
-def not_repeatable(record: ResultRecord) -> str:
-    """Return why a record cannot be computed again from this package alone, empty when it can.
-
-    >>> not_repeatable(ResultRecord(Score("features", 0.9, "ok"), card=ModelCard("features", family="user module")))
-    'its code is not in the registry'
-    """
-    card, name = record.card, record.score.name
-    if card is None or card.family in ("", "features computed elsewhere"):
-        return "its features were computed elsewhere"
-    if card.family == "user module":
-        return "its code is not in the registry"
-    return "its weights do not come with the package" if name.startswith(("local-dir:", "hf-hub:")) else ""
 
 
 def fold_seeds(

@@ -20,6 +20,8 @@ from brainbench.core.errors import DataError, DataFileNotFoundError
 from brainbench.core.files import write_text
 from brainbench.core.records import RECORD_SCHEMA, Interval, ResultRecord, Score, record_identity
 
+_MAKE_ONE = "make one with: brainbench score MODEL --out FOLDER"
+
 
 @dataclass(frozen=True)
 class StoredRecord:
@@ -99,15 +101,15 @@ def read_records(source: str | os.PathLike[str] | Iterable[str | os.PathLike[str
     paths: list[Path] = []
     for item in sources:
         if not item.exists():
-            raise DataFileNotFoundError(f"There is no file or folder {os.fspath(item)!r} to read result records from.")
+            raise DataFileNotFoundError(
+                f"There is no file or folder {os.fspath(item)!r} to read result records from; {_MAKE_ONE}"
+            )
         # A hidden name is another process's unfinished write.
         found = (path for path in item.rglob("*.json") if not path.name.startswith(".")) if item.is_dir() else [item]
         paths += found
     if not paths:
         places = ", ".join(repr(os.fspath(item)) for item in sources) or "the empty list of files"
-        raise DataFileNotFoundError(
-            f"No result records (*.json) in {places}; make one with: brainbench score MODEL --out FOLDER"
-        )
+        raise DataFileNotFoundError(f"No result records (*.json) in {places}; {_MAKE_ONE}")
     stored: dict[str, StoredRecord] = {}
     for path in sorted(set(paths)):
         try:

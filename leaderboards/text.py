@@ -11,42 +11,25 @@ from dataclasses import fields
 from typing import Any
 
 from brainbench.core.records import Interval, ModelCard, ResultRecord, Score
-from leaderboards.entries import Standing, not_repeatable
-
-STANDING: dict[Standing, str] = {
-    "above raw input": "Told apart from chance, and above the raw input of the models.",
-    "above chance": "Told apart from chance, but not above the raw input of the models.",
-    "not told apart from chance": "A model that knows nothing of these stimuli could score as high.",
-    "not tested": "The record states no test against chance.",
-    "unreliable": "Computed, but not to be trusted: the data are too noisy or too few.",
-    "undefined": "No number exists.",
-}
-"""The ladder of words that every page uses, with their meaning."""
+from leaderboards.standing import not_repeatable
 
 SYNTHETIC = "Synthetic demo recordings: ranks say nothing about brains."
 
 _CARD_LABELS = {
-    "family": "family",
     "objective": "training objective",
-    "augmentation": "augmentation",
-    "parameters": "parameters",
     "multiply_adds": "multiply-adds per time step",
     "top1": "top-1 accuracy",
     "top5": "top-5 accuracy",
-    "accuracy_interval": "accuracy interval",
     "accuracy_data": "accuracy measured on",
     "collapsed": "collapsed to one class",
     "twin": "untrained twin",
     "twin_top1": "top-1 accuracy of the untrained twin",
-    "twin_interval": "its interval",
-    "seed": "seed",
+    "twin_interval": "accuracy interval of the untrained twin",
     "weights": "weights (hash)",
-    "input": "input",
-    "encoder": "encoder",
-    "attender": "attender",
     "citation": "architecture from",
+    "layer": "layer committed to",
 }
-"""Card fields that are a line of text; the training and the graph have their own places."""
+"""Labels of card fields that are not just their names."""
 
 
 def number(value: float | None, digits: int = 3) -> str:
@@ -85,14 +68,14 @@ def level(interval: Interval) -> str:
 def p_sentence(score: Score) -> str:
     """Say how the p-value was found and how small it could have been."""
     parts = [score.p_method] if score.p_method else []
-    if math.isfinite(score.p_smallest):
-        least = probability(score.p_smallest)
-        reached = math.isfinite(score.p) and score.p <= score.p_smallest * (1 + 1e-9)
-        parts.append(
-            f"this is the smallest that {len(score.stimuli)} stimuli can give"
-            if reached
-            else f"the smallest possible is {least}"
-        )
+    if score.p <= score.p_smallest * (1 + 1e-9):
+        stimuli = len(score.stimuli)
+        # With many stimuli the number of drawn orders is the limit, not the number of orders that exist.
+        few = stimuli <= 20 and score.p_smallest * math.factorial(stimuli) < 2
+        giver = plural(stimuli, "stimulus", "stimuli") if few else "this number of permutations"
+        parts.append(f"this is the smallest that {giver} can give")
+    elif math.isfinite(score.p_smallest):
+        parts.append(f"the smallest possible is {probability(score.p_smallest)}")
     return "; ".join(parts)
 
 
@@ -139,7 +122,8 @@ def card_rows(card: ModelCard) -> list[tuple[str, str]]:
     rows = []
     for item in fields(card):
         value = getattr(card, item.name)
-        if item.name not in _CARD_LABELS or value is None or value == "":
+        # The name is the page's heading; the training and the graph have their own places.
+        if item.name in ("name", "training", "graph") or value is None or value == "":
             continue
         if isinstance(value, Interval):
             value = f"{span(value)} ({level(value)})"
@@ -149,7 +133,7 @@ def card_rows(card: ModelCard) -> list[tuple[str, str]]:
             value = count(value)
         elif isinstance(value, float):
             value = number(value)
-        rows.append((_CARD_LABELS[item.name], str(value)))
+        rows.append((_CARD_LABELS.get(item.name, item.name.replace("_", " ")), str(value)))
     return rows
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from importlib import metadata
 from typing import Any
 
 from brainbench.cli.output import JsonOption, emit, table
@@ -25,6 +24,8 @@ OPTIONAL = {
     "onnxruntime": ("export", "the check of exported ONNX files"),
     "huggingface_hub": ("hub", "models by hf-hub:OWNER/NAME"),
     "matplotlib": ("report", "pictures and plots of stimuli (brainbench stimuli render | plot)"),
+    "pyarrow": ("board", "LeRobot data sets of robot episodes"),
+    "weasyprint": ("board", "reports as PDF (brainbench leaderboard report --format pdf)"),
     "imageio-ffmpeg": ("report", "films of stimuli as MP4 (GIF needs matplotlib alone)"),
 }
 
@@ -66,11 +67,15 @@ def diagnose() -> dict[str, Any]:
 
 def _required() -> list[str]:
     """Return the packages that this one cannot do without, as its own metadata states them."""
+    from importlib import metadata  # 30 ms that no other command needs
+
     stated = metadata.requires("brainbench") or []
     return [line.split(">")[0].split("<")[0] for line in stated if "extra ==" not in line]
 
 
 def _version(package: str) -> str | None:
+    from importlib import metadata
+
     try:
         return metadata.version(package)
     except metadata.PackageNotFoundError:

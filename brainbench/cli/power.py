@@ -9,10 +9,10 @@ import typer
 
 from brainbench.cli.options import option_fields, with_options
 from brainbench.cli.output import JsonOption, emit, progress_bar, table_of
+from brainbench.core.errors import UsageError
+from brainbench.core.files import to_plain
 
 _EFFECTS = (0.0, 0.3, 0.5, 0.7)
-
-
 DESIGN = "brainbench.metrics.inference.power:ExperimentDesign"
 
 
@@ -45,7 +45,6 @@ def power(
     Correlation, consistency and reliability of your own recordings: 'brainbench score' and
     'brainbench recordings rdm'.
     """
-    from brainbench.core.files import to_plain
     from brainbench.metrics.inference import power as experiments
 
     effects = _EFFECTS if effect is None else (effect,)
@@ -99,9 +98,10 @@ def _dimensions(asked: str, recordings: str | None, conditions: str | None, mode
     Raises:
         UsageError: it is neither a number nor 'auto', or more than one source is given.
     """
-    from brainbench.core.errors import UsageError
     from brainbench.metrics.inference.power import DIMENSIONS
 
+    if conditions is not None and recordings is None:
+        raise UsageError("--conditions labels the trials of --recordings; name those too.")
     sources = [name for name, given in (("--recordings", recordings), ("--model", model)) if given is not None]
     if asked != "auto":
         if not asked.isdecimal() or int(asked) < 1:

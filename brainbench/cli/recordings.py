@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from brainbench.cli.options import SCORE, option
+from brainbench.cli.options import SCORE, option, with_options
 from brainbench.cli.output import JsonOption, emit, progress_bar, table, table_of
 
 if TYPE_CHECKING:
@@ -15,10 +15,6 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from brainbench.metrics.reliability.subject_rdm import SubjectRDM
-
-SelectOption = Annotated[str | None, option(SCORE, "select")]
-WindowOption = Annotated[str | None, option(SCORE, "window")]
-ConditionsOption = Annotated[str | None, option(SCORE, "conditions")]
 
 _LARGEST_SHOWN = 12
 """RDMs of more conditions are only written as JSON."""
@@ -39,11 +35,10 @@ def inspect(
 
 
 @app.command("rdm")
+@with_options(SCORE, ("conditions", "select", "window"), build=False)
 def rdm(
     source: Annotated[str, typer.Argument(help="'demo', an NWB or HDF5 file, a folder, or a glob.")],
-    conditions: ConditionsOption = None,
-    select: SelectOption = None,
-    window: WindowOption = None,
+    options: Any = None,
     pool: Annotated[str, typer.Option(help="One RDM per 'subject', per 'session', or of 'all' together.")] = "subject",
     seed: Annotated[int, typer.Option(help="Seed of the split halves.")] = 0,
     as_json: JsonOption = False,
@@ -57,7 +52,7 @@ def rdm(
     from brainbench.scoring.options import ScoreOptions
 
     with progress_bar() as progress:
-        brain = open_neural_responses(source, conditions=conditions, select=select, window=window, progress=progress)
+        brain = open_neural_responses(source, **options, progress=progress)
     brain = replace(brain, dataset=pooled(brain.dataset, pool))
     labels = brain.vocabulary
     animals = brain.animals(labels, get_metric("rsa-correlation"), ScoreOptions(seed=seed))
@@ -111,7 +106,7 @@ def check(
 def export(
     source: Annotated[str, typer.Argument(help="'demo', an NWB or HDF5 file, a folder, a glob, or LAYOUT:PATH.")],
     target: Annotated[Path, typer.Argument(help="*.h5 (any number of sessions), *.nwb (one), or a folder of NWB.")],
-    select: SelectOption = None,
+    select: Annotated[str | None, option(SCORE, "select")] = None,
     as_json: JsonOption = False,
 ) -> None:
     """Write a small copy without raw data: spike times and tables. Scores of the copy are identical."""

@@ -5,19 +5,21 @@ from __future__ import annotations
 import shlex
 import sys
 import time
+from collections.abc import Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from brainbench.cli.leaderboard.scoring import find_models
 from brainbench.cli.options import SCORE, option, with_options
-from brainbench.cli.output import JsonOption, emit, progress_bar, table
+from brainbench.cli.output import JsonOption, emit, progress_bar, table_of
 from brainbench.core.errors import UsageError
+from brainbench.core.files import provenance, to_plain, write_json
+from brainbench.scoring.options import ScoreOptions
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
     from brainbench.scoring.recovery import Candidate, Recovery, RecoveryDesign
 
 POPULATION = "brainbench.datasets.synthetic.design:PopulationDesign"
@@ -73,14 +75,14 @@ def recovery(
 
     Run again with the same --out, an interrupted recovery goes on where it stopped.
     """
-    from brainbench.core.files import provenance, to_plain
     from brainbench.datasets.synthetic import PopulationDesign
-    from brainbench.scoring.options import ScoreOptions
-    from brainbench.scoring.recovery import RecoveryDesign, find_cheapest, open_candidates, recover
+    from brainbench.scoring.recovery import RecoveryDesign, find_cheapest, open_candidates, plot_confusion, recover
     from brainbench.scoring.recovery.design import parse_trials
 
     if (pool is None) is not (keep is None):
         raise UsageError("Stimuli are picked with both --pool STIMULI and --keep NUMBER; received one of them.")
+    if keep is not None and show is not None:
+        raise UsageError("All stimuli that --keep picks are shown; leave out --show.")
     if want is not None and not 0 < want < 1:
         raise UsageError(f"A wanted rate lies between 0 and 1; received {want}.")
     started = time.perf_counter()
@@ -113,13 +115,13 @@ def recovery(
     )
     text = f"{_text(found, want, data.get('cheapest'))}{told}"
     if out is not None:
-        text += f"\n\n{_write(found, data, out)}"
+        text += f"\n\nresult   {write_json(out / 'recovery.json', data)}"
+        text += f"\npicture  {plot_confusion(found, out / 'recovery.png')}"
     emit(data, text, as_json=as_json)
 
 
 def _find(patterns: Sequence[str] | None) -> list[str]:
     """Return the models that names and patterns mean; the shipped ones without any."""
-    from brainbench.cli.leaderboard.scoring import find_models
     from brainbench.models.training.checkpoints import shipped
 
     if not patterns:
@@ -152,22 +154,13 @@ def _pick(
 
 def _facts(found: Recovery, want: float | None) -> dict[str, Any]:
     """Return what --json and the file say of a recovery."""
-    return {
+    told = ("win_rate", "outcomes", "reliability", "stimuli", "names", "made", "firsts", "lost", "notes", "boards")
+    return {name: getattr(found, name) for name in told} | {
         "answer": found.answer(*([] if want is None else [want])),
-        "win_rate": found.win_rate,
         "interval": found.wins(),
-        "outcomes": found.outcomes,
-        "reliability": found.reliability,
-        "stimuli": found.stimuli,
-        "names": found.names,
-        "made": found.made,
-        "firsts": found.firsts,
         "told_apart": found.told,
-        "lost": found.lost,
         "intervals": {name: found.wins(place) for place, name in enumerate(found.names)},
         "hardest": found.hardest(10),
-        "notes": found.notes,
-        "boards": found.boards,
     }
 
 
@@ -196,28 +189,16 @@ def _text(found: Recovery, want: float | None, cheapest: dict[str, Any] | None) 
         f"tied, {shares['loss']:.0%} lost."
     )
     lines += found.notes
-    rows = []
-    for place, name in enumerate(found.names):
-        interval = found.wins(place)
-        others = [
-            (int(count), other) for other, count in zip(found.names, found.firsts[place], strict=True) if other != name
-        ]
-        count, mistaken = max(others)
-        rows.append(
-            [
-                name,
-                f"{found.firsts[place, place]} of {found.made[place]}",
-                f"[{interval.low:.0%}, {interval.high:.0%}]",
-                f"{mistaken} ({count})" if count else "",
-            ]
-        )
-    return "\n".join(lines) + "\n\n" + table("", ["true network", "first", "interval", "most often mistaken for"], rows)
 
+    def mistaken(place: int) -> str:
+        firsts = zip(found.firsts[place], found.names, strict=True)
+        count, other = max((int(count), other) for count, other in firsts if other != found.names[place])
+        return f"{other} ({count})" if count else ""
 
-def _write(found: Recovery, data: dict[str, Any], out: Path) -> str:
-    """Write the result and the picture."""
-    from brainbench.core.files import write_json
-    from brainbench.scoring.recovery import plot_confusion
-
-    result = write_json(out / "recovery.json", data)
-    return f"result   {result}\npicture  {plot_confusion(found, out / 'recovery.png')}"
+    columns = {
+        "true network": lambda place: found.names[place],
+        "first": lambda place: f"{found.firsts[place, place]} of {found.made[place]}",
+        "interval": lambda place: "[{0.low:.0%}, {0.high:.0%}]".format(found.wins(place)),
+        "most often mistaken for": mistaken,
+    }
+    return "\n".join(lines) + "\n\n" + table_of("", range(len(found.names)), columns)

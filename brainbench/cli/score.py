@@ -5,25 +5,24 @@ from __future__ import annotations
 import math
 import shlex
 import sys
+from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 
 from brainbench.cli.options import SCORE, SCORE_FLAGS, with_options
 from brainbench.cli.output import JsonOption, emit, progress_bar, table, table_of
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from brainbench.core.records import Interval, ResultRecord, Score
-    from brainbench.scoring import ScoreOptions
+from brainbench.core.files import to_plain
+from brainbench.core.records import Interval, ResultRecord, Score
+from brainbench.scoring.options import ScoreOptions
 
 
 def _complete_model(incomplete: str) -> list[str]:
     from brainbench.models.registry import list_models
+    from brainbench.models.training.checkpoints import shipped
 
-    return [name for name in list_models() if name.startswith(incomplete)]
+    return [name for name in (*list_models(), *shipped()) if name.startswith(incomplete)]
 
 
 @with_options(SCORE, flags=SCORE_FLAGS)
@@ -35,7 +34,7 @@ def score(
             autocompletion=_complete_model,
         ),
     ],
-    options: Any,
+    options: ScoreOptions,
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the record and the report.")] = Path(
         "brainbench-results"
     ),
@@ -46,19 +45,17 @@ def score(
     as_json: JsonOption = False,
 ) -> None:
     """Score a model against neural recordings and write a result record and an HTML report."""
-    from brainbench.core.files import to_plain
     from brainbench.metrics.explain import explain_file
     from brainbench.scoring.scores import score_record
     from leaderboards.site.score_page import write_report
     from leaderboards.store import write_record
 
-    chosen: ScoreOptions = options
-    if chosen.explain and Path(model).suffix == ".npz":
+    if options.explain and Path(model).suffix == ".npz":
         steps = to_plain(explain_file(model))
         emit({"estimator_walk": steps}, _walk(steps), as_json=as_json)
         return
     with progress_bar() as progress:
-        record = score_record(model, chosen, command=_command(), progress=progress)
+        record = score_record(model, options, command=_command(), progress=progress)
     path = write_record(record, out)
     report = write_report(record, path.with_suffix(".html"))
     data: dict[str, Any] = {"record": record, "record_path": path, "report_path": report}
@@ -93,20 +90,13 @@ def _text(record: ResultRecord) -> str:
     if record.synthetic:
         parts[0] += "\nSynthetic recordings: ranks on them say nothing about brains."
     ceiling = score.ceiling
+    limits = f"noise ceiling {_number(ceiling.lower)} to {_number(ceiling.upper)}" if ceiling else "no noise ceiling"
     scale = f"chance {_number(score.chance)}, attainable {_number(score.attainable)}"
     rows = [
         ["score", _scaled_value(score), "0 = chance, 1 = explains all that is reliable"],
         ["status", score.status, "; ".join(score.reasons)],
-        [
-            "value",
-            _value(score),
-            f"{score.metric}; {scale}",
-        ],
-        [
-            "raw r",
-            _number(score.r),
-            f"noise ceiling {_number(ceiling.lower)} to {_number(ceiling.upper)}" if ceiling else "no noise ceiling",
-        ],
+        ["value", _with_span(score.value, score.interval), f"{score.metric}; {scale}"],
+        ["raw r", _number(score.r), limits],
         ["reliability", _number(score.reliability), "of the animals' RDMs: split halves, Spearman-Brown, mean"],
         ["permutation p", _number(score.p), f"{score.p_method}; smallest possible {_number(score.p_smallest)}"],
         ["layer", str(score.layer), score.layer_rule],
@@ -164,16 +154,15 @@ def _details(statistics: Mapping[str, Any]) -> list[str]:
 
 def _over_time(course: Mapping[str, Any]) -> str:
     """Lay out the best time and the latency of each layer that matches at some lag."""
-    best = max(filter(_known, course["points"]), key=_scaled, default=None)
+    known = [(_scaled(point), point["time"]) for point in course["points"] if _is_known(point)]
     clear = sum(point["p"] is not None and point["p"] <= 0.05 for point in course["points"])
     text = f"Over time, {len(course['points'])} bins of {course['bin']:g} s: "
-    if best is None:
-        text += "no animal is reliable in any bin"
+    if known:
+        best, when = max(known)
+        text += f"{clear} differ from chance (p of the best {course['p']:.2g}, corrected for all times); the best "
+        text += f"score, {best:.2f} between chance (0) and all that is reliable (1), is at {when:.3g} s"
     else:
-        text += (
-            f"{clear} differ from chance (p of the best {course['p']:.2g}, corrected for all times); the best score, "
-        )
-        text += f"{_scaled(best):.2f} between chance (0) and all that is reliable (1), is at {best['time']:.3g} s"
+        text += "no animal is reliable in any bin"
     columns = {
         "layer": "{0[layer]}",
         ">latency": lambda row: "–" if row["latency"] is None else f"{1000 * row['latency']:.0f} ms",
@@ -187,7 +176,7 @@ def _over_time(course: Mapping[str, Any]) -> str:
     return "\n".join([text, *course["reasons"], "", rows])
 
 
-def _known(point: Mapping[str, Any]) -> bool:
+def _is_known(point: Mapping[str, Any]) -> bool:
     return point["value"] is not None and point["chance"] is not None and point["chance"] < 1
 
 
@@ -200,13 +189,10 @@ def _number(value: float) -> str:
     return f"{value:.3g}" if math.isfinite(value) else "–"
 
 
-def _value(score: Score) -> str:
-    return _with_span(score.value, score.interval)
-
-
 def _scaled_value(score: Score) -> str:
     """Return the score on the scale that all metrics share; its value where there is none."""
-    return _value(score) if math.isnan(score.scaled) else _with_span(score.scaled, score.scaled_interval)
+    value = (score.value, score.interval) if math.isnan(score.scaled) else (score.scaled, score.scaled_interval)
+    return _with_span(*value)
 
 
 def _with_span(value: float, span: Interval | None) -> str:

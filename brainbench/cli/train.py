@@ -10,9 +10,11 @@ import typer
 
 from brainbench.cli.options import part_of, with_options
 from brainbench.cli.output import JsonOption, emit, progress_bar, table_of
+from brainbench.core.errors import DataError, UsageError
+from brainbench.core.files import read_mapping
+from brainbench.core.progress import Progress
 
 if TYPE_CHECKING:
-    from brainbench.core.progress import Progress
     from brainbench.datasets import WhiskingDataset
     from brainbench.models.training.batches import BatchOptions
     from brainbench.models.training.trainer import TrainingResult
@@ -49,8 +51,6 @@ def train(
 
     Several GPUs: torchrun --nproc-per-node N -m brainbench train …
     """
-    from brainbench.core.errors import DataError, UsageError
-    from brainbench.core.files import read_mapping
     from brainbench.models.training.config import TrainingConfig
     from brainbench.models.training.search_space import best_run, sweep_runs
     from brainbench.models.training.trainer import train as run

@@ -10,7 +10,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 
 from brainbench.core.statistics import is_finite
-from leaderboards.boards import RAW_INPUT, Board
+from leaderboards.boards import Board
 from leaderboards.entries import Entry, twins
 from leaderboards.figures.plots import (
     SHOWN,
@@ -24,15 +24,14 @@ from leaderboards.figures.plots import (
     cut_words,
     legend_words,
     row_chart,
-    scatter,
     score_scale,
 )
-from leaderboards.figures.rdms import draw_rdm, rdm_picture
+from leaderboards.figures.rdms import rdm_panel
 from leaderboards.figures.record import PARTS
+from leaderboards.figures.scatter import accuracy_against_fit, parameters_against_fit
 from leaderboards.figures.svg import Drawing, Scale, scale_of, tick_text
+from leaderboards.standing import DOUBTFUL
 from leaderboards.text import number, span
-
-DOUBTFUL = ("unreliable", "undefined")
 
 
 def board_figures(board: Board) -> list[Figure]:
@@ -45,8 +44,8 @@ def board_figures(board: Board) -> list[Figure]:
         accuracy(entries),
         accuracy_against_fit(entries),
         parameters_against_fit(entries),
-        augmentation(entries),
-        masking(entries),
+        _ablation("augmentation", "Augmentation ablation (as figure 3.8 c)", entries, _augmentation, _any_masking),
+        _ablation("masking", "Temporal masking", entries, _masking, _augmentation, "share of masked steps"),
     ]
 
 
@@ -122,44 +121,6 @@ def layer_fit(entries: Sequence[Entry]) -> Figure:
     return Figure(key, title, caption, drawing)
 
 
-def rdm_panel(board: Board) -> Figure:
-    """Draw the RDMs of the raw input, of the best models of each kind and of the brain (figure 3.5)."""
-    key, title, entries = "rdms", "Representational dissimilarity (as figure 3.5)", board.entries
-    picked: list[tuple[str, str, Sequence[float]]] = []
-    raw = next((b.score for b in board.baselines if b.name == RAW_INPUT), None)
-    if raw is not None and raw.model_rdm:
-        picked.append((RAW_INPUT, f"score {number(raw.scaled)}", raw.model_rdm))
-    for label, test in (
-        ("supervised", lambda e: e.card.objective == "supervised"),
-        ("self-supervised", lambda e: e.trained and e.card.objective != "supervised"),
-        ("untrained", lambda e: not e.trained),
-    ):
-        best = next((e for e in entries if e.score.model_rdm and e.standing not in DOUBTFUL and test(e)), None)
-        if best is not None:
-            picked.append((f"best {label}", f"{best.name}, {best.score.layer}", best.score.model_rdm))
-    brain = next((e.score.brain_rdm for e in entries if e.score.brain_rdm), ())
-    if brain:
-        picked.append(("brain", board.recordings, brain))
-    size = len(board.conditions)
-    pictures = [(name, detail, rdm_picture(pairs, board.conditions)) for name, detail, pairs in picked]
-    drawn = [(name, detail, picture) for name, detail, picture in pictures if picture is not None]
-    if not drawn:
-        return Figure(key, title, lacking="no record holds RDMs")
-    side = min(WIDTH / len(drawn) - 16, 170.0)
-    drawing = Drawing(WIDTH, side + 48, f"{len(drawn)} dissimilarity matrices of {size} stimuli")
-    for index, (name, detail, picture) in enumerate(drawn):
-        x0 = index * (WIDTH / len(drawn))
-        drawing.text(x0, 13, name, "title")
-        drawing.text(x0, 28, cut(detail, max(12, int(side / 6.3))), "quiet small")
-        draw_rdm(drawing, x0, 38, side, picture)
-    caption = (
-        "Each cell is the dissimilarity of two stimuli in the order of the records "
-        f"({', '.join(board.conditions[:8])}{', …' if size > 8 else ''}); dark is alike, bright is different, each "
-        "matrix over its own range, as comparisons by correlation ignore scale."
-    )
-    return Figure(key, title, caption, drawing)
-
-
 def accuracy(entries: Sequence[Entry]) -> Figure:
     """Draw the task accuracy beside that of the untrained twin (figure 3.6)."""
     key, title = "accuracy", "Task accuracy (as figure 3.6)"
@@ -167,7 +128,9 @@ def accuracy(entries: Sequence[Entry]) -> Figure:
     if not stated:
         lacking = "no record states a task accuracy (top1 on its model card); trained models do"
         return Figure(key, title, lacking=lacking)
-    models = [e for e in stated if e.trained][:SHOWN] or stated[:SHOWN]
+    # Untrained networks are drawn as twins; a board of such alone still shows them.
+    stated = [e for e in stated if e.trained] or stated
+    models = stated[:SHOWN]
     untrained = twins(entries)
     found = [_twin_accuracy(entry, untrained) for entry in models]
     colour = colours(map(_objective, models))
@@ -192,45 +155,15 @@ def accuracy(entries: Sequence[Entry]) -> Figure:
     return Figure(key, title, caption, drawing)
 
 
-def accuracy_against_fit(entries: Sequence[Entry]) -> Figure:
-    """Draw the task accuracy against the neural fit, with regression and its interval (figure 3.8 a, b)."""
-    key, title = "accuracy-fit", "Task accuracy against neural fit (as figure 3.8)"
-    points = [(e.card.top1, e.scaled, e) for e in entries if e.card.top1 is not None and _trusted(e)]
-    if len(points) < 3:
-        lacking = f"{len(points)} records state both a task accuracy and a trusted score; at least 3 are needed"
-        return Figure(key, title, lacking=lacking)
-    return scatter(key, title, points, "top-1 accuracy", fit=True)
-
-
-def parameters_against_fit(entries: Sequence[Entry]) -> Figure:
-    """Draw the number of parameters against the neural fit (figure 3.3)."""
-    key, title = "parameters", "Parameters against neural fit (as figure 3.3)"
-    points = [(float(e.card.parameters), e.scaled, e) for e in entries if e.card.parameters and _trusted(e)]
-    if len(points) < 2:
-        return Figure(key, title, lacking="fewer than 2 records state parameters and have a trusted score")
-    return scatter(key, title, points, "parameters", log=True)
-
-
-def augmentation(entries: Sequence[Entry]) -> Figure:
-    """Draw the neural fit under each augmentation, for models trained with several (figure 3.8 c)."""
-    title = "Augmentation ablation (as figure 3.8 c)"
-    return _ablation("augmentation", title, entries, _augmentation, _any_masking, "augmentation")
-
-
-def masking(entries: Sequence[Entry]) -> Figure:
-    """Draw the neural fit by the share of masked time steps, for models trained with several."""
-    return _ablation("masking", "Temporal masking", entries, _masking, _augmentation, "share of masked steps")
-
-
 def _ablation(
     key: str,
     title: str,
     entries: Sequence[Entry],
     level: Callable[[Entry], str],
     held: Callable[[Entry], str],
-    what: str,
+    what: str = "augmentation",
 ) -> Figure:
-    """Draw the models trained at several levels of one thing, the other thing ``held`` fixed, and on the same data."""
+    """Draw the fit of models trained at several levels of one thing, on the same data, the other (``held``) fixed."""
     groups: dict[tuple[str, ...], dict[str, Entry]] = {}
     for entry in entries:
         if entry.trained and level(entry) and math.isfinite(entry.scaled):
@@ -255,10 +188,6 @@ def _ablation(
     drawing = row_chart(f"{title}: {len(groups)} models", rows, scale, "scaled score", step=20)
     caption = f"Scaled score with its interval by {what}; hollow grey points are untrained twins."
     return Figure(key, title, caption, drawing)
-
-
-def _trusted(entry: Entry) -> bool:
-    return entry.standing not in DOUBTFUL and math.isfinite(entry.scaled)
 
 
 def _objective(entry: Entry) -> str:

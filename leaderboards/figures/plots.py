@@ -1,4 +1,4 @@
-"""Parts of the figures of a leaderboard: charts of rows, scatter plots, matrices, colours."""
+"""Parts of the figures of a leaderboard: charts of rows, colours, labels."""
 
 from __future__ import annotations
 
@@ -6,20 +6,13 @@ import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
-import numpy as np
-
 from brainbench.core.records import Interval
 from brainbench.core.statistics import is_finite
-from leaderboards.entries import Entry
-from leaderboards.figures.svg import COLOURS, Drawing, Scale, scale_of, shorten, tick_text
-from leaderboards.text import number, span
+from leaderboards.figures.svg import COLOURS, Drawing, Scale, shorten, tick_text
 
 WIDTH = 760.0
 SHOWN = 60
 """Most models in one figure; the table holds all."""
-_LEAST_VARIANCE = 1e-100
-"""Products of two smaller ones would be zero in floating point."""
-_SHAPES = {"supervised": "square", "simclr": "cross", "simsiam": "up", "ae": "down", "untrained": "dot"}
 
 
 @dataclass(frozen=True)
@@ -33,106 +26,6 @@ class Figure:
     drawing: Drawing | None = None
     lacking: str = ""
     """Entries that the records would have to hold; empty when the figure is drawn."""
-
-
-def regression(x: Sequence[float], y: Sequence[float]) -> tuple[float, float, float, Interval | None]:
-    """Return slope, intercept, Pearson's r and its 95 % interval by Fisher's z (None below four points).
-
-    r is NaN when either variable is constant, or so nearly that its variance cannot be divided by.
-    """
-    from scipy.stats import linregress, pearsonr
-
-    if min(x) == max(x) or min(y) == max(y) or min(np.var(x), np.var(y)) < _LEAST_VARIANCE:
-        return math.nan, math.nan, math.nan, None
-    slope, start, r = np.array(linregress(x, y))[:3].tolist()
-    interval = None
-    if len(x) > 3 and abs(r) < 1:
-        ends = pearsonr(x, y).confidence_interval(0.95)
-        interval = Interval(float(ends.low), float(ends.high), 0.95, "Fisher's z")
-    return slope, start, r, interval
-
-
-def scatter(
-    key: str,
-    title: str,
-    points: Sequence[tuple[float, float, Entry]],
-    label: str,
-    *,
-    log: bool = False,
-    fit: bool = False,
-) -> Figure:
-    """Return a scatter plot of entries, with a regression line where one is asked for."""
-    height, left, bottom = 400.0, 56.0, 352.0
-    drawing = Drawing(WIDTH, height, f"{title}: {len(points)} models")
-    xs, ys = [x for x, *_ in points], [y for _, y, _ in points]
-    if log:
-        across = Scale(min(xs) / 1.4, max(xs) * 1.4, left, WIDTH - 190, log=True)
-    else:
-        across = scale_of(xs, left, WIDTH - 190)
-    up = scale_of(ys, bottom, 16, floor=None)
-    for tick in up.ticks:
-        drawing.line(left, up.at(tick), WIDTH - 190, up.at(tick), "one" if tick == 1 else "grid")
-        drawing.text(left - 8, up.at(tick) + 4, tick_text(tick), "end quiet")
-    for tick in across.ticks:
-        drawing.line(across.at(tick), 16, across.at(tick), bottom, "grid")
-        drawing.text(across.at(tick), bottom + 18, tick_text(tick), "mid quiet")
-    drawing.text((left + WIDTH - 190) / 2, height - 8, label, "mid")
-    drawing.text(left - 44, 12, "neural fit", "")
-    caption = ""
-    if fit:
-        caption = fitted(drawing, across, up, xs, ys)
-    colour = colours(encoder_of(entry) for *_, entry in points)
-    for x, y, entry in points:
-        kind = colour[encoder_of(entry)]
-        shape = _SHAPES.get(entry.card.objective or "", "diamond")
-        drawing.mark(across.at(x), up.at(y), shape, kind, f"{entry.name}: {label} {x:g}, fit {number(y)}", 4.5)
-    y = 24.0
-    for name, kind in colour.items():
-        drawing.mark(WIDTH - 172, y - 4, "dot", kind, size=4)
-        drawing.text(WIDTH - 160, y, cut(name, 26), "small")
-        y += 17
-    y += 8
-    for name in dict.fromkeys(entry.card.objective or "not stated" for *_, entry in points):
-        drawing.mark(WIDTH - 172, y - 4, _SHAPES.get(name, "diamond"), "c0", size=4)
-        drawing.text(WIDTH - 160, y, cut(name, 26), "small")
-        y += 17
-    drawing.height = max(height, y + 4)
-    return Figure(
-        key,
-        title,
-        f"{caption}Colours are encoders, shapes are objectives; untrained models are means over their seeds.",
-        drawing,
-    )
-
-
-def encoder_of(entry: Entry) -> str:
-    """Return the encoder for colours: with and without layer norm are one."""
-    return (entry.card.encoder or "not stated").removesuffix("-ln")
-
-
-def fitted(drawing: Drawing, across: Scale, up: Scale, xs: Sequence[float], ys: Sequence[float]) -> str:
-    """Draw the least-squares line with the 95 % band of its mean; return the caption's sentence."""
-    slope, start, r, interval = regression(xs, ys)
-    if math.isnan(r):
-        return "All accuracies or all scores are equal, so there is no line. "
-    from scipy.special import stdtrit
-
-    n, mx = len(xs), math.fsum(xs) / len(xs)
-    sxx = math.fsum((x - mx) ** 2 for x in xs)
-    rest = math.fsum((y - start - slope * x) ** 2 for x, y in zip(xs, ys, strict=True))
-    places = [min(xs) + (max(xs) - min(xs)) * i / 40 for i in range(41)]
-    if n > 2:
-        t = float(stdtrit(n - 2, 0.975)) * math.sqrt(rest / (n - 2))
-        half = [t * math.sqrt(1 / n + (x - mx) ** 2 / sxx) for x in places]
-        over = [(across.at(x), up.at(start + slope * x + h)) for x, h in zip(places, half, strict=True)]
-        under = [(across.at(x), up.at(start + slope * x - h)) for x, h in zip(places, half, strict=True)]
-        outline = "L".join(f"{x:.1f} {y:.1f}" for x, y in [*over, *under[::-1]])
-        drawing.path(f"M{outline}z", "fitband")
-    ends = (min(xs), max(xs))
-    first, last = ((across.at(x), up.at(start + slope * x)) for x in ends)
-    drawing.line(*first, *last, "fit")
-    text = f" {span(interval)}" if interval else ""
-    return f"Least-squares line with the 95 % band of its mean over {n} models: r = {number(r, 2)}{text}. "
 
 
 def interval_ends(interval: Interval | None) -> tuple[float, ...]:

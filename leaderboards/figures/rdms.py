@@ -11,7 +11,11 @@ from dataclasses import dataclass
 from html import escape
 from itertools import combinations
 
+from leaderboards.boards import RAW_INPUT, Board
+from leaderboards.figures.plots import WIDTH, Figure, cut
 from leaderboards.figures.svg import Drawing
+from leaderboards.standing import DOUBTFUL
+from leaderboards.text import number
 
 # Nine equidistant colours of viridis (van der Walt & Smith 2015), perceptually uniform and safe for
 # colour-blind readers.
@@ -30,6 +34,44 @@ class RdmPicture:
     high: float
     description: str
     """The picture in words, for readers who do not see it."""
+
+
+def rdm_panel(board: Board) -> Figure:
+    """Draw the RDMs of the raw input, of the best models of each kind and of the brain (figure 3.5)."""
+    key, title, entries = "rdms", "Representational dissimilarity (as figure 3.5)", board.entries
+    picked: list[tuple[str, str, Sequence[float]]] = []
+    raw = next((b.score for b in board.baselines if b.name == RAW_INPUT), None)
+    if raw is not None and raw.model_rdm:
+        picked.append((RAW_INPUT, f"score {number(raw.scaled)}", raw.model_rdm))
+    for label, test in (
+        ("supervised", lambda e: e.card.objective == "supervised"),
+        ("self-supervised", lambda e: e.trained and e.card.objective != "supervised"),
+        ("untrained", lambda e: not e.trained),
+    ):
+        best = next((e for e in entries if e.score.model_rdm and e.standing not in DOUBTFUL and test(e)), None)
+        if best is not None:
+            picked.append((f"best {label}", f"{best.name}, {best.score.layer}", best.score.model_rdm))
+    brain = next((e.score.brain_rdm for e in entries if e.score.brain_rdm), ())
+    if brain:
+        picked.append(("brain", board.recordings, brain))
+    size = len(board.conditions)
+    pictures = [(name, detail, rdm_picture(pairs, board.conditions)) for name, detail, pairs in picked]
+    drawn = [(name, detail, picture) for name, detail, picture in pictures if picture is not None]
+    if not drawn:
+        return Figure(key, title, lacking="no record holds RDMs")
+    side = min(WIDTH / len(drawn) - 16, 170.0)
+    drawing = Drawing(WIDTH, side + 48, f"{len(drawn)} dissimilarity matrices of {size} stimuli")
+    for index, (name, detail, picture) in enumerate(drawn):
+        x0 = index * (WIDTH / len(drawn))
+        drawing.text(x0, 13, name, "title")
+        drawing.text(x0, 28, cut(detail, max(12, int(side / 6.3))), "quiet small")
+        draw_rdm(drawing, x0, 38, side, picture)
+    caption = (
+        "Each cell is the dissimilarity of two stimuli in the order of the records "
+        f"({', '.join(board.conditions[:8])}{', …' if size > 8 else ''}); dark is alike, bright is different, each "
+        "matrix over its own range, as comparisons by correlation ignore scale."
+    )
+    return Figure(key, title, caption, drawing)
 
 
 def rdm_picture(pairs: Sequence[float], labels: Sequence[str]) -> RdmPicture | None:

@@ -57,15 +57,13 @@ class Drawing:
         height: float,
         kind: str = "",
         *,
-        fill: str = "",
         rx: float = 0,
         tip: str = "",
     ) -> None:
-        """Draw a rectangle, in a colour of its own or by its classes; ``tip`` is shown on hovering."""
-        colour = f' fill="{fill}"' if fill else ""
+        """Draw a rectangle with corners of radius ``rx``; ``tip`` is shown on hovering."""
         round_ = f' rx="{_n(rx)}"' if rx else ""
         size = f'width="{_n(max(width, 0))}" height="{_n(max(height, 0))}"'
-        self.parts.append(f'<rect x="{_n(x)}" y="{_n(y)}" {size}{colour}{round_}{_class(kind)}{_end("rect", tip)}')
+        self.parts.append(f'<rect x="{_n(x)}" y="{_n(y)}" {size}{round_}{_class(kind)}{_end("rect", tip)}')
 
     def path(self, d: str, kind: str = "line") -> None:
         """Draw a path given by its commands."""

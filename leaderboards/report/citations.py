@@ -44,7 +44,8 @@ _ARCHITECTURES = {
     "He, Zhang": "he2016",
     "Gu, Goel": "gu2022",
     "Gu & Dao": "gu2023",
-} | {"Radford, Wu": "radford2019"}
+    "Radford, Wu": "radford2019",
+}
 _OBJECTIVES = {"simclr": "chen2020", "simsiam": "chen2021"}
 _METRICS = {"crossnobis": "walther2016", "cka": "kornblith2019", "procrustes": "williams2021"}
 

@@ -157,7 +157,7 @@ def _models(entries: Sequence[Entry]) -> PaperTable:
             "p": words.probability(entry.p),
             "value": words.number(entry.value),
             "raw r": words.number(entry.r),
-            "layer": entry.score.layer or "",
+            "layer": entry.layer,
             "parameters": words.count(entry.card.parameters),
             "top-1": "" if entry.card.top1 is None else words.number(entry.card.top1),
             "standing": entry.standing + (f", same computation as {entry.same_as}" if entry.same_as else ""),

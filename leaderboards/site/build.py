@@ -26,7 +26,7 @@ from leaderboards.schema import record_schema
 from leaderboards.site.page import render, script_json
 from leaderboards.site.score_page import model_page
 from leaderboards.site.table import COLUMNS, board_label, page_data, table_csv, table_rows
-from leaderboards.store import StoredRecord
+from leaderboards.store import StoredRecord, write_record
 
 PAGE = 50
 """Rows of the table shown at once."""
@@ -50,7 +50,7 @@ def build_leaderboard(
         title: Heading of the first page.
 
     Raises:
-        DataError: there is nothing to show.
+        DataError: there is nothing to show, or a record in memory contradicts itself.
         UsageError: ``folder`` is a file, or a folder that holds something else.
     """
     stored = [StoredRecord(Path(), item) if isinstance(item, ResultRecord) else item for item in records]
@@ -117,11 +117,7 @@ def _write_models(root: Path, boards: Sequence[Board]) -> set[Path]:
     kept = set()
     for entry in (entry for board in boards for entry in board.entries):
         kept.add(write_text(root / "models" / entry.page, model_page(entry)))
-        for record in entry.records:
-            file = root / "records" / record.file_name
-            if not file.is_file():
-                write_text(file, record.to_json() + "\n")
-            kept.add(file)
+        kept |= {write_record(record, root / "records") for record in entry.records}
     return kept
 
 

@@ -7,14 +7,15 @@ import hashlib
 import json
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
+
+from jinja2 import Environment, FileSystemLoader, StrictUndefined
+from markupsafe import Markup
 
 from brainbench.core.files import to_plain
 from leaderboards import text as words
 from leaderboards.figures.rdms import colour_stops
-
-if TYPE_CHECKING:
-    from jinja2 import Environment
+from leaderboards.standing import MEANINGS
 
 _TEMPLATES = Path(__file__).parents[1] / "templates"
 
@@ -25,8 +26,6 @@ def render(template: str, **values: Any) -> str:
     The policy names our style and script by their hash, so even markup that slipped past the
     escaping could not run, load or send anything.
     """
-    from markupsafe import Markup
-
     style = (_TEMPLATES / "page.css").read_text(encoding="utf-8")
     script = (_TEMPLATES / "page.js").read_text(encoding="utf-8")
     policy = (
@@ -47,15 +46,11 @@ _MARKDOWN = str.maketrans({mark: f"\\{mark}" for mark in "\\`*_{}[]|#!"} | {"<":
 
 
 def _escape_markdown(value: Any) -> Any:
-    from markupsafe import Markup
-
     return value if isinstance(value, Markup) else " ".join(str(value).translate(_MARKDOWN).split())
 
 
 def script_json(value: Any) -> Any:
     """Return ``value`` as JSON that can stand inside a script element: nothing in it can end the element."""
-    from markupsafe import Markup
-
     text = json.dumps(to_plain(value), ensure_ascii=False, allow_nan=False, separators=(",", ":"))
     for mark, escaped in (("<", "\\u003c"), (">", "\\u003e"), ("&", "\\u0026")):
         text = text.replace(mark, escaped)
@@ -64,8 +59,6 @@ def script_json(value: Any) -> Any:
 
 @cache
 def _environment() -> Environment:
-    from jinja2 import Environment, FileSystemLoader, StrictUndefined
-
     environment = Environment(
         loader=FileSystemLoader(_TEMPLATES),
         autoescape=True,
@@ -76,7 +69,7 @@ def _environment() -> Environment:
     for helper in (words.number, words.probability, words.count, words.span, words.level):
         environment.filters[helper.__name__] = helper
     environment.globals |= {
-        "STANDING": words.STANDING,
+        "STANDING": MEANINGS,
         "SYNTHETIC": words.SYNTHETIC,
         "p_sentence": words.p_sentence,
         "colour_stops": colour_stops(),

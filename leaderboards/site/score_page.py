@@ -18,13 +18,14 @@ from brainbench.core.files import write_text
 from brainbench.core.records import ResultRecord
 from leaderboards import text
 from leaderboards.boards import RAW_INPUT
-from leaderboards.entries import Entry, not_repeatable, standing_of
+from leaderboards.entries import Entry
 from leaderboards.figures.architecture import diagram, layer_order
 from leaderboards.figures.rdms import rdm_picture
 from leaderboards.figures.record import beside, layers, raw
 from leaderboards.figures.time_course import draw_time_course
 from leaderboards.ranking import compare, lacking
 from leaderboards.site.page import render
+from leaderboards.standing import not_repeatable, standing_of
 
 _MOST_PAIRS = 100
 """An RDM with more pairs than this is shown as a picture only; its numbers are in the record."""

@@ -11,8 +11,9 @@ from typing import Any
 from brainbench.core.records import Interval, Score
 from leaderboards.boards import Baseline, Board
 from leaderboards.conclusions import conclusions
-from leaderboards.entries import Entry, standing_of
+from leaderboards.entries import Entry
 from leaderboards.figures.plots import interval_ends, score_scale
+from leaderboards.standing import standing_of
 from leaderboards.text import ways_to_get
 
 COLUMNS: tuple[dict[str, Any], ...] = (
@@ -146,6 +147,7 @@ def _entry_row(entry: Entry) -> dict[str, Any]:
         "spread": entry.spread,
         "value": entry.value,
         "r": entry.r,
+        "layer": entry.layer or None,
         "seeds": entry.seeds,
         "seed": card.seed if entry.seeds == 1 else None,
         "weights": card.weights if entry.seeds == 1 else None,

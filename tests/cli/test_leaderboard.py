@@ -151,6 +151,26 @@ def test_a_site_is_opened_in_a_browser_and_its_place_is_said_where_there_is_none
     assert run("leaderboard", "build", str(path.parent / "none")).status == 2
 
 
+def test_only_a_score_of_the_same_question_is_known_or_replaced(run, files, tmp_path):
+    to, batch = tmp_path / "board", tmp_path / "batch.toml"
+    given = f'recordings = "{files["recordings"]}"\nstimuli = "{files["arrays"]}"\nconditions = "trials:texture"\n'
+    states = []
+    for option in ("", "layer = 'gru'", "normalize = false", "window = 'start..+0.3'", ""):
+        batch.write_text(f'[options]\n{given}{option}\n[[entries]]\nmodels = ["{files["model"]}"]\n')
+        result = run("leaderboard", "add", "--batch", str(batch), "--to", str(to), "--prune", "--json")
+        assert result.status == 0, result.err
+        states += [item["state"] for item in json.loads(result.out)["results"]]
+    assert states == ["scored"] * 4 + ["known"]
+    assert len(list(to.glob("*.json"))) == 4
+
+
+@pytest.mark.parametrize("option", [("--metric", "cka"), ("--seed", "1")])
+def test_options_of_scores_without_a_model_are_refused(run, tmp_path, option):
+    result = run("leaderboard", "add", str(tmp_path), "--to", str(tmp_path / "board"), *option)
+    assert result.status == 2
+    assert option[0] in result.err
+
+
 def test_nothing_to_add_is_an_error(run):
     result = run("leaderboard", "add")
     assert result.status == 2

@@ -44,3 +44,6 @@ def test_dimensions_that_are_no_number_are_refused(run):
     both = run("power", "--dimensions", "3", "--model", "pixels")
     assert both.status == 2
     assert "--model" in both.err
+    alone = run("power", "--conditions", "trials:stimulus")
+    assert alone.status == 2
+    assert "--recordings" in alone.err

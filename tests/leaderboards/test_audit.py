@@ -63,10 +63,13 @@ def test_the_same_computation_with_other_numbers_is_a_conflict_on_both_sides(mak
     assert conflicting(one, [one, other, unrelated]) == [other]
 
 
-def test_last_digits_and_other_seeds_are_no_conflict(make_record, tmp_path):
+def test_last_digits_and_other_options_are_no_conflict(make_record, tmp_path):
     one, near = make_record("a", 0.5), make_record("a", 0.5 + 1e-6)
-    elsewhere = _with(make_record("a", 0.6), settings={"time": "mean", "seed": 1})
-    assert remarks([_stored(record, tmp_path) for record in (one, near, elsewhere)]) == {}
+    others = [
+        _with(make_record("a", 0.6), settings={"time": "mean", "seed": 0} | change)
+        for change in ({"seed": 1}, {"layer": "conv3"}, {"units_reliability": 0.5})
+    ]
+    assert remarks([_stored(record, tmp_path) for record in (one, near, *others)]) == {}
 
 
 def test_the_examples_hold():

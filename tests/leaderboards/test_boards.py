@@ -35,6 +35,14 @@ def test_models_that_differ_have_ranks_and_those_that_do_not_share_them():
     assert {_ranks(tied)["a"], _ranks(tied)["b"]} == {"1–2"}
 
 
+def test_scores_on_fewer_units_have_a_board_of_their_own():
+    one, other = draw_board({"one": 0.6, "other": 0.4})
+    settings = {**other.score.provenance.settings, "units_reliability": 0.5}
+    boards = rank([one, _with(other, provenance=replace(other.score.provenance, settings=settings))])
+    assert [len(board.entries) for board in boards] == [1, 1]
+    assert sorted("0.5" in board.estimator for board in boards) == [False, True]
+
+
 def test_where_every_model_ties_none_has_a_rank():
     board = _board(draw_board({"a": 0.5, "b": 0.5, "c": 0.5}))
     assert set(_ranks(board).values()) == {"–"}

@@ -41,6 +41,14 @@ def test_each_difference_is_named_by_its_place(make_record):
     }
 
 
+def test_records_in_two_places_are_read_once(make_record, tmp_path):
+    for folder in ("one", "other"):
+        write_record(make_record(), tmp_path / folder / "records")
+    write_record(make_record("another"), tmp_path / "other" / "records")
+    found = open_build(tmp_path / "one", tmp_path / "other")
+    assert sorted(item.record.score.name for item in found) == ["another", "zhuang"]
+
+
 def test_numbers_within_the_tolerance_are_equal(make_record):
     record = make_record()
     near = replace(record, score=replace(record.score, value=0.5235))

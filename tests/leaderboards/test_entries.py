@@ -1,17 +1,14 @@
-"""Seeds fold into one entry, copies of a computation are known, and one ladder of words says what a score is worth."""
+"""Seeds fold into one entry, and copies of a computation are known."""
 
 from __future__ import annotations
 
-import doctest
 import math
 from dataclasses import replace
 
 import pytest
 
-from brainbench.core.records import ModelCard
-from leaderboards import entries as module
 from leaderboards.boards import rank
-from leaderboards.entries import STANDINGS, not_repeatable, same_computation, standing_of, twins
+from leaderboards.entries import same_computation, twins
 from tests.factories.records import draw_board
 
 
@@ -26,6 +23,22 @@ def _run(record, seed: int, by: float = 0.0, *, objective: str = "untrained", **
 def _entries(*records):
     (board,) = rank(records)
     return board.entries
+
+
+def test_every_layer_that_a_seed_was_scored_at_is_named():
+    (record,) = draw_board({"net": 0.6})
+    other = replace(record, score=replace(record.score, layer="another"))
+    (entry,) = _entries(_run(record, 0), _run(other, 1), _run(record, 2))
+    assert entry.layer == f"{record.score.layer}, another"
+
+
+def test_one_seed_without_a_test_leaves_the_entry_untested():
+    (record,) = draw_board({"net": 0.6})
+    untested = replace(record, score=replace(record.score, p=math.nan))
+    (entry,) = _entries(_run(record, 0), _run(untested, 1))
+    assert entry.standing == "not tested"
+    assert math.isnan(entry.p)
+    assert not entry.above_chance
 
 
 def test_seeds_are_one_entry_with_mean_interval_and_spread():
@@ -87,23 +100,6 @@ def test_the_page_keeps_its_address_when_a_seed_is_added():
     assert before.page == after.page
 
 
-@pytest.mark.parametrize(
-    ("change", "above_raw", "standing"),
-    [
-        ({"p": 0.001}, True, "above raw input"),
-        ({"p": 0.001}, False, "above chance"),
-        ({"p": 0.2}, True, "not told apart from chance"),
-        ({"p": math.nan}, True, "not tested"),
-        ({"p": 0.001, "status": "unreliable"}, True, "unreliable"),
-        ({"value": math.nan, "status": "undefined"}, True, "undefined"),
-    ],
-)
-def test_every_score_stands_on_one_rung(make_score, change, above_raw, standing):
-    score = replace(make_score(), **change)
-    assert standing_of(score, above_raw=above_raw) == standing
-    assert standing in STANDINGS
-
-
 def test_copies_of_a_layer_and_other_units_are_the_same_computation():
     one, other = _entries(*draw_board({"one": 0.6, "other": 0.4}))
     assert not same_computation(one, other)
@@ -113,24 +109,3 @@ def test_copies_of_a_layer_and_other_units_are_the_same_computation():
     for score, same in ((copy, True), (scaled, True), (nudged, False)):
         entry = replace(one, records=(replace(one.records[0], score=score),))
         assert same_computation(one, entry) is same
-
-
-@pytest.mark.parametrize(
-    ("name", "family", "repeatable"),
-    [
-        ("s4-small.simclr", "s4", True),
-        ("features", "features computed elsewhere", False),
-        ("mine.py:Mine", "user module", False),
-        ("local-dir:there", "s4", False),
-        ("hf-hub:me/there", "s4", False),
-        ("bare", "", False),
-    ],
-)
-def test_only_what_comes_with_the_package_can_be_repeated(make_record, name, family, repeatable):
-    record = make_record(name)
-    record = replace(record, card=ModelCard(name, family=family))
-    assert (not_repeatable(record) == "") is repeatable
-
-
-def test_the_examples_hold():
-    assert doctest.testmod(module).failed == 0

@@ -10,6 +10,14 @@ from leaderboards import text as words
 from tests.factories.html_page import Page
 
 
+def test_the_limit_of_a_p_value_is_the_stimuli_or_the_permutations(make_score):
+    assert "6 stimuli" in words.p_sentence(make_score(p=1 / 720))
+    forty = make_score(p=0.0005, p_smallest=0.0005, stimuli=tuple(map(str, range(40))), model_rdm=(), brain_rdm=())
+    assert "stimuli" not in words.p_sentence(replace(forty, p_method=""))
+    assert "number of permutations" in words.p_sentence(forty)
+    assert "0.0014" in words.p_sentence(make_score(p=0.02))
+
+
 def _with(record, name="net", **changes):
     card = replace(record.card, **changes)
     return replace(record, score=replace(record.score, name=name), card=card)

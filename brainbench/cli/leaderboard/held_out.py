@@ -9,17 +9,21 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from brainbench.cli.options import SCORE, with_options
 from brainbench.cli.output import JsonOption, emit
+from brainbench.core.errors import UsageError
+from brainbench.core.files import content_hash, write_json
+from brainbench.core.records import ResultRecord, Score
+from leaderboards.held_out import DATA, Commitment, digest, new_salt
 
 if TYPE_CHECKING:
     import xarray as xr
-
-    from brainbench.core.records import ResultRecord, Score
 
 FEWEST = {"animals": 2, "stimuli": 3}
 """Fewest on either side: less has no score."""
 
 
+@with_options(SCORE, ("conditions", "select", "window"), build=False)
 def hold_out(
     recordings: Annotated[str, typer.Argument(help="An NWB or HDF5 file, a folder, a glob, or 'demo'.")],
     animals: Annotated[int, typer.Option(help="Number of animals to hold back.")] = 0,
@@ -28,28 +32,22 @@ def hold_out(
     secret: Annotated[Path, typer.Option(help="Folder of what is kept back; never publish it.")] = Path(
         "held-out-secret"
     ),
-    conditions: Annotated[str | None, typer.Option(help="As in brainbench score.")] = None,
-    select: Annotated[str | None, typer.Option(help="As in brainbench score.")] = None,
-    window: Annotated[str | None, typer.Option(help="As in brainbench score.")] = None,
+    options: Any = None,
     as_json: JsonOption = False,
 ) -> None:
     """Split recordings into a public part and a held-out part, drawn at random, and publish a hash of the latter.
 
     Anybody can score models on the public part; ``leaderboard verify --held-out`` scores a submission on the rest.
     """
-    from brainbench.core.errors import UsageError
-    from brainbench.core.files import write_json
     from brainbench.datasets import write_recordings
     from brainbench.scoring.neural_responses import open_neural_responses
-    from leaderboards.held_out import DATA, Commitment, digest, new_salt
 
     if (animals > 0) == (stimuli > 0):
         raise UsageError(f"Hold back either --animals or --stimuli; received {animals} and {stimuli}.")
     if secret.exists():
         raise UsageError(f"The folder {str(secret)!r} exists; name a new one, so that no earlier secret is lost.")
     kind = "animals" if animals else "stimuli"
-    chosen = {"conditions": conditions, "select": select, "window": window}
-    whole = open_neural_responses(recordings, progress=None, **chosen).dataset
+    whole = open_neural_responses(recordings, progress=None, **options).dataset
     names = list(whole.attrs["vocabulary"]) if stimuli else sorted(set(map(str, whole["subject"].values)))
     held_count = animals or stimuli
     if min(held_count, len(names) - held_count) < FEWEST[kind]:
@@ -75,8 +73,6 @@ def hold_out(
 
 def split(whole: xr.Dataset, kind: str, names: list[str]) -> xr.Dataset:
     """Return the trials, and of animals also the units, of some animals or stimuli of a recordings data set."""
-    from brainbench.core.files import content_hash
-
     if kind == "animals":
         part = whole.isel(trial=whole["subject"].isin(names).values, unit=whole["unit_subject"].isin(names).values)
     else:
@@ -85,7 +81,7 @@ def split(whole: xr.Dataset, kind: str, names: list[str]) -> xr.Dataset:
     return part.assign_attrs(vocabulary=labels, content_hash=content_hash(whole.attrs["content_hash"], kind, names))
 
 
-def score_held_out(record: ResultRecord, commitment: Path, secret: Path) -> dict[str, Any]:
+def score_held_out(record: ResultRecord, told: Commitment, secret: Path) -> dict[str, Any]:
     """Score the model of a record on held-out recordings, with the options that the record states.
 
     The answer is rounded to two digits: many submissions shall learn little of the held-out part.
@@ -96,9 +92,7 @@ def score_held_out(record: ResultRecord, commitment: Path, secret: Path) -> dict
     from brainbench.datasets import open_recordings
     from brainbench.scoring.options import ScoreOptions
     from brainbench.scoring.scores import score_record
-    from leaderboards.held_out import Commitment
 
-    told = Commitment.read(commitment)
     held = open_recordings(told.open(secret))
     pairs = record.score.provenance.pairs
     match = {label: pairs.get(label, label) for label in held.attrs["vocabulary"]}
@@ -109,7 +103,7 @@ def score_held_out(record: ResultRecord, commitment: Path, secret: Path) -> dict
 
 
 def _rounded(score: Score) -> dict[str, Any]:
-    from leaderboards.entries import standing_of
+    from leaderboards.standing import standing_of
 
     span = score.scaled_interval
     values = {"score": score.scaled, "low": span.low if span else math.nan, "high": span.high if span else math.nan}

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
 from pathlib import Path
@@ -11,9 +11,13 @@ from typing import Any
 
 from brainbench.cli.options import SCORE, SCORE_FLAGS, as_flags
 from brainbench.core.errors import DataError, UsageError, unknown_name
+from brainbench.core.files import to_plain
 from brainbench.core.progress import Progress
 from brainbench.core.records import ESTIMATOR_VERSION, ResultRecord
 from brainbench.scoring.options import ScoreOptions
+
+_IN_HASHES = ("stimuli", "conditions", "select", "window", "bin", "fidelity", "whiskers")
+"""Settings that the hashes of recordings and stimuli hold."""
 
 
 @dataclass(frozen=True)
@@ -130,7 +134,7 @@ def find_models(patterns: Sequence[str]) -> list[str]:
 
 
 def missing(jobs: Sequence[ScoringJob], records: Iterable[ResultRecord]) -> list[ScoringJob]:
-    """Return the jobs, of one set of options, whose score is not among the records.
+    """Return the jobs whose score is not among the records.
 
     A record counts only if made by this version of the package and of the estimator from the same weights,
     recordings, stimuli and settings, so that a batch also renews what has become stale.
@@ -140,26 +144,40 @@ def missing(jobs: Sequence[ScoringJob], records: Iterable[ResultRecord]) -> list
     from brainbench.scoring.neural_responses import open_neural_responses
     from brainbench.stimuli import load_stimuli
 
-    options = jobs[0].options
-    brain = open_neural_responses(options.recordings, progress=None, **options.selection)
-    source = options.stimuli or brain.stimuli or DEFAULT_STIMULI
-    shown = load_stimuli(source, whiskers=options.whiskers, fidelity=options.fidelity)
-    names = ("metric", "estimator", "time", "weights_seed", "estimator_version")
-    common = (__version__, brain.origin["content_hash"], shown.config_hash or shown.content_hash)
-    known = set()
+    # Jobs of --model and of a batch file may have other recordings and stimuli.
+    inputs: dict[str, list[Any]] = {}
+    for options in (job.options for job in jobs):
+        if (key := _asked_for(options)) not in inputs:
+            brain = open_neural_responses(options.recordings, progress=None, **options.selection)
+            source = options.stimuli or brain.stimuli or DEFAULT_STIMULI
+            shown = load_stimuli(source, whiskers=options.whiskers, fidelity=options.fidelity)
+            inputs[key] = [brain.origin["content_hash"], shown.config_hash or shown.content_hash]
+    known = []
     for record in records:
         origin = record.score.provenance
         hashes = origin.stimuli.get("config_hash") or origin.stimuli.get("content_hash")
-        made = (origin.version, origin.recordings.get("content_hash"), hashes)
+        versions = [origin.version, origin.settings.get("estimator_version")]
         weights = record.card.weights if record.card else None
-        known.add((record.score.name, weights, *made, *(origin.settings.get(name) for name in names)))
+        made = [record.score.name, weights, origin.recordings.get("content_hash"), hashes, *versions]
+        known.append([*made, full_settings(origin.settings, without=_IN_HASHES)])
     found = []
     for job in jobs:
-        settings = job.options.settings | {"estimator_version": ESTIMATOR_VERSION}
         weights = resolve_model(job.model, seed=job.options.model_seed).card.weights
-        if (job.model, weights, *common, *(settings[name] for name in names)) not in known:
+        wanted = [job.model, weights, *inputs[_asked_for(job.options)], __version__, ESTIMATOR_VERSION]
+        if [*wanted, full_settings(job.options.settings, without=_IN_HASHES)] not in known:
             found.append(job)
     return found
+
+
+def _asked_for(options: ScoreOptions) -> str:
+    """Return the words that ask for the recordings and the stimuli."""
+    return str([options.recordings, *(options.settings[name] for name in _IN_HASHES)])
+
+
+def full_settings(stated: Mapping[str, Any], *, without: Sequence[str] = ()) -> dict[str, Any]:
+    """Return the settings of a score as a record states them, with the default of every option that it leaves out."""
+    whole = {**ScoreOptions().settings, **stated}
+    return to_plain({name: whole[name] for name in ScoreOptions().settings if name not in without})
 
 
 def parse_seeds(text: str) -> tuple[int, ...]:

@@ -9,6 +9,7 @@ from typing import Annotated, Any
 import typer
 
 from brainbench.cli.output import JsonOption, emit, table_of
+from leaderboards.store import StoredRecord, read_records
 
 RECORDS = Path("brainbench-results")
 """Folder that is read where none is named."""
@@ -25,18 +26,13 @@ def build(
 ) -> None:
     """Write the static site of a leaderboard: a folder of pages that need no server and no network."""
     from leaderboards.site.build import build_leaderboard
-    from leaderboards.store import read_records
 
-    sources = records or [RECORDS]
-    for source in sources:
-        _require(source)
-    stored = read_records(sources)
+    stored = read_records(records or [RECORDS])
     page = build_leaderboard(stored, out, title=title)
-    good = [item for item in stored if not item.problem]
-    bad = _problems(stored)
-    text = f"{page}  ({len(good)} records, {len(bad)} with problems)"
-    text += "".join(f"\n  {item['path']}: {item['problem']}" for item in bad)
-    emit({"page": page, "records": len(good), "problems": bad}, text, as_json=as_json)
+    problems = _problems(stored)
+    good = len(stored) - len(problems)
+    text = f"{page}  ({good} records, {len(problems)} with problems){_left_out(problems)}"
+    emit({"page": page, "records": good, "problems": problems}, text, as_json=as_json)
     if show and not webbrowser.open(page.resolve().as_uri()):
         typer.echo("No browser could be opened here; open the file above.", err=True)
 
@@ -56,12 +52,11 @@ def report(
     from leaderboards.changes import open_build
     from leaderboards.report.paper import write_paper
 
-    stored = [item for source in records or [RECORDS] for item in open_build(source)]
+    stored = open_build(*(records or [RECORDS]))
     kind = format or (out.suffix.removeprefix(".") if out is not None and out.suffix else "html")
     files = write_paper(stored, out or Path(f"leaderboard-report.{kind}"), format=kind, title=title)
     problems = _problems(stored)
-    text = "\n".join([*map(str, files), *(f"  left out: {item['path']}: {item['problem']}" for item in problems)])
-    emit({"files": files, "problems": problems}, text, as_json=as_json)
+    emit({"files": files, "problems": problems}, "\n".join(map(str, files)) + _left_out(problems), as_json=as_json)
 
 
 def diff(
@@ -86,19 +81,12 @@ def diff(
     text = table_of("", told, columns) if told else "No difference."
     if restated := len(changes) - len(told):
         text += f"\n{restated} restated: other records with the same inputs and numbers."
-    text += "".join(f"\nleft out: {item['path']}: {item['problem']}" for item in problems)
-    emit({"changes": changes, "problems": problems}, text, as_json=as_json)
+    emit({"changes": changes, "problems": problems}, text + _left_out(problems), as_json=as_json)
 
 
-def _require(source: Path) -> None:
-    from brainbench.core.errors import DataFileNotFoundError
-
-    if not source.exists():
-        raise DataFileNotFoundError(
-            f"There is no file or folder {str(source)!r} to read result records from; "
-            "make one first, for example with: brainbench score zhuang-intersection-ln"
-        )
-
-
-def _problems(stored: Any) -> list[dict[str, Any]]:
+def _problems(stored: list[StoredRecord]) -> list[dict[str, Any]]:
     return [{"path": item.path, "problem": item.problem} for item in stored if item.problem]
+
+
+def _left_out(problems: list[dict[str, Any]]) -> str:
+    return "".join(f"\n  left out: {item['path']}: {item['problem']}" for item in problems)

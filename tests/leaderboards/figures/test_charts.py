@@ -19,8 +19,8 @@ from leaderboards.boards import rank
 from leaderboards.figures import plots, svg
 from leaderboards.figures.architecture import diagram
 from leaderboards.figures.charts import board_figures
-from leaderboards.figures.plots import regression
 from leaderboards.figures.record import layers
+from leaderboards.figures.scatter import regression
 from leaderboards.figures.svg import STYLE, Drawing, Scale, scale_of, standalone
 
 
@@ -75,6 +75,14 @@ def test_the_accuracy_of_a_twin_comes_from_the_trained_record_or_else_from_its_o
     told = _figures(plain, _trained(trained, twin_top1=0.25))["accuracy"]
     assert "untrained twin 0.250" in _texts(told.drawing)
     assert "No record states" not in told.caption
+
+
+def test_untrained_networks_do_not_count_among_the_models_cut_from_the_accuracies(make_record):
+    card = replace(make_record().card, objective="untrained", top1=0.1)
+    plain = [replace(make_record(f"net{i}"), card=replace(card, weights=str(i))) for i in range(plots.SHOWN + 1)]
+    figure = _figures(_trained(make_record("net.supervised")), *plain)["accuracy"]
+    assert "Shown are the first" not in figure.caption
+    assert "Shown are the first" in _figures(*plain)["accuracy"].caption
 
 
 @settings(deadline=None)

@@ -45,6 +45,15 @@ def _seeded(record, seed: int, by: float):
     return replace(record, card=card, score=score)
 
 
+def test_a_damaged_record_of_an_earlier_build_is_written_again(make_record, tmp_path):
+    site = build([make_record()], tmp_path)
+    (record,) = (site / "records").glob("*.json")
+    whole = record.read_text()
+    record.write_text("{}")
+    build([make_record()], tmp_path)
+    assert record.read_text() == whole
+
+
 def test_every_row_says_rank_score_and_interval_and_baselines_follow(tmp_path):
     records = draw_board({"low": 0.0, "a": 0.9, "b": 0.85}, spread=0.1)
     (board,) = data(build(records, tmp_path))["boards"]

@@ -1,0 +1,95 @@
+"""``brainbench leaderboard verify``: check records, and score their models again."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from brainbench.cli.leaderboard.held_out import score_held_out
+from brainbench.cli.leaderboard.scoring import refuse_foreign_code, score_again
+from brainbench.cli.output import JsonOption, emit, progress_bar, table_of
+from brainbench.core.errors import BrainbenchError
+from leaderboards.held_out import Commitment
+from leaderboards.store import read_records
+
+
+def verify(
+    records: Annotated[list[Path], typer.Argument(help="Record files or folders of them.")],
+    recordings: Annotated[
+        str | None, typer.Option("--recordings", "-r", help="Where the recordings are, if not 'demo'.")
+    ] = None,
+    score: Annotated[
+        bool, typer.Option("--score/--no-score", help="Score the model again and compare; else only read the files.")
+    ] = True,
+    tolerance: Annotated[float, typer.Option(help="Numbers that differ by no more are equal.")] = 1e-3,
+    trust_code: Annotated[
+        bool, typer.Option("--trust-code", help="Also run code and weights that do not come with this package.")
+    ] = False,
+    held_out: Annotated[
+        Path | None, typer.Option("--held-out", help="Published commitment; also score on what it holds back.")
+    ] = None,
+    secret: Annotated[Path, typer.Option(help="Folder of the held-out recordings.")] = Path("held-out-secret"),
+    as_json: JsonOption = False,
+) -> None:
+    """Check records: the file against its hash, the records against one another, the numbers against a repetition.
+
+    Only models of the registry and weights that come with the package are repeated: code that a record names could do
+    anything, and could read the answer. Exit status 1 if a file was edited, a repetition gives something else or
+    cannot be made; what differs is printed.
+    """
+    from leaderboards.audit import remarks
+    from leaderboards.changes import differences
+
+    # A commitment or a secret that is not usable is told before anything is scored.
+    told = None if held_out is None else Commitment.read(held_out)
+    if told is not None:
+        told.open(secret)
+    stored = read_records(records)
+    doubts = remarks(stored)
+    results: list[dict[str, Any]] = []
+    with progress_bar() as progress:
+        for index, item in enumerate(stored):
+            progress(index, len(stored), "records verified")
+            result: dict[str, Any] = {"record": item.path.name, "verdict": "refused", "problem": item.problem}
+            if item.record is not None:
+                result |= {"verdict": "intact", "doubts": doubts.get(item.record.identity, ())}
+                try:
+                    if score:
+                        again = score_again(item.record, recordings=recordings, trust_code=trust_code)
+                        found = differences(item.record, again, tolerance=tolerance)
+                        result |= {"verdict": "differs" if found else "confirmed", "differences": found}
+                        result |= {"value": again.score.value}
+                    if told is not None and result["verdict"] in ("intact", "confirmed"):
+                        refuse_foreign_code(item.record, trusted=trust_code)
+                        result |= score_held_out(item.record, told, secret)
+                except BrainbenchError as error:
+                    result |= {"verdict": "not repeated", "problem": str(error)}
+            results.append(result)
+    emit(results, "\n".join(_verdict(result) for result in results), as_json=as_json)
+    if any(result["verdict"] in ("refused", "differs", "not repeated") for result in results):
+        raise typer.Exit(1)
+
+
+def _verdict(result: dict[str, Any]) -> str:
+    from leaderboards.changes import in_short
+
+    words = {
+        "confirmed": "confirmed: scored again with the same result",
+        "intact": "intact: the file fits its hash (not scored again)",
+        "differs": "differs: scored again with another result",
+        "not repeated": f"not repeated: {result['problem']}",
+        "refused": f"refused: {result['problem']}",
+    }
+    lines = [f"{result['record']}\n  {words[result['verdict']]}"]
+    lines += [f"  {doubt}" for doubt in result.get("doubts", ())]
+    if held := result.get("held_out"):
+        columns = {name: f"{{0[{name}]}}" for name in ("on", "score", "low", "high", "standing")}
+        rows = [{"on": "public part", **result["on_public"]}, {"on": f"held-out {held}", **result["on_held_out"]}]
+        lines.append(table_of("", rows, columns))
+    if found := result.get("differences"):
+        shown = [(item.what, in_short(item.before), in_short(item.after)) for item in found[:12]]
+        lines.append(table_of("", shown, {"what": "{0[0]}", "record": "{0[1]}", "now": "{0[2]}"}))
+        lines += [f"  and {len(found) - 12} more"] if len(found) > 12 else []
+    return "\n".join(lines)
