@@ -99,6 +99,7 @@ def _events(trials: SessionTable) -> Iterator[Finding]:
         if known.sum() < 5:
             continue
         inside = {shift: _inside(events, start, stop, shift) for shift in _SHIFTS}
+        # Of shifts that fit equally well the smallest: events that fit every row have not slipped.
         best = max(inside, key=lambda shift: (inside[shift], -abs(shift)))
         values = {"column": name, "inside": inside[0], "shift": best, "inside_shifted": inside[best]}
         if best and inside[best] > 0.8 and inside[0] < 0.5:
@@ -132,6 +133,7 @@ def _contacts(session: Session, trials: SessionTable) -> Iterator[Finding]:
         if not CONTACTS.match(name) or not len(table):
             continue
         begin, end = table.times("start_time"), table.times("stop_time")
+        # The last trial that began before each contact; −1 for contacts before the first trial.
         row = np.searchsorted(start, begin, side="right") - 1
         outside = (row < 0) | (begin > stop[np.maximum(row, 0)])
         if np.mean(outside) > 0.5:

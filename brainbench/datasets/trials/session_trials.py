@@ -96,6 +96,7 @@ def trials_by_subject(dataset: xr.Dataset) -> dict[str, tuple[Trials, ...]]:
         if not keep.any():
             continue
         rows = rows[keep]
+        # Bins past a window's end have NaN counts and duration 0; NaN seconds avoid the division by zero.
         seconds = np.where(duration[rows] > 0, duration[rows], np.nan)
         found.setdefault(subject, []).append(
             Trials(

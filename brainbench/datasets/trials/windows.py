@@ -101,12 +101,14 @@ class Window:
         if self.stop is not None:
             limit = _event(table, self.stop) + self.stop_offset
         if self.anchor == FIRST_CONTACT:
+            # fmin skips NaN: without the event at the end, contacts are sought until the trial stops.
             until = np.fmin(limit, _event(table, "stop")) if "stop_time" in table else limit
             begin = self._first_contacts(session.source, contacts, _event(table, "start"), until, notes)
         else:
             begin = _event(table, self.anchor)
         begin = begin + self.offset
         if self.length is not None:
+            # minimum keeps NaN: where the event at the end is missing, the row has no window at all.
             limit = np.minimum(limit, begin + self.length)
         return np.stack([begin, limit], axis=1)
 
@@ -125,6 +127,7 @@ class Window:
             notes.append(f"{source}: {np.sum(~lasting)} of {len(begin)} contacts too brief to be the first")
         times = np.sort(begin[lasting])
         where = np.searchsorted(times, start, side="left")
+        # The first contact not before the start of each trial; after the last contact of the session it is infinity.
         first = np.append(times, np.inf)[where]
         return np.where(first < until, first, np.nan)
 
