@@ -310,6 +310,7 @@ def _units_in_order(
     ids = as_labels(units.ids()).tolist()
 
     def key(row: int) -> tuple[Any, ...]:
+        """Return the id in natural order, then number of spikes and first spike (s), which tell equal ids apart."""
         return natural_key(ids[row]), len(spikes[row]), spikes[row][:1].tolist()
 
     return np.array(sorted(rows.tolist(), key=key), dtype=np.int64)

@@ -59,6 +59,7 @@ class Processes:
         if self.count == 1:
             return value
         total = torch.tensor([value], dtype=torch.float64, device=self.device)
+        # Every process must come here equally often, or the others wait for ever.
         torch.distributed.all_reduce(total)
         return float(total) / self.count
 
