@@ -91,6 +91,7 @@ def _other_lag(lags: NDArray[np.float64], size: NDArray[np.float64], at_touch: f
     none at the touch itself, and one further away only if it is clearly larger than any nearby.
     """
     close = np.abs(lags) <= RHYTHM
+    # In a recording of a few seconds all lags are close, and none is far.
     far = int(np.argmax(np.where(close, -np.inf, size))) if not close.all() else 0
     near = int(np.argmax(np.where(close, size, -np.inf)))
     if not close.all() and size[far] >= CLEAR and size[far] > 1.5 * size[near]:

@@ -56,6 +56,7 @@ def _impossible(spikes: Spikes, names: list[str]) -> Iterator[Finding]:
         early = [name for name, times in zip(names, spikes, strict=True) if len(times) and times[0] < 0]
         message = f"{share(len(early), len(names))} units have spikes before the session began (first at {low:.3f} s)"
         yield Finding("warning", "times", message, "Was a starting time subtracted twice?", {"first": low})
+    # Times in seconds hardly ever fall on whole numbers, numbers of samples always do.
     whole = all(np.all(times == np.round(times)) for times in spikes)
     if whole and sum(map(len, spikes)) >= _FEWEST:
         message = f"all spike times are whole numbers, up to {high:g}"

@@ -159,6 +159,7 @@ def check_coverage(
     span = recorded_span(spikes)
     if table is None or span is None or "start_time" not in table or not len(table):
         return
+    # Without ends of trials only their beginnings can be held against the recorded span.
     window = layout.window if layout else WHOLE if "stop_time" in table else Window("start", length=1e-3)
     try:
         edges = window.edges(session, table, [])
@@ -173,6 +174,7 @@ def check_coverage(
     low, high = span
     observed = inside_observed_spans(session.units, edges) if session.units is not None else None
     if observed is not None:
+        # One unit is enough: others may have been lost before the trial.
         outside = ~observed.any(axis=1)
     else:
         outside = ~((start >= low) & (stop <= high))
@@ -206,4 +208,5 @@ def _gaps(spikes: list[NDArray[np.float64]], low: float, high: float) -> list[tu
         fired[(times - edges[0]).astype(np.int64)] = True
     busy = np.flatnonzero(fired)
     after = np.flatnonzero(np.diff(busy) > _GAP)
+    # The second of the last spike before a gap does not belong to it.
     return [(float(edges[busy[index]] + 1), float(edges[busy[index + 1]])) for index in after]

@@ -42,6 +42,7 @@ def join_sessions(
     removed: Counter[str] = Counter()
     for part in parts:
         removed.update(part.tally.removed)
+    # A session without trials would add units that are missing in every row.
     everything, parts = parts, [part for part in parts if part.labels] or parts
     empty = [part for part in everything if not part.labels]
     lost = "no trial is left, so its {} units are left out"

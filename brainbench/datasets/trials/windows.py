@@ -15,6 +15,7 @@ FIRST_CONTACT = "first-contact"
 CONTACTS = re.compile(r"^(?:.*/)?contacts_by_whisker_(?P<whisker>\w+)$")
 """Names of the interval tables that hold one whisker's contacts."""
 _ANCHORS = {"start": "start_time", "stop": "stop_time", "choice": "choice_time"}
+# The name is matched lazily, so that it may hold a hyphen (first-contact) and yet leaves a signed number at the end.
 _EDGE = re.compile(r"^(?P<name>.*?)(?P<offset>[+-]\d*\.?\d+)?$")
 
 
