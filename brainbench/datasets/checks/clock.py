@@ -38,6 +38,7 @@ RHYTHM = 2.0
 TOLERANCE = 0.020
 """Shift (s) up to which the clock is taken for right."""
 _FEWEST = 20
+# Longest span of spikes that is searched, s: 8.6 million bins, of which the correlation makes several arrays.
 _LONGEST = 12 * 3600.0
 
 
@@ -90,6 +91,7 @@ def _other_lag(lags: NDArray[np.float64], size: NDArray[np.float64], at_touch: f
     none at the touch itself, and one further away only if it is clearly larger than any nearby.
     """
     close = np.abs(lags) <= RHYTHM
+    # In a recording of a few seconds all lags are close, and none is far.
     far = int(np.argmax(np.where(close, -np.inf, size))) if not close.all() else 0
     near = int(np.argmax(np.where(close, size, -np.inf)))
     if not close.all() and size[far] >= CLEAR and size[far] > 1.5 * size[near]:
@@ -131,15 +133,18 @@ def response_by_lag(
     """
     from scipy.signal import fftconvolve
 
+    # Room for the largest shift on both sides, so that every touch + lag lies on the grid.
     low = min(float(spikes.min()), float(touches[0])) - LARGEST - 1.0
     high = max(float(spikes.max()), float(touches[-1])) + LARGEST + 1.0
     number = int((high - low) / BIN) + 1
+    # Rate of all units together in each bin, Hz.
     rate = np.bincount(((spikes - low) / BIN).astype(np.int64), minlength=number) / BIN
     after = np.zeros(number)
     begin, end = round(RESPONSE[0] / BIN), round(RESPONSE[1] / BIN)
     before = round(BEFORE / BIN)
     total = np.concatenate([[0.0], np.cumsum(rate)])
     index = np.arange(before, number - end)
+    # Mean rate in RESPONSE after each bin less that in BEFORE, Hz: differences of running sums, for all bins at once.
     after[index] = (total[index + end] - total[index + begin]) / (end - begin)
     after[index] -= (total[index] - total[index - before]) / before
     events = np.bincount(((touches - low) / BIN).astype(np.int64), minlength=number).astype(np.float64)
@@ -148,11 +153,14 @@ def response_by_lag(
     # Further away, fewer than half of the touches would still fall into the recording.
     reach = round(min(LARGEST, 0.5 * float(np.ptp(spikes))) / BIN)
     lags = np.arange(-reach, reach + 1, dtype=np.float64) * BIN
+    # Number of touches at each lag whose shifted time lies between the first and the last spike.
     first, last = np.searchsorted(touches, spikes.min() - lags), np.searchsorted(touches, spikes.max() - lags)
     inside = np.maximum(last - first, 1)
     response = correlation[number - 1 - reach : number + reach] / inside
     # A mean of fewer touches is noisier; at equal numbers the noise of all lags can be pooled.
     scaled = (response - np.median(response)) * np.sqrt(inside)
+    # 1.4826 × the median absolute deviation is the standard deviation of normal noise; unlike that, it is not
+    # widened by the few lags at which there is a response.
     spread = max(1.4826 * float(np.median(np.abs(scaled))), 1e-9)
     return lags, response, scaled / spread
 

@@ -56,6 +56,7 @@ def _impossible(spikes: Spikes, names: list[str]) -> Iterator[Finding]:
         early = [name for name, times in zip(names, spikes, strict=True) if len(times) and times[0] < 0]
         message = f"{share(len(early), len(names))} units have spikes before the session began (first at {low:.3f} s)"
         yield Finding("warning", "times", message, "Was a starting time subtracted twice?", {"first": low})
+    # Times in seconds hardly ever fall on whole numbers, numbers of samples always do.
     whole = all(np.all(times == np.round(times)) for times in spikes)
     if whole and sum(map(len, spikes)) >= _FEWEST:
         message = f"all spike times are whole numbers, up to {high:g}"
@@ -119,11 +120,13 @@ def coincidences(spikes: Spikes) -> list[tuple[int, int, float]]:
     size = len(spikes)
     codes, step = [], 1
     while step < len(times):
+        # Times are sorted: once no two spikes `step` places apart are close, none further apart are.
         near = np.flatnonzero(times[step:] - times[:-step] <= COINCIDENT)
         if not len(near):
             break
         one, two = units[near], units[near + step]
         other = one != two
+        # One number per pair of units in either order; how often it occurs is how often they coincide.
         codes.append(np.minimum(one, two)[other] * size + np.maximum(one, two)[other])
         step += 1
     if not codes:
@@ -132,7 +135,9 @@ def coincidences(spikes: Spikes) -> list[tuple[int, int, float]]:
     one, two = pairs // size, pairs % size
     fewer, more = np.minimum(lengths[one], lengths[two]), np.maximum(lengths[one], lengths[two])
     span = max(float(times[-1] - times[0]), COINCIDENT)
+    # An unrelated train of n spikes in T seconds has one within ±δ of a given time with probability 2 δ n/T or so.
     chance = np.minimum(2 * COINCIDENT * more / span, 1.0)
+    # Corrected for chance as Cohen's kappa (1960) is: about 0 for unrelated units, 1 where every spike coincides.
     part = (number / fewer - chance) / np.maximum(1 - chance, 1e-9)
     kept = np.flatnonzero(part >= SIMILAR)
     kept = kept[np.argsort(-part[kept], kind="stable")]

@@ -99,6 +99,7 @@ def _events(trials: SessionTable) -> Iterator[Finding]:
         if known.sum() < 5:
             continue
         inside = {shift: _inside(events, start, stop, shift) for shift in _SHIFTS}
+        # Of shifts that fit equally well the smallest: events that fit every row have not slipped.
         best = max(inside, key=lambda shift: (inside[shift], -abs(shift)))
         values = {"column": name, "inside": inside[0], "shift": best, "inside_shifted": inside[best]}
         if best and inside[best] > 0.8 and inside[0] < 0.5:
@@ -132,6 +133,7 @@ def _contacts(session: Session, trials: SessionTable) -> Iterator[Finding]:
         if not CONTACTS.match(name) or not len(table):
             continue
         begin, end = table.times("start_time"), table.times("stop_time")
+        # The last trial that began before each contact; −1 for contacts before the first trial.
         row = np.searchsorted(start, begin, side="right") - 1
         outside = (row < 0) | (begin > stop[np.maximum(row, 0)])
         if np.mean(outside) > 0.5:
@@ -157,6 +159,7 @@ def check_coverage(
     span = recorded_span(spikes)
     if table is None or span is None or "start_time" not in table or not len(table):
         return
+    # Without ends of trials only their beginnings can be held against the recorded span.
     window = layout.window if layout else WHOLE if "stop_time" in table else Window("start", length=1e-3)
     try:
         edges = window.edges(session, table, [])
@@ -171,6 +174,7 @@ def check_coverage(
     low, high = span
     observed = inside_observed_spans(session.units, edges) if session.units is not None else None
     if observed is not None:
+        # One unit is enough: others may have been lost before the trial.
         outside = ~observed.any(axis=1)
     else:
         outside = ~((start >= low) & (stop <= high))
@@ -204,4 +208,5 @@ def _gaps(spikes: list[NDArray[np.float64]], low: float, high: float) -> list[tu
         fired[(times - edges[0]).astype(np.int64)] = True
     busy = np.flatnonzero(fired)
     after = np.flatnonzero(np.diff(busy) > _GAP)
+    # The second of the last spike before a gap does not belong to it.
     return [(float(edges[busy[index]] + 1), float(edges[busy[index + 1]])) for index in after]

@@ -26,6 +26,7 @@ def adapt(session: Session) -> Session:
     if table is None or "movement" in table or any(name not in table for name in needed):
         return session
     bump = np.isin(np.char.lower(as_labels(table.column("ctr_hold_bump"))), ("true", "1"))
+    # Angles that differ by whole turns are one direction and must get one label.
     angle = table.times("cond_dir") % 360
     return session.with_table(
         table.with_columns(movement=np.where(bump, PASSIVE, "active"), direction=as_labels(angle))

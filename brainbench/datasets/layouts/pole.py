@@ -85,6 +85,7 @@ def recorded_runs(stamps: NDArray[np.float64]) -> NDArray[np.float64]:
     Pauses longer than ten sampling steps are no recording.
     """
     steps = np.diff(stamps)
+    # Nearly all steps lie inside a run, so the median is the sampling step even where pauses are long.
     step = float(np.median(steps)) if len(steps) else 0.0
     breaks = np.flatnonzero(steps > 10 * step)
     return np.stack([stamps[np.append(0, breaks + 1)], stamps[np.append(breaks, len(stamps) - 1)] + step], axis=1)

@@ -135,6 +135,7 @@ def calibrate(
     from scipy.optimize import root_scalar
 
     def excess(modulation: float) -> float:
+        """Return by how much the ceiling at a modulation exceeds the wanted one."""
         tried = replace(design, modulation=modulation)
         return measure_ceiling(geometry, tried, simulations=simulations, seed=seed)[0] - ceiling
 

@@ -33,6 +33,7 @@ class ResponseGeometry:
             DataError: a value is not finite or a row is constant and has no direction.
         """
         values = _checked(features, 2)
+        # Inner products of centred rows of length one are Pearson correlations (r), so the RDM below is 1 − r.
         centred = values - values.mean(axis=1, keepdims=True)
         norms = np.linalg.norm(centred, axis=1)
         if np.any(norms <= 1e-12 * np.maximum(np.abs(values).max(axis=1), 1e-300)):
@@ -55,6 +56,7 @@ class ResponseGeometry:
         if not varied.any():
             raise DataError("Every feature is the same for all stimuli, so there is nothing for neurons to encode.")
         standard = (values[:, varied] - values[:, varied].mean(axis=0)) / spread[varied]
+        # Each standardised feature has a mean square of one over stimuli, so /√F makes the mean squared length one.
         return cls(_principal_axes(standard / np.sqrt(standard.shape[1])), _labels(labels, len(values)))
 
     @classmethod
@@ -68,6 +70,7 @@ class ResponseGeometry:
             UsageError: the length is no number of pairs, or a distance is outside 0 to 2.
         """
         distances = np.asarray(rdm, dtype=np.float64)
+        # P = K (K − 1)/2 solved for K.
         stimuli = round((1 + np.sqrt(1 + 8 * distances.size)) / 2)
         if distances.ndim != 1 or stimuli < 2 or stimuli * (stimuli - 1) // 2 != distances.size:
             raise UsageError(f"An RDM is an upper triangle [K(K-1)/2]; received shape {distances.shape}.")
@@ -107,6 +110,7 @@ def _checked(features: ArrayLike, width: int) -> NDArray[np.float64]:
 
 def _principal_axes(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
     """Rotate K vectors [K, F] into the at most K axes that they span; every angle and length stays."""
+    # X = U S Vᵀ: the rows of U S have the same inner products as those of X, and no more axes than its rank.
     left, values, _ = np.linalg.svd(vectors, full_matrices=False)
     kept = values > 1e-9 * values[0]
     # A singular vector's sign is the machine's choice; the largest entry is made positive.

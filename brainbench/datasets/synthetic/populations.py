@@ -136,6 +136,7 @@ def expected_rates(
     tuning = np.sqrt(1 - design.individual) * _project(axes, design.units, random)
     if design.individual:
         private = own.standard_normal((stimuli, stimuli + 1))
+        # Length one, the root mean square length of the shared axes: before ι weighs them both parts have variance one.
         private /= np.linalg.norm(private, axis=1, keepdims=True)
         tuning += np.sqrt(design.individual) * _project(private, design.units, random)
     # Log-normal over units with the mean rate kept, since E exp(σz − σ²/2) = 1.
@@ -167,6 +168,7 @@ def draw_counts(
 
 def stimulus_means(block: Trials, stimuli: int) -> NDArray[np.float64]:
     """Return the mean response [K, U] to every stimulus; NaN where there is no trial."""
+    # Indicators [K, R]: one product sums the trials of every stimulus.
     member = np.zeros((stimuli, len(block.labels)))
     member[block.labels, np.arange(len(block.labels))] = 1.0
     number = member.sum(axis=1, keepdims=True)

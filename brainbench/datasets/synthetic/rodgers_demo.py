@@ -102,6 +102,7 @@ def make_rodgers_demo(
         for index, own in enumerate(plans):
             for number, plan in enumerate(own):
                 random = np.random.default_rng([seed, VERSION, index, number])
+                # Begun anew for every session: all sessions of an animal draw the same traits (expected_rates).
                 animal = np.random.default_rng([seed, VERSION, index])
                 expected = expected_rates(geometry, plan.design, animal, random)
                 yield SyntheticSession(draw_session(random, plan, geometry, expected, contacts), expected)
@@ -150,6 +151,7 @@ def wrench_features(stimuli: xr.Dataset) -> NDArray[np.float64]:
     tracked = [index for index, name in enumerate(names) if name in rodgers.TRACKED]
     if not tracked:
         raise DataError(f"The stimuli have none of the tracked whiskers {listing(rodgers.TRACKED)}; simulate them too.")
+    # Root mean square of each channel: divided by it, forces (N) and moments (N·m) are comparable.
     scale = np.sqrt(np.mean(wrench[:, :, tracked] ** 2, axis=(0, 1, 2)))
     if not np.any(scale > 0):
         raise DataError("The stimuli exert no force on the whiskers, so there is nothing for neurons to encode.")

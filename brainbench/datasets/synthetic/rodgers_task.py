@@ -101,6 +101,7 @@ def draw_session(
     behaviour = draw_behaviour(random, plan, geometry.labels)
     first = first_contacts(runs, geometry.labels, plan.lost_whisker)
     low, high = behaviour.recorded
+    # Responses need a shape and a window inside the recorded span; in other trials units fire as between windows.
     answered = (behaviour.stimulus >= 0) & (behaviour.onset > low) & (behaviour.lick < high)
     shown = behaviour.stimulus[answered]
     begin = behaviour.onset[answered] + first[shown]
@@ -115,11 +116,13 @@ def draw_session(
         "depth": depth,
         "layer": [next(name for limit, name in _LAYERS if item < limit) for item in depth],
         "inhibitory": random.random(number) < 0.2,
+        # Numbers of clusters with gaps, as in the published files: code that takes an id for a row is found out.
         "id": np.sort(random.choice(np.arange(2, 600), size=number, replace=False)),
     }
     observed = None
     if plan.spans:
         low, high = behaviour.recorded
+        # Every ninth unit is lost after 60 % of the recording; its later trials are missing, not silent.
         ends = np.where(np.arange(number) % 9 == 4, low + 0.6 * (high - low), high)
         spikes = [times[times < end] for times, end in zip(spikes, ends, strict=True)]
         observed = [np.array([[low, end]]) for end in ends]
@@ -162,12 +165,14 @@ def draw_behaviour(random: np.random.Generator, plan: SessionPlan, labels: tuple
     opened = onset + 0.3
     lick = np.round(onset + random.uniform(*CHOICE, number), 4)
     choice_time = lick.copy()
+    # A spoiled trial has no lick: its choice_time lies far beyond its own end.
     choice_time[spoiled] = opened[spoiled] + 45.0
     shape, place = zip(*(label.split("-") for label in labels), strict=True)
     side = np.where(np.array([(*shape, "nothing")[index] == "convex" for index in stimulus]), "left", "right")
     right = random.random(number) < 0.78
     other = np.where(side == "left", "right", "left")
     nowhere = np.array(["close", "medium", "far"])[random.integers(3, size=number)]
+    # Numbers of trials with gaps, as in the published files.
     ids = np.cumsum(random.choice([1, 1, 1, 2, 3], size=number)) + 3
     columns = {
         "start_time": start,
@@ -187,6 +192,7 @@ def draw_behaviour(random: np.random.Generator, plan: SessionPlan, labels: tuple
         "response_window_open_time": opened,
         "id": ids.astype(np.int64),
     }
+    # Recording covers neither the first nor the last trials: these must be excluded, not read as silence.
     return Behaviour(columns, stimulus, onset, lick, (float(start[5]) + 0.2, float(stop[-7])))
 
 
@@ -212,6 +218,7 @@ def draw_contacts(
                 jitter = random.normal(0.0, 0.001, (len(per_stimulus[stimulus]), 1))
                 rows.append(per_stimulus[stimulus] + onset + jitter)
             if random.random() < 0.15:
+                # Begin and end are equal: rows of zero duration are empty intervals and no first contact.
                 rows.append(np.full((1, 2), onset + random.uniform(-0.3, 0.9)))
         contacts = np.round(np.concatenate(rows), 4)
         placed[whisker] = contacts[np.argsort(contacts[:, 0], kind="stable")]

@@ -228,7 +228,9 @@ def spike_trains(
 
 def _times(drawn: DrawnSession) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the contact and the end of every trial [R], s."""
+    # A stream of its own, apart from that of the spikes: data set and files have equal times, whatever else is drawn.
     pause = np.round(np.random.default_rng([*drawn.stream, 2]).uniform(*_AFTER, len(drawn.labels)), 4)
+    # A trial is lead, window and pause, and the next one follows at once; the first begins at 1 s.
     stop = 1.0 + np.cumsum(_BEFORE + drawn.window + pause)
     return stop - pause - drawn.window, stop
 

@@ -105,6 +105,7 @@ def read_truth(folder: str | os.PathLike[str]) -> dict[str, Any]:
 def squared_euclidean_rdm(responses: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the squared Euclidean distances [P] between rows [K, U], divided by the number of units."""
     rows, columns = np.triu_indices(len(responses), 1)
+    # The mean over units, not the sum (as rsatoolbox does), so that populations of different sizes compare.
     return np.mean((responses[rows] - responses[columns]) ** 2, axis=1)
 
 

@@ -62,6 +62,7 @@ def natural_vocabulary(values: Iterable[tuple[str, ...]]) -> tuple[str, ...]:
     Raises:
         DataError: two different combinations of values read the same when joined.
     """
+    # Sorted, not in order of appearance: that depends on the session that comes first, and RDMs would not share axes.
     ordered = sorted(set(values), key=lambda row: [natural_key(item) for item in row])
     labels = ["-".join(row) for row in ordered]
     if len(set(labels)) < len(labels):

@@ -84,6 +84,7 @@ def count_session(session: Session, options: ReadingOptions) -> SessionCounts:
         raise DataError(f"{table.label} has no start_time; conditions need a table of time intervals.")
     values = options.conditions.values(table)
     labels = np.array(joined_labels(values), dtype=str)
+    # Each rule counts only rows that no earlier rule removed, so removed and kept rows add up to the table.
     kept = tally.select(table, options.selection.trials, "trials")
     kept = tally.apply(kept, labels != "", f"trials: no value of {','.join(options.conditions.columns)}")
     if options.vocabulary is not None:
@@ -96,6 +97,7 @@ def count_session(session: Session, options: ReadingOptions) -> SessionCounts:
         kept = tally.apply(kept, ~_overlaps(edges, invalid), "trials: overlap with invalid_times")
 
     spikes = read_spikes(session.units, tally.notes)
+    # A window outside the recorded span is missing data, not silence: zero counts there would lower every mean.
     covered, unit_kept = _coverage(session.units, spikes, edges, options.selection, tally)
     kept = tally.apply(kept, covered.any(axis=1), "trials: outside the recorded span")
     unit_kept = tally.apply(unit_kept, covered[kept].any(axis=0) | ~kept.any(), "units: recorded in no kept trial")
@@ -162,6 +164,7 @@ def read_spikes(units: SessionTable, notes: list[str]) -> list[NDArray[np.float6
             f"{int(bad.sum())} spike times of {units.label} are not finite (first in unit {units.ids()[row]}); "
             f"the file is damaged or was exported wrongly."
         )
+    # NWB stores a ragged column as all values in one array and the end of each row, so all ends but the last cut it.
     spikes = np.split(flat, ends[:-1]) if len(ends) else []
     unsorted = [index for index, times in enumerate(spikes) if np.any(np.diff(times) < 0)]
     if unsorted:
@@ -216,13 +219,17 @@ def count(
                 f"A bin of {bin:g} s cuts windows of up to {longest:g} s into {number:,} bins; with {len(edges):,} "
                 f"trials and {len(spikes):,} units that is more than {_MOST_COUNTS:,} counts. Take wider bins."
             )
+        # Bounds past the end of a shorter window are moved onto it; bins between them have no length and become NaN.
         bounds = np.minimum(edges[:, :1] + bin * np.arange(number + 1), edges[:, 1:])
+        # The tolerance above may leave the last bound just short of the end, which would lose a spike in between.
         bounds[:, -1] = edges[:, 1]
     duration = np.diff(bounds, axis=1)
     found = np.empty((len(spikes), *duration.shape), dtype=np.float32)
     for index, times in enumerate(spikes):
+        # Differences of the numbers of spikes before each bound; "left" puts a spike on a bound into the later bin.
         found[index] = np.diff(np.searchsorted(times, bounds, side="left"), axis=1)
     counts = np.ascontiguousarray(found.transpose(1, 2, 0))
+    # NaN says "not recorded"; zero would say that the unit was silent for a time that nobody observed.
     counts[duration <= 1e-9] = np.nan
     counts[np.broadcast_to(~covered[:, None, :], counts.shape)] = np.nan
     return counts, np.where(duration > 1e-9, duration, 0.0)
@@ -246,6 +253,7 @@ def _coverage(
         covered = observed
     elif (span := recorded_span(spikes)) is not None:
         low, high = span
+        # One span for all units: a unit that fires rarely would get too short a span from its own spikes.
         covered[:] = ((edges[:, 0] >= low) & (edges[:, 1] <= high))[:, None]
         tally.notes.append(
             f"{units.label}: no obs_intervals; recorded span taken from first to last spike, {low:.3f}–{high:.3f} s"
@@ -276,6 +284,7 @@ def _merged(spans: NDArray[np.float64]) -> list[tuple[float, float]]:
     """Join the spans [n, 2] (s) that touch or overlap."""
     merged: list[tuple[float, float]] = []
     for low, high in sorted(map(tuple, spans.tolist())):
+        # Spans that touch are one recording: a window across their common end lies inside it.
         if merged and low <= merged[-1][1]:
             merged[-1] = (merged[-1][0], max(high, merged[-1][1]))
         else:
@@ -301,6 +310,7 @@ def _units_in_order(
     ids = as_labels(units.ids()).tolist()
 
     def key(row: int) -> tuple[Any, ...]:
+        """Return the id in natural order, then number of spikes and first spike (s), which tell equal ids apart."""
         return natural_key(ids[row]), len(spikes[row]), spikes[row][:1].tolist()
 
     return np.array(sorted(rows.tolist(), key=key), dtype=np.int64)

@@ -36,6 +36,7 @@ def trial_covariates(
         chosen = as_labels(table.column("choice"))
         sides = sorted({side for side in chosen.tolist() if side.lower() not in _NO_CHOICE})
         if len(sides) == 2:
+            # Coded in the order of the names, so that 0 and 1 mean the same sides in every session.
             values = np.select([chosen == side for side in sides], [0.0, 1.0], default=np.nan)
             found["choice"] = values[rows]
     return found

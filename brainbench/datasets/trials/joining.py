@@ -37,10 +37,12 @@ def join_sessions(
     """
     import xarray as xr
 
+    # The order must not depend on that of the files: equal data then have equal content hashes.
     parts = sorted(parts, key=lambda part: (natural_key(part.subject), natural_key(part.session)))
     removed: Counter[str] = Counter()
     for part in parts:
         removed.update(part.tally.removed)
+    # A session without trials would add units that are missing in every row.
     everything, parts = parts, [part for part in parts if part.labels] or parts
     empty = [part for part in everything if not part.labels]
     lost = "no trial is left, so its {} units are left out"
@@ -58,6 +60,7 @@ def join_sessions(
             f"({options.conditions}); comparing responses needs at least two, choose another column."
         )
     bins = max(part.counts.shape[1] for part in parts)
+    # One block per session: its units were not recorded in other sessions' trials, so all else is missing, not zero.
     counts = np.full((trials, bins, units), np.nan, dtype=np.float32)
     duration = np.zeros((trials, bins))
     row = column = 0
@@ -68,6 +71,7 @@ def join_sessions(
         row, column = row + count, column + width
     edges = np.concatenate([part.edges for part in parts])
     coordinates: dict[str, Any] = {
+        # Begin of each bin, s from the begin of the trial's window; one bin per window begins at 0.
         "time": ("time", np.arange(bins) * (options.bin or 0.0)),
         "stimulus": ("trial", [label for part in parts for label in part.labels]),
         "subject": ("trial", [part.subject for part in parts for _ in part.labels]),

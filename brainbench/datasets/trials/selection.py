@@ -69,6 +69,7 @@ class Rule:
             keep &= ~np.isin(labels, _spellings(self.refuse))
         if self.low is not None or self.high is not None:
             numbers = table.times(self.column)
+            # Comparisons with NaN are false, so a row without a value fails even a bound that is open.
             keep &= numbers >= (-np.inf if self.low is None else self.low)
             keep &= numbers <= (np.inf if self.high is None else self.high)
         return keep

@@ -92,10 +92,12 @@ def trials_by_subject(dataset: xr.Dataset) -> dict[str, tuple[Trials, ...]]:
         columns = np.flatnonzero((unit_subjects == subject) & (unit_sessions == session))
         own = counts[np.ix_(rows, np.arange(counts.shape[1]), columns)]
         recorded = np.isfinite(own)
+        # Units may be lost in mid-session: only what is missing everywhere is left out, other gaps stay NaN.
         keep, units = recorded.any(axis=(1, 2)), recorded.any(axis=(0, 1))
         if not keep.any():
             continue
         rows = rows[keep]
+        # Bins past a window's end have NaN counts and duration 0; NaN seconds avoid the division by zero.
         seconds = np.where(duration[rows] > 0, duration[rows], np.nan)
         found.setdefault(subject, []).append(
             Trials(

@@ -15,6 +15,7 @@ FIRST_CONTACT = "first-contact"
 CONTACTS = re.compile(r"^(?:.*/)?contacts_by_whisker_(?P<whisker>\w+)$")
 """Names of the interval tables that hold one whisker's contacts."""
 _ANCHORS = {"start": "start_time", "stop": "stop_time", "choice": "choice_time"}
+# The name is matched lazily, so that it may hold a hyphen (first-contact) and yet leaves a signed number at the end.
 _EDGE = re.compile(r"^(?P<name>.*?)(?P<offset>[+-]\d*\.?\d+)?$")
 
 
@@ -101,12 +102,14 @@ class Window:
         if self.stop is not None:
             limit = _event(table, self.stop) + self.stop_offset
         if self.anchor == FIRST_CONTACT:
+            # fmin skips NaN: without the event at the end, contacts are sought until the trial stops.
             until = np.fmin(limit, _event(table, "stop")) if "stop_time" in table else limit
             begin = self._first_contacts(session.source, contacts, _event(table, "start"), until, notes)
         else:
             begin = _event(table, self.anchor)
         begin = begin + self.offset
         if self.length is not None:
+            # minimum keeps NaN: where the event at the end is missing, the row has no window at all.
             limit = np.minimum(limit, begin + self.length)
         return np.stack([begin, limit], axis=1)
 
@@ -125,6 +128,7 @@ class Window:
             notes.append(f"{source}: {np.sum(~lasting)} of {len(begin)} contacts too brief to be the first")
         times = np.sort(begin[lasting])
         where = np.searchsorted(times, start, side="left")
+        # The first contact not before the start of each trial; after the last contact of the session it is infinity.
         first = np.append(times, np.inf)[where]
         return np.where(first < until, first, np.nan)
 

@@ -54,6 +54,7 @@ class GPTBlock(nn.Module):
         self.query_key_value = Linear(width, 3 * width)
         self.project = Linear(width, width, gain=residual)
         self.norm_mlp = nn.LayerNorm(width)
+        # The exact GELU; the thesis' released code uses its tanh form.
         self.mlp = nn.Sequential(
             Linear(width, 4 * width), nn.GELU(), Linear(4 * width, width, gain=residual), nn.Dropout(dropout)
         )

@@ -207,6 +207,7 @@ class LSTM(GatedCell):
     def apply_gates(self, fused: torch.Tensor, x: torch.Tensor, state: torch.Tensor) -> CellStep:
         """Return (y [B, out, H, W], state [B, 2 out, H, W]) from the gates' pre-activations."""
         del x
+        # The state is cat(c, h), in the order of PyTorchTNN: the convolution has read h, and c is carried on here.
         memory = state.chunk(2, 1)[0]
         write, candidate, keep, read = self._normalised(fused, self.gates)
         # The +1 on the forget gate keeps the memory early in training; c is normalised before it is read and stored.

@@ -34,6 +34,7 @@ class S4Block(nn.Module):
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         """Process a sweep [B, T, width]."""
+        # The norm stands before the state space; the thesis' released code normalises after the block.
         return x + self._mixed(self.memory(self.norm(x)))
 
     def step(self, x: torch.Tensor, memory: torch.Tensor, system: System) -> tuple[torch.Tensor, torch.Tensor]:

@@ -213,6 +213,7 @@ class GraphSpec:
         }
         order: list[str] = []
         while waiting:
+            # Kahn (1962), always taking the first listed node that is ready: equal configurations give equal orders.
             ready = next((name for name, sources in waiting.items() if not sources - set(order)), None)
             if ready is None:
                 raise UsageError(
@@ -231,6 +232,7 @@ class GraphSpec:
     @cached_property
     def predecessors(self) -> Mapping[str, tuple[Edge, ...]]:
         """Edges into each node, sorted by the name of their source."""
+        # Channels are concatenated in this order, as in PyTorchTNN: another one would give weights to the wrong inputs.
         ordered = sorted(self.edges, key=lambda edge: edge.source)
         return {node.name: tuple(edge for edge in ordered if edge.target == node.name) for node in self.nodes}
 
@@ -269,6 +271,7 @@ class GraphSpec:
             if name in self.inputs:
                 return self.input_shape[1:]
             ahead = (edge.source for edge in self.predecessors[name] if not edge.feedback)
+            # Of several predecessors the latest sets the grid; what earlier ones (skips) send is resized to it.
             source = max(ahead, key=self.order.index, default=None)
             if source is None:
                 raise UsageError(f"Node {name!r} has only feedback inputs; say with shape_from whose grid it takes.")

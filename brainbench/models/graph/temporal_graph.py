@@ -133,6 +133,7 @@ class TemporalGraph(nn.Module):
         for name, key, operation in self._weighted():
             if key in state and (isinstance(operation, Linear) or name in self.spec.inputs):
                 new, old = tuple(state[key].shape), tuple(operation.weight.shape)
+                # Another stimulus changes axis 1 alone: the inputs of dense layers and of nodes that see the stimulus.
                 if new != old and len(new) == len(old) and new[:1] + new[2:] == old[:1] + old[2:]:
                     resized[key] = new
         return resized
@@ -177,6 +178,7 @@ class TemporalGraph(nn.Module):
         """Return the multiply-adds of matrix products and convolutions in one step of one stimulus."""
         total = 0
         for name, node in self.named_nodes():
+            # A dense layer has no grid left: the product over it is one.
             places = math.prod(self.memory_grid(name))
             if isinstance(node.operation, (Conv2d, Linear)):
                 # A convolution uses each weight once at every place of its output.

@@ -36,6 +36,7 @@ class _Section:
         self.where = where
 
     def take(self, key: str, default: Any = _REQUIRED) -> Any:
+        """Remove a key and return its value, or the default; without either raise :class:`DataError`."""
         if key not in self.data and default is _REQUIRED:
             raise DataError(f"The graph configuration lacks {key!r} in {self.where}.")
         return self.data.pop(key, default)
@@ -63,6 +64,7 @@ class _Section:
         return (numbers[0], numbers[1])
 
     def done(self, *ignored: str) -> None:
+        """Raise :class:`DataError` if keys are left that nobody took, the ``ignored`` ones aside."""
         left = [key for key in self.data if key not in ignored]
         if left:
             raise DataError(f"The graph configuration has the unsupported key {listing(left)} in {self.where}.")

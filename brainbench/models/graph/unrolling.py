@@ -66,6 +66,7 @@ class UnrolledSweep:
         self.graph, self.x, self.steps = graph, x, steps
         self.batch = len(x)
         self.delay = graph.spec.delays(unroll)
+        # Dropout gives every stimulus its own mask, so no step can be computed once and shared.
         self.arrival = dict.fromkeys(graph.layers, 0) if graph.draws_random else graph.spec.first_response(unroll)
         self.kept: dict[str, tuple[int, torch.Tensor]] = {}
 
@@ -131,6 +132,7 @@ class UnrolledSweep:
             # What depends on the input alone is computed for all steps at once, and the loop holds only the recurrence.
             projected = node.memory.project(y)
             rows = [part.unflatten(0, (self.batch, count)) for part in (y, *projected)]
+            # Nodes with a memory are computed from step 0 on (needed_steps), so the empty state is the right one here.
             state, outputs = None, []
             for t in range(count):
                 x, *shares = (row[:, t] for row in rows)
@@ -142,6 +144,7 @@ class UnrolledSweep:
     def _loop(self, group: tuple[str, ...], read: Collection[str]) -> None:
         """Compute nodes that feed back on one another step by step."""
         graph = self.graph
+        # Before step 0 all nodes are silent for every stimulus, so one row of zeros stands for the batch.
         previous = {name: self.x.new_zeros(1, *graph.shapes[name]) for name in group}
         memories: dict[str, torch.Tensor] = {}
         history: dict[str, list[torch.Tensor]] = {name: [] for name in group if name in read}

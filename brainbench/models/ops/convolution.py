@@ -44,6 +44,7 @@ class ConvolutionShape:
 
     def reversed(self) -> ConvolutionShape:
         """Return that of the convolution which takes gradients back."""
+        # Taken back, every input sums over the windows that held it: these reach kernel − 1 − pad beyond the result.
         top, left = (size - 1 - pad for size, pad in zip(self.kernel, self.pads, strict=True))
         return ConvolutionShape(self.kernel, (top, left), self.out, self.grid)
 
@@ -177,6 +178,8 @@ class _WeightMatrix(torch.autograd.Function):
 
 
 class _Convolution(torch.autograd.Function):
+    """Convolution of one step; its backward pass leaves the gradient of the result to the pass's one product."""
+
     @staticmethod
     def forward(ctx: Any, deferred: DeferredWeightGrad, matrix: torch.Tensor, *inputs: torch.Tensor) -> torch.Tensor:
         columns = unfolded(inputs, deferred.geometry, deferred.reserve(len(inputs[0])))

@@ -39,6 +39,7 @@ def usable(x: torch.Tensor) -> bool:
     """Return whether the kernels apply to what is computed from ``x`` here: in bfloat16, on CUDA, not being traced."""
     if not _eager_on_cuda(x) or not _wanted.get():
         return False
+    # Under autocast inputs may still be single: what counts is the precision that convolutions compute in.
     half = torch.get_autocast_dtype("cuda") if torch.is_autocast_enabled("cuda") else x.dtype
     return half == torch.bfloat16 and _installed()
 

@@ -75,6 +75,8 @@ def _rows(maps: torch.Tensor) -> torch.Tensor:
 
 
 class _Gates(torch.autograd.Function):
+    """Fused gates of one step: (pre-activations, x, state) → (y, state), all [B, C, H, W] but for the first's 4 C."""
+
     @staticmethod
     def forward(
         ctx: Any,

@@ -95,6 +95,7 @@ class PackedMatrix:
     def __init__(self, weight: torch.Tensor, bias: torch.Tensor | None, dtype: torch.dtype) -> None:
         self.dtype = dtype
         self.bias = None if bias is None else bias.detach()
+        # The order of oneDNN, where this build of PyTorch has it (a private operation); else the plain one.
         reorder = getattr(torch.ops.mkldnn, "_reorder_linear_weight", None)
         self.ordered, self.weight = reorder is not None, weight.to(dtype).contiguous()
         if reorder is not None:
@@ -141,6 +142,7 @@ class Conv2d(nn.Conv2d):
         if padding == "same":
             left, right, top, bottom = same_padding(kernel_size)
             symmetric = (top, left)
+            # PyTorch pads both sides of a convolution alike, so uneven zeros (even kernels) are added before it.
             if (left, top) != (right, bottom):
                 symmetric, self._extra = (0, 0), (left, right, top, bottom)
         super().__init__(in_channels, out_channels, kernel_size, stride, symmetric, bias=use_bias)

@@ -18,6 +18,8 @@ def linear_scan(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
 
 
 class _LinearScan(torch.autograd.Function):
+    """The recurrence as one operation on a and b [B, T, ...], with its gradient in closed form."""
+
     @staticmethod
     def forward(ctx: Any, a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:  # pyright: ignore[reportIncompatibleMethodOverride]
         h = _solve(a, b)

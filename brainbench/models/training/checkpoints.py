@@ -60,7 +60,9 @@ def save_checkpoint(
     parameters = {name for name, _ in model.named_parameters()}
     state = {}
     for name, value in model.state_dict().items():
+        # Parameters alone are rounded: running averages of batch norm and counters are stored as they are.
         stored = value.detach().cpu().to(kind) if name in parameters else value.detach().cpu()
+        # Asked after the rounding: what is finite in float32 may exceed the largest float16, 65,504.
         if stored.is_floating_point() and not torch.isfinite(stored).all():
             raise DataError(f"The weight {name!r} is not finite in {dtype}, so no checkpoint was written to {folder}.")
         state[name] = stored.contiguous().clone()

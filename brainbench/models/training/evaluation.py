@@ -95,6 +95,7 @@ def evaluate(model: nn.Module, batches: Iterable[tuple[Any, Any]], *, device: An
             digest.update(x.contiguous().cpu().numpy().tobytes() + labels.cpu().long().numpy().tobytes())
             x, labels = x.to(device), labels.to(device).long()
             if encode is not None and decoder is not None:
+                # Encoded once for both, the accuracy and the spread of the features.
                 features = encode(x)
                 answers = decoder(features if isinstance(decoder, AllStepsDecoder) else features[:, -1]).float()
             else:
@@ -106,10 +107,12 @@ def evaluate(model: nn.Module, batches: Iterable[tuple[Any, Any]], *, device: An
                 )
             seen += len(labels)
             first += topk(answers, labels, 1)
+            # Of five classes or fewer every one would be among the first five: one answer fewer keeps it a test.
             five += topk(answers, labels, min(5, answers.shape[1] - 1))
             predictions.update(answers.argmax(1).tolist())
             labelled.update(labels.tolist())
             if features is not None:
+                # Double precision: for collapsed features the variance below is a difference of nearly equal numbers.
                 unit = functional.normalize(features[:, -1].double(), dim=1)
                 sums = torch.stack((unit.sum(0), unit.square().sum(0)))
                 moments = sums if moments is None else moments + sums

@@ -120,6 +120,7 @@ class SimSiam(Learner):
         """Return the loss; labels have no part in it."""
         del labels
         first, second = self.model.encode(torch.cat(views), last=True).chunk(2)
+        # The head sees one view at a time, so its batch norms never mix the statistics of both.
         (z1, p1), (z2, p2) = self.head(first), self.head(second)
         return simsiam_loss(p1, z1, p2, z2)
 

@@ -36,6 +36,7 @@ class Processes:
         """Return the module with gradients (and on CUDA batch norms) averaged over processes."""
         if self.count == 1:
             return module
+        # Gradients are averaged: with equal shares that is the gradient of the whole batch's mean loss.
         ids = [self.device.index] if self.device.type == "cuda" else None
         return nn.parallel.DistributedDataParallel(module, device_ids=ids)
 
@@ -59,6 +60,7 @@ class Processes:
         if self.count == 1:
             return value
         total = torch.tensor([value], dtype=torch.float64, device=self.device)
+        # Every process must come here equally often, or the others wait for ever.
         torch.distributed.all_reduce(total)
         return float(total) / self.count
 

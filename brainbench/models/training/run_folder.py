@@ -66,6 +66,7 @@ def save_state(path: Path, learner: nn.Module, optimizer: torch.optim.Optimizer,
                 tensors[f"optimizer.{index}.{key}"] = value
             else:
                 scalars.setdefault(str(index), {})[key] = value
+    # Dropout draws from these; augmentation does not, its numbers depend on seed, step and view alone.
     tensors["random.cpu"] = torch.get_rng_state()
     if torch.cuda.is_available():
         tensors["random.cuda"] = torch.cuda.get_rng_state()

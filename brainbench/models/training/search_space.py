@@ -57,6 +57,7 @@ def best_run(out: str | Path) -> tuple[Path, dict[str, float]]:
     for path in sorted(Path(out).glob(f"*/{RUN}")):
         if read_json(path).get("status") != "finished":
             continue
+        # Without validation data the losses of the training epochs decide.
         name, lines = path.parent.name, read_log(path.parent, "validation") or read_log(path.parent, "epoch")
         accuracies = [line["top1"] for line in lines if line.get("top1") is not None]
         losses = [line["loss"] for line in lines if line.get("loss") is not None]

@@ -166,6 +166,7 @@ class _Run:
             _log.warning("%s", warning)
 
     def run(self, allowed: float) -> TrainingResult:
+        """Train until all epochs are done or ``allowed`` seconds are over; return how it ended."""
         steps = len(self.batches)
         if self.where.first and self.at.epoch < self.config.epochs:
             _log.info("%s %s: step %d of %d.", self.config.model, self.config.objective, self.at.step, self._steps)
@@ -206,6 +207,7 @@ class _Run:
         for group in self.optimizer.param_groups:
             group["lr"] = config.learning_rate * factor
         found = self.gradients(views, labels)
+        # This waits for the device: a step that is not finite must be found before it changes the weights.
         value, norm = map(float, found)
         # Gradients are averaged over processes, so all of them see the same norm.
         if not math.isfinite(norm) or self.where.any(not math.isfinite(value)):
@@ -281,6 +283,7 @@ class _Run:
                     seed=self.config.seed,
                     device=self.where.device,
                 )
+            # The split that was used least for training, of those that the data set has.
             for split in ("test", "validation", "train"):
                 batches = self._batches(split, shuffle=False, part=False)
                 if batches is not None:
@@ -340,6 +343,7 @@ class _Run:
         if self.where.first:
             tensors = {f"view{index}": view.cpu().contiguous() for index, view in enumerate(views)}
             save_file({**tensors, "labels": labels.cpu()}, self.out / FAILED, metadata={"step": str(self.at.step)})
+            # Before the first validation there is no best model: the last saved state takes its place.
             if not (self.out / BEST / WEIGHTS).is_file() and (self.out / STATE).is_file():
                 load_state(self.out / STATE, self.learner, self.optimizer)
                 self._publish(None)

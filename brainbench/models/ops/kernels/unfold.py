@@ -81,6 +81,7 @@ def unfold_kernel(
     h, w = place // OUT_W - TOP + tap // KERNEL_W, place % OUT_W - LEFT + tap % KERNEL_W
     there = inside & (h >= 0) & (h < H) & (w >= 0) & (w < W)
     value = _from(x0, stimulus, batch0, h, w, row0, place0, c, there, 0, C0, UNIT)
+    # A channel belongs to one input and the others give zero for it, so the sum picks the right one.
     if C1 > 0:
         value += _from(x1, stimulus, batch1, h, w, row1, place1, c, there, C0, C1, UNIT)
     if C2 > 0:
