@@ -95,6 +95,7 @@ def check_rest(
         # Time in which the fastest object covers the distance of each link; a distance stays a bound while it rests.
         for i in range(links):
             link = chains.build[i, job.whisker]
+            # At rest only the bends of the rest shape are left.
             turned = x * link.bend_cosine + y * link.bend_sine
             y = y * link.bend_cosine - x * link.bend_sine
             x = turned
@@ -120,6 +121,8 @@ def check_rest(
                             )
                             slack = wp.min(slack, found.clearance)
                             proximity.leaf[i] = found.leaf
+                    # A little is kept off here and less than that given back below, so that rounding never raises the
+                    # bound.
                     slack = slack - taper.start_radius - real(0.05)
                     proximity.safe_until[i] = real(1e30)
                     if slack <= zero:
@@ -149,6 +152,7 @@ def check_rest(
                     bound = wp.max(bound, row(proximity.clearance, i))
                 proximity.safe_until[i] = bound
             proximity.clearance[i] = row(proximity.safe_until, i)
+    # What is left of a bend (below REST) is dropped, so that rest does not drift.
     if upto <= state.safe_until:
         for i in range(job.links):
             chain.angle[i] = vec2(zero, zero)
