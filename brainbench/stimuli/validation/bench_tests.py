@@ -177,6 +177,7 @@ def peg(
     # Straight below the end point, touching the undeformed rod.
     start = np.array([end[0], -math.copysign(peg_radius + float(whisker.radius(end[0])), offset)])
     settling = _settling_time(whisker)
+    # Slow against the first mode, so that little swings when the peg stops.
     duration = max(0.1, 4 * settling)
     motion = _sliding(lambda times: start + smooth_step(times, duration)[:, None] * (end - start))
     rod = _peg_obstacle(whisker, peg_radius, motion)

@@ -221,6 +221,7 @@ class SweepLauncher:
         knots = np.zeros((len(sweeps), 16))
         for k in range(3):
             knots[:, k] = (place[:, 0] * head[0, k] + place[:, 1] * head[1, k] + place[:, 2] * head[2, k]) * MILLI
+            # The world velocity (0, −v, 0) in the axes of the array; m/s are mm/ms.
             knots[:, 3 + k] = -speed * head[1, k]
         knots[:, 6:10] = quaternion[which]
         still = np.tile([1.0, 0.0, 0.0, 0.0], (len(sweeps), 1))

@@ -95,11 +95,15 @@ def chosen(name: str, sign: str) -> str:
 
 
 @wp.func_native(chosen("min", "<"))
-def minimum(a: real, b: real) -> real: ...
+def minimum(a: real, b: real) -> real:
+    """Return the smaller number; which one, if one is no number, depends on the machine."""
+    ...
 
 
 @wp.func_native(chosen("max", ">"))
-def maximum(a: real, b: real) -> real: ...
+def maximum(a: real, b: real) -> real:
+    """Return the larger number; which one, if one is no number, depends on the machine."""
+    ...
 
 
 def reader(*kinds: tuple[Any, Any]) -> Any:
