@@ -61,5 +61,6 @@ def follow_angles(
     # The number of whole turns follows from the way since t = 0; the even grid makes it independent of ``times``.
     track = np.unwrap(coarse, axis=0)
     track += 2 * np.pi * np.round((np.asarray(first, dtype=float) - track[0]) / (2 * np.pi))
+    # Exact principal angles, each with the whole turns that bring it nearest to the followed ones.
     expected = np.stack([np.interp(times, grid, track[:, axis]) for axis in range(3)], axis=1)
     return fine + 2 * np.pi * np.round((expected - fine) / (2 * np.pi))

@@ -197,6 +197,7 @@ class Recorded:
                 vertical, where these angles lose their meaning.
         """
         first = self.initial_angles(mount)
+        # Recorded turns are in the axes of the array: they act from the left on the starting frame.
         base, line = base_rotation(first), self.line(mount)
         return follow_angles(lambda t: self.trajectory.rotation(line, t) @ base, times, first, mount.full_name)
 

@@ -31,6 +31,7 @@ class Rotations:
 
     def rates(self, mount: MountedWhisker) -> Vector:
         """Return the change of (θ, φ, ζ) per radian of protraction; the left side mirrors the right."""
+        # In a mirrored frame azimuth and torsion change sign, elevation does not (``MountedWhisker.mirrored``).
         mirror = 1.0 if mount.side == "right" else -1.0
         return mirror, self.elevation[mount.row], mirror * self.torsion[mount.row]
 

@@ -188,6 +188,7 @@ def build_delassus(
         i = solver.last_link - back
         joint = first_joint + i
         for k in range(each):
+            # Only joints between the base and the contact feel its force.
             reached = thread + k < solver.contacts and row(own.link, k) >= i
             s1 = none
             s2 = none
@@ -340,6 +341,7 @@ def apply_forces(
         av = none
         for i in range(solver.links):
             extra = vec2(zero, zero)
+            # Joints behind the last contact are only carried along.
             if i <= solver.last_link:
                 extra = row(joint_change, i)
             joint = problems.joint[first_joint + i]

@@ -74,6 +74,7 @@ def check_rest(
     idle_before = state.safe_until
     state.safe_until = real(1e30)
     # Without objects nothing of this remains in the kernel, nor what it keeps.
+    # Objects that never move need to be looked at only once.
     if wp.static(against > NOTHING) and (job.object_speed > zero or before == start):
         pose = pose_at(motions, job.base, before)
         x = rotate(pose.turn, vec3(one, zero, zero))
