@@ -59,6 +59,7 @@ def to_grid(
             raise DataError(_describe_gaps(dataset))
         wrench = np.nan_to_num(wrench, nan=0.0, posinf=0.0, neginf=0.0)
     grid = np.zeros((stimuli, frames, channels, GRID_SHAPE[0] * GRID_SHAPE[1]), dtype=np.float32)
+    # Frames before channels: cutting the frame axis by S then gives channels in the order s·6 + c.
     grid[..., cells] = np.swapaxes(wrench, 2, 3)
     return grid.reshape(stimuli, frames // substeps, substeps * channels, *GRID_SHAPE)
 

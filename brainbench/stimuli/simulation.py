@@ -248,6 +248,7 @@ def _to_world(scene: Scene, traces: Sequence[Trace]) -> NDArray[np.float32]:
     frames = scene.frames
     vectors = np.stack([frames.reduce(trace.wrench) for trace in traces], axis=1)
     vectors = vectors.reshape(frames.count, len(traces), 2, 3)
+    # Jobs stand in the frame of their array at t = 0, which the head does not carry along: one rotation an animal.
     ends = np.cumsum([len(part.array) for part in scene.split()])[:-1]
     parts = zip(np.split(vectors, ends, axis=1), scene.split(), strict=True)
     turned = np.concatenate([own @ part.head.matrix.T for own, part in parts], axis=1)

@@ -289,6 +289,7 @@ class _Whisk:
     amplitude: float
 
     def pose(self, times: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return base points [n, 3] (m), all at the origin, and angles (θ, φ, ζ) [n, 3] (rad) at times [n] (s)."""
         swing = self.amplitude * (1 - np.cos(2 * np.pi * 20 * times) * smooth_step(times, 0.025))
         euler = np.tile([math.pi / 2, 0.0, -math.pi / 2], (len(times), 1))
         euler[:, 0] += swing - swing[0]
@@ -300,6 +301,7 @@ def _whisking(setting: SimulationSetting) -> list[Trace]:
     whisker = _straight("C2")
     jobs = []
     for friction, degrees in ((0.0, 12), (0.48, 12), (0.48, 25)):
+        # The post of 1 mm radius stands at .7 of the length and .2 mm beside the centre line of the resting whisker.
         post = Obstacle((Capsule((0.0107, 0.0012, -0.02), (0.0107, 0.0012, 0.02), 1e-3),), friction=friction)
         jobs.append(Job(whisker, _Whisk(math.radians(degrees)), (post,), _FRAMES))
     return _timed(jobs, setting)
@@ -313,5 +315,6 @@ def _timed(jobs: Sequence[Job], setting: SimulationSetting) -> list[Trace]:
 
 
 def _difference(trace: Trace, reference: Trace) -> float:
+    # Root mean square over moments and frames, relative to that of the reference.
     gap = trace.wrench[:, 3:] - reference.wrench[:, 3:]
     return float(np.sqrt(np.mean(gap**2) / np.mean(reference.wrench[:, 3:] ** 2)))

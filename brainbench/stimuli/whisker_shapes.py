@@ -105,6 +105,7 @@ def bending_moments(job: Job, joints: NDArray[np.float64]) -> NDArray[np.float64
     for link in range(links):
         cosine, sine = np.cos(chain.rest_angles[link]), np.sin(chain.rest_angles[link])
         frame = frame @ np.array([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]])
+        # Turned by a about y and b about z, the x axis is (cos a cos b, sin b, −sin a cos b).
         x, y, z = np.moveaxis(np.einsum("nji,nj->ni", frame, along[:, link]), -1, 0)
         about_y, about_z = np.arctan2(-z, x), np.arctan2(y, np.hypot(x, z))
         moments[:, link] = chain.stiffness[link] * np.hypot(about_y, about_z)

@@ -92,6 +92,7 @@ def bends(array: WhiskerArray, links: int = BENDS) -> NDArray[np.float64]:
         points = mount.whisker.centre_line(np.linspace(0.0, mount.whisker.arc_length, links + 1))
         directions = np.arctan2(*np.diff(points, axis=0).T[::-1])
         found[index, 1:] = np.diff(directions, prepend=0.0)[1:]
+        # The table has no place for the direction of the first link: it is added to the bend of the second.
         found[index, 1] += directions[0]
     return found
 
@@ -164,6 +165,7 @@ def save_run(
     end = ",\n" if dialect == "sense-lab" else "\n"
     root = Path(folder)
     _write(root / "whisker_ID.csv", [[name] for name in names], end)
+    # N to mN, and N·m to mN·mm.
     wrench = one["wrench"].values.astype(float) * np.repeat([1e3, 1e6], 3)
     for index, channel in enumerate(CHANNELS):
         _write(root / "dynamics" / f"{channel}.csv", wrench[:, :, index].tolist(), end)

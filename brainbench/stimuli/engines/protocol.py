@@ -209,6 +209,7 @@ def base_rotation(euler: ArrayLike) -> NDArray[np.float64]:
 
 def _about(axis: str, angle: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return rotation matrices [..., 3, 3] about one coordinate axis."""
+    # The cyclic order of the axes gives all three rotations the right-handed sign.
     first, second = {"x": (1, 2), "y": (2, 0), "z": (0, 1)}[axis]
     matrix = np.zeros((*np.shape(angle), 3, 3))
     matrix[..., [0, 1, 2], [0, 1, 2]] = 1.0

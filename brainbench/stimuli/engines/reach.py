@@ -63,6 +63,7 @@ def reachable(
     kept, nearest = [], math.inf
     for obstacle in obstacles:
         points = _in_obstacle_frame(obstacle, base, times)
+        # Between two times a base is no further from one of its two places than half the way between them.
         between = float(np.linalg.norm(np.diff(points, axis=0), axis=1).max(initial=0.0)) / 2
         obstacle = touched(obstacle, surfaces=surfaces)
         boxes = [part.bounds() for part in obstacle.parts] if obstacle.surface is None else obstacle.surface.boxes
@@ -91,6 +92,7 @@ def _in_obstacle_frame(obstacle: Obstacle, points: NDArray, times: NDArray) -> N
     if obstacle.motion is None:
         return points[:1] if np.ptp(points, axis=0).max() == 0 else points
     position, quaternion = obstacle.motion(times)
+    # The transposed rotation: from world axes into those of the obstacle.
     return np.einsum("nji,nj->ni", to_matrices(quaternion), points - position)
 
 

@@ -36,6 +36,7 @@ def silent_trace(job: Job, fidelity: Fidelity, record_shape: bool, seconds: floa
     count, shape = len(job.times), None
     if record_shape:
         position, euler = job.follicle.pose(job.times[:1])
+        # The rest shape lies in the x-y plane of the base frame.
         rest = np.pad(fidelity.chain(job.whisker).points, ((0, 0), (0, 1))) @ base_rotation(euler)[0].T + position[0]
         shape = np.repeat(rest[None], count, axis=0)
     return Trace(
@@ -90,6 +91,7 @@ class SteppedJob:
     @cached_property
     def where(self) -> NDArray[np.float64]:
         """[n] frames in steps; whole where they fall on one."""
+        # Rounding must not put a frame between two steps when it falls on one.
         where = (self.job.times - self.job.start) / self.step
         return np.where(np.abs(where - np.round(where)) < 1e-6, np.round(where), where)
 

@@ -19,6 +19,7 @@ def cone_vertices(core: float, length: float, *, narrows: bool) -> NDArray[np.fl
 
     It ``narrows`` when the link is thinner at its end than at its start.
     """
+    # Eight sides: a facet lies at most 8 % of ``core``, a difference of radii, inside the cone.
     angle = 2 * np.pi * np.arange(_SIDES) / _SIDES
     wide, apex = (0.0, length) if narrows else (length, 0.0)
     ring = np.stack([np.full(_SIDES, wide), core * np.cos(angle), core * np.sin(angle)], axis=1)

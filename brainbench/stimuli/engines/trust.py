@@ -106,11 +106,14 @@ def judge(facts: RunFacts) -> Verdict:
     for status, words in ends.items():
         text = f"{words}, at {{:.6g}} s; choose more links or a smaller time step"
         blame(facts.status == status, lambda i, text=text: text.format(facts.failed[i]))
+    # Faults with a time: the earliest counts, and what comes before it may be used.
     strong = facts.strong_at < until
     until = np.where(strong, facts.strong_at, until)
     blame(strong, lambda i: f"at {facts.strong_at[i]:.6g} s {too_strong(facts.strength[i], facts.strongest[i])}")
     fast = facts.fast_at < until
     until = np.where(fast, facts.fast_at, until)
+    # Both rest on sums over all steps and have no time, so nothing of the whisker may be used. NaN fails the comparison
+    # and counts as unsolved.
     unsolved = (until == np.inf) & ~(facts.residual <= LARGEST_RESIDUAL)
     crowded = (until == np.inf) & ~unsolved & (facts.crowded > LARGEST_CROWDED_SHARE * facts.steps)
     moved = (
@@ -189,12 +192,15 @@ def step_travel(
 
     ``position`` and ``euler`` [n + 1, 3] (m, rad) are those of the base that carries it, at ``times`` [n + 1] (s).
     """
+    # A rotation is no larger than its three turns together, and no point is further from the base than the arc length.
     turn = np.abs(np.diff(euler, axis=0)).sum(axis=1) * whisker.arc_length
     own = np.linalg.norm(np.diff(position, axis=0), axis=1) + turn
     if obstacle.motion is None:
         return own
     places, quaternions = (np.asarray(values, dtype=float) for values in obstacle.motion(times))
     size = float(np.linalg.norm(obstacle.bounds, axis=1).max())
+    # Quaternions of rotations θ apart differ by 2 sin(θ/4); a point at distance R moves by 2 R sin(θ/2) at most, no
+    # more than 2 R times that.
     chord = np.linalg.norm(np.diff(quaternions, axis=0), axis=1)
     return own + np.linalg.norm(np.diff(places, axis=0), axis=1) + 2 * chord * size
 
@@ -212,6 +218,7 @@ def passed_unseen(job: Job, reach: Reach, position: NDArray, euler: NDArray, tim
         travel = step_travel(job.whisker, position, euler, obstacle, times)
         if not (travel > thickness).any():
             continue
+        # Only where the whisker can be: within its length of the base, and what both move in the step.
         near = distances(obstacle, bounds, position, times)[:-1] <= job.whisker.arc_length + travel
         found = np.flatnonzero((travel > thickness) & near)
         if len(found) and found[0] < first:

@@ -132,6 +132,7 @@ class Lens:
             factor, nearness = np.full_like(x, self.scale), depth
         else:
             away = self.distance - depth
+            # Within a fiftieth of the distance the picture would grow without bound: that counts as behind.
             nearness = np.divide(1.0, away, out=np.full_like(away, np.nan), where=away > 0.02 * self.distance)
             factor = self.scale * self.distance * nearness
         return np.stack([self.size[0] / 2 + factor * x, self.size[1] / 2 - factor * y, nearness], axis=-1)
@@ -148,6 +149,7 @@ class Lens:
 
     def nearness_of(self, length: float, nearness: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return by how much nearness [n] grows over a short ``length`` (m) towards the camera."""
+        # d(1/r) = −dr/r², and nearness is 1/r in perspective.
         return np.full(np.shape(nearness), length) if self.distance is None else length * nearness**2
 
     def pixel_size(self, points: NDArray[np.float64]) -> NDArray[np.float64]:

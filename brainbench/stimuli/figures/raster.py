@@ -93,6 +93,7 @@ def draw(triangles: Triangles, lens: Lens) -> RasterLayer:
     for side in (0, 1):
         at, along_x, along_y = planes.weights[faces, side].T
         normals += (at + along_x * dx + along_y * dy)[:, None] * (corners[:, side + 1] - corners[:, 0])[faces]
+    # Normals are turned to the camera, because thin surfaces are seen from both sides.
     towards = lens.axes[2] if lens.distance is None else lens.target + lens.distance * lens.axes[2] - points
     length = np.maximum(np.sqrt(np.einsum("ni,ni->n", normals, normals)), 1e-12)
     length = np.where(np.sum(normals * towards, axis=1) < 0, -length, length)
@@ -120,8 +121,10 @@ def _planes(flat: NDArray[np.float64]) -> _Planes:
     first = np.ceil(flat[..., :2].min(axis=1) - 0.5).astype(int)
     last = np.floor(flat[..., :2].max(axis=1) - 0.5).astype(int)
     (ax, bx, cx), (ay, by, cy) = ((flat[..., axis] - first[:, None, axis] - 0.5).T for axis in (0, 1))
+    # Twice the signed area; a triangle seen edge-on covers no pixel, which the NaN marks.
     area = (bx - ax) * (cy - ay) - (by - ay) * (cx - ax)
     area = np.where(np.abs(area) > 1e-12, area, np.nan)
+    # Barycentric coordinates are linear in the pixel: value and two slopes hold for the whole triangle.
     second = np.stack([ay * (cx - ax) - ax * (cy - ay), cy - ay, ax - cx], axis=-1) / area[:, None]
     third = np.stack([ax * (by - ay) - ay * (bx - ax), ay - by, bx - ax], axis=-1) / area[:, None]
     near = flat[..., 2]
@@ -173,6 +176,7 @@ def _fill(
     face, row, column, pixel = face[kept], row[kept], column[kept], (y * size[0] + x)[kept]
     at, along_x, along_y = planes.nearness[face].T
     near = at + along_x * column + along_y * row
+    # Several triangles of a group may cover one pixel: first the largest nearness, then the triangle that has it.
     np.maximum.at(nearness, pixel, near)
     winner = near == nearness[pixel]
     owner[pixel[winner]] = face[winner]

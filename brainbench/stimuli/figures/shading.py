@@ -70,11 +70,14 @@ def shade(
     facing = layer.normals @ light.direction.astype(np.float32)
     lit = np.zeros(len(facing), dtype=np.float32)
     bright = np.flatnonzero(facing > 0)
+    # Three pixels of the lamp off the surface, which would otherwise shade itself.
     lifted = layer.points[bright] + 3 / light.lens.scale * layer.normals[bright]
     lit[bright] = light.reaches(lifted, bias)
+    # Faces that look up receive a little more of the ambient light.
     sky = 0.9 + 0.1 * layer.normals[:, 2]
     colors = layer.colors * (AMBIENT * sky + KEY * np.maximum(facing, 0) * lit)[:, None]
     if gloss:
+        # Highlight by the half-way vector of light and view (Blinn 1977).
         half = light.direction + lens.axes[2]
         shine = np.maximum(layer.normals @ (half / np.linalg.norm(half)).astype(np.float32), 0) ** 40
         colors = colors + gloss * (shine * lit)[:, None]
@@ -97,6 +100,7 @@ def floor(lens: Lens, light: Light, height: float) -> NDArray[Any]:
     eye = lens.target + lens.distance * lens.axes[2]
     rays = lens.unproject(x + 1.0, y + 1.0, np.full(x.shape, 1 / lens.distance)) - eye
     down = rays[..., 2] < -1e-9
+    # Where the ray of each pixel meets the plane z = height.
     points = eye + ((height - eye[2]) / rays[down, 2])[:, None] * rays[down]
     shadow = np.zeros(x.shape, dtype=np.float32)
     shadow[down] = FLOOR_SHADE * (1 - light.reaches(points))

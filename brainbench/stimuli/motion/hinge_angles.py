@@ -21,6 +21,8 @@ def principal_angles(rotation: NDArray[np.float64]) -> NDArray[np.float64]:
 
     φ lies within ±90°, θ − 90° and ζ + 90° within ±180°.
     """
+    # Rz(θ − 90°) Ry(−φ) Rx(ζ + 90°) has the first column (cos φ cos θ′, cos φ sin θ′, sin φ) and the last row (sin φ,
+    # cos φ sin ζ′, cos φ cos ζ′), with θ′ = θ − 90° and ζ′ = ζ + 90°.
     theta = np.arctan2(rotation[..., 1, 0], rotation[..., 0, 0]) + np.pi / 2
     phi = np.arcsin(np.clip(rotation[..., 2, 0], -1.0, 1.0))
     zeta = np.arctan2(rotation[..., 2, 1], rotation[..., 2, 2]) - np.pi / 2
@@ -56,7 +58,9 @@ def follow_angles(
                 f"azimuth, elevation and torsion, which lose their meaning beyond "
                 f"{math.degrees(STEEPEST):.0f}° (gimbal lock). Leave this whisker out, or let it move less."
             )
+    # The number of whole turns follows from the way since t = 0; the even grid makes it independent of ``times``.
     track = np.unwrap(coarse, axis=0)
     track += 2 * np.pi * np.round((np.asarray(first, dtype=float) - track[0]) / (2 * np.pi))
+    # Exact principal angles, each with the whole turns that bring it nearest to the followed ones.
     expected = np.stack([np.interp(times, grid, track[:, axis]) for axis in range(3)], axis=1)
     return fine + 2 * np.pi * np.round((expected - fine) / (2 * np.pi))

@@ -36,6 +36,7 @@ _LOG = logging.getLogger(__name__)
 
 _TAIL = 0.01
 """Time [s] for which the last velocity is held beyond the end, for the last steps of a simulation."""
+# Gauss-Legendre nodes of the fourth-order Magnus integrator (Blanes, Casas, Oteo & Ros 2009, Phys. Rep. 470).
 _NODES = (0.5 - math.sqrt(3) / 6, 0.5 + math.sqrt(3) / 6)
 
 
@@ -119,6 +120,7 @@ class Trajectory:
         begin = np.clip(np.floor(times * self.rate), 0, self.velocity.shape[1] - 1)
         before = Rotation.from_quat(self._knots[begin.astype(int), which])
         start = begin / self.rate
+        # Angular velocities are in the axes of the array, so later turns multiply from the left.
         return (Rotation.from_rotvec(self._turn(start, times - start, which)) * before).as_matrix()
 
     @cached_property
@@ -136,6 +138,7 @@ class Trajectory:
         steps = self.velocity.shape[1] - 1
         begin, step = np.arange(steps) / self.rate, np.full(steps, 1 / self.rate)
         turns = np.stack([self._turn(begin, step, which) for which in range(len(self.names))], axis=1)
+        # Rotations do not commute: samples are multiplied in order, those of all whiskers at once.
         current = Rotation.identity(len(self.names))
         knots = np.empty((steps + 1, len(self.names), 4))
         knots[0] = current.as_quat()
@@ -147,6 +150,7 @@ class Trajectory:
     def _turn(self, start: NDArray[np.float64], step: NDArray[np.float64], which: int) -> NDArray[np.float64]:
         """Return rotation vectors [m, 3] from ``start`` [m] over ``step`` [m] (s): h (ω₁ + ω₂)/2 − √3/12 h² ω₁ × ω₂."""
         end = (self.velocity.shape[1] - 1) / self.rate
+        # Behind the last sample its velocity is held; a cubic would run away.
         first, second = (self._splines[which](np.minimum(start + node * step, end)) for node in _NODES)
         h = step[:, None]
         return h / 2 * (first + second) - math.sqrt(3) / 12 * h**2 * np.cross(first, second)
@@ -193,6 +197,7 @@ class Recorded:
                 vertical, where these angles lose their meaning.
         """
         first = self.initial_angles(mount)
+        # Recorded turns are in the axes of the array: they act from the left on the starting frame.
         base, line = base_rotation(first), self.line(mount)
         return follow_angles(lambda t: self.trajectory.rotation(line, t) @ base, times, first, mount.full_name)
 

@@ -31,6 +31,7 @@ class Rotations:
 
     def rates(self, mount: MountedWhisker) -> Vector:
         """Return the change of (θ, φ, ζ) per radian of protraction; the left side mirrors the right."""
+        # In a mirrored frame azimuth and torsion change sign, elevation does not (``MountedWhisker.mirrored``).
         mirror = 1.0 if mount.side == "right" else -1.0
         return mirror, self.elevation[mount.row], mirror * self.torsion[mount.row]
 
@@ -107,6 +108,8 @@ class Whisking(_Motion):
     def azimuth(self, times: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return a(t) [n] (rad), the azimuth relative to rest, positive forward on both sides."""
         times = np.asarray(times, dtype=float)
+        # The published form with cos(x + π) = −cos x, written as the way from the retracted pose, which alone is
+        # smoothed.
         stroke = (self.protraction + self.retraction) / 2 * (1 - np.cos(2 * np.pi * self.frequency * times))
         return smooth_step(times, self.onset) * stroke - self.retraction
 
@@ -245,6 +248,8 @@ class ArrayFollicle:
         angles = self.whisking.angles(self.mount, times)
         if self.turn is not None:
             turn, whisking = self.turn, self.whisking
+            # The head carries the base point and the frame in which the whisker whisks; only hinge angles drive a
+            # follicle, so the product of both rotations is taken apart again.
             position = turn(times) @ np.array(self.mount.position)
             first = whisking.angles(self.mount, np.zeros(1))[0]
             angles = follow_angles(
@@ -260,6 +265,7 @@ def smooth_step(times: NDArray[np.float64], duration: float) -> NDArray[np.float
     if duration == 0:
         return np.ones_like(np.asarray(times, dtype=float))
     u = np.clip(np.asarray(times, dtype=float) / duration, 0.0, 1.0)
+    # Quintic: velocity and acceleration are 0 at both ends, so no step of the acceleration makes whiskers ring.
     return u**3 * (u * (6 * u - 15) + 10)
 
 
@@ -269,6 +275,7 @@ def _smooth_path(times: NDArray[np.float64], onset: float) -> NDArray[np.float64
     if onset == 0:
         return np.maximum(times, 0.0)
     u = np.clip(times / onset, 0.0, 1.0)
+    # Integral of that quintic; it is ½ at u = 1, so half of the onset is lost against full speed.
     return onset * (u**6 - 3 * u**5 + 2.5 * u**4) + np.maximum(times - onset, 0.0)
 
 

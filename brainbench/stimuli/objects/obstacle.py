@@ -51,6 +51,7 @@ class ConvexPart(_Polyhedron):
             raise UsageError(
                 f"A convex part needs at least four finite vertices [m, 3]; received an array of shape {points.shape}."
             )
+        # Singular values of centred points are their extents along the principal axes; the last is the thickness.
         spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
         if spread[2] < 1e-6 * spread[0]:
             raise UsageError("The vertices of a convex part lie in one plane; a part needs volume to be touched.")
@@ -176,6 +177,7 @@ class Cylinder(_Segment):
         """Return axis-aligned bounds [2, 3]: lowest and highest corner."""
         ends = np.array([self.start, self.end])
         axis = (ends[1] - ends[0]) / np.linalg.norm(ends[1] - ends[0])
+        # A disc with unit normal n reaches r √(1 − nᵢ²) along axis i.
         reach = self.radius * np.sqrt(np.clip(1 - axis**2, 0, 1))
         return np.stack([ends.min(axis=0) - reach, ends.max(axis=0) + reach])
 
@@ -199,6 +201,7 @@ class Box(_Primitive):
 
     def bounds(self) -> NDArray[np.float64]:
         """Return axis-aligned bounds [2, 3]: lowest and highest corner."""
+        # The farthest corner along each axis: absolute rotation matrix times the half edge lengths.
         reach = np.abs(to_matrices(self.quaternion)) @ np.array(self.half_sizes)
         return np.stack([np.array(self.centre) - reach, np.array(self.centre) + reach])
 

@@ -51,6 +51,7 @@ class PlacedObject:
             return None
         if isinstance(motion, Translation):
             return lambda times: (motion.displacement(times) @ axes, np.tile([1.0, 0.0, 0.0, 0.0], (len(times), 1)))
+        # World displacements and rotations T seen from the frame: Rᵀ x (for rows, x R) and Rᵀ T R.
         return lambda times: (
             place + motion.displacement(times) @ axes,
             from_matrices(axes.T @ motion.turn(times) @ axes),

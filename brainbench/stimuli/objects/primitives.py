@@ -54,6 +54,7 @@ def rodgers_solid(diagonal: float = 0.055, *, segments: int = 24) -> Solid:
     if segments < 2:
         raise UsageError(f"The Rodgers solid needs at least 2 segments along its curve; received {segments}.")
     t = np.linspace(0.0, 1.0, segments + 1)[:, None]
+    # Bernstein polynomials of degree 3.
     weights = np.hstack([(1 - t) ** 3, 3 * t * (1 - t) ** 2, 3 * t**2 * (1 - t), t**3])
     convex = weights @ np.array(RODGERS_CONTROL)
     concave = convex + np.array(RODGERS_OFFSET)

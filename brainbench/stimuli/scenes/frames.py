@@ -20,6 +20,7 @@ future. ``causal``: it runs forwards, as a sensor would, and delays."""
 
 READINGS_PER_CUTOFF = 4
 """Readings per period of the cut-off that a filter needs at least."""
+# Periods of the cut-off that are read behind the last frame for the backward pass; order of the filter.
 _EDGE = 2.0
 _ORDER = 4
 
@@ -153,8 +154,10 @@ def low_pass(values: NDArray[np.float64], rate: float, cutoff: float, *, phase: 
     """
     from scipy.signal import butter, sosfilt, sosfiltfilt
 
+    # Second-order sections: the coefficients of one polynomial lose digits at low cut-offs.
     sections = butter(_ORDER, cutoff, fs=rate, output="sos")
     flat = np.asarray(values, dtype=float).reshape(len(values), -1)
+    # Readings before the first one that is not finite; signals with as many are filtered together.
     known = np.where(np.isfinite(flat).all(axis=0), len(flat), np.argmin(np.isfinite(flat), axis=0))
     result = np.full_like(flat, np.nan)
     for end in np.unique(known[known > 0]).tolist():

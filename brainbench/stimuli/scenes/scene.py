@@ -143,6 +143,7 @@ class Scene:
         axes = self.head.matrix
         obstacles = tuple(item.obstacle((axes, self.head.position)) for item in self.objects)
         motion = self.head.motion
+        # Row vectors times the matrix are world vectors in the axes of the array; rotations become Rᵀ T R.
         travel = None if isinstance(motion, Still) else lambda times: motion.displacement(times) @ axes
         turn = (lambda times: axes.T @ motion.turn(times) @ axes) if isinstance(motion, Path) else None
         return [

@@ -48,6 +48,7 @@ class Span:
     @property
     def count(self) -> int:
         """Number of values."""
+        # A step that is no binary fraction must not lose the last value.
         return math.floor((self.high - self.low) / self.step + 1e-9) + 1
 
     def draw(self, generator: np.random.Generator) -> float:
@@ -165,6 +166,7 @@ class SweepGrid:
         generator = np.random.default_rng(int(content_hash(["sweeps", self.seed, name]), 16))
         found = []
         for draw in range(self.draws):
+            # The order of the draws belongs to the grid: another order would give other sweeps for the same seed.
             speed, rotation, distance, size = (
                 _values(values, generator) for values in (self.speed, self.rotation, self.distance, self.size)
             )
@@ -184,6 +186,7 @@ class SweepGrid:
         scaled = solid.to_diagonal(sweep.size)
         angles = (0.0, 0.0, sweep.rotation)
         low = _turned_bounds(scaled, euler_matrix(angles))[0]
+        # Objects travel towards −y, so their lowest y leads.
         y = self.start - low[1] if self.placing == "clear" else self.start + low[1]
         forward = Translation((0.0, sweep.speed, 0.0), _HEAD_ONSET)
         backward = Translation((0.0, -sweep.speed, 0.0), 0.0)
@@ -200,6 +203,7 @@ class SweepGrid:
         values = _values(self.height, generator)
         if self.heights_per_draw is None:
             return values
+        # Each draw goes on where the last one stopped.
         first = draw * self.heights_per_draw
         return tuple(values[(first + i) % len(values)] for i in range(self.heights_per_draw))
 

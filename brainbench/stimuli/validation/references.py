@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from brainbench.core.errors import UsageError
 from brainbench.stimuli.whiskers.whisker import Whisker
 
+# Runge-Kutta steps along the rod, and finite elements of the frequencies.
 _STEPS = 400
 _ELEMENTS = 160
 
@@ -81,6 +82,7 @@ def natural_frequencies(whisker: Whisker, count: int = 3) -> NDArray[np.float64]
     length = whisker.arc_length / _ELEMENTS
     nodes, weights = np.polynomial.legendre.leggauss(4)
     for node, weight in zip((nodes + 1) / 2, weights / 2, strict=True):
+        # Cubic Hermite shape functions of deflection and slope at both ends, and their second derivatives.
         shape = np.array(
             [
                 1 - 3 * node**2 + 2 * node**3,
@@ -93,12 +95,14 @@ def natural_frequencies(whisker: Whisker, count: int = 3) -> NDArray[np.float64]
         s = (np.arange(_ELEMENTS) + node) * length
         for e, (k, m) in enumerate(zip(whisker.bending_stiffness(s), whisker.linear_density(s), strict=True)):
             block = slice(2 * e, 2 * e + 4)
+            # K = ∫ E I w″ w″ ds and M = ∫ ρ π r² w w ds of one element, summed over elements that share nodes.
             stiffness[block, block] += weight * length * k * np.outer(bend, bend)
             mass[block, block] += weight * length * m * np.outer(shape, shape)
     # Rotations scaled by the length make the matrices well conditioned; the base node is clamped.
     scale = np.tile([1.0, 1 / whisker.arc_length], _ELEMENTS + 1)[2:]
     stiffness = stiffness[2:, 2:] * np.outer(scale, scale)
     mass = mass[2:, 2:] * np.outer(scale, scale)
+    # M a = ω⁻² K a: the modes wanted are the largest eigenvalues, which are resolved best.
     inverse = eigh(mass, stiffness, eigvals_only=True, subset_by_index=[size - 2 - count, size - 3])[::-1]
     return 1 / np.sqrt(inverse) / (2 * np.pi)
 
@@ -137,6 +141,7 @@ def peg_centre(whisker: Whisker, contact: Contact, peg_radius: float) -> tuple[f
 
     It lies one peg radius plus the local rod radius from the centre line, along the rod's normal.
     """
+    # The peg lies on the side from which it pushes; a push to +y has a positive moment.
     gap = math.copysign(peg_radius + float(whisker.radius(contact.arc)), contact.moment)
     return contact.point[0] + gap * math.sin(contact.slope), contact.point[1] - gap * math.cos(contact.slope)
 
@@ -195,6 +200,7 @@ class _Branch:
         """Return the largest offset (signed) that holds the whisker."""
         from scipy.optimize import minimize_scalar
 
+        # The largest offset lies within one stride of the highest sample.
         points = list(self._walk())
         top = max(range(len(points)), key=lambda k: points[k][2])
         low = points[max(top - 1, 0)]
@@ -211,6 +217,7 @@ class _Branch:
         """Yield (slope, (force, arc), peg offset) from the first touch on, while equilibria exist."""
         rest = math.atan(2 * self.curvature * self.at)
         slope, previous = rest, None
+        # Arc length of the parabola up to x = at, where the undeformed rod would touch.
         u = 2 * self.curvature * self.at
         arc = self.at if abs(u) < 1e-9 else (u * math.sqrt(1 + u * u) + math.asinh(u)) / (4 * self.curvature)
         guess = np.array([0.0, arc])
@@ -221,6 +228,7 @@ class _Branch:
             if not self._valid(solution):
                 return
             yield slope, solution, height
+            # Linear extrapolation along the branch keeps Newton's method from jumping to another one.
             guess = solution if previous is None else 2 * solution - previous
             previous, slope = solution, slope + self._STRIDE
 
@@ -229,6 +237,7 @@ class _Branch:
 
     def _solve(self, slope: float, guess: NDArray) -> NDArray[np.float64]:
         """Return (force, arc) at one contact slope by Newton's method; NaN when it finds none."""
+        # E I/a² and a make both unknowns and both residuals numbers near one.
         force_scale = float(self.whisker.bending_stiffness(0.0)) / self.at**2
         scale = np.array([force_scale, self.at])
         z = guess / scale
@@ -239,6 +248,7 @@ class _Branch:
             )
             if not np.isfinite(jacobian).all() or abs(np.linalg.det(jacobian)) < 1e-14:
                 return np.full(2, math.nan)
+            # Near a fold the Jacobian is almost singular; a whole step would leave the branch.
             step = np.linalg.solve(jacobian, residual)
             z = z - step * min(1.0, 0.3 / max(float(np.abs(step).max()), 1e-300))
             if np.abs(step).max() < 1e-12:
@@ -246,6 +256,7 @@ class _Branch:
         return np.full(2, math.nan)
 
     def _residual(self, slope: float, force: float, arc: float) -> NDArray[np.float64]:
+        # The base is clamped along x, and the centre line passes the peg at a distance of both radii along its normal.
         angle, x, _, _ = self._integrate(slope, force, arc)
         return np.array([angle, (x - self.at + self._gap(arc) * math.sin(slope)) / self.at])
 
@@ -261,6 +272,7 @@ class _Branch:
     def _contact(self, slope: float, solution: NDArray) -> Contact:
         size, arc = map(float, solution)
         _, x, y, moment = self._integrate(slope, size, arc)
+        # Without friction the force is normal to the rod.
         force = (-size * math.sin(slope), self.side * size * math.cos(slope))
         return Contact(force, self.side * moment, arc, self.side * slope, (x, self.side * y))
 
@@ -269,11 +281,14 @@ class _Branch:
         half = np.linspace(arc, 0.0, 2 * _STEPS + 1)
         flexibility = 1 / np.maximum(self.whisker.bending_stiffness(half), 1e-300)
         # Curvature of the rest shape.
+        # Of the parabola: y″/(1 + y′²)^(3/2) = 2A cos³ψ with tan ψ = y′.
         rest = 2 * self.curvature * np.cos(self.whisker.tangent_angle(np.abs(half))) ** 3
         step = -arc / _STEPS
         angle, moment, x, y = slope, 0.0, 0.0, 0.0
         pairs = list(zip(flexibility.tolist(), rest.tolist(), strict=True))
         for k in range(_STEPS):
+            # Classical Runge-Kutta step of θ′ = κ₀ + M/(E I) and M′ = −f cos(θ − θc); x and y are integrated with its
+            # weights.
             (f0, c0), (f1, c1), (f2, c2) = pairs[2 * k : 2 * k + 3]
             a1, m1 = c0 + moment * f0, -force * math.cos(angle - slope)
             t2 = angle + step / 2 * a1

@@ -58,6 +58,8 @@ class MountedWhisker:
     def mirrored(self) -> MountedWhisker:
         """Return the whisker of the other side: x, θ and ζ change sign, the curvature does not."""
         (x, y, z), (theta, phi, zeta) = self.position, self.angles
+        # A mirrored base frame is left-handed. A whisker is symmetric about its x-y plane, so reversing z makes the
+        # frame right-handed again: that is (−θ, φ, −ζ).
         side = "left" if self.side == "right" else "right"
         return dataclasses.replace(self, side=side, position=(-x, y, z), angles=(-theta, phi, -zeta))
 
@@ -249,6 +251,7 @@ def _modelled(species: str) -> WhiskerArray:
 
 def _evaluate(terms: dict[str, float], known: dict[str, float]) -> float:
     """Sum the terms of one equation: a constant and coefficients of known quantities or of their squares."""
+    # The published equations are linear in row, column, the base-point coordinates and their squares.
     values = {"constant": 1.0, **known, **{f"{key}_squared": value**2 for key, value in known.items()}}
     return sum(factor * values[name] for name, factor in terms.items())
 

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from brainbench.core.errors import UsageError
 from brainbench.stimuli.whiskers.whisker import Whisker
 
+# Ratio of the radii across a cell from which ``_compliance`` does without its parabola.
 _STEEPEST = 1.4
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(8)
 
@@ -72,6 +73,7 @@ class Chain:
         A linearly implicit (backward Euler) step of length ``time_step`` (s) adds the damping of one
         step: stiffness-proportional damping β k behaves as (β + dt) k. So β = max(2 ζ/ω₁ − dt, 0).
         """
+        # Damping β k gives a mode ω the ratio β ω/2.
         beta = 2 * self.whisker.damping_ratio / self.frequencies()[0] - time_step
         return max(beta, 0.0) * self.stiffness
 
@@ -86,6 +88,7 @@ class Chain:
         # arm[i, j]: lever of joint j at the centre of mass of link i, which it moves only when j ≤ i.
         arm = np.tril(centres[:, None] - joints[None, :])
         lower = np.tril(np.ones_like(arm))
+        # Σ m v² of the centres of mass, and Σ I ω²: every joint up to link i turns that link.
         return (arm * self.masses[:, None]).T @ arm + lower.T @ (lower * self.inertias[:, 1:])
 
 
@@ -120,8 +123,10 @@ def _compliance(whisker: Whisker, links: int) -> NDArray[np.float64]:
             # a moment that falls towards the tip as under loads spread along a cone.
             total[i] += flexibility @ ((whisker.arc_length - s) / (whisker.arc_length - i * cell)) ** 3
             continue
+        # No joint stands before the base: its half cell takes the parabola of the cell behind it.
         middle = max(i, 1)
         x = s / cell - middle
+        # Lagrange polynomials through the three joints around the cell.
         for j, weight in enumerate((x * (x - 1) / 2, 1 - x**2, x * (x + 1) / 2), start=middle - 1):
             total[j] += flexibility @ weight
     # The free tip carries no moment, so what falls on it needs no joint.
@@ -138,14 +143,17 @@ def _frusta(whisker: Whisker, nodes: NDArray, lengths: NDArray) -> tuple[NDArray
     first = _integrate(lambda s: whisker.linear_density(s) * (s - low[:, None]), low, high)
     second = _integrate(lambda s: whisker.linear_density(s) * (s - low[:, None]) ** 2, low, high)
     polar = _integrate(lambda s: whisker.linear_density(s) * whisker.radius(s) ** 2 / 4, low, high)
+    # Arc to chord: the mass of an arc is spread along a slightly shorter line.
     ratio = lengths / (high - low)
     centres = first / masses * ratio
+    # Parallel axes: from the joint to the centre of mass. A disc adds m r²/4 about a diameter, m r²/2 about its axis.
     transverse = (second - first**2 / masses) * ratio**2 + polar
     return masses, centres, np.stack([2 * polar, transverse], axis=-1)
 
 
 def _integrate(function, low: NDArray, high: NDArray) -> NDArray[np.float64]:  # noqa: ANN001
     """Integrate a function of arc length over each interval [low, high] by Gauss-Legendre quadrature."""
+    # Exact: the integrands are polynomials of degree 5, and eight points integrate degree 15.
     half = (high - low) / 2
     s = low[:, None] + half[:, None] * (_NODES + 1)
     return half * (function(s) @ _WEIGHTS)

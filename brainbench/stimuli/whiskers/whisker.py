@@ -109,6 +109,7 @@ class Whisker:
         """Invert s(x) = (u √(1+u²) + asinh u)/(4A), u = 2 A x, by Newton's method."""
         s = np.asarray(s, dtype=float)
         target = 4 * self.curvature * s
+        # So nearly straight, arc and abscissa are equal to rounding, and the end of this function would divide by 0.
         if abs(self.curvature) * self.arc_length < 1e-9:
             return s.copy()
         # Both bounds lie beyond the root of this convex function, so Newton's method descends to it.

@@ -156,6 +156,7 @@ def pack_chains(capacity: int, chains: Sequence[Chain], quasistatic: bool) -> di
     build, inertia, taper = (np.zeros((capacity, count, 4)) for _ in range(3))
     for w, chain in enumerate(chains):
         n = chain.links
+        # kg to mg, kg·m² to mg·mm², N·m to µN·m.
         lengths = chain.lengths * MILLI
         build[:n, w] = np.stack(
             [lengths, np.cos(chain.rest_angles), np.sin(chain.rest_angles), chain.masses * (mass * MICRO)],
@@ -204,6 +205,7 @@ class PackedJobs:
         """Return what the kernel's ``JobArrays`` hold, with the longest ``step`` [job] (ms) of each job."""
         counts = [len(loads) for loads in self.loads] or [0] * len(self)
         loads = [(load, chains[which]) for which, some in zip(self.whisker, self.loads, strict=False) for load in some]
+        # A load at a joint belongs to the link before it.
         links = [min(max(int(np.searchsorted(c.nodes, load.arc)) - 1, 0), c.links - 1) for load, c in loads]
         shares = [
             (load.arc - c.nodes[link]) / (c.nodes[link + 1] - c.nodes[link])

@@ -43,6 +43,7 @@ class Slices:
         self.recorded = device.is_cuda if recorded is None else recorded
         # Distances and contact forces of a slice need not wait for each other.
         self.streams = [wp.Stream(device) if self.recorded else None for _ in kernels.solve_contacts]
+        # Four near links a whisker, and all links of one: who finds no room asks again in the next slice.
         self.queries = max(4 * lanes, capacity)
         queues, links = (3, lanes), (capacity, lanes)
         on = self.struct = allocate(
@@ -75,6 +76,8 @@ class Slices:
             if not self.recorded or slices == 0:
                 self._several(inputs, left, block)
             else:
+                # A graph launches as many threads as when it was recorded; it is renewed once half of them have no
+                # whisker.
                 if 2 * left <= fits or graph is None:
                     with wp.ScopedCapture(device=self.device) as capture:
                         self._several(inputs, left, block)
@@ -89,6 +92,7 @@ class Slices:
         wp, on, device, kernels = warp(), self.struct, self.device, self.kernels
         for _ in range(SLICES_PER_CHECK):
             wp.launch(kernels.run, left + 3 * WARP, [*inputs, on], device=device, block_dim=block)
+            # After an even number of slices both arrays are back in place, so a recorded graph can be repeated.
             on.queue, on.next_queue = on.next_queue, on.queue
             wp.launch(kernels.swap_queues, 1, [on], device=device)
             for (kernel, threads), stream in zip(kernels.solve_contacts, self.streams, strict=True):

@@ -73,6 +73,7 @@ class SweepLauncher:
         angles = base_rotation([mount.angles for mount in mounts])
         turns = from_matrices(angles)
         self._bases = [still_knots(np.asarray(m.position), turn) for m, turn in zip(mounts, turns, strict=True)]
+        # Steps between readings, rounded as the kernel rounds them.
         spans = np.diff(grid.frames.readings * MILLI, prepend=0.0)
         steps = self.solver.steps
         self._steps_in_full = sum(int(np.ceil(spans / step - 1e-3).clip(1).sum()) for step in steps)
@@ -158,6 +159,7 @@ class SweepLauncher:
 
     def run(self, indices: Sequence[int], retry: int, workers: int) -> SweepBatch:
         """Simulate sweeps of the grid; on a processor ``workers`` threads each take one object at a time."""
+        # Thousands of sweeps fill a GPU; small groups let the threads of a processor end together.
         limit = 4096 if self.device.is_cuda else 4
         groups: list[tuple[str, list[Any]]] = []
         for index in indices:
@@ -221,6 +223,7 @@ class SweepLauncher:
         knots = np.zeros((len(sweeps), 16))
         for k in range(3):
             knots[:, k] = (place[:, 0] * head[0, k] + place[:, 1] * head[1, k] + place[:, 2] * head[2, k]) * MILLI
+            # The world velocity (0, −v, 0) in the axes of the array; m/s are mm/ms.
             knots[:, 3 + k] = -speed * head[1, k]
         knots[:, 6:10] = quaternion[which]
         still = np.tile([1.0, 0.0, 0.0, 0.0], (len(sweeps), 1))

@@ -247,6 +247,7 @@ def _join(first: list[int], second: list[int], start: int, end: int) -> list[int
 def _is_convex(corners: NDArray[np.float64]) -> bool:
     edge = np.roll(corners, -1, 0) - corners
     ahead = np.roll(edge, -1, 0)
+    # Every corner of a counter-clockwise polygon turns left, or goes straight on.
     return bool((edge[:, 0] * ahead[:, 1] - edge[:, 1] * ahead[:, 0] >= -1e-12).all())
 
 
@@ -255,14 +256,17 @@ def transported_normals(tangent: NDArray[np.float64], *, closed: bool = False) -
 
     On a closed path the angle by which the last would miss the first is spread evenly.
     """
+    # The axis that is least along the tangent keeps the product away from zero.
     start = np.cross(tangent[0], np.eye(3)[np.argmin(np.abs(tangent[0]))])
     normals = [start / np.linalg.norm(start)]
     for here in [*tangent[1:], *([tangent[0]] if closed else [])]:
+        # The part of the last normal across the new tangent: the smallest turn from one to the other.
         step = normals[-1] - (normals[-1] @ here) * here
         normals.append(step / np.linalg.norm(step))
     result = np.array(normals[: len(tangent)])
     if not closed:
         return result
+    # Angle between the transported and the first normal, seen along the tangent.
     across = np.cross(tangent[0], result[0])
     slip = math.atan2(float(normals[-1] @ across), float(normals[-1] @ result[0]))
     turn = (-slip * np.arange(len(tangent)) / len(tangent))[:, None]

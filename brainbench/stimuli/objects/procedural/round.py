@@ -30,6 +30,7 @@ def superquadric(draw: ShapeSampler, detail: int) -> Body:
 def bumpy(draw: ShapeSampler, detail: int) -> Body:
     """Sphere with rounded bumps."""
     count, height, width = draw(bumps=range(10, 25), height=(0.15, 0.3), width=(0.25, 0.38))
+    # A spiral by the golden angle with equal steps of z spreads points evenly over a sphere.
     golden = np.pi * (3 - np.sqrt(5)) * np.arange(count)
     z = 1 - (2 * np.arange(count) + 1) / count
     centres = np.column_stack([np.sqrt(1 - z**2) * np.cos(golden), np.sqrt(1 - z**2) * np.sin(golden), z])
@@ -37,6 +38,7 @@ def bumpy(draw: ShapeSampler, detail: int) -> Body:
     centres /= np.linalg.norm(centres, axis=1, keepdims=True)
 
     def warp(points: np.ndarray) -> np.ndarray:
+        # Angle between a point of the sphere and each bump.
         gap = np.arccos(np.clip(points @ centres.T, -1, 1))
         return points * (1 + height * np.exp(-((gap / width) ** 2)).sum(axis=1, keepdims=True))
 

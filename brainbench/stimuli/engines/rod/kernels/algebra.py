@@ -73,6 +73,7 @@ def first_axis(z: vec3, along: vec3, angle: real) -> vec3:
 def rotate(q: vec4, x: vec3) -> vec3:
     """Return the vector turned by a unit quaternion."""
     u = vec3(q[1], q[2], q[3])
+    # Two cross products instead of a rotation matrix: x + q₀ t + u × t with t = 2 u × x.
     t = real(2.0) * wp.cross(u, x)
     return x + q[0] * t + wp.cross(u, t)
 
@@ -94,11 +95,15 @@ def chosen(name: str, sign: str) -> str:
 
 
 @wp.func_native(chosen("min", "<"))
-def minimum(a: real, b: real) -> real: ...
+def minimum(a: real, b: real) -> real:
+    """Return the smaller number; which one, if one is no number, depends on the machine."""
+    ...
 
 
 @wp.func_native(chosen("max", ">"))
-def maximum(a: real, b: real) -> real: ...
+def maximum(a: real, b: real) -> real:
+    """Return the larger number; which one, if one is no number, depends on the machine."""
+    ...
 
 
 def reader(*kinds: tuple[Any, Any]) -> Any:

@@ -56,6 +56,7 @@ def forward_kinematics(
     x = rotate(pose.turn, vec3(real(1.0), zero, zero))
     y = rotate(pose.turn, vec3(zero, real(1.0), zero))
     z = wp.cross(x, y)
+    # All positions count from the base point: single precision keeps its digits however far away the head is.
     vw = pose.spin
     vv = pose.velocity
     at = vec3(zero, zero, zero)
@@ -77,11 +78,13 @@ def forward_kinematics(
         chain.axis2[i] = z
         chain.node[i] = at
         vw = vw + y * rate[0] + z * rate[1]
+        # A joint at p that turns at rate 1 about s moves the point of the body at the base with p × s.
         vv = vv + wp.cross(at, y) * rate[0] + wp.cross(at, z) * rate[1]
         turned = x * cb + y * sb
         y = y * cb - x * sb
         x = turned
         at = at + x * link.length
+        # Velocity is linear along a rigid link, so its faster end is the fastest of its points.
         end_speed = wp.length_sq(vv + wp.cross(vw, at))
         proximity.end_speed[i] = wp.sqrt(wp.max(speed, end_speed))
         fastest = wp.max(fastest, end_speed)
@@ -113,6 +116,7 @@ def articulated_inertia(
     """
     zero = real(0.0)
     one = real(1.0)
+    # A linearly implicit step of length h damps like h k by itself (``Chain.damping``): only the rest of βk is added.
     step_damping = wp.max(job.beta - h, zero)
     vw = last.angular
     vv = last.linear
@@ -141,9 +145,11 @@ def articulated_inertia(
             thin * xa[0] * xa[2] - mc[0] * com[2],
             thin * xa[1] * xa[2] - mc[1] * com[2],
         )
+        # The block that couples rotation and translation is m [com]×, as a matrix of the cross product.
         ib = ib + mat33(zero, -mc[2], mc[1], mc[2], zero, -mc[0], -mc[1], mc[0], zero)
         ic = ic + vec6(m, m, m, zero, zero, zero)
         # Bias force v × Iv, less what loads give.
+        # Linear momentum, and angular momentum about the base point (``spin``).
         momentum = vv * m + wp.cross(vw, mc)
         spin = wp.cross(com, momentum) + vw * inertia.transverse + xa * (thin * wp.dot(xa, vw))
         pw = pw + wp.cross(vw, spin) + wp.cross(vv, momentum)
@@ -156,6 +162,7 @@ def articulated_inertia(
                     pv = pv - pull
         angle = row(chain.angle, i)
         s2 = row(chain.axis2, i)
+        # First axis of the joint: the y axis of the link before the turn about the second axis.
         s1 = wp.cross(s2, xa) * cosine(angle[1]) + xa * sine(angle[1])
         m1 = wp.cross(at, s1)
         m2 = wp.cross(at, s2)
@@ -177,6 +184,7 @@ def articulated_inertia(
         bend = wp.abs(angle[0])
         if bend > real(wp.static(FOLD)):
             soft1 = soft * real(1.0 + wp.static(STOP))
+            # The further spring has no force at FOLD and is implicit too: no jump, and no limit of the time step.
             past = angle[0] * (one - real(wp.static(FOLD)) / bend)
             spring1 = spring1 + real(wp.static(STOP)) * (past + lag * rate[0])
         bend = wp.abs(angle[1])
@@ -196,6 +204,7 @@ def articulated_inertia(
         t2 = -k * spring2 - wp.dot(s2, pw) - wp.dot(m2, pv)
         f1 = i11 * t1 + i12 * t2
         f2 = i12 * t1 + i22 * t2
+        # Gains UD⁻¹. The contact solver reads them again instead of the inertias, which are not kept.
         g1w = u1w * i11 + u2w * i12
         g1v = u1v * i11 + u2v * i12
         g2w = u1w * i12 + u2w * i22
@@ -208,11 +217,13 @@ def articulated_inertia(
         if candidate_count > 0:
             proximity.inverse_inertia[i] = vec3(i11, i12, i22)
         # Velocity-product acceleration of the joint.
+        # Going up, the twist of the link before is that of this link less what the joint adds.
         jw = s1 * rate[0] + s2 * rate[1]
         jv = m1 * rate[0] + m2 * rate[1]
         vw = vw - jw
         vv = vv - jv
         both = rate[0] * rate[1]
+        # c = v × S q̇ with the twist v before the joint, and the first hinge carries the axis of the second one.
         cw = wp.cross(vw, jw) + wp.cross(s1, s2) * both
         cv = wp.cross(vw, jv) + wp.cross(vv, jw) + (wp.cross(s1, m2) + wp.cross(m1, s2)) * both
         # Iᴬ − UD⁻¹Uᵀ, and pᴬ + Iᴬc + UD⁻¹u with the velocity product c.
@@ -221,6 +232,7 @@ def articulated_inertia(
         ib = ib - wp.outer(u1w, g1v) - wp.outer(u2w, g2v)
         pw = pw + symmetric_times(ia, cw) + ib * cv + u1w * f1 + u2w * f2
         pv = pv + cw * ib + symmetric_times(ic, cv) + u1v * f1 + u2v * f2
+    # f = Iᴬa + pᴬ at the base, whose acceleration is given.
     base_wrench = Wrench()
     base_wrench.moment = symmetric_times(ia, base.angular) + ib * base.linear + pw
     base_wrench.force = base.angular * ib + symmetric_times(ic, base.linear) + pv
@@ -232,8 +244,10 @@ def integrate_joint(
     chain: wp.ref[ChainState], state: wp.ref[WhiskerState], i: int, a: vec2, h: real, end: real, quasistatic: int
 ):
     """Move a joint by its accelerations to the end of the step."""
+    # The new rate moves the angle: together with the implicit springs this is a backward Euler step.
     rate = row(chain.rate, i) + a * h
     angle = row(chain.angle, i) + rate * h
+    # Each quasi-static step starts at rest, so nothing swings past its balance.
     if quasistatic == 1:
         rate = vec2(real(0.0), real(0.0))
     chain.rate[i] = rate

@@ -50,11 +50,13 @@ def search_range(job: WhiskerJob, options: StepOptions, state: wp.ref[WhiskerSta
     reach = SearchRange()
     # Contacts that may close within this step.
     travel = h * (state.top_speed + job.object_speed)
+    # Half more than the present speeds give, because links may speed up within the step.
     reach.margin = wp.min(real(1.5) * travel + h * state.velocity_jump + real(0.001), real(wp.static(WIDEST)))
     # How far links and objects have come since the last step: its rates at the end are those now.
     reach.time = real(1.02) * wp.max(h, state.last_step)
     reach.unknown_speed = job.object_speed
     if options.quasistatic == 1:
+        # Quasi-static steps forget their rates, so ``end_speed`` does not contain the way of the last step.
         reach.unknown_speed = job.object_speed + state.velocity_jump
     return reach
 
@@ -129,6 +131,7 @@ def candidate_slot(
     slot = count
     # The same contact seen from two links, or from both ends of a short gap.
     for j in range(count):
+        # Normals within 32° and places within a quarter of the link.
         apart = wp.length_sq(row(candidates.point, j) - point)
         same = wp.dot(row(candidates.normal, j), normal) > real(0.85)
         if same and apart < real(0.0625) * wp.length_sq(link):
@@ -212,6 +215,7 @@ def find_candidates(
                         state.depth = wp.max(state.depth, -gap)
                         normal = rotate(body.turn, rotate(turn_s, way))
                         radius = taper.start_radius + (taper.end_radius - taper.start_radius) * share
+                        # The force acts on the skin of the whisker: its radius is the lever of friction.
                         point = joint + link * share - normal * radius
                         # The object's velocity in the middle of the step.
                         half = pose_at(motions, shapes.track[s], now + real(0.5) * h)

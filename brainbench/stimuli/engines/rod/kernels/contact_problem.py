@@ -91,6 +91,7 @@ def queue_problem(paused: PausedWhiskers, index: int, count: int):
     """Queue a problem with those of like size."""
     queue = int(0)
     if wp.static(cuda):
+        # A small group would not hold many contacts, and a large one would idle on few.
         if count > wp.static(GROUPS[1][0]):
             queue = int(2)
         elif count > wp.static(GROUPS[0][0]):

@@ -59,6 +59,7 @@ def solve_single_contact(own6: vec6, bn: real, b1: real, b2: real, p0: real, q0:
         fn = -bn / nn
         if mu > zero:
             # Sticking: solve for all three, tangents eliminated first.
+            # A straight chain does not yield along itself: the tangents then have no inverse, and the contact slides.
             det = c11 * c22 - c12 * c12
             stuck = int(0)
             if det > real(1e-9) * c11 * c22:
@@ -66,6 +67,7 @@ def solve_single_contact(own6: vec6, bn: real, b1: real, b2: real, p0: real, q0:
                 tb2 = -(c11 * b2 - c12 * b1) / det
                 ta1 = -(c22 * n1 - c12 * n2) / det
                 ta2 = -(c11 * n2 - c12 * n1) / det
+                # Schur complement: compliance along the normal while both tangents are held.
                 stiff = nn + n1 * ta1 + n2 * ta2
                 if stiff > real(1e-6) * nn:
                     tn = -(bn + n1 * tb1 + n2 * tb2) / stiff
@@ -80,12 +82,15 @@ def solve_single_contact(own6: vec6, bn: real, b1: real, b2: real, p0: real, q0:
                 # Sliding: find the direction of slip by a fixed point.
                 f1 = p0
                 f2 = q0
+                # The trace is at least the largest eigenvalue of the block, so that the projected step cannot
+                # overshoot.
                 relaxation = one / (c11 + c22)
                 for _ in range(tries):
                     fn = wp.max(zero, -(bn + n1 * f1 + n2 * f2) / nn)
                     slip1 = f1 - relaxation * (b1 + n1 * fn + c11 * f1 + c12 * f2)
                     slip2 = f2 - relaxation * (b2 + n2 * fn + c12 * f1 + c22 * f2)
                     size = wp.sqrt(slip1 * slip1 + slip2 * slip2)
+                    # Projection on the Coulomb disc of the present normal force.
                     bound = mu * fn
                     if size > bound:
                         slip1 = slip1 * (bound / size)
@@ -109,6 +114,7 @@ def contact_rates(solver: wp.ref[SolverState], own: wp.ref[ThreadContacts], matr
     """Compute the rates at the contacts, less those that would just close the gaps."""
     if refresh == 1:
         for k in range(solver.own_count):
+            # vₙ + g/h: zero where the gap just closes at the end of the step.
             own.rate[3 * k] = row(own.free_rate, 3 * k) - row(own.closing_rate, k)
             own.rate[3 * k + 1] = row(own.free_rate, 3 * k + 1)
             own.rate[3 * k + 2] = row(own.free_rate, 3 * k + 2)
@@ -153,6 +159,7 @@ def gauss_seidel_sweep(
             d1 = found[1] - p0
             d2 = found[2] - q0
             # By how much (mm) the forces so far miss the gap that they should leave.
+            # Without a force the gap may open; only an overlap is an error.
             if n0 == zero:
                 missed = wp.min(missed, zero)
             slipped = block[3] * wp.abs(d1) + block[5] * wp.abs(d2)
@@ -173,6 +180,7 @@ def gauss_seidel_sweep(
         solver.gap_error = gap_error
         solver.force_change = force_change
         solver.force_sum = force_sum
+        # A tenth of a micrometre, or one part in ten thousand of the forces.
         if gap_error <= real(1e-4) or force_change <= real(1e-4) * force_sum:
             solver.converged = 1
 
@@ -256,6 +264,7 @@ def share_normal_forces(
             f1 = row(own.force, 3 * k + 1)
             f2 = row(own.force, 3 * k + 2)
             size = wp.sqrt(f1 * f1 + f2 * f2)
+            # Friction at the edge of its cone slides: it keeps its direction and grows with the normal force.
             if size > zero and size >= real(0.999) * row(own.friction, k) * fn:
                 ratio1[k] = row(own.friction, k) * f1 / size
                 ratio2[k] = row(own.friction, k) * f2 / size
@@ -293,6 +302,7 @@ def share_normal_forces(
                     opening[k] = opening[k] + row(normals, k * wp.static(max_contacts) + e) * value
             # A contact that pulls lets go; one that would open into the object presses.
             flip = worst
+            # Overlaps below 1e-6 mm are rounding and no reason to change the active set.
             lowest = real(-1e-6) / solver.step
             for e in range(count):
                 value = broadcast(opening[wp.static(stride) * e], e)

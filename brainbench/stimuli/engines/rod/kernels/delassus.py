@@ -124,6 +124,7 @@ def add_contact(problems: ContactProblems, solver: wp.ref[SolverState], own: wp.
     own.axis[3 * k + 1] = tangent
     own.axis[3 * k + 2] = wp.cross(normal, tangent)
     # The forces of the last step are a good first guess.
+    # They are kept in world axes, because the tangents turn from step to step.
     guess = vec3(zero, zero, zero)
     for e in range(solver.previous_contacts):
         held = problems.held[index, e]
@@ -153,6 +154,7 @@ def select_contacts(problems: ContactProblems, solver: wp.ref[SolverState], own:
                 add_contact(problems, solver, own, wp.static(stride) * solver.contacts, slot)
             solver.contacts = solver.contacts + 1
     # Threads of a warp walk the same links and contacts.
+    # No force enters behind the last link with a contact, so the passes below begin there.
     top = int(-1)
     for k in range(solver.own_count):
         if solver.thread + k < solver.contacts:
@@ -186,6 +188,7 @@ def build_delassus(
         i = solver.last_link - back
         joint = first_joint + i
         for k in range(each):
+            # Only joints between the base and the contact feel its force.
             reached = thread + k < solver.contacts and row(own.link, k) >= i
             s1 = none
             s2 = none
@@ -330,6 +333,7 @@ def apply_forces(
             joint_change[i] = vec2(inv[0] * u1 + inv[1] * u2, inv[1] * u1 + inv[2] * u2)
     tw = vec3(group_sum(tw[0]), group_sum(tw[1]), group_sum(tw[2]))
     tv = vec3(group_sum(tv[0]), group_sum(tv[1]), group_sum(tv[2]))
+    # The forces that no joint takes up reach the base (tw, tv); they are subtracted from its wrench below.
     # Down again, and where the other candidates are then.
     more = int(0)
     if active == 1:
@@ -337,6 +341,7 @@ def apply_forces(
         av = none
         for i in range(solver.links):
             extra = vec2(zero, zero)
+            # Joints behind the last contact are only carried along.
             if i <= solver.last_link:
                 extra = row(joint_change, i)
             joint = problems.joint[first_joint + i]
@@ -360,6 +365,8 @@ def apply_forces(
             more = int(0)
             crowded = int(1)
         if more == 0 and solver.thread == 0:
+            # Ten micrometres and one per cent, a hundred times what the sweeps aim at: less does not show in the
+            # wrench.
             unsolved = int(0)
             miss = zero
             if (

@@ -12,6 +12,7 @@ from brainbench.stimuli.engines.rod.limits import CAPSULE, CYLINDER, SPHERE
 from .algebra import maximum, minimum, vec2, vec3, vec4, vec5
 from .parameters import real
 
+# As fine as the numbers: 2⁻²⁰ is about 1e-6, 2⁻⁴⁴ about 6e-14 of a link.
 halvings = 20 if real is wp.float32 else 44
 tiny = 1e-12 if real is wp.float32 else 1e-24
 
@@ -44,6 +45,7 @@ def primitive(kind: int, size: vec3, x: vec3) -> vec4:
             ux = x[0] / radial
             uy = x[1] / radial
         uz = wp.where(x[2] < zero, real(-1.0), real(1.0))
+        # Beyond side and end the rim is nearest; otherwise the face with the larger signed distance.
         if side > zero and end > zero:
             far = wp.sqrt(side * side + end * end)
             out = vec4(ux * side / far, uy * side / far, uz * end / far, far)
@@ -81,12 +83,14 @@ def segment_primitive(kind: int, size: vec3, a: vec3, b: vec3, ra: real, rb: rea
     for _ in range(wp.static(halvings)):
         middle = real(0.5) * (low + high)
         here = primitive(kind, size, a + along * middle)
+        # Derivative of the gap along a–b: of the distance, less that of the radius.
         slope = here[0] * along[0] + here[1] * along[1] + here[2] * along[2] - (rb - ra)
         if slope > real(0.0):
             high = middle
         else:
             low = middle
     share = real(0.5) * (low + high)
+    # A minimum at an end is put exactly there, because contacts at ends are handled apart.
     if low == real(0.0):
         share = real(0.0)
     if high == real(1.0):
@@ -101,6 +105,7 @@ def point_triangle(x: vec3, p: vec3, q: vec3, r: vec3) -> vec2:
     pq = q - p
     pr = r - p
     px = x - p
+    # Ericson (2005), section 5.1.5.
     # Voronoi regions of p, q, pq, r, pr, qr, and the face.
     d1 = wp.dot(pq, px)
     d2 = wp.dot(pr, px)
@@ -143,6 +148,7 @@ def segments(a: vec3, d1: vec3, p: vec3, d2: vec3) -> vec2:
     b = wp.dot(d1, d2)
     zero = real(0.0)
     one = real(1.0)
+    # Ericson (2005), section 5.1.9.
     # On the infinite lines; parallel ones take the middle.
     determinant = aa * ee - b * b
     s = real(0.5)
@@ -189,6 +195,7 @@ def segment_triangle(a: vec3, b: vec3, p: vec3, q: vec3, r: vec3) -> vec4:
         if share > zero and share < one:
             inside = a + along * share - p
             square = wp.dot(normal, normal)
+            # Barycentric coordinates by areas: the point is inside when none is negative.
             v = wp.dot(wp.cross(inside, pr), normal) / square
             w = wp.dot(wp.cross(pq, inside), normal) / square
             if v >= zero and w >= zero and v + w <= one:

@@ -130,6 +130,8 @@ def nearest_triangles(
                     beside_p = p - a - axis * tp
                     beside_q = q - a - axis * tq
                     beside_r = r - a - axis * tr
+                    # No point of a triangle is less far along ``way`` than its nearest corner: a bound from three
+                    # products.
                     way = beside_p + beside_q + beside_r
                     beside = minimum(wp.dot(beside_p, way), minimum(wp.dot(beside_q, way), wp.dot(beside_r, way)))
                     beside = maximum(beside, zero)
@@ -211,6 +213,7 @@ def nearest_triangles(
             bound = side_kept[level, k]
             if sure * bound < side_most or sure * end_kept[level, k] < end_most:
                 rank = part * wp.static(children) + k
+                # The bits of positive floats are ordered like their values, so one minimum gives box and rank.
                 code = wp.min(code, ((wp.cast(wp.float32(bound), wp.int32) >> 3) << 3) + rank)
         code = group_min_int(code)
         if busy == 1:
@@ -218,6 +221,7 @@ def nearest_triangles(
                 if level == top:
                     busy = 0
                 else:
+                    # The tree has no pointers: parent and children of a box follow from its rank.
                     # Nothing left below: back to the parent.
                     row = row + size
                     level = level + 1

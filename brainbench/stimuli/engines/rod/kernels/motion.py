@@ -46,6 +46,7 @@ def pose_at(motions: MotionArrays, index: int, time: real) -> BodyMotion:
         return pose
     spacing = motions.spacing[index]
     place = (time - motions.start[index]) / spacing
+    # Outside the knots the first or the last piece goes on.
     i = wp.clamp(int(wp.floor(place)), 0, count - 2)
     u = place - real(i)
     a = first + i
@@ -54,6 +55,7 @@ def pose_at(motions: MotionArrays, index: int, time: real) -> BodyMotion:
     two = real(2.0)
     three = real(3.0)
     # Weights of value and slope at both ends, and their derivatives.
+    # Cubic Hermite basis; the slopes are per ms, hence the spacing.
     v0 = (one + two * u) * (one - u) * (one - u)
     s0 = u * (one - u) * (one - u) * spacing
     v1 = u * u * (three - two * u)
@@ -62,6 +64,7 @@ def pose_at(motions: MotionArrays, index: int, time: real) -> BodyMotion:
     ds0 = (one - u) * (one - three * u)
     ds1 = u * (three * u - two)
     pose.place = motions.place[a] * v0 + motions.velocity[a] * s0 + motions.place[b] * v1 + motions.velocity[b] * s1
+    # The derivatives of both value weights differ in sign only.
     pose.velocity = (motions.place[a] - motions.place[b]) * dv + motions.velocity[a] * ds0 + motions.velocity[b] * ds1
     turn = (
         motions.turn[a] * v0

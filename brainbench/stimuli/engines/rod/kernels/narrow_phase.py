@@ -25,6 +25,7 @@ def pseudo_normal(shapes: ShapeArrays, face: int, v: real, w: real) -> vec3:
     on_p = u > low
     on_q = v > low
     on_r = w > low
+    # Which feature holds the point decides: the normal of one face tells the wrong side near a sharp edge or corner.
     # Slot 0 is the face, 1 to 3 its corners, 4 to 6 the edges opposite to them.
     slot = 0
     if on_p and not on_q and not on_r:
@@ -96,6 +97,7 @@ def mesh_distance(
             away = a + (b - a) * share - surface_point(shapes, first + face, v, w)
             radius = ra + (rb - ra) * share
             out = signed_direction(away, found.clearance, pseudo_normal(shapes, first + face, v, w), radius)
+            # No contact within reach, but the axis lies inside: without this a deep overlap would count as free.
             if out[3] < real(0.0):
                 found.between = 1
                 found.share = share
@@ -171,6 +173,7 @@ def link_shape_distance(
     # Primitives: what lies between the ends, and the far end on its own.
     if meshed == 0:
         nearest = segment_primitive(shapes.kind[s], shapes.size[s] / scale, a, b, ra, rb)
+        # The gap counts from the skin, the bound from the axis; the thinner end keeps it a lower bound.
         found.clearance = nearest[1] + wp.min(ra, rb)
         found.share = nearest[0]
         found.gap = nearest[1]

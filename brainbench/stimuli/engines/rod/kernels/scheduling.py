@@ -29,6 +29,7 @@ def next_job(paused: PausedWhiskers, thread: int) -> int:
             many = paused.queue_size[which]
             if place < many:
                 index = paused.queue[which, place]
+            # Whole warps for each queue: threads of one warp then run the same part of the step.
             place = place - ((many + wp.static(WARP - 1)) // wp.static(WARP)) * wp.static(WARP)
     return index
 
@@ -61,6 +62,7 @@ def pause(
         paused.link[i, index].rate = row(chain.rate, i)
         paused.link[i, index].clearance = row(proximity.clearance, i)
         paused.link[i, index].leaf = row(proximity.leaf, i)
+    # Whiskers that continue at the same place of the step go into one queue.
     queue = wp.static(AFTER_DISTANCES)
     if state.waiting_for == WAIT_FORCES:
         queue = wp.static(AFTER_CONTACTS)

@@ -74,6 +74,7 @@ def check_rest(
     idle_before = state.safe_until
     state.safe_until = real(1e30)
     # Without objects nothing of this remains in the kernel, nor what it keeps.
+    # Objects that never move need to be looked at only once.
     if wp.static(against > NOTHING) and (job.object_speed > zero or before == start):
         pose = pose_at(motions, job.base, before)
         x = rotate(pose.turn, vec3(one, zero, zero))
@@ -95,6 +96,7 @@ def check_rest(
         # Time in which the fastest object covers the distance of each link; a distance stays a bound while it rests.
         for i in range(links):
             link = chains.build[i, job.whisker]
+            # At rest only the bends of the rest shape are left.
             turned = x * link.bend_cosine + y * link.bend_sine
             y = y * link.bend_cosine - x * link.bend_sine
             x = turned
@@ -120,6 +122,8 @@ def check_rest(
                             )
                             slack = wp.min(slack, found.clearance)
                             proximity.leaf[i] = found.leaf
+                    # A little is kept off here and less than that given back below, so that rounding never raises the
+                    # bound.
                     slack = slack - taper.start_radius - real(0.05)
                     proximity.safe_until[i] = real(1e30)
                     if slack <= zero:
@@ -149,6 +153,7 @@ def check_rest(
                     bound = wp.max(bound, row(proximity.clearance, i))
                 proximity.safe_until[i] = bound
             proximity.clearance[i] = row(proximity.safe_until, i)
+    # What is left of a bend (below REST) is dropped, so that rest does not drift.
     if upto <= state.safe_until:
         for i in range(job.links):
             chain.angle[i] = vec2(zero, zero)

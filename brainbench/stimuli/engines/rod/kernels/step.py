@@ -55,11 +55,13 @@ def load_job(
     job.longest_step = jobs.step[index]
     scene = jobs.scene[index]
     job.first_shape = shapes.first[scene]
+    # Times 0 in a kernel against nothing: the compiler then drops the loops over shapes.
     job.end_shape = job.first_shape + (shapes.first[scene + 1] - job.first_shape) * wp.static(min(against, 1))
     for s in range(job.first_shape, job.end_shape):
         job.object_speed = wp.max(job.object_speed, shapes.speed[s])
     job.first_load = jobs.load_first[index]
     job.end_load = jobs.load_first[index + 1]
+    # Rest is skipped, so the base stands still, nothing pulls, and no shape is to be recorded.
     if motions.count[job.base] == 1 and wp.length_sq(motions.velocity[motions.first[job.base]]) == zero:
         if job.first_load == job.end_load and wp.length_sq(options.gravity) == zero and options.shape == 0:
             job.can_rest = 1
@@ -96,11 +98,13 @@ def write_reading(
     index = job.index
     first = jobs.row[index]
     column = jobs.column[index]
+    # The wrench found is that of the base on the whisker; reported is the reaction, in N and N·m.
     acting = options.axes * base_wrench.force * real(-1e-3)
     turning = options.axes * base_wrench.moment * real(-1e-6)
     for d in range(3):
         results.wrench[first, reading, column, d] = acting[d]
         results.wrench[first, reading, column, 3 + d] = turning[d]
+    # Mean arc of the contacts, weighted by their normal forces; mm to m.
     if force_sum > real(0.0):
         results.contact[first, reading, column] = real(1e-3) * arc_sum / force_sum
     if options.shape == 1:
@@ -189,6 +193,7 @@ def run(
                 used = used + 1
             now = until - left
             # Equal steps up to the next reading.
+            # The thousandth keeps rounding from adding a step.
             steps = wp.max(1, int(wp.ceil(left / preferred_step(job, state) - real(1e-3))))
             h = left / real(steps)
             left_whole = left
@@ -219,11 +224,14 @@ def run(
                 moving.angular = pose.spin
                 moving.linear = pose.velocity
                 # The base moves as its track does within the step; gravity is an acceleration of the base.
+                # Spatial acceleration is the rate of the twist at a fixed point: v̇ − ω × v (Featherstone 2008, chapter
+                # 2).
                 base = SpatialAcceleration()
                 base.angular = (later.spin - moving.angular) / h
                 base.linear = (
                     (later.velocity - moving.linear) / h - wp.cross(moving.angular, moving.linear) - options.gravity
                 )
+                # A whisker that pauses takes this step again: with these restored, the step has the same length.
                 previously_near = state.is_near
                 previous_speed = state.top_speed
                 tip = forward_kinematics(chains, job, pose, chain, proximity, state)

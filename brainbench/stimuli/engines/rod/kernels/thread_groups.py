@@ -13,14 +13,17 @@ if group_size == 1:
 
     @wp.func
     def broadcast(value: real, source: int) -> real:
+        """Return the value: a group of one thread has no other."""
         return value
 
     @wp.func
     def group_sum(value: real) -> real:
+        """Return the value, as every reduction over one thread does."""
         return value
 
     @wp.func
     def warp_max(value: int) -> int:
+        """Return the integer, as every reduction of integers over one thread does."""
         return value
 
     group_max = group_min = group_sum
@@ -29,6 +32,7 @@ if group_size == 1:
 else:
 
     def native(device_code: str, host_code: str = "return value;") -> str:
+        """Return the text of native code: one for a GPU, one for a processor."""
         return f"#if defined(__CUDA_ARCH__)\n{device_code}\n#else\n{host_code}\n#endif\n"
 
     def reduce(step: str, name: str = "value", width: int = group_size) -> str:
@@ -40,22 +44,36 @@ else:
         )
 
     @wp.func_native(native(f"return __shfl_sync(0xffffffffu, value, source, {group_size});"))
-    def broadcast(value: real, source: int) -> real: ...
+    def broadcast(value: real, source: int) -> real:
+        """Return the value of the thread ``source`` of the group."""
+        ...
 
     @wp.func_native(reduce("value += other;"))
-    def group_sum(value: real) -> real: ...
+    def group_sum(value: real) -> real:
+        """Return the sum over the group."""
+        ...
 
     @wp.func_native(reduce("value = other > value ? other : value;"))
-    def group_max(value: real) -> real: ...
+    def group_max(value: real) -> real:
+        """Return the largest value of the group."""
+        ...
 
     @wp.func_native(reduce("value = other < value ? other : value;"))
-    def group_min(value: real) -> real: ...
+    def group_min(value: real) -> real:
+        """Return the smallest value of the group."""
+        ...
 
     @wp.func_native(reduce("value = other < value ? other : value;"))
-    def group_min_int(value: int) -> int: ...
+    def group_min_int(value: int) -> int:
+        """Return the smallest integer of the group."""
+        ...
 
     @wp.func_native(reduce("bits |= other;", "bits"))
-    def group_or(bits: int) -> int: ...
+    def group_or(bits: int) -> int:
+        """Return the bits that any thread of the group has set."""
+        ...
 
     @wp.func_native(reduce("value = other > value ? other : value;", width=32))
-    def warp_max(value: int) -> int: ...
+    def warp_max(value: int) -> int:
+        """Return the largest integer of the warp."""
+        ...
