@@ -18,6 +18,7 @@ from brainbench.core.errors import UsageError, unknown_name
 from brainbench.core.provenance import Provenance
 from brainbench.core.records import LayerScore, Score, Status, SubjectScore
 from brainbench.metrics.animals import Animals, ceiling_of, gather, mean_rdm, mean_reliability, recorded_rdm
+from brainbench.metrics.arrays import finite_mean
 from brainbench.metrics.comparisons import LayerComparisons
 from brainbench.metrics.inference.intervals import interval_reasons, t_interval, two_factor_interval
 from brainbench.metrics.inference.permutation import (
@@ -98,13 +99,17 @@ def score_layers(
         raise unknown_name("layer", committed, layers)
     animals = gather(metric, subjects, len(stimuli), estimator=estimator)
     names, result, notes = list(layers), None, ()
-    defined = _defined(metric, layers)
+    usable = defined = _defined(metric, layers)
     if animals.scored and defined and len(stimuli) >= metric.fewest:
         compared = LayerComparisons(
             metric, [metric.take(layers[label], animals.order) for label in defined], animals.sorted, device
         )
         result, defined, notes = _result(compared, defined, animals, estimator, committed, seed)
-    status, reasons = _verdict(metric, animals, names, defined, len(stimuli), estimator, result, committed)
+    lacking = {
+        "constant or not finite": [name for name in names if name not in usable],
+        "not comparable with every animal": [name for name in usable if name not in defined],
+    }
+    status, reasons = _verdict(metric, animals, lacking, defined, len(stimuli), estimator, result, committed)
     reliability, reliability_interval = mean_reliability(animals)
     about = {
         "name": name,
@@ -157,7 +162,7 @@ def score_layers(
         layers=tuple(_layer_score(label, shown.get(label), result, status) for label in names),
         subjects=_subjects(metric, layers, animals, result, defined),
         model_rdm=recorded_rdm(layer) if metric.of_rdms else (),
-        chance=_mean(result.test.null),
+        chance=float(finite_mean(result.test.null)),
         attainable=attainable,
         without_stimulus=tuple(result.without[np.argsort(animals.order)].tolist()),
         provenance=Provenance.of({"statistics": statistics, **stated}),
@@ -275,23 +280,25 @@ def _partly(compared: LayerComparisons, names: Sequence[str]) -> tuple[str, ...]
 def _verdict(
     metric: Metric,
     animals: Animals,
-    names: Sequence[str],
+    lacking: Mapping[str, Sequence[str]],
     defined: Sequence[str],
     stimuli: int,
     estimator: str,
     result: _Result | None,
     committed: str | None,
 ) -> tuple[Status, tuple[str, ...]]:
-    """Return the status of the score and its reasons, the gravest first."""
+    """Return the status of the score and its reasons, the gravest first; ``lacking`` are layers without a value."""
     if result is None:
         if stimuli < metric.fewest:
             reason = (
                 f"{stimuli} stimuli are too few for the metric {metric.name!r}; at least {metric.fewest} are needed"
             )
         elif committed is not None and committed not in defined and animals.scored:
-            reason = f"activations of the layer committed to, {committed!r}, are constant or not finite"
+            why = next(words for words, layers in lacking.items() if committed in layers)
+            reason = f"activations of the layer committed to, {committed!r}, are {why}"
         elif not defined:
-            reason = "activations of every layer are constant or not finite"
+            why = ", ".join(words for words, layers in lacking.items() if layers)
+            reason = f"activations of every layer are {why}"
         elif not animals.scored:
             reason = "no animal can be used"
         else:
@@ -303,9 +310,9 @@ def _verdict(
     reasons += animals.reasons
     if result.rule.kind == "maximum":
         reasons.append("optimistic: the layer was chosen as the maximum on the data that are scored")
-    broken = [name for name in names if name not in defined]
-    if broken:
-        reasons.append(f"layers without a value (constant or not finite), never chosen: {', '.join(broken)}")
+    reasons += [
+        f"layers without a value ({why}), never chosen: {', '.join(found)}" for why, found in lacking.items() if found
+    ]
     reasons += [*metric.reasons, *interval_reasons(len(animals.scored), stimuli)]
     unreliable = not animals.reliable or stimuli < SMALLEST_STIMULI
     return "unreliable" if unreliable else "ok", tuple(reasons)
@@ -359,8 +366,3 @@ def splits_error(values: Floats, subjects: Sequence[Any], comparison: str) -> fl
         errors.append(float(value) * spread / (2 * h * (1 + h)))
     # Splits of different animals are independent, so squared errors add up in the mean over animals.
     return math.sqrt(sum(error**2 for error in errors)) / len(errors)
-
-
-def _mean(null: Floats) -> float:
-    finite = null[np.isfinite(null)]
-    return float(finite.mean()) if finite.size else math.nan

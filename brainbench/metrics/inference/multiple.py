@@ -238,11 +238,9 @@ def compare_scores(first: Score, second: Score) -> PairTest:
         return PairTest(*names, float(animals.mean()) if len(animals) else math.nan, None, math.nan, math.nan, why)
     difference = float(animals.mean())
     interval = two_factor_interval(difference, animals, without)
-    if len(animals) < FEWEST_ANIMALS or np.isfinite(without).sum() < FEWEST_STIMULI:
-        why = (
-            f"{len(animals)} animals and {len(without)} stimuli; at least {FEWEST_ANIMALS} and {FEWEST_STIMULI} are "
-            "needed"
-        )
+    stimuli = int(np.isfinite(without).sum())
+    if len(animals) < FEWEST_ANIMALS or stimuli < FEWEST_STIMULI:
+        why = f"{len(animals)} animals and {stimuli} stimuli; at least {FEWEST_ANIMALS} and {FEWEST_STIMULI} are needed"
         return PairTest(*names, difference, interval, math.nan, math.nan, why)
     error, freedom = two_factor_error(animals, without)
     p = 2 * student_tail(abs(difference), float(error), float(freedom))

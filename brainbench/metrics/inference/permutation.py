@@ -72,10 +72,11 @@ class PermutationTest:
     def summary(self, layers: int, repeated: str = "layer chosen anew in each") -> str:
         """Describe the test of a score, with the score that a model without knowledge gets by the same choice."""
         text = f"{self.method}; {'one layer' if layers == 1 else repeated}"
-        if not self.null.size:
+        known = self.null[np.isfinite(self.null)]
+        if not known.size:
             return text
         # Adding zero keeps a rounded −0.00 out of the sentence.
-        return f"{text}; mean score under permutation {round(float(np.nanmean(self.null)), 2) + 0.0:.2f}"
+        return f"{text}; mean score under permutation {round(float(known.mean()), 2) + 0.0:.2f}"
 
 
 def tail_p(null: Floats, observed: ArrayLike | None = None) -> Floats:
@@ -196,7 +197,9 @@ def layer_p(null: Floats) -> tuple[Floats, Floats]:
     The first row is the observed one; the correction is the maximum statistic (Nichols & Holmes 2002).
     """
     # The maximum over layers in each permutation keeps the family-wise error, however layers depend on one another.
-    return tail_p(null), tail_p(null.max(axis=1, keepdims=True), null[0])
+    # A layer without a value under some order leaves the maximum to the others.
+    known = np.where(np.isfinite(null), null, -np.inf)
+    return tail_p(null), tail_p(known.max(axis=1, keepdims=True), null[0])
 
 
 def most_exact(draws: int) -> int:

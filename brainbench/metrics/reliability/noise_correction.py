@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike
 
 from brainbench.core.errors import UsageError, unknown_name
 from brainbench.core.records import Status
+from brainbench.metrics.arrays import finite_mean
 from brainbench.metrics.rdms.pairs import Floats
 
 RELIABILITY_GATE = 0.5
@@ -153,13 +154,6 @@ def _thesis_input(r_xy: Floats, halves: Floats, others: Floats | None) -> tuple[
     if not kept.size:
         return math.nan, 0, "no split half has a positive reliability"
     return float(np.median(kept)), kept.size, ""
-
-
-def finite_mean(values: Floats) -> Floats:
-    """Return the mean over the finite values of the last axis; NaN where there is none."""
-    present = np.isfinite(values)
-    number = present.sum(axis=-1)
-    return np.where(number > 0, np.where(present, values, 0.0).sum(axis=-1) / np.maximum(number, 1), np.nan)
 
 
 _ESTIMATORS: dict[str, Callable[[Floats, Floats, Floats | None], tuple[float, int, str]]] = {

@@ -15,6 +15,7 @@ import numpy as np
 
 from brainbench.core.errors import UsageError
 from brainbench.core.trials import Trials
+from brainbench.metrics.arrays import finite_mean
 from brainbench.metrics.rdms.comparison import features
 from brainbench.metrics.rdms.pairs import Floats
 from brainbench.metrics.reliability.halves import split_members, weighted_patterns
@@ -34,6 +35,7 @@ def unit_reliability(
 ) -> tuple[Floats, ...]:
     """Return the reliability of every unit's tuning [F], for each session; NaN where it has none.
 
+    Responses are [R, F] or [R, T, F], whose time is averaged.
     A unit without variation over stimuli, or with fewer than two trials of some stimulus in every split,
     has no reliability. Values can be negative.
 
@@ -44,7 +46,9 @@ def unit_reliability(
         raise UsageError(f"A unit's tuning needs at least 3 stimuli and 1 split; received {n_stimuli} and {splits}.")
     found = []
     for block in blocks:
-        responses = response_matrix(block.responses, "trials").astype(np.float64)
+        values = np.asarray(block.responses)
+        values = finite_mean(values, axis=1) if values.ndim == 3 else values
+        responses = response_matrix(values, "trials").astype(np.float64)
         codes, _ = stimulus_codes(block.labels, n_stimuli)
         session = SortedTrials.sort(responses, codes, trial_hashes(block, responses, codes))
         total, number = np.zeros(responses.shape[1]), np.zeros(responses.shape[1])
@@ -79,7 +83,7 @@ def reliable_units(
     for block, value in zip(blocks, values, strict=True):
         good = value >= least
         if good.any():
-            kept.append(replace(block, responses=np.asarray(block.responses)[:, good]))
+            kept.append(replace(block, responses=np.asarray(block.responses)[..., good]))
     every = sum(len(value) for value in values)
     left = sum(int((~(value >= least)).sum()) for value in values)
     return tuple(kept), f"{left} of {every} units left out: reliability of their tuning below {least:g}"

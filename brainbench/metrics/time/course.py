@@ -18,11 +18,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from brainbench.core.errors import UsageError
 from brainbench.core.records import Interval
 from brainbench.core.statistics import FEWEST_ANIMALS, FEWEST_STIMULI
+from brainbench.metrics.arrays import finite_mean
 from brainbench.metrics.inference.intervals import two_factor_interval
 from brainbench.metrics.inference.permutation import tail_p
 from brainbench.metrics.layers import most_chosen
@@ -135,9 +136,9 @@ def score_over_time(
         expected = expected + r.sum(axis=0)
         course, picked = held_out_course(r)
         chosen = picked[0] if chosen is None else chosen
-        courses.append(_mean(course))
-        values.append(_mean(course * factors))
-        matches.append(_mean(votes(r)))
+        courses.append(finite_mean(course))
+        values.append(finite_mean(course * factors))
+        matches.append(finite_mean(votes(r)))
     assert chosen is not None
     # The first order is the given one.
     course, value, match = (np.concatenate(parts) for parts in (courses, values, matches))
@@ -145,14 +146,15 @@ def score_over_time(
     observed = joined.compared()
     own = held_out_course(observed)[0][0] * factors
     left_out = [joined.without_stimulus(stimulus) for stimulus in range(joined.stimuli)]
-    intervals = _intervals(own, np.stack([_mean(held_out_course(item)[0][0] * factors) for item in left_out], axis=-1))
+    without_each = [finite_mean(held_out_course(item)[0][0] * factors) for item in left_out]
+    intervals = _intervals(own, np.stack(without_each, axis=-1))
     points = tuple(
         TimePoint(
             time=(index + 0.5) * width,
             value=float(value[0, index]),
             r=float(course[0, index]),
-            chance=float(_mean(value[:, index])),
-            reliability=float(_mean(reliability[index])),
+            chance=float(finite_mean(value[:, index])),
+            reliability=float(finite_mean(reliability[index])),
             animals=int(np.isfinite(own[index]).sum()),
             p=float(p[index]),
             interval=intervals[index],
@@ -208,20 +210,12 @@ def _factors(reliability: Floats) -> Floats:
     return np.where(trusted, 1 / np.sqrt(np.where(trusted, reliability, 1.0)), np.nan)
 
 
-def _mean(values: Floats) -> NDArray[np.float64]:
-    """Return the mean over the finite entries of the last axis; NaN without any."""
-    present = np.isfinite(values)
-    number = present.sum(axis=-1)
-    total = np.where(present, values, 0.0).sum(axis=-1)
-    return np.divide(total, number, out=np.full(total.shape, np.nan), where=number > 0)
-
-
 def _standardised(null: Floats) -> Floats:
     """Return statistics [N, ...] in standard deviations from their mean over permutations; −∞ where undefined."""
     # Chance differs between times and lags: by an early bin's few spikes, by the bins that overlap.
     with np.errstate(invalid="ignore", divide="ignore"):
-        mean = _mean(np.moveaxis(null, 0, -1))
-        spread = np.sqrt(_mean(np.moveaxis((null - mean) ** 2, 0, -1)))
+        mean = finite_mean(np.moveaxis(null, 0, -1))
+        spread = np.sqrt(finite_mean(np.moveaxis((null - mean) ** 2, 0, -1)))
         z = (null - mean) / spread
     return np.where(np.isfinite(z), z, -np.inf)
 
@@ -238,7 +232,7 @@ def _intervals(animals: Floats, left_out: Floats) -> list[Interval | None]:
     """Return the interval of the mean of values [T, A] whose means without each stimulus are [T, K]."""
     return [
         two_factor_interval(float(mean), *item) if np.isfinite(mean) else None
-        for mean, *item in zip(_mean(animals), animals, left_out, strict=True)
+        for mean, *item in zip(finite_mean(animals), animals, left_out, strict=True)
     ]
 
 
@@ -266,7 +260,7 @@ def _latencies(
     singles = np.stack([latency(np.delete(excess, index, axis=-1)) for index in range(animals)], axis=-1)
     pseudo = animals * best[:, None] - (animals - 1) * singles
     without = np.stack([latency(item) for item in left_out], axis=-1)
-    reached = _mean(votes(excess[None])[0])
+    reached = finite_mean(votes(excess[None])[0])
     found = []
     for index, name in enumerate(names):
         tried, reason = int(np.isfinite(reached[index]).sum()), ""
@@ -303,6 +297,8 @@ def _reasons(animals: Sequence[AnimalMovie], points: tuple[TimePoint, ...], stim
     blind = sum(point.animals == 0 for point in points)
     if blind:
         reasons.append(f"no animal is reliable in {blind} of {len(points)} bins, which have no corrected value")
+    if len(animals) == 1:
+        reasons.append("optimistic: layer and lag are the best of the only animal; the permutations take the same best")
     broken = {item.subject: next(filter(None, item.problems)) for item in animals if any(item.problems)}
     reasons += [f"{subject} has no RDM in some bins: {problem}" for subject, problem in broken.items()]
     return tuple(reasons)
