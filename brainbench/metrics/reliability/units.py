@@ -18,7 +18,7 @@ from brainbench.core.trials import Trials
 from brainbench.metrics.arrays import finite_mean
 from brainbench.metrics.rdms.comparison import features
 from brainbench.metrics.rdms.pairs import Floats
-from brainbench.metrics.reliability.halves import split_members, weighted_patterns
+from brainbench.metrics.reliability.halves import mean_patterns, split_members
 from brainbench.metrics.reliability.noise_correction import spearman_brown
 from brainbench.metrics.reliability.sessions import SortedTrials, trial_hashes
 from brainbench.metrics.stimulus_labels import response_matrix, stimulus_codes
@@ -55,7 +55,7 @@ def unit_reliability(
         for start in range(0, splits, _CHUNK):
             member = split_members(session, n_stimuli, np.arange(start, min(start + _CHUNK, splits)), seed)
             # Split by split, so that memory holds a chunk of splits of one session.
-            halves = [weighted_patterns(session, w, n_stimuli, variances=False)[0] for w in (member, 1.0 - member)]
+            halves = [mean_patterns(session, w, n_stimuli, variances=False)[0] for w in (member, 1.0 - member)]
             # Pearson's r over stimuli between the halves' mean responses, of all units and splits at once.
             first, second = (features(half.swapaxes(-1, -2), "pearson") for half in halves)
             r = np.einsum("sfk,sfk->sf", first, second)
