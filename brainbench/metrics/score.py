@@ -21,12 +21,7 @@ from brainbench.metrics.arrays import finite_mean
 from brainbench.metrics.comparisons import LayerComparisons
 from brainbench.metrics.evaluation import LayerEvaluation, attainable_value, defined_layers, evaluate
 from brainbench.metrics.inference.intervals import interval_reasons, t_interval, two_factor_interval
-from brainbench.metrics.inference.permutation import (
-    SMALLEST_STIMULI,
-    PermutationTest,
-    layer_p,
-    smallest_p,
-)
+from brainbench.metrics.inference.permutation import SMALLEST_STIMULI, PermutationTest, layer_p, smallest_p
 from brainbench.metrics.layers import first_best, most_chosen
 from brainbench.metrics.rdms.pairs import Floats
 from brainbench.metrics.reliability.noise_correction import RELIABILITY_GATE
@@ -111,13 +106,14 @@ def score_layers(
         about |= {"status": "unreliable", "reasons": (hopeless, *told) if status == "ok" else (*told, hopeless)}
     statistics = {
         "monte_carlo_error": {
-            "value": splits_error(result.values, scored, metric.comparison) if metric.of_rdms else 0.0,
+            "value": _splits_error(result.values, scored, metric.comparison) if metric.of_rdms else 0.0,
             "p": result.test.monte_carlo_error,
         },
         **metric.statistics(metric.take(layer, animals.order), animals.sorted, seed),
     }
     if result.layer_null.size:
-        statistics["layer_tests"] = layer_table(defined, result.layer_null)
+        tests = zip(defined, *(p.tolist() for p in layer_p(result.layer_null)), strict=True)
+        statistics["layer_tests"] = [{"layer": name, "p": p, "p_corrected": corrected} for name, p, corrected in tests]
     shown = {label: row for row, label in enumerate(defined)}
     repeated = f"{'layer chosen' if estimator == 'default' else 'maximum over layers taken'} anew in each"
     value = float(result.values.mean())
@@ -141,14 +137,6 @@ def score_layers(
         **about,
     )
     return made, result.test
-
-
-def layer_table(names: Sequence[str], null: Floats) -> list[dict[str, Any]]:
-    """Return each layer's p, alone and corrected for the number of layers, from statistics [N, L]."""
-    return [
-        {"layer": name, "p": p, "p_corrected": corrected}
-        for name, p, corrected in zip(names, *(values.tolist() for values in layer_p(null)), strict=True)
-    ]
 
 
 def _verdict(
@@ -224,7 +212,7 @@ def _subject(animals: Animals, index: int, value: float, r: float, layer: str | 
     return SubjectScore(subject.subject, value, r, correction.reliability, status, subject.units, subject.trials, layer)
 
 
-def splits_error(values: Floats, subjects: Sequence[Any], comparison: str) -> float:
+def _splits_error(values: Floats, subjects: Sequence[Any], comparison: str) -> float:
     """Return the standard error of the mean score over animals from the finite number of random splits.
 
     Splits are independent draws given the trials, so the mean split-half correlation h has standard

@@ -102,8 +102,6 @@ class Power:
     """Wilson interval from the number of simulations."""
     simulations: int
     p_smallest: float
-    mean_score: float = math.nan
-    """Mean raw comparison in the simulated experiments, after the choice of layer."""
     reason: str = ""
     """Reason for doing without simulations; empty otherwise."""
 
@@ -131,14 +129,13 @@ def power(design: ExperimentDesign, *, simulations: int = SIMULATIONS, seed: int
     orders = np.concatenate(list(label_orders(design.stimuli, seed, exact=_EXACT_STIMULI, draws=draws)))
     # A square matrix read row by row: the entry (i, j) comes from (order[i], order[j]).
     places = (orders[:, :, None] * design.stimuli + orders[:, None, :]).reshape(len(orders), -1)
-    found, total = 0, 0.0
+    found = 0
     for size in _chunks(simulations, design, len(places)):
         model, brain = simulate_experiments(generator, design, size)
         null = _statistics(model, brain, places)
         found += int((tail_p(null.T) <= design.alpha).sum())
-        total += float(null[:, 0].sum())
     interval = wilson_interval(found, simulations, over="simulated experiments")
-    return Power(design, found / simulations, interval, simulations, smallest, total / simulations)
+    return Power(design, found / simulations, interval, simulations, smallest)
 
 
 def needed(
