@@ -28,7 +28,6 @@ def score_agreement(
     metric: Metric,
     subjects: Sequence[SubjectRDM],
     *,
-    name: str = "animal-to-animal",
     stimuli: Sequence[str],
     estimator: str = "default",
     seed: int = 0,
@@ -40,7 +39,6 @@ def score_agreement(
     Args:
         metric: What compares them.
         subjects: What :meth:`Metric.animal` made of each animal.
-        name: Name of the score.
         stimuli: Names of the K stimuli.
         estimator: One of the metric's.
         seed: Seed of the permutations.
@@ -82,7 +80,7 @@ def score_agreement(
     scored = [animals.subjects[i] for i in found]
     attainable = float(np.mean(metric.attainable(scored, seed) * animals.factors(found))) if found else math.nan
     made = Score(
-        name=name,
+        name="animal-to-animal",
         value=value,
         status=status,
         reasons=reasons,

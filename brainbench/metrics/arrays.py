@@ -76,6 +76,13 @@ def slices(values: Any, elements: int, device: Any) -> Iterator[tuple[slice, Arr
         yield part, place(values[..., part], device)
 
 
+def finite_mean(values: np.ndarray, axis: int | tuple[int, ...] = -1) -> np.ndarray:
+    """Return the mean over the finite values along axes; NaN where there is none."""
+    present = np.isfinite(values)
+    number = present.sum(axis=axis)
+    return np.where(number > 0, np.where(present, values, 0.0).sum(axis=axis) / np.maximum(number, 1), np.nan)
+
+
 def cholesky(matrix: Array) -> Array | None:
     """Return the lower Cholesky factor [N, N], or None where the matrix has none."""
     if is_tensor(matrix):

@@ -31,7 +31,7 @@ from brainbench.core.records import Status
 from brainbench.metrics.animals import gather
 from brainbench.metrics.layers import held_out
 from brainbench.metrics.measures.rsa import RSA
-from brainbench.metrics.rdms.comparison import compare as compare_rdms
+from brainbench.metrics.rdms.comparison import compare
 from brainbench.metrics.rdms.pairs import Floats, rdm_stack, stimulus_count
 from brainbench.metrics.reliability.noise_correction import RELIABILITY_GATE, THESIS_FILTER, spearman_brown
 from brainbench.metrics.reliability.subject_rdm import SubjectRDM, is_flat
@@ -170,10 +170,8 @@ def explain_splits(r_xy: ArrayLike, r_yy: ArrayLike, *, r_xx: ArrayLike | None =
     return (*steps, Step("gate on reliability: the default", value, status, detail, CORRECTED))
 
 
-def explain_score(
-    layer_rdms: Mapping[str, ArrayLike], subjects: Sequence[SubjectRDM], *, compare: str = "pearson"
-) -> tuple[Step, ...]:
-    """Walk a model's score from the published estimator to the default one, on the same RDMs.
+def explain_score(layer_rdms: Mapping[str, ArrayLike], subjects: Sequence[SubjectRDM]) -> tuple[Step, ...]:
+    """Walk a model's score from the published estimator to the default one, on the same RDMs, by Pearson's r.
 
     The published pool of all animals' units is represented by their mean RDM and halves.
 
@@ -182,7 +180,7 @@ def explain_score(
     """
     rdms = rdm_stack(list(layer_rdms.values()), "layer_rdms")
     rdms = rdms[~is_flat(rdms)]
-    animals = gather(RSA(comparison=compare), subjects, stimulus_count(rdms.shape[-1]), estimator="thesis-input")
+    animals = gather(RSA(comparison="pearson"), subjects, stimulus_count(rdms.shape[-1]), estimator="thesis-input")
     # Without the published estimators' own demands: whoever has an RDM takes part.
     usable = [subject for subject in animals.subjects if subject.problem is None and not is_flat(subject.rdm)]
     if not len(rdms) or not usable:
@@ -198,11 +196,11 @@ def explain_score(
         (f"animals with a reliability below {RELIABILITY_GATE} left out", replace(CORRECTED, best_layer=True)),
         ("layer chosen on the other animals: the default", CORRECTED),
     )
-    return tuple(_step(change, switches, rdms, usable, compare) for change, switches in walk)
+    return tuple(_step(change, switches, rdms, usable) for change, switches in walk)
 
 
-def _step(change: str, switches: Switches, rdms: Floats, subjects: list[SubjectRDM], comparison: str) -> Step:
-    targets = [(subject.subject, subject.rdm, subject.split_half_by(comparison)) for subject in subjects]
+def _step(change: str, switches: Switches, rdms: Floats, subjects: list[SubjectRDM]) -> Step:
+    targets = [(subject.subject, subject.rdm, subject.split_half_by("pearson")) for subject in subjects]
     if not switches.no_gate:
         targets = [
             target
@@ -214,11 +212,11 @@ def _step(change: str, switches: Switches, rdms: Floats, subjects: list[SubjectR
         splits = min(len(subject.halves) for subject in subjects)
         halves = np.mean([subject.halves[:splits] for subject in subjects], axis=0)
         # Halves are averaged split by split over animals, so the pool's halves hold different trials too.
-        agreement = compare_rdms(halves[:, 0], halves[:, 1], method=comparison)
+        agreement = compare(halves[:, 0], halves[:, 1])
         targets.append(("the pool", np.mean([subject.rdm for subject in subjects], axis=0), agreement))
     if not targets:
         return Step(change, math.nan, "undefined", "no animal is reliable", switches)
-    r = compare_rdms(rdms[:, None], np.stack([target[1] for target in targets])[None], method=comparison)
+    r = compare(rdms[:, None], np.stack([target[1] for target in targets])[None])
     # A correction is a factor of the raw comparison: one per target.
     found = [corrected_value(1.0, target[2], switches) for target in targets]
     factors = np.array([item[0] for item in found])

@@ -8,8 +8,7 @@ verdict in words.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -18,48 +17,17 @@ from brainbench.core.errors import UsageError, unknown_name
 from brainbench.core.provenance import Provenance
 from brainbench.core.records import LayerScore, Score, Status, SubjectScore
 from brainbench.metrics.animals import Animals, ceiling_of, gather, mean_rdm, mean_reliability, recorded_rdm
+from brainbench.metrics.arrays import finite_mean
 from brainbench.metrics.comparisons import LayerComparisons
+from brainbench.metrics.evaluation import LayerEvaluation, attainable_value, defined_layers, evaluate
 from brainbench.metrics.inference.intervals import held_to_scale, interval_reasons, t_interval, two_factor_interval
-from brainbench.metrics.inference.permutation import (
-    SMALLEST_STIMULI,
-    PermutationTest,
-    label_orders,
-    layer_p,
-    make_test,
-    most_exact,
-    smallest_p,
-)
-from brainbench.metrics.layers import HALVES, LayerRule, first_best, layer_rule, most_chosen, take_layers
-from brainbench.metrics.rdms.pairs import Floats, Ints
+from brainbench.metrics.inference.permutation import SMALLEST_STIMULI, PermutationTest, layer_p, smallest_p
+from brainbench.metrics.layers import first_best, most_chosen
+from brainbench.metrics.rdms.pairs import Floats
 from brainbench.metrics.reliability.noise_correction import RELIABILITY_GATE
 
 if TYPE_CHECKING:
     from brainbench.metrics.measures.metric import Metric
-
-_CHUNK_ELEMENTS = 1 << 22
-_HALVES_IN_PERMUTATIONS = 100
-"""Splits of a single animal that every permutation repeats; more only cost time."""
-
-
-@dataclass(frozen=True)
-class _Result:
-    """A score's parts. L counts the layers that have a value."""
-
-    rule: LayerRule
-    values: Floats
-    """[A] corrected."""
-    r: Floats
-    """[A] raw comparisons."""
-    chosen: Ints
-    """[A] layers."""
-    layer_values: Floats
-    """[L, A] corrected comparisons of every layer."""
-    layer_r: Floats
-    without: Floats
-    """[K] the score without each stimulus."""
-    test: PermutationTest
-    layer_null: Floats
-    """[N, L] mean of every layer under the orders of the stimuli; empty without a test."""
 
 
 def score_layers(
@@ -98,13 +66,17 @@ def score_layers(
         raise unknown_name("layer", committed, layers)
     animals = gather(metric, subjects, len(stimuli), estimator=estimator)
     names, result, notes = list(layers), None, ()
-    defined = _defined(metric, layers)
+    usable = defined = defined_layers(metric, layers)
     if animals.scored and defined and len(stimuli) >= metric.fewest:
         compared = LayerComparisons(
             metric, [metric.take(layers[label], animals.order) for label in defined], animals.sorted, device
         )
-        result, defined, notes = _result(compared, defined, animals, estimator, committed, seed)
-    status, reasons = _verdict(metric, animals, names, defined, len(stimuli), estimator, result, committed)
+        result, defined, notes = evaluate(compared, defined, animals, estimator, committed, seed)
+    lacking = {
+        "constant or not finite": [name for name in names if name not in usable],
+        "not comparable with every animal": [name for name in usable if name not in defined],
+    }
+    status, reasons = _verdict(metric, animals, lacking, defined, len(stimuli), estimator, result, committed)
     reliability, reliability_interval = mean_reliability(animals)
     about = {
         "name": name,
@@ -128,19 +100,20 @@ def score_layers(
     means = result.layer_values.mean(axis=1)
     best, chosen = first_best(means), most_chosen(result.chosen)
     layer, scored = layers[defined[chosen]], [animals.subjects[i] for i in animals.scored]
-    attainable, hopeless = _attainable(metric, animals, result, seed)
+    attainable, hopeless = attainable_value(metric, animals, result, seed)
     if hopeless:
         told = about["reasons"]
         about |= {"status": "unreliable", "reasons": (hopeless, *told) if status == "ok" else (*told, hopeless)}
     statistics = {
         "monte_carlo_error": {
-            "value": splits_error(result.values, scored, metric.comparison) if metric.of_rdms else 0.0,
+            "value": _splits_error(result.values, scored, metric.comparison) if metric.of_rdms else 0.0,
             "p": result.test.monte_carlo_error,
         },
         **metric.statistics(metric.take(layer, animals.order), animals.sorted, seed),
     }
     if result.layer_null.size:
-        statistics["layer_tests"] = layer_table(defined, result.layer_null)
+        tests = zip(defined, *(p.tolist() for p in layer_p(result.layer_null)), strict=True)
+        statistics["layer_tests"] = [{"layer": name, "p": p, "p_corrected": corrected} for name, p, corrected in tests]
     shown = {label: row for row, label in enumerate(defined)}
     repeated = f"{'layer chosen' if estimator == 'default' else 'maximum over layers taken'} anew in each"
     value = float(result.values.mean())
@@ -157,7 +130,7 @@ def score_layers(
         layers=tuple(_layer_score(label, shown.get(label), result, status) for label in names),
         subjects=_subjects(metric, layers, animals, result, defined),
         model_rdm=recorded_rdm(layer) if metric.of_rdms else (),
-        chance=_mean(result.test.null),
+        chance=float(finite_mean(result.test.null)),
         attainable=attainable,
         without_stimulus=tuple(result.without[np.argsort(animals.order)].tolist()),
         provenance=Provenance.of({"statistics": statistics, **stated}),
@@ -166,132 +139,28 @@ def score_layers(
     return held_to_scale(made), result.test
 
 
-def layer_table(names: Sequence[str], null: Floats) -> list[dict[str, Any]]:
-    """Return each layer's p, alone and corrected for the number of layers, from statistics [N, L]."""
-    return [
-        {"layer": name, "p": p, "p_corrected": corrected}
-        for name, p, corrected in zip(names, *(values.tolist() for values in layer_p(null)), strict=True)
-    ]
-
-
-def _defined(metric: Metric, layers: Mapping[str, Floats]) -> list[str]:
-    """Return the layers with a value for enough stimuli: at least half of them, and as many as the metric needs."""
-    found = []
-    for label, layer in layers.items():
-        known = metric.known(layer)
-        if known.sum() >= max(metric.fewest, len(known) / 2) and metric.varies(
-            metric.take(layer, np.flatnonzero(known))
-        ):
-            found.append(label)
-    return found
-
-
-def _result(
-    compared: LayerComparisons,
-    names: list[str],
-    animals: Animals,
-    estimator: str,
-    committed: str | None,
-    seed: int,
-) -> tuple[_Result | None, list[str], tuple[str, ...]]:
-    """Compare, choose layers by the rule and test; also return the layers with a value, and notes."""
-    metric, factors = compared.metric, animals.factors(animals.scored)
-    given = compared.given()
-    kept = np.flatnonzero(np.isfinite(given).all(axis=1)).tolist()
-    names, given = [names[row] for row in kept], given[kept]
-    if not names or (committed is not None and committed not in names):
-        return None, names, ()
-    compared = compared.among([compared.layers[row] for row in kept], compared.animals)
-    voters = 1 if metric.of_model_alone else len(factors)
-    rule = layer_rule(names, voters, committed=committed, estimator=estimator, factors=factors)
-    judged, tested, weights = compared, compared, factors
-    if rule.kind == "maximum" and estimator == "default" and len(factors) == 1:
-        halves = metric.halves(animals.subjects[animals.scored[0]], animals.order)
-        if halves is not None:
-            parts, factor = halves
-            if not parts:
-                return None, names, ()
-            # The halves stand for animals; fewer of them serve the permutations.
-            rule, judged = HALVES, compared.among(compared.layers, parts)
-            tested = compared.among(compared.layers, parts[: 2 * _HALVES_IN_PERMUTATIONS])
-            weights = np.full(len(parts), factor)
-    r = given if judged is compared else judged.given()
-    chosen = rule.choose(r)
-    held, values = rule.held(r), rule.held(r) * weights
-    # The layers of the data serve without a stimulus too: where the choice jumps between layers that are nearly alike,
-    # a jackknife that repeats it measures the jumps instead of the stimuli.
-    without = take_layers(judged.without_each(), chosen) @ weights / len(weights)
-    test, null = _test(tested, rule, weights[: len(tested.animals)], seed)
-    if rule is HALVES:
-        values, held, chosen = values.mean(keepdims=True), held.mean(keepdims=True), np.array([most_chosen(chosen)])
-    found = _Result(rule, values, held, chosen, given * factors, given, without, test, null)
-    return found, names, _partly(compared, names)
-
-
-def _test(judged: LayerComparisons, rule: LayerRule, weights: Floats, seed: int) -> tuple[PermutationTest, Floats]:
-    """Test the score by orders of the stimuli, the choice of layer repeated in each; also return layers' means."""
-    metric, count = judged.metric, judged.animals[0].count
-    exact, draws = most_exact(metric.orders), metric.orders
-    smallest = smallest_p(count, draws)
-    if count < SMALLEST_STIMULI:
-        reason = f"{count} stimuli allow no p below {smallest:.3g}; at least {SMALLEST_STIMULI} are needed"
-        return PermutationTest(math.nan, smallest, True, 0, math.nan, np.empty(0), reason), np.empty((0, 0))
-    step = max(1, _CHUNK_ELEMENTS // (len(judged.layers) * max(count * count, len(judged.animals))))
-
-    def orders() -> Iterator[Ints]:
-        return label_orders(count, seed, exact=exact, draws=draws, step=step)
-
-    null, means = [], []
-    for r in judged.under(orders):
-        null.append(rule.held(r) @ weights / len(weights))
-        means.append((r * weights).mean(axis=-1))
-    found = np.concatenate(null)
-    # An order under which a comparison has no value says nothing.
-    found = np.where(np.isfinite(found), found, -np.inf)
-    return make_test(found, exact=count <= exact, smallest=smallest), np.concatenate(means)
-
-
-def _attainable(metric: Metric, animals: Animals, result: _Result, seed: int) -> tuple[float, str]:
-    """Return the value of a perfect model, NaN where chance reaches it in one of twenty orders, and why."""
-    raw = metric.attainable([animals.subjects[i] for i in animals.scored], seed)
-    found = float((raw * animals.factors(animals.scored)).mean())
-    null = result.test.null[np.isfinite(result.test.null)]
-    if null.size and not found > (reached := float(np.quantile(null, 0.95))):
-        return math.nan, f"no scale: a perfect model would score {found:.2f}, which chance reaches ({reached:.2f})"
-    return found, ""
-
-
-def _partly(compared: LayerComparisons, names: Sequence[str]) -> tuple[str, ...]:
-    lacking = [
-        f"{name} ({(~known).sum()} of {len(known)})"
-        for name, known in zip(names, compared.known, strict=True)
-        if not known.all()
-    ]
-    if not lacking:
-        return ()
-    return (f"layers without a value for some stimuli, compared over the others: {', '.join(lacking)}",)
-
-
 def _verdict(
     metric: Metric,
     animals: Animals,
-    names: Sequence[str],
+    lacking: Mapping[str, Sequence[str]],
     defined: Sequence[str],
     stimuli: int,
     estimator: str,
-    result: _Result | None,
+    result: LayerEvaluation | None,
     committed: str | None,
 ) -> tuple[Status, tuple[str, ...]]:
-    """Return the status of the score and its reasons, the gravest first."""
+    """Return the status of the score and its reasons, the gravest first; ``lacking`` are layers without a value."""
     if result is None:
         if stimuli < metric.fewest:
             reason = (
                 f"{stimuli} stimuli are too few for the metric {metric.name!r}; at least {metric.fewest} are needed"
             )
         elif committed is not None and committed not in defined and animals.scored:
-            reason = f"activations of the layer committed to, {committed!r}, are constant or not finite"
+            why = next(words for words, layers in lacking.items() if committed in layers)
+            reason = f"activations of the layer committed to, {committed!r}, are {why}"
         elif not defined:
-            reason = "activations of every layer are constant or not finite"
+            why = ", ".join(words for words, layers in lacking.items() if layers)
+            reason = f"activations of every layer are {why}"
         elif not animals.scored:
             reason = "no animal can be used"
         else:
@@ -303,15 +172,15 @@ def _verdict(
     reasons += animals.reasons
     if result.rule.kind == "maximum":
         reasons.append("optimistic: the layer was chosen as the maximum on the data that are scored")
-    broken = [name for name in names if name not in defined]
-    if broken:
-        reasons.append(f"layers without a value (constant or not finite), never chosen: {', '.join(broken)}")
+    reasons += [
+        f"layers without a value ({why}), never chosen: {', '.join(found)}" for why, found in lacking.items() if found
+    ]
     reasons += [*metric.reasons, *interval_reasons(len(animals.scored), stimuli)]
     unreliable = not animals.reliable or stimuli < SMALLEST_STIMULI
     return "unreliable" if unreliable else "ok", tuple(reasons)
 
 
-def _layer_score(label: str, row: int | None, result: _Result, status: Status) -> LayerScore:
+def _layer_score(label: str, row: int | None, result: LayerEvaluation, status: Status) -> LayerScore:
     if row is None:
         return LayerScore(label, math.nan, math.nan, "undefined")
     values = result.layer_values[row]
@@ -319,7 +188,7 @@ def _layer_score(label: str, row: int | None, result: _Result, status: Status) -
 
 
 def _subjects(
-    metric: Metric, layers: Mapping[str, Any], animals: Animals, result: _Result, names: Sequence[str]
+    metric: Metric, layers: Mapping[str, Any], animals: Animals, result: LayerEvaluation, names: Sequence[str]
 ) -> tuple[SubjectScore, ...]:
     """Return every animal's part; one that did not vote meets the layer that the others chose."""
     overall = names[most_chosen(result.chosen)]
@@ -343,7 +212,7 @@ def _subject(animals: Animals, index: int, value: float, r: float, layer: str | 
     return SubjectScore(subject.subject, value, r, correction.reliability, status, subject.units, subject.trials, layer)
 
 
-def splits_error(values: Floats, subjects: Sequence[Any], comparison: str) -> float:
+def _splits_error(values: Floats, subjects: Sequence[Any], comparison: str) -> float:
     """Return the standard error of the mean score over animals from the finite number of random splits.
 
     Splits are independent draws given the trials, so the mean split-half correlation h has standard
@@ -359,8 +228,3 @@ def splits_error(values: Floats, subjects: Sequence[Any], comparison: str) -> fl
         errors.append(float(value) * spread / (2 * h * (1 + h)))
     # Splits of different animals are independent, so squared errors add up in the mean over animals.
     return math.sqrt(sum(error**2 for error in errors)) / len(errors)
-
-
-def _mean(null: Floats) -> float:
-    finite = null[np.isfinite(null)]
-    return float(finite.mean()) if finite.size else math.nan

@@ -63,7 +63,11 @@ class NeuralResponses:
             if options.units_reliability is not None:
                 trials, note = reliable_units(trials, len(kept), least=options.units_reliability, seed=options.seed)
             animal = metric.animal(subject, trials, len(kept), stimuli=kept, seed=options.seed)
-            animals.append(replace(animal, notes=(note, *animal.notes)) if note else animal)
+            if not trials and note:
+                animal = replace(animal, problem=note)
+            elif note:
+                animal = replace(animal, notes=(note, *animal.notes))
+            animals.append(animal)
         return tuple(animals)
 
     def trials(self, kept: tuple[str, ...]) -> dict[str, tuple[Trials, ...]]:

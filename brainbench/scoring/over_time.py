@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+import math
+from typing import Any
 
 import numpy as np
 
@@ -10,11 +11,11 @@ from brainbench.core.errors import DataError, UsageError
 from brainbench.core.progress import Progress
 from brainbench.metrics.measures.registry import get_metric, list_metrics
 from brainbench.metrics.measures.rsa import RSA
-from brainbench.metrics.time import TimeCourse, animal_movie, layer_movie, score_over_time
-
-if TYPE_CHECKING:
-    from brainbench.scoring.model_responses import ModelResponses
-    from brainbench.scoring.neural_responses import NeuralResponses
+from brainbench.metrics.reliability.units import reliable_units
+from brainbench.metrics.time import AnimalMovie, TimeCourse, animal_movie, layer_movie, score_over_time
+from brainbench.scoring.model_responses import ModelResponses
+from brainbench.scoring.neural_responses import NeuralResponses
+from brainbench.scoring.options import ScoreOptions
 
 
 def check_metric(metric: Any) -> None:
@@ -30,8 +31,8 @@ def time_course(
     metric: RSA,
     kept: tuple[str, ...],
     rows: list[int],
+    options: ScoreOptions,
     *,
-    seed: int = 0,
     progress: Progress | None = None,
 ) -> TimeCourse:
     """Return the score over time of a model against recordings in bins.
@@ -45,7 +46,7 @@ def time_course(
         metric: How RDMs are made and compared.
         kept: Labels that are scored, in order.
         rows: Rows of the activations for these labels.
-        seed: Seed of split halves and permutations.
+        options: Hold the seed of split halves and permutations, and the reliability that units must have.
         progress: Called with (done, total, what).
 
     Raises:
@@ -65,12 +66,19 @@ def time_course(
     total, animals, layers = len(sessions) + len(network.activations), [], {}
     for subject, blocks in sessions.items():
         _tell(progress, len(animals), total)
-        animals.append(animal_movie(subject, blocks, len(kept), stimuli=kept, seed=seed, **how))
+        note = ""
+        if options.units_reliability is not None:
+            blocks, note = reliable_units(blocks, len(kept), least=options.units_reliability, seed=options.seed)
+        if blocks:
+            animals.append(animal_movie(subject, blocks, len(kept), stimuli=kept, seed=options.seed, **how))
+        else:
+            nothing = np.full((len(begins), math.comb(len(kept), 2)), np.nan)
+            animals.append(AnimalMovie(subject, nothing, nothing[:, 0], (note,) * len(begins)))
     for name, values in network.activations.items():
         _tell(progress, len(animals) + len(layers), total)
         layers[name] = layer_movie(values[rows], seconds / values.shape[1], width, method=metric.model_method)
     _tell(progress, total, total)
-    return score_over_time(layers, animals, width=width, comparison=metric.comparison, seed=seed)
+    return score_over_time(layers, animals, width=width, comparison=metric.comparison, seed=options.seed)
 
 
 def _tell(progress: Progress | None, done: int, total: int) -> None:

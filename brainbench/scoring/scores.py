@@ -128,7 +128,7 @@ def score_record(
     if options.over_time and isinstance(metric, RSA):
         from brainbench.scoring.over_time import time_course
 
-        course = time_course(brain, network, metric, kept, rows, seed=options.seed, progress=progress)
+        course = time_course(brain, network, metric, kept, rows, options, progress=progress)
         statistics[0] = {**statistics[0], "time_course": to_plain(course)}
     first, *others = (
         replace(item, provenance=replace(origin, statistics=found))

@@ -92,3 +92,15 @@ def test_metrics_without_rdms_and_recordings_without_time_are_refused(moving):
         _score(moving, metric="ridge")
     with pytest.raises(DataError, match="--bin"):
         _score(moving, bin=1.0)
+
+
+def test_unreliable_units_are_left_out_at_each_time_too(moving):
+    courses = [
+        _score(moving, baselines=False, units_reliability=least).score.provenance.statistics["time_course"]
+        for least in (-0.99, 0.8, 0.9999)
+    ]
+    every, some, none = ([point["reliability"] for point in course["points"]] for course in courses)
+    assert all(np.isfinite([*every, *some]))
+    assert every != some
+    assert set(none) == {None}
+    assert any("reliability of their tuning below" in reason for reason in courses[2]["reasons"])

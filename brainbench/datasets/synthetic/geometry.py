@@ -38,7 +38,7 @@ class ResponseGeometry:
         norms = np.linalg.norm(centred, axis=1)
         if np.any(norms <= 1e-12 * np.maximum(np.abs(values).max(axis=1), 1e-300)):
             raise DataError(f"The features of stimulus {int(np.argmin(norms))} are constant, so it has no direction.")
-        return cls(_principal_axes(centred / norms[:, None]), _labels(labels, len(values)))
+        return cls(principal_axes(centred / norms[:, None]), _labels(labels, len(values)))
 
     @classmethod
     def from_activations(cls, features: ArrayLike, labels: Sequence[str] | None = None) -> ResponseGeometry:
@@ -57,7 +57,7 @@ class ResponseGeometry:
             raise DataError("Every feature is the same for all stimuli, so there is nothing for neurons to encode.")
         standard = (values[:, varied] - values[:, varied].mean(axis=0)) / spread[varied]
         # Each standardised feature has a mean square of one over stimuli, so /√F makes the mean squared length one.
-        return cls(_principal_axes(standard / np.sqrt(standard.shape[1])), _labels(labels, len(values)))
+        return cls(principal_axes(standard / np.sqrt(standard.shape[1])), _labels(labels, len(values)))
 
     @classmethod
     def from_rdm(cls, rdm: ArrayLike, labels: Sequence[str] | None = None) -> ResponseGeometry:
@@ -108,7 +108,7 @@ def _checked(features: ArrayLike, width: int) -> NDArray[np.float64]:
     return values
 
 
-def _principal_axes(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
+def principal_axes(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
     """Rotate K vectors [K, F] into the at most K axes that they span; every angle and length stays."""
     # X = U S Vᵀ: the rows of U S have the same inner products as those of X, and no more axes than its rank.
     left, values, _ = np.linalg.svd(vectors, full_matrices=False)

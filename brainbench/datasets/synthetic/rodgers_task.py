@@ -15,7 +15,8 @@ from brainbench.datasets.sessions import Series, Session, make_session
 from brainbench.datasets.synthetic.design import PopulationDesign
 from brainbench.datasets.synthetic.geometry import ResponseGeometry
 from brainbench.datasets.synthetic.populations import draw_counts
-from brainbench.datasets.synthetic.sessions import REST, spike_trains
+from brainbench.datasets.synthetic.sessions import REST
+from brainbench.datasets.synthetic.spikes import spike_trains
 
 CHOICE = (0.80, 0.97)
 """Earliest and latest choice, s after the shape comes into reach."""

@@ -20,6 +20,7 @@ from brainbench.datasets.hdf5 import write_recordings
 from brainbench.datasets.sessions import Session, make_session
 from brainbench.datasets.synthetic.geometry import ResponseGeometry
 from brainbench.datasets.synthetic.populations import DrawnSession, PopulationDesign, draw_sessions
+from brainbench.datasets.synthetic.spikes import spike_trains
 from brainbench.datasets.synthetic.truth import SyntheticSession, correlation_rdm, write_synthetic_nwb, write_with_truth
 from brainbench.datasets.trials.conditions import Conditions
 from brainbench.datasets.trials.counting import UNIT_COLUMNS, ReadingOptions, SessionCounts, missing_column
@@ -36,12 +37,6 @@ _BEFORE = 0.5
 _AFTER = (0.25, 1.25)
 """Least and most time from the end of the window to the end of the trial, s: no two trials are alike in
 length, so that a shifted clock cannot hide behind a regular rhythm."""
-_LATENCY, _JITTER = 0.012, 0.003
-"""Onset response after contact, s."""
-_ONSET = 0.15
-"""Share of the spikes in a window that belong to the onset response."""
-_DEAD = 0.002
-"""Refractory time, s."""
 REST = 0.5
 """Rate between windows, as a share of a unit's mean rate."""
 _TOUCH = 0.05
@@ -153,77 +148,6 @@ def write_files(
         shared=geometry.rdm,
         **about,
     )
-
-
-def place_spikes(
-    random: np.random.Generator,
-    counts: NDArray[np.int64],
-    begin: NDArray[np.float64],
-    length: float | NDArray[np.float64],
-    onset: float,
-) -> NDArray[np.float64]:
-    """Place counted spikes [R] in windows, none within the refractory time of another.
-
-    Positions are drawn in the window shortened by all refractory times, sorted, and spread apart by
-    them: exactly ``counts`` spikes, at least the refractory time between any two.
-
-    Args:
-        random: source of the draws.
-        counts: spikes of each window.
-        begin: begin of each window, s.
-        length: length of all windows, or of each [R], s.
-        onset: share of the spikes at the latency after the begin.
-
-    Returns:
-        spike times, s, window after window.
-    """
-    long = np.broadcast_to(np.asarray(length, dtype=np.float64), counts.shape)
-    # At high counts the refractory time shrinks, so that it fills at most half of any window.
-    dead = min(_DEAD, float(np.min(0.5 * long / np.maximum(counts, 1))))
-    which = np.repeat(np.arange(len(counts)), counts)
-    # A hair less than the window, which is half open and must hold the last spike after rounding.
-    free = (long[which] - counts[which] * dead) * (1 - 1e-9)
-    # Given their number, Poisson spikes lie evenly in the window; an onset response is moved to its latency below.
-    position = random.random(len(which)) * free
-    early = random.random(len(which)) < onset
-    latency = _LATENCY + _JITTER * random.standard_normal(int(early.sum()))
-    position[early] = np.clip(latency, 0.0, free[early])
-    order = np.lexsort((position, which))
-    # The i-th spike of a window moves by i refractory times, which keeps the order and makes the gaps.
-    rank = np.arange(len(which)) - np.repeat(np.cumsum(counts) - counts, counts)
-    return begin[which] + position[order] + rank * dead
-
-
-def spike_trains(
-    random: np.random.Generator,
-    counts: NDArray[np.int64],
-    begin: NDArray[np.float64],
-    length: float | NDArray[np.float64],
-    rest: NDArray[np.float64],
-    span: tuple[float, float],
-) -> list[NDArray[np.float64]]:
-    """Place the spikes of a session: counted ones in the trials' windows, and others at a constant rate between them.
-
-    Args:
-        random: source of the draws.
-        counts: [R, U] spikes in each window.
-        begin: [R] begin of the windows, ascending, s.
-        length: length of all windows, or of each [R], s; they do not overlap.
-        rest: [U] rate outside the windows, Hz.
-        span: first and last second of the recording.
-
-    Returns:
-        spike times of each unit [U], s; 15 % of those in a window come about 12 ms after its begin.
-    """
-    # The margins keep the refractory time between the spikes of a window and those around it.
-    opened = np.concatenate([[span[0]], begin + length]) + _DEAD
-    pause = np.concatenate([begin, [span[1]]]) - _DEAD - opened
-    trains = []
-    for unit in range(counts.shape[1]):
-        window = place_spikes(random, counts[:, unit], begin, length, _ONSET)
-        idle = place_spikes(random, random.poisson(rest[unit] * pause), opened, pause, 0.0)
-        trains.append(np.sort(np.concatenate([window, idle])))
-    return trains
 
 
 def _times(drawn: DrawnSession) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -9,7 +9,7 @@ share: 0 is chance and 1 all that is reliable.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -116,4 +116,10 @@ def turing_test(
             f"Model and animals must be scored by one estimator; received {score.estimator!r} and "
             f"{animal_to_animal.estimator!r}."
         )
-    return equivalence_test(*paired_differences(score, animal_to_animal), margin=margin, alpha=alpha)
+    found = equivalence_test(*paired_differences(score, animal_to_animal), margin=margin, alpha=alpha)
+    doubtful = [one.name for one in (score, animal_to_animal) if one.status != "ok"]
+    if found.status == "undefined" or not doubtful:
+        return found
+    # A verdict is no better than the scores behind it.
+    told = f"the score of {' and of '.join(doubtful)} is unreliable"
+    return replace(found, status="unreliable", reason="; ".join(filter(None, (told, found.reason))))

@@ -46,8 +46,8 @@ def two_factor_interval(
     if not math.isfinite(error):
         return None
     half = float(stdtrit(freedom, (1 + level) / 2)) * error if error > 0 else 0.0
-    count = int(np.isfinite(np.asarray(animals, dtype=np.float64)).sum())
-    what = f"t over {count} animals and {np.size(without_stimulus)} stimuli (jackknife)"
+    count, stimuli = (np.isfinite(np.asarray(part, dtype=np.float64)).sum() for part in (animals, without_stimulus))
+    what = f"t over {count} animals and {stimuli} stimuli (jackknife)"
     return Interval(value - half, value + half, level, what)
 
 

@@ -1,4 +1,4 @@
-"""Tests of many models or layers at once, and of models against one another.
+"""Tests of many models at once, and of models against one another.
 
 ``p`` of a single model is the share of permutations of the stimuli that score as high. Among many models some do by
 luck; the corrected p asks how often *the luckiest of them all* would, under the same permutations for
@@ -22,13 +22,12 @@ from numpy.typing import ArrayLike
 from brainbench.core.errors import UsageError, unknown_name
 from brainbench.core.records import Interval, Score
 from brainbench.core.statistics import FEWEST_ANIMALS, FEWEST_STIMULI, two_factor_error
-from brainbench.metrics.animals import gather
 from brainbench.metrics.inference.intervals import two_factor_interval
-from brainbench.metrics.inference.permutation import SMALLEST_STIMULI, layer_p, permuted_values, tail_p
+from brainbench.metrics.inference.permutation import tail_p
 from brainbench.metrics.measures.rsa import RSA, check_layers
 from brainbench.metrics.rdms.comparison import check_comparison
-from brainbench.metrics.rdms.pairs import Floats, rdm_stack, stimulus_count
-from brainbench.metrics.reliability.subject_rdm import SubjectRDM, is_flat
+from brainbench.metrics.rdms.pairs import Floats
+from brainbench.metrics.reliability.subject_rdm import SubjectRDM
 from brainbench.metrics.score import score_layers
 
 CORRECTIONS = ("holm", "fdr", "none")
@@ -123,59 +122,6 @@ def compare_models(
     )
 
 
-@dataclass(frozen=True)
-class LayerTest:
-    """One layer among those of a model."""
-
-    layer: str
-    value: float
-    """Mean noise-corrected comparison over the reliable animals."""
-    p: float
-    p_corrected: float
-    """P(the largest of all layers under permuted stimuli reaches this layer's value)."""
-
-
-def layer_tests(
-    layer_rdms: Mapping[str, ArrayLike],
-    subjects: Sequence[SubjectRDM],
-    *,
-    compare: str = "pearson",
-    seed: int = 0,
-    device: Any = None,
-) -> tuple[LayerTest, ...]:
-    """Test every layer, corrected for their number by the maximum statistic (Nichols & Holmes 2002).
-
-    Layers without a usable RDM have NaN throughout and do not count. With fewer than four stimuli or
-    no usable animal every p is NaN.
-
-    Raises:
-        UsageError: no layers or animals, RDMs that do not fit, unknown comparison.
-    """
-    check_comparison(compare)
-    if not layer_rdms:
-        raise UsageError("There are no layers to test; give the RDM of at least one layer.")
-    rdms = rdm_stack(list(layer_rdms.values()), "layer_rdms")
-    animals = gather(RSA(comparison=compare), subjects, stimulus_count(rdms.shape[1]))
-    nothing = [LayerTest(name, math.nan, math.nan, math.nan) for name in layer_rdms]
-    usable = np.flatnonzero(~is_flat(rdms))
-    if not len(usable) or not animals.scored or rdms.shape[1] < SMALLEST_STIMULI * (SMALLEST_STIMULI - 1) // 2:
-        return tuple(nothing)
-    factors = animals.factors(animals.scored)
-    # Every permutation is corrected by the same factors as the data, so p belongs to the values that are reported.
-    values = permuted_values(
-        rdms[usable],
-        animals.rdms(animals.scored),
-        lambda r: (r * factors).mean(axis=-1),
-        method=compare,
-        seed=seed,
-        device=device,
-    )
-    found = zip(usable.tolist(), values[0].tolist(), *(p.tolist() for p in layer_p(values)), strict=True)
-    for index, observed, p, corrected in found:
-        nothing[index] = LayerTest(nothing[index].layer, observed, p, corrected)
-    return tuple(nothing)
-
-
 def step_down(null: Floats) -> Floats:
     """Return corrected p [M] of tests with joint null statistics [M, N], the observed ones first (maximum statistic).
 
@@ -238,11 +184,9 @@ def compare_scores(first: Score, second: Score) -> PairTest:
         return PairTest(*names, float(animals.mean()) if len(animals) else math.nan, None, math.nan, math.nan, why)
     difference = float(animals.mean())
     interval = two_factor_interval(difference, animals, without)
-    if len(animals) < FEWEST_ANIMALS or np.isfinite(without).sum() < FEWEST_STIMULI:
-        why = (
-            f"{len(animals)} animals and {len(without)} stimuli; at least {FEWEST_ANIMALS} and {FEWEST_STIMULI} are "
-            "needed"
-        )
+    stimuli = int(np.isfinite(without).sum())
+    if len(animals) < FEWEST_ANIMALS or stimuli < FEWEST_STIMULI:
+        why = f"{len(animals)} animals and {stimuli} stimuli; at least {FEWEST_ANIMALS} and {FEWEST_STIMULI} are needed"
         return PairTest(*names, difference, interval, math.nan, math.nan, why)
     error, freedom = two_factor_error(animals, without)
     p = 2 * student_tail(abs(difference), float(error), float(freedom))

@@ -72,10 +72,11 @@ class PermutationTest:
     def summary(self, layers: int, repeated: str = "layer chosen anew in each") -> str:
         """Describe the test of a score, with the score that a model without knowledge gets by the same choice."""
         text = f"{self.method}; {'one layer' if layers == 1 else repeated}"
-        if not self.null.size:
+        known = self.null[np.isfinite(self.null)]
+        if not known.size:
             return text
         # Adding zero keeps a rounded −0.00 out of the sentence.
-        return f"{text}; mean score under permutation {round(float(np.nanmean(self.null)), 2) + 0.0:.2f}"
+        return f"{text}; mean score under permutation {round(float(known.mean()), 2) + 0.0:.2f}"
 
 
 def tail_p(null: Floats, observed: ArrayLike | None = None) -> Floats:
@@ -124,49 +125,23 @@ def permutation_test(
             f"A permutation test takes one model RDM [P] and brain RDMs [A, P] of the same stimuli; received shapes "
             f"{model.shape} and {brain.shape}."
         )
-    return permuted_statistic(
-        model[None], brain, lambda r: r[:, 0].mean(axis=-1), method=method, seed=seed, device=device
-    )
-
-
-def permuted_statistic(
-    layers: Floats,
-    brain: Floats,
-    statistic: Callable[[Floats], Floats],
-    *,
-    method: str = "pearson",
-    seed: int = 0,
-    device: Any = None,
-) -> PermutationTest:
-    """Test any statistic of the comparisons of layers with brain RDMs.
-
-    Args:
-        layers: [L, P] RDMs of one model; a permutation moves the stimuli of all of them alike.
-        brain: [A, P] RDMs.
-        statistic: Takes comparisons [N, L, A] under N permutations, returns [N]. What is chosen on the
-            data (a layer) must be chosen inside, or p is too small.
-        method: Comparison.
-        seed: Seed of the random orders.
-        device: Torch device for the products, or None for numpy.
-    """
-    stimuli = stimulus_count(layers.shape[-1])
-    exact = stimuli <= EXACT_STIMULI
+    stimuli = stimulus_count(len(model))
+    exact, smallest = stimuli <= EXACT_STIMULI, smallest_p(stimuli)
     count = math.factorial(stimuli) if exact else RANDOM_PERMUTATIONS + 1
-    smallest = smallest_p(stimuli)
-    reason = ""
+    null, reason = np.empty(0), ""
     if stimuli < SMALLEST_STIMULI:
         reason = f"{stimuli} stimuli allow no p below {smallest:.3g}; at least {SMALLEST_STIMULI} are needed"
-    elif not (np.isfinite(layers).all() and np.isfinite(brain).all()):
+    elif not (np.isfinite(model).all() and np.isfinite(brain).all()):
         reason = "an RDM has missing pairs, so its stimuli cannot be permuted"
-    if reason:
-        return PermutationTest(math.nan, smallest, exact, count, math.nan, np.empty(0), reason)
-    null = permuted_values(layers, brain, statistic, method=method, seed=seed, device=device)
-    if not np.isfinite(null[0]):
-        return PermutationTest(
-            math.nan, smallest, exact, count, math.nan, null, "the comparison is undefined (a constant RDM)"
+    else:
+        # The given order comes first, so the observed statistic went through the same arithmetic.
+        null = permuted_values(
+            model[None], brain, lambda r: r[:, 0].mean(axis=-1), method=method, seed=seed, device=device
         )
-    # The given order comes first, so the observed statistic went through the same arithmetic.
-    return make_test(null, exact=exact, smallest=smallest)
+        if np.isfinite(null[0]):
+            return make_test(null, exact=exact, smallest=smallest)
+        reason = "the comparison is undefined (a constant RDM)"
+    return PermutationTest(math.nan, smallest, exact, count, math.nan, null, reason)
 
 
 def permuted_values(
@@ -180,9 +155,12 @@ def permuted_values(
 ) -> Floats:
     """Return a statistic [N, ...] of comparisons [N, L, A] under every order of the stimuli, the given one first.
 
-    Orders depend on the brain's RDMs and the seed alone, so entry n of two models is the same permutation.
+    Orders depend on the brain's RDMs and the seed alone, so entry n of two models is the same permutation. What a
+    statistic chooses on the data (a layer) must be chosen inside it, or p is too small.
     """
-    layers, brain = _canonical(layers, brain)
+    # Sorted, random orders do not depend on how the stimuli were listed.
+    pairs = permuted_pairs(canonical_order(brain)[None])[0]
+    layers, brain = layers[:, pairs], brain[:, pairs]
     # Chunks bound the permuted RDMs [N, L, P]; of each only the statistics are kept.
     step = max(1, _CHUNK_ELEMENTS // layers.size)
     chunks = label_orders(stimulus_count(layers.shape[-1]), seed, step=step)
@@ -196,7 +174,9 @@ def layer_p(null: Floats) -> tuple[Floats, Floats]:
     The first row is the observed one; the correction is the maximum statistic (Nichols & Holmes 2002).
     """
     # The maximum over layers in each permutation keeps the family-wise error, however layers depend on one another.
-    return tail_p(null), tail_p(null.max(axis=1, keepdims=True), null[0])
+    # A layer without a value under some order leaves the maximum to the others.
+    known = np.where(np.isfinite(null), null, -np.inf)
+    return tail_p(null), tail_p(known.max(axis=1, keepdims=True), null[0])
 
 
 def most_exact(draws: int) -> int:
@@ -243,9 +223,3 @@ def label_orders(
 def canonical_order(brain: Floats) -> Ints:
     """Return an order of stimuli that depends on the RDMs [A, P] alone, not on how they were listed."""
     return np.argsort(square(brain.mean(axis=0)).sum(axis=-1), kind="stable")
-
-
-def _canonical(layers: Floats, brain: Floats) -> tuple[Floats, Floats]:
-    """Sort the stimuli, so that random orders do not depend on how the stimuli were listed."""
-    pairs = permuted_pairs(canonical_order(brain)[None])[0]
-    return layers[:, pairs], brain[:, pairs]

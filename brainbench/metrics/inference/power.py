@@ -27,6 +27,7 @@ from brainbench.core.records import Interval
 from brainbench.core.statistics import wilson_interval
 from brainbench.metrics.inference.permutation import SMALLEST_STIMULI, label_orders, smallest_p, tail_p
 from brainbench.metrics.layers import held_out
+from brainbench.metrics.measures.rsa import RSA
 from brainbench.metrics.rdms.comparison import features
 from brainbench.metrics.rdms.pairs import Floats, Ints, upper
 
@@ -39,8 +40,9 @@ DIMENSIONS = 10
 """Dimensions of the patterns where nothing is known of them."""
 _COMPARISON = "whitened-pearson"
 _ORDERS = 999
-"""Random orders above this many stimuli; up to it all are taken."""
+"""Random orders of simulated tests at levels from .01 on; below, as many as a score takes."""
 _EXACT_STIMULI = 6
+"""Up to this many stimuli all orders are taken."""
 _CHUNK_ELEMENTS = 1 << 21
 
 
@@ -100,8 +102,6 @@ class Power:
     """Wilson interval from the number of simulations."""
     simulations: int
     p_smallest: float
-    mean_score: float = math.nan
-    """Mean raw comparison in the simulated experiments, after the choice of layer."""
     reason: str = ""
     """Reason for doing without simulations; empty otherwise."""
 
@@ -119,23 +119,23 @@ def power(design: ExperimentDesign, *, simulations: int = SIMULATIONS, seed: int
     """
     if simulations < 1:
         raise UsageError(f"A power analysis needs at least 1 simulation; received {simulations}.")
-    smallest = smallest_p(design.stimuli)
+    smallest = smallest_p(design.stimuli, RSA.orders)
     if design.stimuli < SMALLEST_STIMULI or smallest > design.alpha:
         reason = f"{design.stimuli} stimuli allow no p below {smallest:.3g}, whatever is true"
         return Power(design, 0.0, None, 0, smallest, reason=reason)
     generator = np.random.default_rng(seed)
     # All experiments share their orders of the stimuli, so places are looked up once.
-    orders = np.concatenate(list(label_orders(design.stimuli, seed, exact=_EXACT_STIMULI, draws=_ORDERS)))
+    draws = _ORDERS if design.alpha >= 0.01 else RSA.orders
+    orders = np.concatenate(list(label_orders(design.stimuli, seed, exact=_EXACT_STIMULI, draws=draws)))
     # A square matrix read row by row: the entry (i, j) comes from (order[i], order[j]).
     places = (orders[:, :, None] * design.stimuli + orders[:, None, :]).reshape(len(orders), -1)
-    found, total = 0, 0.0
+    found = 0
     for size in _chunks(simulations, design, len(places)):
         model, brain = simulate_experiments(generator, design, size)
         null = _statistics(model, brain, places)
         found += int((tail_p(null.T) <= design.alpha).sum())
-        total += float(null[:, 0].sum())
     interval = wilson_interval(found, simulations, over="simulated experiments")
-    return Power(design, found / simulations, interval, simulations, smallest, total / simulations)
+    return Power(design, found / simulations, interval, simulations, smallest)
 
 
 def needed(

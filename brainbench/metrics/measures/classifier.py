@@ -16,11 +16,12 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from brainbench.core.errors import UsageError
+from brainbench.metrics.inference.permutation import label_orders, most_exact, tail_p
 from brainbench.metrics.rdms.pairs import Floats, Ints
 from brainbench.metrics.stimulus_labels import response_matrix
 
-ORDERS = 200
-"""Most assignments of classes to stimuli that the test takes."""
+ORDERS = 199
+"""Random orders of the classes over stimuli that the test takes, where all are more than five times as many."""
 
 
 @dataclass(frozen=True)
@@ -32,13 +33,13 @@ class Decoding:
     chance: float
     """One over the number of classes, as published."""
     p: float
-    """P(accuracy with classes assigned to stimuli in another way ≥ observed)."""
+    """P(accuracy with the classes in another order over stimuli ≥ observed)."""
     expected: float
-    """Mean accuracy over those assignments: what no information gives."""
+    """Mean accuracy over those orders: what no information gives."""
     correct: tuple[float, ...]
     """Share of each stimulus' rows decoded rightly, in order of the stimuli."""
     count: int
-    """Assignments that were tried, the given one included."""
+    """Orders that were tried, the given one included."""
 
 
 def decode(
@@ -51,7 +52,7 @@ def decode(
         stimuli: [R] stimulus of each row, 0 … K−1.
         classes: [K] class of each stimulus, such as ``["convex", "convex", "concave", …]``.
         penalty: Inverse strength C of the penalty, on features scaled to unit mean square.
-        seed: Seed of random assignments, where there are more than 200.
+        seed: Seed of random orders of the classes, above 6 stimuli.
 
     Raises:
         UsageError: shapes that do not fit, fewer than two classes, a class of a single stimulus (it
@@ -74,18 +75,17 @@ def decode(
         )
     if not np.isfinite(matrix).all():
         raise UsageError("Responses to be decoded must be finite; leave out units or trials with missing values.")
-    assignments = class_assignments(codes, seed)
     decoder = Decoder(matrix, rows, penalty=penalty)
-    accuracy = np.array([decoder(assignment) for assignment in assignments])
-    # The given assignment is one of those counted, so p is never zero; 1e-12 lets equal accuracies tie.
+    orders = np.concatenate(list(label_orders(len(codes), seed, exact=most_exact(ORDERS), draws=ORDERS)))
+    accuracy = np.array([decoder(codes[order]) for order in orders])
     means = accuracy.mean(axis=1)
     return Decoding(
         accuracy=float(means[0]),
         chance=1 / len(names),
-        p=float((means >= means[0] - 1e-12).mean()),
+        p=float(tail_p(means)),
         expected=float(means.mean()),
         correct=tuple(accuracy[0].tolist()),
-        count=len(assignments),
+        count=len(orders),
     )
 
 
@@ -168,25 +168,3 @@ def _partition(codes: Ints) -> tuple[int, ...]:
     """Give the classes numbers in order of first appearance."""
     seen: dict[int, int] = {}
     return tuple(seen.setdefault(code, len(seen)) for code in codes.tolist())
-
-
-def class_assignments(codes: Ints, seed: int) -> list[Ints]:
-    """Return ways to give the classes to the stimuli, the given one first: all up to 200, else 200 random ones."""
-    counts = np.bincount(codes)
-    # Multinomial coefficient: how many assignments differ.
-    number = math.factorial(len(codes)) // math.prod(math.factorial(int(count)) for count in counts)
-    if number <= ORDERS:
-        found = {tuple(codes.tolist())}
-        _extend((), counts.tolist(), found)
-        rest = sorted(found - {tuple(codes.tolist())})
-        return [codes, *(np.array(item) for item in rest)]
-    generator = np.random.default_rng(seed)
-    return [codes, *(generator.permutation(codes) for _ in range(ORDERS - 1))]
-
-
-def _extend(start: tuple[int, ...], left: list[int], found: set[tuple[int, ...]]) -> None:
-    if not any(left):
-        found.add(start)
-    for code, count in enumerate(left):
-        if count:
-            _extend((*start, code), [n - (i == code) for i, n in enumerate(left)], found)

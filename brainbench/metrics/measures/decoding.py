@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
@@ -115,31 +115,25 @@ class LabelDecoding(Metric):
 
     def score(self, features: Mapping[str, ArrayLike], animals: Sequence[SubjectRDM], **options: Any) -> Score:
         """Score a model by the features [K, F] of its layers; options are those of :meth:`Metric.score`."""
-        properties = self._properties(options["stimuli"])
-        if isinstance(properties, Score):
-            return replace(properties, name=options["name"])
-        bound = _BoundDecoding(properties)
-        return Metric.score(bound, features, animals, **options)
+        properties = label_properties(options["stimuli"])
+        if not properties:
+            return self._undefined(options["name"], options["stimuli"])
+        return Metric.score(_BoundDecoding(properties), features, animals, **options)
 
     def score_animals(self, animals: Sequence[SubjectRDM], **options: Any) -> Score:
         """Return the accuracy of each animal's own mean responses."""
-        properties = self._properties(options["stimuli"])
-        if isinstance(properties, Score):
-            return replace(properties, name="animal-to-animal")
-        bound = _BoundDecoding(properties)
-        return Metric.score_animals(bound, animals, **options)
+        properties = label_properties(options["stimuli"])
+        if not properties:
+            return self._undefined("animal-to-animal", options["stimuli"])
+        return Metric.score_animals(_BoundDecoding(properties), animals, **options)
 
-    def _properties(self, stimuli: Sequence[str]) -> dict[str, Ints] | Score:
-        """Return the properties that labels name, or an undefined score that says why there are none."""
-        found = label_properties(stimuli)
-        if found:
-            return found
+    def _undefined(self, name: str, stimuli: Sequence[str]) -> Score:
         reason = (
             "the labels name no property that at least two stimuli of each class share, as 'convex-far' and "
             f"'convex-close' do: {', '.join(map(str, stimuli[:4]))}"
         )
         about = {"metric": self.describe(()), "stimuli": tuple(map(str, stimuli))}
-        return Score("", math.nan, "undefined", (reason,), **about)
+        return Score(name, math.nan, "undefined", (reason,), **about)
 
 
 class _BoundDecoding(LabelDecoding):

@@ -164,7 +164,7 @@ def score_rdms(
         stimuli: Names of the K stimuli, in the order of the RDMs.
         estimator: See :func:`noise_corrected`.
         compare: Comparison of RDMs, see :func:`brainbench.metrics.compare`.
-        seed: Seed of random permutations (more than 8 stimuli).
+        seed: Seed of random permutations (more than 7 stimuli).
         device: Torch device for the permutations, which pays from some hundred stimuli on; numpy by default.
 
     Raises:

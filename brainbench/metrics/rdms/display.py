@@ -75,7 +75,7 @@ class RDM:
         return len(self.values)
 
     def _repr_html_(self) -> str:
-        """Draw the matrix as an inline SVG: dark is unlike, hatched is missing."""
+        """Draw the matrix as an inline SVG: dark is unlike, grey is missing."""
         count = len(self.stimuli)
         if count > _LARGEST_DRAWN:
             return f"<p>{escape(self.title or 'RDM')}: {count} stimuli, {len(self):,} pairs</p>"

@@ -1,6 +1,5 @@
-"""RDMs of weighted trials of an animal, and of the halves of random splits of them, many at once.
+"""RDMs of an animal's trials, and of the halves of random splits of them, many at once.
 
-Weights [N, R] say how often each trial counts: once in the data themselves, as often as it was drawn in a bootstrap.
 Where nothing is missing, inner products of summed trials give the distances: the sums of one half, and those of all
 trials less them, are all that a split needs. Else mean patterns are formed. Both give the same distances.
 """
@@ -21,7 +20,7 @@ from brainbench.metrics.reliability.sessions import SortedTrials
 from brainbench.metrics.reliability.trial_hashes import Hashes, draws
 
 _CHUNK_BYTES = 1 << 20
-"""Sums of one chunk of weightings stay in the processor's cache."""
+"""Sums of one chunk of splits stay in the processor's cache."""
 
 _COMMON = 1e-3
 """Products of trials lose digits when less than this share of a pattern's square is left after taking
@@ -31,37 +30,39 @@ BY_PRODUCTS = ("correlation", "sqeuclidean", "crossnobis")
 """Methods whose distances follow from inner products of summed trials."""
 
 
-class WeightedRDMs:
-    """RDMs [N, P] of an animal's trials under N weightings, and of their halves.
+class SplitRDMs:
+    """RDMs of an animal's trials and of their halves.
 
     Args:
         sessions: Those of the animal.
-        weights: [N, R] of each session; N may be 1 where only the halves differ.
         count: K.
         method: RDM method.
     """
 
-    def __init__(self, sessions: list[SortedTrials], weights: list[Floats], count: int, method: str) -> None:
-        self._sessions, self._weights, self._count, self._method = sessions, weights, count, method
+    def __init__(self, sessions: list[SortedTrials], count: int, method: str) -> None:
+        self._sessions, self._count, self._method = sessions, count, method
+        self._every = [np.ones((1, len(session.labels))) for session in sessions]
         by_products = method in BY_PRODUCTS and all(session.complete for session in sessions)
-        self._sums = [_Sums(*each, count) for each in zip(sessions, weights, strict=True)] if by_products else None
+        # Sums over all trials are made once for all splits.
+        self._sums = self._summed(self._every) if by_products else None
 
     def whole(self) -> Floats:
-        """Return the RDMs [N, P] of all weighted trials."""
+        """Return the RDM [P] of all trials."""
         found = None if self._sums is None else self._from_products(self._sums)
-        return self._from_patterns(self._weights) if found is None else found
+        return (self._from_patterns(self._every) if found is None else found)[0]
 
     def halves(self, members: list[Floats]) -> tuple[Floats, Floats]:
-        """Return the RDMs [N, P] of both halves, from 1 for the trials [N or 1, R] of each session's first half."""
-        first = [weight * member for weight, member in zip(self._weights, members, strict=True)]
+        """Return the RDMs [N, P] of both halves, from 1 for the trials [N, R] of each session's first half, else 0."""
         if self._sums is not None:
-            sums = [_Sums(*each, self._count) for each in zip(self._sessions, first, strict=True)]
+            sums = self._summed(members)
             rest = [whole.without(half) for whole, half in zip(self._sums, sums, strict=True)]
             one, two = self._from_products(sums), self._from_products(rest)
             if one is not None and two is not None:
                 return one, two
-        second = [weight - half for weight, half in zip(self._weights, first, strict=True)]
-        return self._from_patterns(first), self._from_patterns(second)
+        return self._from_patterns(members), self._from_patterns([1.0 - member for member in members])
+
+    def _summed(self, members: list[Floats]) -> list[_Sums]:
+        return [_Sums(*each, self._count) for each in zip(self._sessions, members, strict=True)]
 
     def _from_products(self, sums: list[_Sums]) -> Floats | None:
         """Return RDMs from summed trials, NaN where a stimulus has none left; None where that would lose digits."""
@@ -74,7 +75,7 @@ class WeightedRDMs:
                 own = part.gram / (number[:, :, None] * number[:, None, :])
                 if self._method == "crossnobis":
                     # The product of a trial with itself holds its noise; those of different trials do not.
-                    pairs = part.number**2 - part.number_squared
+                    pairs = part.number * (part.number - 1)
                     free = (np.einsum("nii->ni", part.gram) - part.squares) / np.where(pairs > 0, pairs, np.nan)
                     diagonal = np.einsum("nii->ni", own)
                     diagonal[...] = diagonal - self._sessions[index].inflation * (diagonal - free)
@@ -88,12 +89,12 @@ class WeightedRDMs:
             return None
         return correlation_from_gram(centred, np.zeros(gram.shape[:2]))
 
-    def _from_patterns(self, weights: list[Floats]) -> Floats:
+    def _from_patterns(self, members: list[Floats]) -> Floats:
         """Return RDMs from mean patterns: any method, missing entries, large common offsets."""
         unbiased = self._method == "crossnobis"
         found = [
-            weighted_patterns(session, weight, self._count, variances=unbiased)
-            for session, weight in zip(self._sessions, weights, strict=True)
+            mean_patterns(session, member, self._count, variances=unbiased)
+            for session, member in zip(self._sessions, members, strict=True)
         ]
         patterns, variances = (np.concatenate([item[part] for item in found], axis=-1) for part in (0, 1))
         if unbiased:
@@ -107,21 +108,20 @@ class WeightedRDMs:
 
 
 class _Sums:
-    """Sums over weighted trials of one session: of patterns [N, K, F], and of what distances take from them."""
+    """Sums over the member trials of one session: of patterns [N, K, F], and of what distances take from them."""
 
-    def __init__(self, session: SortedTrials, weights: Floats, count: int) -> None:
+    def __init__(self, session: SortedTrials, members: Floats, count: int) -> None:
         groups = [session.group(stimulus) for stimulus in range(count)]
         factor = session.factor
-        self.patterns = np.empty((len(weights), count, factor.shape[1]))
+        self.patterns = np.empty((len(members), count, factor.shape[1]))
         for stimulus, rows in enumerate(groups):
-            np.matmul(weights[:, rows], factor[rows], out=self.patterns[:, stimulus])
+            np.matmul(members[:, rows], factor[rows], out=self.patterns[:, stimulus])
         # Trials are sorted by stimulus, so one pass of reduceat sums each of them.
         starts = [rows.start for rows in groups]
         own = np.einsum("ru,ru->r", factor, factor)
-        self.number = np.add.reduceat(weights, starts, axis=1)
-        self.number_squared = np.add.reduceat(weights**2, starts, axis=1)
-        self.units = np.add.reduceat(weights * session.responses.sum(axis=1), starts, axis=1)
-        self.squares = np.add.reduceat(weights**2 * own, starts, axis=1)
+        self.number = np.add.reduceat(members, starts, axis=1)
+        self.units = np.add.reduceat(members * session.responses.sum(axis=1), starts, axis=1)
+        self.squares = np.add.reduceat(members * own, starts, axis=1)
         self.gram = self.patterns @ self.patterns.swapaxes(-1, -2)
 
     def without(self, half: _Sums) -> _Sums:
@@ -130,7 +130,7 @@ class _Sums:
         # (S − H)(S − H)ᵀ = SSᵀ − SHᵀ − HSᵀ + HHᵀ for the sums S of all trials and H of one half.
         cross = self.patterns @ half.patterns.swapaxes(-1, -2)
         other.gram = self.gram - cross - cross.swapaxes(-1, -2) + half.gram
-        for name in ("number", "number_squared", "units", "squares"):
+        for name in ("number", "units", "squares"):
             setattr(other, name, getattr(self, name) - getattr(half, name))
         return other
 
@@ -151,33 +151,34 @@ def _unbiased_distances(patterns: Floats, variances: Floats) -> Floats:
         return product_distances(seen, seen, missing=True) - upper((own + np.swapaxes(own, -1, -2)) / both)
 
 
-def weighted_patterns(session: SortedTrials, weights: Floats, count: int, *, variances: bool) -> tuple[Floats, Floats]:
-    """Return mean patterns [N, K, F] over trials weighted by [N, R], and their variances (empty unless asked for).
+def mean_patterns(session: SortedTrials, members: Floats, count: int, *, variances: bool) -> tuple[Floats, Floats]:
+    """Return mean patterns [N, K, F] over the trials that are 1 in [N, R], and, if asked for, their variances.
 
-    A unit without a weighted trial of a stimulus is NaN there; a variance needs two.
+    A unit without a trial of a stimulus is NaN there; a variance needs two.
     """
-    shape = (len(weights), count, session.responses.shape[1])
+    shape = (len(members), count, session.responses.shape[1])
     means, spread = np.empty(shape), np.empty(shape if variances else (0, *shape[1:]))
     filled = session.responses if session.complete else np.nan_to_num(session.responses)
     with np.errstate(invalid="ignore", divide="ignore"):
         for stimulus in range(count):
             rows = session.group(stimulus)
-            weight = weights[:, rows]
+            member = members[:, rows]
             # A unit unseen in these trials is missing here, not silent.
-            seen = np.ones((weight.shape[1], 1)) if session.complete else np.isfinite(session.responses[rows]) * 1.0
-            number = weight @ seen
+            seen = np.ones((member.shape[1], 1)) if session.complete else np.isfinite(session.responses[rows]) * 1.0
+            number = member @ seen
             number[number == 0] = np.nan
-            means[:, stimulus] = weight @ filled[rows] / number
+            means[:, stimulus] = member @ filled[rows] / number
             if variances:
-                # Repeats of one trial tell nothing of its noise: only products of different trials count.
-                squares, pairs = weight**2 @ filled[rows] ** 2, number**2 - weight**2 @ seen
-                free = ((weight @ filled[rows]) ** 2 - squares) / np.where(pairs > 0, pairs, np.nan)
+                # The product of a trial with itself holds its noise: only those of different trials count.
+                pairs = number * (number - 1)
+                products = (member @ filled[rows]) ** 2 - member @ filled[rows] ** 2
+                free = products / np.where(pairs > 0, pairs, np.nan)
                 spread[:, stimulus] = session.inflation * (means[:, stimulus] ** 2 - free)
     return means, spread
 
 
 def chunk_size(sessions: list[SortedTrials], count: int) -> int:
-    """Return how many weightings are computed at once."""
+    """Return how many splits are computed at once."""
     width = sum(min(session.responses.shape) for session in sessions)
     return max(1, _CHUNK_BYTES // (8 * count * max(width, count)))
 
@@ -202,10 +203,10 @@ def split_members(session: SortedTrials, count: int, index: Ints, seed: int) -> 
 
 def half_rdms(sessions: list[SortedTrials], count: int, method: str, index: Ints, seed: int) -> tuple[Floats, Floats]:
     """Return the RDMs [S, P] of both halves of the splits ``index`` [S]."""
-    all_trials = WeightedRDMs(sessions, [np.ones((1, len(session.labels))) for session in sessions], count, method)
+    every = SplitRDMs(sessions, count, method)
     step = chunk_size(sessions, count)
     parts = [
-        all_trials.halves([split_members(session, count, index[start : start + step], seed) for session in sessions])
+        every.halves([split_members(session, count, index[start : start + step], seed) for session in sessions])
         for start in range(0, len(index), step)
     ]
     return np.concatenate([part[0] for part in parts]), np.concatenate([part[1] for part in parts])

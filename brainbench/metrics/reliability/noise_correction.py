@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike
 
 from brainbench.core.errors import UsageError, unknown_name
 from brainbench.core.records import Status
+from brainbench.metrics.arrays import finite_mean
 from brainbench.metrics.rdms.pairs import Floats
 
 RELIABILITY_GATE = 0.5
@@ -113,7 +114,7 @@ def noise_corrected(
     r = float(finite_mean(comparison))
     sides = [float(spearman_brown(finite_mean(side))) for side in (halves, others) if side is not None]
     reliability = sides[0] if len(sides) == 1 else math.sqrt(math.prod(sides)) if min(sides) > 0 else min(sides)
-    value, splits, reason = _ESTIMATORS[estimator](comparison, halves, others)
+    value, splits, reason = _ESTIMATORS[estimator](comparison, halves, others, sides)
     if math.isnan(r):
         value, reason = math.nan, "the comparison of the RDMs is undefined (a constant or missing RDM)"
     if math.isnan(value):
@@ -126,9 +127,8 @@ def noise_corrected(
     return Corrected(value, "ok", "", r, reliability, splits)
 
 
-def _default(r_xy: Floats, halves: Floats, others: Floats | None) -> tuple[float, int, str]:
+def _default(r_xy: Floats, halves: Floats, others: Floats | None, sides: list[float]) -> tuple[float, int, str]:
     # Correlations are averaged before the ratio is formed, so that no split with a denominator near zero dominates.
-    sides = [float(spearman_brown(finite_mean(side))) for side in (halves, others) if side is not None]
     lowest = min(sides) if not any(map(math.isnan, sides)) else math.nan
     if math.isnan(lowest):
         return math.nan, 0, "the split-half reliability is undefined"
@@ -137,7 +137,7 @@ def _default(r_xy: Floats, halves: Floats, others: Floats | None) -> tuple[float
     return float(finite_mean(r_xy)) / math.sqrt(math.prod(sides)), int(np.isfinite(halves).sum()), ""
 
 
-def _thesis(r_xy: Floats, halves: Floats, others: Floats | None) -> tuple[float, int, str]:
+def _thesis(r_xy: Floats, halves: Floats, others: Floats | None, sides: list[float]) -> tuple[float, int, str]:
     ratio, _ = corrected_splits(r_xy, halves, others)
     # As published for models: splits below the filter are dropped, which keeps the lucky ones.
     kept = ratio[np.broadcast_to(halves >= THESIS_FILTER, ratio.shape) & np.isfinite(ratio)]
@@ -146,7 +146,7 @@ def _thesis(r_xy: Floats, halves: Floats, others: Floats | None) -> tuple[float,
     return float(kept.mean()), kept.size, ""
 
 
-def _thesis_input(r_xy: Floats, halves: Floats, others: Floats | None) -> tuple[float, int, str]:
+def _thesis_input(r_xy: Floats, halves: Floats, others: Floats | None, sides: list[float]) -> tuple[float, int, str]:
     ratio, _ = corrected_splits(r_xy, halves, others)
     # As published for the raw input: imaginary ratios vanish, and the median is taken of the others.
     kept = ratio[np.isfinite(ratio)]
@@ -155,14 +155,7 @@ def _thesis_input(r_xy: Floats, halves: Floats, others: Floats | None) -> tuple[
     return float(np.median(kept)), kept.size, ""
 
 
-def finite_mean(values: Floats) -> Floats:
-    """Return the mean over the finite values of the last axis; NaN where there is none."""
-    present = np.isfinite(values)
-    number = present.sum(axis=-1)
-    return np.where(number > 0, np.where(present, values, 0.0).sum(axis=-1) / np.maximum(number, 1), np.nan)
-
-
-_ESTIMATORS: dict[str, Callable[[Floats, Floats, Floats | None], tuple[float, int, str]]] = {
+_ESTIMATORS: dict[str, Callable[[Floats, Floats, Floats | None, list[float]], tuple[float, int, str]]] = {
     "default": _default,
     "thesis": _thesis,
     "thesis-input": _thesis_input,

@@ -23,7 +23,7 @@ from brainbench.core.records import Interval
 from brainbench.core.trials import Trials
 from brainbench.metrics.rdms.comparison import check_comparison, compare
 from brainbench.metrics.rdms.pairs import Floats, Ints, permuted_pairs, stimulus_count
-from brainbench.metrics.reliability.halves import WeightedRDMs, half_rdms
+from brainbench.metrics.reliability.halves import SplitRDMs, half_rdms
 from brainbench.metrics.reliability.noise_correction import spearman_brown
 from brainbench.metrics.reliability.sessions import SortedTrials, shifted_sessions, usable_sessions
 from brainbench.metrics.reliability.whitening import whitened_sessions
@@ -172,9 +172,8 @@ def subject_rdm(
     patterns, variances = _mean_responses(sessions, n_stimuli)
     if distance != "poisson":
         sessions = shifted_sessions(sessions, n_stimuli, by_unit=distance != "correlation")
-    every = WeightedRDMs(sessions, [np.ones((1, len(session.labels))) for session in sessions], n_stimuli, distance)
-    # Sums over all trials are made once; halves are weightings of the same sorted trials.
-    rdm, halves, r = every.whole()[0], *_split_halves(sessions, n_stimuli, distance, comparison, splits, seed)
+    rdm = SplitRDMs(sessions, n_stimuli, distance).whole()
+    halves, r = _split_halves(sessions, n_stimuli, distance, comparison, splits, seed)
     found = replace(empty, rdm=rdm, split_half_r=r, halves=halves, patterns=patterns, noise=variances)
     finite = r[np.isfinite(r)]
     if not np.isfinite(rdm).all() or not finite.size:

@@ -15,9 +15,10 @@ import numpy as np
 
 from brainbench.core.errors import UsageError
 from brainbench.core.trials import Trials
+from brainbench.metrics.arrays import finite_mean
 from brainbench.metrics.rdms.comparison import features
 from brainbench.metrics.rdms.pairs import Floats
-from brainbench.metrics.reliability.halves import split_members, weighted_patterns
+from brainbench.metrics.reliability.halves import mean_patterns, split_members
 from brainbench.metrics.reliability.noise_correction import spearman_brown
 from brainbench.metrics.reliability.sessions import SortedTrials, trial_hashes
 from brainbench.metrics.stimulus_labels import response_matrix, stimulus_codes
@@ -34,6 +35,7 @@ def unit_reliability(
 ) -> tuple[Floats, ...]:
     """Return the reliability of every unit's tuning [F], for each session; NaN where it has none.
 
+    Responses are [R, F] or [R, T, F], whose time is averaged.
     A unit without variation over stimuli, or with fewer than two trials of some stimulus in every split,
     has no reliability. Values can be negative.
 
@@ -44,14 +46,16 @@ def unit_reliability(
         raise UsageError(f"A unit's tuning needs at least 3 stimuli and 1 split; received {n_stimuli} and {splits}.")
     found = []
     for block in blocks:
-        responses = response_matrix(block.responses, "trials").astype(np.float64)
+        values = np.asarray(block.responses)
+        values = finite_mean(values, axis=1) if values.ndim == 3 else values
+        responses = response_matrix(values, "trials").astype(np.float64)
         codes, _ = stimulus_codes(block.labels, n_stimuli)
         session = SortedTrials.sort(responses, codes, trial_hashes(block, responses, codes))
         total, number = np.zeros(responses.shape[1]), np.zeros(responses.shape[1])
         for start in range(0, splits, _CHUNK):
             member = split_members(session, n_stimuli, np.arange(start, min(start + _CHUNK, splits)), seed)
             # Split by split, so that memory holds a chunk of splits of one session.
-            halves = [weighted_patterns(session, w, n_stimuli, variances=False)[0] for w in (member, 1.0 - member)]
+            halves = [mean_patterns(session, w, n_stimuli, variances=False)[0] for w in (member, 1.0 - member)]
             # Pearson's r over stimuli between the halves' mean responses, of all units and splits at once.
             first, second = (features(half.swapaxes(-1, -2), "pearson") for half in halves)
             r = np.einsum("sfk,sfk->sf", first, second)
@@ -79,7 +83,7 @@ def reliable_units(
     for block, value in zip(blocks, values, strict=True):
         good = value >= least
         if good.any():
-            kept.append(replace(block, responses=np.asarray(block.responses)[:, good]))
+            kept.append(replace(block, responses=np.asarray(block.responses)[..., good]))
     every = sum(len(value) for value in values)
     left = sum(int((~(value >= least)).sum()) for value in values)
     return tuple(kept), f"{left} of {every} units left out: reliability of their tuning below {least:g}"

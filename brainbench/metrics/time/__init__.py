@@ -1,11 +1,12 @@
 """Scores over time: when a model's layers and animals represent stimuli alike, and how far one lags behind the other.
 
 Data pass in this order: ``movies`` (an RDM for every time bin, of layers and of animals) → ``lags`` (each layer against
-the animals at every lag) → ``course`` (the score at each time, corrected for having looked at many times, and the
-latency of each layer).
+the animals at every lag) → ``course`` (the score at each time, corrected for having looked at many times) and
+``latency`` (of each layer).
 """
 
-from brainbench.metrics.time.course import LayerLatency, TimeCourse, TimePoint, score_over_time
+from brainbench.metrics.time.course import TimeCourse, TimePoint, score_over_time
+from brainbench.metrics.time.latency import LayerLatency
 from brainbench.metrics.time.movies import AnimalMovie, animal_movie, in_bins, layer_movie
 
 __all__ = [

@@ -1,12 +1,9 @@
-"""The score at each time, and the latency of each layer.
+"""The score at each time.
 
 The layer and the lag for an animal are those that suit the *other* animals best over all times; at each time the
 animal's comparison with that layer is corrected for the animal's noise in that bin. All of it is repeated under
 permuted stimuli, and a time counts as significant where its standardised mean comparison exceeds the largest over all
 times of the permutations (maximum statistic, Nichols & Holmes 2002, doi:10.1002/hbm.1058).
-
-A layer's latency is the lag at which its mean comparison over times and animals, less chance, is highest. Its error is
-a jackknife over animals and stimuli (Miller, Patterson & Ulrich 1998, doi:10.1111/1469-8986.3510099, for animals).
 
 Letters: N permutation, L layer, G lag, T time bin, A animal, K stimulus, P RDM pair.
 """
@@ -18,24 +15,24 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from brainbench.core.errors import UsageError
 from brainbench.core.records import Interval
 from brainbench.core.statistics import FEWEST_ANIMALS, FEWEST_STIMULI
+from brainbench.metrics.arrays import finite_mean
 from brainbench.metrics.inference.intervals import two_factor_interval
 from brainbench.metrics.inference.permutation import tail_p
 from brainbench.metrics.layers import most_chosen
 from brainbench.metrics.rdms.comparison import check_comparison
 from brainbench.metrics.rdms.pairs import Floats, rdm_stack
 from brainbench.metrics.reliability.noise_correction import RELIABILITY_GATE
-from brainbench.metrics.time.lags import LaggedRDMs, best_lag, held_out_course, votes
+from brainbench.metrics.time.lags import LaggedRDMs, held_out_course, votes
+from brainbench.metrics.time.latency import LayerLatency, layer_latencies, standardised
 from brainbench.metrics.time.movies import AnimalMovie
 
 PERMUTATIONS = 1000
 """Random orders of the stimuli, above six stimuli; all orders up to six."""
-ALPHA = 0.05
-"""Level at which a layer's latency is given."""
 _FARTHEST = 0.4
 """Largest lag, as a share of the recorded time."""
 
@@ -60,23 +57,6 @@ class TimePoint:
     """Permutation p, corrected for the number of times."""
     interval: Interval | None = None
     """Interval of ``value`` over animals and stimuli."""
-
-
-@dataclass(frozen=True)
-class LayerLatency:
-    """How far the animals lag behind one layer."""
-
-    layer: str
-    latency: float
-    """Lag of the best match, seconds; positive where neurons follow the model. NaN where ``reason`` says why."""
-    value: float
-    """Mean raw comparison at the best lag, less chance."""
-    p: float
-    """Permutation p of the best match over lags, corrected for the number of layers and lags."""
-    interval: Interval | None = None
-    """Interval of ``latency`` over animals and stimuli."""
-    reason: str = ""
-    """Reason for having no latency."""
 
 
 @dataclass(frozen=True)
@@ -135,9 +115,9 @@ def score_over_time(
         expected = expected + r.sum(axis=0)
         course, picked = held_out_course(r)
         chosen = picked[0] if chosen is None else chosen
-        courses.append(_mean(course))
-        values.append(_mean(course * factors))
-        matches.append(_mean(votes(r)))
+        courses.append(finite_mean(course))
+        values.append(finite_mean(course * factors))
+        matches.append(finite_mean(votes(r)))
     assert chosen is not None
     # The first order is the given one.
     course, value, match = (np.concatenate(parts) for parts in (courses, values, matches))
@@ -145,14 +125,15 @@ def score_over_time(
     observed = joined.compared()
     own = held_out_course(observed)[0][0] * factors
     left_out = [joined.without_stimulus(stimulus) for stimulus in range(joined.stimuli)]
-    intervals = _intervals(own, np.stack([_mean(held_out_course(item)[0][0] * factors) for item in left_out], axis=-1))
+    without_each = [finite_mean(held_out_course(item)[0][0] * factors) for item in left_out]
+    intervals = _intervals(own, np.stack(without_each, axis=-1))
     points = tuple(
         TimePoint(
             time=(index + 0.5) * width,
             value=float(value[0, index]),
             r=float(course[0, index]),
-            chance=float(_mean(value[:, index])),
-            reliability=float(_mean(reliability[index])),
+            chance=float(finite_mean(value[:, index])),
+            reliability=float(finite_mean(reliability[index])),
             animals=int(np.isfinite(own[index]).sum()),
             p=float(p[index]),
             interval=intervals[index],
@@ -161,7 +142,7 @@ def score_over_time(
     )
     names, chance = tuple(layers), expected / len(course)
     excess, without = observed[0] - chance, [item[0] - chance for item in left_out]
-    latencies = _latencies(names, joined.lags.astype(np.float64) * width, excess, without, match)
+    latencies = layer_latencies(names, joined.lags.astype(np.float64) * width, excess, without, match)
     if not np.isfinite(factors).any():
         # What unreliable bins match is noise, or what all bins share, and either has no lag.
         reason = "no animal is reliable in any bin"
@@ -208,27 +189,9 @@ def _factors(reliability: Floats) -> Floats:
     return np.where(trusted, 1 / np.sqrt(np.where(trusted, reliability, 1.0)), np.nan)
 
 
-def _mean(values: Floats) -> NDArray[np.float64]:
-    """Return the mean over the finite entries of the last axis; NaN without any."""
-    present = np.isfinite(values)
-    number = present.sum(axis=-1)
-    total = np.where(present, values, 0.0).sum(axis=-1)
-    return np.divide(total, number, out=np.full(total.shape, np.nan), where=number > 0)
-
-
-def _standardised(null: Floats) -> Floats:
-    """Return statistics [N, ...] in standard deviations from their mean over permutations; −∞ where undefined."""
-    # Chance differs between times and lags: by an early bin's few spikes, by the bins that overlap.
-    with np.errstate(invalid="ignore", divide="ignore"):
-        mean = _mean(np.moveaxis(null, 0, -1))
-        spread = np.sqrt(_mean(np.moveaxis((null - mean) ** 2, 0, -1)))
-        z = (null - mean) / spread
-    return np.where(np.isfinite(z), z, -np.inf)
-
-
 def _largest_p(null: Floats) -> tuple[Floats, float]:
     """Return p of every entry of statistics [N, M], corrected by the largest in each permutation, and of the best."""
-    z = _standardised(null)
+    z = standardised(null)
     largest = z.max(axis=1)
     p = np.where(np.isfinite(null[0]), tail_p(largest[:, None], z[0]), np.nan)
     return p, float(tail_p(largest))
@@ -238,59 +201,8 @@ def _intervals(animals: Floats, left_out: Floats) -> list[Interval | None]:
     """Return the interval of the mean of values [T, A] whose means without each stimulus are [T, K]."""
     return [
         two_factor_interval(float(mean), *item) if np.isfinite(mean) else None
-        for mean, *item in zip(_mean(animals), animals, left_out, strict=True)
+        for mean, *item in zip(finite_mean(animals), animals, left_out, strict=True)
     ]
-
-
-def _latencies(
-    names: tuple[str, ...], lags: Floats, excess: Floats, left_out: list[Floats], match: Floats
-) -> tuple[LayerLatency, ...]:
-    """Return every layer's latency.
-
-    Args:
-        names: Layers.
-        lags: [G] seconds.
-        excess: Comparisons less chance [L, G, T, A].
-        left_out: The same without each stimulus in turn.
-        match: Mean comparison under permutations [N, L, G], the given order first.
-    """
-    z = _standardised(match)
-    p = tail_p(z.reshape(len(z), -1).max(axis=1)[:, None], z[0].max(axis=-1))
-    animals, step = excess.shape[-1], lags[1] - lags[0]
-
-    def latency(values: Floats) -> Floats:
-        return lags[0] + step * best_lag(values)
-
-    best = latency(excess)
-    # Pseudo-values, whose variance over animals is that of the jackknife.
-    singles = np.stack([latency(np.delete(excess, index, axis=-1)) for index in range(animals)], axis=-1)
-    pseudo = animals * best[:, None] - (animals - 1) * singles
-    without = np.stack([latency(item) for item in left_out], axis=-1)
-    reached = _mean(votes(excess[None])[0])
-    found = []
-    for index, name in enumerate(names):
-        tried, reason = int(np.isfinite(reached[index]).sum()), ""
-        if tried < 3:
-            reason = "the layer has no time" if tried == 1 else "too few lags have a comparison"
-        elif p[index] > ALPHA:
-            reason = "no lag matches better than permuted stimuli"
-        elif not math.isfinite(best[index]):
-            reason = f"the best match lies at the end of the lags tried, {lags[0]:g} to {lags[-1]:g} s"
-        # One replicate without a peak would make the error too small.
-        steady = bool(np.isfinite(pseudo[index]).all() and np.isfinite(without[index]).all()) and animals > 1
-        found.append(
-            LayerLatency(
-                layer=name,
-                latency=math.nan if reason else float(best[index]),
-                value=float(np.nanmax(reached[index])) if tried else math.nan,
-                p=float(p[index]) if tried else math.nan,
-                interval=two_factor_interval(float(best[index]), pseudo[index], without[index])
-                if steady and not reason
-                else None,
-                reason=reason,
-            )
-        )
-    return tuple(found)
 
 
 def _reasons(animals: Sequence[AnimalMovie], points: tuple[TimePoint, ...], stimuli: int) -> tuple[str, ...]:
@@ -303,6 +215,8 @@ def _reasons(animals: Sequence[AnimalMovie], points: tuple[TimePoint, ...], stim
     blind = sum(point.animals == 0 for point in points)
     if blind:
         reasons.append(f"no animal is reliable in {blind} of {len(points)} bins, which have no corrected value")
+    if len(animals) == 1:
+        reasons.append("optimistic: layer and lag are the best of the only animal; the permutations take the same best")
     broken = {item.subject: next(filter(None, item.problems)) for item in animals if any(item.problems)}
     reasons += [f"{subject} has no RDM in some bins: {problem}" for subject, problem in broken.items()]
     return tuple(reasons)

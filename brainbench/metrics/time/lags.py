@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from brainbench.metrics.arrays import finite_mean
 from brainbench.metrics.inference.permutation import canonical_order, label_orders
 from brainbench.metrics.layers import choose_on_others
 from brainbench.metrics.rdms.comparison import compare_all, permuted_comparisons
@@ -109,10 +110,7 @@ class LaggedRDMs:
 
 def votes(r: Floats) -> Floats:
     """Return the mean over time [N, L, G, A] of comparisons [N, L, G, T, A]; NaN where there are none."""
-    present = np.isfinite(r)
-    number = present.sum(axis=-2)
-    total = np.where(present, r, 0.0).sum(axis=-2)
-    return np.divide(total, number, out=np.full(total.shape, np.nan), where=number > 0)
+    return finite_mean(r, axis=-2)
 
 
 def held_out_course(r: Floats) -> tuple[Floats, Ints]:
@@ -140,7 +138,7 @@ def profile(excess: Floats) -> Floats:
     response nothing does). So neighbouring lags are compared over the bins that both have, and the differences added
     up. NaN where a lag has no comparison.
     """
-    steps = _mean_over_bins(excess[:, 1:] - excess[:, :-1])
+    steps = finite_mean(excess[:, 1:] - excess[:, :-1], axis=(-2, -1))
     total = np.cumsum(np.nan_to_num(steps), axis=-1)
     found = np.concatenate([np.zeros((len(excess), 1)), total], axis=-1)
     return np.where(np.isfinite(excess).any(axis=(-2, -1)), found, np.nan)
@@ -157,17 +155,9 @@ def best_lag(excess: Floats) -> Floats:
     at = np.clip(top, 1, excess.shape[1] - 2)
     three = np.take_along_axis(excess, (at[:, None] + np.arange(-1, 2))[:, :, None, None], axis=1)
     shared = np.where(np.isfinite(three).all(axis=1, keepdims=True), three, np.nan)
-    before, here, after = _mean_over_bins(shared).T
+    before, here, after = finite_mean(shared, axis=(-2, -1)).T
     with np.errstate(invalid="ignore", divide="ignore"):
         shift = 0.5 * (before - after) / (before - 2 * here + after)
     # Over fewer bins the peak may move, but not beyond the neighbours.
     inside = (top == at) & np.isfinite(shift) & (before - 2 * here + after < 0)
     return np.where(inside, at + np.clip(shift, -1, 1), np.nan)
-
-
-def _mean_over_bins(values: Floats) -> Floats:
-    """Return the mean [L, G] over the finite entries of values [L, G, T, A]."""
-    present = np.isfinite(values)
-    number = present.sum(axis=(-2, -1))
-    total = np.where(present, values, 0.0).sum(axis=(-2, -1))
-    return np.divide(total, number, out=np.full(total.shape, np.nan), where=number > 0)

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 
 from brainbench.core.errors import UsageError
 from brainbench.core.trials import Trials
-from brainbench.metrics.rdms.dissimilarity import rdm_movie
+from brainbench.metrics.rdms.movies import rdm_movie
 from brainbench.metrics.rdms.pairs import Floats
 from brainbench.metrics.reliability.subject_rdm import subject_rdm
 

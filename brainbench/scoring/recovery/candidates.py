@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -16,11 +16,9 @@ from numpy.typing import ArrayLike, NDArray
 from brainbench.core.errors import UsageError, listing, unknown_name
 from brainbench.core.files import content_hash
 from brainbench.core.progress import Progress
-from brainbench.datasets.synthetic.geometry import ResponseGeometry
+from brainbench.datasets.synthetic.geometry import ResponseGeometry, principal_axes
+from brainbench.metrics.measures.metric import Metric
 from brainbench.scoring.options import ScoreOptions
-
-if TYPE_CHECKING:
-    from brainbench.metrics.measures.metric import Metric
 
 
 @dataclass(frozen=True)
@@ -95,12 +93,7 @@ class Candidate:
     @cached_property
     def _axes(self) -> dict[str, NDArray[np.float64]]:
         """Layer → [K, ≤ K] stimuli on the principal axes of its features: the same distances in fewer columns."""
-        found = {}
-        for layer, values in self.features.items():
-            left, size, _ = np.linalg.svd(values - values.mean(axis=0), full_matrices=False)
-            signs = np.sign(left[np.abs(left).argmax(axis=0), np.arange(left.shape[1])])
-            found[layer] = (left * signs * size)[:, size > 1e-9 * size[0]]
-        return found
+        return {layer: principal_axes(values - values.mean(axis=0)) for layer, values in self.features.items()}
 
     @property
     def identity(self) -> str:

@@ -11,22 +11,20 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from brainbench.core.errors import UsageError
 from brainbench.core.progress import Progress
 from brainbench.metrics.layers import held_out
+from brainbench.metrics.measures.metric import Metric
 from brainbench.metrics.measures.registry import get_metric
 from brainbench.metrics.rdms.comparison import compare_all
 from brainbench.metrics.rdms.pairs import Floats, Ints, permuted_pairs
 from brainbench.scoring.recovery.boards import draw_board
 from brainbench.scoring.recovery.candidates import Candidate
 from brainbench.scoring.recovery.design import FEWEST_STIMULI, RecoveryDesign
-
-if TYPE_CHECKING:
-    from brainbench.metrics.measures.metric import Metric
+from brainbench.scoring.recovery.study import check_candidates
 
 BOARDS = 4
 """Boards of each candidate on which stimuli are chosen."""
@@ -68,9 +66,10 @@ def select_stimuli(
         progress: Called as ``progress(exchanges tried, exchanges, what)``.
 
     Raises:
-        UsageError: the pool is too small, ``keep`` too few, or the metric does not compare RDMs.
+        UsageError: as :func:`recover`; the pool is too small, ``keep`` too few, or the metric does not compare RDMs.
     """
     design = replace(design or RecoveryDesign(), stimuli=None)
+    check_candidates(candidates, design, boards)
     pool = len(candidates[0].stimuli)
     if not FEWEST_STIMULI <= keep <= pool:
         raise UsageError(f"The pool has {pool} stimuli; {keep} cannot be kept, only {FEWEST_STIMULI} to {pool}.")

@@ -8,6 +8,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from brainbench.core.errors import UsageError
 from brainbench.core.files import content_hash, read_json, to_plain, write_json
 from brainbench.core.jobs import run_jobs
@@ -68,7 +70,7 @@ def recover(
             the folder holds another recovery.
     """
     design = design or RecoveryDesign()
-    _check(candidates, design, boards)
+    check_candidates(candidates, design, boards)
     jobs = [
         _Job(true, tuple(range(start, min(start + _TOGETHER, first + boards))))
         for start in range(first, first + boards, _TOGETHER)
@@ -107,8 +109,8 @@ def _shown(candidates: Sequence[Candidate], design: RecoveryDesign) -> int:
     return design.stimuli or len(candidates[0].stimuli)
 
 
-def _check(candidates: Sequence[Candidate], design: RecoveryDesign, boards: int) -> None:
-    """Refuse what cannot be run, before any work."""
+def check_candidates(candidates: Sequence[Candidate], design: RecoveryDesign, boards: int) -> None:
+    """Raise UsageError for what cannot be run, before any work."""
     if len(candidates) < 2:
         raise UsageError(f"A recovery tells candidates apart and needs at least two; received {len(candidates)}.")
     if boards < 1:
@@ -118,10 +120,12 @@ def _check(candidates: Sequence[Candidate], design: RecoveryDesign, boards: int)
         raise UsageError("The candidates saw different stimuli; run all of them on the same ones in the same order.")
     if _shown(candidates, design) > pool:
         raise UsageError(f"A board of {design.stimuli} stimuli was asked for; the pool has {pool}.")
-    get_metric(design.metric)
+    if get_metric(design.metric).of_model_alone:
+        raise UsageError(
+            f"The metric {design.metric!r} scores a model without looking at the animals, so it cannot tell who made "
+            "their data; choose another, such as 'rsa'."
+        )
     if design.layer not in ("any", "last"):
-        import numpy as np
-
         for item in candidates:
             item.choose(design.layer, np.random.default_rng(0))
 

@@ -64,6 +64,10 @@ def test_a_model_of_the_shared_geometry_passes_and_an_unrelated_one_does_not():
     luck = score_rdms({"a": rdm(make_latent(99, stimuli=16))}, animals, name="luck", stimuli=stimuli)
     assert turing_test(true, between, margin=0.15).verdict == "equivalent"
     assert turing_test(luck, between, margin=0.15).verdict == "worse"
+    # A verdict is no better than the scores behind it.
+    doubtful = turing_test(dataclasses.replace(true, status="unreliable"), between, margin=0.15)
+    assert (doubtful.verdict, doubtful.status) == ("equivalent", "unreliable")
+    assert "true" in doubtful.reason
     with pytest.raises(UsageError, match="'default' and 'thesis'"):
         turing_test(true, dataclasses.replace(between, estimator="thesis"))
 

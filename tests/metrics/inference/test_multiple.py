@@ -10,8 +10,8 @@ from scipy import stats
 
 from brainbench.core.errors import UsageError
 from brainbench.metrics import compare, compare_models, permutation_test
-from brainbench.metrics.inference.multiple import adjust, compare_scores, layer_tests, step_down
-from brainbench.metrics.inference.permutation import permuted_values
+from brainbench.metrics.inference.multiple import adjust, compare_scores, step_down
+from brainbench.metrics.inference.permutation import layer_p, permuted_values
 from brainbench.metrics.measures.rsa import score_rdms
 from tests.factories.animals import STIMULI, make_rdm, make_subject
 
@@ -122,16 +122,15 @@ def test_layers_are_corrected_by_their_largest():
     shared = make_rdm(rng)
     animals = _make_animals(rng, shared)
     layers = {"luck": make_rdm(rng), "flat": np.full(15, 0.5), "true": shared}
-    luck, flat, true = layer_tests(layers, animals)
+    score = score_rdms(layers, animals, name="x", stimuli=STIMULI)
+    luck, true = score.provenance.statistics["layer_tests"]
     brain = np.stack([animal.rdm for animal in animals])
-    assert luck.p == pytest.approx(permutation_test(layers["luck"], brain).p, abs=0.02)
-    assert luck.p_corrected >= luck.p
-    assert true.p == true.p_corrected == pytest.approx(1 / 720)
-    assert np.isnan([flat.value, flat.p, flat.p_corrected]).all()
+    assert (luck["layer"], true["layer"]) == ("luck", "true")
+    assert luck["p"] == pytest.approx(permutation_test(layers["luck"], brain).p, abs=0.02)
+    assert luck["p_corrected"] >= luck["p"]
+    assert true["p"] == true["p_corrected"] == pytest.approx(1 / 720)
     factor = np.sqrt((1 + 0.45 / 0.55) / 2 / (0.45 / 0.55))
-    assert luck.value == pytest.approx(compare(layers["luck"], brain).mean() * factor, rel=1e-6)
-    without = [dataclasses.replace(animal, problem="no trials of 'a'") for animal in animals]
-    assert np.isnan(layer_tests(layers, without)[0].p)
+    assert score.layers[0].value == pytest.approx(compare(layers["luck"], brain).mean() * factor, rel=1e-6)
 
 
 @pytest.mark.slow
@@ -141,10 +140,9 @@ def test_false_alarms_over_twenty_models_and_over_twelve_layers_keep_their_level
     for _ in range(2000):
         animals = _make_animals(rng, make_rdm(rng), 3, noise=0.1)
         given = np.stack([make_rdm(rng) for _ in range(20)])
-        found = layer_tests({str(i): rdm for i, rdm in enumerate(given)}, animals)
-        layers.append(min(test.p_corrected for test in found) <= 0.05)
         brain = np.stack([animal.rdm for animal in animals])
         null = permuted_values(given, brain, lambda r: r.mean(axis=-1))
+        layers.append(layer_p(null)[1].min() <= 0.05)
         models.append(step_down(null.T).min() <= 0.05)
     # Two standard errors of 2,000 simulations are .01.
     assert np.mean(models) <= 0.06
@@ -158,5 +156,3 @@ def test_misuse_is_told_in_a_sentence():
         compare_models({"a": {"x": make_rdm(rng)}}, animals, stimuli=STIMULI, correction="hollm")
     with pytest.raises(UsageError, match="no models"):
         compare_models({}, animals, stimuli=STIMULI)
-    with pytest.raises(UsageError, match="no layers"):
-        layer_tests({}, animals)

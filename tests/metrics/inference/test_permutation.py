@@ -10,7 +10,7 @@ from scipy import stats
 
 from brainbench.core.errors import UsageError
 from brainbench.metrics import compare, permutation_test
-from brainbench.metrics.inference.permutation import label_orders
+from brainbench.metrics.inference.permutation import label_orders, layer_p, make_test
 from brainbench.metrics.rdms.pairs import permuted_pairs, square
 from tests.factories.animals import make_rdm
 
@@ -151,3 +151,10 @@ def test_misuse_is_told_in_a_sentence():
         permutation_test(np.ones((2, 15)), np.ones(15))
     with pytest.raises(UsageError, match="of the same stimuli"):
         permutation_test(np.ones(15), np.ones(6))
+
+
+def test_orders_without_a_value_take_no_part_in_the_largest_layer_or_in_the_words():
+    null = np.array([[0.5, 0.1], [0.6, np.nan], [0.1, 0.2], [0.7, np.nan]])
+    assert layer_p(null)[1].tolist() == [0.75, 1.0]
+    test = make_test(np.array([0.4, -np.inf, 0.2]), exact=True)
+    assert "0.30" in test.summary(1)

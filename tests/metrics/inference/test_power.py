@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -154,3 +156,12 @@ def test_other_misuse_is_told_in_a_sentence():
         needed(ExperimentDesign(), target=1.0)
     with pytest.raises(UsageError, match="at least 1 simulation"):
         power(ExperimentDesign(), simulations=0)
+
+
+def test_levels_that_only_many_orders_can_reach_are_simulated_with_as_many_as_a_score_takes():
+    easy = ExperimentDesign(stimuli=16, animals=10, effect=0.8, alpha=0.0008)
+    assert power(easy, simulations=40).power > 0.5
+    impossible = power(dataclasses.replace(easy, alpha=0.0004), simulations=40)
+    assert impossible.power == 0
+    assert impossible.p_smallest == pytest.approx(1 / 2000)
+    assert "16 stimuli" in impossible.reason

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -95,3 +97,14 @@ def test_recordings_without_covariates_are_undefined_in_words():
         assert score.status == "undefined"
         assert "no contacts, licks or choices" in score.reasons[-1]
         assert told in score.reasons[-1]
+
+
+def test_a_layer_that_the_nuisances_explain_wholly_is_not_called_constant():
+    metric, latent = get_metric("rsa-partial"), np.random.default_rng(4).normal(size=(7, 3))
+    animals = _animals("rsa-partial", _make_blocks(latent, number=3))
+    animals = [replace(one, nuisances={"touches": rdm(COUNTER)}) for one in animals]
+    score = _score(metric, animals, COUNTER)
+    assert score.status == "undefined"
+    assert "not comparable with every animal" in score.reasons[0]
+    both = metric.score({"known": latent, "counter": COUNTER}, animals, name="x", stimuli=STIMULI)
+    assert any("not comparable" in reason and "counter" in reason for reason in both.reasons)

@@ -7,7 +7,7 @@ import pytest
 
 from brainbench.core.errors import UsageError
 from brainbench.metrics import compare, rdm
-from brainbench.metrics.rdms.dissimilarity import rdm_movie
+from brainbench.metrics.rdms.movies import rdm_movie
 
 
 @pytest.mark.parametrize("method", ["correlation", "sqeuclidean", "poisson"])

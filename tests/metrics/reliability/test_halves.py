@@ -14,7 +14,7 @@ from brainbench.core.errors import DataError, UsageError
 from brainbench.core.trials import Trials
 from brainbench.metrics import compare, rdm
 from brainbench.metrics.rdms.pairs import permuted_pairs
-from brainbench.metrics.reliability.halves import WeightedRDMs, members
+from brainbench.metrics.reliability.halves import SplitRDMs, members
 from brainbench.metrics.reliability.noise_correction import spearman_brown
 from brainbench.metrics.reliability.subject_rdm import subject_rdm
 from brainbench.metrics.reliability.trial_hashes import content_hashes, draws, key_hashes
@@ -147,7 +147,7 @@ def test_products_of_trials_and_half_means_give_the_same_halves(method, offset, 
     blocks = [make_block(make_latent(9), seed=i, units=15 + i, repeats=3 + i, noise=2.0) for i in range(3)]
     blocks = [Trials(block.responses + offset, block.labels, block.keys) for block in blocks]
     by_products = subject_rdm("a", blocks, 6, method=method, splits=40)
-    monkeypatch.setattr(WeightedRDMs, "_from_products", lambda *_: None)
+    monkeypatch.setattr(SplitRDMs, "_from_products", lambda *_: None)
     by_means = subject_rdm("a", blocks, 6, method=method, splits=40)
     np.testing.assert_allclose(by_products.halves, by_means.halves, rtol=1e-11 if offset < 1e6 else 1e-6)
 

@@ -9,7 +9,7 @@ import pytest
 
 from brainbench.core.trials import Trials
 from brainbench.metrics import noise_precision, rdm
-from brainbench.metrics.reliability.halves import WeightedRDMs, half_rdms, split_members
+from brainbench.metrics.reliability.halves import SplitRDMs, half_rdms, split_members
 from brainbench.metrics.reliability.sessions import SortedTrials
 from brainbench.metrics.reliability.subject_rdm import subject_rdm
 from brainbench.metrics.reliability.trial_hashes import key_hashes
@@ -56,8 +56,7 @@ def test_halves_by_products_and_by_patterns_are_the_same(method, monkeypatch):
     first, second = half_rdms([session], 6, method, index, seed=3)
     member = split_members(session, 6, index, 3)
     monkeypatch.setattr("brainbench.metrics.reliability.halves.BY_PRODUCTS", ())
-    for half, weights in ((first, member), (second, 1 - member)):
-        by_patterns = WeightedRDMs([session], [weights], 6, method).whole()
+    for half, by_patterns in zip((first, second), SplitRDMs([session], 6, method).halves([member]), strict=True):
         np.testing.assert_allclose(half, by_patterns, atol=1e-11)
 
 

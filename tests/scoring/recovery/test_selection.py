@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -48,7 +50,7 @@ def test_kept_stimuli_keep_their_features():
 def test_more_stimuli_than_the_pool_has_are_refused():
     with pytest.raises(UsageError, match="8 stimuli; 9"):
         select_stimuli(make_candidates(8), 9, DESIGN)
-    from dataclasses import replace
-
+    with pytest.raises(UsageError, match="at least two"):
+        select_stimuli(make_candidates(8, names=("a",)), 4, DESIGN)
     with pytest.raises(UsageError, match="'procrustes'"):
         select_stimuli(make_candidates(8), 4, replace(DESIGN, metric="procrustes"))

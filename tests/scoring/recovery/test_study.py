@@ -59,6 +59,7 @@ def test_a_folder_of_another_recovery_is_refused(tmp_path):
         (make_candidates(8), {"stimuli": 9}, 1, "9 stimuli .* the pool has 8"),
         (make_candidates(8), {"metric": "rsaa"}, 1, "'rsa'"),
         (make_candidates(8), {"layer": "layr1"}, 1, "'layer1'"),
+        (make_candidates(8), {"metric": "decoding"}, 1, "'decoding'"),
         (make_candidates(8), {}, 0, "received 0"),
         ((*make_candidates(8), *make_candidates(9, names=("d",))), {}, 1, "different stimuli"),
     ],
