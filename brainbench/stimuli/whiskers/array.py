@@ -241,6 +241,7 @@ def _modelled(species: str) -> WhiskerArray:
         mounts.append(
             dataclasses.replace(
                 average,
+                # No cos φ in x and y, unlike spherical coordinates: WHISKiT places base points so.
                 position=(radius * math.cos(azimuth), radius * math.sin(azimuth), radius * math.sin(elevation)),
                 angles=(theta, phi, zeta),
                 whisker=published_whisker(length, curvature, average.row, average.col, species=species),
@@ -271,4 +272,5 @@ def _radii(arc_length: float, row: int, col: int, rule: dict[str, Any]) -> tuple
     diameter = base["constant"] + base["arc_length"] * arc_length + base["row"] * (row + 1) + base["column"] * col
     taper = slope["constant"] + slope["row"] * (row + 1) + slope["column"] * col + slope["column_squared"] * col**2
     radius = diameter / 2
+    # The tip has half of what the slope leaves of the base radius: the rule in the table (``tip_radius_rule``).
     return radius, max((radius - taper * arc_length) / 2, rule["tip_radius_floor_mm"])
