@@ -92,7 +92,7 @@ def test_a_spike_train_of_zeros_and_ones_is_a_unit_recorded_in_trials_only(tmp_p
         dataset["counts"].values[:, 0, 0], [np.sum((spikes >= begin) & (spikes < begin + 0.1)) for begin in low]
     )
     # Between trials nothing was sampled: that is missing, not silence.
-    with pytest.raises(DataError, match="recorded span removed 24"):
+    with pytest.raises(DataError, match=r"a\.nwb: trials: .*span .*24"):
         open_recordings(tmp_path / "a.nwb", window="stop-0.2..+0.4", select="none")
 
 
@@ -102,7 +102,7 @@ def test_series_of_zeros_and_ones_say_what_is_wrong_with_them():
     np.testing.assert_allclose(Series("s", "", flags, start=5.0, rate=10.0).active_times(), [5.1, 5.3])
     with pytest.raises(DataError, match="4 samples"):
         Series("s", "", flags, stamps[:3]).active_times()
-    with pytest.raises(DataError, match="timestamps nor a rate"):
+    with pytest.raises(DataError, match=r"series s .*rate"):
         Series("s", "", flags).active_times()
     with pytest.raises(DataError, match="it reaches 7"):
         Series("s", "", flags * 7, stamps).active_times()

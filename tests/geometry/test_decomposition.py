@@ -82,7 +82,7 @@ def test_the_limit_of_time_is_kept_in_words():
 
 
 def test_the_limit_of_memory_is_kept_in_words():
-    with pytest.raises(DataError, match=r"'big' .*0.1 GB of memory"):
+    with pytest.raises(DataError, match=r"'big' .*0\.1 GB"):
         decompose(_angle_bracket("big"), DecompositionSettings(memory=1e8, seed=7))
 
 

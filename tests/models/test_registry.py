@@ -76,7 +76,7 @@ def test_equal_seeds_give_equal_weights_and_disturb_nobody():
 
 @pytest.mark.parametrize("seed", [-1, 1.5, True, "0", 2**63])
 def test_a_seed_is_a_whole_number(seed):
-    with pytest.raises(UsageError, match="must be a whole number"):
+    with pytest.raises(UsageError, match=r"seed .*received"):
         load_model(SMALL, seed=seed)
 
 
@@ -92,11 +92,11 @@ def test_weights_are_loaded_under_a_tag_only(tmp_path):
     save_file(source, file)
     loaded = load_model(f"{SMALL}.supervised", pretrained=file).state_dict()
     assert all(torch.equal(value, loaded[name]) for name, value in source.items())
-    with pytest.raises(UsageError, match=f"Without a tag '{SMALL}'"):
+    with pytest.raises(UsageError, match=rf"'{SMALL}' .*{SMALL}\.supervised"):
         load_model(SMALL, pretrained=file)
     with pytest.raises(DataError, match=r"'zhuang-gru-small\.simclr'"):
         load_model("zhuang-gru-small.simclr", pretrained=file)
-    with pytest.raises(DataFileNotFoundError, match="no file of weights"):
+    with pytest.raises(DataFileNotFoundError, match=rf"none\.safetensors'.*'{SMALL}\.ae'"):
         load_model(f"{SMALL}.ae", pretrained=tmp_path / "none.safetensors")
     file.write_bytes(b"nothing")
     with pytest.raises(DataError, match="not a readable"):
@@ -225,5 +225,5 @@ def test_models_of_other_packages_arrive_and_broken_ones_are_announced(tmp_path,
 @pytest.mark.parametrize("use", [load_model, describe_model])
 def test_a_builder_that_gives_no_module_is_answered_in_one_sentence(use):
     register_model("no-module", family="theirs")(lambda: {"weights": 3})
-    with pytest.raises(UsageError, match="'no-module' gave a dict"):
+    with pytest.raises(UsageError, match=r"'no-module' .*dict"):
         use("no-module")

@@ -91,7 +91,7 @@ def test_shapes_come_from_the_cache_and_from_nowhere_else(monkeypatch, tmp_path,
 
 
 def test_a_backend_without_shapes_is_refused_in_words():
-    with pytest.raises(UsageError, match="'fake' reports no whisker shapes"):
+    with pytest.raises(UsageError, match=r"'fake' .*'rod' or 'mujoco'"):
         _record(Scene("air", ARRAY), [0.01], backend=FakeEngine())
 
 

@@ -21,7 +21,7 @@ def test_nodes_are_sorted_along_the_feedforward_edges():
 
 
 def test_a_feedforward_cycle_is_refused_by_name():
-    with pytest.raises(UsageError, match="among 'b', 'c' form a cycle"):
+    with pytest.raises(UsageError, match=r"'b', 'c' .*cycle"):
         _spec([Edge("a", "b"), Edge("b", "c"), Edge("c", "b")])
 
 

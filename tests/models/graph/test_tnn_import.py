@@ -128,7 +128,7 @@ def test_a_missing_key_is_named(key):
 
 
 def test_several_outputs_are_refused():
-    with pytest.raises(DataError, match=r"\['a', 'b'\]; exactly one"):
+    with pytest.raises(DataError, match=r"\['a', 'b'\]; .*one"):
         read_graph(_config(output_node=["a", "b"]))
 
 
@@ -142,7 +142,7 @@ def test_a_file_is_read_and_a_bad_one_named(tmp_path):
     good.write_text(json.dumps(_config()))
     bad.write_text("{")
     assert read_graph(good) == read_graph(_config())
-    with pytest.raises(DataError, match=r"bad\.json' is not valid"):
+    with pytest.raises(DataError, match=r"bad\.json' .*JSON"):
         read_graph(bad)
     with pytest.raises(DataError, match="There is no file"):
         read_graph(tmp_path / "none.json")

@@ -96,7 +96,7 @@ def test_shapes_share_their_slots_and_scale_in_all_lengths() -> None:
     assert with_sizes(shapes, (1.0, 1.0)) == shapes
     with pytest.raises(UsageError, match="positive range"):
         with_sizes(shapes, (0.0, 1.0))
-    with pytest.raises(UsageError, match="shorter than the tool"):
+    with pytest.raises(UsageError, match=r"received 0\.2 m of 0\.1 m"):
         screwdriver(0.1, 0.2, 0.02, 0.004)
 
 
@@ -128,7 +128,7 @@ def test_only_links_that_can_meet_collide() -> None:
 
 def test_a_finger_that_the_hand_lacks_is_named() -> None:
     task = replace(tasks.load("in_palm_rotate"), moves=("tentacle",))
-    with pytest.raises(UsageError, match="fingers of hand 'xhand1' are"):
+    with pytest.raises(UsageError, match=r"tentacle; .*'xhand1' .*index"):
         build(task, hands.load("xhand1"))
     with pytest.raises(UsageError, match="does not have"):
         build(replace(tasks.load("in_palm_rotate"), joints={"xhand1": {"elbow": 1.0}}), hands.load("xhand1"))

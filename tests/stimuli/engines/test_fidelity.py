@@ -30,11 +30,11 @@ def test_auto_takes_the_cheapest_measured_setting_that_is_good_enough():
 
 
 def test_auto_refuses_what_was_never_measured():
-    with pytest.raises(UsageError, match="No measured setting reaches an error of 1e-06"):
+    with pytest.raises(UsageError, match=r"1e-06; .*time_step"):
         Fidelity.auto(error=1e-6)
-    with pytest.raises(UsageError, match="error must be positive"):
+    with pytest.raises(UsageError, match=r"error .*received 0"):
         Fidelity.auto(error=0)
-    with pytest.raises(UsageError, match="Unknown measured backend 'mujocco'; did you mean 'mujoco'"):
+    with pytest.raises(UsageError, match="'mujocco'; did you mean 'mujoco'"):
         Fidelity.auto(backend="mujocco")
 
 

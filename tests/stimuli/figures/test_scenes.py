@@ -1,5 +1,6 @@
 import dataclasses
 import math
+import re
 import sys
 
 import numpy as np
@@ -100,7 +101,7 @@ def test_whiskers_of_unknown_shape_are_left_out_and_said_aloud(caplog, tmp_path,
     assert recording.unstable == ("C1",)
     monkeypatch.setattr(module, "record", lambda *args, **options: recording)
     render(SCENE, tmp_path / "a.png", times=[0.0], camera=ABOVE, style=SMALL)
-    assert "unstable whiskers are not drawn from then on: 'C1'" in caplog.text
+    assert re.search("unstable .*'C1'", caplog.text)
 
 
 def test_a_picture_is_written_whole_and_the_same_every_time(tmp_path):
@@ -164,7 +165,7 @@ def test_an_mp4_has_a_frame_per_instant(tmp_path):
 def test_a_missing_package_is_named_with_its_extra(tmp_path, monkeypatch, package, name):
     monkeypatch.setitem(sys.modules, package, None)
     backend = FakeEngine()
-    with pytest.raises(MissingDependencyError, match=r"pip install 'brainbench\[report\]'"):
+    with pytest.raises(MissingDependencyError, match=r"brainbench\[report\]"):
         render(SCENE, tmp_path / name, times=[0.0], style=SMALL, backend=backend)
     assert not backend.jobs
     assert not list(tmp_path.iterdir())

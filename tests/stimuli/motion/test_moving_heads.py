@@ -122,7 +122,7 @@ def test_impossible_paths_are_refused(arguments, message):
 
 def test_a_scene_longer_than_the_path_is_refused():
     scene = Scene("long", PAIR, head=PLACE, frames=Frames(0.0, 0.01, 40))
-    with pytest.raises(UsageError, match=r"path ends at 0\.12 s; the scene needs it at"):
+    with pytest.raises(UsageError, match=r"0\.12 s; .*0\.39 s"):
         simulate(scene, backend=FakeEngine())
 
 
@@ -131,7 +131,7 @@ def test_a_head_that_turns_a_whisker_upright_is_refused_in_words():
     # C3 lies across the head, so that a pitch by 90 degrees carries it past the vertical within 2 degrees.
     array = WhiskerArray.mouse(whiskers="C3")
     scene = Scene("over", array, head=Head(motion=over), whisking=Still(), frames=Frames(0, 0.01, 15))
-    with pytest.raises(UsageError, match=r"whisker C3 points along the vertical axis.*gimbal lock"):
+    with pytest.raises(UsageError, match=r"C3 .*gimbal lock"):
         simulate(scene, backend=FakeEngine())
 
 
@@ -172,7 +172,7 @@ def test_whiskers_of_animals_are_chosen_by_name():
 
 def test_the_grid_refuses_several_animals_even_in_different_cells_and_takes_one():
     dataset = simulate(_crowd(), backend=FakeEngine())
-    with pytest.raises(UsageError, match=r"2 animals and a grid holds one; select .*: 'a:\*' or 'b:\*'"):
+    with pytest.raises(UsageError, match=r"2 animals .*'a:\*' or 'b:\*'"):
         to_grid(dataset)
     apart = dataset.isel(whisker=[0, 3])
     with pytest.raises(UsageError, match="2 animals"):
@@ -190,5 +190,5 @@ def test_animals_count_in_the_configuration_and_single_ones_change_nothing():
 
 def test_animals_need_different_names():
     for name in ("a", "", "x:y"):
-        with pytest.raises(UsageError, match="different names without a colon"):
+        with pytest.raises(UsageError, match=rf"received \['a', '{name}'\]"):
             _crowd(others=(Animal(name, PAIR),))

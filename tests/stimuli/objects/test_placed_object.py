@@ -179,7 +179,7 @@ def test_a_file_that_brings_its_convex_pieces_keeps_its_concavity(tmp_path):
     assert len(solid.parts) == 6
     volume = sum(ConvexHull(part.vertices).volume for part in solid.parts)
     assert volume == pytest.approx(rodgers_solid(segments=6).mesh.to_trimesh().volume, rel=1e-4)
-    with pytest.raises(UsageError, match="Unknown collision geometry 'piece'; did you mean 'pieces'"):
+    with pytest.raises(UsageError, match="'piece'; did you mean 'pieces'"):
         mesh_solid(path, unit="mm", collision="piece")
 
 
@@ -214,7 +214,7 @@ def test_an_exact_mesh_is_its_surface_and_has_a_convex_part_only_when_it_is_conv
     assert concave.diagonal == pytest.approx(0.03)
     assert "that takes the backend 'rod'" in concave.notes[0]
     assert concave.config()["hash"] != concave.to_diagonal(0.04).config()["hash"]
-    with pytest.raises(UsageError, match=r"'open' is not closed .*collision = 'hull'"):
+    with pytest.raises(UsageError, match=r"'open'.*collision = 'hull'"):
         mesh_solid(sheet, unit="mm", collision="exact")
 
 
@@ -294,7 +294,7 @@ def test_engines_of_convex_bodies_refuse_a_concave_surface_and_name_what_works(b
     item = PlacedObject(shape_solid(procedural.make("bumpy", 0, detail=2000), collision="exact"), (1.0, 0.0, 0.0))
     whisker = Whisker(0.02, 60e-6, 6e-6, young_modulus=5e9, density=1260.0, damping_ratio=0.3)
     job = Job(whisker, StillFollicle(), (item.obstacle(),), np.array([1e-3]))
-    with pytest.raises(UsageError, match=rf"'{backend}' collides convex .*collision = 'decomposition'.*backend 'rod'"):
+    with pytest.raises(UsageError, match=rf"'{backend}'.*'decomposition'.*'rod'"):
         get_engine(backend).run([job], Fidelity(links=4, time_step=2e-4))
 
 

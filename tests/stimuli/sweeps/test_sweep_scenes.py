@@ -216,20 +216,20 @@ def test_impossible_grids_are_refused(changes, message):
 
 
 def test_spans_ascend():
-    with pytest.raises(UsageError, match="ascends from low to high"):
+    with pytest.raises(UsageError, match=r"received Span\(low=2\.0"):
         Span(2.0, 1.0, 1.0)
 
 
 def test_recipes_say_which_of_them_take_objects():
-    with pytest.raises(UsageError, match="'thesis-low' moves objects past the whiskers and needs some"):
+    with pytest.raises(UsageError, match=r"'thesis-low'.*objects="):
         get_recipe("thesis-low")
-    with pytest.raises(UsageError, match="'rodgers' has objects of its own; only thesis-low, thesis-high take some"):
+    with pytest.raises(UsageError, match=r"'rodgers' .*thesis-low, thesis-high"):
         get_recipe("rodgers", objects=SOLIDS)
-    with pytest.raises(UsageError, match="Several objects are called 'sphere'"):
+    with pytest.raises(UsageError, match=r"Several .*'sphere'"):
         get_recipe("thesis-low", objects=[sphere(1.0), sphere(2.0)])
     with pytest.raises(UsageError, match="at least one object"):
         SweepScenes(SweepGrid(), [])
-    with pytest.raises(UsageError, match="Unknown species 'cat'"):
+    with pytest.raises(UsageError, match="'cat'; did you mean 'rat'"):
         SweepScenes(SweepGrid(species="cat"), SOLIDS)
 
 

@@ -113,9 +113,9 @@ def test_a_fitted_calibration_gives_touched_sites_unit_size() -> None:
         HandCalibration.fit(torch.zeros(3, 30, 5, 7))
     with pytest.raises(DataError, match="not finite"):
         HandCalibration.fit(torch.full((3, 30, 5, 7), torch.nan))
-    with pytest.raises(UsageError, match="positive number; received -1"):
+    with pytest.raises(UsageError, match=r"force .*received -1"):
         HandCalibration(force=-1)
-    with pytest.raises(UsageError, match="fields 'force' and 'moment'"):
+    with pytest.raises(UsageError, match="'force' and 'moment'; received"):
         HandCalibration.of({"mass": 1})
 
 
@@ -145,7 +145,7 @@ def test_unsuited_networks_and_names_are_refused() -> None:
         FrontEnd("zhuang-small", GRID, learning="froze")  # type: ignore[arg-type]
     with pytest.raises(UsageError, match="did you mean 'resampled'"):
         FrontEnd("zhuang-small", GRID, time="resample")  # type: ignore[arg-type]
-    with pytest.raises(UsageError, match="encoder-attender-decoder"):
+    with pytest.raises(UsageError, match="received 'Linear'"):
         FrontEnd(torch.nn.Linear(3, 3), GRID)
-    with pytest.raises(UsageError, match="takes 5 sub-steps; received 4"):
+    with pytest.raises(UsageError, match="5 sub-steps; received 4"):
         FrontEnd("zhuang-small", GRID).stimulus(torch.zeros(1, 4, GRID.items, 6))

@@ -297,7 +297,7 @@ def test_knobs_outside_their_range_are_refused(knobs, message):
 
 def test_a_sensor_refuses_knobs_it_does_not_have():
     Noise(white=1.0, crosstalk_sigma=3.0).check(TAXEL_KNOBS, "ContactDepthProbe")
-    with pytest.raises(UsageError, match="no noise knob 'crosstalk'"):
+    with pytest.raises(UsageError, match=r"'crosstalk'; .*bias"):
         Noise(crosstalk=0.1).check(TAXEL_KNOBS, "ContactDepthProbe")
 
 
