@@ -1,3 +1,5 @@
+import re
+
 import h5py
 import numpy as np
 import pytest
@@ -70,7 +72,7 @@ def test_trials_outside_the_recorded_span_are_excluded_not_read_as_silence(tmp_p
     )
     assert dataset["window_start"].values.tolist() == [5.0, 7.0, 9.0, 11.0, 13.0]
     assert dataset.attrs["removed"]["trials: outside the recorded span"] == 7
-    assert "recorded span taken from first to last spike, 5.000–15.500 s" in "".join(dataset.attrs["notes"])
+    assert "5.000–15.500 s" in "".join(dataset.attrs["notes"])
 
 
 def test_a_unit_lost_before_the_end_is_missing_from_then_on(tmp_path):
@@ -181,7 +183,7 @@ def test_unsorted_spikes_are_sorted_and_said(tmp_path):
     plain = open_recordings(write(tmp_path / "a.h5", session), conditions="trials:stimulus")
     dataset = open_recordings(write(tmp_path / "b.h5", mixed), conditions="trials:stimulus")
     xr.testing.assert_identical(plain.drop_attrs(), dataset.drop_attrs())
-    assert "spike times of 1 units were not in order and have been sorted" in "".join(dataset.attrs["notes"])
+    assert re.search("spike times of 1 unit.* sorted", "".join(dataset.attrs["notes"]))
 
 
 def test_spike_times_that_are_not_finite_are_refused(tmp_path):
@@ -266,7 +268,7 @@ def test_globs_lists_and_layouts_name_sources(tmp_path):
     xr.testing.assert_identical(by_glob.drop_attrs(), by_list.drop_attrs())
     with pytest.raises(UsageError, match="'rodgrs'; did you mean 'rodgers'"):
         open_recordings(f"rodgrs:{tmp_path}")
-    with pytest.raises(UsageError, match="write rodgers:PATH"):
+    with pytest.raises(UsageError, match=r"'rodgers:' .*rodgers:PATH"):
         open_recordings("rodgers:")
     with pytest.raises(UsageError, match="simulated stimuli"):
         open_recordings("demo")

@@ -223,7 +223,7 @@ def test_a_stimulus_that_does_not_fit_says_what_was_given_and_what_failed(stimul
 
 @pytest.mark.parametrize(("x", "chunk"), [(np.zeros((0, T, 30, 5, 7)), 4), (np.zeros(3), 4), (np.zeros((2, T, 3)), 0)])
 def test_nothing_to_extract_from_is_an_error(x, chunk):
-    with pytest.raises(UsageError, match="needs stimuli"):
+    with pytest.raises(UsageError, match=re.escape(f"{list(x.shape)} and chunk {chunk}")):
         extract(nn.Flatten(2), x, chunk=chunk)
 
 

@@ -1,5 +1,6 @@
 import importlib
 import logging
+import re
 import subprocess
 import sys
 
@@ -99,7 +100,7 @@ def test_weights_are_loaded_under_a_tag_only(tmp_path):
     with pytest.raises(DataFileNotFoundError, match=rf"none\.safetensors'.*'{SMALL}\.ae'"):
         load_model(f"{SMALL}.ae", pretrained=tmp_path / "none.safetensors")
     file.write_bytes(b"nothing")
-    with pytest.raises(DataError, match="not a readable"):
+    with pytest.raises(DataError, match=r"weights\.safetensors' .*safetensors file"):
         load_model(f"{SMALL}.ae", pretrained=file)
 
 
@@ -181,7 +182,7 @@ def test_our_names_are_taken_from_the_start():
 
 @pytest.mark.parametrize("name", ["Zhuang", "a.b", "a b", "a--b", "", "a/b", "+a"])
 def test_a_name_outside_the_grammar_is_refused(name):
-    with pytest.raises(UsageError, match="joined by"):
+    with pytest.raises(UsageError, match=re.escape(f"received '{name}'")):
         register_model(name, family="x")
 
 

@@ -78,7 +78,7 @@ def test_a_wrong_attribute_is_answered_in_one_sentence(tmp_path, name, message):
 
 @pytest.mark.parametrize("target", ["mine.py", "zhuang", ":make_model", "mine.py:"])
 def test_a_target_without_both_parts_is_refused(target):
-    with pytest.raises(UsageError, match=r"package\.module:NAME"):
+    with pytest.raises(UsageError, match=rf"package\.module:NAME.*'{target}'"):
         load_user_model(target)
 
 

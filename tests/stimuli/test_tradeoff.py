@@ -114,7 +114,7 @@ def test_the_solver_is_an_axis_of_the_backend_that_has_two_and_no_rival_of_the_p
     assert [(item.backend, item.fidelity) for item in chosen] == [
         ("rod", Fidelity(links=8, time_step=1e-3, solver="quasistatic"))
     ]
-    with pytest.raises(UsageError, match="quasistatic"):
+    with pytest.raises(UsageError, match="'static'; did you mean 'quasistatic'"):
         tradeoff.settings(solvers=("static",))
     point = {"links": 8, "links_per_mm": None, "time_step": 1e-3, "steps_per_period": None, "backend": "rod"}
     moving, still = ({**point, "solver": name, "error": 0.1, "cost": 1.0} for name in ("dynamic", "quasistatic"))

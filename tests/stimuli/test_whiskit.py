@@ -114,7 +114,7 @@ def test_a_missing_table_is_named(tmp_path):
         load_parameters(tmp_path)
     save_parameters(WhiskerArray.mouse(whiskers="C1"), tmp_path)
     shutil.move(tmp_path / "param_s_a.csv", tmp_path / "elsewhere.csv")
-    with pytest.raises(DataFileNotFoundError, match="param_s_a"):
+    with pytest.raises(DataFileNotFoundError, match=r"/param_s_a\.csv'"):
         load_parameters(tmp_path)
     with pytest.raises(UsageError, match=r"bends .*received \(2, 20\)"):
         save_parameters(WhiskerArray.mouse(whiskers="C1"), tmp_path, bends_table=np.zeros((2, 20)))
@@ -182,7 +182,7 @@ def test_a_run_that_cannot_be_written_says_why(tmp_path, run):
         save_run(dataset, tmp_path, shapes=[shape[:3] for shape in shapes])
     with pytest.raises(UsageError, match="several animals"):
         save_run(dataset.isel(whisker=[0, 0]), tmp_path)
-    with pytest.raises(UsageError, match="on which side"):
+    with pytest.raises(UsageError, match=r"WHISKiT.*need"):
         save_run(dataset.drop_vars("side"), tmp_path)
     both = dataset.isel(stimulus=[0, 0]).assign_coords(stimulus=["a", "b"])
     with pytest.raises(UsageError, match=r"2 stimuli; .*'a'"):

@@ -202,9 +202,9 @@ def test_folders_without_a_finished_data_set_say_what_to_do(copy, tmp_path):
     with pytest.raises(DataError, match=r"version 99; .*version 1"):
         WhiskingDataset(copy)
     (copy / "manifest.json").unlink()
-    with pytest.raises(DataError, match="is not finished"):
+    with pytest.raises(DataError, match=r"/set' .*finished"):
         WhiskingDataset(copy)
-    with pytest.raises(DataError, match="brainbench stimuli sweep"):
+    with pytest.raises(DataError, match=r"/nowhere' .*brainbench stimuli sweep"):
         WhiskingDataset(tmp_path / "nowhere")
 
 

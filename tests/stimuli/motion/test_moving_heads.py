@@ -166,7 +166,7 @@ def test_whiskers_of_animals_are_chosen_by_name():
     assert scene.select("b:*").names == ("C1", "D2")
     assert scene.select("b:*").head == PLACE
     assert scene.select("a:C2,b:D2").names == ("a:C2", "b:D2")
-    with pytest.raises(UsageError, match="Unknown whisker"):
+    with pytest.raises(UsageError, match="'c:C1'; did you mean 'b:C1'"):
         scene.select("c:C1")
 
 

@@ -320,9 +320,9 @@ def test_wrong_settings_are_explained(knobs, message):
 
 def test_a_grid_needs_finite_geometry_or_corners():
     scene = TouchScene(("world",), (Geometry(name="floor", link="world", kind="plane"),))
-    with pytest.raises(UsageError, match="of finite size"):
+    with pytest.raises(UsageError, match=r"'world' .*low, high"):
         SensorSuite(scene, {"grid": TemperatureGrid(link="world")}, num_envs=1)
-    with pytest.raises(UsageError, match="positive"):
+    with pytest.raises(UsageError, match=r"conductivity .*received -1"):
         ThermalMaterial(-1, 1, 1)
     assert MATERIALS["steel"].effusivity == pytest.approx(math.sqrt(15 * 7900 * 480))
     suite, _state = _make()

@@ -114,9 +114,9 @@ def test_unknown_backends_and_bad_jobs_are_refused():
     assert "mujoco" in list_engines()
     with pytest.raises(UsageError, match="did you mean 'mujoco'"):
         get_engine("mojoco")
-    with pytest.raises(UsageError, match="increasing list"):
+    with pytest.raises(UsageError, match=r"frame times .*increasing"):
         Job(C2, StillFollicle(), (), np.array([0.2, 0.1]))
-    with pytest.raises(UsageError, match="before the start"):
+    with pytest.raises(UsageError, match=r"\(0 s\) .*\(0\.1 s\)"):
         Job(C2, StillFollicle(), (), np.array([0.0]), start=0.1)
     with pytest.raises(UsageError, match=r"0\.02 m.*0\.0152\d* m"):
         Job(C2, StillFollicle(), (), np.array([0.1]), loads=(Load(0.02, (0, 0, 1e-6)),))
