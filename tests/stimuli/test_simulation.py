@@ -274,10 +274,10 @@ def test_a_changed_number_in_the_cache_is_noticed(engine, tmp_path, caplog):
     ("scenes", "message"),
     [
         ([], "no scene to simulate"),
-        ([_scene("a"), _scene("a")], "labels of the scenes must differ"),
-        ([_scene("a"), _scene("b", array=ARRAY.select("C1"))], "'a' and 'b' have different whiskers"),
-        ([_scene("a"), _scene("b", array=ARRAY.on_side("left"))], "'a' and 'b' have different whiskers"),
-        ([_scene("a"), _scene("b", frames=Frames())], "'a' and 'b' are read at different times"),
+        ([_scene("a"), _scene("a")], r"labels .*received \['a', 'a'\]"),
+        ([_scene("a"), _scene("b", array=ARRAY.select("C1"))], r"'a' and 'b' .*whiskers"),
+        ([_scene("a"), _scene("b", array=ARRAY.on_side("left"))], r"'a' and 'b' .*whiskers"),
+        ([_scene("a"), _scene("b", frames=Frames())], r"'a' and 'b' .*times"),
     ],
 )
 def test_scenes_that_do_not_fit_together_are_refused(scenes, message):

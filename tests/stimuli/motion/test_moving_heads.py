@@ -107,12 +107,12 @@ def test_circling_at_constant_speed_pulls_the_base_outwards_with_the_centripetal
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (((0.0,), ((0, 0, 0),), ((0, 0, 0),)), "ascend from 0 and are at least two"),
+        (((0.0,), ((0, 0, 0),), ((0, 0, 0),)), r"times .*received \(0\.0,\)"),
         (((0.0, 0.0), ((0, 0, 0),) * 2, ((0, 0, 0),) * 2), "ascend from 0"),
         (((0.1, 0.2), ((0, 0, 0),) * 2, ((0, 0, 0),) * 2), "ascend from 0"),
-        (((0.0, 0.2), ((0, 0, 0),) * 3, ((0, 0, 0),) * 2), "numbers of displacements for each of its 2 times"),
-        (((0.0, 0.2), ((0, 0, 0),) * 2, ((0, 0), (0, 0))), "numbers of rotations for each"),
-        (((0.0, 0.2), ((1, 0, 0),) * 2, ((0, 0, 0),) * 2), "starts without displacements"),
+        (((0.0, 0.2), ((0, 0, 0),) * 3, ((0, 0, 0),) * 2), r"displacements .*2 times"),
+        (((0.0, 0.2), ((0, 0, 0),) * 2, ((0, 0), (0, 0))), r"rotations .*2 times"),
+        (((0.0, 0.2), ((1, 0, 0),) * 2, ((0, 0, 0),) * 2), r"received \(1\.0, 0\.0, 0\.0\)"),
     ],
 )
 def test_impossible_paths_are_refused(arguments, message):

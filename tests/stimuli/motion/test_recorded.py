@@ -202,11 +202,11 @@ def test_files_are_read_with_or_without_trailing_commas(tmp_path):
         ([[1, 2, 3, 4, 5, 6]] * 60, {}, UsageError, r"60 lines, which does not tell whose whiskers.*rat-60 \(60\)"),
         ([[1, 2, 3, 4, 5, 6]] * 62, {"layout": "rat-60"}, DataError, "62 lines; the layout 'rat-60' has 60"),
         ([[1, 2, 3]] * 62, {"layout": "rat60"}, UsageError, "did you mean 'rat-60'"),
-        ([["a", 2, 3]] * 62, {}, DataError, "not a table of comma-separated numbers"),
-        ([[1, 2, 3]] * 61 + [[1]], {}, DataError, "not a table of comma-separated numbers"),
+        ([["a", 2, 3]] * 62, {}, DataError, r"bad\.csv' .*comma"),
+        ([[1, 2, 3]] * 61 + [[1]], {}, DataError, r"bad\.csv' .*comma"),
         ([[1, 2, 3, "nan", 1, 1]] * 62, {}, DataError, "not finite"),
         ([[1, 2, 3]] * 62, {}, DataError, "at least two samples"),
-        ([[1, 2, 3, 4, 5, 6]] * 62, {"rate": 0.0}, UsageError, "rate of a trajectory must be positive"),
+        ([[1, 2, 3, 4, 5, 6]] * 62, {"rate": 0.0}, UsageError, r"rate .*received 0"),
     ],
 )
 def test_files_that_are_no_trajectories_are_refused(tmp_path, lines, options, error, message):

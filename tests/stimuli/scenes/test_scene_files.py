@@ -163,7 +163,7 @@ def test_a_mesh_can_be_decomposed_by_keys_of_its_table(tmp_path):
             '[[scene]]\nlabel="a"\n[[scene.object]]\nshape = "sphere"\nradius_mm = 1\ncolour = "red"',
             "Unknown key of .*'colour'",
         ),
-        ('[[scene]]\nlabel="a"\n[[scene]]\nlabel="a"', "several scenes have the label 'a'"),
+        ('[[scene]]\nlabel="a"\n[[scene]]\nlabel="a"', r"pole\.toml: .*label 'a'"),
         ('[array]\nspecies = "mous"\n[[scene]]\nlabel="a"', "Unknown species 'mous'; did you mean 'mouse'"),
         ('[array]\nwhiskers = "C9"\n[[scene]]\nlabel="a"', "Unknown whisker 'C9'"),
         ('[frames]\ncount = 1.5\n[[scene]]\nlabel="a"', r"'count' of \[frames\] must be a whole number"),
@@ -268,7 +268,7 @@ def test_an_object_turns_or_follows_keyframes(tmp_path):
 @pytest.mark.parametrize(
     ("keys", "message"),
     [
-        ("spin_deg_s = [0, 0, 9]\nvelocity_mm_s = [1, 0, 0]", "takes a velocity, a spin or keyframes, not several"),
+        ("spin_deg_s = [0, 0, 9]\nvelocity_mm_s = [1, 0, 0]", r"scene 'a' .*velocity.*spin.*keyframes"),
         ("spin_deg_s = 9", "'spin_deg_s' of .* must be three numbers in brackets"),
         ("spin_deg = [0, 0, 9]", "did you mean 'spin_deg_s'"),
         ("path_mm = [[0, 0, 0], [1, 0, 0]]", "needs the key 'times_ms' beside its path"),

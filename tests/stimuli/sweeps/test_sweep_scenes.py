@@ -200,12 +200,12 @@ def test_one_sweep_is_simulated_end_to_end():
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"speed": ()}, "speed of a sweep grid needs at least one finite value"),
-        ({"speed": (0.0,)}, "speed of a sweep grid must be positive"),
-        ({"size": Span(-0.01, 0.02, 0.01)}, "size of a sweep grid must be positive"),
+        ({"speed": ()}, r"speed .*received \(\)"),
+        ({"speed": (0.0,)}, r"speed .*received \(0"),
+        ({"size": Span(-0.01, 0.02, 0.01)}, r"size .*received Span"),
         ({"mover": "heat"}, "Unknown mover 'heat'; did you mean 'head'"),
         ({"placing": "cleer"}, "did you mean 'clear'"),
-        ({"heights_per_draw": 2}, "between 1 and the number of listed heights"),
+        ({"heights_per_draw": 2}, r"heights_per_draw .*got 2"),
         ({"draws": 0}, "needs a draw"),
         ({"head": Head(motion=Translation((0.0, 0.1, 0.0)))}, "choose mover='head'"),
     ],
