@@ -265,12 +265,12 @@ def test_a_scene_turned_about_z_and_moved_gives_turned_wrenches(engine, turn, sh
             position, euler = here.pose(times)
             return position + np.array(shift), euler + np.array([turn, 0, 0])
 
-    post = np.array([0.010, 2e-3, 0.0])
-    moved = rotation @ post + shift
+    place = np.array([0.010, 2e-3, 0.0])
+    moved = rotation @ place + shift
     times = np.arange(1.0, 26.0) * 2e-3
     a, b = _run(
         engine,
-        Job(C2, here, (post(*post[:2], friction=0.0),), times),
+        Job(C2, here, (post(*place[:2], friction=0.0),), times),
         Job(C2, There(), (post(*moved[:2], friction=0.0),), times),
     )
     assert a.contact.any()
