@@ -96,10 +96,10 @@ def test_a_hash_is_equal_on_every_machine():
 
 
 def test_reading_json_says_what_is_wrong(tmp_path: Path):
-    with pytest.raises(DataError, match="There is no file"):
+    with pytest.raises(DataError, match=r"/none\.json'"):
         files.read_json(tmp_path / "none.json")
     (tmp_path / "bad.json").write_text("{")
-    with pytest.raises(DataError, match="is not valid JSON"):
+    with pytest.raises(DataError, match=r"/bad\.json' .*JSON"):
         files.read_json(tmp_path / "bad.json")
 
 
@@ -125,10 +125,10 @@ def test_names_and_values_are_read_from_toml_and_json(tmp_path):
         == {"epochs": 4, "augmentation": "none"}
     )
     (tmp_path / "b.toml").write_text("epochs = \n")
-    with pytest.raises(DataError, match="not valid TOML"):
+    with pytest.raises(DataError, match=r"/b\.toml' .*TOML"):
         files.read_mapping(tmp_path / "b.toml")
     with pytest.raises(DataFileNotFoundError):
         files.read_mapping(tmp_path / "none.toml")
     (tmp_path / "c.json").write_text("[1]")
-    with pytest.raises(DataError, match="holds a list"):
+    with pytest.raises(DataError, match=r"/c\.json' .*list"):
         files.read_mapping(tmp_path / "c.json")

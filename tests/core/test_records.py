@@ -138,21 +138,21 @@ def _make_stimulus_set() -> xr.Dataset:
 def test_a_stimulus_set_is_checked_against_the_contract():
     good = _make_stimulus_set()
     assert check_stimulus_set(good) is good
-    with pytest.raises(DataError, match="needs the variable 'wrench'"):
+    with pytest.raises(DataError, match=r"stimulus set .*'wrench'"):
         check_stimulus_set(good.drop_vars("wrench"))
-    with pytest.raises(DataError, match="has dimensions"):
+    with pytest.raises(DataError, match=r"'wrench' .*\('time', 'stimulus',"):
         check_stimulus_set(good.transpose("time", "stimulus", "whisker", "channel"))
-    with pytest.raises(DataError, match="lacks the coordinate 'row'"):
+    with pytest.raises(DataError, match="coordinate 'row'"):
         check_stimulus_set(good.drop_vars("row"))
     with pytest.raises(DataError, match="expected \\['Fx'"):
         check_stimulus_set(good.assign_coords(channel=list(CHANNELS[::-1])))
     bare = good.copy()
     bare.attrs = {}
-    with pytest.raises(DataError, match="lacks the attribute"):
+    with pytest.raises(DataError, match=r"attribute .*'backend'"):
         check_stimulus_set(bare)
 
 
 def test_recordings_without_duration_are_refused():
     dataset = xr.Dataset({"counts": (("trial", "time", "unit"), np.zeros((1, 1, 1)))})
-    with pytest.raises(DataError, match="lacks the variable 'duration'"):
+    with pytest.raises(DataError, match=r"recordings .*'duration'"):
         check_recordings(dataset)

@@ -1,6 +1,7 @@
 """Trade-off fronts."""
 
 import math
+import re
 
 import pytest
 from hypothesis import given
@@ -36,17 +37,17 @@ def test_the_cheapest_is_good_enough_and_no_good_enough_point_is_cheaper(points,
         assert found.error <= error
         assert found.cost == min(good)
     else:
-        with pytest.raises(UsageError, match="No measured setting reaches"):
+        with pytest.raises(UsageError, match=re.escape(f"error of {error:g}")):
             cheapest(points, error)
 
 
 def test_failed_measurements_are_never_chosen():
     points = [TradeoffPoint(math.nan, 1), TradeoffPoint(math.inf, 1), TradeoffPoint(0.1, 5, {"links": 3})]
     assert cheapest(points, 0.2).settings == {"links": 3}
-    with pytest.raises(UsageError, match="No measured setting is usable"):
+    with pytest.raises(UsageError, match=r"setting .*usable"):
         cheapest(points[:2], 0.2)
 
 
 def test_the_error_names_the_most_accurate_setting():
-    with pytest.raises(UsageError, match=r"most accurate one has 0\.1 \(links 3\)"):
+    with pytest.raises(UsageError, match=r"0\.01; .*0\.1 \(links 3\)"):
         cheapest([TradeoffPoint(0.1, 5, {"links": 3}), TradeoffPoint(0.5, 1, {"links": 2})], 0.01)

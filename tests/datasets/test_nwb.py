@@ -1,3 +1,4 @@
+import re
 from datetime import UTC, datetime
 
 import h5py
@@ -38,7 +39,7 @@ def test_the_subject_comes_from_the_file_else_from_its_name(tmp_path):
         write_nwb(tmp_path / "sub-k2_ses-3_ecephys.nwb", subject="", session=""), conditions="trials:texture"
     )
     assert (guessed["subject"].values[0], guessed["session"].values[0]) == ("k2", "3")
-    assert "no subject_id; the subject 'k2' was taken from the file name" in "".join(guessed.attrs["notes"])
+    assert re.search("subject_id.*'k2'", "".join(guessed.attrs["notes"]))
 
 
 def test_files_without_units_are_skipped_in_a_folder_and_refused_alone(tmp_path):
@@ -188,7 +189,7 @@ def test_a_probe_export_without_trials_says_what_it_lacks(reference):
     assert report.sessions[0].subject == path.stem
     with pytest.raises(DataError, match=r"no interval.*'epochs'"):
         open_recordings(path)
-    with pytest.raises(UsageError, match="Unknown table 'trials'"):
+    with pytest.raises(UsageError, match=r"'trials'.*'epochs'"):
         open_recordings(path, conditions="trials:stimulus")
 
 

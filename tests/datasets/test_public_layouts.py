@@ -83,7 +83,7 @@ def test_a_spike_train_of_zeros_and_ones_is_a_unit_recorded_in_trials_only(tmp_p
     spikes, touches = write_hires(tmp_path / "a.nwb")
     dataset = open_recordings(tmp_path / "a.nwb", window="first-contact..+0.1", select="none")
     assert dataset.sizes["unit"] == 1
-    assert "the unit was made from the 0/1 signal acquisition/SpikeTrain" in "".join(dataset.attrs["notes"])
+    assert "acquisition/SpikeTrain" in "".join(dataset.attrs["notes"])
     np.testing.assert_allclose(
         dataset["window_start"].values, touches[np.searchsorted(touches, make_pole_task()[0]["start_time"])]
     )
@@ -92,7 +92,7 @@ def test_a_spike_train_of_zeros_and_ones_is_a_unit_recorded_in_trials_only(tmp_p
         dataset["counts"].values[:, 0, 0], [np.sum((spikes >= begin) & (spikes < begin + 0.1)) for begin in low]
     )
     # Between trials nothing was sampled: that is missing, not silence.
-    with pytest.raises(DataError, match="recorded span removed 24"):
+    with pytest.raises(DataError, match=r"a\.nwb: trials: .*span .*24"):
         open_recordings(tmp_path / "a.nwb", window="stop-0.2..+0.4", select="none")
 
 
@@ -102,7 +102,7 @@ def test_series_of_zeros_and_ones_say_what_is_wrong_with_them():
     np.testing.assert_allclose(Series("s", "", flags, start=5.0, rate=10.0).active_times(), [5.1, 5.3])
     with pytest.raises(DataError, match="4 samples"):
         Series("s", "", flags, stamps[:3]).active_times()
-    with pytest.raises(DataError, match="timestamps nor a rate"):
+    with pytest.raises(DataError, match=r"series s .*rate"):
         Series("s", "", flags).active_times()
     with pytest.raises(DataError, match="it reaches 7"):
         Series("s", "", flags * 7, stamps).active_times()
@@ -133,7 +133,7 @@ def test_bumps_and_reaches_are_told_apart_by_direction(tmp_path):
 
 def test_the_test_trials_of_the_benchmark_are_refused_in_words(tmp_path):
     write_area2(tmp_path / "a.nwb", test=True)
-    with pytest.raises(DataError, match="no interval table"):
+    with pytest.raises(DataError, match=r"a\.nwb .*interval .*'trials'"):
         open_recordings(tmp_path / "a.nwb")
     with pytest.raises(UsageError, match="column 'movement'"):
         open_recordings(f"area2-bump:{tmp_path / 'a.nwb'}")

@@ -1,3 +1,5 @@
+import re
+
 import h5py
 import numpy as np
 import pytest
@@ -70,7 +72,7 @@ def test_trials_outside_the_recorded_span_are_excluded_not_read_as_silence(tmp_p
     )
     assert dataset["window_start"].values.tolist() == [5.0, 7.0, 9.0, 11.0, 13.0]
     assert dataset.attrs["removed"]["trials: outside the recorded span"] == 7
-    assert "recorded span taken from first to last spike, 5.000–15.500 s" in "".join(dataset.attrs["notes"])
+    assert "5.000–15.500 s" in "".join(dataset.attrs["notes"])
 
 
 def test_a_unit_lost_before_the_end_is_missing_from_then_on(tmp_path):
@@ -122,10 +124,10 @@ def test_units_with_no_spikes_are_removed_and_counted_or_kept_on_request(tmp_pat
 def test_a_session_of_silent_units_has_no_recorded_span(tmp_path):
     table = {"start_time": np.arange(4.0), "stop_time": np.arange(4.0) + 1, "stimulus": ["a", "b", "a", "b"]}
     path = write(tmp_path / "a.h5", make_session("m", "1", [np.zeros(0)] * 2, {"trials": table}))
-    with pytest.raises(DataError, match=r"trial.*no spikes removed 2"):
+    with pytest.raises(DataError, match=r"a\.h5: units: .*2; trials: .*4"):
         open_recordings(path, conditions="trials:stimulus")
     path = write(tmp_path / "b.h5", make_session("m", "1", [], {"trials": table}))
-    with pytest.raises(DataError, match="table with spike_times"):
+    with pytest.raises(DataError, match=r"b\.h5:.*spike_times"):
         open_recordings(path, conditions="trials:stimulus")
 
 
@@ -135,7 +137,7 @@ def test_units_are_chosen_by_layer_depth_and_number_of_spikes(tmp_path):
     chosen = open_recordings(path, conditions="trials:stimulus", select="units.layer=4; units.inhibitory=false")
     assert chosen["depth"].values.tolist() == [500.0]
     assert chosen.attrs["removed"]["units: layer=4"] == 1
-    with pytest.raises(DataError, match=r"unit.*9999.*removed 3"):
+    with pytest.raises(DataError, match=r"units: .*9999 .*3"):
         open_recordings(path, conditions="trials:stimulus", select="min_spikes=9999")
 
 
@@ -168,7 +170,7 @@ def test_one_condition_only_is_refused(tmp_path):
 
 
 def test_no_trial_left_tells_which_rules_removed_them(tmp_path):
-    with pytest.raises(DataError, match=r"stimulus=z removed 12"):
+    with pytest.raises(DataError, match=r"stimulus=z .*12"):
         open_recordings(write(tmp_path / "a.h5"), conditions="trials:stimulus", select="stimulus=z")
 
 
@@ -181,7 +183,7 @@ def test_unsorted_spikes_are_sorted_and_said(tmp_path):
     plain = open_recordings(write(tmp_path / "a.h5", session), conditions="trials:stimulus")
     dataset = open_recordings(write(tmp_path / "b.h5", mixed), conditions="trials:stimulus")
     xr.testing.assert_identical(plain.drop_attrs(), dataset.drop_attrs())
-    assert "spike times of 1 units were not in order and have been sorted" in "".join(dataset.attrs["notes"])
+    assert re.search("spike times of 1 unit.* sorted", "".join(dataset.attrs["notes"]))
 
 
 def test_spike_times_that_are_not_finite_are_refused(tmp_path):
@@ -214,7 +216,7 @@ def test_missing_files_and_empty_searches_are_named(tmp_path):
     with pytest.raises(DataFileNotFoundError, match=r"matches no file"):
         open_recordings(str(tmp_path / "*.nwb"), conditions="trials:stimulus")
     (tmp_path / "empty").mkdir()
-    with pytest.raises(DataFileNotFoundError, match="holds no recordings"):
+    with pytest.raises(DataFileNotFoundError, match=r"/empty' .*\.nwb"):
         open_recordings(tmp_path / "empty", conditions="trials:stimulus")
 
 
@@ -266,7 +268,7 @@ def test_globs_lists_and_layouts_name_sources(tmp_path):
     xr.testing.assert_identical(by_glob.drop_attrs(), by_list.drop_attrs())
     with pytest.raises(UsageError, match="'rodgrs'; did you mean 'rodgers'"):
         open_recordings(f"rodgrs:{tmp_path}")
-    with pytest.raises(UsageError, match="write rodgers:PATH"):
+    with pytest.raises(UsageError, match=r"'rodgers:' .*rodgers:PATH"):
         open_recordings("rodgers:")
     with pytest.raises(UsageError, match="simulated stimuli"):
         open_recordings("demo")

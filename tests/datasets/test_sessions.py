@@ -42,7 +42,7 @@ def test_a_column_of_another_length_is_refused():
 def test_a_list_column_cannot_be_a_label():
     table = SessionTable("trials", {"tags": np.array(["a", "b", "c"]), "tags_index": np.array([1, 3])}, "f")
     assert len(table) == 2
-    with pytest.raises(DataError, match="holds a list per row"):
+    with pytest.raises(DataError, match=r"'tags' .*list"):
         table.column("tags")
 
 
@@ -64,5 +64,5 @@ def test_an_unknown_column_suggests_the_nearest():
 def test_make_session_refuses_columns_of_different_length():
     with pytest.raises(DataError, match=r"'stimulus' .* 1 of 2 rows"):
         make_session("m", "1", [np.zeros(1)], {"trials": {"start_time": [0.0, 1.0], "stimulus": ["a"]}})
-    with pytest.raises(UsageError, match="start_time"):
+    with pytest.raises(UsageError, match=r"'start_time'.*'stimulus'"):
         make_session("m", "1", [np.zeros(1)], {"trials": {"stimulus": ["a"]}})

@@ -1,4 +1,4 @@
-"""A head that swings out and stays: a motion that engines must follow."""
+"""Motions of a follicle that engines must follow."""
 
 from __future__ import annotations
 
@@ -24,3 +24,18 @@ class Swing:
         u = np.clip(times / self.duration, 0, 1)[:, None]
         ramp = u**3 * (10 - 15 * u + 6 * u**2)
         return ramp * np.array(self.shift), ramp * np.array(self.angles) + np.array(self.rest)
+
+
+@dataclass(frozen=True)
+class Oscillation:
+    """Sinusoidal angles (rad) about a rest pose and a sinusoidal displacement (m) at ``frequency`` (Hz)."""
+
+    angles: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    shift: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    rest: tuple[float, float, float] = FLAT
+    frequency: float = 20.0
+
+    def pose(self, times):
+        phase = 2 * np.pi * self.frequency * times
+        euler = np.sin(phase)[:, None] * np.array(self.angles) + np.array(self.rest)
+        return np.sin(phase + 0.3)[:, None] * np.array(self.shift), euler

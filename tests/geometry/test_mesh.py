@@ -81,7 +81,7 @@ def test_the_hull_of_a_dented_solid_is_larger():
 
 def test_a_flat_mesh_has_no_hull():
     flat = Mesh([[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0]], [[0, 1, 2], [1, 3, 2]], "sheet")
-    with pytest.raises(DataError, match="'sheet' has no volume"):
+    with pytest.raises(DataError, match=r"'sheet' .*volume"):
         flat.hull()
 
 
@@ -104,7 +104,7 @@ def test_an_unknown_unit_names_the_nearest(tmp_path):
 
 
 def test_a_missing_mesh_file_is_named(tmp_path):
-    with pytest.raises(DataFileNotFoundError, match=r"mesh file.*nothing\.obj"):
+    with pytest.raises(DataFileNotFoundError, match=r"/nothing\.obj'"):
         load_mesh(tmp_path / "nothing.obj", unit="m")
 
 

@@ -103,5 +103,5 @@ def test_the_wall_of_a_cavity_keeps_pointing_inward():
 
 
 def test_a_mesh_of_nothing_but_degenerate_triangles_is_refused():
-    with pytest.raises(DataError, match="'line' has no triangle"):
+    with pytest.raises(DataError, match=r"'line' .*triangle"):
         repair(Mesh([[0, 0, 0], [1, 0, 0]], [[0, 1, 1]], "line"))

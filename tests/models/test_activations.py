@@ -1,4 +1,5 @@
 import logging
+import re
 import tracemalloc
 from types import SimpleNamespace
 
@@ -173,9 +174,9 @@ def test_a_layer_that_knows_no_stimuli_is_an_error_only_when_asked_for(stimuli):
             return self.head(x.flatten(2)) + self.bias(torch.tensor([1]))
 
     assert list(extract(Biased(), stimuli)) == ["head", "output"]
-    with pytest.raises(UsageError, match=r"'bias' gave \[\[1, 3\]\]"):
+    with pytest.raises(UsageError, match=r"'bias' .*\[\[1, 3\]\]"):
         extract(Biased(), stimuli, layers=["bias"])
-    with pytest.raises(UsageError, match="'unused' gave nothing"):
+    with pytest.raises(UsageError, match=r"'unused' .*nothing"):
         extract(Biased(), stimuli, layers=["unused"])
 
 
@@ -187,7 +188,7 @@ def test_values_that_are_not_finite_are_kept_and_counted(stimuli, value, caplog)
         activations = extract(model, stimuli)
     assert not np.isfinite(activations["output"][..., 1]).any()
     assert activations.nonfinite == {"1": K * T, "output": K * T}
-    assert f"{K * T} of {3 * K * T} activations of layer '1' are not finite" in caplog.text
+    assert re.search(f"{K * T} of {3 * K * T} .*'1'", caplog.text)
 
 
 @pytest.mark.parametrize(
@@ -217,12 +218,12 @@ def test_a_model_of_another_precision_is_fed_in_it(stimuli):
 def test_a_stimulus_that_does_not_fit_says_what_was_given_and_what_failed(stimuli, model, failure):
     with pytest.raises(UsageError, match=failure) as caught:
         extract(model(), stimuli[:, :, :6])
-    assert "cannot process stimuli of shape [5, 4, 6, 5, 7] [stimulus, time, channel, row, column]" in str(caught.value)
+    assert "[5, 4, 6, 5, 7] [stimulus, time, channel, row, column]" in str(caught.value)
 
 
 @pytest.mark.parametrize(("x", "chunk"), [(np.zeros((0, T, 30, 5, 7)), 4), (np.zeros(3), 4), (np.zeros((2, T, 3)), 0)])
 def test_nothing_to_extract_from_is_an_error(x, chunk):
-    with pytest.raises(UsageError, match="needs stimuli"):
+    with pytest.raises(UsageError, match=re.escape(f"{list(x.shape)} and chunk {chunk}")):
         extract(nn.Flatten(2), x, chunk=chunk)
 
 

@@ -197,9 +197,9 @@ def test_gated_cells_may_change_the_number_of_channels():
 
 def test_wrong_parameters_are_named():
     cell = UGRNN(3, 3, kernel_size=2)
-    with pytest.raises(DataError, match=r"missing 'conv.bias'; unexpected 'conv.bais' \(did you mean 'conv.bais'"):
+    with pytest.raises(DataError, match=r"'conv.bias'.*'conv.bais' → 'conv.bias'"):
         cell.load_tnn_state({"conv.weight": torch.zeros(6, 6, 2, 2), "conv.bais": torch.zeros(6)})
-    with pytest.raises(DataError, match=r"'conv.weight' has shape \[6, 6, 3, 3\], expected \[6, 6, 2, 2\]"):
+    with pytest.raises(DataError, match=r"'conv.weight' .*\[6, 6, 3, 3\].*\[6, 6, 2, 2\]"):
         cell.load_tnn_state({"conv.weight": torch.zeros(6, 6, 3, 3), "conv.bias": torch.zeros(6)})
 
 

@@ -1,5 +1,6 @@
 import importlib
 import logging
+import re
 import subprocess
 import sys
 
@@ -76,7 +77,7 @@ def test_equal_seeds_give_equal_weights_and_disturb_nobody():
 
 @pytest.mark.parametrize("seed", [-1, 1.5, True, "0", 2**63])
 def test_a_seed_is_a_whole_number(seed):
-    with pytest.raises(UsageError, match="must be a whole number"):
+    with pytest.raises(UsageError, match=r"seed .*received"):
         load_model(SMALL, seed=seed)
 
 
@@ -92,14 +93,14 @@ def test_weights_are_loaded_under_a_tag_only(tmp_path):
     save_file(source, file)
     loaded = load_model(f"{SMALL}.supervised", pretrained=file).state_dict()
     assert all(torch.equal(value, loaded[name]) for name, value in source.items())
-    with pytest.raises(UsageError, match=f"Without a tag '{SMALL}'"):
+    with pytest.raises(UsageError, match=rf"'{SMALL}' .*{SMALL}\.supervised"):
         load_model(SMALL, pretrained=file)
     with pytest.raises(DataError, match=r"'zhuang-gru-small\.simclr'"):
         load_model("zhuang-gru-small.simclr", pretrained=file)
-    with pytest.raises(DataFileNotFoundError, match="no file of weights"):
+    with pytest.raises(DataFileNotFoundError, match=rf"none\.safetensors'.*'{SMALL}\.ae'"):
         load_model(f"{SMALL}.ae", pretrained=tmp_path / "none.safetensors")
     file.write_bytes(b"nothing")
-    with pytest.raises(DataError, match="not a readable"):
+    with pytest.raises(DataError, match=r"weights\.safetensors' .*safetensors file"):
         load_model(f"{SMALL}.ae", pretrained=file)
 
 
@@ -181,7 +182,7 @@ def test_our_names_are_taken_from_the_start():
 
 @pytest.mark.parametrize("name", ["Zhuang", "a.b", "a b", "a--b", "", "a/b", "+a"])
 def test_a_name_outside_the_grammar_is_refused(name):
-    with pytest.raises(UsageError, match="joined by"):
+    with pytest.raises(UsageError, match=re.escape(f"received '{name}'")):
         register_model(name, family="x")
 
 
@@ -225,5 +226,5 @@ def test_models_of_other_packages_arrive_and_broken_ones_are_announced(tmp_path,
 @pytest.mark.parametrize("use", [load_model, describe_model])
 def test_a_builder_that_gives_no_module_is_answered_in_one_sentence(use):
     register_model("no-module", family="theirs")(lambda: {"weights": 3})
-    with pytest.raises(UsageError, match="'no-module' gave a dict"):
+    with pytest.raises(UsageError, match=r"'no-module' .*dict"):
         use("no-module")

@@ -1,5 +1,6 @@
 import dataclasses
 import json
+import re
 
 import numpy as np
 import pytest
@@ -114,7 +115,7 @@ def test_pairs_of_an_engine_that_touches_surfaces_are_counted_in_triangles():
     assert told.bodies == "convex parts and triangles"
     assert told.pairs_in_full == 3 * FAST.links * (2 * triangles + 1)
     assert triangles < told.pairs < 3 * FAST.links * (triangles + 1)
-    assert "(links × convex parts and triangles) can ever meet" in str(told)
+    assert "links × convex parts and triangles" in str(told)
 
 
 def test_a_whisker_inside_the_bounds_of_a_surface_but_far_from_its_triangles_does_not_reach_it():
@@ -185,14 +186,14 @@ def test_the_text_says_what_was_saved():
         )
     )
     assert "2 stimuli × 3 whiskers = 6 runs of 6 links" in text
-    assert "saved          17 % of the steps" in text
+    assert re.search("saved +17 %", text)
     assert "near: D6" in text
 
 
 def test_steps_that_had_to_be_shorter_are_no_saving():
     told = Explanation.of(simulate(_scene("near", NEAR), fidelity=FAST, backend=FakeEngine()))
     more = dataclasses.replace(told, steps=told.steps_in_full * 106 // 100)
-    assert "saved          none of the steps (6 % more: some contacts needed shorter ones)" in str(more)
+    assert re.search(r"saved +none .*6 % more", str(more))
 
 
 def test_a_set_without_or_with_a_damaged_explanation_is_refused_in_words():

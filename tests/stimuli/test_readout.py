@@ -50,18 +50,18 @@ def test_whiskers_that_were_not_simulated_are_zero_and_the_others_as_in_the_full
 
 def test_other_sub_steps_divide_time_otherwise():
     assert to_grid(_dataset(), substeps=1).shape == (2, 110, 6, 5, 7)
-    with pytest.raises(UsageError, match="110 frames do not divide into time steps of 4 sub-steps"):
+    with pytest.raises(UsageError, match=r"110 frames .*4 sub-steps"):
         to_grid(_dataset(), substeps=4)
 
 
 def test_both_sides_do_not_fit_one_grid():
-    with pytest.raises(UsageError, match=r"two whiskers in one cell .both sides."):
+    with pytest.raises(UsageError, match=r"both sides.*one side"):
         to_grid(_dataset(side="both", whiskers="C2"))
 
 
 def test_an_unstable_whisker_is_refused_unless_zero_is_asked_for():
     dataset = _dataset("C1,C2", unstable={0: "blew up"})
-    with pytest.raises(DataError, match=r"became unstable .*C1 in a.* finer fidelity"):
+    with pytest.raises(DataError, match=r"'C1 in a'.*unstable='zero'"):
         to_grid(dataset)
     grid = to_grid(dataset, unstable="zero")
     assert np.isfinite(grid).all()

@@ -100,21 +100,21 @@ def test_an_array_file_that_does_not_fit_says_what_it_holds(tmp_path, content, m
 
 def test_whiskers_of_an_array_file_have_no_names(tmp_path):
     path = _arrays(tmp_path / "a.h5", stimuli=np.zeros((1, 2)), labels=["a"])
-    with pytest.raises(UsageError, match="leave the selection at 'all'"):
+    with pytest.raises(UsageError, match=r"a\.h5' .*'all'"):
         load_stimuli(path, whiskers="C2")
 
 
 def test_an_unknown_name_suggests_the_nearest_and_the_kinds_of_files():
-    with pytest.raises(UsageError, match=r"Unknown stimuli 'rodger'; did you mean 'rodgers'.*scene file"):
+    with pytest.raises(UsageError, match=r"'rodger'; did you mean 'rodgers'.*\.toml"):
         load_stimuli("rodger")
 
 
 def test_files_that_are_missing_or_damaged_are_named(tmp_path, dataset):
-    with pytest.raises(DataFileNotFoundError, match=r"no stimulus file .*gone\.h5"):
+    with pytest.raises(DataFileNotFoundError, match=r"/gone\.h5'"):
         load_stimuli(tmp_path / "gone.h5")
     text = tmp_path / "text.h5"
     text.write_text("hello")
-    with pytest.raises(DataError, match=r"text\.h5.* cannot be read as HDF5"):
+    with pytest.raises(DataError, match=r"text\.h5' .*HDF5"):
         load_stimuli(text)
     path = write_stimulus_set(dataset, tmp_path / "set.h5")
     path.write_bytes(path.read_bytes()[:5000])
@@ -126,5 +126,5 @@ def test_an_edited_set_is_noticed(tmp_path, dataset):
     path = write_stimulus_set(dataset, tmp_path / "set.h5")
     with h5py.File(path, "r+") as file:
         file["wrench"][0, 0, 0, 0] += 1
-    with pytest.raises(DataError, match="do not match the content hash"):
+    with pytest.raises(DataError, match=r"set\.h5' .*hash_stimulus_set"):
         load_stimuli(path)

@@ -49,7 +49,7 @@ def test_a_setting_is_measured_once_and_the_reference_differs_from_itself_by_not
 def test_a_table_of_other_experiments_is_refused(tmp_path):
     path = tmp_path / "table.json"
     path.write_text(json.dumps({"protocol": 1, "points": []}))
-    with pytest.raises(DataError, match="measured by other experiments"):
+    with pytest.raises(DataError, match=r"table\.json'.*MuJoCo"):
         tradeoff.measure_tradeoff(path, [COARSE])
 
 
@@ -78,7 +78,7 @@ def test_collision_geometries_of_a_concave_object_are_measured_beside_the_bench_
 
 @pytest.mark.parametrize("text", ["hul", "decomposition", "decomposition-fine", "hull-0.1"])
 def test_an_unknown_collision_geometry_is_refused(text):
-    with pytest.raises(UsageError, match=f"Unknown collision geometry '{text}'.*'decomposition-0.02'"):
+    with pytest.raises(UsageError, match=f"'{text}'.*'decomposition-0.02'"):
         SimulationSetting(COARSE.fidelity, collision=text)
 
 
@@ -114,7 +114,7 @@ def test_the_solver_is_an_axis_of_the_backend_that_has_two_and_no_rival_of_the_p
     assert [(item.backend, item.fidelity) for item in chosen] == [
         ("rod", Fidelity(links=8, time_step=1e-3, solver="quasistatic"))
     ]
-    with pytest.raises(UsageError, match="quasistatic"):
+    with pytest.raises(UsageError, match="'static'; did you mean 'quasistatic'"):
         tradeoff.settings(solvers=("static",))
     point = {"links": 8, "links_per_mm": None, "time_step": 1e-3, "steps_per_period": None, "backend": "rod"}
     moving, still = ({**point, "solver": name, "error": 0.1, "cost": 1.0} for name in ("dynamic", "quasistatic"))

@@ -94,7 +94,7 @@ def _spoil(folder, name, text):
 @pytest.mark.parametrize(
     ("name", "text", "message"),
     [
-        ("param_name", "RC2\nRC1\n", "param_name says 'RC2' where param_side_row_col says 'RC1'"),
+        ("param_name", "RC2\nRC1\n", r"param_name .*'RC2' .*param_side_row_col .*'RC1'"),
         ("param_name", "RC1\n", r"param_side_row_col.* has shape \[2, 3\]; 1 names need \[1, 3\]"),
         ("param_s_a", "1,2\n3\n", "not a table of"),
         ("param_s_a", "a,2\n3,4\n", "not a table of"),
@@ -110,13 +110,13 @@ def test_folders_that_do_not_fit_together_are_refused(tmp_path, name, text, mess
 
 
 def test_a_missing_table_is_named(tmp_path):
-    with pytest.raises(DataFileNotFoundError, match=r"param_name\.csv.*a WHISKiT parameter folder has one"):
+    with pytest.raises(DataFileNotFoundError, match=r"/param_name\.csv'"):
         load_parameters(tmp_path)
     save_parameters(WhiskerArray.mouse(whiskers="C1"), tmp_path)
     shutil.move(tmp_path / "param_s_a.csv", tmp_path / "elsewhere.csv")
-    with pytest.raises(DataFileNotFoundError, match="param_s_a"):
+    with pytest.raises(DataFileNotFoundError, match=r"/param_s_a\.csv'"):
         load_parameters(tmp_path)
-    with pytest.raises(UsageError, match="bends of 1 whiskers have shape"):
+    with pytest.raises(UsageError, match=r"bends .*received \(2, 20\)"):
         save_parameters(WhiskerArray.mouse(whiskers="C1"), tmp_path, bends_table=np.zeros((2, 20)))
 
 
@@ -172,19 +172,19 @@ def test_shapes_and_contacts_are_written_per_whisker(tmp_path, run):
 
 def test_a_run_that_cannot_be_written_says_why(tmp_path, run):
     dataset, shapes = run
-    with pytest.raises(UsageError, match="Unknown stimulus 'bal'; did you mean 'ball'"):
+    with pytest.raises(UsageError, match="'bal'; did you mean 'ball'"):
         save_run(dataset, tmp_path, stimulus="bal")
     with pytest.raises(UsageError, match="did you mean 'thesis'"):
         save_run(dataset, tmp_path, dialect="tesis")
-    with pytest.raises(UsageError, match="2 whiskers need as many shapes"):
+    with pytest.raises(UsageError, match=r"2 whiskers .*received 1"):
         save_run(dataset, tmp_path, shapes=shapes[:1])
-    with pytest.raises(UsageError, match=r"shape of RC1 is \[16, links \+ 1, 3\]"):
+    with pytest.raises(UsageError, match=r"RC1 .*received \(3, 9, 3\)"):
         save_run(dataset, tmp_path, shapes=[shape[:3] for shape in shapes])
     with pytest.raises(UsageError, match="several animals"):
         save_run(dataset.isel(whisker=[0, 0]), tmp_path)
-    with pytest.raises(UsageError, match="on which side"):
+    with pytest.raises(UsageError, match=r"WHISKiT.*need"):
         save_run(dataset.drop_vars("side"), tmp_path)
     both = dataset.isel(stimulus=[0, 0]).assign_coords(stimulus=["a", "b"])
-    with pytest.raises(UsageError, match="2 stimuli; say which"):
+    with pytest.raises(UsageError, match=r"2 stimuli; .*'a'"):
         save_run(both, tmp_path)
     assert save_run(both, tmp_path / "b", stimulus="b").is_dir()

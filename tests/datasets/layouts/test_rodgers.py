@@ -1,3 +1,4 @@
+import re
 from pathlib import Path
 
 import h5py
@@ -81,7 +82,7 @@ def test_absent_optional_columns_are_tolerated_and_said(tmp_path):
     nothing = np.array(0)
     dataset = open_recordings(write_rodgers(tmp_path / "a.h5", optogenetic=nothing, ignore_trial=nothing))
     assert dataset.sizes["trial"] == ROWS
-    assert "no column 'optogenetic', so the rule optogenetic!=true did not apply" in "".join(dataset.attrs["notes"])
+    assert "optogenetic!=true" in "".join(dataset.attrs["notes"])
 
 
 def test_a_session_without_contact_tables_is_read_before_the_choice(tmp_path):
@@ -112,7 +113,7 @@ def test_files_of_different_layouts_are_not_mixed_silently(tmp_path):
     write_rodgers(tmp_path / "a.h5")
     session = make_session("m", "1", [np.arange(5.0)], {"trials": {"start_time": [0.0, 1.0], "stim": ["a", "b"]}})
     write_recordings(tmp_path / "b.h5", session)
-    with pytest.raises(UsageError, match=r"b\.h5:m-1 has another"):
+    with pytest.raises(UsageError, match=r"b\.h5:m-1 .*a\.h5:231CR-1"):
         open_recordings(tmp_path)
 
 
@@ -132,7 +133,7 @@ def test_the_two_tasks_can_be_read_apart(tmp_path):
     one = open_recordings(f"rodgers-discrimination:{tmp_path}")
     assert (set(one["subject"].values), set(one["unit_subject"].values)) == ({"231CR"}, {"231CR"})
     assert one.attrs["removed"]["trials: task=discrimination"] == ROWS
-    assert "b.h5:233CR-1: no trial is left, so its 1 units are left out" in "".join(one.attrs["notes"])
+    assert re.search("b.h5:233CR-1: .* 1 unit", "".join(one.attrs["notes"]))
     assert [item["trials"] for item in one.attrs["sessions"]] == [ROWS, 0]
     other = open_recordings(f"rodgers-detection:{tmp_path}")
     assert set(other["subject"].values) == {"233CR"}

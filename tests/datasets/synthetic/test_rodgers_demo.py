@@ -170,17 +170,17 @@ def test_unsuitable_stimuli_are_refused(monkeypatch, tmp_path):
     stimuli = make_stimuli()
     with pytest.raises(DataError, match="'convex-close'"):
         make_rodgers_demo("unused", stimuli.isel(stimulus=slice(5)))
-    with pytest.raises(DataError, match="these have none"):
+    with pytest.raises(DataError, match=r"contact \[stimulus, time, whisker\]"):
         make_rodgers_demo("unused", stimuli.drop_vars("contact"))
     with pytest.raises(DataError, match="'C0', 'C1', 'C2', 'C3'"):
         make_rodgers_demo("unused", stimuli.isel(whisker=slice(10)))
     with pytest.raises(DataError, match="wrench for 'A3'"):
         make_rodgers_demo("unused", stimuli.assign(wrench=stimuli["wrench"].where(stimuli["whisker"] != "A3")))
-    with pytest.raises(DataError, match="exert no force"):
+    with pytest.raises(DataError, match=r"stimuli .*force"):
         make_rodgers_demo("unused", stimuli.assign(wrench=stimuli["wrench"] * 0))
-    with pytest.raises(DataError, match="'concave-far' touches"):
+    with pytest.raises(DataError, match=r"'concave-far' .*'C0', 'C1'"):
         make_rodgers_demo("unused", stimuli.assign(contact=stimuli["contact"] & (stimuli["stimulus"] != "concave-far")))
-    with pytest.raises(UsageError, match="at least one animal"):
+    with pytest.raises(UsageError, match="animal; received 0"):
         make_rodgers_demo("unused", stimuli, animals=0)
     assert list(tmp_path.iterdir()) == []
 

@@ -14,7 +14,7 @@ def test_conditions_are_a_table_and_columns():
 
 @pytest.mark.parametrize("source", ["stimulus", "trials:", ":stimulus", "trials:a,,b"])
 def test_unreadable_conditions_show_the_form(source):
-    with pytest.raises(UsageError, match="TABLE:COLUMN,COLUMN"):
+    with pytest.raises(UsageError, match=rf"'{source}' .*TABLE:COLUMN,COLUMN"):
         Conditions.parse(source)
 
 

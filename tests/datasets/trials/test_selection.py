@@ -33,7 +33,7 @@ def test_a_missing_value_fails_what_is_asked_for_and_passes_what_is_refused():
 def test_an_optional_rule_without_its_column_says_so():
     tally = Tally()
     assert tally.select(make_table(a=[1, 2]), (Rule("b", refuse=("x",), required=False),), "trials").all()
-    assert "no column 'b', so the rule b!=x did not apply" in tally.notes[0]
+    assert "rule b!=x" in tally.notes[0]
     assert tally.removed == {}
 
 
@@ -43,7 +43,7 @@ def test_a_required_rule_without_its_column_suggests_the_nearest():
 
 
 def test_a_range_over_text_is_refused():
-    with pytest.raises(DataError, match="holds text"):
+    with pytest.raises(DataError, match=r"'layer' .*text .*'2/3'"):
         Rule("layer", low=1, high=4).keep(make_table(layer=["2/3", "4"]))
 
 

@@ -1,3 +1,5 @@
+import re
+
 import numpy as np
 import pytest
 
@@ -29,14 +31,14 @@ def test_windows_are_read_from_text_and_written_back(source):
 
 @pytest.mark.parametrize("source", ["start", "..stop", "start..", "5"])
 def test_unreadable_windows_show_the_form(source):
-    with pytest.raises(UsageError, match=r"or FROM\.\.\+SECONDS"):
+    with pytest.raises(UsageError, match=rf"'{re.escape(source)}' .*FROM\.\.\+SECONDS"):
         Window.parse(source)
 
 
 def test_a_window_needs_an_end_and_a_positive_length():
-    with pytest.raises(UsageError, match="has no end"):
+    with pytest.raises(UsageError, match=r"'start' .*stop .*length"):
         Window("start")
-    with pytest.raises(UsageError, match="positive"):
+    with pytest.raises(UsageError, match=r"length .*received 0"):
         Window("start", length=0.0)
 
 
@@ -51,7 +53,7 @@ def test_a_contact_of_zero_duration_is_no_contact_unless_asked_for():
     session = make_contacts(C0=[(1.0, 1.0), (2.0, 2.1)])
     found, notes = edges(Window("first-contact", stop="choice"), session)
     assert found[0, 0] == 2.0
-    assert "1 of 2 contacts too brief to be the first" in notes[0]
+    assert "1 of 2 contacts" in notes[0]
     found, _ = edges(Window("first-contact", stop="choice", shortest_contact=-1.0), session)
     assert found[0, 0] == 1.0
 
@@ -65,7 +67,7 @@ def test_a_session_without_contact_tables_takes_the_fallback_and_says_so():
     window = Window("first-contact", stop="choice", fallback=Window("choice", offset=-1.0, length=1.0))
     found, notes = edges(window, make_contacts())
     np.testing.assert_allclose(found[0], [4.0, 5.0])
-    assert "no contact tables; window choice-1..+1 for its 3 trials" in notes[0]
+    assert "window choice-1..+1 for its 3 trials" in notes[0]
     with pytest.raises(DataError, match="contacts_by_whisker_"):
         edges(Window("first-contact", stop="choice"), make_contacts())
 

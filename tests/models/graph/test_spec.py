@@ -21,7 +21,7 @@ def test_nodes_are_sorted_along_the_feedforward_edges():
 
 
 def test_a_feedforward_cycle_is_refused_by_name():
-    with pytest.raises(UsageError, match="among 'b', 'c' form a cycle"):
+    with pytest.raises(UsageError, match=r"'b', 'c' .*cycle"):
         _spec([Edge("a", "b"), Edge("b", "c"), Edge("c", "b")])
 
 
@@ -32,7 +32,7 @@ def test_a_feedforward_cycle_is_refused_by_name():
         ([Edge("a", "b"), Edge("b", "c")], {"output": "C"}, "Unknown output node 'C'; did you mean 'c'"),
         ([Edge("a", "b"), Edge("b", "c")], {"inputs": ("x",)}, "Unknown input node 'x'"),
         ([Edge("a", "b")], {}, r"No path leads from the input nodes \['a'\] to 'c'"),
-        ([Edge("a", "b"), Edge("b", "c"), Edge("a", "b")], {}, "The edge a → b appears more than once"),
+        ([Edge("a", "b"), Edge("b", "c"), Edge("a", "b")], {}, r"a → b .*once"),
         ([Edge("a", "b"), Edge("b", "c")], {"input_shape": (3, 5)}, r"must be \(channels, rows, columns\)"),
         ([], {"nodes": (Node("a", CONV), Node("a", CONV)), "output": "a"}, "appears more than once"),
         ([], {"nodes": (Node("a.b", CONV),), "inputs": ("a.b",), "output": "a.b"}, "contains a dot"),

@@ -89,10 +89,10 @@ def test_ff_order_decides_what_is_feedback():
         ({"pre_memory": {"name": "Conv3dCell"}}, "Unknown module in the pre-memory of 'b' 'Conv3dCell'; did you mean"),
         ({"recurrent_cell": {"name": "UGRNN"}}, "cell in the recurrent cell of 'b' 'UGRNN'; did you mean 'UGRNNCell'"),
         ({"harbor_policy": {"name": "RGC"}}, "Unknown harbor policy of node 'b' 'RGC'"),
-        ({"post_memory": {"name": "ResidualAdd"}}, "Unknown module in the post-memory of 'b' 'ResidualAdd'"),
+        ({"post_memory": {"name": "ResidualAdd"}}, "'b' 'ResidualAdd'"),
         ({"gain": 2}, "unsupported key 'gain' in node 'b'"),
         ({"out_channels": 5}, "Node 'b' has out_channels 5, its pre-memory 4"),
-        ({"residual": True}, "has 'residual': True in node 'b'; only None is supported"),
+        ({"residual": True}, r"'residual': True .*'b'; .*None"),
     ],
 )
 def test_an_unsupported_node_is_refused_in_one_sentence(change, message):
@@ -103,12 +103,12 @@ def test_an_unsupported_node_is_refused_in_one_sentence(change, message):
 @pytest.mark.parametrize(
     ("key", "value", "message"),
     [
-        ("batchnorm", 4, "'batchnorm': 4 in the pre-memory of 'a'; only None is supported"),
+        ("batchnorm", 4, r"'batchnorm': 4 .*'a'; .*None"),
         ("dilation", 2, "'dilation': 2"),
-        ("ksize", "3", "'ksize' in the pre-memory of 'a' must be a whole number or a pair"),
+        ("ksize", "3", r"'ksize' .*'a' .*'3'"),
         ("padding", "reflect", "Unknown padding in the pre-memory of 'a' 'reflect'"),
         ("stride", 2, "'same' in the pre-memory of 'a' needs stride 1"),
-        ("init_dict", {"method": "kaiming"}, "Unknown initialiser in the pre-memory of 'a' 'kaiming'"),
+        ("init_dict", {"method": "kaiming"}, "'kaiming'; did you mean 'kaiming_normal_'"),
         ("colour", 1, "unsupported key 'colour' in the pre-memory of 'a'"),
     ],
 )
@@ -128,12 +128,12 @@ def test_a_missing_key_is_named(key):
 
 
 def test_several_outputs_are_refused():
-    with pytest.raises(DataError, match=r"\['a', 'b'\]; exactly one"):
+    with pytest.raises(DataError, match=r"\['a', 'b'\]; .*one"):
         read_graph(_config(output_node=["a", "b"]))
 
 
 def test_an_incomplete_order_is_refused():
-    with pytest.raises(DataError, match="every node once"):
+    with pytest.raises(DataError, match=r"'ff_order' .*\['a', 'b'\]"):
         read_graph(_config(ff_order=["a"]))
 
 
@@ -142,7 +142,7 @@ def test_a_file_is_read_and_a_bad_one_named(tmp_path):
     good.write_text(json.dumps(_config()))
     bad.write_text("{")
     assert read_graph(good) == read_graph(_config())
-    with pytest.raises(DataError, match=r"bad\.json' is not valid"):
+    with pytest.raises(DataError, match=r"bad\.json' .*JSON"):
         read_graph(bad)
-    with pytest.raises(DataError, match="There is no file"):
+    with pytest.raises(DataError, match=r"/none\.json'"):
         read_graph(tmp_path / "none.json")

@@ -44,7 +44,7 @@ def test_shipped_weights_are_found_by_name(folder, monkeypatch):
     monkeypatch.setattr(registry, "shipped", lambda: {f"{NAME}.simclr": folder})
     assert _equal(load_model(f"{NAME}.simclr"), load_model(f"local-dir:{folder}"))
     assert describe_model(f"{NAME}.simclr").name == f"{NAME}.simclr"
-    with pytest.raises(UsageError, match=r"'resnet18-small\.supervised' yet"):
+    with pytest.raises(UsageError, match="train resnet18-small --objective"):
         load_model(f"{NAME}.supervised")
 
 
@@ -73,10 +73,10 @@ def test_weights_that_are_not_finite_are_not_written(tmp_path):
 
 
 def test_folders_that_are_no_models_are_told_apart(folder, tmp_path):
-    with pytest.raises(DataFileNotFoundError, match="no folder"):
+    with pytest.raises(DataFileNotFoundError, match="/none'"):
         load_model(f"local-dir:{tmp_path / 'none'}")
     (tmp_path / "empty").mkdir()
-    with pytest.raises(DataFileNotFoundError, match=r"no config\.json"):
+    with pytest.raises(DataFileNotFoundError, match=r"config\.json .*/empty'"):
         load_model(f"local-dir:{tmp_path / 'empty'}")
     config = json.loads((folder / "config.json").read_text())
     for change, message in (

@@ -148,14 +148,14 @@ def test_a_folder_of_another_run_is_refused(tmp_path):
 def test_a_damaged_state_is_named(tmp_path):
     train(_config(), tiny(), out=tmp_path, device="cpu", stop_after=0.0)
     (tmp_path / "state.safetensors").write_bytes(b"nothing")
-    with pytest.raises(DataError, match="readable training state"):
+    with pytest.raises(DataError, match=r"/state\.safetensors' "):
         train(_config(), tiny(), out=tmp_path, device="cpu")
 
 
 def test_missing_data_and_devices_are_named(tmp_path):
     with pytest.raises(DataError, match="no split 'train'"):
         train(_config(), tiny(train=0), out=tmp_path, device="cpu")
-    with pytest.raises(UsageError, match="'tpuu' is not a device"):
+    with pytest.raises(UsageError, match=r"'tpuu' .*cuda:N"):
         train(_config(), tiny(), out=tmp_path, device="tpuu")
 
 

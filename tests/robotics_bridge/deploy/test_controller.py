@@ -218,23 +218,23 @@ def test_real_values_fill_all_slots_and_simulated_ones_the_rest() -> None:
     np.testing.assert_allclose(again, pressure)
     simulated = RealTouch("force", links, (5, 9, 3), tips=tips, fingers=(), fallback=lambda r: np.ones((5, 9, 3)))
     assert simulated(reading).all()
-    with pytest.raises(UsageError, match="cannot measure 'force'"):
+    with pytest.raises(UsageError, match=r"'force', .*'agg_force'"):
         RealTouch("force", links, (5, 9, 3), tips=tips, fingers=())
     with pytest.raises(UsageError, match=r"link \(3\).* reads 4"):
         RealTouch("agg_bool", links, (5, 4, 1), tips=tips, fingers=("thumb", "index"))
 
 
 def test_what_does_not_fit_is_refused_before_anything_moves() -> None:
-    with pytest.raises(UsageError, match="reads the group 'goal'"):
+    with pytest.raises(UsageError, match="group 'goal'"):
         _control(groups=("proprio", "goal"))
-    with pytest.raises(UsageError, match="lacks 'action_map'"):
+    with pytest.raises(UsageError, match=r"'action_map' .*policy export"):
         Actuation.of({"joints": []})
     with pytest.raises(UsageError, match=r"'timeout' .* -1"):
         _limits(timeout=-1)
     hand = hands.load("xhand1")
     limits = SafetyLimits.of_hand(hand, hand.joints)
     assert limits.speed.max() == pytest.approx(14.38)
-    with pytest.raises(UsageError, match="has no joint 'knee'"):
+    with pytest.raises(UsageError, match=r"'xhand1' .*'knee'"):
         SafetyLimits.of_hand(hand, ("knee",))
     report, _, _ = _control(groups=("proprio", "goal"), sources={"goal": lambda r: np.array([np.nan])})
     assert report.reason == "the observation 'goal' holds values that are no numbers"

@@ -218,13 +218,13 @@ def test_quaternions_agree_with_mujoco():
 def test_unknown_names_and_unusable_files_are_explained(tmp_path):
     with pytest.raises(UsageError, match=r"'xhand1'.*URDF or MJCF"):
         hands.load("xhand")
-    with pytest.raises(DataError, match="no hand file"):
+    with pytest.raises(DataError, match=r"/none\.urdf'"):
         hands.load(tmp_path / "none.urdf")
     (tmp_path / "broken.xml").write_text("<mujoco><nonsense/></mujoco>")
-    with pytest.raises(DataError, match="MuJoCo cannot read"):
+    with pytest.raises(DataError, match=r"/broken\.xml'"):
         hands.load(tmp_path / "broken.xml")
     (tmp_path / "still.xml").write_text('<mujoco><worldbody><geom size="1"/></worldbody></mujoco>')
-    with pytest.raises(DataError, match="it has no joints"):
+    with pytest.raises(DataError, match=r"still\.xml' .*joints"):
         hands.load(tmp_path / "still.xml")
     with pytest.raises(UsageError, match="resolution 'hi'"):
         hands.load("xhand1").layout("hi")
@@ -235,20 +235,20 @@ def test_unknown_names_and_unusable_files_are_explained(tmp_path):
 def test_probe_files_of_another_form_or_for_another_hand_are_refused(tmp_path):
     path = tmp_path / "probes.json"
     path.write_text('{"a": 1}')
-    with pytest.raises(DataError, match="a list of links"):
+    with pytest.raises(DataError, match=r"probes\.json .*'link_name'"):
         read_probes(path)
     path.write_text('[{"link_name": "a", "probes": [[{"radius": 1}]]}]')
     with pytest.raises(DataError, match="link 1"):
         read_probes(path)
     write_probes(path, hands.load("sharpa").layout("low"))
-    with pytest.raises(UsageError, match="link 'right_hand_C_MC'"):
+    with pytest.raises(UsageError, match="'right_hand_C_MC'; did you mean"):
         hands.load("xhand1").with_probes(path)
 
 
 def test_a_hand_that_does_not_hang_together_is_refused():
     links = (Link("a", 0.1, (CapsuleGeometry((0, 0, 0), (0, 0, 1), 0.1),)), Link("b", 0.1), Link("c", 0.1))
     joint = Joint("j", "b", "c", (0, 0, 0), (0, 0, 0), (0, 0, 1), (0, 1), 1, 1, 1, 1, 0.1)
-    with pytest.raises(UsageError, match="form no tree"):
+    with pytest.raises(UsageError, match=r"'broken' .*'b'"):
         build(HandSpec("broken", "a", links, (joint,), {}))
     with pytest.raises(UsageError, match="has no link 'd'"):
         HandSpec("broken", "a", links, (joint,), {"finger": ("d",)})

@@ -58,7 +58,7 @@ def test_sizes_of_a_hand_follow_from_counts_of_taxels_and_links():
 def test_wrong_names_and_shapes_are_explained():
     with pytest.raises(UsageError, match=r"'forces'; .* 'force'"):
         observe("forces", {}, _layout())
-    with pytest.raises(UsageError, match="among the readings 'a'"):
+    with pytest.raises(UsageError, match=r"'a'.*Allowed: 'b'"):
         observe("depth", {"b": torch.zeros(1, 3)}, _layout())
     with pytest.raises(UsageError, match=r"\(1, 5\).* 6 probes"):
         observe("depth", {"a": torch.zeros(1, 5), "b": torch.zeros(1, 3)}, _layout())

@@ -220,11 +220,11 @@ def test_configurations_survive_a_file_and_name_what_is_wrong() -> None:
         EncoderConfig.of({"resolutio": "med"})
     with pytest.raises(UsageError, match="did you mean 'tactile_cnn'"):
         EncoderConfig(name="tactil_cnn").build()
-    with pytest.raises(UsageError, match="needs a grid of taxels"):
+    with pytest.raises(UsageError, match=r"'tactile_cnn' .*'agg_bool'"):
         EncoderConfig(name="tactile_cnn", observe="agg_bool").build()
-    with pytest.raises(UsageError, match=r"reads \[sub-steps, items, channels\] = \[5, 199, 6\]"):
+    with pytest.raises(UsageError, match=r"\[5, 199, 6\]; .*\[5, 45, 6\]"):
         TactilePolicy(_observations(1)[0], GROUPS, "student", 12, tactile={"name": "mlp"})
-    with pytest.raises(UsageError, match="hold touch; name its encoder"):
+    with pytest.raises(UsageError, match=r"tactile={'name'"):
         TactilePolicy(_observations(1)[0], GROUPS, "student", 12)
 
 

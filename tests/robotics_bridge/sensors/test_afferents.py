@@ -65,12 +65,12 @@ def test_a_reset_forgets_in_its_environment_alone():
 
 
 def test_bands_that_do_not_fit_the_rate_and_unknown_afferents_are_explained():
-    with pytest.raises(UsageError, match=r"more than 800 .* received 200"):
+    with pytest.raises(UsageError, match=r"800 .*received 200"):
         AfferentFilter(200.0)
     assert set(AfferentFilter(200.0, ("SA-I", "FA-I")).bands) == {"SA-I", "FA-I"}
     with pytest.raises(UsageError, match=r"'FA-1'; .* 'FA-I'"):
         AfferentFilter(2000.0, ("FA-1",))
-    with pytest.raises(UsageError, match="lower to a higher"):
+    with pytest.raises(UsageError, match=r"received 5\.0, 5\.0"):
         Band(5.0, 5.0)
     with pytest.raises(UsageError, match="1 to 8"):
         Band(0.0, 5.0, 9)

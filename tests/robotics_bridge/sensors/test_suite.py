@@ -268,13 +268,13 @@ def test_states_and_names_that_do_not_fit_are_refused() -> None:
     suite = _suite({"depth": ContactDepthProbe(link="hand", probes=GRID)}, envs=2)
     with pytest.raises(UsageError, match=r"2 environments .* has 1"):
         suite.update(state_of(suite.scene, _touching(1)))
-    with pytest.raises(UsageError, match="positive time"):
+    with pytest.raises(UsageError, match=r"dt .*received 0"):
         suite.update(state_of(suite.scene, _touching(2)), dt=0.0)
     with pytest.raises(UsageError, match="did you mean 'depth'"):
         suite.read("dept")
-    with pytest.raises(UsageError, match="keeps no history"):
+    with pytest.raises(UsageError, match=r"'depth' .*history="):
         suite.read_history("depth")
-    with pytest.raises(UsageError, match="nearest=True"):
+    with pytest.raises(UsageError, match=r"'depth' .*nearest=True"):
         suite.read_nearest("depth")
     with pytest.raises(UsageError, match="are 0 to 1"):
         suite.reset([2])

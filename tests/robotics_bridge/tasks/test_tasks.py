@@ -59,9 +59,9 @@ def test_unknown_names_are_met_with_the_nearest() -> None:
         tasks.load("screwdrivr")
     with pytest.raises(UsageError, match="did you mean 'published'"):
         tasks.load("screwdriver", "publish")
-    with pytest.raises(UsageError, match="observation group"):
+    with pytest.raises(UsageError, match="'priv_obj_stat'; did you mean"):
         replace(tasks.load("screwdriver"), groups={"actor": ("priv_obj_stat",)})
-    with pytest.raises(UsageError, match="positive length"):
+    with pytest.raises(UsageError, match=r"'screwdriver' .*received 0\.0"):
         replace(tasks.load("screwdriver"), episode=0.0)
     with pytest.raises(UsageError, match="range"):
         replace(tasks.load("screwdriver"), object_changes=ObjectRandomisation(friction=(2.0, 1.0)))
@@ -94,9 +94,9 @@ def test_shapes_share_their_slots_and_scale_in_all_lengths() -> None:
     assert sizes[0].extent == pytest.approx((0.02, 0.025, 0.03))
     assert sizes[-1].solids[0].position == pytest.approx((0.0, 0.3, 0.0))
     assert with_sizes(shapes, (1.0, 1.0)) == shapes
-    with pytest.raises(UsageError, match="positive range"):
+    with pytest.raises(UsageError, match=r"size .*received \(0\.0, 1\.0\)"):
         with_sizes(shapes, (0.0, 1.0))
-    with pytest.raises(UsageError, match="shorter than the tool"):
+    with pytest.raises(UsageError, match=r"received 0\.2 m of 0\.1 m"):
         screwdriver(0.1, 0.2, 0.02, 0.004)
 
 
@@ -128,9 +128,9 @@ def test_only_links_that_can_meet_collide() -> None:
 
 def test_a_finger_that_the_hand_lacks_is_named() -> None:
     task = replace(tasks.load("in_palm_rotate"), moves=("tentacle",))
-    with pytest.raises(UsageError, match="fingers of hand 'xhand1' are"):
+    with pytest.raises(UsageError, match=r"tentacle; .*'xhand1' .*index"):
         build(task, hands.load("xhand1"))
-    with pytest.raises(UsageError, match="does not have"):
+    with pytest.raises(UsageError, match=r"'elbow', .*'xhand1'"):
         build(replace(tasks.load("in_palm_rotate"), joints={"xhand1": {"elbow": 1.0}}), hands.load("xhand1"))
 
 
@@ -160,5 +160,5 @@ def test_the_latch_needs_the_heat_of_the_hot_ball() -> None:
     env.step(torch.zeros(2, env.num_actions))
     assert not thermometers.latched.any()
     assert env.state.episode.metric.tolist() == [0.0, 0.0]
-    with pytest.raises(UsageError, match="hotter than the room"):
+    with pytest.raises(UsageError, match=r"received 10\.0 and 22\.0"):
         ThermalSettings(hot=10.0)

@@ -30,11 +30,11 @@ def test_auto_takes_the_cheapest_measured_setting_that_is_good_enough():
 
 
 def test_auto_refuses_what_was_never_measured():
-    with pytest.raises(UsageError, match="No measured setting reaches an error of 1e-06"):
+    with pytest.raises(UsageError, match=r"1e-06; .*time_step"):
         Fidelity.auto(error=1e-6)
-    with pytest.raises(UsageError, match="error must be positive"):
+    with pytest.raises(UsageError, match=r"error .*received 0"):
         Fidelity.auto(error=0)
-    with pytest.raises(UsageError, match="Unknown measured backend 'mujocco'; did you mean 'mujoco'"):
+    with pytest.raises(UsageError, match="'mujocco'; did you mean 'mujoco'"):
         Fidelity.auto(backend="mujocco")
 
 
@@ -56,10 +56,10 @@ def test_stiff_whiskers_get_shorter_steps():
 @pytest.mark.parametrize(
     ("values", "message"),
     [
-        ({"links": 1}, "links must lie between 2 and 100"),
-        ({"links_per_mm": 0.0}, "links_per_mm must be positive"),
-        ({"time_step": 0.1}, "time_step must lie between"),
-        ({"steps_per_period": 1}, "steps_per_period must lie between"),
+        ({"links": 1}, r"links .*2 and 100; received 1"),
+        ({"links_per_mm": 0.0}, r"links_per_mm .*received 0"),
+        ({"time_step": 0.1}, r"time_step .*received 0\.1"),
+        ({"steps_per_period": 1}, r"steps_per_period .*received 1"),
     ],
 )
 def test_impossible_settings_are_refused(values, message):
@@ -85,8 +85,8 @@ def test_a_preset_in_a_text_may_be_changed_value_by_value():
     [
         ("balancd", "balanced"),
         ("fast,link=3", "'links'"),
-        ("fast,links=many", "links takes a whole number; received 'many'"),
-        ("fast,time_step=", "time_step takes a number; received ''"),
+        ("fast,links=many", r"links .*received 'many'"),
+        ("fast,time_step=", r"time_step .*received ''"),
         ("fast,solver=static", "quasistatic"),
         ("fast,time_step=1", "between 1e-7 and 5e-3"),
     ],

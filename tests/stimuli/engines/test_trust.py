@@ -1,6 +1,7 @@
 """What the engines share: how far things move in a step, and what then cannot be trusted."""
 
 import math
+import re
 
 import numpy as np
 import pytest
@@ -64,8 +65,8 @@ def test_an_object_that_flies_farther_than_it_is_thick_may_pass_unseen(obstacle,
     reach = reachable(WHISKER, STILL[0], (obstacle,), TIMES, surfaces=True)
     step, reason = passed_unseen(job, reach, *STILL, TIMES)
     assert step < 5
-    assert f"moves by 4 mm against the whisker in one step at {TIMES[step]:g} s" in reason
-    assert f"is only {thickness:g} mm thick" in reason
+    assert re.search(f"4 mm .* {TIMES[step]:g} s", reason)
+    assert f" {thickness:g} mm thick" in reason
     fine = np.linspace(0.0, 0.01, 201)
     assert passed_unseen(job, reach, *StillFollicle().pose(fine), fine) == (200, "")
 
@@ -79,7 +80,7 @@ def test_a_surface_without_parts_is_refused_in_words():
     parts = Obstacle((Sphere((0, 0, 0), 1e-3),), surface=TETRAHEDRON)
     require_parts([Job(WHISKER, StillFollicle(), (parts,), TIMES[1:])], "mujoco")
     bare = Obstacle((), surface=TETRAHEDRON)
-    with pytest.raises(UsageError, match="a concave surface of 4 triangles"):
+    with pytest.raises(UsageError, match=r"'mujoco' .* 4 triangles.*'rod'"):
         require_parts([Job(WHISKER, StillFollicle(), (parts, bare), TIMES[1:])], "mujoco")
 
 

@@ -1,5 +1,6 @@
 import dataclasses
 import math
+import re
 import sys
 
 import numpy as np
@@ -100,7 +101,7 @@ def test_whiskers_of_unknown_shape_are_left_out_and_said_aloud(caplog, tmp_path,
     assert recording.unstable == ("C1",)
     monkeypatch.setattr(module, "record", lambda *args, **options: recording)
     render(SCENE, tmp_path / "a.png", times=[0.0], camera=ABOVE, style=SMALL)
-    assert "unstable whiskers are not drawn from then on: 'C1'" in caplog.text
+    assert re.search("unstable .*'C1'", caplog.text)
 
 
 def test_a_picture_is_written_whole_and_the_same_every_time(tmp_path):
@@ -164,7 +165,7 @@ def test_an_mp4_has_a_frame_per_instant(tmp_path):
 def test_a_missing_package_is_named_with_its_extra(tmp_path, monkeypatch, package, name):
     monkeypatch.setitem(sys.modules, package, None)
     backend = FakeEngine()
-    with pytest.raises(MissingDependencyError, match=r"pip install 'brainbench\[report\]'"):
+    with pytest.raises(MissingDependencyError, match=r"brainbench\[report\]"):
         render(SCENE, tmp_path / name, times=[0.0], style=SMALL, backend=backend)
     assert not backend.jobs
     assert not list(tmp_path.iterdir())
@@ -180,7 +181,7 @@ def test_the_telling_instant_of_a_scene_is_its_first_full_protraction():
 def test_a_film_runs_from_start_to_stop():
     np.testing.assert_allclose(film_times(SCENE, 0.01, 0.03, 0.005), [0.01, 0.015, 0.02, 0.025, 0.03])
     assert film_times(SCENE)[-1] == pytest.approx(0.09)
-    with pytest.raises(UsageError, match="later time"):
+    with pytest.raises(UsageError, match=r"received 0\.05 s to 0\.01 s"):
         film_times(SCENE, 0.05, 0.01)
     with pytest.raises(UsageError, match="at most 10,000"):
         film_times(SCENE, 0.0, 1.0, 1e-6)
@@ -195,7 +196,7 @@ def test_a_film_runs_from_start_to_stop():
         ({"thickness": 0.0}, "positive number"),
         ({"supersampling": 9}, "1, 2, 3 or 4"),
         ({"frames_per_second": 0.0}, "120 frames"),
-        ({"moment_limit": -1.0}, "moment_limit must be positive"),
+        ({"moment_limit": -1.0}, r"moment_limit .*received -1"),
     ],
 )
 def test_impossible_styles_are_refused(options, message):

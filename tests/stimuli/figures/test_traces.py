@@ -89,7 +89,7 @@ def test_several_stimuli_make_a_file_each_with_equal_bytes_every_time(few, tmp_p
 def test_one_stimulus_and_a_part_of_the_time_can_be_chosen(few, tmp_path):
     (path,) = plot(few, tmp_path / "one.png", stimulus="one", window=(0.02, 0.05), size=(400, 240))
     assert path == tmp_path / "one.png"
-    with pytest.raises(UsageError, match="fewer than two frames"):
+    with pytest.raises(UsageError, match=r"0\.021–0\.022 s"):
         plot(few, tmp_path / "none.png", window=(0.021, 0.022))
 
 
@@ -110,5 +110,5 @@ def test_wrong_requests_are_refused_in_words(dataset, tmp_path, options, message
 
 def test_two_sides_do_not_share_a_panel(tmp_path):
     both = _simulate(array=WhiskerArray.mouse(side="both", whiskers="C2"))
-    with pytest.raises(UsageError, match="select one side"):
+    with pytest.raises(UsageError, match=r"two whiskers .*one side"):
         plot(both, tmp_path / "a.png")

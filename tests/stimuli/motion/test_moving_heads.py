@@ -107,12 +107,12 @@ def test_circling_at_constant_speed_pulls_the_base_outwards_with_the_centripetal
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (((0.0,), ((0, 0, 0),), ((0, 0, 0),)), "ascend from 0 and are at least two"),
+        (((0.0,), ((0, 0, 0),), ((0, 0, 0),)), r"times .*received \(0\.0,\)"),
         (((0.0, 0.0), ((0, 0, 0),) * 2, ((0, 0, 0),) * 2), "ascend from 0"),
         (((0.1, 0.2), ((0, 0, 0),) * 2, ((0, 0, 0),) * 2), "ascend from 0"),
-        (((0.0, 0.2), ((0, 0, 0),) * 3, ((0, 0, 0),) * 2), "numbers of displacements for each of its 2 times"),
-        (((0.0, 0.2), ((0, 0, 0),) * 2, ((0, 0), (0, 0))), "numbers of rotations for each"),
-        (((0.0, 0.2), ((1, 0, 0),) * 2, ((0, 0, 0),) * 2), "starts without displacements"),
+        (((0.0, 0.2), ((0, 0, 0),) * 3, ((0, 0, 0),) * 2), r"displacements .*2 times"),
+        (((0.0, 0.2), ((0, 0, 0),) * 2, ((0, 0), (0, 0))), r"rotations .*2 times"),
+        (((0.0, 0.2), ((1, 0, 0),) * 2, ((0, 0, 0),) * 2), r"received \(1\.0, 0\.0, 0\.0\)"),
     ],
 )
 def test_impossible_paths_are_refused(arguments, message):
@@ -122,7 +122,7 @@ def test_impossible_paths_are_refused(arguments, message):
 
 def test_a_scene_longer_than_the_path_is_refused():
     scene = Scene("long", PAIR, head=PLACE, frames=Frames(0.0, 0.01, 40))
-    with pytest.raises(UsageError, match=r"path ends at 0\.12 s; the scene needs it at"):
+    with pytest.raises(UsageError, match=r"0\.12 s; .*0\.39 s"):
         simulate(scene, backend=FakeEngine())
 
 
@@ -131,7 +131,7 @@ def test_a_head_that_turns_a_whisker_upright_is_refused_in_words():
     # C3 lies across the head, so that a pitch by 90 degrees carries it past the vertical within 2 degrees.
     array = WhiskerArray.mouse(whiskers="C3")
     scene = Scene("over", array, head=Head(motion=over), whisking=Still(), frames=Frames(0, 0.01, 15))
-    with pytest.raises(UsageError, match=r"whisker C3 points along the vertical axis.*gimbal lock"):
+    with pytest.raises(UsageError, match=r"C3 .*gimbal lock"):
         simulate(scene, backend=FakeEngine())
 
 
@@ -166,13 +166,13 @@ def test_whiskers_of_animals_are_chosen_by_name():
     assert scene.select("b:*").names == ("C1", "D2")
     assert scene.select("b:*").head == PLACE
     assert scene.select("a:C2,b:D2").names == ("a:C2", "b:D2")
-    with pytest.raises(UsageError, match="Unknown whisker"):
+    with pytest.raises(UsageError, match="'c:C1'; did you mean 'b:C1'"):
         scene.select("c:C1")
 
 
 def test_the_grid_refuses_several_animals_even_in_different_cells_and_takes_one():
     dataset = simulate(_crowd(), backend=FakeEngine())
-    with pytest.raises(UsageError, match=r"2 animals and a grid holds one; select .*: 'a:\*' or 'b:\*'"):
+    with pytest.raises(UsageError, match=r"2 animals .*'a:\*' or 'b:\*'"):
         to_grid(dataset)
     apart = dataset.isel(whisker=[0, 3])
     with pytest.raises(UsageError, match="2 animals"):
@@ -190,5 +190,5 @@ def test_animals_count_in_the_configuration_and_single_ones_change_nothing():
 
 def test_animals_need_different_names():
     for name in ("a", "", "x:y"):
-        with pytest.raises(UsageError, match="different names without a colon"):
+        with pytest.raises(UsageError, match=rf"received \['a', '{name}'\]"):
             _crowd(others=(Animal(name, PAIR),))

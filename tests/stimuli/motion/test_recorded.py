@@ -114,7 +114,7 @@ def test_a_whisker_that_turns_upright_is_refused_in_words():
     def rotation(times):
         return base_rotation(np.outer(times, [0.0, math.pi, 0.0]))
 
-    with pytest.raises(UsageError, match=r"whisker RC2 points along the vertical axis.* at 0\.48.*gimbal lock"):
+    with pytest.raises(UsageError, match=r"RC2 .* 0\.48.*gimbal lock"):
         follow_angles(rotation, np.linspace(0, 0.6, 7), (0.0, 0.0, 0.0), "RC2")
 
 
@@ -148,7 +148,7 @@ def test_whiskers_are_matched_by_name_and_missing_ones_move_as_their_neighbour()
     assert recorded.line(WhiskerArray.rat(side="both")["LE6"]) == "LE6"
     only_c = Recorded(Trajectory(("RC0", "RC1"), np.zeros((2, 5, 3))))
     assert only_c.line(mouse["RC6"]) == "RC1"
-    with pytest.raises(UsageError, match="no whisker of row A on the right side, which RA0 needs"):
+    with pytest.raises(UsageError, match=r"row A .*RA0 .*'RC0', 'RC1'"):
         only_c.line(mouse["RA0"])
 
 
@@ -169,7 +169,7 @@ def test_starting_angles_replace_rest_where_they_are_given():
 def test_a_scene_longer_than_the_recording_is_refused():
     recorded = Recorded(Trajectory(("RC2",), np.zeros((1, 100, 3))))
     scene = Scene("long", WhiskerArray.mouse(whiskers="C2"), whisking=recorded, frames=Frames(0.0, 0.01, 20))
-    with pytest.raises(UsageError, match=r"lasts 0\.1 s; the scene needs it at 0\.1"):
+    with pytest.raises(UsageError, match=r"0\.1 s; .*0\.19 s"):
         simulate(scene, cache=False)
 
 
@@ -202,11 +202,11 @@ def test_files_are_read_with_or_without_trailing_commas(tmp_path):
         ([[1, 2, 3, 4, 5, 6]] * 60, {}, UsageError, r"60 lines, which does not tell whose whiskers.*rat-60 \(60\)"),
         ([[1, 2, 3, 4, 5, 6]] * 62, {"layout": "rat-60"}, DataError, "62 lines; the layout 'rat-60' has 60"),
         ([[1, 2, 3]] * 62, {"layout": "rat60"}, UsageError, "did you mean 'rat-60'"),
-        ([["a", 2, 3]] * 62, {}, DataError, "not a table of comma-separated numbers"),
-        ([[1, 2, 3]] * 61 + [[1]], {}, DataError, "not a table of comma-separated numbers"),
+        ([["a", 2, 3]] * 62, {}, DataError, r"bad\.csv' .*comma"),
+        ([[1, 2, 3]] * 61 + [[1]], {}, DataError, r"bad\.csv' .*comma"),
         ([[1, 2, 3, "nan", 1, 1]] * 62, {}, DataError, "not finite"),
         ([[1, 2, 3]] * 62, {}, DataError, "at least two samples"),
-        ([[1, 2, 3, 4, 5, 6]] * 62, {"rate": 0.0}, UsageError, "rate of a trajectory must be positive"),
+        ([[1, 2, 3, 4, 5, 6]] * 62, {"rate": 0.0}, UsageError, r"rate .*received 0"),
     ],
 )
 def test_files_that_are_no_trajectories_are_refused(tmp_path, lines, options, error, message):
@@ -215,7 +215,7 @@ def test_files_that_are_no_trajectories_are_refused(tmp_path, lines, options, er
 
 
 def test_missing_files_are_named(tmp_path):
-    with pytest.raises(DataFileNotFoundError, match=r"no file .*gone\.csv"):
+    with pytest.raises(DataFileNotFoundError, match=r"/gone\.csv'"):
         load_trajectory(tmp_path / "gone.csv")
     with pytest.raises(DataFileNotFoundError, match=r"no file 'gone\.csv'"):
         get_recipe("rodgers-recorded gone.csv")
@@ -224,14 +224,14 @@ def test_missing_files_are_named(tmp_path):
 def test_the_recorded_recipe_asks_for_its_file_and_for_nothing_twice():
     assert is_recipe("rodgers-recorded some/file.csv")
     assert "FILE" in describe_recipe("rodgers-recorded")
-    with pytest.raises(UsageError, match="plays a trajectory file and needs one: 'rodgers-recorded FILE'"):
+    with pytest.raises(UsageError, match="'rodgers-recorded FILE'"):
         get_recipe("rodgers-recorded")
     trajectory = Trajectory(("RC2",), np.zeros((1, 1000, 3)))
-    with pytest.raises(UsageError, match="give one of them"):
+    with pytest.raises(UsageError, match=r"'rodgers-recorded' .*one of"):
         get_recipe("rodgers-recorded x.csv", trajectory=trajectory)
-    with pytest.raises(UsageError, match="'rodgers' takes no trajectory"):
+    with pytest.raises(UsageError, match=r"'rodgers' .*'rodgers-recorded'"):
         get_recipe("rodgers", trajectory=trajectory)
-    with pytest.raises(UsageError, match="Unknown species 'cat'"):
+    with pytest.raises(UsageError, match="'cat'; did you mean 'rat'"):
         get_recipe("rodgers-recorded", trajectory=trajectory, species="cat")
 
 
@@ -251,7 +251,7 @@ def test_a_scene_file_plays_a_recording(tmp_path):
     (tmp_path / "c.toml").write_text(
         text.replace('path = "w.csv"\n', "") + '[[scene]]\nlabel = "a"\n', encoding="utf-8"
     )
-    with pytest.raises(UsageError, match=r"\[whisking\] needs the key 'path'"):
+    with pytest.raises(UsageError, match=r"\[whisking\] .*'path'"):
         load_scene(tmp_path / "c.toml")
 
 

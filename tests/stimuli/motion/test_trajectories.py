@@ -86,11 +86,11 @@ def test_the_left_side_whisks_as_the_mirror_image():
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"frequency": 0.0}, "whisking frequency .Hz. must be positive; received 0.0"),
+        ({"frequency": 0.0}, r"frequency .*received 0\.0"),
         ({"frequency": float("nan")}, "must be positive"),
-        ({"protraction": 30.0}, "within ±90° .given in rad.; received 30.0"),
-        ({"protraction": -0.2, "retraction": 0.1}, "sum is the peak-to-peak amplitude"),
-        ({"onset": -1.0}, "onset .s. must be zero or more"),
+        ({"protraction": 30.0}, r"protraction .*±90° .*received 30\.0"),
+        ({"protraction": -0.2, "retraction": 0.1}, r"received -0\.2 and 0\.1 rad"),
+        ({"onset": -1.0}, r"onset .*received -1"),
     ],
 )
 def test_impossible_whisking_is_refused(changes, message):
@@ -148,5 +148,5 @@ def test_a_travelling_head_carries_its_follicles():
 
 
 def test_a_velocity_needs_three_numbers():
-    with pytest.raises(UsageError, match="three finite numbers in m/s"):
+    with pytest.raises(UsageError, match=r"m/s; received \(1\.0, 2\.0\)"):
         Translation((1.0, 2.0))

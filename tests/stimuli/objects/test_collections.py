@@ -78,7 +78,7 @@ def test_a_shapenet_tree_names_its_models_and_their_classes(tmp_path):
     first = resolve_objects([f"shapenet:{tmp_path}:2"])
     assert list(first) == list(found)[:2]
     assert pickle.loads(pickle.dumps(found["03797390/a"])).load().diagonal == pytest.approx(0.04)
-    with pytest.raises(UsageError, match="3 models, fewer than the 9"):
+    with pytest.raises(UsageError, match=r"\b3 models.*\b9\b"):
         resolve_objects([f"shapenet:{tmp_path}:9"])
 
 
@@ -102,5 +102,5 @@ def test_files_need_a_unit_and_must_exist(tmp_path):
     trimesh.creation.box().export(tmp_path / "a.stl")
     with pytest.raises(UsageError, match="--unit"):
         resolve_objects([str(tmp_path / "a.stl")])
-    with pytest.raises(DataError, match="No mesh file matches"):
+    with pytest.raises(DataError, match=r"/\*\.obj'"):
         resolve_objects([str(tmp_path / "*.obj")], unit="m")

@@ -179,7 +179,7 @@ def test_a_file_that_brings_its_convex_pieces_keeps_its_concavity(tmp_path):
     assert len(solid.parts) == 6
     volume = sum(ConvexHull(part.vertices).volume for part in solid.parts)
     assert volume == pytest.approx(rodgers_solid(segments=6).mesh.to_trimesh().volume, rel=1e-4)
-    with pytest.raises(UsageError, match="Unknown collision geometry 'piece'; did you mean 'pieces'"):
+    with pytest.raises(UsageError, match="'piece'; did you mean 'pieces'"):
         mesh_solid(path, unit="mm", collision="piece")
 
 
@@ -214,7 +214,7 @@ def test_an_exact_mesh_is_its_surface_and_has_a_convex_part_only_when_it_is_conv
     assert concave.diagonal == pytest.approx(0.03)
     assert "that takes the backend 'rod'" in concave.notes[0]
     assert concave.config()["hash"] != concave.to_diagonal(0.04).config()["hash"]
-    with pytest.raises(UsageError, match=r"'open' is not closed .*collision = 'hull'"):
+    with pytest.raises(UsageError, match=r"'open'.*collision = 'hull'"):
         mesh_solid(sheet, unit="mm", collision="exact")
 
 
@@ -294,7 +294,7 @@ def test_engines_of_convex_bodies_refuse_a_concave_surface_and_name_what_works(b
     item = PlacedObject(shape_solid(procedural.make("bumpy", 0, detail=2000), collision="exact"), (1.0, 0.0, 0.0))
     whisker = Whisker(0.02, 60e-6, 6e-6, young_modulus=5e9, density=1260.0, damping_ratio=0.3)
     job = Job(whisker, StillFollicle(), (item.obstacle(),), np.array([1e-3]))
-    with pytest.raises(UsageError, match=rf"'{backend}' collides convex .*collision = 'decomposition'.*backend 'rod'"):
+    with pytest.raises(UsageError, match=rf"'{backend}'.*'decomposition'.*'rod'"):
         get_engine(backend).run([job], Fidelity(links=4, time_step=2e-4))
 
 
@@ -305,14 +305,14 @@ def test_labelled_sets_of_shapes_are_made_on_demand():
     assert len(shape_solids()) >= 24
     with pytest.raises(UsageError, match="did you mean 'brick'"):
         shape_solids(["brik"])
-    with pytest.raises(UsageError, match="at least one member"):
+    with pytest.raises(UsageError, match="member; received 0"):
         shape_solids(members=0)
 
 
 def test_a_flat_mesh_cannot_be_touched(tmp_path):
     path = tmp_path / "sheet.obj"
     path.write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nv 1 1 0\nf 1 2 3\nf 2 4 3\n")
-    with pytest.raises(DataError, match="no volume"):
+    with pytest.raises(DataError, match=r"'sheet' .*volume"):
         mesh_solid(path, unit="m")
 
 

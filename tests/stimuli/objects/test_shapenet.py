@@ -1,4 +1,5 @@
 import json
+import re
 
 import pytest
 import trimesh
@@ -36,7 +37,7 @@ def test_an_id_list_chooses_orders_and_reports_what_is_missing(tree, tmp_path, c
     found = load_shapenet(tree, ids=ids)
     assert [model.name for model in found] == [CHAIR, PLANE]
     assert found.missing == ("04379243/zz",)
-    assert "1 of 3 ShapeNet models are missing: '04379243/zz'" in caplog.text
+    assert re.search("1 of 3 .*'04379243/zz'", caplog.text)
 
 
 @pytest.mark.parametrize("suffix", [".csv", ".json"])
@@ -81,13 +82,13 @@ def test_ids_that_name_no_model_are_refused(tree, ids, message):
 
 
 def test_a_folder_without_models_says_what_it_should_hold(tree, tmp_path):
-    with pytest.raises(DataError, match=r"holds none of the 1 models .*/models/model_normalized\.obj"):
+    with pytest.raises(DataError, match=r"ShapeNetCore\.v2' .*model_normalized\.obj"):
         load_shapenet(tree, ids=["03001627/nothing"])
-    with pytest.raises(DataFileNotFoundError, match="no ShapeNet folder"):
+    with pytest.raises(DataFileNotFoundError, match=r"ShapeNet .*/nowhere'"):
         load_shapenet(tmp_path / "nowhere")
     bad = tmp_path / "bad.csv"
     bad.write_text("02691156,air,plane\n")
-    with pytest.raises(DataError, match=r"Row 1 .* a name and a label"):
+    with pytest.raises(DataError, match=r"Row 1 .*bad\.csv'.*'02691156,air,plane'"):
         read_categories(bad)
 
 

@@ -57,7 +57,7 @@ def test_the_instant_recipe_differs_in_its_readings_alone():
 
 
 def test_an_unknown_recipe_suggests_the_nearest():
-    with pytest.raises(UsageError, match="Unknown stimulus recipe 'rogers'; did you mean 'rodgers'"):
+    with pytest.raises(UsageError, match="'rogers'; did you mean 'rodgers'"):
         get_recipe("rogers")
 
 

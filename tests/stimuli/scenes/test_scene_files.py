@@ -120,7 +120,7 @@ def test_a_mesh_can_be_decomposed_by_keys_of_its_table(tmp_path):
     )
     solid = load_scene(_write(tmp_path, text)).scenes[0].objects[0].solid
     assert len(solid.parts) > 1
-    with pytest.raises(UsageError, match=r"threshold of a decomposition lies between 0\.01 and 1"):
+    with pytest.raises(UsageError, match=r"threshold .*0\.01 .*1; received 3"):
         load_scene(_write(tmp_path, text.replace("0.3", "3")))
 
 
@@ -163,7 +163,7 @@ def test_a_mesh_can_be_decomposed_by_keys_of_its_table(tmp_path):
             '[[scene]]\nlabel="a"\n[[scene.object]]\nshape = "sphere"\nradius_mm = 1\ncolour = "red"',
             "Unknown key of .*'colour'",
         ),
-        ('[[scene]]\nlabel="a"\n[[scene]]\nlabel="a"', "several scenes have the label 'a'"),
+        ('[[scene]]\nlabel="a"\n[[scene]]\nlabel="a"', r"pole\.toml: .*label 'a'"),
         ('[array]\nspecies = "mous"\n[[scene]]\nlabel="a"', "Unknown species 'mous'; did you mean 'mouse'"),
         ('[array]\nwhiskers = "C9"\n[[scene]]\nlabel="a"', "Unknown whisker 'C9'"),
         ('[frames]\ncount = 1.5\n[[scene]]\nlabel="a"', r"'count' of \[frames\] must be a whole number"),
@@ -178,12 +178,12 @@ def test_mistakes_in_a_scene_file_are_named_with_the_file(tmp_path, text, messag
 
 
 def test_a_file_that_is_not_toml_is_refused(tmp_path):
-    with pytest.raises(DataError, match="cannot be read as TOML"):
+    with pytest.raises(DataError, match=r"pole\.toml' .*TOML"):
         load_scene(_write(tmp_path, "= ="))
 
 
 def test_a_missing_scene_file_is_named(tmp_path):
-    with pytest.raises(DataFileNotFoundError, match=r"no scene file .*gone\.toml"):
+    with pytest.raises(DataFileNotFoundError, match=r"/gone\.toml'"):
         load_scene(tmp_path / "gone.toml")
 
 
@@ -192,9 +192,9 @@ def test_the_frames_table_sets_rate_filter_axes_and_clip(tmp_path):
     frames = load_scene(_write(tmp_path, POLE.replace("interval_ms = 1", table))).scenes[0].frames
     assert frames == Frames(0.0, 0.01, 10, 10, lowpass=40.0, phase="causal", axes="follicle", clip=1.0)
     both = POLE.replace("interval_ms = 1", "interval_ms = 1\nrate_hz = 1000")
-    with pytest.raises(UsageError, match="interval_ms or rate_hz, not both"):
+    with pytest.raises(UsageError, match=r"\[frames\] .*interval_ms .*rate_hz"):
         load_scene(_write(tmp_path, both))
-    with pytest.raises(UsageError, match=r"'rate_hz' of .frames. must be positive"):
+    with pytest.raises(UsageError, match=r"'rate_hz' .*received 0"):
         load_scene(_write(tmp_path, POLE.replace("interval_ms = 1", "rate_hz = 0")))
     with pytest.raises(UsageError, match="did you mean 'lowpass_hz'"):
         load_scene(_write(tmp_path, POLE.replace("interval_ms = 1", "lowpas_hz = 40")))
@@ -268,7 +268,7 @@ def test_an_object_turns_or_follows_keyframes(tmp_path):
 @pytest.mark.parametrize(
     ("keys", "message"),
     [
-        ("spin_deg_s = [0, 0, 9]\nvelocity_mm_s = [1, 0, 0]", "takes a velocity, a spin or keyframes, not several"),
+        ("spin_deg_s = [0, 0, 9]\nvelocity_mm_s = [1, 0, 0]", r"scene 'a' .*velocity.*spin.*keyframes"),
         ("spin_deg_s = 9", "'spin_deg_s' of .* must be three numbers in brackets"),
         ("spin_deg = [0, 0, 9]", "did you mean 'spin_deg_s'"),
         ("path_mm = [[0, 0, 0], [1, 0, 0]]", "needs the key 'times_ms' beside its path"),

@@ -45,7 +45,7 @@ def test_a_cluster_only_makes_what_is_missing(threads, tmp_path):
 
 def test_workers_that_write_to_a_disk_of_their_own_are_noticed(threads, tmp_path, monkeypatch):
     monkeypatch.setattr(running, "make_shard", _write_elsewhere)
-    with pytest.raises(DataError, match=r"wrote \w+-00000.h5, but not here: .* must be a folder that .* all workers"):
+    with pytest.raises(DataError, match=r"\w+-00000\.h5, .*all workers"):
         generate(small_plan(("brick:2",), split="object", limit=1), tmp_path, scheduler=threads.scheduler_address)
 
 
@@ -81,7 +81,7 @@ def test_a_worker_killed_during_the_run_costs_nothing(tmp_path):
 
 def test_no_scheduler_at_the_address_is_said(tmp_path, monkeypatch):
     monkeypatch.setattr(jobs, "TIMEOUT", 0.5)
-    with pytest.raises(UsageError, match="No Dask scheduler answers at 'tcp:"):
+    with pytest.raises(UsageError, match=r"'tcp://.*dask scheduler"):
         generate(small_plan(), tmp_path, scheduler="tcp://127.0.0.1:9")
 
 

@@ -92,10 +92,10 @@ def test_several_processes_write_the_same_bytes(plan, unbroken, tmp_path):
 
 
 def test_another_data_set_in_the_folder_is_refused_and_named(unbroken, tmp_path):
-    with pytest.raises(UsageError, match=r"begun with other seed, whiskers"):
+    with pytest.raises(UsageError, match="other seed, whiskers"):
         generate(small_plan(("brick:4", "cone:4"), shard_size=4, seed=3, whiskers="C2"), unbroken)
     (tmp_path / "thesis.docx").write_text("")
-    with pytest.raises(UsageError, match=r"not empty and holds no data set of sweeps \(it has 'thesis.docx'\)"):
+    with pytest.raises(UsageError, match=r"'thesis\.docx'"):
         generate(small_plan(), tmp_path)
 
 
@@ -109,7 +109,7 @@ def test_a_first_try_that_made_nothing_does_not_stand_in_the_way(tmp_path):
 def test_a_disk_that_is_too_small_is_said_before_anything_is_simulated(tmp_path, monkeypatch):
     usage = namedtuple("usage", "total used free")
     monkeypatch.setattr(shutil, "disk_usage", lambda path: usage(1e9, 1e9 - 60e6, 60e6))
-    with pytest.raises(DataError, match=r"The 16 sweeps still to be made take .* has 60 MB free; choose another"):
+    with pytest.raises(DataError, match=r"16 sweeps .*60 MB .*--limit"):
         generate(small_plan(), tmp_path / "set")
     assert not list((tmp_path / "set").glob("*.h5"))
 
@@ -120,7 +120,7 @@ def test_two_runs_do_not_write_one_folder_at_a_time(plan, unbroken):
     handle = os.open(unbroken, os.O_RDONLY)
     try:
         fcntl.flock(handle, fcntl.LOCK_EX)
-        with pytest.raises(UsageError, match="Another process is writing"):
+        with pytest.raises(UsageError, match=f"process .*{unbroken.name}'"):
             generate(plan, unbroken)
     finally:
         os.close(handle)
@@ -135,7 +135,7 @@ def test_an_object_that_changed_between_shards_is_found(tmp_path):
 
     with h5py.File(folder / plan.shards[0].name, "r+") as file:
         file["object_hash"][0] = b"0" * 16
-    with pytest.raises(DataError, match="'brick-0' was not built alike"):
+    with pytest.raises(DataError, match=r"'brick-0' .*0000000000000000"):
         generate(plan, folder, workers=1)
 
 
@@ -147,5 +147,5 @@ def test_the_remaining_time_is_logged(tmp_path, caplog):
 
 
 def test_no_workers_are_refused(tmp_path):
-    with pytest.raises(UsageError, match="workers must be at least 1"):
+    with pytest.raises(UsageError, match=r"workers .*received 0"):
         generate(small_plan(), tmp_path, workers=0)

@@ -57,7 +57,7 @@ def test_an_unstable_whisker_is_marked_with_its_reason(monkeypatch):
 
 
 def test_a_device_that_the_engine_does_not_have_is_refused():
-    with pytest.raises(UsageError, match="'mujoco' does not run on 'cuda'; it runs on 'cpu'"):
+    with pytest.raises(UsageError, match=r"'mujoco' .*'cuda'; .*'cpu'"):
         simulate_sweeps(small_scenes(), [0], fidelity=FAST, backend="mujoco", device="cuda")
 
 
@@ -67,5 +67,5 @@ def test_a_batch_that_hides_instability_cannot_be_made():
     unstable[1, 2] = True
     with pytest.raises(UsageError, match="reason"):
         SweepBatch(wrench, contact, unstable, ("", ""), 1, 1)
-    with pytest.raises(UsageError, match="received"):
+    with pytest.raises(UsageError, match=r"received \(2, 5, 3, 6\), \(1, 3\)"):
         SweepBatch(wrench, contact[:1], unstable, ("", "bent"), 1, 1)

@@ -200,12 +200,12 @@ def test_one_sweep_is_simulated_end_to_end():
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"speed": ()}, "speed of a sweep grid needs at least one finite value"),
-        ({"speed": (0.0,)}, "speed of a sweep grid must be positive"),
-        ({"size": Span(-0.01, 0.02, 0.01)}, "size of a sweep grid must be positive"),
+        ({"speed": ()}, r"speed .*received \(\)"),
+        ({"speed": (0.0,)}, r"speed .*received \(0"),
+        ({"size": Span(-0.01, 0.02, 0.01)}, r"size .*received Span"),
         ({"mover": "heat"}, "Unknown mover 'heat'; did you mean 'head'"),
         ({"placing": "cleer"}, "did you mean 'clear'"),
-        ({"heights_per_draw": 2}, "between 1 and the number of listed heights"),
+        ({"heights_per_draw": 2}, r"heights_per_draw .*got 2"),
         ({"draws": 0}, "needs a draw"),
         ({"head": Head(motion=Translation((0.0, 0.1, 0.0)))}, "choose mover='head'"),
     ],
@@ -216,20 +216,20 @@ def test_impossible_grids_are_refused(changes, message):
 
 
 def test_spans_ascend():
-    with pytest.raises(UsageError, match="ascends from low to high"):
+    with pytest.raises(UsageError, match=r"received Span\(low=2\.0"):
         Span(2.0, 1.0, 1.0)
 
 
 def test_recipes_say_which_of_them_take_objects():
-    with pytest.raises(UsageError, match="'thesis-low' moves objects past the whiskers and needs some"):
+    with pytest.raises(UsageError, match=r"'thesis-low'.*objects="):
         get_recipe("thesis-low")
-    with pytest.raises(UsageError, match="'rodgers' has objects of its own; only thesis-low, thesis-high take some"):
+    with pytest.raises(UsageError, match=r"'rodgers' .*thesis-low, thesis-high"):
         get_recipe("rodgers", objects=SOLIDS)
-    with pytest.raises(UsageError, match="Several objects are called 'sphere'"):
+    with pytest.raises(UsageError, match=r"Several .*'sphere'"):
         get_recipe("thesis-low", objects=[sphere(1.0), sphere(2.0)])
     with pytest.raises(UsageError, match="at least one object"):
         SweepScenes(SweepGrid(), [])
-    with pytest.raises(UsageError, match="Unknown species 'cat'"):
+    with pytest.raises(UsageError, match="'cat'; did you mean 'rat'"):
         SweepScenes(SweepGrid(species="cat"), SOLIDS)
 
 

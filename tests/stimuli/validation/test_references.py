@@ -107,7 +107,7 @@ def test_beyond_the_slip_off_offset_there_is_no_equilibrium():
     at = 0.7 * C2.arc_length
     limit = references.slip_off_offset(C2, at)
     assert references.elastica(C2, at, 0.99 * limit).arc <= C2.arc_length
-    with pytest.raises(UsageError, match=r"slips off at an offset of 0\.005336 m"):
+    with pytest.raises(UsageError, match=r"offset of 0\.005336 m"):
         references.elastica(C2, at, 1.01 * limit)
 
 
@@ -128,10 +128,10 @@ def test_the_slip_off_depth_of_a_round_peg_tends_to_that_of_a_point_on_a_thin_ro
 
 
 def test_a_peg_beyond_the_tip_is_refused():
-    with pytest.raises(UsageError, match=r"0 < at ≤ 0\.015265 m"):
+    with pytest.raises(UsageError, match=r"0\.015265 m.*received 0\.02"):
         references.elastica(C2, 0.02, 1e-3)
 
 
 def test_closed_forms_refuse_curved_whiskers():
-    with pytest.raises(UsageError, match="use elastica"):
+    with pytest.raises(UsageError, match=r"curvature 10 .*elastica"):
         references.point_load_deflection(replace(C2, curvature=10.0), 1e-6, 0.01)

@@ -93,7 +93,7 @@ def test_switching_sides_and_back_changes_nothing():
     array = WhiskerArray.mouse()
     assert array.on_side("left").on_side("right") == array
     assert array.on_side("both").on_side("left") == WhiskerArray.mouse(side="left")
-    with pytest.raises(UsageError, match="Unknown side 'lefty'; did you mean 'left'"):
+    with pytest.raises(UsageError, match="'lefty'; did you mean 'left'"):
         array.on_side("lefty")
 
 
@@ -102,7 +102,7 @@ def test_properties_of_selected_whiskers_can_be_replaced():
     assert array["C1"].whisker.young_modulus == 3.3e9
     assert array["C2"].angles == (1.0, 0.0, 0.0)
     assert array["D1"] == WhiskerArray.mouse()["D1"]
-    with pytest.raises(UsageError, match="Unknown whisker property 'youngs_modulus'; did you mean 'young_modulus'"):
+    with pytest.raises(UsageError, match="'youngs_modulus'; did you mean 'young_modulus'"):
         array.replace("C2", youngs_modulus=1.0)
     with pytest.raises(UsageError, match="Unknown whisker 'Q7'"):
         array["Q7"]
@@ -151,7 +151,7 @@ def test_the_model_rat_lies_close_to_the_average_rat():
 
 
 def test_the_mouse_has_no_model_equations_and_says_so():
-    with pytest.raises(UsageError, match="no model equations of the mouse"):
+    with pytest.raises(UsageError, match=r"mouse.*source='average'"):
         WhiskerArray.mouse(source="model")
-    with pytest.raises(UsageError, match="Unknown source of an array 'modell'; did you mean 'model'"):
+    with pytest.raises(UsageError, match="'modell'; did you mean 'model'"):
         WhiskerArray.rat(source="modell")

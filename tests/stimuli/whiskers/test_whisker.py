@@ -61,13 +61,13 @@ def test_a_curvature_of_the_other_sign_mirrors_the_shape():
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"arc_length": -1.0}, "arc_length of a whisker must be positive"),
-        ({"tip_radius": 0.0}, "tip_radius of a whisker must be positive"),
-        ({"young_modulus": math.nan}, "young_modulus of a whisker must be a finite number"),
+        ({"arc_length": -1.0}, r"arc_length .*received -1"),
+        ({"tip_radius": 0.0}, r"tip_radius .*received 0"),
+        ({"young_modulus": math.nan}, r"young_modulus .*received nan"),
         ({"density": (1.0, 2.0, 3.0)}, "one number or \\(base, tip\\)"),
-        ({"density": (1260.0, -1.0)}, "density of a whisker must be positive"),
-        ({"damping_ratio": -0.1}, "damping_ratio of a whisker must be zero or more"),
-        ({"curvature": math.inf}, "curvature of a whisker must be a finite number"),
+        ({"density": (1260.0, -1.0)}, r"density .*received -1"),
+        ({"damping_ratio": -0.1}, r"damping_ratio .*received -0"),
+        ({"curvature": math.inf}, r"curvature .*received inf"),
         ({"base_radius": 0.05}, "no slender rod"),
     ],
 )

@@ -113,9 +113,9 @@ def test_a_fitted_calibration_gives_touched_sites_unit_size() -> None:
         HandCalibration.fit(torch.zeros(3, 30, 5, 7))
     with pytest.raises(DataError, match="not finite"):
         HandCalibration.fit(torch.full((3, 30, 5, 7), torch.nan))
-    with pytest.raises(UsageError, match="positive number; received -1"):
+    with pytest.raises(UsageError, match=r"force .*received -1"):
         HandCalibration(force=-1)
-    with pytest.raises(UsageError, match="fields 'force' and 'moment'"):
+    with pytest.raises(UsageError, match="'force' and 'moment'; received"):
         HandCalibration.of({"mass": 1})
 
 
@@ -139,13 +139,13 @@ def test_seeds_make_random_encoders_and_nothing_else_does() -> None:
 
 
 def test_unsuited_networks_and_names_are_refused() -> None:
-    with pytest.raises(UsageError, match="runs without end"):
+    with pytest.raises(UsageError, match=r"32 steps.*'gpt'"):
         FrontEnd("zhuang-small+gpt", GRID)
     with pytest.raises(UsageError, match="did you mean 'frozen'"):
         FrontEnd("zhuang-small", GRID, learning="froze")  # type: ignore[arg-type]
     with pytest.raises(UsageError, match="did you mean 'resampled'"):
         FrontEnd("zhuang-small", GRID, time="resample")  # type: ignore[arg-type]
-    with pytest.raises(UsageError, match="encoder-attender-decoder"):
+    with pytest.raises(UsageError, match="received 'Linear'"):
         FrontEnd(torch.nn.Linear(3, 3), GRID)
-    with pytest.raises(UsageError, match="takes 5 sub-steps; received 4"):
+    with pytest.raises(UsageError, match="5 sub-steps; received 4"):
         FrontEnd("zhuang-small", GRID).stimulus(torch.zeros(1, 4, GRID.items, 6))

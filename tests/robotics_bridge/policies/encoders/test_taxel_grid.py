@@ -184,14 +184,14 @@ def test_a_hand_of_a_file_and_a_layout_of_ones_own_have_grids(tmp_path) -> None:
 def test_unreadable_finger_names_take_rows_in_their_order() -> None:
     assert finger_rows({"mf": (), "th": (), "ff": ()}) == {"mf": 2, "th": 0, "ff": 1}
     assert finger_rows({"fingertip": (), "fingertip_2": ()}) == {"fingertip": 0, "fingertip_2": 1}
-    with pytest.raises(UsageError, match="rows for 5 fingers; this hand has 6"):
+    with pytest.raises(UsageError, match=r"5 fingers; .*\b6\b"):
         finger_rows({f"finger{i}": () for i in range(6)})
 
 
 def test_errors_say_what_is_wrong() -> None:
-    with pytest.raises(UsageError, match="'none' has no touch"):
+    with pytest.raises(UsageError, match=r"'none' .*touch"):
         TaxelGrid("xhand1", observe="none")
-    with pytest.raises(UsageError, match="199 items, 6 channels"):
+    with pytest.raises(UsageError, match=r"199 items, 6 channels.*198"):
         _GRIDS["xhand1"](torch.zeros(1, 5, 198, 6))
     with pytest.raises(UsageError, match="did you mean 'tips'"):
         TaxelGrid("xhand1", placement="tip")

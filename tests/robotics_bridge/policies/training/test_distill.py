@@ -157,7 +157,7 @@ def test_tables_4_4_fills_what_is_left_open_and_logs_say_what_was_learned(tmp_pa
 
 def test_requests_that_do_not_fit_are_refused(tmp_path) -> None:
     _run(tmp_path, iterations=2)
-    with pytest.raises(UsageError, match="its learning_rate differs"):
+    with pytest.raises(UsageError, match=r"\(its learning_rate"):
         _run(tmp_path, iterations=2, learning_rate=1e-2)
     with pytest.raises(UsageError, match="did you mean 'mse'"):
         _config(loss="ms")
@@ -165,8 +165,8 @@ def test_requests_that_do_not_fit_are_refused(tmp_path) -> None:
         _config(teacher_share=2)
     with pytest.raises(UsageError, match="did you mean 'placement'"):
         DistillConfig.of({"task": "x", "placment": "tips"})
-    with pytest.raises(UsageError, match=r"num_envs .* at least 1"):
+    with pytest.raises(UsageError, match=r"num_envs .*received 0"):
         _config(num_envs=0)
     (tmp_path / "config.json").write_text("{}")
-    with pytest.raises(DataError, match="holds no student"):
+    with pytest.raises(DataError, match=r"student; .*policy distill"):
         load_student(tmp_path)

@@ -51,5 +51,5 @@ def test_a_teacher_that_touches_nothing_is_mentioned(tmp_path, caplog) -> None:
 
 
 def test_a_student_needs_a_teacher(tmp_path) -> None:
-    with pytest.raises(UsageError, match="needs a teacher"):
+    with pytest.raises(UsageError, match=r"teacher: .*brainbench policy train"):
         train_student(_config(), tmp_path)

@@ -116,7 +116,7 @@ def test_a_run_may_begin_with_the_networks_of_another(tmp_path: Path) -> None:
     assert result.iterations == 1
     config = json.loads((tmp_path / "second" / "config.json").read_text())
     assert config["start"]["file"].endswith("first/model_2.safetensors")
-    with pytest.raises(DataError, match=r"actor of .* does not fit: 'mlp\.0\.weight' has the shape \(16"):
+    with pytest.raises(DataError, match=r"'mlp\.0\.weight' .*\(16, .*\(32"):
         Trainer(env, replace(settings, hidden=(32, 16))).begin_from(tmp_path / "first")
 
 
@@ -130,7 +130,7 @@ def test_exploration_may_begin_anew_with_the_networks_of_another(tmp_path: Path)
         assert trainer.algorithm.get_policy().output_std.mean().item() == pytest.approx(expected)
     for _ in range(3):
         assert 9e-4 <= trainer.iterate()["learning_rate"] <= 1.1e-3
-    with pytest.raises(UsageError, match="goes with a run to start from"):
+    with pytest.raises(UsageError, match=r"start_std .*received 0\.3"):
         train(_env(), tmp_path / "second", settings=SMALL, iterations=1, start_std=0.3)
 
 
@@ -160,16 +160,16 @@ def test_learning_begins_with_the_wide_goal_and_goes_on_with_the_one_it_reached(
 
 def test_a_folder_of_another_run_is_refused(tmp_path: Path) -> None:
     train(_env(), tmp_path, settings=SMALL, iterations=1)
-    with pytest.raises(UsageError, match="Choose another folder"):
+    with pytest.raises(UsageError, match=r"'epochs': 2.*'epochs': 3"):
         train(_env(), tmp_path, settings=replace(SMALL, epochs=3), iterations=2)
 
 
 def test_a_policy_of_another_task_is_refused(tmp_path: Path) -> None:
     train(_env(), tmp_path, settings=SMALL, iterations=1)
     other = tasks.make("in_hand_repose", num_envs=2, threads=1)
-    with pytest.raises(DataError, match="does not fit this environment"):
+    with pytest.raises(DataError, match=r"'in_palm_rotate' .*'in_hand_repose'"):
         load_teacher(tmp_path, other)
-    with pytest.raises(DataError, match="holds no trained policy"):
+    with pytest.raises(DataError, match=r"/nothing' .*model_"):
         newest(tmp_path / "nothing")
 
 

@@ -108,7 +108,7 @@ def test_decays_follow_rayleigh_and_results_are_cached(tmp_path, monkeypatch):
 
 
 def test_modes_and_solids_outside_their_range_are_refused():
-    with pytest.raises(UsageError, match="as many frequencies"):
+    with pytest.raises(UsageError, match="received 1, 0 and 0"):
         Modes((1.0,), (), ())
     with pytest.raises(UsageError, match="positive frequency"):
         Modes((0.0,), (1.0,), (1.0,))
@@ -116,9 +116,9 @@ def test_modes_and_solids_outside_their_range_are_refused():
         ElasticSolid("bx", (1, 1, 1))
     with pytest.raises(UsageError, match="3 positive sizes"):
         ElasticSolid("box", (1, 1))
-    with pytest.raises(UsageError, match="needs its mesh"):
+    with pytest.raises(UsageError, match=r"'mesh' .*mesh"):
         ElasticSolid("mesh")
-    with pytest.raises(UsageError, match="finer mesh"):
+    with pytest.raises(UsageError, match=r"60 modes .*6 tetrahedra; .*cells"):
         find_modes(ElasticSolid("box", (1, 1, 1)), "wood", count=60, cells=1)
     with pytest.raises(UsageError, match="did you mean 'glass'"):
         elastic_material("glas")

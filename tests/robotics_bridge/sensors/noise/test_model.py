@@ -284,7 +284,7 @@ def test_a_shorter_step_than_the_ring_has_room_for_is_refused():
     [
         ({"white": -1.0}, "white must be zero or positive; received -1.0"),
         ({"gain": (1.2, 0.8)}, "gain is a range"),
-        ({"dead_probability": 1.5}, "dead_probability lies between 0 and 1"),
+        ({"dead_probability": 1.5}, r"dead_probability .*received 1\.5"),
         ({"jitter": 0.1}, "must not exceed read_delay"),
         ({"hysteresis": 0.5, "hysteresis_tau": 0.0}, "positive hysteresis_tau"),
         ({"bias": math.nan}, "must be finite"),
@@ -297,7 +297,7 @@ def test_knobs_outside_their_range_are_refused(knobs, message):
 
 def test_a_sensor_refuses_knobs_it_does_not_have():
     Noise(white=1.0, crosstalk_sigma=3.0).check(TAXEL_KNOBS, "ContactDepthProbe")
-    with pytest.raises(UsageError, match="no noise knob 'crosstalk'"):
+    with pytest.raises(UsageError, match=r"'crosstalk'; .*bias"):
         Noise(crosstalk=0.1).check(TAXEL_KNOBS, "ContactDepthProbe")
 
 
@@ -344,12 +344,12 @@ def test_a_preset_survives_its_file_and_other_files_are_refused(tmp_path):
     with pytest.raises(DataError, match="knobs: 'whit'"):
         Noise.load(path)
     path.write_text("[]")
-    with pytest.raises(DataError, match="is no noise preset"):
+    with pytest.raises(DataError, match=r"/preset\.json' .*'brainbench-noise-1'"):
         Noise.load(path)
 
 
 def test_a_signal_with_other_axes_is_refused():
-    with pytest.raises(UsageError, match="environment, probe"):
+    with pytest.raises(UsageError, match=r"received \(3, 4\)"):
         simulate(Noise(), np.zeros((3, 4)), dt=0.01)
 
 

@@ -302,11 +302,11 @@ def test_a_hot_ball_resting_on_a_plate_warms_the_cells_below_it():
 @pytest.mark.parametrize(
     ("knobs", "message"),
     [
-        ({"cells": (2, 0, 1)}, "three positive numbers of cells"),
+        ({"cells": (2, 0, 1)}, r"cells; received \(2, 0, 1\)"),
         ({"low": (0, 0, 0)}, "both corners"),
-        ({"low": (0, 0, 0), "high": (1, 0, 1)}, "differ along every axis"),
+        ({"low": (0, 0, 0), "high": (1, 0, 1)}, r"received \(0, 0, 0\), \(1, 0, 1\)"),
         ({"material": "alumium"}, "did you mean 'aluminium'"),
-        ({"source": np.zeros((1, 2))}, "source is a number or an array"),
+        ({"source": np.zeros((1, 2))}, r"source .*received \(1, 2\)"),
         ({"tau": -1.0}, "tau must be zero or positive"),
         ({"conduction": "real"}, "Unknown conduction"),
         ({"bodies": {"object": ThermalBody("woood")}}, "did you mean 'wood'"),
@@ -320,9 +320,9 @@ def test_wrong_settings_are_explained(knobs, message):
 
 def test_a_grid_needs_finite_geometry_or_corners():
     scene = TouchScene(("world",), (Geometry(name="floor", link="world", kind="plane"),))
-    with pytest.raises(UsageError, match="of finite size"):
+    with pytest.raises(UsageError, match=r"'world' .*low, high"):
         SensorSuite(scene, {"grid": TemperatureGrid(link="world")}, num_envs=1)
-    with pytest.raises(UsageError, match="positive"):
+    with pytest.raises(UsageError, match=r"conductivity .*received -1"):
         ThermalMaterial(-1, 1, 1)
     assert MATERIALS["steel"].effusivity == pytest.approx(math.sqrt(15 * 7900 * 480))
     suite, _state = _make()

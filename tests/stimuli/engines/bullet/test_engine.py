@@ -23,6 +23,7 @@ from brainbench.stimuli.scenes.frames import Frames
 from brainbench.stimuli.validation import bench_tests
 from brainbench.stimuli.whiskers.chain import build_chain
 from brainbench.stimuli.whiskers.whisker import Whisker
+from tests.factories.obstacles import post
 from tests.factories.swing import Swing
 from tests.factories.whiskers import C2
 
@@ -36,10 +37,6 @@ def _run(*jobs, fidelity=COARSE, backend="bullet", **options):
     return get_engine(backend).run(jobs, fidelity, **options)
 
 
-def _post(x, y, radius=1e-3, **options):
-    return Obstacle((Capsule((x, y, -0.02), (x, y, 0.02), radius),), **options)
-
-
 def _scale(wrench):
     """Largest force and largest moment, as a divisor of [n, 6] differences."""
     return np.repeat([np.abs(wrench[:, :3]).max(), np.abs(wrench[:, 3:]).max()], 3)
@@ -50,7 +47,7 @@ def test_without_pybullet_the_error_names_the_extra_or_the_python(monkeypatch):
     with pytest.raises(MissingDependencyError, match=r"brainbench\[bullet\]"):
         model.engine()
     monkeypatch.setattr(sys, "version_info", (3, 12, 0, "final", 0))
-    with pytest.raises(MissingDependencyError, match=r"Python below 3.12.*or the backend 'mujoco'"):
+    with pytest.raises(MissingDependencyError, match=r"'bullet' .*3\.12.*'mujoco'"):
         _run(Job(C2, StillFollicle(), (), np.array([0.01])))
 
 
@@ -123,7 +120,7 @@ SWEPT = np.arange(1.0, 31.0) * 2e-3
 
 @needs_bullet
 def test_a_gentle_contact_is_felt_as_in_mujoco():
-    job = Job(CRITICAL, SWEEP, (_post(0.010, 0.0022, friction=0.0),), SWEPT)
+    job = Job(CRITICAL, SWEEP, (post(0.010, 0.0022, friction=0.0),), SWEPT)
     ours, mujoco = _run(job)[0], _run(job, backend="mujoco")[0]
     assert ours.status == mujoco.status == "ok"
     assert ours.contact[-1]
@@ -135,7 +132,7 @@ def test_a_gentle_contact_is_felt_as_in_mujoco():
 
 @needs_bullet
 def test_with_friction_a_resting_whisker_keeps_the_drag_and_the_step_does_not_matter():
-    job = Job(CRITICAL, SWEEP, (_post(0.010, 0.0022, friction=0.48),), SWEPT)
+    job = Job(CRITICAL, SWEEP, (post(0.010, 0.0022, friction=0.48),), SWEPT)
     coarse, fine = (_run(job, fidelity=Fidelity(links=8, time_step=step))[0] for step in (2e-4, 5e-5))
     assert np.abs((coarse.wrench - fine.wrench) / _scale(fine.wrench)).max() < 0.01
     # The sweep ends after 40 ms; MuJoCo's soft friction then creeps, Coulomb's does not.
@@ -236,9 +233,9 @@ def _steps_of_bullet(bullet, client, body, chain, step, count, load):
 def test_more_links_than_pybullet_moves_are_refused():
     job = Job(C2, StillFollicle(), (), np.array([0.01]), gravity=(0.0, 0.0, -9.81))
     assert _run(job, fidelity=Fidelity(links=MOST_LINKS, time_step=1e-3))[0].status == "ok"
-    with pytest.raises(UsageError, match=r"at most 60 links .* received 61"):
+    with pytest.raises(UsageError, match=r"60 links .*received 61"):
         _run(job, fidelity=Fidelity(links=MOST_LINKS + 1, time_step=1e-3))
-    with pytest.raises(UsageError, match="workers must be at least 1"):
+    with pytest.raises(UsageError, match=r"workers .*received 0"):
         _run(job, workers=0)
 
 

@@ -1,8 +1,8 @@
 """The MuJoCo backend against Newton's and Euler's laws."""
 
 import logging
-import math
-from dataclasses import dataclass, replace
+import re
+from dataclasses import replace
 from importlib import import_module
 
 import numpy as np
@@ -13,48 +13,29 @@ from brainbench.stimuli.engines import get_engine, list_engines
 from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.engines.protocol import Job, Load, StillFollicle
 from brainbench.stimuli.engines.reach import reachable
-from brainbench.stimuli.objects.obstacle import Capsule, Obstacle
 from brainbench.stimuli.whiskers.chain import build_chain
+from tests.factories.obstacles import post
+from tests.factories.swing import Oscillation
 from tests.factories.whiskers import C2
 
 STIFF = replace(C2, young_modulus=5e13, damping_ratio=6.0)
 COARSE = Fidelity(links=8, time_step=1e-4)
-FLAT = (math.pi / 2, 0.0, -math.pi / 2)
-
-
-@dataclass(frozen=True)
-class Swing:
-    """Sinusoidal angles about a rest pose and a sinusoidal displacement."""
-
-    angles: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    shift: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    rest: tuple[float, float, float] = FLAT
-    frequency: float = 20.0
-
-    def pose(self, times):
-        phase = 2 * np.pi * self.frequency * times
-        euler = np.sin(phase)[:, None] * np.array(self.angles) + np.array(self.rest)
-        return np.sin(phase + 0.3)[:, None] * np.array(self.shift), euler
 
 
 def _run(*jobs, fidelity=COARSE, **options):
     return get_engine("mujoco").run(jobs, fidelity, **options)
 
 
-def _post(x, y, radius=1e-3, **options):
-    return Obstacle((Capsule((x, y, -0.02), (x, y, 0.02), radius),), **options)
-
-
-def test_the_follicle_follows_its_trajectory_to_a_millionth_against_a_post():
-    follicle = Swing(angles=(0.35, 0.1, 0.2), shift=(5e-4, 0, 0))
+def test_the_follicle_follows_its_trajectory_to_a_millionth_against_apost():
+    follicle = Oscillation(angles=(0.35, 0.1, 0.2), shift=(5e-4, 0, 0))
     times = np.arange(1.0, 101.0) * 1e-3
-    trace = _run(Job(C2, follicle, (_post(0.010, 0.002),), times), record_shape=True)[0]
+    trace = _run(Job(C2, follicle, (post(0.010, 0.002),), times), record_shape=True)[0]
     assert trace.contact.any()
     assert trace.link_positions is not None
     # The recorded shape uses the prescribed base; the engine's own base is checked through its state.
     from brainbench.stimuli.engines.mujoco import model as _mujoco_model
 
-    job = Job(C2, follicle, (_post(0.010, 0.002),), times)
+    job = Job(C2, follicle, (post(0.010, 0.002),), times)
     steps = np.arange(0.0, 1002.0) * 1e-4
     chain = build_chain(C2, 8)
     reach = reachable(C2, follicle.pose(steps)[0], job.obstacles, steps)
@@ -92,7 +73,7 @@ def _follow(built, steps):
 
 def test_refining_step_and_links_converges():
     times = np.arange(1.0, 101.0) * 1e-3
-    job = Job(C2, Swing(angles=(0.25, 0, 0)), (_post(0.0107, 0.0025, friction=0.0),), times)
+    job = Job(C2, Oscillation(angles=(0.25, 0, 0)), (post(0.0107, 0.0025, friction=0.0),), times)
     best = _run(job, fidelity=Fidelity(links=24, time_step=2e-5))[0].wrench[:, 5]
     assert np.abs(best).max() > 1e-7
     gaps = [
@@ -105,7 +86,7 @@ def test_refining_step_and_links_converges():
 
 
 def test_frames_between_steps_are_interpolated():
-    swing = Swing(angles=(0.3, 0, 0))
+    swing = Oscillation(angles=(0.3, 0, 0))
     fine = np.array([0.0100, 0.01005, 0.0101])
     trace = _run(Job(C2, swing, (), fine))[0]
     np.testing.assert_allclose(trace.wrench[1], trace.wrench[[0, 2]].mean(axis=0), rtol=1e-12)
@@ -113,7 +94,7 @@ def test_frames_between_steps_are_interpolated():
 
 def test_results_do_not_depend_on_workers_order_or_company():
     times = np.arange(1.0, 31.0) * 1e-3
-    jobs = [Job(C2, Swing(angles=(a, 0, 0)), (_post(0.010, 2e-3),), times) for a in (0.1, 0.2, 0.3)]
+    jobs = [Job(C2, Oscillation(angles=(a, 0, 0)), (post(0.010, 2e-3),), times) for a in (0.1, 0.2, 0.3)]
     calls = []
     together = _run(*jobs, workers=2, progress=lambda done, total: calls.append((done, total)))
     alone = [_run(job, workers=1)[0] for job in jobs]
@@ -126,18 +107,18 @@ def test_an_overdamping_step_is_told_in_the_log(caplog):
     with caplog.at_level(logging.WARNING):
         light = replace(C2, damping_ratio=0.1)
         _run(Job(light, StillFollicle(), (), np.array([0.01])), fidelity=Fidelity(links=8, time_step=1e-3))
-    assert "damps the first mode of at least one whisker" in caplog.text
+    assert re.search(r"time step .*0\.001 s .*ratio", caplog.text)
 
 
 def test_unknown_backends_and_bad_jobs_are_refused():
     assert "mujoco" in list_engines()
     with pytest.raises(UsageError, match="did you mean 'mujoco'"):
         get_engine("mojoco")
-    with pytest.raises(UsageError, match="increasing list"):
+    with pytest.raises(UsageError, match=r"frame times .*increasing"):
         Job(C2, StillFollicle(), (), np.array([0.2, 0.1]))
-    with pytest.raises(UsageError, match="before the start"):
+    with pytest.raises(UsageError, match=r"\(0 s\) .*\(0\.1 s\)"):
         Job(C2, StillFollicle(), (), np.array([0.0]), start=0.1)
-    with pytest.raises(UsageError, match="A load acts at arc length"):
+    with pytest.raises(UsageError, match=r"0\.02 m.*0\.0152\d* m"):
         Job(C2, StillFollicle(), (), np.array([0.1]), loads=(Load(0.02, (0, 0, 1e-6)),))
-    with pytest.raises(UsageError, match="workers must be at least 1"):
+    with pytest.raises(UsageError, match=r"workers .*received 0"):
         _run(Job(C2, StillFollicle(), (), np.array([0.1])), workers=0)
