@@ -47,7 +47,6 @@ class Result:
     title: str
     columns: list[str]
     rows: list[list[str]]
-    note: str = ""
     picture: Callable[[], None] | None = None
 
 
@@ -502,7 +501,8 @@ def main() -> None:
         body = f"{heading}\n\n{table(result.columns, result.rows)}"
         print(f"\n## {name}\n\n{body}", flush=True)
         if options.write:
-            command = f"python -m benchmarks.scores.calibration {name} --simulations {options.simulations} --write"
+            counts = f"--simulations {options.simulations} --seed {options.seed}"
+            command = f"python -m benchmarks.scores.calibration {name} {counts} --write"
             write_section(f"Calibration: {name}", command, body, subject="scores")
             write_docs(name, body)
             if result.picture:

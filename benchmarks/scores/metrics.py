@@ -101,12 +101,6 @@ def rsatoolbox_rows() -> list[list[str]]:
     return rows
 
 
-def _ceiling(brain: np.ndarray, method: str) -> tuple[float, float]:
-    from brainbench.metrics import noise_ceiling
-
-    return tuple(noise_ceiling(brain, method=method))
-
-
 def parity_rows() -> list[list[str]]:
     """Measure how far every RDM method and comparison is from rsatoolbox on balanced data, in 20 draws."""
     from rsatoolbox.data import Dataset

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from brainbench.cli.leaderboard.scoring import find_models
-from brainbench.cli.options import SCORE, option, with_options
+from brainbench.cli.options import SCORE, SchedulerOption, WorkersOption, option, with_options
 from brainbench.cli.output import JsonOption, emit, progress_bar, table_of
 from brainbench.core.errors import UsageError
 from brainbench.core.files import provenance, to_plain, write_json
@@ -63,12 +63,8 @@ def recovery(
         Path | None,
         typer.Option("--out", "-o", help="Folder for result and picture, and for going on after an interruption."),
     ] = None,
-    workers: Annotated[
-        int | None, typer.Option(min=1, help="Processes. [default: as many as there are processors]")
-    ] = None,
-    scheduler: Annotated[
-        str | None, typer.Option(help="Let the workers of this Dask scheduler (tcp://host:8786) do it.")
-    ] = None,
+    workers: WorkersOption = None,
+    scheduler: SchedulerOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Say whether an experiment could tell networks apart: animals are drawn from each, and all are scored on them.

@@ -1,7 +1,7 @@
 """Run the command line in this process, as the console script does, and files for it to score."""
 
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -42,14 +42,12 @@ def run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> 
     return call
 
 
-@pytest.fixture
-def files(tmp_path: Path) -> dict[str, str]:
-    """A recording of two animals, features and arrays for its four conditions."""
-    rng = np.random.default_rng(0)
-    for animal in "xy":
-        order = np.repeat(np.arange(4), 10)
+def _record(rng: np.random.Generator, folder: Path, animals: str, labels: Sequence[str], repeats: int, until: float):
+    """Write a recording of twelve units for each animal, observed until a time (s)."""
+    for animal in animals:
+        order = np.repeat(np.arange(len(labels)), repeats)
         starts = 1.0 + np.arange(len(order))
-        rates = rng.gamma(2.0, 8.0, size=(4, 12))
+        rates = rng.gamma(2.0, 8.0, size=(len(labels), 12))
         spikes = [
             np.sort(
                 np.concatenate(
@@ -58,13 +56,26 @@ def files(tmp_path: Path) -> dict[str, str]:
             )
             for u in range(12)
         ]
-        table = {"start_time": starts, "stop_time": starts + 0.5, "texture": [LABELS[k] for k in order]}
-        session = make_session(animal, "1", spikes, {"trials": table}, observed=[np.array([[0.0, 60.0]])] * 12)
-        write_recordings(tmp_path / "data" / f"{animal}.h5", session)
+        table = {"start_time": starts, "stop_time": starts + 0.5, "texture": [labels[k] for k in order]}
+        seen = [np.array([[0.0, until]])] * 12
+        session = make_session(animal, "1", spikes, {"trials": table}, observed=seen)
+        write_recordings(folder / f"{animal}.h5", session)
+
+
+def _show(rng: np.random.Generator, path: Path, labels: Sequence[str]):
+    """Write random arrays as stimuli."""
+    with h5py.File(path, "w") as file:
+        file["stimuli"] = rng.normal(size=(len(labels), 3, 2, 2, 2)).astype(np.float32)
+        file["labels"] = np.array(labels, dtype=h5py.string_dtype())
+
+
+@pytest.fixture
+def files(tmp_path: Path) -> dict[str, str]:
+    """A recording of two animals, features and arrays for its four conditions."""
+    rng = np.random.default_rng(0)
+    _record(rng, tmp_path / "data", "xy", LABELS, 10, 60.0)
     features = write_features(tmp_path / "features.h5", LABELS, {"fc": rng.normal(size=(4, 6))})
-    with h5py.File(tmp_path / "arrays.h5", "w") as file:
-        file["stimuli"] = rng.normal(size=(4, 3, 2, 2, 2)).astype(np.float32)
-        file["labels"] = np.array(LABELS, dtype=h5py.string_dtype())
+    _show(rng, tmp_path / "arrays.h5", LABELS)
     (tmp_path / "mine.py").write_text(
         "from torch import nn\n\n\nclass Mine(nn.Module):\n"
         "    def __init__(self):\n        super().__init__()\n        self.gru = nn.GRU(8, 6, batch_first=True)\n\n"
@@ -83,24 +94,8 @@ def files(tmp_path: Path) -> dict[str, str]:
 def study(tmp_path: Path) -> dict[str, str]:
     """Four animals and eight stimuli; features and a module for them."""
     rng = np.random.default_rng(0)
-    for animal in "wxyz":
-        order = np.repeat(np.arange(len(EIGHT)), 8)
-        starts = 1.0 + np.arange(len(order))
-        rates = rng.gamma(2.0, 8.0, size=(len(EIGHT), 12))
-        spikes = [
-            np.sort(
-                np.concatenate(
-                    [s + rng.uniform(0, 0.5, rng.poisson(rates[k, u])) for s, k in zip(starts, order, strict=True)]
-                )
-            )
-            for u in range(12)
-        ]
-        table = {"start_time": starts, "stop_time": starts + 0.5, "texture": [EIGHT[k] for k in order]}
-        session = make_session(animal, "1", spikes, {"trials": table}, observed=[np.array([[0.0, 90.0]])] * 12)
-        write_recordings(tmp_path / "data" / f"{animal}.h5", session)
-    with h5py.File(tmp_path / "eight.h5", "w") as file:
-        file["stimuli"] = rng.normal(size=(len(EIGHT), 3, 2, 2, 2)).astype(np.float32)
-        file["labels"] = np.array(EIGHT, dtype=h5py.string_dtype())
+    _record(rng, tmp_path / "data", "wxyz", EIGHT, 8, 90.0)
+    _show(rng, tmp_path / "eight.h5", EIGHT)
     features = write_features(tmp_path / "features.h5", EIGHT, {"fc": rng.normal(size=(len(EIGHT), 6))})
     paths = {"data": "data", "arrays": "eight.h5", "board": "board", "secret": "secret", "out": "out"}
     return {name: str(tmp_path / path) for name, path in paths.items()} | {"features": str(features)}

@@ -8,7 +8,7 @@ from typing import Annotated, Any
 import typer
 
 from brainbench.cli.leaderboard.scoring import ScoringJob, full_settings, jobs_of, missing, parse_seeds, read_batch
-from brainbench.cli.options import SCORE, SCORE_FLAGS, with_options
+from brainbench.cli.options import SCORE, SCORE_FLAGS, SchedulerOption, with_options
 from brainbench.cli.output import JsonOption, emit, progress_bar
 from brainbench.core.errors import DataFileNotFoundError, UsageError
 from brainbench.core.records import ResultRecord
@@ -42,9 +42,7 @@ def add(
         typer.Option("--prune", help="Remove records that a new score of the same model, seed and settings replaces."),
     ] = False,
     workers: Annotated[int, typer.Option(min=1, help="Processes that score.")] = 1,
-    scheduler: Annotated[
-        str | None, typer.Option(help="Let the workers of this Dask scheduler (tcp://host:8786) score.")
-    ] = None,
+    scheduler: SchedulerOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Add records to a folder: files that somebody sends, or scores computed now.

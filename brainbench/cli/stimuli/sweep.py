@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from brainbench.cli.options import with_options
+from brainbench.cli.options import SchedulerOption, WorkersOption, with_options
 from brainbench.cli.output import JsonOption, emit, facts, progress_bar
 from brainbench.cli.stimuli.scenes import BackendOption, FidelityOption, WhiskersOption
 from brainbench.core.errors import UsageError, unknown_name
@@ -42,12 +42,8 @@ def sweep(
         Path | None, typer.Option("--out", "-o", help="Simulate, into shards and a manifest in this folder.")
     ] = None,
     options: Any = None,
-    workers: Annotated[
-        int | None, typer.Option(min=1, help="Processes. [default: as many as there are processors]")
-    ] = None,
-    scheduler: Annotated[
-        str | None, typer.Option(help="Let the workers of this Dask scheduler (tcp://host:8786) do it.")
-    ] = None,
+    workers: WorkersOption = None,
+    scheduler: SchedulerOption = None,
     unit: Annotated[str | None, typer.Option(help="Length unit of mesh files: m, cm, mm, …")] = None,
     collision: Annotated[str | None, typer.Option(help="What whiskers touch: hull, exact, decomposition, …")] = None,
     whiskers: WhiskersOption = "all",
