@@ -68,6 +68,8 @@ class Gradients:
         clip: Largest norm; 0 leaves it alone.
         autocast: Makes the context of the forward pass.
         record: Record the pass for the shape that comes first, and replay it whenever that shape comes again.
+        average: Of several processes: replaces a vector by its mean over them. Every process then returns the same
+            loss and norm, those of the whole batch.
     """
 
     def __init__(
@@ -78,8 +80,10 @@ class Gradients:
         clip: float,
         autocast: Callable[[], Any],
         record: bool = False,
+        average: Callable[[torch.Tensor], None] | None = None,
     ) -> None:
         self.module, self.forward, self.clip, self.autocast, self.record = module, forward, clip, autocast, record
+        self.average = average
         self.parameters = [parameter for parameter in module.parameters() if parameter.requires_grad]
         self._inputs: tuple[torch.Tensor, ...] = ()
         self._kept: list[torch.Tensor | None] = []
@@ -87,7 +91,10 @@ class Gradients:
 
     def __call__(self, views: tuple[torch.Tensor, ...], labels: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Return (loss, norm of the gradients before clipping), not yet waited for."""
-        given = (*views, labels)
+        found = self._pass((*views, labels))
+        return found if self.average is None else self._clip(self._averaged(found[0]))
+
+    def _pass(self, given: tuple[torch.Tensor, ...]) -> tuple[torch.Tensor, torch.Tensor]:
         if not self.record:
             return self._compute(given)
         if not self._inputs:
@@ -108,9 +115,26 @@ class Gradients:
         with self.autocast():
             loss = self.forward(given[:-1], given[-1])
         loss.backward()
+        # The gradient of several processes is clipped once it is the mean of all.
+        return self._clip(loss.detach()) if self.average is None else (loss.detach(), loss.detach())
+
+    def _clip(self, loss: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         # One norm over all tensors keeps the direction of the step; an infinite limit measures it alone.
-        trained = [parameter for parameter in self.parameters if parameter.grad is not None]
-        return loss.detach(), torch.nn.utils.clip_grad_norm_(trained, self.clip or float("inf"))
+        return loss, torch.nn.utils.clip_grad_norm_(self._trained, self.clip or float("inf"))
+
+    def _averaged(self, loss: torch.Tensor) -> torch.Tensor:
+        """Average gradients and loss over processes in one vector: one collective, also beside a recorded pass."""
+        gradients = [parameter.grad for parameter in self._trained if parameter.grad is not None]
+        vector = torch.cat([*(item.reshape(-1).float() for item in gradients), loss.reshape(1).float()])
+        if self.average is not None:
+            self.average(vector)
+        parts = vector.split([*(item.numel() for item in gradients), 1])
+        torch._foreach_copy_(gradients, [part.view_as(item) for part, item in zip(parts, gradients, strict=False)])
+        return parts[-1][0]
+
+    @property
+    def _trained(self) -> list[nn.Parameter]:
+        return [parameter for parameter in self.parameters if parameter.grad is not None]
 
     def _record(self, given: tuple[torch.Tensor, ...]) -> None:
         device = given[0].device

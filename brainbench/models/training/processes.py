@@ -32,13 +32,13 @@ class Processes:
         """True in the process that writes files and shows progress."""
         return self.rank == 0
 
-    def wrap(self, module: nn.Module) -> nn.Module:
-        """Return the module with gradients (and on CUDA batch norms) averaged over processes."""
-        if self.count == 1:
-            return module
-        # Gradients are averaged: with equal shares that is the gradient of the whole batch's mean loss.
-        ids = [self.device.index] if self.device.type == "cuda" else None
-        return nn.parallel.DistributedDataParallel(module, device_ids=ids)
+    def average(self, vector: torch.Tensor) -> None:
+        """Replace a vector by its mean over processes.
+
+        With equal shares of a batch, the mean of the gradients is that of the whole batch's mean loss.
+        """
+        torch.distributed.all_reduce(vector)
+        vector.div_(self.count)
 
     def prepare(self, module: nn.Module) -> nn.Module:
         """Return the module on its device, with batch norms that pool over processes.
@@ -64,14 +64,20 @@ class Processes:
         torch.distributed.all_reduce(total)
         return float(total) / self.count
 
-    def any(self, flag: bool) -> bool:
-        """Return whether the flag is up in any process."""
-        return self.mean(float(flag)) > 0
+    def any(self, *flags: bool) -> tuple[bool, ...]:
+        """Return for each flag whether it is up in any process."""
+        if self.count == 1:
+            return flags
+        total = torch.tensor(flags, dtype=torch.int32, device=self.device)
+        torch.distributed.all_reduce(total, op=torch.distributed.ReduceOp.MAX)
+        return tuple(bool(value) for value in total.tolist())
 
     def wait(self) -> None:
         """Wait until all processes have come here."""
         if self.count > 1:
-            torch.distributed.barrier()
+            # NCCL guesses a device, and warns, unless it is told.
+            ids = [self.device.index] if self.device.type == "cuda" else None
+            torch.distributed.barrier(device_ids=ids)
 
 
 @contextmanager
@@ -90,7 +96,10 @@ def processes(device: str | None = None) -> Iterator[Processes]:
     if count == 1:
         yield Processes(0, 1, where)
         return
-    torch.distributed.init_process_group("nccl" if where.type == "cuda" else "gloo")
+    if where.type == "cuda":
+        torch.distributed.init_process_group("nccl", device_id=where)
+    else:
+        torch.distributed.init_process_group("gloo")
     try:
         yield Processes(rank, count, where)
     finally:

@@ -148,10 +148,11 @@ class _Run:
         self.optimizer = make_optimizer(config.optimizer, self.learner.parameters(), config.learning_rate)
         self.gradients = Gradients(
             self.learner,
-            compiled(where.wrap(self.learner), config.compile),
+            compiled(self.learner, config.compile),
             clip=config.clip,
             autocast=self._precision,
-            record=config.compile == "graphs" and where.count == 1,
+            record=config.compile == "graphs",
+            average=where.average if where.count > 1 else None,
         )
         self.augmentation = Augmentation(config.augmentation, config.masking)
         batches = self._batches("train", shuffle=True)
@@ -173,13 +174,16 @@ class _Run:
         while self.at.epoch < self.config.epochs:
             self.learner.train()
             over, stopped = False, f"the {allowed:g} s allowed are over; start it again to go on"
+            self.began, self.seen = time.monotonic(), 0
             for x, labels in self.batches:
                 failure = self._advance(x, labels, steps)
                 if failure:
                     return self._result("diverged", failure)
                 self.progress(self.at.step, self._steps, f"training {self.config.model}")
-                over = self.where.any(time.monotonic() - self.started > allowed)
-                due = self.where.any(time.monotonic() - self.saved > self.config.checkpoint_seconds)
+                now = time.monotonic()
+                over, due = self.where.any(
+                    now - self.started > allowed, now - self.saved > self.config.checkpoint_seconds
+                )
                 # After an epoch's last batch the end of the epoch saves; a state between the two would lose it.
                 if (over or due) and self.at.step % steps:
                     self._save()
@@ -209,10 +213,11 @@ class _Run:
         found = self.gradients(views, labels)
         # This waits for the device: a step that is not finite must be found before it changes the weights.
         value, norm = map(float, found)
-        # Gradients are averaged over processes, so all of them see the same norm.
-        if not math.isfinite(norm) or self.where.any(not math.isfinite(value)):
+        # Loss and gradients are averaged over processes, so all of them decide alike.
+        if not math.isfinite(norm) or not math.isfinite(value):
             return self._keep_failure(views, labels, value, norm)
         self.optimizer.step()
+        self.seen += len(x) * self.where.count
         self.at.step += 1
         self.at.total, self.at.count = self.at.total + value, self.at.count + 1
         if self.at.step % _LOG_STEPS == 0:
@@ -228,9 +233,16 @@ class _Run:
         )
 
     def _end_epoch(self) -> None:
-        loss = self.where.mean(self.at.total / max(self.at.count, 1))
+        loss = self.at.total / max(self.at.count, 1)
         self.at.total, self.at.count = 0.0, 0
-        self.log.write("epoch", self.at.step, epoch=self.at.epoch, loss=loss)
+        # Of the part of the epoch that this session trained, without its validation.
+        seconds = time.monotonic() - self.began
+        rate = self.seen / seconds if seconds else 0.0
+        speed = {"seconds": round(seconds, 3), "sweeps_per_second": round(rate, 1)}
+        self.log.write("epoch", self.at.step, epoch=self.at.epoch, loss=loss, **speed)
+        if self.where.first:
+            told = (self.config.model, self.at.epoch, self.config.epochs, loss, seconds, rate)
+            _log.info("%s: epoch %d of %d, loss %.4f, %.1f s, %.0f sweeps/s.", *told)
         score = self._validate(loss)
         # Strictly better, so of equal epochs the first is kept, and a NaN never is.
         if score < self.at.best:

@@ -96,8 +96,21 @@ def test_a_run_stopped_after_every_step_ends_as_an_unbroken_one(objective, tmp_p
             break
     assert result.status == "finished"
     assert _equal(_weights(tmp_path / "whole"), _weights(tmp_path / "broken"))
-    logs = [[line for line in _lines(tmp_path / name)] for name in ("whole", "broken")]
+    clock = ("seconds", "sweeps_per_second")
+    logs = [
+        [{key: value for key, value in line.items() if key not in clock} for line in _lines(tmp_path / name)]
+        for name in ("whole", "broken")
+    ]
     assert logs[0] == logs[1]
+
+
+def test_the_log_says_how_fast_every_epoch_was(tmp_path):
+    train(_config(epochs=2), tiny(), out=tmp_path, device="cpu")
+    epochs = [line for line in _lines(tmp_path) if line["kind"] == "epoch"]
+    assert len(epochs) == 2
+    # 0.001 s is what the log rounds to.
+    sweeps = [line["seconds"] * line["sweeps_per_second"] for line in epochs]
+    assert sweeps == pytest.approx([24, 24], rel=0.05)
 
 
 def test_equal_seeds_give_equal_weights_and_others_do_not(tmp_path):
