@@ -69,6 +69,15 @@ class Architecture:
         return f"{self.encoder}{cell}{'-ln' if self.layer_norm else ''}"
 
     @property
+    def version(self) -> int:
+        """Version of what the weights mean: 2 where published details changed the computation (S4, GPT), else 1.
+
+        Version 1 of S4 normalised before its blocks, and of GPT used the exact GELU.
+        """
+        changed = self.encoder == "s4" or (self.attender == "gpt" and self.encoder in ("zhuang", "resnet18"))
+        return 2 if changed else 1
+
+    @property
     def full(self) -> Architecture:
         """Same architecture, at full size and untrained."""
         return replace(self, small=False, tag=None)

@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from functools import partial
 from typing import TYPE_CHECKING
 
+from brainbench.core.errors import UsageError
 from brainbench.models.architecture import Architecture
 from brainbench.models.registry import register_model
 
@@ -67,7 +68,12 @@ def citation(item: Architecture) -> str:
 
 
 def build(
-    item: Architecture, *, classes: int = 117, decoder: str = "linear", unroll: Unroll = "biological"
+    item: Architecture,
+    *,
+    classes: int = 117,
+    decoder: str = "linear",
+    unroll: Unroll = "biological",
+    version: int | None = None,
 ) -> EncoderAttenderDecoder:
     """Build the network with new random weights.
 
@@ -76,6 +82,7 @@ def build(
         classes: Number of outputs.
         decoder: ``linear``, ``mlp`` or ``all-steps``.
         unroll: ``biological`` or ``full``, for a Zhuang encoder.
+        version: 1 for weights of an older :attr:`Architecture.version`; None is the newest.
 
     Raises:
         UsageError: an option does not exist or does not fit.
@@ -83,13 +90,16 @@ def build(
     from brainbench.models.heads.decoders import make_decoder
     from brainbench.models.network import EncoderAttenderDecoder
 
-    encoder = _encoder(item)
-    attender = _attender(item, encoder.features)
+    if version not in (None, 1, item.version):
+        raise UsageError(f"The versions of {item} are 1 to {item.version}; received {version!r}.")
+    older = version is not None and version < item.version
+    encoder = _encoder(item, older)
+    attender = _attender(item, encoder.features, older)
     features = encoder.features if attender is None else attender.features
     return EncoderAttenderDecoder(encoder, attender, make_decoder(decoder, features, classes), unroll=unroll)
 
 
-def _encoder(item: Architecture) -> Encoder:
+def _encoder(item: Architecture, older: bool) -> Encoder:
     if item.encoder == "resnet18":
         from brainbench.models.encoders.resnet import ResNet18Encoder
 
@@ -97,7 +107,7 @@ def _encoder(item: Architecture) -> Encoder:
     if item.encoder == "s4":
         from brainbench.models.encoders.s4 import S4Encoder
 
-        return S4Encoder(small=item.small)
+        return S4Encoder(small=item.small, norm_first=older, dropout=0.0 if older else 0.2)
     from brainbench.models.encoders.zhuang import zhuang_graph
     from brainbench.models.graph.temporal_graph import TemporalGraph
 
@@ -106,12 +116,13 @@ def _encoder(item: Architecture) -> Encoder:
     return TemporalGraph(zhuang_graph(cell, item.layer_norm, item.small, feedforward=feedforward))
 
 
-def _attender(item: Architecture, features: int) -> Attender | None:
+def _attender(item: Architecture, features: int, older: bool) -> Attender | None:
     if item.attender == "gpt":
         from brainbench.models.attenders.gpt import GPTAttender
 
         # As published, the ResNet's transformer is half as wide as its features.
-        return GPTAttender(features, features // 2 if item.encoder == "resnet18" else features)
+        width = features // 2 if item.encoder == "resnet18" else features
+        return GPTAttender(features, width, gelu="none" if older else "tanh")
     if item.attender == "mamba":
         from brainbench.models.attenders.mamba import MambaAttender
 

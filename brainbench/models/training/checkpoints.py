@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from brainbench.core.errors import DataError, DataFileNotFoundError, UsageError, check_name, missing_dependency
+from brainbench.models.architecture import Architecture
 
 if TYPE_CHECKING:
     import torch
@@ -72,6 +73,7 @@ def save_checkpoint(
     if card:
         write_text(folder / CARD, card)
     stated = {"brainbench_model": FORMAT, "architecture": architecture, "options": dict(options), "dtype": dtype}
+    stated["version"] = options.get("version", Architecture.parse(architecture).version)
     write_json(folder / CONFIG, {**(info or {}), **stated})
     return folder
 
@@ -81,7 +83,7 @@ def read_config(folder: str | os.PathLike[str]) -> dict[str, Any]:
 
     Raises:
         DataFileNotFoundError: there is no such folder, or no configuration in it.
-        DataError: the configuration is of another kind.
+        DataError: the configuration is of another kind, or its weights of a version that is not computed here.
     """
     from brainbench.core.files import read_mapping
 
@@ -98,6 +100,15 @@ def read_config(folder: str | os.PathLike[str]) -> dict[str, Any]:
         )
     if not isinstance(config.get("architecture"), str) or not isinstance(config.get("options"), dict):
         raise DataError(f"{os.fspath(path)!r} lacks the name 'architecture' or the mapping 'options'.")
+    version, known = config.get("version", 1), Architecture.parse(config["architecture"]).version
+    if version not in (1, known):
+        raise DataError(
+            f"{os.fspath(folder)!r} holds version {version!r} of {config['architecture']!r}; this brainbench computes "
+            f"versions up to {known}: train anew with brainbench train, or install the brainbench that made it."
+        )
+    if version != known:
+        # Weights of version 1 still compute what they were trained for, by an option of the architecture.
+        config["options"] = {**config["options"], "version": version}
     return config
 
 

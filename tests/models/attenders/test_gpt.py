@@ -1,3 +1,5 @@
+from functools import partial
+
 import pytest
 import torch
 from torch import nn
@@ -19,15 +21,17 @@ def test_parameters_equal_the_published_counts(width, parameters):
     assert attender.max_steps == 32
 
 
-def test_a_pass_equals_pytorchs_transformer():
-    attender = _attender()
+@pytest.mark.parametrize("form", ["tanh", "none"])
+def test_a_pass_equals_pytorchs_transformer(form):
+    attender, gelu = _attender(gelu=form), partial(functional.gelu, approximate=form)
     layers = nn.ModuleList(
-        nn.TransformerEncoderLayer(16, 4, 64, 0.0, "gelu", batch_first=True, norm_first=True) for _ in range(2)
+        nn.TransformerEncoderLayer(16, 4, 64, 0.0, gelu, batch_first=True, norm_first=True) for _ in range(2)
     ).eval()
     x, steps = torch.randn(3, 5, 12), 5
     with torch.no_grad():
         for block, layer in zip(attender.blocks, layers, strict=True):
-            layer.self_attn.in_proj_weight.copy_(block.query_key_value.weight)
+            layer.self_attn.in_proj_weight.copy_(block.query_key_value.weight.mul_(3.0))
+            block.mlp[0].weight.mul_(3.0)  # large enough that the two forms differ
             layer.self_attn.in_proj_bias.copy_(block.query_key_value.bias.normal_())
             layer.self_attn.out_proj.load_state_dict(block.project.state_dict())
             layer.linear1.load_state_dict(block.mlp[0].state_dict())

@@ -9,6 +9,7 @@ from brainbench.core.errors import DataError, DataFileNotFoundError, MissingDepe
 from brainbench.models import registry
 from brainbench.models.registry import describe_model, load_model
 from brainbench.models.training.checkpoints import find_folder, save_checkpoint
+from tests.factories.training_sweeps import random_sweeps
 
 NAME = "resnet18-small"
 
@@ -117,3 +118,25 @@ def test_a_score_carries_what_the_checkpoint_says(folder):
     card = resolve_model(f"local-dir:{folder}").card
     assert (card.objective, card.top1, card.accuracy_interval.high, card.twin, card.seed) == ("ae", 0.5, 0.6, NAME, 4)
     assert resolve_model(NAME).card.objective == "untrained"
+
+
+def test_weights_of_an_older_version_compute_what_they_did(tmp_path):
+    x, model = random_sweeps(1, 4), load_model("s4-small+gpt", seed=3, classes=7, version=1)
+    folder = save_checkpoint(tmp_path, model, architecture="s4-small+gpt", options={"classes": 7, "version": 1})
+    config = json.loads((folder / "config.json").read_text())
+    # Checkpoints made before there were versions state none.
+    del config["version"], config["options"]["version"]
+    (folder / "config.json").write_text(json.dumps(config))
+    again, newest = load_model(f"local-dir:{folder}"), load_model("s4-small+gpt", seed=3, classes=7)
+    assert _equal(again, newest)
+    assert torch.equal(again(x), model(x))
+    assert not torch.allclose(newest(x), model(x), atol=1e-3)
+
+
+def test_a_version_that_nobody_computes_is_refused(folder):
+    config = json.loads((folder / "config.json").read_text())
+    (folder / "config.json").write_text(json.dumps(config | {"version": 7}))
+    with pytest.raises(DataError, match=r"version 7 .* train anew"):
+        load_model(f"local-dir:{folder}")
+    with pytest.raises(UsageError, match="received 7"):
+        load_model(NAME, version=7)
