@@ -139,7 +139,6 @@ class _Run:
         claim(out, {**config.identity, "classes": list(data.classes)}, write=where.first)
         where.wait()
         model = load_model(config.model, seed=config.seed, **self.options).train()
-        self.drawn = draw_silent_biases(model)
         learner = make_learner(config.objective, model)
         if where.count > 1 and config.batch_size % where.count:
             raise UsageError(f"A batch of {config.batch_size} cannot be shared evenly by {where.count} processes.")
@@ -305,7 +304,6 @@ class _Run:
             epochs_done=self.at.epoch,
             best_epoch=self.at.best_epoch,
             evaluation=result,
-            drawn_biases=self.drawn,
         )
         save_checkpoint(
             self.out / BEST,
@@ -371,29 +369,3 @@ def _generator(seed: int, step: int, view: int) -> torch.Generator:
     """Return random numbers that depend on nothing but where training stands, so that no state need be kept."""
     # Distinct numbers for every step and view of a run; the modulus keeps negative steps (validation) valid.
     return torch.Generator().manual_seed(((seed * 1_000_003 + step) * 2 + view) % 2**63)
-
-
-@torch.no_grad()
-def draw_silent_biases(model: nn.Module) -> int:
-    """Draw the biases that are zero, uniform within 1/√fan_in, in a network with layer norm.
-
-    Before an object arrives a sweep is exactly zero, and so is every activation of a network whose biases are zero.
-    There layer norm has its steepest slope, 1/√ε = 316, at every place, step and layer: back through 22 steps of an
-    unrolled network the gradient overflows single precision, and four S4 blocks alone make it 1e9. With drawn biases
-    silence has a spread over channels, and the slope is of the order of one.
-
-    Args:
-        model: Changed in place; a network without layer norm is left alone.
-
-    Returns:
-        How many layers got biases. They come from PyTorch's global random state.
-    """
-    if not any(isinstance(part, nn.LayerNorm) for part in model.modules()):
-        return 0
-    drawn = 0
-    for part in model.modules():
-        if isinstance(part, (nn.Conv2d, nn.Linear)) and part.bias is not None and not part.bias.any():
-            bound = 1.0 / math.sqrt(part.weight[0].numel())
-            part.bias.uniform_(-bound, bound)
-            drawn += 1
-    return drawn
