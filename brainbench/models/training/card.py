@@ -19,8 +19,12 @@ def checkpoint_info(
     epochs_done: float | None,
     best_epoch: float | None,
     evaluation: Evaluation | None,
+    twin: Mapping[str, Any] | None = None,
 ) -> dict[str, Any]:
-    """Return what a checkpoint's configuration says beside the architecture, in plain values."""
+    """Return what a checkpoint's configuration says beside the architecture, in plain values.
+
+    ``twin`` is what :func:`~brainbench.models.training.twins.describe_twin` told of the network before its training.
+    """
     return {
         "objective": config.objective,
         "augmentation": config.augmentation + (f" + {config.masking:.0%} masking" if config.masking else ""),
@@ -31,7 +35,7 @@ def checkpoint_info(
         "best_epoch": best_epoch,
         "training": dataclasses.asdict(config),
         "evaluation": to_plain(evaluation),
-        "twin": config.model,
+        "twin": dict(twin or {"name": config.model, "seed": config.seed}),
         "licence": "MIT",
         "provenance": provenance(),
     }
@@ -64,7 +68,8 @@ def model_card(config: TrainingConfig, info: Mapping[str, Any]) -> str:
             "test data": found["data"],
             "collapsed": f"yes: {found['reason']}" if found["collapsed"] else "no",
         }
-    rows["untrained twin"] = f"{info['twin']}{_beside(found, info.get('twin_evaluation'))}"
+    twin = info["twin"]
+    rows["untrained twin"] = f"{twin['name']}, seed {twin['seed']}{_beside(found, info.get('twin_evaluation'))}"
     rows["licence"] = info["licence"]
     table = "".join(f"| {name} | {told} |\n" for name, told in rows.items() if told)
     return (

@@ -46,6 +46,7 @@ from brainbench.models.training.run_folder import (
     mark,
     save_state,
 )  # fmt: skip
+from brainbench.models.training.twins import describe_twin, difference
 
 _log = logging.getLogger(__name__)
 
@@ -139,6 +140,7 @@ class _Run:
         claim(out, {**config.identity, "classes": list(data.classes)}, write=where.first)
         where.wait()
         model = load_model(config.model, seed=config.seed, **self.options).train()
+        self.twin = self._twin(describe_twin(config.model, config.seed, model))
         learner = make_learner(config.objective, model)
         if where.count > 1 and config.batch_size % where.count:
             raise UsageError(f"A batch of {config.batch_size} cannot be shared evenly by {where.count} processes.")
@@ -163,6 +165,19 @@ class _Run:
         self.log = RunLog(out, step=self.at.step, active=where.first)
         for warning in config_warnings(config, self.model) if where.first else ():
             _log.warning("%s", warning)
+
+    def _twin(self, now: dict[str, Any]) -> dict[str, Any]:
+        """Return what is told of the network that the run started from, which may have been drawn elsewhere."""
+        if not self.where.first:
+            return now
+        kept = read_json(self.out / RUN).get("twin")
+        if kept is None:
+            if (self.out / STATE).is_file():  # of an earlier version, which kept no hash
+                del now["state"]
+            mark(self.out, twin=now)
+        elif told := difference(kept, now):
+            _log.warning("The run goes on, but without its untrained twin: %s.", told)
+        return kept or now
 
     def run(self, allowed: float) -> TrainingResult:
         """Train until all epochs are done or ``allowed`` seconds are over; return how it ended."""
@@ -304,6 +319,7 @@ class _Run:
             epochs_done=self.at.epoch,
             best_epoch=self.at.best_epoch,
             evaluation=result,
+            twin=self.twin,
         )
         save_checkpoint(
             self.out / BEST,

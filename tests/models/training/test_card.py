@@ -40,4 +40,4 @@ def test_a_card_does_not_hide_that_the_untrained_twin_is_as_good(correct, verdic
 
 
 def test_a_card_without_its_twin_claims_nothing():
-    assert "| untrained twin | zhuang-small |" in _card(200)
+    assert "| untrained twin | zhuang-small, seed 0 |" in _card(200)

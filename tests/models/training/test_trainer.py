@@ -56,7 +56,7 @@ def test_a_run_learns_what_can_be_learned_and_leaves_a_model_to_load(tmp_path):
     known = describe_model(f"local-dir:{result.folder}")
     assert known.trained["classes"] == list(CLASSES)
     assert known.trained["evaluation"]["top1"] == pytest.approx(result.evaluation.top1)
-    assert known.trained["twin"] == MODEL
+    assert (known.trained["twin"]["name"], known.trained["twin"]["seed"]) == (MODEL, 0)
     card = (result.folder / "README.md").read_text()
     assert f"{MODEL}.supervised" in card
     assert "8 (published: 100)" in card
