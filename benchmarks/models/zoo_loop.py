@@ -34,7 +34,7 @@ from brainbench.models.training.gradients import copy_state, fuse
 from brainbench.models.training.objectives import make_learner
 from brainbench.models.training.optimizers import make_optimizer, rate_factor
 from brainbench.models.training.run_folder import load_state, save_state
-from brainbench.models.training.trainer import draw_silent_biases
+from brainbench.models.training.twins import describe_twin
 
 STATE, BEST, RESULT, LOG = "state.safetensors", "best", "result.json", "log.jsonl"
 EVALUATED = 512
@@ -123,7 +123,7 @@ class Trainer:
         self.options = {"classes": len(data.classes), "decoder": self.config.decoder}
         with seeded(job.seed):
             model = load_model(job.model, seed=job.seed, **self.options)
-            self.drawn = draw_silent_biases(model)
+            self.twin = describe_twin(job.model, job.seed, model)
             self.learner: Any = make_learner(job.objective, model).to(device)
         torch.manual_seed(job.seed)  # of dropout
         if device.type == "cuda":
@@ -337,7 +337,7 @@ def publish(trainer: Trainer, out: Path) -> dict[str, Any]:
             epochs_done=epochs,
             best_epoch=best_epoch,
             evaluation=evaluation,
-            drawn_biases=trainer.drawn,
+            twin=trainer.twin,
         )
         info |= {"data": data.summary(), "refit_decoder": trainer.refit and job.objective == "supervised"}
         card = model_card(config, info)

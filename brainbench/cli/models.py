@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated
 
@@ -80,6 +81,12 @@ def show(
         data["recipe"] = to_plain(recipe)
         if not as_json:
             data["recipe"] |= {"setting": str(recipe.setting), "search": [f"({item})" for item in recipe.search]}
+    twin = (record.trained or {}).get("twin")
+    if isinstance(twin, Mapping):
+        from brainbench.models.training.twins import draw_twin
+
+        _, told = draw_twin(twin, data["trained"]["options"])
+        data["twin"] = told or f"{twin['name']} with seed {twin['seed']}, drawn here to the last bit"
     shown = {key.replace("_", " "): _text(value) for key, value in data.items() if value is not None}
     emit(data, facts(shown), as_json=as_json)
 

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from functools import partial
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 from brainbench.core.errors import UsageError
 from brainbench.models.architecture import Architecture
 from brainbench.models.registry import register_model
 
 if TYPE_CHECKING:
+    from torch import nn
+
     from brainbench.models.graph.spec import Unroll
     from brainbench.models.network import EncoderAttenderDecoder
     from brainbench.models.parts import Attender, Encoder
@@ -89,12 +91,18 @@ def build(
     """
     from brainbench.models.heads.decoders import make_decoder
     from brainbench.models.network import EncoderAttenderDecoder
+    from brainbench.models.ops.layers import draw_silent_biases
 
     if version not in (None, 1, item.version):
         raise UsageError(f"The versions of {item} are 1 to {item.version}; received {version!r}.")
     older = version is not None and version < item.version
     encoder = _encoder(item, older)
     attender = _attender(item, encoder.features, older)
+    # Before the decoder, so that features do not depend on the number of classes; here, so that the model by name is
+    # the network that training starts from.
+    for part in (encoder, attender):
+        if part is not None:
+            draw_silent_biases(cast("nn.Module", part))
     features = encoder.features if attender is None else attender.features
     return EncoderAttenderDecoder(encoder, attender, make_decoder(decoder, features, classes), unroll=unroll)
 

@@ -169,10 +169,13 @@ def _trained(config: Mapping[str, Any] | None) -> dict[str, Any]:
     if config is None:
         return {}
     found, twin = config.get("evaluation") or {}, config.get("twin_evaluation") or {}
+    # Networks that came with the package before twins were hashed name theirs alone.
+    start = config.get("twin")
     stated = {name: config.get(name) for name in ("epochs", "published_epochs", "best_epoch", "licence")}
     options = {name: value for name, value in (config.get("training") or {}).items() if name not in ("model", "seed")}
     return {
-        **{name: config.get(name) for name in ("objective", "augmentation", "twin", "seed")},
+        **{name: config.get(name) for name in ("objective", "augmentation", "seed")},
+        "twin": start["name"] if isinstance(start, Mapping) else start,
         "layer": config.get("committed_layer"),
         **{name: found.get(name) for name in ("top1", "top5", "collapsed")},
         "accuracy_interval": Interval(**found["interval"]) if found.get("interval") else None,

@@ -24,6 +24,7 @@ def test_a_model_is_trained_scored_by_its_folder_and_exported(run, folder, tmp_p
     assert f"brainbench score local-dir:{tmp_path / 'run' / 'best'}" in trained.out
     shown = json.loads(run("models", "show", f"local-dir:{tmp_path / 'run' / 'best'}", "--json").out)
     assert shown["trained"]["classes"] == ["brick", "cone"]
+    assert "s4-small with seed 0, drawn here" in shown["twin"]
     file = tmp_path / "s4.pt2"
     exported = run(
         "export", f"local-dir:{tmp_path / 'run' / 'best'}", "--format", "torch", "--out", str(file), "--json"

@@ -11,8 +11,6 @@ from brainbench.models.registry import describe_model
 from brainbench.models.training.config import TrainingConfig
 from brainbench.models.training.evaluation import Evaluation
 
-_START = "biases drawn as PyTorch does: layer norm of silence has a slope of 316, step after step"
-
 
 def checkpoint_info(
     config: TrainingConfig,
@@ -21,11 +19,11 @@ def checkpoint_info(
     epochs_done: float | None,
     best_epoch: float | None,
     evaluation: Evaluation | None,
-    drawn_biases: int = 0,
+    twin: Mapping[str, Any] | None = None,
 ) -> dict[str, Any]:
     """Return what a checkpoint's configuration says beside the architecture, in plain values.
 
-    ``drawn_biases`` is what :func:`~brainbench.models.training.trainer.draw_silent_biases` returned.
+    ``twin`` is what :func:`~brainbench.models.training.twins.describe_twin` told of the network before its training.
     """
     return {
         "objective": config.objective,
@@ -35,10 +33,9 @@ def checkpoint_info(
         "epochs": epochs_done,
         "published_epochs": 100,
         "best_epoch": best_epoch,
-        "drawn_biases": drawn_biases,
         "training": dataclasses.asdict(config),
         "evaluation": to_plain(evaluation),
-        "twin": config.model,
+        "twin": dict(twin or {"name": config.model, "seed": config.seed}),
         "licence": "MIT",
         "provenance": provenance(),
     }
@@ -58,7 +55,6 @@ def model_card(config: TrainingConfig, info: Mapping[str, Any]) -> str:
         "epochs": f"{info['epochs']} (published: {info['published_epochs']}); best: {info['best_epoch']}",
         "optimiser": f"{config.optimizer}, {config.schedule}, learning rate {config.learning_rate:g}, batch "
         f"{config.batch_size}, gradients clipped to a norm of {config.clip:g}, {config.precision}",
-        "start": info.get("drawn_biases") and _START,
         "augmentation": info["augmentation"],
         "seed": str(config.seed),
     }
@@ -72,7 +68,8 @@ def model_card(config: TrainingConfig, info: Mapping[str, Any]) -> str:
             "test data": found["data"],
             "collapsed": f"yes: {found['reason']}" if found["collapsed"] else "no",
         }
-    rows["untrained twin"] = f"{info['twin']}{_beside(found, info.get('twin_evaluation'))}"
+    twin = info["twin"]
+    rows["untrained twin"] = f"{twin['name']}, seed {twin['seed']}{_beside(found, info.get('twin_evaluation'))}"
     rows["licence"] = info["licence"]
     table = "".join(f"| {name} | {told} |\n" for name, told in rows.items() if told)
     return (

@@ -46,6 +46,7 @@ from brainbench.models.training.run_folder import (
     mark,
     save_state,
 )  # fmt: skip
+from brainbench.models.training.twins import describe_twin, difference
 
 _log = logging.getLogger(__name__)
 
@@ -139,7 +140,7 @@ class _Run:
         claim(out, {**config.identity, "classes": list(data.classes)}, write=where.first)
         where.wait()
         model = load_model(config.model, seed=config.seed, **self.options).train()
-        self.drawn = draw_silent_biases(model)
+        self.twin = self._twin(describe_twin(config.model, config.seed, model))
         learner = make_learner(config.objective, model)
         if where.count > 1 and config.batch_size % where.count:
             raise UsageError(f"A batch of {config.batch_size} cannot be shared evenly by {where.count} processes.")
@@ -165,6 +166,19 @@ class _Run:
         self.log = RunLog(out, step=self.at.step, active=where.first)
         for warning in config_warnings(config, self.model) if where.first else ():
             _log.warning("%s", warning)
+
+    def _twin(self, now: dict[str, Any]) -> dict[str, Any]:
+        """Return what is told of the network that the run started from, which may have been drawn elsewhere."""
+        if not self.where.first:
+            return now
+        kept = read_json(self.out / RUN).get("twin")
+        if kept is None:
+            if (self.out / STATE).is_file():  # of an earlier version, which kept no hash
+                del now["state"]
+            mark(self.out, twin=now)
+        elif told := difference(kept, now):
+            _log.warning("The run goes on, but without its untrained twin: %s.", told)
+        return kept or now
 
     def run(self, allowed: float) -> TrainingResult:
         """Train until all epochs are done or ``allowed`` seconds are over; return how it ended."""
@@ -317,7 +331,7 @@ class _Run:
             epochs_done=self.at.epoch,
             best_epoch=self.at.best_epoch,
             evaluation=result,
-            drawn_biases=self.drawn,
+            twin=self.twin,
         )
         save_checkpoint(
             self.out / BEST,
@@ -383,29 +397,3 @@ def _generator(seed: int, step: int, view: int) -> torch.Generator:
     """Return random numbers that depend on nothing but where training stands, so that no state need be kept."""
     # Distinct numbers for every step and view of a run; the modulus keeps negative steps (validation) valid.
     return torch.Generator().manual_seed(((seed * 1_000_003 + step) * 2 + view) % 2**63)
-
-
-@torch.no_grad()
-def draw_silent_biases(model: nn.Module) -> int:
-    """Draw the biases that are zero, uniform within 1/√fan_in, in a network with layer norm.
-
-    Before an object arrives a sweep is exactly zero, and so is every activation of a network whose biases are zero.
-    There layer norm has its steepest slope, 1/√ε = 316, at every place, step and layer: back through 22 steps of an
-    unrolled network the gradient overflows single precision, and four S4 blocks alone make it 1e9. With drawn biases
-    silence has a spread over channels, and the slope is of the order of one.
-
-    Args:
-        model: Changed in place; a network without layer norm is left alone.
-
-    Returns:
-        How many layers got biases. They come from PyTorch's global random state.
-    """
-    if not any(isinstance(part, nn.LayerNorm) for part in model.modules()):
-        return 0
-    drawn = 0
-    for part in model.modules():
-        if isinstance(part, (nn.Conv2d, nn.Linear)) and part.bias is not None and not part.bias.any():
-            bound = 1.0 / math.sqrt(part.weight[0].numel())
-            part.bias.uniform_(-bound, bound)
-            drawn += 1
-    return drawn

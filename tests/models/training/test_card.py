@@ -29,8 +29,6 @@ def test_a_card_says_what_was_trained_on_what_and_for_how_long():
     assert "0123abcd: 3,259 sweeps to train, 405 to validate, 407 of other objects to test; 921 left out" in text
     assert "0.500 [0.451, 0.549] on 400 sweeps (linear probe on the frozen network)" in text
     assert "gradients clipped to a norm of 1" in text
-    assert "biases drawn" not in text
-    assert "biases drawn" in _card(200, drawn_biases=4)
 
 
 @pytest.mark.parametrize(
@@ -42,4 +40,4 @@ def test_a_card_does_not_hide_that_the_untrained_twin_is_as_good(correct, verdic
 
 
 def test_a_card_without_its_twin_claims_nothing():
-    assert "| untrained twin | zhuang-small |" in _card(200)
+    assert "| untrained twin | zhuang-small, seed 0 |" in _card(200)
