@@ -211,11 +211,12 @@ class Worker:
 
     def _rate(self, job: Job) -> float | None:
         """Return the learning rate that seed 0 found; None where it has to be searched."""
+        if not (job.trained and job.seed):
+            return None
         first = job.name.removesuffix(f"seed{job.seed}") + "seed0"
         path = self.args.work / "jobs" / first / "result.json"
-        if job.seed and path.is_file():
-            return json.loads(path.read_text(encoding="utf-8"))["learning_rate"]
-        return self.done.get(first, {}).get("learning_rate") if job.seed else None
+        known = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else self.done.get(first, {})
+        return known.get("learning_rate")
 
 
 def _end_with(parent: int) -> None:

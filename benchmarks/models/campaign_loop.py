@@ -146,7 +146,7 @@ class Trainer:
         x, labels = self.data.train.take(rows), self.data.train.labels.index_select(0, rows)
         self.rate.copy_(self.rates.index_select(0, self.cursor)[0])
         self.optimizer.zero_grad(set_to_none=True)
-        with torch.autocast(self.device.type, dtype=torch.bfloat16):
+        with self._autocast():
             views = tuple(self.augmentation(x, self.generator) for _ in range(self.learner.views))
             loss = self.learner(views, labels)
         loss.backward()
@@ -156,6 +156,10 @@ class Trainer:
         self.optimizer.step()
         self.losses.index_copy_(0, self.cursor, torch.nan_to_num(loss.detach().float()).view(1))
         self.cursor.add_(1).remainder_(self.steps)
+
+    def _autocast(self) -> torch.autocast:
+        # On the processor PyTorch's bf16 gradients of strided convolutions are now and then not finite.
+        return torch.autocast(self.device.type, dtype=torch.bfloat16, enabled=self.device.type == "cuda")
 
     def _set_epoch(self, epoch: int, epochs: int, rate: float) -> None:
         """Draw the order of an epoch of a training that has so many, with a highest rate."""
@@ -179,7 +183,7 @@ class Trainer:
     def accuracy(self) -> float:
         """Return the share of validation sweeps named rightly: by the decoder, or by a ridge probe of the features."""
         self.learner.eval()
-        with torch.no_grad(), torch.autocast(self.device.type, dtype=torch.bfloat16):
+        with torch.no_grad(), self._autocast():
             if self.learner.supervised:
                 right = [(self.model(x).argmax(1) == labels).sum() for x, labels in self.data.validation.batches()]
                 return float(sum(right)) / len(self.data.validation)
