@@ -75,6 +75,9 @@ class Split:
         for rows in torch.arange(len(self), device=self.labels.device).split(size):
             yield self.take(rows), self.labels[rows]
 
+    def __iter__(self) -> Iterator[tuple[torch.Tensor, torch.Tensor]]:
+        return self.batches()
+
 
 class Resident:
     """A data set in device memory."""
