@@ -52,6 +52,7 @@ def train(
     Several GPUs: torchrun --nproc-per-node N -m brainbench train …
     """
     from brainbench.models.training.config import TrainingConfig
+    from brainbench.models.training.evaluation import RANDOM, RAW, TWIN
     from brainbench.models.training.search_space import best_run, sweep_runs
     from brainbench.models.training.trainer import train as run
 
@@ -70,7 +71,10 @@ def train(
     with progress_bar() as progress:
         for item, folder in runs:
             told = _named(progress, folder.name) if sweep is not None else progress
-            results[str(folder)] = run(item, source, out=folder, device=device, stop_after=stop_after, progress=told)
+            results[str(folder)] = run(
+                item, source, out=folder, device=device, stop_after=stop_after, progress=told,
+                controls=where if sweep is not None else None,
+            )  # fmt: skip
     if os.environ.get("RANK", "0") != "0":
         return
     columns = {
@@ -80,6 +84,9 @@ def train(
         ">best": lambda item: "–" if item[1].best_epoch is None else item[1].best_epoch,
         ">top-1": lambda item: _told(item[1], "{0.top1:.3f} [{0.interval.low:.3f}, {0.interval.high:.3f}]"),
         ">top-5": lambda item: _told(item[1], "{0.top5:.3f}"),
+        ">raw input": lambda item: _control(item[1], RAW),
+        ">random features": lambda item: _control(item[1], RANDOM),
+        ">untrained twin": lambda item: _control(item[1], TWIN),
         "collapsed": lambda item: _told(item[1], "{0.reason}") or "no",
     }
     text = table_of("", results.items(), columns)
@@ -122,6 +129,10 @@ class SweepFolder:
 
 def _named(progress: Progress, name: str) -> Progress:
     return lambda done, total, what: progress(done, total, f"{what}: {name}")
+
+
+def _control(result: TrainingResult, name: str) -> str:
+    return f"{result.controls[name].top1:.3f}" if name in result.controls else "–"
 
 
 def _told(result: TrainingResult, form: str) -> str:

@@ -172,6 +172,7 @@ def _trained(config: Mapping[str, Any] | None) -> dict[str, Any]:
     # Networks that came with the package before twins were hashed name theirs alone.
     start = config.get("twin")
     stated = {name: config.get(name) for name in ("epochs", "published_epochs", "best_epoch", "licence")}
+    stated |= {f"{name} top-1": item.get("top1") for name, item in (config.get("baselines") or {}).items()}
     options = {name: value for name, value in (config.get("training") or {}).items() if name not in ("model", "seed")}
     return {
         **{name: config.get(name) for name in ("objective", "augmentation", "seed")},

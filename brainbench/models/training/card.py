@@ -9,7 +9,7 @@ from typing import Any
 from brainbench.core.files import provenance, to_plain
 from brainbench.models.registry import describe_model
 from brainbench.models.training.config import TrainingConfig
-from brainbench.models.training.evaluation import Evaluation
+from brainbench.models.training.evaluation import TWIN, Evaluation
 
 
 def checkpoint_info(
@@ -20,11 +20,14 @@ def checkpoint_info(
     best_epoch: float | None,
     evaluation: Evaluation | None,
     twin: Mapping[str, Any] | None = None,
+    controls: Mapping[str, Evaluation] | None = None,
 ) -> dict[str, Any]:
     """Return what a checkpoint's configuration says beside the architecture, in plain values.
 
-    ``twin`` is what :func:`~brainbench.models.training.twins.describe_twin` told of the network before its training.
+    ``twin`` is what :func:`~brainbench.models.training.twins.describe_twin` told of the network before its training,
+    ``controls`` are evaluations of :data:`~brainbench.models.training.evaluation.CONTROLS`.
     """
+    compared = {name: to_plain(found) for name, found in (controls or {}).items()}
     return {
         "objective": config.objective,
         "augmentation": config.augmentation + (f" + {config.masking:.0%} masking" if config.masking else ""),
@@ -38,7 +41,7 @@ def checkpoint_info(
         "twin": dict(twin or {"name": config.model, "seed": config.seed}),
         "licence": "MIT",
         "provenance": provenance(),
-    }
+    } | ({"twin_evaluation": compared.pop(TWIN, None), "baselines": compared} if compared else {})
 
 
 def model_card(config: TrainingConfig, info: Mapping[str, Any]) -> str:
@@ -68,6 +71,8 @@ def model_card(config: TrainingConfig, info: Mapping[str, Any]) -> str:
             "test data": found["data"],
             "collapsed": f"yes: {found['reason']}" if found["collapsed"] else "no",
         }
+    for name, told in (info.get("baselines") or {}).items():
+        rows[name.replace("-", " ")] = f"linear probe: {_top1(told)}"
     twin = info["twin"]
     rows["untrained twin"] = f"{twin['name']}, seed {twin['seed']}{_beside(found, info.get('twin_evaluation'))}"
     rows["licence"] = info["licence"]
@@ -90,4 +95,8 @@ def _beside(found: Mapping[str, Any] | None, twin: Mapping[str, Any] | None) -> 
         verdict = "**training made it worse**"
     else:
         verdict = "**training changed less than these intervals can tell**"
-    return f", linear probe: top-1 {twin['top1']:.3f} [{low:.3f}, {high:.3f}]; {verdict}"
+    return f", linear probe: {_top1(twin)}; {verdict}"
+
+
+def _top1(found: Mapping[str, Any]) -> str:
+    return f"top-1 {found['top1']:.3f} [{found['interval']['low']:.3f}, {found['interval']['high']:.3f}]"

@@ -1,4 +1,4 @@
-"""The accuracy of a trained network, its collapse, and the linear probe that reads classes from it.
+"""The accuracy of a trained network, its collapse, the linear probe that reads classes from it, and baselines.
 
 Nothing before the probe's layer changes, so every sweep is encoded once, without augmentation. Features are
 standardised over the training sweeps for the optimiser's sake; that map is folded into the layer afterwards, which
@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -18,14 +18,19 @@ import torch
 from torch import nn
 from torch.nn import functional
 
-from brainbench.core.errors import DataError
+from brainbench.core.contracts import CHANNELS
+from brainbench.core.errors import DataError, UsageError
 from brainbench.core.records import Interval
 from brainbench.core.statistics import wilson_interval
 from brainbench.models.activations import evaluating
 from brainbench.models.heads.decoders import AllStepsDecoder
+from brainbench.models.normaliser import Normaliser
 from brainbench.models.ops.layers import Linear
 from brainbench.models.recipes import BATCH_SIZE, PROBE
 from brainbench.models.training.optimizers import make_optimizer, rate_factor
+
+RAW, RANDOM, TWIN = CONTROLS = ("raw-input", "random-features", "untrained-twin")
+"""What a network's accuracy is compared with, each read by the linear probe."""
 
 SPREAD_LIMIT = 0.01
 """A collapsed network's unit-length features scatter by less than this times what random directions do."""
@@ -145,46 +150,156 @@ def fit_probe(
     epochs: int,
     seed: int = 0,
     device: torch.device | str | None = None,
+    memory: float = math.inf,
 ) -> nn.Linear:
     """Fit a linear layer [F] → [classes] to the last step's features and put it in place as ``model.decoder``.
 
-    The network, on ``device``, has ``encode`` and ``features``; its weights stay as they are. ``batches`` are one pass
-    over labelled training sweeps, ``epochs`` passes over their features.
+    The network, on ``device``, has ``encode``; its weights stay as they are. ``batches`` are one pass over labelled
+    training sweeps, ``epochs`` passes over their features. Features of more than ``memory`` bytes are not held: every
+    pass asks ``batches`` for the sweeps again and shuffles as many as fit, so they should come in a new order.
 
     Raises:
         DataError: there are no batches, or the features are not finite.
+        UsageError: there are more features than memory, and ``batches`` can be read but once.
     """
-    found, labelled = [], []
-    with evaluating(model), torch.no_grad():
-        for x, labels in batches:
-            found.append(model.encode(x.to(device), last=True).float())
-            labelled.append(labels.to(device).long())
-    if not found:
+    held, pools, count, moments = None, 0, 0, torch.zeros(())
+    for held in _feature_pools(model, batches, device, memory):
+        pools, count = pools + 1, count + len(held[1])
+        for part in held[0].split(BATCH_SIZE):
+            # Double precision: the variance below is a difference of sums.
+            part = part.double()
+            moments = moments.to(part) + torch.stack((part.sum(0), part.square().sum(0)))
+    if held is None:
         raise DataError("There is nothing to fit a probe to: the data set gave no batch.")
-    features, labels = torch.cat(found), torch.cat(labelled)
-    if not torch.isfinite(features).all():
+    if not torch.isfinite(moments).all():
         raise DataError("The features of the training sweeps are not finite, so no probe can be fitted.")
-    mean, scale = features.mean(0), features.std(0)
+    if pools > 1:
+        _check_repeatable(batches, "sweeps whose features do not fit into memory")
+        held = None
+    center = moments[0] / count
+    scale = ((moments[1] / count - center.square()).clamp_min(0) * (count / max(count - 1, 1))).sqrt().float()
+    mean = center.float()
     # What hardly varies is left small: blown up, its weights would be too large to be stored.
     scale = scale.clamp_min(max(1e-4 * float(scale.max()), 1e-12))
-    features = (features - mean) / scale
     generator = torch.Generator().manual_seed(seed)
-    layer = Linear(features.shape[1], classes).to(features.device)
+    layer = Linear(len(mean), classes).to(mean.device)
     with torch.no_grad():
         # Variance 1/fan_in from a generator of its own, so that the probe does not depend on what was drawn before.
-        bound = (3.0 / features.shape[1]) ** 0.5
+        bound = (3.0 / len(mean)) ** 0.5
         layer.weight.copy_((2 * torch.rand(layer.weight.shape, generator=generator) - 1) * bound)
     optimizer = make_optimizer(PROBE.optimizer, layer.parameters(), PROBE.learning_rate)
     for epoch in range(epochs):
         for group in optimizer.param_groups:
             group["lr"] = PROBE.learning_rate * rate_factor(PROBE.schedule, epoch, epochs=epochs)
-        for chosen in torch.randperm(len(labels), generator=generator).to(labels.device).split(BATCH_SIZE):
-            optimizer.zero_grad()
-            functional.cross_entropy(layer(features[chosen]), labels[chosen]).backward()
-            optimizer.step()
+        for features, labels in [held] if held else _feature_pools(model, batches, device, memory):
+            for chosen in torch.randperm(len(labels), generator=generator).to(labels.device).split(BATCH_SIZE):
+                optimizer.zero_grad()
+                functional.cross_entropy(layer((features[chosen] - mean) / scale), labels[chosen]).backward()
+                optimizer.step()
     with torch.no_grad():
         # w·(x − m)/s + b = (w/s)·x + (b − (w/s)·m): standardisation becomes part of the layer.
         layer.weight.div_(scale)
         layer.bias.sub_(layer.weight @ mean)
     model.decoder = layer
     return layer
+
+
+def _feature_pools(
+    model: Any, batches: Iterable[tuple[torch.Tensor, torch.Tensor]], device: Any, memory: float
+) -> Iterator[tuple[torch.Tensor, torch.Tensor]]:
+    """Yield the last step's features [N, F] and labels [N] of one pass, as many together as fit into ``memory``."""
+    found: list[tuple[torch.Tensor, torch.Tensor]] = []
+    size = 0
+    for x, labels in batches:
+        with evaluating(model), torch.no_grad():
+            features = model.encode(x.to(device), last=True).float()
+        if found and size + features.nbytes > memory:
+            yield torch.cat([item for item, _ in found]), torch.cat([item for _, item in found])
+            found, size = [], 0
+        found.append((features, labels.to(device).long()))
+        size += features.nbytes
+    if found:
+        yield torch.cat([item for item, _ in found]), torch.cat([item for _, item in found])
+
+
+def _check_repeatable(batches: Iterable[Any], what: str) -> None:
+    if iter(batches) is batches:
+        raise UsageError(
+            f"The {what} are read several times, and a {type(batches).__name__} can be read but once; give a list of "
+            "batches or an object whose __iter__ starts anew."
+        )
+
+
+class RawInput(nn.Module):
+    """Network without weights: its features [B, T·S·C·H·W] are the whole sweep, in the normaliser's units."""
+
+    def encode(self, x: torch.Tensor, *, last: bool = False) -> torch.Tensor:
+        """Return the features [B, F] of sweeps [B, T, S·C, H, W] in SI, or without ``last`` [B, 1, F]."""
+        normaliser = Normaliser.physical(x.shape[2] // len(CHANNELS)).to(x.device)
+        features = self.read(normaliser(x.float()).flatten(1))
+        return features if last else features[:, None]
+
+    def read(self, x: torch.Tensor) -> torch.Tensor:
+        """Return the features of flat sweeps [B, T·S·C·H·W]."""
+        return x
+
+
+class RandomFeatures(RawInput):
+    """Fixed random projection of the whole sweep, rectified: [B, T, S·C, H, W] → [B, F] (Rahimi & Recht 2008)."""
+
+    def __init__(self, features: int, *, seed: int = 0) -> None:
+        super().__init__()
+        self.features, self.seed = features, seed
+        self.weight: torch.Tensor | None = None
+
+    def read(self, x: torch.Tensor) -> torch.Tensor:
+        """Return the features of flat sweeps."""
+        if self.weight is None:
+            # On the CPU, so that every device has the same. Variance 2/fan_in keeps the scale behind a rectifier.
+            generator = torch.Generator().manual_seed(self.seed)
+            weight = torch.randn(x.shape[1], self.features, generator=generator) * math.sqrt(2 / x.shape[1])
+            self.weight = weight.to(x.device)
+        return functional.relu(x @ self.weight)
+
+
+def baselines(
+    train: Iterable[tuple[torch.Tensor, torch.Tensor]],
+    test: Iterable[tuple[torch.Tensor, torch.Tensor]],
+    *,
+    features: int,
+    classes: int,
+    epochs: int,
+    seed: int = 0,
+    device: torch.device | str | None = None,
+    memory: float = 2**31,
+) -> dict[str, Evaluation]:
+    """Evaluate what a linear probe reads without any network: from the raw input, and from random features of it.
+
+    The probe is that of :func:`fit_probe`. Both see all steps of a sweep.
+
+    Args:
+        train: Labelled training sweeps ([B, T, S·C, H, W] in SI, [B]), read several times, best in a new order each
+            time.
+        test: Sweeps to evaluate on, read twice.
+        features: Number of random features: as many as the probe of the network beside it sees.
+        classes: Number of classes.
+        epochs: Passes of the probe.
+        seed: Seed of the random features and of the probes.
+        device: Where it is computed; the sweeps are moved there.
+        memory: Bytes of raw sweeps that are held (about three times as many are used); a larger training set is read
+            again in every pass.
+
+    Returns:
+        Evaluations on the test sweeps by the names ``raw-input`` and ``random-features``.
+
+    Raises:
+        DataError: there are no batches, or the sweeps are not finite.
+        UsageError: the batches can be read but once.
+    """
+    for batches in (train, test):
+        _check_repeatable(batches, "sweeps of a baseline")
+    found = {}
+    for name, reader in ((RAW, RawInput()), (RANDOM, RandomFeatures(features, seed=seed))):
+        fit_probe(reader, train, classes=classes, epochs=epochs, seed=seed, device=device, memory=memory)
+        found[name] = evaluate(reader, test, device=device)
+    return found

@@ -24,6 +24,7 @@ from brainbench.core.files import atomic_path, read_json, write_json, write_text
 _log = logging.getLogger(__name__)
 
 RUN, STATE, LOG, BEST, FAILED = "run.json", "state.safetensors", "log.jsonl", "best", "failed-batch.safetensors"
+CONTROLS_FILE = "controls.json"
 
 
 def claim(folder: Path, identity: Mapping[str, Any], *, write: bool) -> None:

@@ -11,6 +11,7 @@ from __future__ import annotations
 import logging
 import math
 import time
+from collections.abc import Mapping
 from contextlib import nullcontext
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -20,7 +21,7 @@ import torch
 from torch import nn
 
 from brainbench.core.errors import DataError, UsageError
-from brainbench.core.files import read_json
+from brainbench.core.files import read_json, write_json
 from brainbench.core.progress import Progress
 from brainbench.models.activations import evaluating
 from brainbench.models.ops.seeding import seeded
@@ -30,13 +31,14 @@ from brainbench.models.training.batches import Batches, BatchOptions, Data
 from brainbench.models.training.card import checkpoint_info, model_card
 from brainbench.models.training.checkpoints import WEIGHTS, load_weights, save_checkpoint
 from brainbench.models.training.config import TrainingConfig, config_warnings
-from brainbench.models.training.evaluation import Evaluation, evaluate, fit_probe
+from brainbench.models.training.evaluation import TWIN, Evaluation, baselines, evaluate, fit_probe
 from brainbench.models.training.gradients import Gradients, compiled
 from brainbench.models.training.objectives import make_learner
 from brainbench.models.training.optimizers import make_optimizer, rate_factor
 from brainbench.models.training.processes import Processes, processes
 from brainbench.models.training.run_folder import (
     BEST,
+    CONTROLS_FILE,
     FAILED,
     RUN,
     STATE,
@@ -46,7 +48,7 @@ from brainbench.models.training.run_folder import (
     mark,
     save_state,
 )  # fmt: skip
-from brainbench.models.training.twins import describe_twin, difference
+from brainbench.models.training.twins import describe_twin, difference, draw_twin
 
 _log = logging.getLogger(__name__)
 
@@ -70,6 +72,9 @@ class TrainingResult:
     """Epoch of the best validation, from 1."""
     evaluation: Evaluation | None
     """Accuracy on the test split (else validation, else training); None until the run is finished."""
+    controls: Mapping[str, Evaluation]
+    """Accuracy of :data:`~brainbench.models.training.evaluation.CONTROLS` on the same sweeps; empty until then, and
+    without passes of a probe."""
     seconds: float
     """Time of this session."""
 
@@ -81,6 +86,7 @@ def train(
     out: str | Path,
     device: str | None = None,
     stop_after: float | None = None,
+    controls: str | Path | None = None,
     progress: Progress | None = None,
 ) -> TrainingResult:
     """Train a network, or go on with a run that was interrupted.
@@ -92,6 +98,8 @@ def train(
         device: ``cpu``, ``cuda`` or ``cuda:N``; None takes CUDA when there is one. Under torchrun every process
             takes its own.
         stop_after: Save the state and return after so many seconds.
+        controls: Folder where the accuracies of raw input, random features and the untrained twin are kept, for all
+            runs of one model on one data set; the run's own when None.
         progress: Called with (steps done, steps in all, what).
 
     Returns:
@@ -103,7 +111,7 @@ def train(
         DataError: the data set has no training sweeps, or a file of the run is damaged.
     """
     with processes(device) as where, seeded(config.seed):
-        run = _Run(config, data, Path(out), where, progress)
+        run = _Run(config, data, Path(out), where, progress, Path(controls or out) / CONTROLS_FILE)
         try:
             return run.run(math.inf if stop_after is None else stop_after)
         finally:
@@ -129,11 +137,18 @@ class _Position:
 
 class _Run:
     def __init__(
-        self, config: TrainingConfig, data: Data, out: Path, where: Processes, progress: Progress | None
+        self,
+        config: TrainingConfig,
+        data: Data,
+        out: Path,
+        where: Processes,
+        progress: Progress | None,
+        controls: Path,
     ) -> None:
         if config.precision == "auto":
             config = replace(config, precision="bf16" if where.device.type == "cuda" else "float32")
         self.config, self.data, self.out, self.where = config, data, out, where
+        self.controls_file, self.controls = controls, {}
         self.progress = progress if progress is not None and where.first else (lambda done, total, what: None)
         self.started = self.saved = time.monotonic()
         self.options: dict[str, Any] = {"classes": len(data.classes), "decoder": config.decoder}
@@ -292,7 +307,9 @@ class _Run:
     def _finish(self) -> TrainingResult:
         result = None
         if self.where.first:
-            done = read_json(self.out / RUN).get("evaluation")
+            told = read_json(self.out / RUN)
+            self.controls = _evaluations(told.get("controls") or {})
+            done = told.get("evaluation")
             if done is not None:
                 return self._result("finished", "", Evaluation.from_plain(done))
             # The best weights as they were published, so that what is evaluated is what is shipped.
@@ -314,15 +331,38 @@ class _Run:
                 batches = self._batches(split, shuffle=False, part=False)
                 if batches is not None:
                     result = evaluate(self.model, batches, device=self.where.device)
+                    self.controls = self._compare(result, batches)
                     break
             self._publish(result)
             if result is not None:
                 self.log.write("test", self.at.step, top1=result.top1, top5=result.top5, spread=result.spread)
                 if result.collapsed:
                     _log.warning("%s has collapsed: %s.", self.config.model, result.reason)
-            mark(self.out, evaluation=asdict(result) if result is not None else None, status="finished")
+            found = {name: asdict(item) for name, item in self.controls.items()}
+            mark(self.out, evaluation=asdict(result) if result else None, controls=found, status="finished")
         self.where.wait()
         return self._result("finished", "", result)
+
+    def _compare(self, result: Evaluation, test: Batches) -> dict[str, Evaluation]:
+        """Return how well the raw input, random features of it and the untrained twin are read on the same sweeps."""
+        features, train = getattr(self.model, "features", None), self._batches("train", shuffle=True, part=False)
+        if features is None or train is None or not self.config.probe_epochs:
+            return {}
+        probe: dict[str, Any] = {"epochs": self.config.probe_epochs, "seed": self.config.seed}
+        key = {**probe, "classes": list(self.data.classes), "data": result.data, "twin": self.twin}
+        if self.controls_file.is_file() and (kept := read_json(self.controls_file)).get("of") == key:
+            return _evaluations(kept["controls"])
+        self.progress(self._steps, self._steps, "probing raw input, random features and the untrained twin")
+        device = self.where.device
+        probe |= {"classes": len(self.data.classes), "device": device}
+        memory = torch.cuda.get_device_properties(device).total_memory // 8 if device.type == "cuda" else 2**31
+        found = baselines(train, test, features=features, memory=memory, **probe)
+        twin, other = draw_twin(self.twin, self.options)
+        if not other:
+            fit_probe(twin.to(device), train, **probe)
+            found[TWIN] = evaluate(twin, test, device=device)
+        write_json(self.controls_file, {"of": key, "controls": {name: asdict(item) for name, item in found.items()}})
+        return found
 
     def _publish(self, result: Evaluation | None) -> None:
         info = checkpoint_info(
@@ -332,6 +372,7 @@ class _Run:
             best_epoch=self.at.best_epoch,
             evaluation=result,
             twin=self.twin,
+            controls=self.controls,
         )
         save_checkpoint(
             self.out / BEST,
@@ -379,7 +420,8 @@ class _Run:
     def _result(self, status: Any, reason: str, evaluation: Evaluation | None = None) -> TrainingResult:
         seconds = round(time.monotonic() - self.started, 3)
         at = self.at
-        return TrainingResult(status, reason, self.out / BEST, at.step, at.epoch, at.best_epoch, evaluation, seconds)
+        done = (at.step, at.epoch, at.best_epoch, evaluation, self.controls)
+        return TrainingResult(status, reason, self.out / BEST, *done, seconds)
 
     def _batches(self, split: str, *, shuffle: bool, part: bool = True) -> Batches | None:
         mine = self.where.part if part else (0, 1)
@@ -391,6 +433,10 @@ class _Run:
             return nullcontext()
         # bfloat16 has the range of single precision, so losses need no scaling.
         return torch.autocast(self.where.device.type, dtype=torch.bfloat16)
+
+
+def _evaluations(plain: Mapping[str, Any]) -> dict[str, Evaluation]:
+    return {name: Evaluation.from_plain(found) for name, found in plain.items()}
 
 
 def _generator(seed: int, step: int, view: int) -> torch.Generator:

@@ -39,5 +39,13 @@ def test_a_card_does_not_hide_that_the_untrained_twin_is_as_good(correct, verdic
     assert verdict in _card(correct, twin=200)
 
 
+def test_a_card_compares_with_the_raw_input_and_random_features():
+    controls = {"raw-input": _found(100), "random-features": _found(120), "untrained-twin": _found(180)}
+    text = _card(200, controls=controls)
+    assert "| raw input | linear probe: top-1 0.250 [0.210, 0.295] |" in text
+    assert "| random features | linear probe: top-1 0.300" in text
+    assert "zhuang-small, seed 0, linear probe: top-1 0.450" in text
+
+
 def test_a_card_without_its_twin_claims_nothing():
     assert "| untrained twin | zhuang-small, seed 0 |" in _card(200)

@@ -4,9 +4,11 @@ import pytest
 import torch
 from torch import nn
 
-from brainbench.core.errors import DataError
+from brainbench.core.errors import DataError, UsageError
 from brainbench.models.registry import load_model
-from brainbench.models.training.evaluation import collapse, evaluate, fit_probe, topk
+from brainbench.models.training.batches import ArrayBatches, BatchOptions
+from brainbench.models.training.evaluation import RawInput, baselines, collapse, evaluate, fit_probe, topk
+from tests.factories.training_sweeps import sweeps
 
 
 class Fixed(nn.Module):
@@ -93,3 +95,56 @@ def test_features_that_hardly_vary_leave_weights_that_half_precision_holds():
     layer = fit_probe(_Frozen(), [(x, labels)], classes=2, epochs=20)
     assert torch.isfinite(layer.weight.half()).all()
     assert (layer(x).argmax(1) == labels).float().mean() > 0.95
+
+
+def test_a_probe_whose_features_do_not_fit_into_memory_reads_them_anew():
+    x, labels = _batches((1.0, 1.0, 1.0))
+    batches = [(x[start : start + 32], labels[start : start + 32]) for start in range(0, 200, 32)]
+    held = fit_probe(_Frozen(), batches, classes=2, epochs=20)
+    roomy = fit_probe(_Frozen(), batches, classes=2, epochs=20, memory=x.nbytes)
+    assert torch.equal(roomy.weight, held.weight)
+    narrow = fit_probe(_Frozen(), batches, classes=2, epochs=20, memory=x.nbytes // 3)
+    assert not torch.equal(narrow.weight, held.weight)
+    assert (narrow(x).argmax(1) == labels).float().mean() > 0.95
+    assert torch.equal(fit_probe(_Frozen(), iter(batches), classes=2, epochs=20).weight, held.weight)
+    with pytest.raises(UsageError, match="list_iterator"):
+        fit_probe(_Frozen(), iter(batches), classes=2, epochs=20, memory=x.nbytes // 3)
+
+
+def _toy(count, seed, *, mixed=False):
+    x, labels = sweeps(count, seed, steps=2)
+    if mixed:
+        labels = labels[torch.randperm(count, generator=torch.Generator().manual_seed(seed))]
+    return ArrayBatches(x, labels, BatchOptions(64, shuffle=seed == 0))
+
+
+def _baselines(**changes):
+    mixed = changes.pop("mixed", False)
+    options = {"features": 96, "classes": 3, "epochs": 10} | changes
+    return baselines(_toy(300, 0, mixed=mixed), _toy(300, 1, mixed=mixed), **options)
+
+
+def test_baselines_read_what_the_input_shows_and_nothing_from_mixed_labels():
+    found = _baselines()
+    assert list(found) == ["raw-input", "random-features"]
+    assert min(item.top1 for item in found.values()) > 0.95
+    assert {item.data for item in found.values()} == {evaluate(Fixed(3), _toy(300, 1)).data}
+    assert all(abs(item.top1 - 1 / 3) < 0.12 for item in _baselines(mixed=True).values())
+
+
+def test_baselines_repeat_with_the_seed():
+    first = _baselines(features=2)
+    assert first == _baselines(features=2)
+    assert first["random-features"] != _baselines(features=2, seed=1)["random-features"]
+
+
+def test_the_raw_input_is_every_number_of_the_sweep_in_order():
+    x, _ = sweeps(3, 0, steps=2)
+    features = RawInput().encode(x, last=True)
+    assert features.shape == (3, 2 * 30 * 5 * 7)
+    assert features[1, 1050 + 3 * 35 + 8] == pytest.approx(float(x[1, 1, 3, 1, 1]) / 1e-6)
+
+
+def test_baselines_of_batches_that_can_be_read_once_are_refused():
+    with pytest.raises(UsageError, match="generator"):
+        baselines((batch for batch in _toy(8, 0)), _toy(8, 1), features=2, classes=3, epochs=1)

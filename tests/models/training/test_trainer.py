@@ -12,7 +12,9 @@ from safetensors.torch import load_file
 
 from brainbench.core.errors import DataError, UsageError
 from brainbench.models.registry import describe_model, load_model
+from brainbench.models.training.batches import BatchOptions
 from brainbench.models.training.config import TrainingConfig
+from brainbench.models.training.evaluation import evaluate, fit_probe
 from brainbench.models.training.objectives import make_learner
 from brainbench.models.training.run_folder import read_log
 from brainbench.models.training.trainer import train
@@ -153,6 +155,28 @@ def test_a_finished_run_is_not_repeated(tmp_path):
     again = train(_config(epochs=1), tiny(), out=tmp_path, device="cpu")
     assert again.evaluation == first.evaluation
     assert len(_lines(tmp_path)) == 3
+
+
+def test_a_run_is_compared_with_raw_input_random_features_and_its_twin_once(tmp_path, monkeypatch):
+    shared = tmp_path / "search"
+    first = train(_config(epochs=1), tiny(), out=shared / "a", controls=shared, device="cpu")
+    assert set(first.controls) == {"raw-input", "random-features", "untrained-twin"}
+    assert {item.data for item in first.controls.values()} == {first.evaluation.data}
+    stated = json.loads((first.folder / "config.json").read_text())
+    assert stated["baselines"]["raw-input"]["top1"] == first.controls["raw-input"].top1
+    assert stated["twin_evaluation"]["top1"] == first.controls["untrained-twin"].top1
+    model = load_model(MODEL, classes=3)
+    fit_probe(model, tiny().batches("train", BatchOptions(8)), classes=3, epochs=3)
+    assert evaluate(model, tiny().batches("test", BatchOptions(8, shuffle=False))) == first.controls["untrained-twin"]
+
+    computed = []
+    monkeypatch.setattr("brainbench.models.training.trainer.baselines", lambda *args, **kw: computed.append(1) or {})
+    other = train(_config(epochs=1, learning_rate=1e-2), tiny(), out=shared / "b", controls=shared, device="cpu")
+    again = train(_config(epochs=1), tiny(), out=shared / "a", controls=shared, device="cpu")
+    assert first.controls == other.controls == again.controls
+    assert not computed
+    train(_config(epochs=1), tiny(test=6), out=shared / "c", controls=shared, device="cpu")
+    assert computed  # other sweeps
 
 
 def test_the_random_state_of_others_is_left_alone(tmp_path):
