@@ -97,7 +97,8 @@ def open_file(path: Path) -> Iterator[h5py.File]:
         raise DataError(f"{path} may not be read by this user; change its permissions.")
     if not h5py.is_hdf5(path):
         raise DataError(
-            f"{path} is not an HDF5 file{_why_not(path)}; brainbench reads NWB 2.x and its own HDF5 layout."
+            f"{path} is not an HDF5 file{_why_not(path)}; brainbench reads NWB 2.x, its own HDF5 layout "
+            "and, alone, the published .npz recordings."
         )
     try:
         with h5py.File(path, "r") as file:
