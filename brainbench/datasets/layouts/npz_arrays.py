@@ -31,7 +31,7 @@ def read_arrays(path: Path) -> dict[str, NDArray[np.float64]]:
         )
     if {"r_xy", "r_yy"} <= arrays.keys():
         raise DataError(
-            f"{path} holds split halves of a score, not recordings; try `brainbench score {path} --explain`."
+            f"{path} holds split halves of a score, not recordings; try `brainbench score {path} --explain-estimator`."
         )
     animals = {name: array for name, array in arrays.items() if not _is_stray(name, array)}
     if not animals:

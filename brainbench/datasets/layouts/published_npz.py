@@ -131,8 +131,8 @@ def open_published(path: Path, **options: object) -> xr.Dataset:
     """
     if given := [name for name, value in options.items() if value is not None]:
         raise UsageError(
-            f"{path} holds rates without spike times, so {', '.join(given)} cannot apply; leave that out, or open the "
-            "original NWB files (DANDI 000231)."
+            f"{path} holds rates without spike times or bins, so conditions, select, window, bin and scores over time "
+            f"cannot apply (received {', '.join(given)}); leave them out, or open the original files (DANDI 000231)."
         )
     sessions = list(read_published(path))
     touch = "touch_to_choice" in path.stem

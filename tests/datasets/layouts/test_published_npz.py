@@ -109,6 +109,21 @@ def test_options_for_spike_times_are_refused(tmp_path):
         open_recordings(path, window="start..choice")
 
 
+def test_other_layouts_lists_and_copies_are_refused(tmp_path):
+    from brainbench.datasets import export
+
+    path = write_published(tmp_path / "a.npz", m1=make_zero_filled([24])[0])
+    assert open_recordings(f"published-npz:{path}").sizes["trial"] == 24
+    for refused in (
+        lambda: open_recordings(f"rodgers:{path}"),
+        lambda: open_recordings([path, write_published(tmp_path / "b.npz", m1=make_zero_filled([24])[0])]),
+        lambda: export(path, tmp_path / "a.h5"),
+    ):
+        with pytest.raises(DataError, match="one at a time"):
+            refused()
+    assert not (tmp_path / "a.h5").exists()
+
+
 def _edited(change):
     array = make_zero_filled([24, 30])[0]
     change(array)
@@ -127,7 +142,7 @@ BAD = {
     "NaN row": (_edited(lambda a: a.__setitem__((2, slice(None), 1), np.nan)), "NaN inside"),
     "two slots": (_edited(lambda a: a.__setitem__((2, slice(None), 1), 3.0)), "several slots"),
     "sweep": ({"data": np.zeros((110, 35, 6)), "shape": np.array("a/b"), "label": np.array(3)}, "whisker sweep"),
-    "splits": ({"r_xy": np.zeros(3), "r_yy": np.zeros(3)}, "--explain"),
+    "splits": ({"r_xy": np.zeros(3), "r_yy": np.zeros(3)}, "--explain-estimator"),
     "nothing": ({}, "no animal"),
 }
 
