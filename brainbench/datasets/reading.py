@@ -97,8 +97,8 @@ def open_file(path: Path) -> Iterator[h5py.File]:
         raise DataError(f"{path} may not be read by this user; change its permissions.")
     if path.suffix.lower() == ".npz":
         raise DataError(
-            f"{path} is an .npz file: published recordings are opened one at a time and without a layout, to be inspected, "
-            "checked and scored; they hold no spike times to join or copy."
+            f"{path} is an .npz file: published recordings are opened one at a time and without a layout, to be "
+            "inspected, checked and scored; they hold no spike times to join or copy."
         )
     if not h5py.is_hdf5(path):
         raise DataError(

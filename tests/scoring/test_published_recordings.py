@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -75,3 +77,14 @@ def test_other_numbers_of_stimuli_need_a_match(file, features, tmp_path):
     score = brainbench.score(features, recordings=file, match=pairs, metric="rsa-correlation")
     assert dict(score.provenance.pairs) == pairs
     assert score.status == "unreliable"
+
+
+@pytest.mark.shared
+def test_the_numbers_of_the_page_are_those_of_the_example(reference):
+    page = (Path(__file__).parents[2] / "docs" / "published-files.md").read_text(encoding="utf-8")
+    for line, options in (("thesis", {"estimator": "thesis"}), ("rsa-correlation", {"metric": "rsa-correlation"})):
+        row = next(row for row in page.splitlines() if row.startswith("| `--") and line in row)
+        stated = [float(cell.replace("−", "-")) for cell in row.split("|")[2:5]]
+        record = score_record("zhuang-small", recordings=reference / "published" / "rodgers6_example.npz", **options)
+        raw, animals = record.baselines["raw input"], record.animal_to_animal
+        assert [raw.value, raw.p, animals.value] == pytest.approx(stated, abs=0.02)
