@@ -24,7 +24,7 @@ app = typer.Typer(no_args_is_help=True, help="Inspect, check, copy and fetch neu
 
 @app.command("inspect")
 def inspect(
-    path: Annotated[Path, typer.Argument(help="'demo', an NWB file or a file in our HDF5 layout.")],
+    path: Annotated[Path, typer.Argument(help="'demo', an NWB file, a file in our HDF5 layout or a published .npz.")],
     as_json: JsonOption = False,
 ) -> None:
     """Show what a file holds and which --conditions could label its trials."""
@@ -37,7 +37,7 @@ def inspect(
 @app.command("rdm")
 @with_options(SCORE, ("conditions", "select", "window"), build=False)
 def rdm(
-    source: Annotated[str, typer.Argument(help="'demo', an NWB or HDF5 file, a folder, or a glob.")],
+    source: Annotated[str, typer.Argument(help="'demo', an NWB, HDF5 or published .npz file, a folder, or a glob.")],
     options: Any = None,
     pool: Annotated[str, typer.Option(help="One RDM per 'subject', per 'session', or of 'all' together.")] = "subject",
     seed: Annotated[int, typer.Option(help="Seed of the split halves.")] = 0,
@@ -81,7 +81,9 @@ def rdm(
 
 @app.command("check")
 def check(
-    source: Annotated[str, typer.Argument(help="'demo', an NWB or HDF5 file, a folder, a glob, or LAYOUT:PATH.")],
+    source: Annotated[
+        str, typer.Argument(help="'demo', an NWB, HDF5 or published .npz file, a folder, a glob, or LAYOUT:PATH.")
+    ],
     conditions: Annotated[
         str | None, typer.Option(help="TABLE:COLUMN[,COLUMN] whose labels are checked; the layout's by default.")
     ] = None,

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from brainbench.core.errors import DataError
 from brainbench.core.files import to_json
 from brainbench.datasets import hdf5
+from brainbench.datasets.layouts.published_npz import LAYOUT, is_published, open_published
 from brainbench.datasets.layouts.registry import RecordingLayout
 from brainbench.datasets.reading import each_session, find_files, open_file
 from brainbench.datasets.sessions import SPIKES, Session, SessionTable, as_labels, natural_key
@@ -159,6 +160,8 @@ def inspect(path: str | os.PathLike[str]) -> Inspection:
     formats: dict[str, None] = {}
     layouts: set[str | None] = set()
     for file_path in find_files(path):
+        if is_published(file_path):
+            return _counted(open_published(file_path), file_path, f"published .npz, layout {LAYOUT.name}")
         with open_file(file_path) as file:
             if hdf5.holds_counts(file, file_path):
                 return _counted(hdf5.read_counts(file, file_path), file_path)
@@ -240,16 +243,30 @@ def _table(table: SessionTable) -> TableSummary:
         return TableSummary(table.name, len(table), (), str(error))
 
 
-def _counted(dataset: xr.Dataset, path: Path) -> Inspection:
+def _counted(
+    dataset: xr.Dataset, path: Path, kind: str = f"{hdf5.FORMAT} {hdf5.VERSION}, counted responses"
+) -> Inspection:
     labels = Counter(dataset["stimulus"].values.astype(str).tolist())
     pairs = dict.fromkeys(zip(dataset["subject"].values.tolist(), dataset["session"].values.tolist(), strict=True))
+    doubt = (dataset.attrs["label_doubt"],) if "label_doubt" in dataset.attrs else ()
     sessions = tuple(
-        SessionSummary(str(subject), str(session), "", bool(dataset.attrs["synthetic"]), None, (), (), (), ())
-        for subject, session in pairs
+        SessionSummary(
+            str(subject),
+            str(session),
+            "",
+            bool(dataset.attrs["synthetic"]),
+            None,
+            (),
+            (),
+            (),
+            (),
+            () if number else doubt,
+        )
+        for number, (subject, session) in enumerate(pairs)
     )
     vocabulary = tuple(dataset.attrs["vocabulary"])
     proposal = Proposal("(already counted)", vocabulary, min(labels[label] for label in vocabulary))
-    return Inspection(str(path), f"{hdf5.FORMAT} {hdf5.VERSION}, counted responses", None, sessions, (proposal,))
+    return Inspection(str(path), kind, None, sessions, (proposal,))
 
 
 def _session_lines(session: SessionSummary) -> Iterator[str]:

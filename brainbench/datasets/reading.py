@@ -95,6 +95,11 @@ def open_file(path: Path) -> Iterator[h5py.File]:
 
     if not os.access(path, os.R_OK):
         raise DataError(f"{path} may not be read by this user; change its permissions.")
+    if path.suffix.lower() == ".npz":
+        raise DataError(
+            f"{path} is an .npz file: published recordings are opened one at a time and without a layout, to be "
+            "inspected, checked and scored; they hold no spike times to join or copy."
+        )
     if not h5py.is_hdf5(path):
         raise DataError(
             f"{path} is not an HDF5 file{_why_not(path)}; brainbench reads NWB 2.x and its own HDF5 layout."

@@ -6,7 +6,7 @@ only: trials are sorted by subject, session, start time and id, units by subject
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
@@ -15,6 +15,7 @@ from brainbench.core.contracts import check_recordings
 from brainbench.core.errors import DataError, UsageError, listing, unknown_name
 from brainbench.datasets import hdf5
 from brainbench.datasets.inspection import propose
+from brainbench.datasets.layouts.published_npz import is_published, open_published
 from brainbench.datasets.layouts.registry import RecordingLayout, list_layouts
 from brainbench.datasets.reading import Source, each_session, find_recordings, open_file, resolve_selection
 from brainbench.datasets.sessions import Session
@@ -39,7 +40,7 @@ def open_recordings(
     """Read recordings into counted trials.
 
     Args:
-        source: a file (NWB 2.x or our HDF5 layout), a folder, a glob, a list of these, or
+        source: a file (NWB 2.x, our HDF5 layout or the published ``.npz``), a folder, a glob, a list of these, or
             ``LAYOUT:PATH`` to read them by a named layout. Every file is a session.
         conditions: ``TABLE:COLUMN[,COLUMN]``: the interval table whose rows are trials and the columns
             whose values, joined with "-", label them.
@@ -70,7 +71,8 @@ def open_recordings(
     """
     layout, paths = find_recordings(source)
     wanted = Conditions.parse(conditions) if isinstance(conditions, str) else conditions
-    if len(paths) == 1 and (ready := _already_counted(paths[0], (wanted, select, window, bin, layout))) is not None:
+    given = {"conditions": wanted, "select": select, "window": window, "bin": bin}
+    if len(paths) == 1 and (ready := _already_counted(paths[0], layout, given)) is not None:
         return ready
     reader = _Reader(
         conditions=wanted,
@@ -182,11 +184,13 @@ def _no_conditions(session: Session) -> NoReturn:
     )
 
 
-def _already_counted(path: Path, options: Iterable[Any]) -> xr.Dataset | None:
+def _already_counted(path: Path, layout: RecordingLayout | None, given: Mapping[str, Any]) -> xr.Dataset | None:
+    if is_published(path, layout):
+        return open_published(path, **given)
     with open_file(path) as file:
         if not hdf5.holds_counts(file, path):
             return None
-        if any(option is not None for option in options):
+        if layout is not None or any(option is not None for option in given.values()):
             raise UsageError(
                 f"{path} holds responses that are already counted, so conditions, select, window, bin and layouts "
                 f"cannot apply; leave them out, or open the original spike times."

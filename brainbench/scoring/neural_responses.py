@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from brainbench.core.errors import UsageError, listing
+from brainbench.core.labels import join_labels
 from brainbench.core.progress import Progress
 from brainbench.scoring.demo import DEMOS, HIDDEN_NETWORK, demo_recordings
 
@@ -51,6 +53,37 @@ class NeuralResponses:
         # Boards of the demo say whether the network that made it was found.
         truth = {"truth": HIDDEN_NETWORK} if self.source == "demo" and self.synthetic else {}
         return {"source": self.source, **{name: self.dataset.attrs[name] for name in names}, **truth}
+
+    @property
+    def label_doubt(self) -> str:
+        """Reason why the labels cannot be trusted; empty where they can."""
+        return str(self.dataset.attrs.get("label_doubt", ""))
+
+    def pairs(self, stimuli: tuple[str, ...], match: Any) -> dict[str, str]:
+        """Pair recording labels with stimuli; slots without names one by one, as the published code does.
+
+        Raises:
+            UsageError: as :func:`brainbench.core.labels.join_labels`, or slots and stimuli differ in number.
+        """
+        if self.label_doubt and match is None:
+            if len(stimuli) != len(self.vocabulary):
+                raise UsageError(
+                    f"{self.source} has {len(self.vocabulary)} slots without names and there are {len(stimuli)} "
+                    f"stimuli ({listing(stimuli, limit=6)}); use --stimuli rodgers, or --match FILE with a stimulus "
+                    f"for each of {listing(self.vocabulary)}."
+                )
+            match = dict(zip(self.vocabulary, stimuli, strict=True))
+        return join_labels(self.vocabulary, stimuli, match)
+
+    def zero_filled(self, kept: tuple[str, ...]) -> dict[str, NDArray[np.floating]] | None:
+        """Return each animal's rates [R, K, U] as a published file holds them; None for other recordings."""
+        from brainbench.datasets.layouts.npz_arrays import read_arrays
+        from brainbench.datasets.layouts.published_npz import LAYOUT
+
+        if self.dataset.attrs.get("layout") != LAYOUT.name:
+            return None
+        slots = [self.vocabulary.index(label) for label in kept]
+        return {name: array[:, slots] for name, array in read_arrays(Path(self.dataset.attrs["source"])).items()}
 
     def animals(self, kept: tuple[str, ...], metric: Metric, options: ScoreOptions) -> tuple[Any, ...]:
         """Prepare every animal by a metric over the labels ``kept``, in that order."""

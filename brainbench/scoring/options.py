@@ -39,7 +39,8 @@ class ScoreOptions:
     """
 
     recordings: str | os.PathLike[str] | Sequence[str | os.PathLike[str]] | xr.Dataset = "demo"
-    """'demo' or 'demo-rodgers' (synthetic), an NWB or HDF5 file, a folder, or a glob; in Python also a data set."""
+    """'demo' or 'demo-rodgers' (synthetic), an NWB, HDF5 or published .npz file, a folder, or a glob; in Python also a
+    data set."""
     stimuli: str | os.PathLike[str] | Stimuli | xr.Dataset | None = None
     """A recipe, a scene file, a stimulus-set file, or an HDF5 array; by default what the recordings name."""
     conditions: str | None = None

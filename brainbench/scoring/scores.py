@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, Any
 
 from brainbench.core.errors import UsageError, unknown_name
 from brainbench.core.files import provenance, to_plain
-from brainbench.core.labels import join_labels
 from brainbench.core.progress import Progress
 from brainbench.core.provenance import Provenance
 from brainbench.core.records import ESTIMATOR_VERSION, ResultRecord, Score
@@ -22,6 +21,7 @@ from brainbench.scoring.options import ScoreOptions
 
 if TYPE_CHECKING:
     from brainbench.metrics import Metric
+    from brainbench.scoring.neural_responses import NeuralResponses
 
 
 def score(
@@ -96,18 +96,15 @@ def score_record(
     # Recordings name the stimuli that the animals felt; the caller's choice goes first.
     options = replace(options, stimuli=brain.stimuli if options.stimuli is None else options.stimuli)
     network = resolved.respond(options, progress=progress)
-    pairs = join_labels(brain.vocabulary, network.labels, options.match)
+    pairs = brain.pairs(network.labels, options.match)
     kept = tuple(pairs)
     rows = [network.labels.index(label) for label in pairs.values()]
     animals = brain.animals(kept, metric, options)
 
-    common: dict[str, Any] = {"stimuli": kept, "estimator": options.estimator, "seed": options.seed}
     features = network.features(rows)
-    scores = [metric.score(features, animals, name=network.card.name, layer=network.card.layer, **common)]
-    others = network.baseline_features(rows, options.seed) if baselines else {}
-    scores += [metric.score(values, animals, name=name, **common) for name, values in others.items()]
-    between = metric.score_animals(animals, **common) if baselines else None
-
+    named = {network.card.name: features, **(network.baseline_features(rows, options.seed) if baselines else {})}
+    layer = network.card.layer
+    scores, between = _compare(named, brain, animals, metric, kept, options, layer=layer, agreement=baselines)
     settings = {"estimator_version": ESTIMATOR_VERSION, "model": model if isinstance(model, str) else None}
     origin = Provenance.of(
         provenance(
@@ -139,6 +136,52 @@ def score_record(
     if between is not None:
         between = replace(between, brain_rdm=(), provenance=replace(origin, statistics=between.provenance.statistics))
     return ResultRecord(first, between, {item.name: item for item in others}, network.card, brain.synthetic)
+
+
+def _compare(
+    named: Mapping[str, Mapping[str, Any]],
+    brain: NeuralResponses,
+    animals: tuple[Any, ...],
+    metric: Metric,
+    kept: tuple[str, ...],
+    options: ScoreOptions,
+    *,
+    layer: str | None,
+    agreement: bool,
+) -> tuple[list[Score], Score | None]:
+    """Score the features of the model (the first) and of baselines, and the animals against one another if asked.
+
+    The published estimators take a published file as its authors' code does: zeros kept, the maximum over all layers.
+    """
+    how: dict[str, Any] = {"stimuli": kept, "estimator": options.estimator}
+    arrays = None if options.estimator == "default" else brain.zero_filled(kept)
+    if arrays is None:
+        how |= {"seed": options.seed}
+        layers = [layer, *(None for _ in range(len(named) - 1))]
+        scores = [
+            metric.score(features, animals, name=name, layer=chosen, **how)
+            for (name, features), chosen in zip(named.items(), layers, strict=True)
+        ]
+        between = metric.score_animals(animals, **how) if agreement else None
+    else:
+        from brainbench.metrics.published import make_targets, score_published, score_published_animals
+
+        targets = make_targets(arrays)
+        if options.layer is not None:
+            model = next(iter(named))
+            named = {**named, model: {options.layer: named[model][options.layer]}}
+        scores = [score_published(features, targets, name=name, **how) for name, features in named.items()]
+        between = score_published_animals(arrays, stimuli=kept) if agreement else None
+    if brain.label_doubt:
+        scores = [_doubted(item, brain.label_doubt) for item in scores]
+        between = between and _doubted(between, brain.label_doubt)
+    return scores, between
+
+
+def _doubted(score: Score, doubt: str) -> Score:
+    """Return a score that is never ``ok``, with the doubt as its first reason."""
+    status = "unreliable" if score.status == "ok" else score.status
+    return replace(score, status=status, reasons=(doubt, *score.reasons))
 
 
 def _metric(options: ScoreOptions) -> Metric:

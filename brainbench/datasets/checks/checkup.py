@@ -17,8 +17,10 @@ from brainbench.datasets import hdf5
 from brainbench.datasets.checks.clock import check_clock
 from brainbench.datasets.checks.findings import SEVERITIES, Finding, repeats
 from brainbench.datasets.checks.labels import check_labels
+from brainbench.datasets.checks.published import check_published
 from brainbench.datasets.checks.spikes import check_spikes
 from brainbench.datasets.checks.tables import check_coverage, check_tables
+from brainbench.datasets.layouts.published_npz import is_published
 from brainbench.datasets.layouts.registry import RecordingLayout
 from brainbench.datasets.reading import Source, each_session, find_recordings, open_file
 from brainbench.datasets.sessions import Session
@@ -94,6 +96,9 @@ def check(source: Source, *, conditions: str | Conditions | None = None) -> Chec
 def _check_file(
     path: Path, layout: RecordingLayout | None, conditions: Conditions | None, names: list[str]
 ) -> Iterator[Finding]:
+    if is_published(path, layout):
+        yield from check_published(path, names)
+        return
     with open_file(path) as file:
         if hdf5.holds_counts(file, path):
             hdf5.read_counts(file, path)

@@ -1,0 +1,174 @@
+"""Check of the published ``.npz`` recordings: what zeros, padding and slots without names do to scores, in numbers."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from brainbench.datasets.checks.findings import Finding, share
+from brainbench.datasets.layouts.npz_arrays import SLOTS, has_stray_entry, read_arrays
+from brainbench.datasets.layouts.published_npz import ZeroFilledSession, recover_sessions
+
+_FEW = 4
+"""Trials of every stimulus that unbiased distances need."""
+_DRAWS = 200
+"""Random orders, and random RDMs, that agreement is held against."""
+_FEWEST_UNITS = 3
+"""Units from which a correlation distance says anything."""
+_ORDERS = np.array(list(itertools.permutations(range(len(SLOTS)))))
+
+
+def check_published(path: Path, names: list[str]) -> Iterator[Finding]:
+    """Yield the findings about a file, and add its sessions to ``names``.
+
+    Raises:
+        DataError: the file cannot be read.
+    """
+    arrays = read_arrays(path)
+    found = {name: recover_sessions(name, array) for name, array in arrays.items()}
+    sessions = [item for items in found.values() for item in items]
+    names += [f"{item.subject} / {item.session}" for item in sessions]
+    where = path.name
+    if has_stray_entry(path):
+        message = "the entry 'allow_pickle' is a keyword that numpy before 2.2 stored by mistake"
+        yield Finding(
+            "note", "file", message, "It is skipped; code that takes every entry for an animal fails.", where=where
+        )
+    split = sum(item.split_by == "slots" for item in sessions)
+    message = (
+        f"{len(sessions) - len(found) - split} borders between sessions are changes of the number of trials, {split} "
+        "are contradicting slots of sessions of equal length; where those never contradict, two sessions look like one"
+    )
+    yield Finding("note", "sessions", message, "Only the original files tell all borders.", where=where)
+    yield replace(_zeros(arrays, sessions), where=where)
+    yield replace(_labels(sessions), where=where)
+    if (shared := _agreement(sessions)) is not None:
+        yield replace(shared, where=where)
+    for name, items in found.items():
+        for finding in _animal(arrays[name], items):
+            yield replace(finding, where=name)
+
+
+def _zeros(arrays: dict[str, NDArray[np.float64]], sessions: Sequence[ZeroFilledSession]) -> Finding:
+    """Return how many values are zeros of slots that a trial did not show, and what they do to means."""
+    recorded = sum(int(np.isfinite(array).sum()) for array in arrays.values())
+    filled = sum((len(SLOTS) - 1) * item.rates.size for item in sessions)
+    # A mean over all trials of a session is the mean over the slot's own trials times the share of those trials.
+    parts = np.concatenate([_trials_of_slots(item) / len(item.slots) for item in sessions])
+    message = (
+        f"{share(filled, recorded)} values are zeros in slots that the trial did not show, so a mean over trials "
+        f"is only {parts.min():.2f} to {parts.max():.2f} of a stimulus' true rate"
+    )
+    advice = (
+        "Scores treat them as missing. `--estimator thesis` keeps them, as published: distances then also tell how "
+        "often each stimulus was shown."
+    )
+    return Finding("warning", "zeros", message, advice, {"zeros": filled, "least": parts.min(), "most": parts.max()})
+
+
+def _labels(sessions: Sequence[ZeroFilledSession]) -> Finding:
+    ordered = sum(item.by_first_appearance for item in sessions)
+    message = (
+        f"in {share(ordered, len(sessions))} sessions the slots first appear in the order 1 to {len(SLOTS)}: a slot's "
+        "number says when its stimulus came first, not which stimulus it is, and no names are stored"
+    )
+    advice = (
+        "No score on this file can be trusted. The original files have names: `brainbench recordings fetch rodgers`."
+    )
+    return Finding("error", "labels", message, advice, {"by_first_appearance": ordered})
+
+
+def _animal(array: NDArray[np.float64], sessions: Sequence[ZeroFilledSession]) -> Iterator[Finding]:
+    """Yield the trials, borders and silent trials of one animal."""
+    told = "; ".join(
+        f"{item.session}: {item.units} units, {len(item.slots)} trials, "
+        f"{'/'.join(str(number) for number in _trials_of_slots(item))} per slot"
+        for item in sessions
+    )
+    yield Finding("note", "sessions", f"{len(sessions)} session{'s' * (len(sessions) > 1)} found ({told})")
+    silent = sum(int((item.slots < 0).sum()) for item in sessions)
+    if silent:
+        message = f"{share(silent, sum(len(item.slots) for item in sessions))} trials are 0 in all slots"
+        yield Finding("warning", "silent", message, "Their stimulus cannot be known; scores leave them out.")
+    few = [item.session for item in sessions if _trials_of_slots(item).min() < _FEW]
+    if few:
+        message = f"fewer than {_FEW} trials of some slot in session {', '.join(few)}"
+        yield Finding("warning", "labels", message, "The metric 'rsa' leaves them out; 'rsa-correlation' needs two.")
+    padded = int(np.isnan(array[-1, 0]).sum())
+    if padded:
+        message = f"{share(padded, array.shape[2])} units are padded with NaN to {len(array)} trials"
+        advice = "Rows of different sessions share a number without belonging together."
+        yield Finding("note", "padding", message, advice)
+
+
+def _trials_of_slots(session: ZeroFilledSession) -> NDArray[np.int64]:
+    return np.bincount(session.slots[session.slots >= 0], minlength=len(SLOTS))
+
+
+def _agreement(sessions: Sequence[ZeroFilledSession]) -> Finding | None:
+    """Return whether animals could share labels: agreement of sessions' RDMs as stored, at best, and by chance."""
+    usable = [item for item in sessions if item.units >= _FEWEST_UNITS and _trials_of_slots(item).all()]
+    rdms = [_pearson_distances(item) for item in usable]
+    usable = [item for item, rdm in zip(usable, rdms, strict=True) if np.isfinite(rdm).all()]
+    subjects = np.array([item.subject for item in usable])
+    pairs = subjects[:, None] < subjects[None]
+    if not pairs.any():
+        return None
+    square = np.stack([rdm for rdm in rdms if np.isfinite(rdm).all()])
+    rows, columns = np.triu_indices(len(SLOTS), 1)
+    vectors = _standardised(square[:, rows, columns])
+    rng = np.random.default_rng(0)
+    stored, best = _best(square, vectors, pairs)
+    # Orders drawn anew for every session: what the file's order would reach if it meant nothing.
+    orders = [[rng.permutation(len(SLOTS)) for _ in usable] for _ in range(_DRAWS)]
+    random = [
+        np.stack([rdm[np.ix_(order, order)] for rdm, order in zip(square, draw, strict=True)])[:, rows, columns]
+        for draw in orders
+    ]
+    by_chance = [float((z @ z.T)[pairs].mean()) for z in map(_standardised, random)]
+    # RDMs with their pairs shuffled have no geometry left to share, but 720 orders to choose from.
+    unrelated = []
+    for _ in range(_DRAWS):
+        shuffled = np.zeros_like(square)
+        shuffled[:, rows, columns] = rng.permuted(square[:, rows, columns], axis=1)
+        unrelated.append(_best(shuffled + shuffled.swapaxes(1, 2), vectors, pairs)[1])
+    high, reached = np.quantile(by_chance, 0.95), np.quantile(unrelated, 0.95)
+    message = (
+        f"RDMs of {len(usable)} sessions of different animals agree by r = {stored:.2f} as stored (random orders: "
+        f"up to {high:.2f} in 95 %) and by {best:.2f} when every pair takes the best of {len(_ORDERS)} orders "
+        f"(unrelated RDMs: up to {reached:.2f})"
+    )
+    advice = (
+        "The slots' numbers carry stimuli across animals to some degree."
+        if stored > high
+        else "The geometry is shared, but nothing says which slots belong together."
+        if best > reached
+        else "Neither the stored order nor any other makes these animals share labels beyond chance."
+    )
+    values = {"stored": stored, "stored_chance": high, "best": best, "best_chance": reached}
+    return Finding("warning", "labels", message, advice, {name: float(value) for name, value in values.items()})
+
+
+def _pearson_distances(session: ZeroFilledSession) -> NDArray[np.float64]:
+    """Return correlation distances [6, 6] of mean rates over each slot's own trials."""
+    means = np.stack([session.rates[session.slots == slot].mean(axis=0) for slot in range(len(SLOTS))])
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return 1 - np.corrcoef(means)
+
+
+def _standardised(rdms: NDArray[np.float64]) -> NDArray[np.float64]:
+    centred = rdms - rdms.mean(axis=-1, keepdims=True)
+    return centred / np.linalg.norm(centred, axis=-1, keepdims=True)
+
+
+def _best(moved: NDArray[np.float64], vectors: NDArray[np.float64], pairs: NDArray[np.bool_]) -> tuple[float, float]:
+    """Return the mean correlation over pairs of sessions as given, and at the best order for each pair."""
+    rows, columns = np.triu_indices(len(SLOTS), 1)
+    every = _standardised(moved[:, _ORDERS[:, rows], _ORDERS[:, columns]])
+    r = np.einsum("sop,tp->ost", every, vectors, optimize=True)
+    return float(r[0][pairs].mean()), float(r.max(axis=0)[pairs].mean())

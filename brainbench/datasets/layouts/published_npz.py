@@ -1,0 +1,177 @@
+"""Layout of the recordings that Chung et al. (2025) publish as ``.npz``, such as ``rodgers6_data.npz``.
+
+One array per animal: rates (spikes/s) [trials, 6 slots, units]. The rates of a trial stand in the slot of its
+stimulus, and the other five slots are 0. Units of all sessions stand side by side; shorter sessions are padded with
+NaN. Slots are numbered anew in every session, by the first appearance of their stimulus, and the names of the stimuli
+are not stored.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from brainbench.core.errors import UsageError
+from brainbench.datasets.layouts.npz_arrays import SLOTS, read_arrays
+from brainbench.datasets.layouts.registry import RecordingLayout
+from brainbench.datasets.trials.conditions import Conditions
+from brainbench.datasets.trials.counting import UNIT_COLUMNS, ReadingOptions, SessionCounts
+from brainbench.datasets.trials.joining import join_sessions
+from brainbench.datasets.trials.selection import Selection, Tally
+from brainbench.datasets.trials.windows import FIRST_CONTACT, Window
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+SILENT = "trials: 0 in all slots, so the stimulus cannot be known"
+
+LAYOUT = RecordingLayout(
+    name="published-npz",
+    title="preprocessed recordings of the published study, rates in slots without names",
+    citation="Chung et al. (2025), neuroagents-lab/2025-tactile-whisking; data as of the layout rodgers",
+    conditions=Conditions("trials", ("slot",)),
+    orders={"slot": SLOTS},
+    selection=Selection(name="published-npz", min_spikes=0),
+    window=Window("start", stop="choice"),
+    columns=(),
+    stimuli="rodgers",
+    remarks=(
+        SILENT,
+        "labels: slots, in the file's order; they cannot be trusted, because every session numbers its stimuli anew",
+        "sessions: neighbouring units with other numbers of trials, or with rates in other slots of the same trial",
+        "rates: spikes/s over windows of unequal length, which the file does not state",
+        "trials: chosen by the authors (correct, not ignored, with a shape)",
+    ),
+)
+
+
+@dataclass(frozen=True)
+class ZeroFilledSession:
+    """One session of an animal, as far as the file tells."""
+
+    subject: str
+    session: str
+    first: int
+    """Its first unit in the animal's array."""
+    slots: NDArray[np.int64] = field(repr=False)
+    """[R] slot of each trial, from 0; −1 where no unit fired."""
+    rates: NDArray[np.float64] = field(repr=False)
+    """[R, U] spikes/s."""
+    split_by: str = "trials"
+    """What parts it from the session before: ``trials`` (their number) or ``slots`` (contradicting ones)."""
+
+    @property
+    def units(self) -> int:
+        """Number of units."""
+        return self.rates.shape[1]
+
+    @property
+    def by_first_appearance(self) -> bool:
+        """Whether slots appear for the first time in the order of their numbers."""
+        seen = self.slots[self.slots >= 0].tolist()
+        return (order := list(dict.fromkeys(seen))) == sorted(order)
+
+
+def is_published(path: Path, layout: RecordingLayout | None = None) -> bool:
+    """Return whether a file is one of these, by its ending or by the layout that was named."""
+    return layout is LAYOUT or (layout is None and path.suffix.lower() == ".npz")
+
+
+def recover_sessions(subject: str, array: NDArray[np.float64]) -> list[ZeroFilledSession]:
+    """Return the sessions of an animal's checked array [trials, 6, units].
+
+    A trial has one stimulus, so all units of a session that fired in it did so in one slot. A unit begins another
+    session when its number of trials differs from that of the unit before, or its slots contradict those of the session
+    so far. Sessions of equal length whose slots never contradict each other cannot be told apart.
+    """
+    fired = array > 0
+    slots = np.where(fired.any(axis=1), fired.argmax(axis=1), -1)
+    lengths = np.isfinite(array[:, 0]).sum(axis=0)
+    rates = np.where(np.isfinite(array), array, 0.0).sum(axis=1)
+    borders: list[tuple[int, str]] = []
+    known = slots[:, 0]
+    for unit in range(array.shape[2]):
+        own = slots[:, unit]
+        contradicts = bool(((own >= 0) & (known >= 0) & (own != known)).any())
+        if unit == 0 or lengths[unit] != lengths[unit - 1] or contradicts:
+            borders.append((unit, "slots" if unit and lengths[unit] == lengths[unit - 1] else "trials"))
+            known = own
+        known = np.where(own >= 0, own, known)
+    ends = [*(first for first, _ in borders[1:]), array.shape[2]]
+    return [
+        ZeroFilledSession(
+            subject,
+            f"{number:02d}",
+            first,
+            slots[: lengths[first], first:last].max(axis=1),
+            rates[: lengths[first], first:last],
+            split_by,
+        )
+        for number, ((first, split_by), last) in enumerate(zip(borders, ends, strict=True), 1)
+    ]
+
+
+def read_published(path: Path) -> Iterator[ZeroFilledSession]:
+    """Yield the sessions of all animals of a file; raises as :func:`read_arrays`."""
+    for name, array in read_arrays(path).items():
+        yield from recover_sessions(name, array)
+
+
+def open_published(path: Path, **options: object) -> xr.Dataset:
+    """Read the file into the recordings contract; rates stand for counts in bins of one second.
+
+    Raises:
+        UsageError: conditions, select, window or bin are given, which need spike times.
+        DataError: as :func:`read_arrays`, or no trial has a stimulus.
+    """
+    if given := [name for name, value in options.items() if value is not None]:
+        raise UsageError(
+            f"{path} holds rates without spike times or bins, so conditions, select, window, bin and scores over time "
+            f"cannot apply (received {', '.join(given)}); leave them out, or open the original files (DANDI 000231)."
+        )
+    sessions = list(read_published(path))
+    touch = "touch_to_choice" in path.stem
+    reading = ReadingOptions(
+        LAYOUT.conditions, SLOTS, LAYOUT.selection, Window(FIRST_CONTACT if touch else "start", stop="choice")
+    )
+    notes = ["rates over windows of unequal length, which the file does not state", *LAYOUT.remarks[1:3]]
+    parts = [_session_counts(item, path) for item in sessions]
+    dataset = join_sessions(parts, reading, source=str(path), layout=LAYOUT.name, notes=notes)
+    animals = len({item.subject for item in sessions})
+    total, told = sum(len(item.slots) for item in sessions), dataset.sizes["trial"]
+    dataset.attrs["label_doubt"] = (
+        f"labels cannot be trusted: every session of {path.name} numbers its stimuli by their first appearance and "
+        "their names are not stored, so slots taken as stimuli in the file's order are a guess (recovered: the slot of "
+        f"{told} of {total} trials, {len(sessions)} sessions of {animals} animal{'s' * (animals > 1)})"
+    )
+    return dataset
+
+
+def _session_counts(item: ZeroFilledSession, path: Path) -> SessionCounts:
+    kept = np.flatnonzero(item.slots >= 0)
+    labels = tuple(SLOTS[slot] for slot in item.slots[kept].tolist())
+    lost = {name: np.nan if kind is float else "" for name, kind in UNIT_COLUMNS.items()}
+    return SessionCounts(
+        subject=item.subject,
+        session=item.session,
+        source=f"{path}:{item.subject}/{item.session}",
+        values=tuple((label,) for label in labels),
+        labels=labels,
+        trial_ids=tuple(map(str, kept.tolist())),
+        unit_ids=tuple(map(str, range(item.first, item.first + item.units))),
+        edges=np.full((len(kept), 2), np.nan),
+        counts=item.rates[kept][:, None].astype(np.float32),
+        duration=np.ones((len(kept), 1)),
+        columns={name: np.full(item.units, value) for name, value in lost.items()},
+        covariates={},
+        tally=Tally(removed={SILENT: len(item.slots) - len(kept)}),
+        trials=len(item.slots),
+        units=item.units,
+        synthetic=False,
+        stimuli=LAYOUT.stimuli,
+    )

@@ -1,0 +1,237 @@
+"""The published score of a model, computed on the authors' arrays as their code takes them.
+
+An array holds one animal's rates [R, K, U], with zeros in the slots of stimuli that a trial did not show. Their code
+(2025-tactile-whisking, 3420db6, with brainmodel_utils) averages trials with those zeros, takes the stimuli in the order
+of the file and all units, and splits trials into halves with fixed seeds. Splits whose halves' RDMs correlate below .5
+are dropped, the others are corrected one by one, and the score is the maximum over layers and over targets: every
+animal, and the pool of all units.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from brainbench.core.errors import UsageError
+from brainbench.core.provenance import Provenance
+from brainbench.core.records import LayerScore, Score, SubjectScore
+from brainbench.metrics.animals import recorded_rdm
+from brainbench.metrics.inference.permutation import EXACT_STIMULI, make_test, permuted_values
+from brainbench.metrics.rdms.comparison import compare
+from brainbench.metrics.rdms.pairs import Floats
+from brainbench.metrics.reliability.noise_correction import THESIS_FILTER, noise_corrected
+
+POOL = "concatenated"
+"""Name of the target that holds the units of all animals."""
+SPLITS, FIRST_SEED = 1000, 1234
+"""Random halves, and the seed of the first; every split has a seed of its own."""
+_CHUNK = 1 << 24
+
+
+@dataclass(frozen=True)
+class Target:
+    """One animal, or the pool, as the published code takes it."""
+
+    name: str
+    rdm: Floats = field(repr=False)
+    """[P] correlation distances of the means over trials, zeros included."""
+    split_half_r: Floats = field(repr=False)
+    """[S] correlations of the halves' RDMs; NaN for a split that their code skips."""
+    units: int
+    trials: int
+
+
+def make_targets(arrays: Mapping[str, NDArray[np.floating]], *, splits: int = SPLITS) -> tuple[Target, ...]:
+    """Return the animals and, of several, their pool.
+
+    Args:
+        arrays: Animal → rates [R, K, U], NaN where a unit's session had fewer trials.
+        splits: Random halves.
+
+    Raises:
+        UsageError: no animals.
+    """
+    if not arrays:
+        raise UsageError("There are no animals to score against; give at least one array [trials, stimuli, units].")
+    named = dict(arrays) if len(arrays) == 1 else {**arrays, POOL: concatenate(list(arrays.values()))}
+    return tuple(_target(name, np.asarray(array, dtype=np.float64), splits) for name, array in named.items())
+
+
+def concatenate(arrays: Sequence[NDArray[np.floating]]) -> Floats:
+    """Return the units of all animals side by side, padded with NaN to the most trials."""
+    most = max(len(array) for array in arrays)
+    padding = [((0, most - len(array)), (0, 0), (0, 0)) for array in arrays]
+    padded = [np.pad(array, width, constant_values=np.nan) for array, width in zip(arrays, padding, strict=True)]
+    return np.concatenate(padded, axis=2)
+
+
+def _target(name: str, array: Floats, splits: int) -> Target:
+    trials, count, units = array.shape
+    # Padding spans all slots of a unit's trial, so one slot tells it.
+    seen = np.isfinite(array[:, 0]).astype(np.float64)
+    flat = np.where(np.isfinite(array), array, 0.0).reshape(trials, -1)
+
+    def distances(member: Floats) -> Floats:
+        """Return the RDMs [S, P] of the mean rates over the trials in ``member`` [S, R]."""
+        with np.errstate(invalid="ignore", divide="ignore"):
+            # A unit without a trial among them is 0/0 = NaN, and so is then the whole RDM.
+            return _distances((member @ flat).reshape(-1, count, units) / (member @ seen)[:, None])
+
+    found = np.empty(splits)
+    step = max(1, _CHUNK // (8 * count * units))
+    for start in range(0, splits, step):
+        index = range(start, min(start + step, splits))
+        first = np.stack([first_half(trials, FIRST_SEED + split) for split in index]).astype(np.float64)
+        found[start : index.stop] = _correlations(distances(first), distances(1 - first))
+    return Target(name, distances(np.ones((1, trials)))[0], found, units, trials)
+
+
+def _distances(patterns: Floats) -> Floats:
+    """Return correlation distances [..., P] of patterns [..., K, U]; NaN where a pattern is constant or missing."""
+    centred = patterns - patterns.mean(axis=-1, keepdims=True)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        centred = centred / np.linalg.norm(centred, axis=-1, keepdims=True)
+    rows, columns = np.triu_indices(patterns.shape[-2], 1)
+    found = 1 - (centred @ centred.swapaxes(-1, -2))[..., rows, columns]
+    return np.where(np.isfinite(found).all(axis=-1, keepdims=True), found, np.nan)
+
+
+def _correlations(first: Floats, second: Floats) -> Floats:
+    """Return Pearson's r [S]; NaN where either RDM lacks a pair."""
+    known = np.isfinite(first).all(axis=-1) & np.isfinite(second).all(axis=-1)
+    found = np.full(known.shape, np.nan)
+    found[known] = compare(first[known], second[known])
+    return found
+
+
+def first_half(trials: int, seed: int) -> NDArray[np.bool_]:
+    """Return which trials [R] the published code puts into the first half: the smaller one of an odd number."""
+    order = list(range(trials))
+    # Their generator: numpy keeps the stream of RandomState as it is.
+    np.random.RandomState(seed).shuffle(order)
+    return np.isin(np.arange(trials), order[: trials // 2])
+
+
+def score_published(
+    features: Mapping[str, ArrayLike],
+    targets: Sequence[Target],
+    *,
+    name: str,
+    stimuli: Sequence[str],
+    estimator: str = "thesis",
+    seed: int = 0,
+) -> Score:
+    """Score a model as published; the value is a maximum over layers and targets, and so never ``ok``.
+
+    The permutation test takes the same maximum under every order of the stimuli.
+
+    Args:
+        features: Layer → features [K, F], the stimuli in the order of the slots.
+        targets: From :func:`make_targets`.
+        name: Name of the model.
+        stimuli: Names of the K stimuli.
+        estimator: ``thesis``, or ``thesis-input`` (the bar of the raw input: the last target alone, median over all
+            splits).
+        seed: Seed of random orders (more than 8 stimuli).
+    """
+    targets = targets[-1:] if estimator == "thesis-input" else targets
+    rdms = {layer: _distances(np.asarray(values, dtype=np.float64)) for layer, values in features.items()}
+    names = [layer for layer, values in rdms.items() if np.ptp(values) > 0]
+    corrected = {target.name: noise_corrected(1.0, target.split_half_r, estimator=estimator) for target in targets}
+    used = [item for item in targets if np.isfinite(corrected[item.name].value) and np.isfinite(item.rdm).all()]
+    lost = [item.name for item in targets if item not in used]
+    told = (f"left out, no split counts (raw correlation of halves below {THESIS_FILTER}): {', '.join(lost)}",)
+    told = told if lost else ()
+    about = {
+        "name": name,
+        "estimator": estimator,
+        "stimuli": tuple(map(str, stimuli)),
+        "metric": "RSA: correlation RDM of mean rates with their zeros, pearson comparison",
+        "provenance": Provenance.of({"splits": len(targets[0].split_half_r), "seed": seed}),
+    }
+    if not names or not used:
+        return Score(value=math.nan, status="undefined", reasons=told or ("no layer has an RDM",), **about)
+    layers, brain = np.stack([rdms[layer] for layer in names]), np.stack([item.rdm for item in used])
+    factors = np.array([corrected[item.name].value for item in used])
+    raw = compare(layers[:, None], brain[None])
+    values = raw * factors
+    best, place = np.unravel_index(int(values.argmax()), values.shape)
+    null = permuted_values(layers, brain, lambda r: (r * factors).max(axis=(-2, -1)), seed=seed)
+    test = make_test(null, exact=len(stimuli) <= EXACT_STIMULI)
+    rows, columns = values.argmax(axis=0), values.argmax(axis=1)
+    return Score(
+        value=float(values.max()),
+        status="unreliable",
+        reasons=(
+            f"optimistic: as published, the maximum over {len(names)} layers and {len(used)} targets (best: "
+            f"{used[place].name}; mean of the targets' maxima {values.max(axis=0).mean():.2f})",
+            "the published estimator averages zeros of slots that a trial did not show, and knows no gate",
+            *told,
+        ),
+        r=float(raw[best, place]),
+        reliability=corrected[used[place].name].reliability,
+        p=test.p,
+        p_method=test.summary(0, "maximum over layers and targets taken anew in each"),
+        p_smallest=test.smallest,
+        layer=names[best],
+        layer_rule="maximum over layers and targets on the data that are scored (as published; optimistic)",
+        best_layer=names[best],
+        best_layer_value=float(values.max()),
+        layers=tuple(
+            LayerScore(layer, float(values[row, column]), float(raw[row, column]), "unreliable")
+            for row, (layer, column) in enumerate(zip(names, columns, strict=True))
+        ),
+        subjects=tuple(
+            SubjectScore(
+                item.name,
+                float(values[row, column]),
+                float(raw[row, column]),
+                corrected[item.name].reliability,
+                "unreliable",
+                item.units,
+                item.trials,
+                names[row],
+            )
+            for column, (item, row) in enumerate(zip(used, rows, strict=True))
+        ),
+        model_rdm=recorded_rdm(layers[best]),
+        brain_rdm=recorded_rdm(brain[place]),
+        chance=float(null.mean()),
+        attainable=1.0,
+        **about,
+    )
+
+
+def score_published_animals(
+    arrays: Mapping[str, NDArray[np.floating]], *, stimuli: Sequence[str], splits: int = SPLITS
+) -> Score:
+    """Score every animal against the units of all others, both sides corrected; the value is the mean over animals."""
+    parts = []
+    for name, array in arrays.items():
+        others = [other for label, other in arrays.items() if label != name]
+        if not others:
+            break
+        animal, rest = _target(name, array, splits), _target(POOL, concatenate(others), splits)
+        # As for models: a split counts where both sides' halves correlate by .5 or more.
+        kept = np.where(rest.split_half_r >= THESIS_FILTER, animal.split_half_r, np.nan)
+        r = float(_correlations(animal.rdm[None], rest.rdm[None])[0])
+        found = noise_corrected(r, kept, estimator="thesis", other_split_half_r=rest.split_half_r)
+        status = "undefined" if math.isnan(found.value) else "unreliable"
+        parts.append(SubjectScore(name, found.value, r, found.reliability, status, animal.units, animal.trials))
+    known = [item for item in parts if math.isfinite(item.value)]
+    return Score(
+        name="animal-to-animal",
+        value=float(np.mean([item.value for item in known])) if known else math.nan,
+        status="unreliable" if known else "undefined",
+        reasons=(
+            f"as published: mean over {len(known)} of {len(arrays)} animals, each against the units of the others",
+        ),
+        r=float(np.mean([item.r for item in known])) if known else math.nan,
+        subjects=tuple(parts),
+        estimator="thesis",
+        stimuli=tuple(map(str, stimuli)),
+    )

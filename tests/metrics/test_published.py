@@ -1,0 +1,137 @@
+"""The published estimator on the authors' arrays, against their procedure written out split by split."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.stats import pearsonr
+
+from brainbench.metrics.published import (
+    FIRST_SEED,
+    POOL,
+    concatenate,
+    first_half,
+    make_targets,
+    score_published,
+    score_published_animals,
+)
+from tests.factories.published_files import make_zero_filled
+
+SPLITS = 60
+STIMULI = [str(number) for number in range(6)]
+
+
+def _rdm(patterns):
+    with np.errstate(invalid="ignore"):
+        return (1 - np.corrcoef(patterns))[np.triu_indices(6, 1)]
+
+
+def _r(first, second):
+    """Pearson's r of two RDMs; NaN where a slot that no trial of a half showed leaves one without correlations."""
+    return pearsonr(first, second)[0] if np.isfinite([first, second]).all() else np.nan
+
+
+def _halves(array, split):
+    """Both halves' means as the published code makes them: a shuffled list of trials, cut in the middle."""
+    order = list(range(len(array)))
+    np.random.RandomState(FIRST_SEED + split).shuffle(order)
+    return [np.nanmean(array[part], axis=0) for part in (order[: len(array) // 2], order[len(array) // 2 :])]
+
+
+def _ratios(source, target, splits=SPLITS):
+    """Corrected scores of every split that counts, of features [6, F] or of an array [R, 6, U]."""
+    whole = source if source.ndim == 2 else np.nanmean(source, axis=0)
+    r_xy = _r(_rdm(whole), _rdm(np.nanmean(target, axis=0)))
+    found = []
+    for split in range(splits):
+        r_yy = _r(*map(_rdm, _halves(target, split)))
+        r_xx = 1.0 if source.ndim == 2 else _r(*map(_rdm, _halves(source, split)))
+        if r_yy >= 0.5 and r_xx >= 0.5:
+            found.append(r_xy / np.sqrt(2 * r_xx / (1 + r_xx) * 2 * r_yy / (1 + r_yy)))
+    return np.array(found)
+
+
+@pytest.fixture(scope="module")
+def arrays():
+    return {f"m{seed}": make_zero_filled([60, 48], units=8, seed=seed)[0] for seed in range(3)}
+
+
+@pytest.fixture(scope="module")
+def features():
+    rng = np.random.default_rng(5)
+    return {f"layer{number}": rng.normal(size=(6, 20)) for number in range(4)}
+
+
+def test_a_score_is_the_best_layer_and_target_of_their_procedure(arrays, features):
+    score = score_published(features, make_targets(arrays, splits=SPLITS), name="m", stimuli=STIMULI)
+    targets = {**arrays, POOL: concatenate(list(arrays.values()))}
+    expected = {
+        (layer, name): _ratios(values, array).mean()
+        for layer, values in features.items()
+        for name, array in targets.items()
+    }
+    assert score.value == pytest.approx(max(expected.values()), abs=1e-12)
+    assert score.layer == max(expected, key=expected.get)[0]
+    for part in score.subjects:
+        assert part.value == pytest.approx(max(expected[layer, part.subject] for layer in features), abs=1e-12)
+    assert score.status == "unreliable"
+    assert any("maximum over 4 layers and 4 targets" in reason for reason in score.reasons)
+
+
+@pytest.mark.shared
+def test_the_example_file_scores_as_their_procedure_does(reference, features):
+    with np.load(reference / "published" / "rodgers6_example.npz", allow_pickle=False) as stored:
+        arrays = {name: stored[name] for name in stored.files if stored[name].ndim}
+    # One slot of this animal was shown once, so one half never has it and the RDM of no split exists.
+    lost = arrays.pop("sub-228CR")
+    score = score_published(features, make_targets(arrays), name="m", stimuli=STIMULI)
+    targets = {**arrays, POOL: concatenate(list(arrays.values()))}
+    expected = [_ratios(item, array, 1000).mean() for item in features.values() for array in targets.values()]
+    assert score.value == pytest.approx(max(expected), abs=1e-12)
+    assert score_published(features, make_targets({"lost": lost}), name="m", stimuli=STIMULI).status == "undefined"
+
+
+def test_animals_are_scored_against_the_units_of_the_others(arrays):
+    score = score_published_animals(arrays, stimuli=STIMULI, splits=SPLITS)
+    expected = []
+    for name, array in arrays.items():
+        others = concatenate([other for label, other in arrays.items() if label != name])
+        expected.append(_ratios(others, array).mean())
+    np.testing.assert_allclose([part.value for part in score.subjects], expected, rtol=1e-9)
+    assert score.value == pytest.approx(np.mean(expected))
+    assert score_published_animals({"m0": arrays["m0"]}, stimuli=STIMULI, splits=2).status == "undefined"
+
+
+def test_the_bar_of_the_raw_input_is_the_median_for_the_pool(arrays, features):
+    layer = {"input": features["layer0"]}
+    targets = make_targets(arrays, splits=SPLITS)
+    score = score_published(layer, targets, name="input", stimuli=STIMULI, estimator="thesis-input")
+    pool = concatenate(list(arrays.values()))
+    r_yy = np.array([_r(*map(_rdm, _halves(pool, split))) for split in range(SPLITS)])
+    r_xy = _r(_rdm(layer["input"]), _rdm(np.nanmean(pool, axis=0)))
+    ratio = r_xy / np.sqrt((2 * r_yy / (1 + r_yy))[r_yy > 0])
+    assert score.value == pytest.approx(np.median(ratio))
+    assert [part.subject for part in score.subjects] == [POOL]
+
+
+def test_p_takes_the_maximum_again_under_every_order(arrays, features):
+    targets = make_targets(arrays, splits=SPLITS)
+    rng = np.random.default_rng(0)
+    found = [
+        score_published({name: rng.normal(size=(6, 20)) for name in features}, targets, name="m", stimuli=STIMULI).p
+        for _ in range(60)
+    ]
+    # Unrelated models: p is uniform, so its mean lies near .5 (standard error .037).
+    assert abs(np.mean(found) - 0.5) < 0.15
+
+
+def test_halves_are_disjoint_and_the_first_is_the_smaller():
+    assert first_half(7, 0).sum() == 3
+    assert (first_half(40, 1) != first_half(40, 2)).any()
+
+
+def test_a_half_without_a_session_loses_its_split():
+    array, _ = make_zero_filled([60, 12], units=5)
+    array[1:, :, 5:] = np.nan
+    # A session of one trial is missing in one half of every split.
+    assert np.isnan(make_targets({"m": array}, splits=10)[0].split_half_r).all()
