@@ -39,7 +39,7 @@ FRAME_TIMES = {1000: (0.001, 0.009), 110: (0.0, 1 / 110)}
 """Time of the first frame and interval [s]: of 1000 rows 1, 10, … 982 are kept, of 110 all."""
 CONDITIONS = ("speed", "height", "rotation", "distance", "size")
 """Conditions of a sweep, in m/s, m, rad, m and m; what a file does not say is that of table 3.1 of the thesis."""
-FAULTS = ("repeated", "too_large", "missing", "first_row")
+FAULTS = ("repeated", "too large", "missing", "unwritten")
 """Values that equal those of the frame before in a channel that moves (so the published cleaning fills gaps), beyond
 :data:`LARGEST`, not a number, and other than 0 in row 0 at 110 Hz, which is memory that nothing has written."""
 
@@ -64,14 +64,16 @@ class SweepFile:
         trusted = np.abs(self.data) <= LARGEST
         return np.where(trusted, self.data * SCALE, math.nan).astype(np.float32)
 
-    def faults(self) -> tuple[int, ...]:
-        """Count the values with each of :data:`FAULTS`."""
-        repeated = (self.data[1:] == self.data[:-1]) & (self.data[1:] != 0)
+    def faulty(self) -> dict[str, NDArray[np.bool_]]:
+        """Return where [110, 30, 6] a value has each of :data:`FAULTS`."""
+        before = np.pad(self.data, ((1, 0), (0, 0), (0, 0)))[:-1]
+        repeated = (self.data == before) & (self.data != 0)
         # A whisker may rest on the object: an equal value is a filled gap where most frames differ.
-        moving = 2 * repeated.sum(axis=0) < (self.data[1:] != 0).sum(axis=0)
-        counts = (repeated & moving, np.abs(self.data) > LARGEST, np.isnan(self.data), self.data[0] != 0)
-        found = [int(count.sum()) for count in counts]
-        return (*found[:3], found[3] if self.rate == 110 else 0)
+        moving = 2 * repeated.sum(axis=0) < (self.data != 0).sum(axis=0)
+        unwritten = np.zeros(self.data.shape, dtype=bool)
+        unwritten[0] = (self.data[0] != 0) & (self.rate == 110)
+        masks = (repeated & moving, np.abs(self.data) > LARGEST, np.isnan(self.data), unwritten)
+        return dict(zip(FAULTS, masks, strict=True))
 
 
 def read_sweep(path: str | os.PathLike[str]) -> SweepFile:

@@ -208,9 +208,9 @@ def _open(root: Path, stamps: tuple[tuple[str, int, int], ...]) -> SweepTree:
 def _report(tree: SweepTree) -> None:
     told = {
         "values equal those of the frame before, as the published cleaning fills gaps": tree.faults["repeated"],
-        "values are beyond 1000 mN or µN·m": tree.faults["too_large"],
+        "values are beyond 1000 mN or µN·m": tree.faults["too large"],
         "values are missing": tree.faults["missing"],
-        "values of row 0 come from memory that nothing has written": tree.faults["first_row"],
+        "values of row 0 come from memory that nothing has written": tree.faults["unwritten"],
         "sweeps have no label and are left out": tree.left_out,
     }
     if found := [f"{count} {what}" for what, count in told.items() if count]:
@@ -249,7 +249,8 @@ def _list(root: Path, stamps: Sequence[tuple[str, int, int]]) -> Listed:
 def _row(root: Path, path: str) -> tuple[Any, ...]:
     sweep = read_sweep(root / path)
     label = -1 if sweep.label is None else sweep.label
-    return path, sweep.shape, label, sweep.rate, sweep.conditions, sweep.faults(), file_hash(root / path)
+    faults = [int(where.sum()) for where in sweep.faulty().values()]
+    return path, sweep.shape, label, sweep.rate, sweep.conditions, faults, file_hash(root / path)
 
 
 def _classes(root: Path, listed: Listed) -> tuple[str, ...]:
