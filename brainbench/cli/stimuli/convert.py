@@ -123,8 +123,7 @@ def _data_set(source: Path, out: Path) -> tuple[dict[str, Any], str]:
         "classes": f"{classes} of {len(tree.classes)} labels have sweeps",
         "frames": f"110 from {tree.times[0] * 1e3:g} ms every {(tree.times[1] - tree.times[0]) * 1e3:.4g} ms",
         "left out": f"{manifest['left_out']:,} without a label",
-        "faults": ", ".join(f"{count:,} values {name}" for name, count in manifest["faults"].items() if count)
-        or "none",
+        "faults": _told(manifest["faults"]),
         "unstable": f"{manifest['unstable']:,} sweeps with values that are missing or too large",
         "hash": manifest["content_hash"],
         "data set": str(out),
@@ -208,7 +207,10 @@ def _run(source: Path, out: Path, options: dict[str, Any]) -> tuple[dict[str, An
     with tempfile.TemporaryDirectory(dir=out.parent, prefix=".run-") as temporary:
         chosen = {"dialect": "thesis"} | {name: value for name, value in options.items() if value is not None}
         save_run(dataset, Path(temporary) / "run", **chosen).rename(out)
-    shape = f"{dataset.sizes['time']} rows of {dataset.sizes['whisker']} whiskers, mN and µN·m"
-    return {"kind": "run"}, facts(
-        {"run": f"{shape} (world axes, action of the whisker on its base)", "folder": str(out)}
-    )
+    shape = f"{dataset.sizes['time']} rows of {dataset.sizes['whisker']} whiskers"
+    units = "mN and µN·m; action of the whisker on its base, world axes"
+    return {"kind": "run"}, facts({"run": shape, "units": units, "folder": str(out)})
+
+
+def _told(faults: Mapping[str, int]) -> str:
+    return ", ".join(f"{count:,} values {name}" for name, count in faults.items() if count) or "none"

@@ -15,6 +15,7 @@ import zipfile
 import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -42,6 +43,7 @@ CONDITIONS = ("speed", "height", "rotation", "distance", "size")
 FAULTS = ("repeated", "too large", "missing", "unwritten")
 """Values that equal those of the frame before in a channel that moves (so the published cleaning fills gaps), beyond
 :data:`LARGEST`, not a number, and other than 0 in row 0 at 110 Hz, which is memory that nothing has written."""
+_UNREADABLE = (OSError, ValueError, TypeError, AttributeError, EOFError, MemoryError, zipfile.BadZipFile, zlib.error)
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,13 +87,22 @@ def read_sweep(path: str | os.PathLike[str]) -> SweepFile:
     name = os.fspath(path)
     fields = {"data", "shape", "label", *RATES[1000], *RATES[110]}
     try:
-        loaded: Any = np.load(path, allow_pickle=False)
-        with loaded as file:
+        # Opened here, because numpy leaves damaged archives open.
+        with Path(path).open("rb") as stream, np.load(stream, allow_pickle=False) as file:
             held = tuple(file.files)
             values = {key: file[key] for key in held if key in fields}
     except FileNotFoundError as error:
         raise DataFileNotFoundError(f"There is no sweep file {name!r}.") from error
-    except (OSError, ValueError, TypeError, AttributeError, EOFError, zipfile.BadZipFile, zlib.error) as error:
+    except (
+        OSError,
+        ValueError,
+        TypeError,
+        AttributeError,
+        EOFError,
+        MemoryError,
+        zipfile.BadZipFile,
+        zlib.error,
+    ) as error:
         reason = str(error).split(".")[0] or type(error).__name__
         raise DataError(
             f"{name!r} cannot be read as a sweep: a file of arrays (.npz) without objects is needed ({reason})."
