@@ -31,7 +31,9 @@ OFFERED = (
 @with_options(TRAINING, OFFERED, given=True)
 def train(
     model: Annotated[str, typer.Argument(help="A registry name, such as zhuang-intersection-ln-small.")],
-    data: Annotated[Path, typer.Option("--data", "-d", help="Folder that brainbench stimuli sweep wrote.")],
+    data: Annotated[
+        Path, typer.Option("--data", "-d", help="Data set of brainbench stimuli sweep, or published sweeps.")
+    ],
     options: dict[str, Any],
     config: Annotated[
         Path | None, typer.Option(help="TOML or JSON file of training options; options given here win.")

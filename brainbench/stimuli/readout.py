@@ -105,5 +105,6 @@ def _describe_gaps(dataset: xr.Dataset) -> str:
     names = [f"{dataset['whisker'].values[j]} in {dataset['stimulus'].values[i]}" for i, j in np.argwhere(bad)]
     return (
         f"The simulation of {len(names)} whiskers became unstable ({listing(names, limit=4)}): simulate with a finer "
-        "fidelity, or read them as zero with to_grid(…, unstable='zero')."
+        "fidelity, convert runs of WHISKiT with --cleaning published, or read them as zero with to_grid(…, "
+        "unstable='zero')."
     )

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import typer
 
-from brainbench.cli.stimuli import draw, hand, objects, scenes, simulate, sweep
+from brainbench.cli.stimuli import convert, draw, hand, objects, scenes, simulate, sweep
 
 app = typer.Typer(no_args_is_help=True, help="Simulate whiskers on objects; look at scenes and forces.")
 app.command("list")(scenes.list_)
@@ -16,6 +16,7 @@ for _command in (
     simulate.simulate,
     sweep.sweep,
     simulate.separability,
+    convert.convert,
     draw.render,
     draw.plot,
     objects.objects,

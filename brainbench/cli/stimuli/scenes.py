@@ -131,7 +131,7 @@ def _of_file(dataset: xr.Dataset, stimulus: str | None) -> dict[str, Any]:
     made = {name: dataset.attrs[name] for name in ("backend", "version", "content_hash")}
     return {
         "name": "stimulus set",
-        "description": f"simulated by {made['backend']}, brainbench {made['version']}",
+        "description": f"simulated by {made['backend']}, written by brainbench {made['version']}",
         "array": json.loads(dataset.attrs["array"]),
         "scenes": scenes,
         "fidelity": json.loads(dataset.attrs["fidelity"]),
@@ -153,7 +153,7 @@ def _text(data: dict[str, Any]) -> str:
         f"whiskers  {array['species']}, {array['side']}: {len(array['whiskers'])} ({', '.join(array['whiskers'])})",
         f"frames    {span}, {readings}",
     ]
-    if "fidelity" in data:
+    if data.get("fidelity"):
         lines.append("fidelity  " + ", ".join(f"{name} {value}" for name, value in data["fidelity"].items()))
     rows = [row for scene in scenes[:_SHOWN] for row in _rows(scene)]
     lines += ["", table("", ["scene", "", "position mm", "rotation °", "motion", ""], rows)]
@@ -163,6 +163,8 @@ def _text(data: dict[str, Any]) -> str:
 
 
 def _rows(scene: dict[str, Any]) -> list[list[str]]:
+    if "head" not in scene:  # forces that were simulated elsewhere
+        return [[scene["label"], scene.get("shape", ""), "", "", "", "no scene is known"]]
     head = scene["head"]
     rows = [
         [scene["label"], "head", _point(head["position"]), _angles(head["rotation"]), _motion(head["motion"]), ""],

@@ -78,7 +78,7 @@ def _summary(dataset: Any) -> list[dict[str, Any]]:
 
 
 def separability(
-    folder: Annotated[Path, typer.Argument(help="Data set that brainbench stimuli sweep --out made.")],
+    folder: Annotated[Path, typer.Argument(help="Data set of stimuli sweep, or published sweeps.")],
     classes: Annotated[
         str | None, typer.Option(help="Classes, with commas between them. [default: the four with the most objects]")
     ] = None,

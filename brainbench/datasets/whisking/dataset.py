@@ -1,7 +1,8 @@
 """Read data sets of whisker sweeps for training: memory-mapped shards, shuffled batches, exact resume.
 
-The files are those of ``brainbench stimuli sweep --out``; their layout is described in ``docs/datasets.md``. Letters:
-B batch, T time step, S sub-step, C channel, W whisker, H×W whisker grid, N sweep.
+The files are those of ``brainbench stimuli sweep --out``, whose layout is described in ``docs/datasets.md``, or the
+sweep folders of the published study (:mod:`~brainbench.datasets.whisking.sweep_tree`). Letters: B batch, T time step,
+S sub-step, C channel, W whisker, H×W whisker grid, N sweep.
 """
 
 from __future__ import annotations
@@ -21,7 +22,8 @@ import numpy as np
 from brainbench.core.contracts import CHANNELS, GRID_SHAPE
 from brainbench.core.errors import DataError, UsageError, check_name, listing
 from brainbench.core.files import cache_dir, content_hash, read_json, write_json
-from brainbench.datasets.whisking.files import Buffers, most_open, open_shard, read_manifest, verify_shard
+from brainbench.datasets.whisking.files import Buffers, most_open, open_shard, read_manifest
+from brainbench.datasets.whisking.sweep_tree import is_sweep_tree, open_sweep_tree
 
 if TYPE_CHECKING:
     import torch
@@ -69,7 +71,7 @@ class WhiskingDataset:
     >>> for x, y in data: ...  # doctest: +SKIP
 
     Args:
-        folder: where ``brainbench stimuli sweep`` wrote.
+        folder: where ``brainbench stimuli sweep`` wrote, or a folder of published sweeps.
         split: one of :data:`SPLITS`.
         batch_size: B.
         view: ``grid`` gives [B, T, S·C, H, W] as ``to_grid`` of a stimulus set does; ``raw`` [B, frame, W, C].
@@ -117,10 +119,14 @@ class WhiskingDataset:
         self.split, self.view, self.substeps, self.unstable = split, view, substeps, unstable
         self.batch_size, self.shuffle, self.seed, self.device = batch_size, shuffle, seed, device
         self.drop_last, self.part = drop_last, part
-        self.manifest: Mapping[str, Any] = read_manifest(self.folder)
+        tree = open_sweep_tree(self.folder) if is_sweep_tree(self.folder) else None
+        self.manifest: Mapping[str, Any] = read_manifest(self.folder) if tree is None else tree.manifest()
         self.classes = tuple(str(name) for name in self.manifest["classes"])
         entries = [item for item in self.manifest["shards"] if split in ("all", item["split"])]
-        self._shards = [open_shard(self.folder / item["name"], item, self.manifest) for item in entries]
+        if tree is None:
+            self._shards = [open_shard(self.folder / item["name"], item, self.manifest) for item in entries]
+        else:
+            self._shards = [tree.open_shard(item["split"]) for item in entries]
         self._choose()
         self._buffers = Buffers(2 * (_AHEAD + 2))
         self._forces = lru_cache(most_open())(lambda index: self._shards[index].forces())
@@ -269,7 +275,7 @@ class WhiskingDataset:
             DataError: a shard is not what was generated; the message names it.
         """
         for shard in self._shards:
-            verify_shard(shard)
+            shard.verify()
 
     def statistics(self) -> ChannelStatistics:
         """Return mean, spread and largest value of each channel over the sweeps of the split.

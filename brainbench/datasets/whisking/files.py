@@ -48,6 +48,23 @@ class Shard:
         shape = (self.sweeps, *self.shape)
         return np.memmap(self.path, "<f4", "r", self.offset, shape).view(np.ndarray)
 
+    def verify(self) -> None:
+        """Compare what the shard holds with the hash in the manifest; a difference is a :class:`DataError`."""
+        import h5py
+
+        try:
+            opened: Any = h5py.File(self.path, "r")
+            with opened as file:
+                arrays = {name: file[name][()] for name in file if name != "wrench"}
+        except (OSError, KeyError) as error:
+            raise DataError(f"The shard {str(self.path)!r} is damaged ({error}); generate it again.") from error
+        arrays["wrench"] = self.forces()
+        if hash_arrays(arrays) != self.content_hash:
+            raise DataError(
+                f"The numbers in {str(self.path)!r} do not match the hash in the manifest: it was damaged or edited; "
+                "remove it and give the command that made the data set again."
+            )
+
 
 def read_manifest(folder: Path) -> Mapping[str, Any]:
     """Read the manifest of a finished data set.
@@ -62,8 +79,9 @@ def read_manifest(folder: Path) -> Mapping[str, Any]:
                 f"The data set in {str(folder)!r} is not finished: give the command that began it again; it goes on."
             )
         raise DataFileNotFoundError(
-            f"There is no data set of sweeps in {str(folder)!r} (no manifest.json); make one with: brainbench stimuli "
-            "sweep thesis-low --objects procedural-24:10 --out FOLDER."
+            f"There is no data set of sweeps in {str(folder)!r} (no manifest.json, and no folders train, validate and "
+            "test with published sweeps); make one with: brainbench stimuli sweep thesis-low --objects "
+            "procedural-24:10 --out FOLDER."
         )
     manifest = read_json(path)
     found = (manifest.get("format"), manifest.get("schema")) if isinstance(manifest, dict) else (None, None)
@@ -117,28 +135,6 @@ def open_shard(path: Path, entry: Mapping[str, Any], manifest: Mapping[str, Any]
     if config != manifest["config_hash"] or sweeps != entry["sweeps"] or channels != CHANNELS:
         raise DataError(f"The shard {str(path)!r} does not belong to the manifest beside it; {again}.")
     return shard
-
-
-def verify_shard(shard: Shard) -> None:
-    """Compare what a shard holds with the hash in the manifest.
-
-    Raises:
-        DataError: it differs.
-    """
-    import h5py
-
-    try:
-        opened: Any = h5py.File(shard.path, "r")
-        with opened as file:
-            arrays = {name: file[name][()] for name in file if name != "wrench"}
-    except (OSError, KeyError) as error:
-        raise DataError(f"The shard {str(shard.path)!r} is damaged ({error}); generate it again.") from error
-    arrays["wrench"] = shard.forces()
-    if hash_arrays(arrays) != shard.content_hash:
-        raise DataError(
-            f"The numbers in {str(shard.path)!r} do not match the hash in the manifest: it was damaged or edited; "
-            "remove it and give the command that made the data set again."
-        )
 
 
 class Buffers:

@@ -20,7 +20,7 @@ from brainbench.core.progress import Progress
 from brainbench.stimuli.engines import get_engine
 from brainbench.stimuli.sweeps import running
 from brainbench.stimuli.sweeps.manifest import MANIFEST, is_complete, make_manifest
-from brainbench.stimuli.sweeps.plan import GenerationPlan, ShardTask
+from brainbench.stimuli.sweeps.plan import GenerationPlan, PlannedDataSet, PlannedShard
 
 _LOG = logging.getLogger(__name__)
 
@@ -65,6 +65,28 @@ def generate(
             "it is imported; put what it does under: if __name__ == '__main__':"
         )
     get_engine(plan.settings.backend, device=plan.settings.device)
+
+    def run(missing: Sequence[Any], folder: Path, done: Callable[[int], None]) -> None:
+        if scheduler is not None:
+            running.run_shards_on_cluster(missing, folder, scheduler, done)
+        elif missing:
+            running.run_here(missing, folder, workers, done)
+
+    return write_data_set(plan, out, run, what="simulating sweeps", progress=progress)
+
+
+def write_data_set(
+    plan: PlannedDataSet,
+    out: str | os.PathLike[str],
+    run: Callable[[Sequence[Any], Path, Callable[[int], None]], None],
+    *,
+    what: str,
+    progress: Progress | None = None,
+) -> dict[str, Any]:
+    """Let ``run(missing shards, folder, done)`` write the shards that are missing, then write and return the manifest.
+
+    ``run`` calls ``done`` with the number of sweeps of each shard that it wrote. Errors are those of :func:`generate`.
+    """
     folder = Path(out).absolute()
     folder.mkdir(parents=True, exist_ok=True)
     with _locked(folder):
@@ -72,20 +94,17 @@ def generate(
         _clean(folder)
         missing = [task for task in plan.shards if not is_complete(folder / task.name, task)]
         _check_space(missing, folder)
-        report = _reporter(sum(map(len, missing)), progress)
+        report = _reporter(sum(map(len, missing)), what, progress)
         if len(missing) < len(plan.shards):
             _LOG.info("%d of %d shards are there already", len(plan.shards) - len(missing), len(plan.shards))
-        if scheduler is not None:
-            running.run_shards_on_cluster(missing, folder, scheduler, report)
-        elif missing:
-            running.run_here(missing, folder, workers, report)
+        run(missing, folder, report)
         _clean(folder)
         manifest = make_manifest(plan, folder)
         write_json(folder / MANIFEST, manifest)
     return manifest
 
 
-def _reporter(total: int, progress: Progress | None) -> Callable[[int], None]:
+def _reporter(total: int, what: str, progress: Progress | None) -> Callable[[int], None]:
     """Return what tells how far the run is: a progress bar, and the log every half minute with the time left."""
     done, started = 0, time.monotonic()
     told = started
@@ -94,7 +113,7 @@ def _reporter(total: int, progress: Progress | None) -> Callable[[int], None]:
         nonlocal done, told
         done += sweeps
         if progress is not None:
-            progress(done, total, "simulating sweeps")
+            progress(done, total, what)
         now = time.monotonic()
         if now - told >= 30 or done == total:
             told = now
@@ -126,7 +145,7 @@ def _locked(folder: Path) -> Iterator[None]:
         os.close(handle)
 
 
-def _check_config(plan: GenerationPlan, folder: Path) -> None:
+def _check_config(plan: PlannedDataSet, folder: Path) -> None:
     """Refuse to go on with what was begun otherwise; note what is begun."""
     path, config = folder / CONFIG, to_plain(plan.config)
     if not path.exists():
@@ -157,7 +176,7 @@ def _clean(folder: Path) -> None:
             item.unlink(missing_ok=True)
 
 
-def _check_space(missing: Sequence[ShardTask], folder: Path) -> None:
+def _check_space(missing: Sequence[PlannedShard], folder: Path) -> None:
     needed = sum(task.bytes for task in missing)
     free = shutil.disk_usage(folder).free
     if needed + _SPARE > free:

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from functools import cached_property
 from importlib import metadata
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,6 +27,88 @@ SHARD_SIZES = {"mujoco": 32, "bullet": 8}
 USUAL_SHARD = 512
 GPU_SHARD = 2048
 """Sweeps per shard on a GPU, which takes thousands at a time."""
+
+
+class PlannedShard(Protocol):
+    """A shard that is to be written: simulated (:class:`ShardTask`) or converted."""
+
+    @property
+    def name(self) -> str:
+        """File name."""
+        ...
+
+    @property
+    def split(self) -> str:
+        """Name of the split."""
+        ...
+
+    @property
+    def objects(self) -> Sequence[NamedObject]:
+        """Objects of the shard."""
+        ...
+
+    @property
+    def config_hash(self) -> str:
+        """Hash of the plan that it belongs to."""
+        ...
+
+    @property
+    def bytes(self) -> int:
+        """About how large the file becomes."""
+        ...
+
+    def __len__(self) -> int:
+        """Count the sweeps."""
+        ...
+
+
+class PlannedDataSet(Protocol):
+    """A data set that is to be written."""
+
+    @property
+    def shards(self) -> Sequence[Any]:
+        """The shards, each a :class:`PlannedShard`."""
+        ...
+
+    @property
+    def objects(self) -> Mapping[str, NamedObject]:
+        """All objects by name."""
+        ...
+
+    @property
+    def classes(self) -> tuple[str, ...]:
+        """Class labels."""
+        ...
+
+    @property
+    def config(self) -> Mapping[str, Any]:
+        """Plain values that determine every byte."""
+        ...
+
+    @property
+    def config_hash(self) -> str:
+        """Hash of ``config``."""
+        ...
+
+    @property
+    def sweeps(self) -> int:
+        """Number of sweeps."""
+        ...
+
+    @property
+    def notes(self) -> Mapping[str, Any]:
+        """Further entries of the manifest."""
+        ...
+
+
+def shard_name(split: str, place: int) -> str:
+    """Return the file name of a shard."""
+    return f"{split}-{place:05d}.h5"
+
+
+def shard_bytes(sweeps: int, whiskers: int, frames: int) -> int:
+    """Return about how large a shard becomes."""
+    return sweeps * (whiskers * (24 * frames + 5) + 200) + 40_000
 
 
 @dataclass(frozen=True)
@@ -101,8 +183,7 @@ class ShardTask:
     @property
     def bytes(self) -> int:
         """About how large the file becomes."""
-        whiskers, frames = len(self.config["whiskers"]["names"]), self.grid.frames.count
-        return len(self) * (whiskers * (24 * frames + 5) + 200) + 40_000
+        return shard_bytes(len(self), len(self.config["whiskers"]["names"]), self.grid.frames.count)
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,6 +201,11 @@ class GenerationPlan:
     def __post_init__(self) -> None:
         if not self.objects:
             raise UsageError("A data set of sweeps needs at least one object.")
+
+    @property
+    def notes(self) -> Mapping[str, Any]:
+        """Further entries of the manifest: none."""
+        return {}
 
     @cached_property
     def array(self) -> WhiskerArray:
@@ -202,7 +288,7 @@ class GenerationPlan:
                 local = {owner: index for index, owner in enumerate(used)}
                 shards.append(
                     ShardTask(
-                        name=f"{split}-{place:05d}.h5",
+                        name=shard_name(split, place),
                         split=split,
                         grid=self.grid,
                         whiskers=self.whiskers,

@@ -6,7 +6,7 @@ The bytes of a shard depend on what was asked for alone: no time, no machine and
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -17,9 +17,10 @@ from numpy.typing import NDArray
 from brainbench.core.contracts import CHANNELS, SWEEPS_FORMAT, SWEEPS_SCHEMA
 from brainbench.core.errors import DataError, UsageError
 from brainbench.core.files import atomic_path, content_hash, hash_arrays, to_json
+from brainbench.stimuli.objects.collections import NamedObject
 from brainbench.stimuli.objects.solid import Solid
 from brainbench.stimuli.sweeps.grid import Sweep
-from brainbench.stimuli.sweeps.plan import ShardTask
+from brainbench.stimuli.sweeps.plan import PlannedShard, ShardTask
 from brainbench.stimuli.sweeps.simulation import simulate_sweeps
 from brainbench.stimuli.sweeps.sweep_scenes import SweepScenes
 from brainbench.stimuli.whiskers.array import WhiskerArray
@@ -37,7 +38,7 @@ _CONDITIONS = tuple(item.name for item in fields(Sweep))
 class ShardContent:
     """Content of a shard's file."""
 
-    task: ShardTask
+    task: PlannedShard
     arrays: Mapping[str, NDArray[Any]]
     """By name, in the order of the file; ``wrench`` is last."""
     attributes: Mapping[str, Any]
@@ -70,7 +71,9 @@ def prepare_shard(task: ShardTask) -> PreparedShard:
             built.append((None, str(error) or type(error).__name__))
     solids, reasons = zip(*built, strict=True)
     hashes = ["" if solid is None else _hash_solid(solid) for solid in solids]
-    return PreparedShard(solids, reasons, {**_tables(task, hashes), **_conditions(task)})
+    array = WhiskerArray.of(task.grid.species).select(task.whiskers)
+    tables = shard_tables(array, task.grid.frames.times, task.classes, task.objects, hashes)
+    return PreparedShard(solids, reasons, {**tables, **_conditions(task)})
 
 
 def simulate_shard(task: ShardTask, prepared: PreparedShard, workers: int | None = None) -> ShardContent:
@@ -110,22 +113,29 @@ def simulate_shard(task: ShardTask, prepared: PreparedShard, workers: int | None
         **prepared.tables,
         "contact": contact,
         "status": status,
-        "reason": _texts(reasons),
+        "reason": encode_texts(reasons),
         "wrench": np.ascontiguousarray(wrench, dtype="<f4"),
     }
-    attributes = {
+    return ShardContent(task, arrays, shard_attributes(task, task.config, frames.axes, status, counts))
+
+
+def shard_attributes(
+    task: PlannedShard, config: Mapping[str, Any], axes: str, status: NDArray[np.uint8], counts: Mapping[str, int]
+) -> dict[str, Any]:
+    """Return the attributes of a shard: what it belongs to, its axes, and counts of steps and failures."""
+    return {
         "format": SWEEPS_FORMAT,
         "schema": SWEEPS_SCHEMA,
         "split": task.split,
-        "axes": frames.axes,
+        "axes": axes,
         # An attribute has room for 64 kB; thousands of classes stand in the table of that name.
-        "config": to_json({key: item for key, item in task.config.items() if key != "classes"}, indent=None),
+        "config": to_json({key: item for key, item in config.items() if key != "classes"}, indent=None),
         "config_hash": task.config_hash,
+        **dict.fromkeys(("steps", "steps_in_full", "retried"), 0),
         **counts,
         "unstable": int((status == UNSTABLE).any(axis=1).sum()),
         "unusable": int((status == UNUSABLE).any(axis=1).sum()),
     }
-    return ShardContent(task, arrays, attributes)
 
 
 def write_shard(content: ShardContent, folder: str | os.PathLike[str]) -> int:
@@ -149,25 +159,25 @@ def write_shard(content: ShardContent, folder: str | os.PathLike[str]) -> int:
     return len(content.task)
 
 
-def _tables(task: ShardTask, hashes: Sequence[str]) -> dict[str, NDArray[Any]]:
+def shard_tables(
+    array: WhiskerArray,
+    times: NDArray[np.float64],
+    classes: Sequence[str],
+    objects: Sequence[NamedObject],
+    hashes: Sequence[str],
+) -> dict[str, NDArray[Any]]:
     """Return the names behind the numbers: times, whiskers, channels, classes and objects."""
-    mounts = list(WhiskerArray.of(task.grid.species).select(task.whiskers))
     return {
-        "time": task.grid.frames.times,
-        "whisker": _texts([mount.name for mount in mounts]),
-        "row": np.array([mount.row for mount in mounts], dtype=np.int16),
-        "col": np.array([mount.col for mount in mounts], dtype=np.int16),
-        "channel": _texts(CHANNELS),
-        "class": _texts(task.classes),
-        "object": _texts([item.name for item in task.objects]),
-        "object_class": _labels(task),
-        "object_hash": _texts(hashes),
+        "time": times,
+        "whisker": encode_texts(mount.name for mount in array),
+        "row": np.array([mount.row for mount in array], dtype=np.int16),
+        "col": np.array([mount.col for mount in array], dtype=np.int16),
+        "channel": encode_texts(CHANNELS),
+        "class": encode_texts(classes),
+        "object": encode_texts(item.name for item in objects),
+        "object_class": np.array([classes.index(item.label) for item in objects], dtype=np.int32),
+        "object_hash": encode_texts(hashes),
     }
-
-
-def _labels(task: ShardTask) -> NDArray[np.int32]:
-    """Return the number [object] of each object's class."""
-    return np.array([task.classes.index(item.label) for item in task.objects], dtype=np.int32)
 
 
 def _hash_solid(solid: Solid) -> str:
@@ -185,7 +195,7 @@ def _conditions(task: ShardTask) -> dict[str, NDArray[Any]]:
     for owner, item in enumerate(task.objects):
         every = task.grid.sweeps(item.name)
         sweeps += [every[within] for within in task.within[task.owner == owner].tolist()]
-    labels = _labels(task)
+    labels = np.array([task.classes.index(item.label) for item in task.objects], dtype=np.int32)
     kinds = {name: np.int32 if name == "draw" else np.float64 for name in _CONDITIONS}
     return {
         "sweep": task.index.astype(np.int64),
@@ -195,7 +205,7 @@ def _conditions(task: ShardTask) -> dict[str, NDArray[Any]]:
     }
 
 
-def _texts(values: Any) -> NDArray[np.bytes_]:
+def encode_texts(values: Iterable[Any]) -> NDArray[np.bytes_]:
     """Return texts as UTF-8 of a fixed length, which has the same bytes in every file."""
     encoded = [str(value).encode() for value in values]
     return np.array(encoded, dtype=f"S{max(1, *map(len, encoded))}")

@@ -1,0 +1,154 @@
+"""Sweep files of the published study: one ``.npz`` per sweep, as its ``process_raw_dataset.py`` writes them.
+
+``data`` [110, 35, 6] in mN and mN·mm = µN·m, Fx … Mz, in world axes: the action of the whisker on its base, as ours.
+The 35 cells are the flat 5 × 7 grid, of which 5, 6, 12, 13 and 34 have no whisker; without ``--process_values`` there
+are the 30 whiskers alone. ``shape`` is "category/object", ``label`` the number of the class. Sweeps at 1000 Hz hold
+``h``, ``d``, ``t`` as texts (mm, mm, degrees), those at 110 Hz ``h``, ``to``, ``t``, ``v``, ``s`` (mm, degrees,
+degrees, mm/s, mm).
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import zipfile
+import zlib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from brainbench.core.contracts import CHANNELS, GRID_SHAPE
+from brainbench.core.errors import DataError, DataFileNotFoundError
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+FRAMES = 110
+EMPTY_CELLS = (5, 6, 12, 13, 34)
+CELLS = np.setdiff1d(np.arange(GRID_SHAPE[0] * GRID_SHAPE[1]), EMPTY_CELLS)
+"""[30] flat cell of each whisker: A0–A4, B0–B4, C0–C6, D0–D6, E0–E5."""
+LARGEST = 1000.0
+"""Magnitude [mN, µN·m] above which the published cleaning trusts no value."""
+SCALE = np.repeat([1e-3, 1e-6], 3)
+"""N and N·m per mN and µN·m, by channel."""
+RATES: Mapping[int, tuple[str, ...]] = {1000: ("h", "d", "t"), 110: ("h", "to", "t", "v", "s")}
+"""Fields with the conditions, by simulated rate [Hz]."""
+FRAME_TIMES = {1000: (0.001, 0.009), 110: (0.0, 1 / 110)}
+"""Time of the first frame and interval [s]: of 1000 rows 1, 10, … 982 are kept, of 110 all."""
+CONDITIONS = ("speed", "height", "rotation", "distance", "size")
+"""Conditions of a sweep, in m/s, m, rad, m and m; what a file does not say is that of table 3.1 of the thesis."""
+FAULTS = ("repeated", "too large", "missing", "unwritten")
+"""Values that equal those of the frame before in a channel that moves (so the published cleaning fills gaps), beyond
+:data:`LARGEST`, not a number, and other than 0 in row 0 at 110 Hz, which is memory that nothing has written."""
+_UNREADABLE = (OSError, ValueError, TypeError, AttributeError, EOFError, MemoryError, zipfile.BadZipFile, zlib.error)
+
+
+@dataclass(frozen=True, eq=False)
+class SweepFile:
+    """One sweep as its file holds it."""
+
+    data: NDArray[np.float64]
+    """[110, 30, 6] forces and moments of the 30 whiskers (mN, µN·m)."""
+    label: int | None
+    """Number of the class; None where the file has none, or "?"."""
+    shape: str
+    """"category/object"."""
+    rate: int
+    """Simulated frames per second, 1000 or 110."""
+    conditions: tuple[float, ...]
+    """Values of :data:`CONDITIONS`."""
+
+    def wrench(self) -> NDArray[np.float32]:
+        """Return the forces [110, 30, 6] in N and N·m; NaN where a value is missing or beyond :data:`LARGEST`."""
+        trusted = np.abs(self.data) <= LARGEST
+        return np.where(trusted, self.data * SCALE, math.nan).astype(np.float32)
+
+    def faulty(self) -> dict[str, NDArray[np.bool_]]:
+        """Return where [110, 30, 6] a value has each of :data:`FAULTS`."""
+        before = np.pad(self.data, ((1, 0), (0, 0), (0, 0)))[:-1]
+        repeated = (self.data == before) & (self.data != 0)
+        # A whisker may rest on the object: an equal value is a filled gap where most frames differ.
+        moving = 2 * repeated.sum(axis=0) < (self.data != 0).sum(axis=0)
+        unwritten = np.zeros(self.data.shape, dtype=bool)
+        unwritten[0] = (self.data[0] != 0) & (self.rate == 110)
+        masks = (repeated & moving, np.abs(self.data) > LARGEST, np.isnan(self.data), unwritten)
+        return dict(zip(FAULTS, masks, strict=True))
+
+
+def read_sweep(path: str | os.PathLike[str]) -> SweepFile:
+    """Read a sweep file; no pickle is loaded.
+
+    Raises:
+        DataError: the file is missing, damaged or another one; the message says what it holds.
+    """
+    name = os.fspath(path)
+    fields = {"data", "shape", "label", *RATES[1000], *RATES[110]}
+    try:
+        # Opened here, because numpy leaves damaged archives open.
+        with Path(path).open("rb") as stream, np.load(stream, allow_pickle=False) as file:
+            held = tuple(file.files)
+            values = {key: file[key] for key in held if key in fields}
+    except FileNotFoundError as error:
+        raise DataFileNotFoundError(f"There is no sweep file {name!r}.") from error
+    except (
+        OSError,
+        ValueError,
+        TypeError,
+        AttributeError,
+        EOFError,
+        MemoryError,
+        zipfile.BadZipFile,
+        zlib.error,
+    ) as error:
+        reason = str(error).split(".")[0] or type(error).__name__
+        raise DataError(
+            f"{name!r} cannot be read as a sweep: a file of arrays (.npz) without objects is needed ({reason})."
+        ) from error
+    rates = [rate for rate, needed in RATES.items() if {"data", "shape", *needed} <= set(values)]
+    if not rates:
+        raise DataError(
+            f"{name!r} is no sweep of the published study: it holds {', '.join(held) or 'nothing'}; needed are data, "
+            "shape, label and h, d, t (1000 Hz) or h, to, t, v, s (110 Hz)."
+        )
+    try:
+        told = {key: float(str(values[key])) for key in RATES[rates[0]]}
+    except ValueError as error:
+        raise DataError(f"{name!r} has a condition that is no number ({error}).") from error
+    return SweepFile(
+        _whiskers(values["data"], name), _label(values.get("label")), str(values["shape"]), rates[0], _conditions(told)
+    )
+
+
+def _whiskers(data: NDArray[Any], name: str) -> NDArray[np.float64]:
+    """Return the 30 whiskers of an array of 35 cells, or of the whiskers alone."""
+    grid, alone = (FRAMES, GRID_SHAPE[0] * GRID_SHAPE[1], len(CHANNELS)), (FRAMES, len(CELLS), len(CHANNELS))
+    if data.dtype.kind not in "fiu" or data.shape not in (grid, alone):
+        raise DataError(
+            f"'data' in {name!r} is {list(data.shape)} of {data.dtype}; a published sweep has numbers {list(grid)} "
+            f"(frame, cell, channel), or {list(alone)} for the whiskers alone."
+        )
+    if data.shape == grid and np.any(data[:, EMPTY_CELLS]):
+        raise DataError(
+            f"'data' in {name!r} has forces in cells {', '.join(map(str, EMPTY_CELLS))}, where the published grid has "
+            "no whisker; its cells are in another order."
+        )
+    return np.asarray(data if data.shape == alone else data[:, CELLS], dtype=np.float64)
+
+
+def _label(value: NDArray[Any] | None) -> int | None:
+    """Return a class number; None for anything that is not one."""
+    try:
+        number = float(str(value))
+    except ValueError:
+        return None
+    return int(number) if number >= 0 and number.is_integer() else None
+
+
+def _conditions(told: Mapping[str, float]) -> tuple[float, ...]:
+    """Return :data:`CONDITIONS` of the fields of a file; rotation is the turn and its offset ``to`` together."""
+    speed, distance, size = told.get("v", 30.0), told.get("d", 5.0), told.get("s", 40.0)
+    rotation = math.radians(told["t"] + told.get("to", 0.0))
+    return speed / 1e3, told["h"] / 1e3, rotation, distance / 1e3, size / 1e3

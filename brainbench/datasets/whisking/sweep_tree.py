@@ -1,0 +1,278 @@
+"""Folders of the published study's sweeps, ``train/ validate/ test/`` with a file per sweep, read as a data set.
+
+Every file is read once to list it, which finds what is damaged before any work and counts the known faults; the list
+is kept in the cache. After that the forces are read from the files when a batch asks for them.
+"""
+
+from __future__ import annotations
+
+import functools
+import logging
+import os
+from collections import Counter, defaultdict
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from brainbench.core.contracts import CHANNELS
+from brainbench.core.devices import usable_processors
+from brainbench.core.errors import DataError
+from brainbench.core.files import atomic_path, cache_dir, content_hash, file_hash, read_json
+from brainbench.datasets.whisking.files import Shard
+from brainbench.datasets.whisking.sweep_files import CELLS, CONDITIONS, FAULTS, FRAME_TIMES, FRAMES, read_sweep
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+_LOG = logging.getLogger(__name__)
+
+FOLDERS = {"train": "train", "validate": "validation", "validation": "validation", "val": "validation", "test": "test"}
+"""Split of each folder's sweeps."""
+MOST_CLASSES = 10_000
+_VERSION = 1
+_TOGETHER = 2048
+"""Files listed between two entries in the cache: what a killed run loses."""
+
+
+class Listed(NamedTuple):
+    """Columns of the list of sweep files, one entry per file."""
+
+    path: NDArray[np.str_]
+    """Path in the folder: ``train/00000000.npz``."""
+    shape: NDArray[np.str_]
+    label: NDArray[np.int64]
+    """Number of the class; −1 without."""
+    rate: NDArray[np.int64]
+    conditions: NDArray[np.float64]
+    """[file, condition] in the order of :data:`CONDITIONS`."""
+    faults: NDArray[np.int64]
+    """[file, fault] in the order of :data:`FAULTS`."""
+    digest: NDArray[np.str_]
+    """Hash of the file."""
+
+
+@dataclass(frozen=True, eq=False)
+class SweepTree:
+    """The labelled sweeps of a folder, those of training first, in the order of their names."""
+
+    folder: Path
+    listed: Listed
+    """Without the sweeps that have no label."""
+    split: NDArray[np.str_]
+    classes: tuple[str, ...]
+    """Names by the number in the files."""
+    left_out: int
+    """Sweeps without a label."""
+
+    @property
+    def rate(self) -> int:
+        """Simulated frames per second, 1000 or 110."""
+        return int(self.listed.rate[0])
+
+    @property
+    def times(self) -> NDArray[np.float64]:
+        """Times of the frames [s]."""
+        first, interval = FRAME_TIMES[self.rate]
+        return first + interval * np.arange(FRAMES)
+
+    @property
+    def broken(self) -> NDArray[np.bool_]:
+        """[sweep] true where a value is missing or too large to be trusted."""
+        return self.listed.faults[:, 1:3].any(axis=1)
+
+    @property
+    def faults(self) -> dict[str, int]:
+        """Values with each known fault, in all sweeps."""
+        return dict(zip(FAULTS, self.listed.faults.sum(axis=0).tolist(), strict=True))
+
+    @functools.cached_property
+    def content_hash(self) -> str:
+        """Hash of the content of all files, their labels and splits."""
+        return content_hash(self.listed.path.tolist(), self.listed.digest.tolist(), self.classes, _VERSION)
+
+    def wrenches(self, sweeps: Sequence[int] | NDArray[np.integer]) -> NDArray[np.float32]:
+        """Return the forces [sweep, frame, whisker, channel] of some sweeps (N, N·m)."""
+        return np.stack([read_sweep(self.folder / path).wrench() for path in self.listed.path[sweeps]])
+
+    def conditions(self) -> dict[str, NDArray[np.float64]]:
+        """Return the conditions [sweep] by name, in SI units."""
+        return dict(zip(CONDITIONS, self.listed.conditions.T, strict=True))
+
+    def manifest(self) -> dict[str, Any]:
+        """Return what the manifest of a data set of ours says, for sweeps that stay where they are."""
+        sizes = Counter(self.split.tolist())
+        return {
+            "content_hash": self.content_hash,
+            "classes": list(self.classes),
+            "sweeps": len(self.split),
+            "left_out": self.left_out,
+            "faults": self.faults,
+            "splits": {name: {"sweeps": sizes[name]} for name in dict.fromkeys(FOLDERS.values())},
+            "shards": [{"name": name, "split": name, "sweeps": size} for name, size in sizes.items()],
+        }
+
+    def open_shard(self, split: str) -> FileShard:
+        """Return the sweeps of one split as a shard."""
+        mine = np.flatnonzero(self.split == split)
+        return FileShard(
+            path=self.folder / split,
+            offset=0,
+            sweeps=len(mine),
+            shape=(FRAMES, len(CELLS), len(CHANNELS)),
+            cells=CELLS,
+            labels=self.listed.label[mine].astype(np.int32),
+            objects=self.listed.shape[mine],
+            indices=mine,
+            broken=self.broken[mine],
+            empty=np.zeros(len(mine), dtype=bool),
+            content_hash=self.content_hash,
+            tree=self,
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class FileShard(Shard):
+    """The sweeps of one split, each in its own file."""
+
+    tree: SweepTree
+
+    def forces(self) -> Any:
+        """Return what gives the forces [frame, whisker, channel] (N, N·m) of one sweep by its number."""
+        return _Forces(self)
+
+    def verify(self) -> None:
+        """Compare every file with what it was when it was listed; a difference is a :class:`DataError`."""
+        for path, digest in zip(
+            self.tree.listed.path[self.indices], self.tree.listed.digest[self.indices], strict=True
+        ):
+            if file_hash(self.tree.folder / path) != digest:
+                raise DataError(f"{str(self.tree.folder / path)!r} changed since it was listed; start again.")
+
+
+@dataclass(frozen=True, eq=False)
+class _Forces:
+    shard: FileShard
+
+    def __getitem__(self, row: int) -> NDArray[np.float32]:
+        return self.shard.tree.wrenches([self.shard.indices[row]])[0]
+
+
+def is_sweep_tree(folder: str | os.PathLike[str]) -> bool:
+    """Return whether a folder has folders for splits and is no data set of ours."""
+    root = Path(folder)
+    made = (root / "manifest.json").is_file() or (root / "config.json").is_file()
+    return not made and any((root / name).is_dir() for name in FOLDERS)
+
+
+def open_sweep_tree(folder: str | os.PathLike[str]) -> SweepTree:
+    """List the sweeps of a folder and say once, in the log, what is wrong with them.
+
+    Class names are those of ``categories.json`` ("category/object" → number) in the folder, or of the sweeps' shapes;
+    a number without a name is ``class-N``.
+
+    Raises:
+        DataError: there are no sweeps or no labels, a file is damaged or another one, or sweeps of 1000 and 110 Hz
+            are mixed.
+    """
+    root = Path(folder).absolute()
+    paths = [path for name in FOLDERS for path in sorted((root / name).glob("*.npz"))]
+    if not paths:
+        raise DataError(f"The folders {', '.join(_present(root))} of {str(folder)!r} hold no sweeps (*.npz).")
+    return _open(root, tuple(_stamp(root, path) for path in paths))
+
+
+@functools.lru_cache(maxsize=2)
+def _open(root: Path, stamps: tuple[tuple[str, int, int], ...]) -> SweepTree:
+    every = _list(root, stamps)
+    if len(rates := np.unique(every.rate)) > 1:
+        first = [str(every.path[np.flatnonzero(every.rate == rate)[0]]) for rate in rates]
+        raise DataError(
+            f"{str(root)!r} mixes sweeps of 110 and 1000 Hz ({first[0]!r} and {first[1]!r}), whose frames lie 9.09 and "
+            "9 ms apart; put each set into a folder of its own."
+        )
+    kept = np.flatnonzero(every.label >= 0)
+    if not len(kept):
+        raise DataError(f"None of the {len(every.path)} sweeps of {str(root)!r} has a label; training needs classes.")
+    listed = Listed(*(column[kept] for column in every))
+    split = np.array([FOLDERS[path.partition("/")[0]] for path in listed.path.tolist()])
+    left_out = len(every.path) - len(kept)
+    tree = SweepTree(root, listed, split, _classes(root, listed), left_out)
+    _report(tree)
+    return tree
+
+
+def _report(tree: SweepTree) -> None:
+    told = {
+        "values equal those of the frame before, as the published cleaning fills gaps": tree.faults["repeated"],
+        "values are beyond 1000 mN or µN·m": tree.faults["too large"],
+        "values are missing": tree.faults["missing"],
+        "values of row 0 come from memory that nothing has written": tree.faults["unwritten"],
+        "sweeps have no label and are left out": tree.left_out,
+    }
+    if found := [f"{count} {what}" for what, count in told.items() if count]:
+        _LOG.warning("%s, %d sweeps: %s", tree.folder, len(tree.split), "; ".join(found))
+
+
+def _present(root: Path) -> list[str]:
+    return [name for name in FOLDERS if (root / name).is_dir()]
+
+
+def _stamp(root: Path, path: Path) -> tuple[str, int, int]:
+    state = path.stat()
+    return path.relative_to(root).as_posix(), state.st_size, state.st_mtime_ns
+
+
+def _list(root: Path, stamps: Sequence[tuple[str, int, int]]) -> Listed:
+    """List all files, part after part; a part that was listed before comes from the cache."""
+    parts: list[Listed] = []
+    with ThreadPoolExecutor(usable_processors()) as pool:
+        for first in range(0, len(stamps), _TOGETHER):
+            part = stamps[first : first + _TOGETHER]
+            kept = cache_dir("sweep-files") / f"{content_hash(str(root), part, _VERSION, length=24)}.npz"
+            if kept.is_file():
+                with np.load(kept, allow_pickle=False) as file:
+                    parts.append(Listed(**{name: file[name] for name in Listed._fields}))
+                continue
+            rows = list(pool.map(functools.partial(_row, root), [path for path, _, _ in part]))
+            parts.append(Listed(*map(np.array, zip(*rows, strict=True))))
+            with atomic_path(kept) as temporary:
+                np.savez(temporary, **parts[-1]._asdict())
+            if len(stamps) > _TOGETHER:
+                _LOG.info("%d of %d sweep files are listed", first + len(part), len(stamps))
+    return Listed(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
+
+
+def _row(root: Path, path: str) -> tuple[Any, ...]:
+    sweep = read_sweep(root / path)
+    label = -1 if sweep.label is None else sweep.label
+    faults = [int(where.sum()) for where in sweep.faulty().values()]
+    return path, sweep.shape, label, sweep.rate, sweep.conditions, faults, file_hash(root / path)
+
+
+def _classes(root: Path, listed: Listed) -> tuple[str, ...]:
+    """Return the name of every number from 0 to the largest: its category, or its shape where that tells more."""
+    path = root / "categories.json"
+    known: dict[str, int] = read_json(path) if path.is_file() else {}
+    if not isinstance(known, dict) or not all(isinstance(number, int) and number >= 0 for number in known.values()):
+        raise DataError(f"{str(path)!r} must map 'category/object' to the number of the class.")
+    shapes: defaultdict[int, set[str]] = defaultdict(set)
+    for shape, number in [*known.items(), *zip(listed.shape.tolist(), listed.label.tolist(), strict=True)]:
+        if known.get(shape, number) != number:
+            raise DataError(f"{shape!r} has the label {number} in a sweep and {known[shape]} in {str(path)!r}.")
+        shapes[number].add(shape)
+    if max(shapes) >= MOST_CLASSES:
+        raise DataError(f"A sweep of {str(root)!r} has the label {max(shapes)}; labels are 0 to {MOST_CLASSES - 1}.")
+    categories = {number: {shape.partition("/")[0] for shape in found} for number, found in shapes.items()}
+    owners = Counter(name for found in categories.values() for name in found)
+    return tuple(_name(number, categories.get(number), shapes.get(number), owners) for number in range(max(shapes) + 1))
+
+
+def _name(number: int, categories: set[str] | None, shapes: set[str] | None, owners: Mapping[str, int]) -> str:
+    for names in (categories or (), shapes or ()):
+        if len(names) == 1 and owners[name := next(iter(names))] <= 1:
+            return name
+    return f"class-{number}"

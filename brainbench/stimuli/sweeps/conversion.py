@@ -1,0 +1,212 @@
+"""Conversion of sweeps that others simulated into a data set of ours, shard by shard.
+
+Where the sweeps come from is the caller's: a table says what is known of each, and a function reads their forces.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import cached_property, partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from brainbench import __version__
+from brainbench.core.contracts import SWEEPS_FORMAT, SWEEPS_SCHEMA
+from brainbench.core.errors import DataError
+from brainbench.core.files import content_hash
+from brainbench.core.progress import Progress
+from brainbench.stimuli.objects.collections import NamedObject
+from brainbench.stimuli.objects.solid import Solid
+from brainbench.stimuli.sweeps.generation import write_data_set
+from brainbench.stimuli.sweeps.plan import USUAL_SHARD, shard_bytes, shard_name
+from brainbench.stimuli.sweeps.shards import (
+    OK,
+    UNSTABLE,
+    ShardContent,
+    encode_texts,
+    shard_attributes,
+    shard_tables,
+    write_shard,
+)
+from brainbench.stimuli.sweeps.split import SPLITS
+from brainbench.stimuli.whiskers.array import WhiskerArray
+
+
+@dataclass(frozen=True, eq=False)
+class SweepTable:
+    """What is known of the sweeps of a data set; arrays have one entry per sweep.
+
+    Raises:
+        DataError: sweeps of one object have different labels.
+    """
+
+    label: NDArray[np.integer]
+    """Index into ``classes``."""
+    object: NDArray[np.str_]
+    """Name of the object."""
+    split: NDArray[np.str_]
+    """One of :data:`~brainbench.stimuli.sweeps.split.SPLITS`."""
+    conditions: Mapping[str, NDArray[np.float64]]
+    """Speed, height, rotation, distance and size, as in :class:`~brainbench.stimuli.sweeps.grid.Sweep`."""
+    classes: tuple[str, ...]
+    times: NDArray[np.float64]
+    """Times of the frames [s]."""
+    source: str
+    """Description of where the sweeps come from."""
+    source_hash: str
+    """Hash of everything that their files say."""
+    read: Callable[[NDArray[np.int64]], NDArray[np.float32]]
+    """Function from numbers of sweeps to their forces [sweep, frame, whisker, 6] (N, N·m; NaN where they cannot be
+    trusted) of the 30 whiskers of the mouse's right side, in the order of that array."""
+    notes: Mapping[str, Any]
+    """Further entries of the manifest, such as counts of faults."""
+
+    def __post_init__(self) -> None:
+        names, owner = np.unique(self.object, return_inverse=True)
+        pairs = np.unique(np.stack([owner, self.label], axis=1), axis=0)
+        if len(pairs) > len(names):
+            twice = np.flatnonzero(np.bincount(pairs[:, 0]) > 1)[0]
+            labels = pairs[pairs[:, 0] == twice, 1].tolist()
+            raise DataError(f"The object {str(names[twice])!r} has the labels {labels}; an object has one label.")
+
+
+@dataclass(frozen=True, eq=False)
+class ConvertedShard:
+    """The sweeps of one shard."""
+
+    name: str
+    split: str
+    objects: tuple[NamedObject, ...]
+    index: NDArray[np.int64]
+    """Numbers of the sweeps in the table."""
+    config_hash: str
+    bytes: int
+
+    def __len__(self) -> int:
+        return len(self.index)
+
+
+@dataclass(frozen=True, eq=False)
+class ConversionPlan:
+    """The shards of a data set, in the order of the table within each split."""
+
+    table: SweepTable
+    shard_size: int = USUAL_SHARD
+
+    @property
+    def classes(self) -> tuple[str, ...]:
+        """Class labels."""
+        return self.table.classes
+
+    @property
+    def sweeps(self) -> int:
+        """Number of sweeps."""
+        return len(self.table.label)
+
+    @property
+    def notes(self) -> Mapping[str, Any]:
+        """Further entries of the manifest."""
+        return self.table.notes
+
+    @cached_property
+    def array(self) -> WhiskerArray:
+        """The whiskers."""
+        return WhiskerArray.mouse()
+
+    @cached_property
+    def config(self) -> dict[str, Any]:
+        """Plain values that determine every byte of the data set."""
+        return {
+            "format": SWEEPS_FORMAT,
+            "schema": SWEEPS_SCHEMA,
+            "recipe": self.table.source,
+            "source": self.table.source_hash,
+            "whiskers": {"names": list(self.array.names)},
+            "classes": list(self.classes),
+            "shard_size": self.shard_size,
+            "version": __version__,
+        }
+
+    @cached_property
+    def config_hash(self) -> str:
+        """Hash of :attr:`config`."""
+        return content_hash(self.config)
+
+    @cached_property
+    def objects(self) -> dict[str, NamedObject]:
+        """The objects by name; only their names are known."""
+        names, first = np.unique(self.table.object, return_index=True)
+        pairs = zip(names.tolist(), self.table.label[first].tolist(), strict=True)
+        return {
+            name: NamedObject(name, self.classes[label], self.table.source, partial(_no_solid, name))
+            for name, label in pairs
+        }
+
+    @cached_property
+    def shards(self) -> tuple[ConvertedShard, ...]:
+        """The shards, those of training first."""
+        found = []
+        for split in SPLITS:
+            mine = np.flatnonzero(self.table.split == split)
+            for place, first in enumerate(range(0, len(mine), self.shard_size)):
+                index = mine[first : first + self.shard_size]
+                objects = tuple(self.objects[name] for name in np.unique(self.table.object[index]).tolist())
+                size = shard_bytes(len(index), len(self.array), len(self.table.times))
+                name = shard_name(split, place)
+                found.append(ConvertedShard(name, split, objects, index, self.config_hash, size))
+        return tuple(found)
+
+    def read(self, shard: ConvertedShard) -> ShardContent:
+        """Read the sweeps of a shard; a whisker with missing values is marked as unstable."""
+        table, index = self.table, shard.index
+        wrench = np.ascontiguousarray(table.read(index), dtype="<f4")
+        bad = ~np.isfinite(wrench)
+        status = np.where(bad.any(axis=(1, 3)), UNSTABLE, OK).astype(np.uint8)
+        names = [item.name for item in shard.objects]
+        arrays = {
+            **shard_tables(self.array, table.times, self.classes, shard.objects, [""] * len(names)),
+            "sweep": index.astype(np.int64),
+            "label": table.label[index].astype(np.int32),
+            "owner": np.searchsorted(names, table.object[index]).astype(np.int32),
+            **{name: np.asarray(values[index], dtype=np.float64) for name, values in table.conditions.items()},
+            "draw": np.zeros(len(index), dtype=np.int32),
+            # Which whiskers touch is in no file of theirs.
+            "contact": np.full(status.shape, np.nan, dtype=np.float32),
+            "status": status,
+            "reason": encode_texts(f"{n} values cannot be trusted" if n else "" for n in bad.sum(axis=(1, 2, 3))),
+            "wrench": wrench,
+        }
+        return ShardContent(shard, arrays, shard_attributes(shard, self.config, "world", status, {}))
+
+
+def convert_sweeps(
+    table: SweepTable,
+    out: str | os.PathLike[str],
+    *,
+    shard_size: int = USUAL_SHARD,
+    progress: Progress | None = None,
+) -> dict[str, Any]:
+    """Write a data set of sweeps, one shard in memory at a time, and return its manifest.
+
+    A run that was killed goes on when it is started again, and ends with the same bytes.
+
+    Raises:
+        UsageError: the folder holds another data set, or another process is writing it.
+        DataError: a file cannot be read, or the disk is too small; finished shards are kept.
+    """
+    plan = ConversionPlan(table, shard_size)
+
+    def run(missing: Any, folder: Path, done: Callable[[int], None]) -> None:
+        for shard in missing:
+            done(write_shard(plan.read(shard), folder))
+
+    return write_data_set(plan, out, run, what="converting sweeps", progress=progress)
+
+
+def _no_solid(name: str) -> Solid:
+    raise DataError(f"Of the object {name!r} no more is known than its name.")

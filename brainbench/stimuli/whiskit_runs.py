@@ -1,0 +1,221 @@
+"""Results of WHISKiT Physics read as a stimulus set; :func:`brainbench.stimuli.whiskit.save_run` writes them.
+
+A run is a folder with ``whisker_ID.csv`` (names such as ``RC2``) and ``dynamics/Fx.csv`` … ``Mz.csv`` (line: time,
+column: whisker; mN and µN·m, world axes, action of the whisker on its base). ``kinematics`` are optional; only the
+contacts in ``kinematics/c`` are read. The simulator writes a line *before* it computes the frame: line 0 is memory that
+nothing has written, and the other lines hold the last of the sub-steps, not a mean.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import re
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+from brainbench.core.contracts import CHANNELS, GRID_SHAPE
+from brainbench.core.errors import DataError, DataFileNotFoundError, UsageError, listing, nearest, unknown_name
+from brainbench.stimuli.external import FRAME_STATUSES, assemble_stimulus_set
+from brainbench.stimuli.motion.recorded import read_numbers
+from brainbench.stimuli.scenes.frames import Frames
+from brainbench.stimuli.whiskers.selection import ROWS
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+Cleaning = Literal["mark", "published"]
+"""``mark``: values that cannot be trusted become missing (NaN) and their frames get a status. ``published``: what the
+released ``process_raw_dataset.py --process_values`` does: of 1000 rows 1, 10, … 982 are kept; a missing value becomes
+0; a value beyond 1000 becomes the last one that is not, or 0."""
+
+LARGEST = 1000.0
+"""Magnitude [mN, µN·m] beyond which no value is trusted."""
+_NAMES = [f"{side}{row}{col}" for side in "RL" for row in ROWS for col in range(GRID_SHAPE[1])]
+_SCALE = np.repeat([1e-3, 1e-6], 3)
+_ROWS = {1000: Frames(first=0.0, interval=0.001, count=1000), 110: Frames(first=0.0, interval=1 / 110, count=110)}
+"""Frames of a run by its number of rows, as the study ran them: one second at 1000 or 110 Hz."""
+_KEPT = Frames(first=0.001, interval=0.009, count=110)
+"""Frames that the published cleaning keeps of 1000."""
+
+
+@dataclass(frozen=True, eq=False)
+class WhiskitRun:
+    """One run as its files hold it."""
+
+    label: str
+    """Name of the folder."""
+    names: tuple[str, ...]
+    """Whiskers with their side: ``RC2``."""
+    dynamics: NDArray[np.float64]
+    """[row, whisker, channel] as written (mN, µN·m), with its missing and impossible values."""
+    contact: NDArray[np.bool_] | None
+    """[row, whisker] whether any link touches; None without kinematics."""
+
+
+def find_runs(folder: str | os.PathLike[str]) -> tuple[Path, ...]:
+    """Return the folder itself if it is a run, or else the runs in it, by name."""
+    root = Path(folder)
+    if (root / "whisker_ID.csv").is_file() or (root / "dynamics").is_dir():
+        return (root,)
+    return tuple(sorted({path.parent for name in ("whisker_ID.csv", "dynamics") for path in root.glob(f"*/{name}")}))
+
+
+def read_run(folder: str | os.PathLike[str]) -> WhiskitRun:
+    """Read one run without changing a value.
+
+    Raises:
+        DataError: a file is missing, the files do not fit together, or a whisker has no name of WHISKiT's.
+    """
+    root = Path(folder).absolute()
+    names = _names(root)
+    tables = {name: _table(root, name) for name in CHANNELS}
+    shapes = {name: table.shape for name, table in tables.items()}
+    for axis, what in enumerate(("rows", "columns")):
+        sizes = {name: shape[axis] for name, shape in shapes.items()}
+        needed = len(names) if axis else Counter(sizes.values()).most_common(1)[0][0]
+        if odd := [name for name, size in sizes.items() if size != needed]:
+            reason = "whisker_ID.csv has as many names" if axis else "as most of its components have"
+            raise DataError(
+                f"'dynamics/{odd[0]}.csv' of the run {str(root)!r} has {sizes[odd[0]]} {what}; it needs {needed}, "
+                f"{reason}."
+            )
+    dynamics = np.stack(list(tables.values()), axis=-1)
+    return WhiskitRun(root.name, names, dynamics, _contacts(root, names, len(dynamics)))
+
+
+def published_cleaning(dynamics: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the 110 rows [110, whisker, channel] of a run (mN, µN·m) that the released cleaning makes of it.
+
+    Raises:
+        UsageError: the run has neither 1000 nor 110 rows.
+    """
+    if len(dynamics) not in _ROWS:
+        raise UsageError(f"The published cleaning takes runs of 1000 or 110 rows; received {len(dynamics)}.")
+    kept = dynamics[1:983:9] if len(dynamics) == 1000 else dynamics
+    kept = np.where(np.isnan(kept), 0.0, kept)
+    good = np.abs(kept) <= LARGEST
+    rows = np.arange(len(kept))[:, None, None]
+    last = np.maximum.accumulate(np.where(good, rows, -1), axis=0)
+    filled = np.take_along_axis(kept, np.maximum(last, 0), axis=0)
+    return np.where(last < 0, 0.0, filled)
+
+
+def read_runs(
+    folders: Sequence[str | os.PathLike[str]], *, cleaning: Cleaning = "mark", rate: float | None = None
+) -> xr.Dataset:
+    """Read runs as one stimulus set in SI units, a stimulus per run.
+
+    ``frame_status`` [stimulus, time, whisker] says of every frame of a whisker whether it can be trusted
+    (:data:`~brainbench.stimuli.external.FRAME_STATUSES`), ``status`` and ``reason`` [stimulus, whisker] sum that up,
+    and the attribute ``faults`` counts the values (JSON). With ``cleaning="published"`` they tell what was replaced.
+
+    Args:
+        folders: one or more runs with the same whiskers and as many rows.
+        cleaning: one of :data:`Cleaning`.
+        rate: rows per second [Hz]; by the number of rows when None: 1000 and 110 rows are one second.
+
+    Raises:
+        UsageError: the rate is unknown, or an option is out of range.
+        DataError: a run cannot be read, or runs differ in whiskers or rows.
+    """
+    if cleaning not in get_args(Cleaning):
+        raise unknown_name("cleaning", cleaning, get_args(Cleaning))
+    runs = [read_run(folder) for folder in folders]
+    if not runs:
+        raise DataError("There is no run of WHISKiT (whisker_ID.csv and dynamics/) to be read.")
+    first = runs[0]
+    for run in runs[1:]:
+        if (run.names, len(run.dynamics)) != (first.names, len(first.dynamics)):
+            raise DataError(
+                f"The runs {first.label!r} and {run.label!r} differ in whiskers or rows ({len(first.names)} and "
+                f"{len(run.names)} whiskers, {len(first.dynamics)} and {len(run.dynamics)} rows); convert them apart."
+            )
+    raw = np.stack([run.dynamics for run in runs])
+    frames = _frames(len(first.dynamics), cleaning, rate)
+    rows = slice(1, 983, 9) if frames is _KEPT else slice(None)
+    bad = {"missing": np.isnan(raw), "too large": np.abs(raw) > LARGEST}
+    if cleaning == "published":
+        values = np.stack([published_cleaning(run.dynamics) for run in runs])
+    else:
+        values = np.where(bad["missing"] | bad["too large"], math.nan, raw)
+    frame_status = np.zeros(raw.shape[:3], dtype=np.uint8)
+    frame_status[:, 0] = FRAME_STATUSES.index("unwritten")
+    for name, where in bad.items():
+        frame_status[where.any(axis=-1)] = FRAME_STATUSES.index(name)
+    touching = None if any(run.contact is None for run in runs) else np.stack([run.contact for run in runs])
+    if rows == slice(None):
+        bad["unwritten"] = np.zeros(raw.shape, dtype=bool)
+        bad["unwritten"][:, 0] = (raw[:, 0] != 0) & (np.abs(raw[:, 0]) <= LARGEST)
+    counted = {name: where[:, rows].sum(axis=(1, 2, 3)).tolist() for name, where in bad.items()}
+    faults = {
+        run.label: {name: counts[i] for name, counts in counted.items() if counts[i]} for i, run in enumerate(runs)
+    }
+    return assemble_stimulus_set(
+        [run.label for run in runs],
+        values * _SCALE,
+        first.names,
+        frames,
+        backend="whiskit",
+        frame_status=frame_status[:, rows],
+        contact=None if touching is None else touching[:, rows],
+        about={"cleaning": cleaning, "faults": faults},
+    )
+
+
+def _frames(rows: int, cleaning: Cleaning, rate: float | None) -> Frames:
+    if cleaning == "published" and rows == 1000:
+        return _KEPT
+    if rate is None and rows not in _ROWS:
+        raise UsageError(
+            f"A run of {rows} rows does not tell its times; say how many rows make a second, as --rate does (1000 and "
+            "110 rows are taken as one second)."
+        )
+    if rate is not None and not 0 < rate < math.inf:
+        raise UsageError(f"The rate is a positive number of rows per second [Hz]; received {rate!r}.")
+    return _ROWS[rows] if rate is None else Frames(first=0.0, interval=1 / rate, count=rows)
+
+
+def _names(root: Path) -> tuple[str, ...]:
+    path = root / "whisker_ID.csv"
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines()
+    except FileNotFoundError as error:
+        message = f"There is no file {str(path)!r}; it names the columns of a WHISKiT run."
+        raise DataFileNotFoundError(message) from error
+    except UnicodeDecodeError as error:
+        raise DataError(f"{str(path)!r} is not a text file ({error}).") from error
+    names = [name for line in lines for name in re.split(r"[,\s]+", line.strip()) if name]
+    for name in names:
+        if name not in _NAMES:
+            guess = nearest(name, _NAMES)
+            hint = f"; did you mean {guess!r}?" if guess else "."
+            raise DataError(f"{str(path)!r} names a whisker {name!r}; a name is side, row and column such as RC2{hint}")
+    if not names or len(set(names)) < len(names):
+        raise DataError(f"{str(path)!r} must name each whisker once; it has {listing(names)}.")
+    return tuple(names)
+
+
+def _table(root: Path, name: str) -> NDArray[np.float64]:
+    path = root / "dynamics" / f"{name}.csv"
+    if not path.is_file():
+        needed = ", ".join(f"{channel}.csv" for channel in CHANNELS)
+        raise DataFileNotFoundError(f"There is no file {str(path)!r}; the dynamics of a WHISKiT run are {needed}.")
+    return read_numbers(path)
+
+
+def _contacts(root: Path, names: Sequence[str], rows: int) -> NDArray[np.bool_] | None:
+    """Return whether any link of a whisker touches [row, whisker]; None where nobody wrote it."""
+    paths = [root / "kinematics" / "c" / f"{name}.csv" for name in names]
+    if not all(path.is_file() for path in paths):
+        return None
+    flags = [(read_numbers(path) != 0).any(axis=1) for path in paths]
+    if odd := [path for path, flag in zip(paths, flags, strict=True) if len(flag) != rows]:
+        raise DataError(f"{str(odd[0])!r} has another number of rows than the {rows} of dynamics.")
+    return np.stack(flags, axis=1)

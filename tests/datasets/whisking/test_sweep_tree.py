@@ -1,0 +1,137 @@
+import json
+import os
+import zipfile
+
+import numpy as np
+import pytest
+
+from brainbench.core.errors import DataError
+from brainbench.datasets.whisking.dataset import WhiskingDataset
+from tests.factories.published_sweeps import sweep_data, write_sweep, write_tree
+
+
+@pytest.fixture(scope="module")
+def tree(tmp_path_factory):
+    return write_tree(tmp_path_factory.mktemp("tree"))
+
+
+@pytest.mark.shared
+def test_the_reference_tree_gives_the_input_of_the_published_networks(reference, tmp_path):
+    zipfile.ZipFile(reference / "published" / "sweep_tree.zip").extractall(tmp_path)
+    (tmp_path / "categories.json").write_text((reference / "published" / "categories.json").read_text())
+    names = {"train": "train", "validation": "validate", "test": "test"}
+    for split, name in names.items():
+        data = WhiskingDataset(tmp_path, split=split, batch_size=2, shuffle=False)
+        (x, y) = next(iter(data))
+        files = [np.load(tmp_path / name / f"{number:08d}.npz") for number in range(2)]
+        # Channel 6 · sub-step + component, five samples to a step, cells row by row; mN and µN·m.
+        raw = np.stack([f["data"].reshape(22, 5, 5, 7, 6).transpose(0, 1, 4, 2, 3) for f in files])
+        raw = raw * np.repeat([1e-3, 1e-6], 3)[:, None, None]
+        np.testing.assert_allclose(x.numpy(), raw.reshape(2, 22, 30, 5, 7), rtol=1e-6)
+        assert y.tolist() == [int(f["label"]) for f in files]
+        assert [data.classes[label] for label in y.tolist()] == [str(f["shape"]).split("/")[0] for f in files]
+    assert len(data.classes) == 117
+    assert data.manifest["faults"]["repeated"] == 36
+
+
+def test_sweeps_are_shuffled_and_batches_go_on_where_a_state_was_saved(tree):
+    first, second = (WhiskingDataset(tree, batch_size=2, seed=3) for _ in range(2))
+    kept = []
+    for number, (x, y) in enumerate(first):
+        if number == 0:
+            state = json.loads(json.dumps(first.state_dict()))
+        else:
+            kept.append((x.clone(), y))
+    assert first.order(0).tolist() != sorted(first.order(0).tolist())
+    second.load_state_dict(state)
+    for (x, y), (again, label) in zip(kept, second, strict=True):
+        np.testing.assert_array_equal(x.numpy(), again.numpy())
+        assert y.tolist() == label.tolist()
+
+
+def test_classes_keep_their_numbers_and_take_names_from_the_shapes(tree):
+    assert WhiskingDataset(tree, batch_size=2).classes == ("03211117", "class-1", "04530566", "class-3", "03593526")
+    assert WhiskingDataset(tree, split="all", batch_size=2).sweeps == 16
+
+
+def test_names_come_from_the_categories_beside_the_sweeps(tmp_path):
+    write_tree(tmp_path)
+    (tmp_path / "categories.json").write_text(json.dumps({"02691156/plane": 1, "02691156/jet": 3, "0/x": 3, "9/y": 5}))
+    names = WhiskingDataset(tmp_path, batch_size=2).classes
+    assert names == ("03211117", "02691156/plane", "04530566", "class-3", "03593526", "9")
+
+
+def test_sweeps_without_a_label_are_left_out_and_all_faults_are_said_once(tmp_path, caplog):
+    write_tree(tmp_path, rate=110)
+    write_sweep(tmp_path / "train" / "a.npz", label="?", rate=110)
+    write_sweep(tmp_path / "train" / "b.npz", leave_out=("label",), rate=110)
+    data = sweep_data(3, cells=30)
+    data[4, 2, 0], data[5, 2, 0], data[0, 1, 1] = np.nan, 2e3, 1.0
+    write_sweep(tmp_path / "train" / "c.npz", data=data, rate=110)
+    sets = [WhiskingDataset(tmp_path, split=split, batch_size=2) for split in ("all", "train")]
+    assert sets[0].manifest["left_out"] == 2
+    assert sets[0].manifest["faults"] == {"repeated": 0, "too large": 1, "missing": 1, "unwritten": 1}
+    assert (sets[1].sweeps, sets[1].skipped) == (8, 1)
+    zeros = WhiskingDataset(tmp_path, batch_size=9, shuffle=False, unstable="zero", view="raw")
+    assert np.isfinite(next(iter(zeros)).input.numpy()).all()
+    assert len(caplog.records) == 1
+    assert "2 sweeps have no label" in caplog.text
+
+
+def test_a_file_that_changed_is_found(tmp_path):
+    write_tree(tmp_path)
+    data = WhiskingDataset(tmp_path, split="test", batch_size=2)
+    data.verify()
+    write_sweep(tmp_path / "test" / "00000001.npz", seed=77)
+    with pytest.raises(DataError, match=r"00000001\.npz"):
+        data.verify()
+    assert WhiskingDataset(tmp_path, split="test", batch_size=2).state_dict() != data.state_dict()
+
+
+def _mix(folder):
+    write_sweep(folder / "test" / "z.npz", rate=110)
+
+
+def _damage(folder):
+    os.truncate(folder / "test" / "00000002.npz", 900)
+
+
+def _relabel(folder):
+    (folder / "categories.json").write_text('{"04530566/boat": 3}')
+
+
+def _list_categories(folder):
+    (folder / "categories.json").write_text('["04530566/boat"]')
+
+
+def _number_wildly(folder):
+    write_sweep(folder / "test" / "z.npz", label=10**9)
+
+
+@pytest.mark.parametrize(
+    ("spoil", "culprit"),
+    [
+        (_mix, "1000 Hz"),
+        (_damage, r"00000002\.npz"),
+        (_relabel, "04530566/boat"),
+        (_list_categories, r"categories\.json"),
+        (_number_wildly, "1000000000"),
+    ],
+)
+def test_a_folder_that_cannot_be_used_is_refused_before_any_batch(tmp_path, spoil, culprit):
+    spoil(write_tree(tmp_path))
+    with pytest.raises(DataError, match=culprit):
+        WhiskingDataset(tmp_path, batch_size=2)
+
+
+def test_folders_without_sweeps_labels_or_splits_are_refused(tmp_path):
+    (tmp_path / "empty" / "train").mkdir(parents=True)
+    with pytest.raises(DataError, match="train"):
+        WhiskingDataset(tmp_path / "empty")
+    with pytest.raises(DataError, match="label"):
+        WhiskingDataset(write_tree(tmp_path / "mute", leave_out=("label",)))
+    write_sweep(tmp_path / "flat" / "0.npz")
+    with pytest.raises(DataError, match="train, validate and test"):
+        WhiskingDataset(tmp_path / "flat")
+    with pytest.raises(DataError, match="'validation'"):
+        WhiskingDataset(write_tree(tmp_path / "part", (4, 0, 2)), split="validation", batch_size=2)
