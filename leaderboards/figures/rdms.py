@@ -83,7 +83,8 @@ def rdm_lines(board: Board) -> Figure:
     lines = [("brain", truth[known])]
     for name, pairs in models:
         # Comparisons by correlation ignore scale and offset: least squares puts each RDM on the brain's.
-        slope, offset = np.polyfit(pairs[known], truth[known], 1) if np.ptp(pairs[known]) > 0 else (0.0, truth.mean())
+        flat = np.ptp(pairs[known]) == 0
+        slope, offset = (0.0, truth[known].mean()) if flat else np.polyfit(pairs[known], truth[known], 1)
         lines.append((name, offset + slope * pairs[known]))
     drawing = Drawing(WIDTH, 300, f"{len(lines)} flattened dissimilarity matrices of {known.sum()} pairs")
     means = [np.array([values[group].mean() for group in groups]) for _, values in lines]

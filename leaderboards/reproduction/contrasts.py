@@ -4,8 +4,8 @@ A contrast is the mean of matched comparisons, each the mean of some networks mi
 two parts, which are added, with the degrees of freedom of Welch and Satterthwaite:
 
 - *training*: with three comparisons or more their variance over the comparisons; with fewer the variance over seeds,
-  pooled over the networks of the same objectives that were trained more than once (of differences seed by seed where
-  the two networks of a comparison begin from the same initial state);
+  pooled over the networks of the same objectives that were trained more than once, or of all objectives where there are
+  none (of differences seed by seed where the two networks of a comparison begin from the same initial state);
 - *test*: of accuracies the binomial variance over test sweeps, as if every network had its own; of fits the variance
   over animals and stimuli (:func:`brainbench.core.statistics.two_factor_error`).
 """
@@ -174,7 +174,9 @@ def _training(
     if not trained:
         return 0.0, 1.0
     objectives = {item.objective for item in trained.values()}
-    variance, freedom = _pooled([list(item.seeds.values()) for item in pool if item.objective in objectives])
+    repeated = [item for item in pool if item.objective and len(item.seeds) > 1]
+    same = [item for item in repeated if item.objective in objectives]
+    variance, freedom = _pooled([list(item.seeds.values()) for item in same or repeated])
     return variance * sum(weights[name] ** 2 / len(item.seeds) for name, item in trained.items()), freedom
 
 

@@ -52,14 +52,10 @@ def write_page(campaign: Campaign, out: str | os.PathLike[str]) -> tuple[list[Pa
         "absent": [figure for figure in figures if figure.drawing is None],
         "left_out": _left_out(campaign),
     }
-    text = "\n".join(line.rstrip() for line in render_markdown("reproduction.md.j2", **values).splitlines())
-    images = [
-        write_text(out / file, standalone(figure.drawing, follow=True)) for figure, file in drawn if figure.drawing
-    ]
-    return [write_text(out / PAGE, re.sub(r"\n{3,}", "\n\n", text) + "\n"), *images], [
-        *accuracy,
-        *(fit[0] if fit else []),
-    ]
+    lines = (line.rstrip() for line in render_markdown("reproduction.md.j2", **values).splitlines())
+    text = re.sub(r"\n{3,}", "\n\n", "\n".join(lines)) + "\n"
+    images = [write_text(out / file, standalone(one.drawing, follow=True)) for one, file in drawn if one.drawing]
+    return [write_text(out / PAGE, text), *images], [*accuracy, *(fit[0] if fit else [])]
 
 
 def _figures(campaign: Campaign) -> list[Figure]:
