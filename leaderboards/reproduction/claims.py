@@ -33,6 +33,7 @@ from leaderboards.reproduction.measures import (
 )
 
 SYNTHETIC_REASON = "the animals are synthetic"
+FIT_MEASURES = ("fit", "accuracy-fit", "parameters-fit", "layers", "blocks")
 GOAL = 0.8
 """Kendall's τ that the rankings of two seeds should reach."""
 
@@ -103,7 +104,10 @@ def judge_accuracy(campaign: Campaign) -> list[Judgement]:
 
 
 def judge_fit(campaign: Campaign, place: int) -> list[Judgement]:
-    """Judge the claims on neural fit on one board."""
+    """Judge the claims on neural fit on one board; without any board all are of networks not trained yet."""
+    if not campaign.boards:
+        claims = [claim for claim in published_claims() if claim.measure in FIT_MEASURES]
+        return [Judgement(claim, None, "not trained yet", "not trained yet") for claim in claims]
     board, fit = campaign.boards[place], fits(campaign, place)
     lacks = lacking(
         max((len(entry.score.subjects) for entry in board.entries), default=0),

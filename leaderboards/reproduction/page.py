@@ -34,7 +34,7 @@ def write_page(campaign: Campaign, out: str | os.PathLike[str]) -> tuple[list[Pa
     """Write the page with its figures into a folder; return its files, the page first, and the judgements on it."""
     out = Path(out)
     accuracy = judge_accuracy(campaign)
-    fit = [judge_fit(campaign, place) for place in range(len(campaign.boards))]
+    fit = [judge_fit(campaign, place) for place in range(max(1, len(campaign.boards)))]
     figures = _figures(campaign)
     drawn = [(figure, f"{_FIGURES}/{figure.key}.svg") for figure in figures if figure.drawing is not None]
     values = {
@@ -43,7 +43,7 @@ def write_page(campaign: Campaign, out: str | os.PathLike[str]) -> tuple[list[Pa
         "counts": _counts(accuracy, fit),
         "accuracy": [_accuracy_row(item) for item in accuracy],
         "boards": [board_name(board) for board in campaign.boards],
-        "fit": [_fit_row(items) for items in zip(*fit, strict=True)],
+        "fit": [_fit_row(items, bool(campaign.boards)) for items in zip(*fit, strict=True)],
         "goal": GOAL,
         "seeds": _seed_rows(campaign),
         "networks": _network_rows(campaign),
@@ -55,7 +55,7 @@ def write_page(campaign: Campaign, out: str | os.PathLike[str]) -> tuple[list[Pa
     lines = (line.rstrip() for line in render_markdown("reproduction.md.j2", **values).splitlines())
     text = re.sub(r"\n{3,}", "\n\n", "\n".join(lines)) + "\n"
     images = [write_text(out / file, standalone(one.drawing, follow=True)) for one, file in drawn if one.drawing]
-    return [write_text(out / PAGE, text), *images], [*accuracy, *(fit[0] if fit else [])]
+    return [write_text(out / PAGE, text), *images], [*accuracy, *fit[0]]
 
 
 def _figures(campaign: Campaign) -> list[Figure]:
@@ -92,7 +92,7 @@ def _counts(accuracy: Sequence[Judgement], fit: Sequence[Sequence[Judgement]]) -
         return f"{name}: " + ", ".join(f"{verdict} {count}" for verdict, count in Counter(verdicts).most_common())
 
     lines = [told("Accuracy and training", (item.verdict for item in accuracy))]
-    return lines + ([told("Neural fit", (item.verdict for item in fit[0]))] if fit else ["Neural fit: no record yet"])
+    return [*lines, told("Neural fit", (item.verdict for item in fit[0]))]
 
 
 def _effect(effect: Effect | None) -> str:
@@ -122,10 +122,10 @@ def _verdict(item: Judgement) -> str:
     return item.verdict + (f": {item.reason}" if item.reason else "")
 
 
-def _fit_row(items: Sequence[Judgement]) -> tuple[str, ...]:
+def _fit_row(items: Sequence[Judgement], scored: bool) -> tuple[str, ...]:
     """Return the row of one claim, with what the rule says on each board; the verdict is that of the first."""
     first = items[0]
-    cells = [_effect(one.effect) + (f", {one.rule}" if one.effect else "") for one in items]
+    cells = [_effect(one.effect) + (f", {one.rule}" if one.effect else "") for one in items if scored]
     return (first.claim.claim, _published(first), *cells, _verdict(first))
 
 

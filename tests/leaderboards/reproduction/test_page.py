@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import re
+from pathlib import Path
 from xml.etree import ElementTree
 
 import pytest
 
-from leaderboards.reproduction.campaign import join_campaign
-from leaderboards.reproduction.page import write_page
+from leaderboards.reproduction.campaign import join_campaign, read_campaign
+from leaderboards.reproduction.page import PAGE, write_page
 from tests.factories.campaigns import draw_campaign
+
+ROOT = Path(__file__).parents[3]
 
 
 @pytest.fixture(scope="module")
@@ -53,10 +56,19 @@ def test_figures_of_the_study_are_drawn_for_light_and_dark(written):
         assert path.relative_to(files[0].parent).as_posix() in text
 
 
+@pytest.mark.slow
+def test_the_page_of_the_documentation_is_that_of_the_campaign_beside_the_code(tmp_path):
+    folder = ROOT / "leaderboards" / "reproduction"
+    begun = (folder / "trainings.jsonl").exists() or (folder / "records").exists()
+    files, _ = write_page(read_campaign(folder) if begun else join_campaign([], []), tmp_path)
+    assert files[0].read_text(encoding="utf-8") == (ROOT / "docs" / PAGE).read_text(encoding="utf-8")
+
+
 def test_a_campaign_without_records_or_of_nothing_gives_a_page(tmp_path):
     lines = draw_campaign(1).trainings
     text = write_page(join_campaign(lines, []), tmp_path)[0][0].read_text(encoding="utf-8")
     assert "No network has been scored yet" in text
+    assert "| Trained networks fit better than the raw input |" in text
     assert "not scored yet" in text
     text = write_page(join_campaign([], []), tmp_path)[0][0].read_text(encoding="utf-8")
     assert "not trained yet" in text
