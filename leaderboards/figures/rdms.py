@@ -11,9 +11,11 @@ from dataclasses import dataclass
 from html import escape
 from itertools import combinations
 
+import numpy as np
+
 from leaderboards.boards import RAW_INPUT, Board
 from leaderboards.figures.plots import WIDTH, Figure, cut
-from leaderboards.figures.svg import Drawing
+from leaderboards.figures.svg import Drawing, Scale, scale_of, tick_text
 from leaderboards.standing import DOUBTFUL
 from leaderboards.text import number
 
@@ -21,6 +23,8 @@ from leaderboards.text import number
 # colour-blind readers.
 _VIRIDIS = ("440154", "472d7b", "3b528b", "2c728e", "21918c", "28ae80", "5ec962", "addc30", "fde725")
 _LEVELS = 254
+MOST_GROUPS = 60
+"""Most points of a line over pairs of stimuli."""
 
 
 @dataclass(frozen=True)
@@ -37,23 +41,9 @@ class RdmPicture:
 
 
 def rdm_panel(board: Board) -> Figure:
-    """Draw the RDMs of the raw input, of the best models of each kind and of the brain (figure 3.5)."""
-    key, title, entries = "rdms", "Representational dissimilarity (as figure 3.5)", board.entries
-    picked: list[tuple[str, str, Sequence[float]]] = []
-    raw = next((b.score for b in board.baselines if b.name == RAW_INPUT), None)
-    if raw is not None and raw.model_rdm:
-        picked.append((RAW_INPUT, f"score {number(raw.scaled)}", raw.model_rdm))
-    for label, test in (
-        ("supervised", lambda e: e.card.objective == "supervised"),
-        ("self-supervised", lambda e: e.trained and e.card.objective != "supervised"),
-        ("untrained", lambda e: not e.trained),
-    ):
-        best = next((e for e in entries if e.score.model_rdm and e.standing not in DOUBTFUL and test(e)), None)
-        if best is not None:
-            picked.append((f"best {label}", f"{best.name}, {best.score.layer}", best.score.model_rdm))
-    brain = next((e.score.brain_rdm for e in entries if e.score.brain_rdm), ())
-    if brain:
-        picked.append(("brain", board.recordings, brain))
+    """Draw the RDMs of the raw input, of the best models of each kind and of the brain (figure 3.5 a to d)."""
+    key, title = "rdms", "Representational dissimilarity (as figure 3.5)"
+    picked = _picked(board)
     size = len(board.conditions)
     pictures = [(name, detail, rdm_picture(pairs, board.conditions)) for name, detail, pairs in picked]
     drawn = [(name, detail, picture) for name, detail, picture in pictures if picture is not None]
@@ -72,6 +62,70 @@ def rdm_panel(board: Board) -> Figure:
         "matrix over its own range, as comparisons by correlation ignore scale."
     )
     return Figure(key, title, caption, drawing)
+
+
+def rdm_lines(board: Board) -> Figure:
+    """Draw the same RDMs as lines over the pairs of stimuli, each scaled to fit the brain's (figure 3.5 e).
+
+    Pairs stand in the order of the brain's dissimilarity; many pairs are averaged in groups of equal size.
+    """
+    key, title = "rdm-lines", "Flattened dissimilarity matrices (as figure 3.5 e)"
+    *models, brain = [(name, np.asarray(pairs, dtype=np.float64)) for name, _, pairs in _picked(board)] or [("", None)]
+    if brain[0] != "brain" or brain[1] is None or not models:
+        return Figure(key, title, lacking="no record holds the RDMs of a model and of the brain")
+    truth = brain[1]
+    models = [(name, pairs) for name, pairs in models if pairs.shape == truth.shape]
+    known = np.isfinite([truth, *(pairs for _, pairs in models)]).all(axis=0)
+    if known.sum() < 3:
+        return Figure(key, title, lacking="fewer than 3 pairs of stimuli are defined in all RDMs")
+    order = np.argsort(truth[known], kind="stable")
+    groups = np.array_split(order, min(len(order), MOST_GROUPS))
+    lines = [("brain", truth[known])]
+    for name, pairs in models:
+        # Comparisons by correlation ignore scale and offset: least squares puts each RDM on the brain's.
+        flat = np.ptp(pairs[known]) == 0
+        slope, offset = (0.0, truth[known].mean()) if flat else np.polyfit(pairs[known], truth[known], 1)
+        lines.append((name, offset + slope * pairs[known]))
+    drawing = Drawing(WIDTH, 300, f"{len(lines)} flattened dissimilarity matrices of {known.sum()} pairs")
+    means = [np.array([values[group].mean() for group in groups]) for _, values in lines]
+    across = Scale(0, len(groups) - 1, 56, WIDTH - 170)
+    up = scale_of(np.concatenate(means).tolist(), 262, 16, floor=None)
+    for tick in up.ticks:
+        drawing.line(56, up.at(tick), WIDTH - 170, up.at(tick), "grid")
+        drawing.text(48, up.at(tick) + 4, tick_text(tick), "end quiet")
+    drawing.text((56 + WIDTH - 170) / 2, 286, "pairs of stimuli, by the brain's dissimilarity", "mid")
+    for place, ((name, _), values) in enumerate(zip(lines, means, strict=True)):
+        points = "L".join(f"{across.at(i):.1f} {up.at(value):.1f}" for i, value in enumerate(values))
+        drawing.path(f"M{points}", f"trace c{place}")
+        drawing.mark(WIDTH - 156, 20 + 18 * place, "square", f"c{place}", size=4)
+        drawing.text(WIDTH - 144, 24 + 18 * place, cut(name, 24), "small")
+    few = f" in {len(groups)} groups" if len(groups) < known.sum() else ""
+    caption = (
+        f"{known.sum()} pairs of stimuli{few} in the order of the brain's dissimilarity; the other matrices are scaled "
+        "to it by least squares. A line that rises with the brain's orders the pairs as the brain does."
+    )
+    return Figure(key, title, caption, drawing)
+
+
+def _picked(board: Board) -> list[tuple[str, str, Sequence[float]]]:
+    """Return name, detail and pairs of the RDMs that are shown, the brain's last."""
+    entries = board.entries
+    picked: list[tuple[str, str, Sequence[float]]] = []
+    raw = next((b.score for b in board.baselines if b.name == RAW_INPUT), None)
+    if raw is not None and raw.model_rdm:
+        picked.append((RAW_INPUT, f"score {number(raw.scaled)}", raw.model_rdm))
+    for label, test in (
+        ("supervised", lambda e: e.card.objective == "supervised"),
+        ("self-supervised", lambda e: e.trained and e.card.objective != "supervised"),
+        ("untrained", lambda e: not e.trained),
+    ):
+        best = next((e for e in entries if e.score.model_rdm and e.standing not in DOUBTFUL and test(e)), None)
+        if best is not None:
+            picked.append((f"best {label}", f"{best.name}, {best.score.layer}", best.score.model_rdm))
+    brain = next((e.score.brain_rdm for e in entries if e.score.brain_rdm), ())
+    if brain:
+        picked.append(("brain", board.recordings, brain))
+    return picked
 
 
 def rdm_picture(pairs: Sequence[float], labels: Sequence[str]) -> RdmPicture | None:

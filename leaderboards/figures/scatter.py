@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -20,22 +20,57 @@ _SHAPES = {"supervised": "square", "simclr": "cross", "simsiam": "up", "ae": "do
 
 
 def accuracy_against_fit(entries: Sequence[Entry]) -> Figure:
-    """Draw the task accuracy against the neural fit, with regression and its interval (figure 3.8 a, b)."""
-    key, title = "accuracy-fit", "Task accuracy against neural fit (as figure 3.8)"
-    points = [(e.card.top1, e.scaled, e) for e in entries if e.card.top1 is not None and _trusted(e)]
-    if len(points) < 3:
-        lacking = f"{len(points)} records state both a task accuracy and a trusted score; at least 3 are needed"
-        return Figure(key, title, lacking=lacking)
-    return scatter(key, title, points, "top-1 accuracy", fit=True)
+    """Draw the task accuracy against the neural fit, with regression and its interval (figure 3.8 a)."""
+    return _accuracy_fit("accuracy-fit", "Task accuracy against neural fit (as figure 3.8 a)", entries)
+
+
+def supervised_accuracy_against_fit(entries: Sequence[Entry]) -> Figure:
+    """Draw the same of supervised networks alone (figure 3.8 b)."""
+    supervised = [entry for entry in entries if entry.card.objective == "supervised"]
+    title = "Accuracy of supervised networks against neural fit (as figure 3.8 b)"
+    return _accuracy_fit("supervised-fit", title, supervised, "supervised ")
 
 
 def parameters_against_fit(entries: Sequence[Entry]) -> Figure:
-    """Draw the number of parameters against the neural fit (figure 3.3)."""
-    key, title = "parameters", "Parameters against neural fit (as figure 3.3)"
+    """Draw the number of parameters against the neural fit (figure 3.3 b)."""
+    key, title = "parameters", "Parameters against neural fit (as figure 3.3 b)"
     points = [(float(e.card.parameters), e.scaled, e) for e in entries if e.card.parameters and _trusted(e)]
     if len(points) < 2:
         return Figure(key, title, lacking="fewer than 2 records state parameters and have a trusted score")
     return scatter(key, title, points, "parameters", log=True)
+
+
+def parameters_against_accuracy(entries: Sequence[Entry]) -> Figure:
+    """Draw the number of parameters against the task accuracy (figure 3.3 c)."""
+    key, title = "parameters-accuracy", "Parameters against task accuracy (as figure 3.3 c)"
+    label, read = _accuracy_of(entries)
+    found = [(e.card.parameters, read(e), e) for e in entries]
+    points = [(float(count), value, e) for count, value, e in found if count and value is not None]
+    if len(points) < 2:
+        return Figure(key, title, lacking="fewer than 2 records state both parameters and a task accuracy")
+    return scatter(key, title, points, "parameters", up_label=label, log=True)
+
+
+def _accuracy_fit(key: str, title: str, entries: Sequence[Entry], kind: str = "") -> Figure:
+    label, read = _accuracy_of(entries)
+    points = [(value, e.scaled, e) for e in entries if (value := read(e)) is not None and _trusted(e)]
+    if len(points) < 3:
+        lacking = f"{len(points)} {kind}records state both a task accuracy and a trusted score; at least 3 are needed"
+        return Figure(key, title, lacking=lacking)
+    return scatter(key, title, points, label, fit=True)
+
+
+def _accuracy_of(entries: Sequence[Entry]) -> tuple[str, Callable[[Entry], float | None]]:
+    """Return which accuracy is drawn, with what reads it: top-5 where all entries with an accuracy state it."""
+    stated = [entry.card for entry in entries if entry.card.top1 is not None]
+    name = "top5" if stated and all(card.top5 is not None for card in stated) else "top1"
+
+    def read(entry: Entry) -> float | None:
+        cards = [record.card for record in entry.records if record.card is not None]
+        values = [value for card in cards if (value := getattr(card, name)) is not None]
+        return math.fsum(values) / len(values) if values else None
+
+    return f"{name[:3]}-{name[3:]} accuracy", read
 
 
 def regression(x: Sequence[float], y: Sequence[float]) -> tuple[float, float, float, Interval | None]:
@@ -61,6 +96,7 @@ def scatter(
     points: Sequence[tuple[float, float, Entry]],
     label: str,
     *,
+    up_label: str = "neural fit",
     log: bool = False,
     fit: bool = False,
 ) -> Figure:
@@ -80,13 +116,13 @@ def scatter(
         drawing.line(across.at(tick), 16, across.at(tick), bottom, "grid")
         drawing.text(across.at(tick), bottom + 18, tick_text(tick), "mid quiet")
     drawing.text((left + WIDTH - 190) / 2, height - 8, label, "mid")
-    drawing.text(left - 44, 12, "neural fit", "")
+    drawing.text(left - 44, 12, up_label, "")
     caption = fitted(drawing, across, up, xs, ys) if fit else ""
     colour = colours(encoder_of(entry) for *_, entry in points)
     for x, y, entry in points:
         kind = colour[encoder_of(entry)]
         shape = _SHAPES.get(entry.card.objective or "", "diamond")
-        drawing.mark(across.at(x), up.at(y), shape, kind, f"{entry.name}: {label} {x:g}, fit {number(y)}", 4.5)
+        drawing.mark(across.at(x), up.at(y), shape, kind, f"{entry.name}: {label} {x:g}, {up_label} {number(y)}", 4.5)
     objectives = dict.fromkeys(entry.card.objective or "not stated" for *_, entry in points)
     legend = [(name, "dot", kind) for name, kind in colour.items()]
     legend += [(name, _SHAPES.get(name, "diamond"), "c0") for name in objectives]

@@ -45,7 +45,7 @@ def test_figures_that_the_records_cannot_fill_say_what_they_lack(make_record):
     assert "at least 3 are needed" in figures["accuracy-fit"].lacking
     assert "more than one augmentation" in figures["augmentation"].lacking
     assert "more than one share of masked steps" in figures["masking"].lacking
-    assert {key for key, figure in figures.items() if figure.drawing} == {"fit", "layers", "rdms"}
+    assert {key for key, figure in figures.items() if figure.drawing} == {"fit", "layers", "rdms", "rdm-lines"}
 
 
 def test_every_figure_is_drawn_when_the_records_hold_what_it_needs(make_record):
@@ -54,6 +54,7 @@ def test_every_figure_is_drawn_when_the_records_hold_what_it_needs(make_record):
     ]
     for i, augmentation in enumerate(("physical", "image", "none")):
         records.append(_trained(make_record(f"net.{i}", 0.5 + 0.1 * i), "simclr", augmentation, top1=0.1 + 0.1 * i))
+        records.append(_trained(make_record(f"net.s{i}", 0.4 + 0.1 * i), top1=0.3 + 0.1 * i))
     records.append(_trained(make_record("net.3", 0.9), "simclr", "physical", 0.75, top1=0.5))
     figures = _figures(*records)
     assert [key for key, figure in figures.items() if figure.drawing is None] == []
@@ -65,6 +66,21 @@ def test_every_figure_is_drawn_when_the_records_hold_what_it_needs(make_record):
         assert "nan" not in figure.drawing.render()
     assert "r = " in figures["accuracy-fit"].caption
     assert any("untrained twin 0.300" in text for text in _texts(figures["fit"].drawing))
+
+
+def test_only_supervised_networks_enter_their_own_panel(make_record):
+    records = [_trained(make_record(f"net.s{i}", 0.4 + 0.1 * i), top1=0.3, top5=0.5 + 0.1 * i) for i in range(4)]
+    records.append(_trained(make_record("net.other", 0.9), "simclr", top1=0.1, top5=0.2))
+    figures = _figures(*records)
+    tips = [text for text in _texts(figures["supervised-fit"].drawing) if "neural fit" in text]
+    assert len([text for text in tips if text.startswith("net.")]) == 4
+    assert "r = 1.00" in figures["supervised-fit"].caption
+    assert "r = 1.00" not in figures["accuracy-fit"].caption
+    texts = _texts(figures["parameters-accuracy"].drawing)
+    assert "net.other: parameters 3.79888e+07, top-5 accuracy 0.200" in texts
+    # One record without top-5 brings all to top-1, so that one axis has one meaning.
+    mixed = _figures(*records, _trained(make_record("net.mixed", 0.5), top1=0.3))
+    assert any("top-1 accuracy" in text for text in _texts(mixed["accuracy-fit"].drawing))
 
 
 def test_the_accuracy_of_a_twin_comes_from_the_trained_record_or_else_from_its_own(make_record):

@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import math
+import re
+from dataclasses import replace
 
 import pytest
 
-from leaderboards.figures.rdms import rdm_picture
+from leaderboards.boards import rank
+from leaderboards.figures.rdms import MOST_GROUPS, rdm_lines, rdm_picture
+from tests.factories.records import BRAIN_RDM
 
 
 @pytest.mark.parametrize(
@@ -21,3 +25,36 @@ def test_undefined_pairs_are_counted_and_a_constant_matrix_is_drawn():
     assert picture is not None
     assert "from 0.5 to 0.5" in picture.description
     assert "Undefined pairs: 1." in picture.description
+
+
+def _lines(*records):
+    (board,) = rank(records)
+    figure = rdm_lines(board)
+    return figure, re.findall(r'<path d="M([^"z]+)" class="trace', figure.drawing.render()) if figure.drawing else []
+
+
+def test_a_flattened_rdm_that_differs_in_scale_alone_lies_on_the_brains(make_record):
+    record = make_record("net")
+    scaled = tuple(3 * value + 2 for value in BRAIN_RDM)
+    alike = replace(record, score=replace(record.score, model_rdm=scaled), baselines={})
+    figure, (brain, model) = _lines(alike)
+    assert model == brain
+    heights = [float(point.split()[1]) for point in brain.split("L")]
+    assert heights == sorted(heights, reverse=True)  # upwards, in the order of the brain's dissimilarity
+    assert f"{len(BRAIN_RDM)} pairs" in figure.caption
+    _, (_, other) = _lines(replace(alike, score=replace(record.score, model_rdm=scaled[::-1])))
+    assert other != brain
+
+
+def test_many_pairs_are_drawn_in_groups_and_undefined_ones_left_out(make_record):
+    record = make_record("net")
+    labels = tuple(f"s{i}" for i in range(20))
+    brain = tuple(float(i) for i in range(190))
+    score = replace(
+        record.score, stimuli=labels, model_rdm=brain, brain_rdm=(math.nan, *brain[1:]), without_stimulus=()
+    )
+    figure, (line, _) = _lines(replace(record, score=score, baselines={}))
+    assert len(line.split("L")) == MOST_GROUPS
+    assert f"189 pairs of stimuli in {MOST_GROUPS} groups" in figure.caption
+    empty = replace(score, model_rdm=())
+    assert "no record holds" in _lines(replace(record, score=empty, baselines={}))[0].lacking

@@ -1,0 +1,271 @@
+"""The trainings and result records of a campaign, joined by network and seed.
+
+A line of ``trainings.jsonl`` and a record belong together when architecture, objective, augmentation, masking and seed
+agree. A record says these on its model card; where the card does not, its name does
+(``<architecture>.<objective>[.<augmentation>][.masked75][.seed0]``).
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import re
+from collections import Counter, defaultdict
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import msgspec
+
+from brainbench.core.errors import DataError, DataFileNotFoundError, check_name
+from brainbench.core.records import ResultRecord
+from leaderboards.boards import Board, rank
+from leaderboards.store import read_records
+
+TRAININGS = "trainings.jsonl"
+RECORDS = "records"
+OBJECTIVES = ("supervised", "simclr", "simsiam", "ae", "untrained", "baseline")
+_NAME = re.compile(
+    r"(?P<model>[^.]+)\.(?P<objective>supervised|simclr|simsiam|ae|untrained)"
+    r"(?:\.(?P<augmentation>physical|image|none|thesis))?(?:\.masked(?P<masked>\d+))?(?:\.seed(?P<seed>\d+))?"
+)
+
+
+class NetworkKey(NamedTuple):
+    """One way of training one architecture, in all seeds; names as in the registry, without the size."""
+
+    encoder: str
+    attender: str = "none"
+    objective: str = "supervised"
+    variant: str = ""
+    """Empty for the usual augmentation without masking, else what differs: ``image``, ``masked``."""
+
+    @property
+    def name(self) -> str:
+        """Name in print."""
+        model = self.encoder + (f"+{self.attender}" if self.attender != "none" else "")
+        return ".".join(filter(None, (model, self.objective, self.variant)))
+
+    @classmethod
+    def of(cls, model: str, objective: str, variant: str = "") -> NetworkKey:
+        """Return the key of a registry name."""
+        encoder, _, attender = model.partition("+")
+        return cls(encoder.removesuffix("-small"), attender or "none", objective, variant)
+
+
+@dataclass(frozen=True)
+class Accuracy:
+    """Accuracy on the test sweeps, as :class:`brainbench.models.training.evaluation.Evaluation` states it."""
+
+    top1: float
+    top5: float
+    count: int
+    collapsed: bool = False
+    reason: str = ""
+
+
+@dataclass(frozen=True)
+class Training:
+    """One line of ``trainings.jsonl``: a network trained once, an untrained one, or a baseline."""
+
+    name: str
+    objective: str
+    model: str = ""
+    seed: int = 0
+    augmentation: str = "none"
+    masking: float = 0.0
+    epochs: int | None = None
+    learning_rate: float | None = None
+    evaluation: Accuracy | None = None
+    """None for a training that diverged or is not finished."""
+    twin_evaluation: Accuracy | None = None
+    parameters: int | None = None
+    status: str = "finished"
+    data: Mapping[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Network:
+    """A network with all that is known of it, by seed."""
+
+    key: NetworkKey
+    trainings: Mapping[int, Training] = field(default_factory=dict)
+    records: Mapping[int, Mapping[int, ResultRecord]] = field(default_factory=dict)
+    """Place of the board in :attr:`Campaign.boards` → seed → record."""
+
+
+@dataclass(frozen=True)
+class Campaign:
+    """A campaign, of whatever is there of it."""
+
+    networks: Mapping[NetworkKey, Network]
+    baselines: Mapping[str, Training] = field(default_factory=dict)
+    boards: tuple[Board, ...] = ()
+    """Boards with enough animals and stimuli for tests first, of those the one of most networks."""
+    unmatched: tuple[str, ...] = ()
+    """Names of records that say neither objective nor architecture."""
+    other_sizes: tuple[str, ...] = ()
+    """Names of networks of another size than most; they enter no comparison."""
+
+    @property
+    def trainings(self) -> list[Training]:
+        """All trainings of networks, none of baselines."""
+        return [training for network in self.networks.values() for training in network.trainings.values()]
+
+
+def read_campaign(folder: str | os.PathLike[str]) -> Campaign:
+    """Read a folder with ``trainings.jsonl``, ``records/`` or both.
+
+    Raises:
+        DataFileNotFoundError: the folder holds neither.
+        DataError: a line or a record is damaged, two lines are of one training, or trainings used other data.
+    """
+    folder = Path(folder)
+    lines, records = folder / TRAININGS, folder / RECORDS
+    if not lines.is_file() and not records.is_dir():
+        raise DataFileNotFoundError(
+            f"{os.fspath(folder)!r} holds neither {TRAININGS!r} nor a folder {RECORDS!r}; name a campaign's folder."
+        )
+    trainings = read_trainings(lines) if lines.is_file() else []
+    stored = read_records(records) if records.is_dir() and any(records.rglob("*.json")) else []
+    if problem := next((item.problem for item in stored if item.problem), None):
+        raise DataError(f"A record of the campaign cannot be used: {problem}")
+    return join_campaign(trainings, [item.record for item in stored if item.record is not None])
+
+
+def read_trainings(path: Path) -> list[Training]:
+    """Read the lines of a campaign, each checked.
+
+    Raises:
+        DataError: a line is not JSON, lacks a field, holds an impossible value, or stands there twice.
+    """
+    found: dict[str, Training] = {}
+    for number, line in enumerate(path.read_text(encoding="utf-8", errors="replace").splitlines(), start=1):
+        if not line.strip():
+            continue
+        place = f"Line {number} of {path.name!r}"
+        try:
+            training = msgspec.convert(json.loads(line), Training)
+        except ValueError as error:  # msgspec's is one too
+            raise DataError(f"{place} is not a training: {error}; write the line again or delete it.") from error
+        check_name(f"objective in line {number} of {path.name!r}", training.objective, OBJECTIVES)
+        for result in filter(None, (training.evaluation, training.twin_evaluation)):
+            if not 0 <= result.top1 <= result.top5 <= 1 or result.count < 1:
+                raise DataError(
+                    f"{place} ({training.name!r}) has top-1 {result.top1}, top-5 {result.top5} of {result.count} "
+                    "sweeps; expected 0 ≤ top-1 ≤ top-5 ≤ 1 of at least one."
+                )
+        if training.objective != "baseline" and not training.model:
+            raise DataError(f"{place} ({training.name!r}) names no model; give the registry name as 'model'.")
+        if found.setdefault(training.name, training) is not training:
+            raise DataError(f"{place} repeats {training.name!r}; keep one line for each training.")
+    hashes = {item.data["hash"] for item in found.values() if item.evaluation and item.data.get("hash")}
+    if len(hashes) > 1:
+        raise DataError(
+            f"The trainings of {path.name!r} used different data ({', '.join(sorted(map(str, hashes)))}), so their "
+            "accuracies cannot be compared; keep one campaign in a file."
+        )
+    return list(found.values())
+
+
+def join_campaign(trainings: Sequence[Training], records: Sequence[ResultRecord]) -> Campaign:
+    """Join trainings and records by network and seed.
+
+    Raises:
+        DataError: two trainings are of the same network and seed.
+    """
+    boards = tuple(sorted(rank(records), key=lambda board: (bool(board.lacks), "ridge" in board_name(board))))
+    identities = [_identity(record) for board in boards for record in _records(board)]
+    placed = [(place, record) for place, board in enumerate(boards) for record in _records(board)]
+    runs = [_Identity(item.model, item.objective, item.augmentation, item.masking, item.seed) for item in trainings]
+    usual = _usual_augmentations([*runs, *filter(None, identities)])
+    models = [item.model for item in (*runs, *filter(None, identities)) if item.model]
+    small = sum("-small" in model for model in models) * 2 >= len(models)
+    others = sorted({model for model in models if ("-small" in model) is not small})
+    by_seed: dict[NetworkKey, dict[int, Training]] = defaultdict(dict)
+    baselines: dict[str, Training] = {}
+    for training, run in zip(trainings, runs, strict=True):
+        if training.objective == "baseline":
+            baselines[training.name] = training
+        elif training.model not in others:
+            held = by_seed[run.key(usual)].setdefault(training.seed, training)
+            if held is not training:
+                raise DataError(
+                    f"{held.name!r} and {training.name!r} are the same network and seed; keep one of the two lines."
+                )
+    scored: dict[NetworkKey, dict[int, dict[int, ResultRecord]]] = defaultdict(lambda: defaultdict(dict))
+    for (place, record), identity in zip(placed, identities, strict=True):
+        if identity is not None and identity.model not in others:
+            seeds = scored[identity.key(usual)][place]
+            # Of one network and seed the newest record counts, as on the board.
+            old = seeds.get(identity.seed)
+            if old is None or old.score.provenance.time < record.score.provenance.time:
+                seeds[identity.seed] = record
+    keys = sorted({*by_seed, *scored})
+    return Campaign(
+        {key: Network(key, by_seed.get(key, {}), scored.get(key, {})) for key in keys},
+        baselines,
+        boards,
+        tuple(sorted({r.score.name for (_, r), one in zip(placed, identities, strict=True) if one is None})),
+        tuple(others),
+    )
+
+
+def board_name(board: Board) -> str:
+    """Return recordings and metric, as ``demo, rsa``."""
+    metric = _records(board)[0].score.provenance.settings.get("metric") or board.metric
+    return f"{board.recordings}, {metric}"
+
+
+def _records(board: Board) -> list[ResultRecord]:
+    return [record for entry in board.entries for record in entry.records]
+
+
+@dataclass(frozen=True)
+class _Identity:
+    """What tells one training from another."""
+
+    model: str
+    objective: str
+    augmentation: str
+    masking: float
+    seed: int
+
+    def key(self, usual: Mapping[str, str]) -> NetworkKey:
+        if self.objective == "untrained":
+            return NetworkKey.of(self.model, self.objective)
+        parts = [] if self.augmentation == usual.get(self.objective) else [self.augmentation]
+        parts += ["masked"] if self.masking else []
+        return NetworkKey.of(self.model, self.objective, " ".join(parts))
+
+
+def _identity(record: ResultRecord) -> _Identity | None:
+    """Return the identity that a record states on its card, or else in its name; None where neither says it."""
+    card, settings = record.card, record.score.provenance.settings
+    name = record.score.name.removeprefix("local-dir:").rstrip("/").rpartition("/")[2]
+    told = _NAME.fullmatch(name)
+    stated = told.groupdict() if told else {}
+    objective = (card.objective if card else None) or stated.get("objective")
+    if objective is None and "." not in name:
+        objective = "untrained"
+    if objective not in OBJECTIVES[:5]:
+        return None
+    model = stated.get("model") or name.partition(".")[0]
+    seed = stated.get("seed") or (card.seed if card else None) or settings.get("weights_seed") or 0
+    augmentation = stated.get("augmentation") or (card.augmentation if card else None) or "none"
+    # The card of a masked training names both: "physical + 75 % of the steps masked".
+    augmentation = augmentation.partition(" + ")[0]
+    masking = (card.training.get("masking") if card else None) or float(stated.get("masked") or 0) / 100
+    masking = float(masking) if isinstance(masking, (int, float)) and math.isfinite(masking) else 0.0
+    return _Identity(model, objective, augmentation, masking, int(seed))
+
+
+def _usual_augmentations(runs: Sequence[_Identity]) -> dict[str, str]:
+    """Return the augmentation that most unmasked trainings of each objective used."""
+    counts: dict[str, Counter[str]] = defaultdict(Counter)
+    for run in runs:
+        if not run.masking:
+            counts[run.objective][run.augmentation] += 1
+    return {name: min(count, key=lambda one: (-count[one], one != "physical")) for name, count in counts.items()}
