@@ -85,11 +85,22 @@ def run(args: argparse.Namespace) -> None:
             if workers[place].poll() not in (None, 0) and faults < MOST_FAULTS:
                 faults += 1
                 _log.error("worker %d ended with %s; another one takes its place", place, workers[place].poll())
+                release(args.work, place)
                 workers[place] = start(args, gpu if gpus else None, worker=place)
         time.sleep(1.0)
     for worker in workers:
         worker.kill()
     _log.info("everything after %.0f s", time.monotonic() - began)
+
+
+def release(work: Path, place: int) -> None:
+    """Let others take the job of a worker that is gone, once: the second time the job itself may be to blame."""
+    for claim in (work / "claims").iterdir():
+        mine = claim.read_text(encoding="utf-8") == str(place)
+        if mine and not (work / "jobs" / claim.name / "result.json").is_file():
+            again = claim.with_name(f"again-{claim.name}")
+            if not again.exists():
+                claim.rename(again)
 
 
 def count_gpus() -> int:
@@ -203,7 +214,8 @@ class Worker:
             if not self.args.epochs and self.slower * job.seconds > self.args.until - time.time():
                 continue
             try:
-                os.close(os.open(self.args.work / "claims" / job.name, os.O_CREAT | os.O_EXCL))
+                with (self.args.work / "claims" / job.name).open("x", encoding="utf-8") as claim:
+                    claim.write(str(self.args.worker))
             except FileExistsError:
                 continue
             return job
