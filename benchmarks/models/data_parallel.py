@@ -35,9 +35,9 @@ def main() -> None:
     told.add_argument("--networks", default=",".join(NETWORKS))
     told.add_argument("--how", default="graphs", help="way to compile")
     told.add_argument("--out", type=Path, default=Path("data-parallel.json"))
-    told.add_argument("--run", type=Path, help=argparse.SUPPRESS)
+    told.add_argument("--into", type=Path, help=argparse.SUPPRESS)
     args = told.parse_args()
-    if args.run is not None:
+    if args.into is not None:
         train_once(args)
         return
     rows = []
@@ -53,7 +53,7 @@ def measure(args: argparse.Namespace, network: str, count: int) -> dict[str, obj
     with tempfile.TemporaryDirectory() as folder:
         words = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", str(count), "-m"]
         words += ["benchmarks.models.data_parallel", str(args.folder), "--networks", network, "--how", args.how]
-        found = subprocess.run([*words, "--run", folder], check=False, capture_output=True, text=True)
+        found = subprocess.run([*words, "--into", folder], check=False, capture_output=True, text=True)
         warnings = sorted({line for line in found.stderr.splitlines() if "NCCL" in line or "device" in line.lower()})
         if found.returncode:
             return {"network": network, "devices": count, "failed": found.stderr[-1500:]}
@@ -86,7 +86,7 @@ def train_once(args: argparse.Namespace) -> None:
         model, objective, epochs=EPOCHS, batch_size=BATCH, optimizer="adamw", schedule="constant", learning_rate=3e-4,
         warmup_epochs=0, decoder="linear", precision="bf16", compile=args.how, probe_epochs=0,
     )  # fmt: skip
-    train(config, data, out=args.run)
+    train(config, data, out=args.into)
 
 
 if __name__ == "__main__":
