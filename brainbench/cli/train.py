@@ -86,9 +86,9 @@ def train(
         ">best": lambda item: "–" if item[1].best_epoch is None else item[1].best_epoch,
         ">top-1": lambda item: _told(item[1], "{0.top1:.3f} [{0.interval.low:.3f}, {0.interval.high:.3f}]"),
         ">top-5": lambda item: _told(item[1], "{0.top5:.3f}"),
-        ">raw input": lambda item: _control(item[1], RAW),
-        ">random features": lambda item: _control(item[1], RANDOM),
-        ">untrained twin": lambda item: _control(item[1], TWIN),
+        ">raw": lambda item: _control(item[1], RAW),
+        ">random": lambda item: _control(item[1], RANDOM),
+        ">twin": lambda item: _control(item[1], TWIN),
         "collapsed": lambda item: _told(item[1], "{0.reason}") or "no",
     }
     text = table_of("", results.items(), columns)

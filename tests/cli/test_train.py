@@ -21,6 +21,7 @@ def test_a_model_is_trained_scored_by_its_folder_and_exported(run, folder, tmp_p
     trained = run("train", "s4-small", *_options(folder, tmp_path / "run"), "--augmentation", "none")
     assert trained.status == 0, trained.err
     assert "finished" in trained.out
+    assert {"raw", "random", "twin"} <= set(trained.out.split())
     assert f"brainbench score local-dir:{tmp_path / 'run' / 'best'}" in trained.out
     shown = json.loads(run("models", "show", f"local-dir:{tmp_path / 'run' / 'best'}", "--json").out)
     assert shown["trained"]["classes"] == ["brick", "cone"]

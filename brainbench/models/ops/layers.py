@@ -104,10 +104,10 @@ def draw_silent_biases(part: nn.Module) -> None:
     """
     if not any(isinstance(module, nn.LayerNorm) for module in part.modules()):
         return
-    for module in part.modules():
-        bias = module.bias if isinstance(module, (nn.Conv2d, nn.Linear)) else None
+    for layer in (module for module in part.modules() if isinstance(module, (nn.Conv2d, nn.Linear))):
+        bias = layer.bias
         if bias is not None and not bias.is_meta and not bias.any():
-            bound = 1.0 / math.sqrt(module.weight[0].numel())
+            bound = 1.0 / math.sqrt(layer.weight[0].numel())
             bias.uniform_(-bound, bound)
 
 
