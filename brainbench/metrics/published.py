@@ -71,15 +71,15 @@ def concatenate(arrays: Sequence[Floats]) -> Floats:
 
 def _target(name: str, array: Floats, splits: int) -> Target:
     trials, count, units = array.shape
-    # Padding spans all slots of a unit's trial, so one slot tells it.
-    seen = np.isfinite(array[:, 0]).astype(np.float64)
-    flat = np.where(np.isfinite(array), array, 0.0).reshape(trials, -1)
+    flat = array.reshape(trials, -1)
+    seen = np.isfinite(flat).astype(np.float64)
+    flat = np.where(seen > 0, flat, 0.0)
 
     def distances(member: Floats) -> Floats:
         """Return the RDMs [S, P] of the mean rates over the trials in ``member`` [S, R]."""
         with np.errstate(invalid="ignore", divide="ignore"):
             # A unit without a trial among them is 0/0 = NaN, and so is then the whole RDM.
-            return _distances((member @ flat).reshape(-1, count, units) / (member @ seen)[:, None])
+            return _distances((member @ flat / (member @ seen)).reshape(-1, count, units))
 
     found = np.empty(splits)
     step = max(1, _CHUNK // (8 * count * units))

@@ -89,8 +89,8 @@ def _check_rates(what: str, array: NDArray[Any]) -> None:
         bad = "infinite" if infinite else "negative"
         raise DataError(f"{what} holds {bad} rates; rates are finite and at least 0 spikes/s.")
     gone: NDArray[np.bool_] = np.asarray(missing.all(axis=1))
-    if np.any(missing.any(axis=1) != gone) or np.any(gone[:-1] & ~gone[1:]) or np.any(gone[0]):
-        raise DataError(f"{what} has NaN inside a session; NaN may only pad a unit's trials at the end.")
+    if np.any(gone[:-1] & ~gone[1:]) or np.any(gone[0]):
+        raise DataError(f"{what} has trials of NaN inside a session; they may only pad a unit's trials at the end.")
     several = np.argwhere((array > 0).sum(axis=1) > 1)
     if len(several):
         trial, unit = several[0]

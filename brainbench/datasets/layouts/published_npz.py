@@ -28,7 +28,7 @@ from brainbench.datasets.trials.windows import FIRST_CONTACT, Window
 if TYPE_CHECKING:
     import xarray as xr
 
-SILENT = "trials: 0 in all slots, so the stimulus cannot be known"
+SILENT = "trials: no rate above 0 in any slot, so the stimulus cannot be known"
 
 LAYOUT = RecordingLayout(
     name="published-npz",
@@ -59,7 +59,7 @@ class ZeroFilledSession:
     first: int
     """Its first unit in the animal's array."""
     slots: NDArray[np.int64] = field(repr=False)
-    """[R] slot of each trial, from 0; −1 where no unit fired."""
+    """[R] slot of each trial, from 0; −1 where no unit fired (or, in a window of no length, none has a rate)."""
     rates: NDArray[np.float64] = field(repr=False)
     """[R, U] spikes/s."""
     split_by: str = "trials"
@@ -91,8 +91,9 @@ def recover_sessions(subject: str, array: NDArray[np.float64]) -> list[ZeroFille
     """
     fired = array > 0
     slots = np.where(fired.any(axis=1), fired.argmax(axis=1), -1)
-    lengths = np.isfinite(array[:, 0]).sum(axis=0)
-    rates = np.where(np.isfinite(array), array, 0.0).sum(axis=1)
+    lengths = (~np.isnan(array).all(axis=1)).sum(axis=0)
+    # One slot at most is not 0. A rate that is NaN there (a window of no length) stays missing.
+    rates = array.sum(axis=1)
     borders: list[tuple[int, str]] = []
     known = slots[:, 0]
     for unit in range(array.shape[2]):

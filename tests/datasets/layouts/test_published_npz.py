@@ -75,6 +75,15 @@ def test_zeros_of_other_slots_are_missing_and_silent_trials_are_counted(tmp_path
     np.testing.assert_allclose(dataset["counts"].values[:, 0], array[kept, slots[0][kept]], rtol=1e-6)
 
 
+def test_a_trial_whose_window_has_no_length_is_missing(tmp_path):
+    array, slots = make_zero_filled([24, 30])
+    # The mean over no bins: NaN in the slot of the trial, zeros elsewhere.
+    array[7, slots[0][7], :6] = np.nan
+    dataset = open_recordings(write_published(tmp_path / "a.npz", m1=array))
+    assert dataset.attrs["removed"] == {SILENT: 1}
+    assert np.unique(dataset["session"].values, return_counts=True)[1].tolist() == [23, 30]
+
+
 def test_sessions_of_equal_length_are_parted_where_their_slots_contradict(tmp_path):
     array, slots = make_zero_filled([24, 24])
     found = list(read_published(write_published(tmp_path / "a.npz", m1=array)))
@@ -138,8 +147,7 @@ BAD = {
     "all NaN": ({"m1": np.full((5, 6, 3), np.nan)}, "every value is NaN"),
     "negative": (_edited(lambda a: a.__setitem__((0, 0, 0), -1)), "negative"),
     "infinite": (_edited(lambda a: a.__setitem__((0, 0, 0), np.inf)), "infinite"),
-    "NaN within": (_edited(lambda a: a.__setitem__((2, 3, 1), np.nan)), "NaN inside"),
-    "NaN row": (_edited(lambda a: a.__setitem__((2, slice(None), 1), np.nan)), "NaN inside"),
+    "NaN row": (_edited(lambda a: a.__setitem__((2, slice(None), 1), np.nan)), "inside a session"),
     "two slots": (_edited(lambda a: a.__setitem__((2, slice(None), 1), 3.0)), "several slots"),
     "sweep": ({"data": np.zeros((110, 35, 6)), "shape": np.array("a/b"), "label": np.array(3)}, "whisker sweep"),
     "splits": ({"r_xy": np.zeros(3), "r_yy": np.zeros(3)}, "--explain-estimator"),
