@@ -44,7 +44,8 @@ LAYOUT = RecordingLayout(
         SILENT,
         "labels: slots, in the file's order; they cannot be trusted, because every session numbers its stimuli anew",
         "sessions: neighbouring units with other numbers of trials, or with rates in other slots of the same trial",
-        "rates: spikes/s over windows of unequal length, which the file does not state",
+        "rates: spikes/s over windows of unequal length, which the file does not state, in whole bins of 45 ms, so up to "
+        "one bin too low; the authors' code shifted spikes, but not trials, by the recording's starting time",
         "trials: chosen by the authors (correct, not ignored, with a shape)",
     ),
 )
@@ -140,9 +141,8 @@ def open_published(path: Path, **options: object) -> xr.Dataset:
     reading = ReadingOptions(
         LAYOUT.conditions, SLOTS, LAYOUT.selection, Window(FIRST_CONTACT if touch else "start", stop="choice")
     )
-    notes = ["rates over windows of unequal length, which the file does not state", *LAYOUT.remarks[1:3]]
     parts = [_session_counts(item, path) for item in sessions]
-    dataset = join_sessions(parts, reading, source=str(path), layout=LAYOUT.name, notes=notes)
+    dataset = join_sessions(parts, reading, source=str(path), layout=LAYOUT.name, notes=list(LAYOUT.remarks[1:]))
     animals = len({item.subject for item in sessions})
     total, told = sum(len(item.slots) for item in sessions), dataset.sizes["trial"]
     dataset.attrs["label_doubt"] = (

@@ -92,6 +92,20 @@ def test_sessions_of_equal_length_are_parted_where_their_slots_contradict(tmp_pa
         np.testing.assert_array_equal(item.slots, true)
 
 
+def test_all_borders_of_many_sparse_sessions_are_found(tmp_path):
+    rng = np.random.default_rng(0)
+    lengths = {f"m{number}": rng.choice([180, 220, 260], 4).tolist() for number in range(11)}
+    animals = {name: make_zero_filled(item, 20, seed=seed)[0] for seed, (name, item) in enumerate(lengths.items())}
+    for array in animals.values():
+        # A quarter of the units fires in one trial of fifty.
+        sparse = np.arange(array.shape[2]) % 4 == 0
+        array *= ~sparse | (rng.random((len(array), 1, array.shape[2])) < 0.02)
+    path = write_published(tmp_path / "a.npz", **animals)
+    found = [(item.subject, item.first) for item in read_published(path)]
+    assert found == [(name, first) for name in lengths for first in range(0, 80, 20)]
+    assert sum(np.diff(item).tolist().count(0) for item in lengths.values()) > 5
+
+
 def test_sessions_that_never_contradict_look_like_one(tmp_path):
     shown = np.resize(np.arange(6), 24)
     array, _ = make_zero_filled([24, 24], order=[shown, shown])
