@@ -44,8 +44,8 @@ LAYOUT = RecordingLayout(
         SILENT,
         "labels: slots, in the file's order; they cannot be trusted, because every session numbers its stimuli anew",
         "sessions: neighbouring units with other numbers of trials, or with rates in other slots of the same trial",
-        "rates: spikes/s over windows of unequal length, which the file does not state, in whole bins of 45 ms, so up to "
-        "one bin too low; the authors' code shifted spikes, but not trials, by the recording's starting time",
+        "rates: spikes/s over windows of unequal length, which the file does not state, in whole bins of 45 ms, "
+        "so up to one bin too low; the authors' code shifted spikes, but not trials, by the recording's starting time",
         "trials: chosen by the authors (correct, not ignored, with a shape)",
     ),
 )
