@@ -158,7 +158,7 @@ def _means(session: ZeroFilledSession, rng: np.random.Generator | None = None) -
 def _distances(means: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return correlation distances [6, 6] of mean rates [6, U]."""
     with np.errstate(invalid="ignore", divide="ignore"):
-        return 1 - np.corrcoef(means)
+        return np.asarray(1 - np.corrcoef(means))
 
 
 def _agree(means: Sequence[NDArray[np.float64]], pairs: NDArray[np.bool_]) -> tuple[float, float]:
