@@ -45,7 +45,7 @@ class Target:
     trials: int
 
 
-def make_targets(arrays: Mapping[str, NDArray[np.floating]], *, splits: int = SPLITS) -> tuple[Target, ...]:
+def make_targets(arrays: Mapping[str, Floats], *, splits: int = SPLITS) -> tuple[Target, ...]:
     """Return the animals and, of several, their pool.
 
     Args:
@@ -58,10 +58,10 @@ def make_targets(arrays: Mapping[str, NDArray[np.floating]], *, splits: int = SP
     if not arrays:
         raise UsageError("There are no animals to score against; give at least one array [trials, stimuli, units].")
     named = dict(arrays) if len(arrays) == 1 else {**arrays, POOL: concatenate(list(arrays.values()))}
-    return tuple(_target(name, np.asarray(array, dtype=np.float64), splits) for name, array in named.items())
+    return tuple(_target(name, array, splits) for name, array in named.items())
 
 
-def concatenate(arrays: Sequence[NDArray[np.floating]]) -> Floats:
+def concatenate(arrays: Sequence[Floats]) -> Floats:
     """Return the units of all animals side by side, padded with NaN to the most trials."""
     most = max(len(array) for array in arrays)
     padding = [((0, most - len(array)), (0, 0), (0, 0)) for array in arrays]
@@ -71,15 +71,15 @@ def concatenate(arrays: Sequence[NDArray[np.floating]]) -> Floats:
 
 def _target(name: str, array: Floats, splits: int) -> Target:
     trials, count, units = array.shape
-    # Padding spans all slots of a unit's trial, so one slot tells it.
-    seen = np.isfinite(array[:, 0]).astype(np.float64)
-    flat = np.where(np.isfinite(array), array, 0.0).reshape(trials, -1)
+    flat = array.reshape(trials, -1)
+    seen = np.isfinite(flat).astype(np.float64)
+    flat = np.where(seen > 0, flat, 0.0)
 
     def distances(member: Floats) -> Floats:
         """Return the RDMs [S, P] of the mean rates over the trials in ``member`` [S, R]."""
         with np.errstate(invalid="ignore", divide="ignore"):
             # A unit without a trial among them is 0/0 = NaN, and so is then the whole RDM.
-            return _distances((member @ flat).reshape(-1, count, units) / (member @ seen)[:, None])
+            return _distances((member @ flat / (member @ seen)).reshape(-1, count, units))
 
     found = np.empty(splits)
     step = max(1, _CHUNK // (8 * count * units))
@@ -206,9 +206,7 @@ def score_published(
     )
 
 
-def score_published_animals(
-    arrays: Mapping[str, NDArray[np.floating]], *, stimuli: Sequence[str], splits: int = SPLITS
-) -> Score:
+def score_published_animals(arrays: Mapping[str, Floats], *, stimuli: Sequence[str], splits: int = SPLITS) -> Score:
     """Score every animal against the units of all others, both sides corrected; the value is the mean over animals."""
     parts = []
     for name, array in arrays.items():

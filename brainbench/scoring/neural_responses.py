@@ -75,7 +75,7 @@ class NeuralResponses:
             match = dict(zip(self.vocabulary, stimuli, strict=True))
         return join_labels(self.vocabulary, stimuli, match)
 
-    def zero_filled(self, kept: tuple[str, ...]) -> dict[str, NDArray[np.floating]] | None:
+    def zero_filled(self, kept: tuple[str, ...]) -> dict[str, NDArray[np.float64]] | None:
         """Return each animal's rates [R, K, U] as a published file holds them; None for other recordings."""
         from brainbench.datasets.layouts.npz_arrays import read_arrays
         from brainbench.datasets.layouts.published_npz import LAYOUT

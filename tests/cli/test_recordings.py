@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from brainbench.datasets.synthetic import ResponseGeometry, write_files
+from tests.factories.published_files import make_zero_filled, write_published
 from tests.factories.recordings import quiet_design
 
 
@@ -65,3 +66,14 @@ def test_fetching_without_the_client_says_how_to_get_it(run, monkeypatch, tmp_pa
     assert result.status == 1
     assert "pip install 'brainbench[dandi]'" in result.err
     assert "did you mean 'rodgers'" in run("recordings", "fetch", "rogers").err
+
+
+def test_a_published_file_is_checked_and_inspected_from_the_command_line(run, tmp_path):
+    path = write_published(tmp_path / "rodgers6_data.npz", m1=make_zero_filled([24, 30])[0])
+    result = run("recordings", "check", str(path), "--json")
+    assert result.status == 1
+    data = json.loads(result.out)
+    assert data["sessions"] == ["m1 / 01", "m1 / 02"]
+    assert data["findings"][0]["check"] == "labels"
+    assert "slot-6" in run("recordings", "inspect", str(path)).out
+    assert "published-npz" in run("recordings", "recipe").out

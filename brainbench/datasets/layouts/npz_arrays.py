@@ -5,6 +5,7 @@ from __future__ import annotations
 import zipfile
 import zlib
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -72,7 +73,7 @@ def _plain_arrays(path: Path) -> dict[str, NDArray[np.generic]]:
     return found
 
 
-def _check_rates(what: str, array: NDArray[np.generic]) -> None:
+def _check_rates(what: str, array: NDArray[Any]) -> None:
     if array.dtype.kind not in "fiu":
         raise DataError(f"{what} holds {array.dtype}, not numbers; expected rates [trials, {len(SLOTS)}, units].")
     if array.ndim != 3 or array.shape[1] != len(SLOTS) or not array.size:
@@ -83,14 +84,16 @@ def _check_rates(what: str, array: NDArray[np.generic]) -> None:
     missing = np.isnan(array)
     if missing.all():
         raise DataError(f"{what} holds no rate: every value is NaN; leave this animal out.")
-    if np.isinf(array).any() or (array[~missing] < 0).any():
-        bad = "infinite" if np.isinf(array).any() else "negative"
+    infinite = bool(np.isinf(array).any())
+    if infinite or bool(np.any(array[~missing] < 0)):
+        bad = "infinite" if infinite else "negative"
         raise DataError(f"{what} holds {bad} rates; rates are finite and at least 0 spikes/s.")
-    gone = missing.all(axis=1)
-    if (missing.any(axis=1) != gone).any() or (gone[:-1] & ~gone[1:]).any() or gone[0].any():
-        raise DataError(f"{what} has NaN inside a session; NaN may only pad a unit's trials at the end.")
-    if ((array > 0).sum(axis=1) > 1).any():
-        trial, unit = np.argwhere((array > 0).sum(axis=1) > 1)[0]
+    gone: NDArray[np.bool_] = np.asarray(missing.all(axis=1))
+    if np.any(gone[:-1] & ~gone[1:]) or np.any(gone[0]):
+        raise DataError(f"{what} has trials of NaN inside a session; they may only pad a unit's trials at the end.")
+    several = np.argwhere((array > 0).sum(axis=1) > 1)
+    if len(several):
+        trial, unit = several[0]
         raise DataError(
             f"{what} has rates in several slots of one trial (trial {trial}, unit {unit}); a trial has one stimulus "
             "and zeros in the other slots."

@@ -28,7 +28,7 @@ from brainbench.datasets.trials.windows import FIRST_CONTACT, Window
 if TYPE_CHECKING:
     import xarray as xr
 
-SILENT = "trials: 0 in all slots, so the stimulus cannot be known"
+SILENT = "trials: no rate above 0 in any slot, so the stimulus cannot be known"
 
 LAYOUT = RecordingLayout(
     name="published-npz",
@@ -44,7 +44,8 @@ LAYOUT = RecordingLayout(
         SILENT,
         "labels: slots, in the file's order; they cannot be trusted, because every session numbers its stimuli anew",
         "sessions: neighbouring units with other numbers of trials, or with rates in other slots of the same trial",
-        "rates: spikes/s over windows of unequal length, which the file does not state",
+        "rates: spikes/s over windows of unequal length, which the file does not state, in whole bins of 45 ms, "
+        "so up to one bin too low; the authors' code shifted spikes, but not trials, by the recording's starting time",
         "trials: chosen by the authors (correct, not ignored, with a shape)",
     ),
 )
@@ -59,7 +60,7 @@ class ZeroFilledSession:
     first: int
     """Its first unit in the animal's array."""
     slots: NDArray[np.int64] = field(repr=False)
-    """[R] slot of each trial, from 0; −1 where no unit fired."""
+    """[R] slot of each trial, from 0; −1 where no unit fired (or, in a window of no length, none has a rate)."""
     rates: NDArray[np.float64] = field(repr=False)
     """[R, U] spikes/s."""
     split_by: str = "trials"
@@ -91,8 +92,9 @@ def recover_sessions(subject: str, array: NDArray[np.float64]) -> list[ZeroFille
     """
     fired = array > 0
     slots = np.where(fired.any(axis=1), fired.argmax(axis=1), -1)
-    lengths = np.isfinite(array[:, 0]).sum(axis=0)
-    rates = np.where(np.isfinite(array), array, 0.0).sum(axis=1)
+    lengths = (~np.isnan(array).all(axis=1)).sum(axis=0)
+    # One slot at most is not 0. A rate that is NaN there (a window of no length) stays missing.
+    rates = array.sum(axis=1)
     borders: list[tuple[int, str]] = []
     known = slots[:, 0]
     for unit in range(array.shape[2]):
@@ -139,9 +141,8 @@ def open_published(path: Path, **options: object) -> xr.Dataset:
     reading = ReadingOptions(
         LAYOUT.conditions, SLOTS, LAYOUT.selection, Window(FIRST_CONTACT if touch else "start", stop="choice")
     )
-    notes = ["rates over windows of unequal length, which the file does not state", *LAYOUT.remarks[1:3]]
     parts = [_session_counts(item, path) for item in sessions]
-    dataset = join_sessions(parts, reading, source=str(path), layout=LAYOUT.name, notes=notes)
+    dataset = join_sessions(parts, reading, source=str(path), layout=LAYOUT.name, notes=list(LAYOUT.remarks[1:]))
     animals = len({item.subject for item in sessions})
     total, told = sum(len(item.slots) for item in sessions), dataset.sizes["trial"]
     dataset.attrs["label_doubt"] = (

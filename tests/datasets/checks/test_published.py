@@ -54,6 +54,20 @@ def test_labels_that_agree_are_told_from_labels_that_could(tmp_path, scramble):
     assert (values["stored"] > values["stored_chance"]) is not scramble
 
 
+def test_tuning_that_no_animals_share_is_not_called_shared(tmp_path):
+    rng = np.random.default_rng(2)
+    animals = {}
+    for animal in range(6):
+        means = np.exp(2 + 0.4 * rng.normal(size=(6, 15)))
+        slots = np.resize(np.arange(6), 60)
+        array = np.zeros((60, 6, 15))
+        array[np.arange(60), slots] = rng.poisson(means[slots]) + 0.1
+        animals[f"m{animal}"] = array
+    values = _finding(check(write_published(tmp_path / "a.npz", **animals)), "labels", "agree by").values
+    assert values["best"] > 0.5
+    assert values["best"] < values["best_chance"]
+
+
 def test_trials_without_a_spike_and_rare_slots_are_warned_of(tmp_path):
     array, _ = make_zero_filled([24], order=[np.resize(np.arange(6), 24)])
     array[3] = 0
