@@ -153,7 +153,7 @@ def read_runs(
     frame_status[:, 0] = FRAME_STATUSES.index("unwritten")
     for name, where in bad.items():
         frame_status[where.any(axis=-1)] = FRAME_STATUSES.index(name)
-    touching = None if any(run.contact is None for run in runs) else np.stack([run.contact for run in runs])
+    touching = [run.contact for run in runs if run.contact is not None]
     if rows == slice(None):
         bad["unwritten"] = np.zeros(raw.shape, dtype=bool)
         bad["unwritten"][:, 0] = (raw[:, 0] != 0) & (np.abs(raw[:, 0]) <= LARGEST)
@@ -168,7 +168,7 @@ def read_runs(
         frames,
         backend="whiskit",
         frame_status=frame_status[:, rows],
-        contact=None if touching is None else touching[:, rows],
+        contact=np.stack(touching)[:, rows] if len(touching) == len(runs) else None,
         about={"cleaning": cleaning, "faults": faults},
     )
 

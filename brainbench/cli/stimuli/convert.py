@@ -56,7 +56,7 @@ def convert(
     if not source.exists():
         raise DataFileNotFoundError(f"There is no file or folder {str(source)!r}.")
     of_runs = {"cleaning": cleaning, "rate": rate}
-    of_sets = {"stimulus": stimulus, "dialect": dialect}
+    of_sets: dict[str, Any] = {"stimulus": stimulus, "dialect": dialect}
     if source.is_dir() and is_sweep_tree(source):
         _refuse("a folder of sweeps", of_runs | of_sets)
         made, text = _data_set(source, out)
@@ -66,7 +66,7 @@ def convert(
         made, text = _write_set(_sweep_set(sweeps), out)
     elif source.is_file():
         _refuse("a stimulus set", of_runs)
-        made, text = _run(source, out, of_sets)
+        made, text = _run(source, out, stimulus=stimulus, dialect=dialect or "thesis")
     elif runs := find_runs(source):
         _refuse("runs", of_sets)
         _check_set_name(out, source)
@@ -195,7 +195,7 @@ def _write_set(dataset: Any, out: Path) -> tuple[dict[str, Any], str]:
     return made, facts(rows)
 
 
-def _run(source: Path, out: Path, options: dict[str, Any]) -> tuple[dict[str, Any], str]:
+def _run(source: Path, out: Path, **options: Any) -> tuple[dict[str, Any], str]:
     from brainbench.stimuli import read_stimulus_set
     from brainbench.stimuli.whiskit import save_run
 
@@ -205,7 +205,9 @@ def _run(source: Path, out: Path, options: dict[str, Any]) -> tuple[dict[str, An
     out.parent.mkdir(parents=True, exist_ok=True)
     # A run is many files: they appear together, or not at all.
     with tempfile.TemporaryDirectory(dir=out.parent, prefix=".run-") as temporary:
-        chosen = {"dialect": "thesis"} | {name: value for name, value in options.items() if value is not None}
+        chosen: dict[str, Any] = {"dialect": "thesis"} | {
+            name: value for name, value in options.items() if value is not None
+        }
         save_run(dataset, Path(temporary) / "run", **chosen).rename(out)
     shape = f"{dataset.sizes['time']} rows of {dataset.sizes['whisker']} whiskers"
     units = "mN and µN·m; action of the whisker on its base, world axes"
