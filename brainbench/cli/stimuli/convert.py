@@ -32,17 +32,17 @@ def convert(
     cleaning: Annotated[
         str | None,
         typer.Option(
-            help="Of runs. mark: values that cannot be trusted become missing; published: replaced as "
-            "process_raw_dataset.py does. [default: mark]"
+            help="Of runs. mark (default): values that cannot be trusted become missing; published: they are "
+            "replaced as process_raw_dataset.py does."
         ),
     ] = None,
     rate: Annotated[
-        float | None, typer.Option(help="Rows of a run per second. [default: 1000 or 110, by their number]")
+        float | None, typer.Option(help="Rows of a run per second; 1000 and 110 rows are one second.")
     ] = None,
     stimulus: Annotated[str | None, typer.Option("--stimulus", "-s", help="Stimulus of a set to write.")] = None,
     dialect: Annotated[
         str | None,
-        typer.Option(help="Of a written run: sense-lab (commas end lines) or thesis. [default: thesis]"),
+        typer.Option(help="Of a written run: thesis (default), or sense-lab, where commas end lines."),
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
@@ -205,10 +205,7 @@ def _run(source: Path, out: Path, **options: Any) -> tuple[dict[str, Any], str]:
     out.parent.mkdir(parents=True, exist_ok=True)
     # A run is many files: they appear together, or not at all.
     with tempfile.TemporaryDirectory(dir=out.parent, prefix=".run-") as temporary:
-        chosen: dict[str, Any] = {"dialect": "thesis"} | {
-            name: value for name, value in options.items() if value is not None
-        }
-        save_run(dataset, Path(temporary) / "run", **chosen).rename(out)
+        save_run(dataset, Path(temporary) / "run", **options).rename(out)
     shape = f"{dataset.sizes['time']} rows of {dataset.sizes['whisker']} whiskers"
     units = "mN and µN·m; action of the whisker on its base, world axes"
     return {"kind": "run"}, facts({"run": shape, "units": units, "folder": str(out)})
