@@ -66,9 +66,9 @@ def assemble_stimulus_set(
     text = functools.partial(to_json, indent=None)
     grid, over_time = ("stimulus", "whisker"), ("stimulus", "time", "whisker")
     counts = {name: (frame_status == code).sum(axis=1) for code, name in enumerate(FRAME_STATUSES) if code}
-    unstable = sum(counts[name] for name in _DOUBTFUL) > 0
-    reasons = np.empty(unstable.shape, dtype=object)
-    for place in np.ndindex(*unstable.shape):
+    unstable = np.any([counts[name] > 0 for name in _DOUBTFUL], axis=0)
+    reasons = np.empty((len(labels), len(names)), dtype=object)
+    for place in np.ndindex(*reasons.shape):
         reasons[place] = ", ".join(f"frames {name}: {n}" for name, count in counts.items() if (n := count[place]))
     sides = [_SIDES[name[0]] for name in names]
     short = [name[1:] for name in names]

@@ -13,7 +13,7 @@ import os
 import re
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, get_args
 
@@ -50,7 +50,7 @@ class WhiskitRun:
     """One run as its files hold it."""
 
     label: str
-    """Name of the folder."""
+    """Name of the folder; in a set of several, its path below what they have in common."""
     names: tuple[str, ...]
     """Whiskers with their side: ``RC2``."""
     dynamics: NDArray[np.float64]
@@ -60,11 +60,10 @@ class WhiskitRun:
 
 
 def find_runs(folder: str | os.PathLike[str]) -> tuple[Path, ...]:
-    """Return the folder itself if it is a run, or else the runs in it, by name."""
+    """Return the folder itself if it is a run, or else all runs below it, by path."""
     root = Path(folder)
-    if (root / "whisker_ID.csv").is_file() or (root / "dynamics").is_dir():
-        return (root,)
-    return tuple(sorted({path.parent for name in ("whisker_ID.csv", "dynamics") for path in root.glob(f"*/{name}")}))
+    found = {path.parent for name in ("whisker_ID.csv", "dynamics") for path in root.rglob(name)}
+    return (root,) if root in found else tuple(sorted(found))
 
 
 def read_run(folder: str | os.PathLike[str]) -> WhiskitRun:
@@ -130,6 +129,11 @@ def read_runs(
     runs = [read_run(folder) for folder in folders]
     if not runs:
         raise DataError("There is no run of WHISKiT (whisker_ID.csv and dynamics/) to be read.")
+    if len(runs) > 1:
+        # Runs of several objects have the same names; their paths differ.
+        paths = [Path(folder).absolute() for folder in folders]
+        common = os.path.commonpath(paths)
+        runs = [replace(run, label=path.relative_to(common).as_posix()) for run, path in zip(runs, paths, strict=True)]
     first = runs[0]
     for run in runs[1:]:
         if (run.names, len(run.dynamics)) != (first.names, len(first.dynamics)):
@@ -149,7 +153,7 @@ def read_runs(
     frame_status[:, 0] = FRAME_STATUSES.index("unwritten")
     for name, where in bad.items():
         frame_status[where.any(axis=-1)] = FRAME_STATUSES.index(name)
-    touching = None if any(run.contact is None for run in runs) else np.stack([run.contact for run in runs])
+    touching = [run.contact for run in runs if run.contact is not None]
     if rows == slice(None):
         bad["unwritten"] = np.zeros(raw.shape, dtype=bool)
         bad["unwritten"][:, 0] = (raw[:, 0] != 0) & (np.abs(raw[:, 0]) <= LARGEST)
@@ -164,7 +168,7 @@ def read_runs(
         frames,
         backend="whiskit",
         frame_status=frame_status[:, rows],
-        contact=None if touching is None else touching[:, rows],
+        contact=np.stack(touching)[:, rows] if len(touching) == len(runs) else None,
         about={"cleaning": cleaning, "faults": faults},
     )
 

@@ -32,17 +32,17 @@ def convert(
     cleaning: Annotated[
         str | None,
         typer.Option(
-            help="Of runs. mark: values that cannot be trusted become missing; published: replaced as "
-            "process_raw_dataset.py does. [default: mark]"
+            help="Of runs. mark (default): values that cannot be trusted become missing; published: they are "
+            "replaced as process_raw_dataset.py does."
         ),
     ] = None,
     rate: Annotated[
-        float | None, typer.Option(help="Rows of a run per second. [default: 1000 or 110, by their number]")
+        float | None, typer.Option(help="Rows of a run per second; 1000 and 110 rows are one second.")
     ] = None,
     stimulus: Annotated[str | None, typer.Option("--stimulus", "-s", help="Stimulus of a set to write.")] = None,
     dialect: Annotated[
         str | None,
-        typer.Option(help="Of a written run: sense-lab (commas end lines) or thesis. [default: thesis]"),
+        typer.Option(help="Of a written run: thesis (default), or sense-lab, where commas end lines."),
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
@@ -56,7 +56,7 @@ def convert(
     if not source.exists():
         raise DataFileNotFoundError(f"There is no file or folder {str(source)!r}.")
     of_runs = {"cleaning": cleaning, "rate": rate}
-    of_sets = {"stimulus": stimulus, "dialect": dialect}
+    of_sets: dict[str, Any] = {"stimulus": stimulus, "dialect": dialect}
     if source.is_dir() and is_sweep_tree(source):
         _refuse("a folder of sweeps", of_runs | of_sets)
         made, text = _data_set(source, out)
@@ -66,7 +66,7 @@ def convert(
         made, text = _write_set(_sweep_set(sweeps), out)
     elif source.is_file():
         _refuse("a stimulus set", of_runs)
-        made, text = _run(source, out, of_sets)
+        made, text = _run(source, out, stimulus=stimulus, dialect=dialect or "thesis")
     elif runs := find_runs(source):
         _refuse("runs", of_sets)
         _check_set_name(out, source)
@@ -195,7 +195,7 @@ def _write_set(dataset: Any, out: Path) -> tuple[dict[str, Any], str]:
     return made, facts(rows)
 
 
-def _run(source: Path, out: Path, options: dict[str, Any]) -> tuple[dict[str, Any], str]:
+def _run(source: Path, out: Path, **options: Any) -> tuple[dict[str, Any], str]:
     from brainbench.stimuli import read_stimulus_set
     from brainbench.stimuli.whiskit import save_run
 
@@ -205,8 +205,7 @@ def _run(source: Path, out: Path, options: dict[str, Any]) -> tuple[dict[str, An
     out.parent.mkdir(parents=True, exist_ok=True)
     # A run is many files: they appear together, or not at all.
     with tempfile.TemporaryDirectory(dir=out.parent, prefix=".run-") as temporary:
-        chosen = {"dialect": "thesis"} | {name: value for name, value in options.items() if value is not None}
-        save_run(dataset, Path(temporary) / "run", **chosen).rename(out)
+        save_run(dataset, Path(temporary) / "run", **options).rename(out)
     shape = f"{dataset.sizes['time']} rows of {dataset.sizes['whisker']} whiskers"
     units = "mN and µN·m; action of the whisker on its base, world axes"
     return {"kind": "run"}, facts({"run": shape, "units": units, "folder": str(out)})

@@ -1,5 +1,5 @@
-"""Training data: whisker sweeps in shards.
+"""Training data: whisker sweeps in shards of ours, or in the files of the published study.
 
-``files`` opens the shards, ``dataset`` makes batches of them in reused memory, and ``separability`` measures how
-well their classes are told apart.
+``files`` opens the shards, ``sweep_files`` and ``sweep_tree`` the published sweeps; ``dataset`` makes batches of either
+in reused memory, and ``separability`` measures how well their classes are told apart.
 """

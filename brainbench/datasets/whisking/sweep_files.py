@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import math
 import os
+import tokenize
 import zipfile
 import zlib
 from collections.abc import Mapping
@@ -43,7 +44,11 @@ CONDITIONS = ("speed", "height", "rotation", "distance", "size")
 FAULTS = ("repeated", "too large", "missing", "unwritten")
 """Values that equal those of the frame before in a channel that moves (so the published cleaning fills gaps), beyond
 :data:`LARGEST`, not a number, and other than 0 in row 0 at 110 Hz, which is memory that nothing has written."""
-_UNREADABLE = (OSError, ValueError, TypeError, AttributeError, EOFError, MemoryError, zipfile.BadZipFile, zlib.error)
+_UNREADABLE = (
+    OSError, ValueError, TypeError, AttributeError, EOFError, MemoryError, RuntimeError, SyntaxError, SystemError,
+    tokenize.TokenError, zipfile.BadZipFile, zlib.error,
+)  # fmt: skip
+"""Errors that numpy and zipfile raise on damaged archives and on what is none (found by changing bytes at random)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,41 +90,31 @@ def read_sweep(path: str | os.PathLike[str]) -> SweepFile:
         DataError: the file is missing, damaged or another one; the message says what it holds.
     """
     name = os.fspath(path)
-    fields = {"data", "shape", "label", *RATES[1000], *RATES[110]}
+    fields = {"shape", "label", *RATES[1000], *RATES[110]}
     try:
         # Opened here, because numpy leaves damaged archives open.
         with Path(path).open("rb") as stream, np.load(stream, allow_pickle=False) as file:
             held = tuple(file.files)
-            values = {key: file[key] for key in held if key in fields}
+            texts = {key: str(file[key]) for key in held if key in fields}
+            data = np.asarray(file["data"] if "data" in held else ())
     except FileNotFoundError as error:
         raise DataFileNotFoundError(f"There is no sweep file {name!r}.") from error
-    except (
-        OSError,
-        ValueError,
-        TypeError,
-        AttributeError,
-        EOFError,
-        MemoryError,
-        zipfile.BadZipFile,
-        zlib.error,
-    ) as error:
+    except _UNREADABLE as error:
         reason = str(error).split(".")[0] or type(error).__name__
         raise DataError(
             f"{name!r} cannot be read as a sweep: a file of arrays (.npz) without objects is needed ({reason})."
         ) from error
-    rates = [rate for rate, needed in RATES.items() if {"data", "shape", *needed} <= set(values)]
+    rates = [rate for rate, needed in RATES.items() if {"data", "shape", *needed} <= {*held}]
     if not rates:
         raise DataError(
             f"{name!r} is no sweep of the published study: it holds {', '.join(held) or 'nothing'}; needed are data, "
             "shape, label and h, d, t (1000 Hz) or h, to, t, v, s (110 Hz)."
         )
     try:
-        told = {key: float(str(values[key])) for key in RATES[rates[0]]}
+        told = {key: float(texts[key]) for key in RATES[rates[0]]}
     except ValueError as error:
         raise DataError(f"{name!r} has a condition that is no number ({error}).") from error
-    return SweepFile(
-        _whiskers(values["data"], name), _label(values.get("label")), str(values["shape"]), rates[0], _conditions(told)
-    )
+    return SweepFile(_whiskers(data, name), _label(texts.get("label", "")), texts["shape"], rates[0], _conditions(told))
 
 
 def _whiskers(data: NDArray[Any], name: str) -> NDArray[np.float64]:
@@ -138,13 +133,13 @@ def _whiskers(data: NDArray[Any], name: str) -> NDArray[np.float64]:
     return np.asarray(data if data.shape == alone else data[:, CELLS], dtype=np.float64)
 
 
-def _label(value: NDArray[Any] | None) -> int | None:
+def _label(text: str) -> int | None:
     """Return a class number; None for anything that is not one."""
     try:
-        number = float(str(value))
+        number = float(text)
     except ValueError:
         return None
-    return int(number) if number >= 0 and number.is_integer() else None
+    return int(number) if 0 <= number < 2**31 and number.is_integer() else None
 
 
 def _conditions(told: Mapping[str, float]) -> tuple[float, ...]:

@@ -77,12 +77,13 @@ class SweepTree:
     def times(self) -> NDArray[np.float64]:
         """Times of the frames [s]."""
         first, interval = FRAME_TIMES[self.rate]
-        return first + interval * np.arange(FRAMES)
+        return np.asarray(first + interval * np.arange(FRAMES), dtype=np.float64)
 
     @property
     def broken(self) -> NDArray[np.bool_]:
         """[sweep] true where a value is missing or too large to be trusted."""
-        return self.listed.faults[:, 1:3].any(axis=1)
+        large, missing = (self.listed.faults[:, FAULTS.index(name)] for name in ("too large", "missing"))
+        return large + missing > 0
 
     @property
     def faults(self) -> dict[str, int]:
@@ -197,7 +198,7 @@ def _open(root: Path, stamps: tuple[tuple[str, int, int], ...]) -> SweepTree:
     kept = np.flatnonzero(every.label >= 0)
     if not len(kept):
         raise DataError(f"None of the {len(every.path)} sweeps of {str(root)!r} has a label; training needs classes.")
-    listed = Listed(*(column[kept] for column in every))
+    listed = Listed._make(column[kept] for column in every)
     split = np.array([FOLDERS[path.partition("/")[0]] for path in listed.path.tolist()])
     left_out = len(every.path) - len(kept)
     tree = SweepTree(root, listed, split, _classes(root, listed), left_out)
@@ -235,15 +236,15 @@ def _list(root: Path, stamps: Sequence[tuple[str, int, int]]) -> Listed:
             kept = cache_dir("sweep-files") / f"{content_hash(str(root), part, _VERSION, length=24)}.npz"
             if kept.is_file():
                 with np.load(kept, allow_pickle=False) as file:
-                    parts.append(Listed(**{name: file[name] for name in Listed._fields}))
+                    parts.append(Listed._make(file[name] for name in Listed._fields))
                 continue
             rows = list(pool.map(functools.partial(_row, root), [path for path, _, _ in part]))
-            parts.append(Listed(*map(np.array, zip(*rows, strict=True))))
+            parts.append(Listed._make(map(np.array, zip(*rows, strict=True))))
             with atomic_path(kept) as temporary:
                 np.savez(temporary, **parts[-1]._asdict())
             if len(stamps) > _TOGETHER:
                 _LOG.info("%d of %d sweep files are listed", first + len(part), len(stamps))
-    return Listed(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
+    return Listed._make(np.concatenate(columns) for columns in zip(*parts, strict=True))
 
 
 def _row(root: Path, path: str) -> tuple[Any, ...]:

@@ -12,7 +12,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from datetime import timedelta
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from brainbench.core.errors import DataError, UsageError
 from brainbench.core.files import read_json, to_plain, write_json
@@ -20,7 +20,11 @@ from brainbench.core.progress import Progress
 from brainbench.stimuli.engines import get_engine
 from brainbench.stimuli.sweeps import running
 from brainbench.stimuli.sweeps.manifest import MANIFEST, is_complete, make_manifest
-from brainbench.stimuli.sweeps.plan import GenerationPlan, PlannedDataSet, PlannedShard
+from brainbench.stimuli.sweeps.plan import GenerationPlan, ShardTask
+
+if TYPE_CHECKING:
+    from brainbench.stimuli.sweeps.conversion import ConversionPlan, ConvertedShard
+
 
 _LOG = logging.getLogger(__name__)
 
@@ -76,7 +80,7 @@ def generate(
 
 
 def write_data_set(
-    plan: PlannedDataSet,
+    plan: GenerationPlan | ConversionPlan,
     out: str | os.PathLike[str],
     run: Callable[[Sequence[Any], Path, Callable[[int], None]], None],
     *,
@@ -145,7 +149,7 @@ def _locked(folder: Path) -> Iterator[None]:
         os.close(handle)
 
 
-def _check_config(plan: PlannedDataSet, folder: Path) -> None:
+def _check_config(plan: GenerationPlan | ConversionPlan, folder: Path) -> None:
     """Refuse to go on with what was begun otherwise; note what is begun."""
     path, config = folder / CONFIG, to_plain(plan.config)
     if not path.exists():
@@ -176,7 +180,7 @@ def _clean(folder: Path) -> None:
             item.unlink(missing_ok=True)
 
 
-def _check_space(missing: Sequence[PlannedShard], folder: Path) -> None:
+def _check_space(missing: Sequence[ShardTask | ConvertedShard], folder: Path) -> None:
     needed = sum(task.bytes for task in missing)
     free = shutil.disk_usage(folder).free
     if needed + _SPARE > free:

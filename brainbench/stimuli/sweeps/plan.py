@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from functools import cached_property
 from importlib import metadata
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,78 +27,6 @@ SHARD_SIZES = {"mujoco": 32, "bullet": 8}
 USUAL_SHARD = 512
 GPU_SHARD = 2048
 """Sweeps per shard on a GPU, which takes thousands at a time."""
-
-
-class PlannedShard(Protocol):
-    """A shard that is to be written: simulated (:class:`ShardTask`) or converted."""
-
-    @property
-    def name(self) -> str:
-        """File name."""
-        ...
-
-    @property
-    def split(self) -> str:
-        """Name of the split."""
-        ...
-
-    @property
-    def objects(self) -> Sequence[NamedObject]:
-        """Objects of the shard."""
-        ...
-
-    @property
-    def config_hash(self) -> str:
-        """Hash of the plan that it belongs to."""
-        ...
-
-    @property
-    def bytes(self) -> int:
-        """About how large the file becomes."""
-        ...
-
-    def __len__(self) -> int:
-        """Count the sweeps."""
-        ...
-
-
-class PlannedDataSet(Protocol):
-    """A data set that is to be written."""
-
-    @property
-    def shards(self) -> Sequence[Any]:
-        """The shards, each a :class:`PlannedShard`."""
-        ...
-
-    @property
-    def objects(self) -> Mapping[str, NamedObject]:
-        """All objects by name."""
-        ...
-
-    @property
-    def classes(self) -> tuple[str, ...]:
-        """Class labels."""
-        ...
-
-    @property
-    def config(self) -> Mapping[str, Any]:
-        """Plain values that determine every byte."""
-        ...
-
-    @property
-    def config_hash(self) -> str:
-        """Hash of ``config``."""
-        ...
-
-    @property
-    def sweeps(self) -> int:
-        """Number of sweeps."""
-        ...
-
-    @property
-    def notes(self) -> Mapping[str, Any]:
-        """Further entries of the manifest."""
-        ...
 
 
 def shard_name(split: str, place: int) -> str:

@@ -9,7 +9,7 @@ import os
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,10 +20,14 @@ from brainbench.core.files import atomic_path, content_hash, hash_arrays, to_jso
 from brainbench.stimuli.objects.collections import NamedObject
 from brainbench.stimuli.objects.solid import Solid
 from brainbench.stimuli.sweeps.grid import Sweep
-from brainbench.stimuli.sweeps.plan import PlannedShard, ShardTask
+from brainbench.stimuli.sweeps.plan import ShardTask
 from brainbench.stimuli.sweeps.simulation import simulate_sweeps
 from brainbench.stimuli.sweeps.sweep_scenes import SweepScenes
 from brainbench.stimuli.whiskers.array import WhiskerArray
+
+if TYPE_CHECKING:
+    from brainbench.stimuli.sweeps.conversion import ConvertedShard
+
 
 OK, UNSTABLE, UNUSABLE = 0, 1, 2
 """Values of ``status``: fine; the simulation failed; the object could not be built."""
@@ -38,7 +42,7 @@ _CONDITIONS = tuple(item.name for item in fields(Sweep))
 class ShardContent:
     """Content of a shard's file."""
 
-    task: PlannedShard
+    task: ShardTask | ConvertedShard
     arrays: Mapping[str, NDArray[Any]]
     """By name, in the order of the file; ``wrench`` is last."""
     attributes: Mapping[str, Any]
@@ -120,7 +124,11 @@ def simulate_shard(task: ShardTask, prepared: PreparedShard, workers: int | None
 
 
 def shard_attributes(
-    task: PlannedShard, config: Mapping[str, Any], axes: str, status: NDArray[np.uint8], counts: Mapping[str, int]
+    task: ShardTask | ConvertedShard,
+    config: Mapping[str, Any],
+    axes: str,
+    status: NDArray[np.uint8],
+    counts: Mapping[str, int],
 ) -> dict[str, Any]:
     """Return the attributes of a shard: what it belongs to, its axes, and counts of steps and failures."""
     return {
