@@ -13,14 +13,15 @@ import os
 import re
 from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import msgspec
 
-from brainbench.core.errors import DataError, DataFileNotFoundError, check_name
+from brainbench.core.errors import DataError, DataFileNotFoundError, check_name, listing
 from brainbench.core.records import ResultRecord
+from brainbench.core.statistics import wilson_interval
 from leaderboards.boards import Board, rank
 from leaderboards.store import read_records
 
@@ -85,6 +86,11 @@ class Training:
     status: str = "finished"
     data: Mapping[str, Any] = field(default_factory=dict)
 
+    @property
+    def finished(self) -> bool:
+        """False for a training that diverged or was interrupted: its network counts for nothing."""
+        return self.status == "finished"
+
 
 @dataclass(frozen=True)
 class Network:
@@ -120,7 +126,7 @@ def read_campaign(folder: str | os.PathLike[str]) -> Campaign:
 
     Raises:
         DataFileNotFoundError: the folder holds neither.
-        DataError: a line or a record is damaged, two lines are of one training, or trainings used other data.
+        DataError: a line or a record is damaged, two lines are of one training, or trainings had other classes.
     """
     folder = Path(folder)
     lines, records = folder / TRAININGS, folder / RECORDS
@@ -161,11 +167,11 @@ def read_trainings(path: Path) -> list[Training]:
             raise DataError(f"{place} ({training.name!r}) names no model; give the registry name as 'model'.")
         if found.setdefault(training.name, training) is not training:
             raise DataError(f"{place} repeats {training.name!r}; keep one line for each training.")
-    hashes = {item.data["hash"] for item in found.values() if item.evaluation and item.data.get("hash")}
-    if len(hashes) > 1:
+    classes = {item.data["classes"] for item in found.values() if item.data.get("classes")}
+    if len(classes) > 1:
         raise DataError(
-            f"The trainings of {path.name!r} used different data ({', '.join(sorted(map(str, hashes)))}), so their "
-            "accuracies cannot be compared; keep one campaign in a file."
+            f"The trainings of {path.name!r} have different numbers of classes ({listing(map(str, classes))}), so "
+            "their accuracies cannot be compared; keep one campaign in a file."
         )
     return list(found.values())
 
@@ -176,10 +182,12 @@ def join_campaign(trainings: Sequence[Training], records: Sequence[ResultRecord]
     Raises:
         DataError: two trainings are of the same network and seed.
     """
-    boards = tuple(sorted(rank(records), key=lambda board: (bool(board.lacks), "ridge" in board_name(board))))
-    identities = [_identity(record) for board in boards for record in _records(board)]
-    placed = [(place, record) for place, board in enumerate(boards) for record in _records(board)]
     runs = [_Identity(item.model, item.objective, item.augmentation, item.masking, item.seed) for item in trainings]
+    known = dict(zip(runs, trainings, strict=True))
+    completed = [_completed(record, known) for record in records]
+    boards = tuple(sorted(rank(completed), key=lambda board: (bool(board.lacks), "ridge" in board_name(board))))
+    placed = [(place, record) for place, board in enumerate(boards) for record in _records(board)]
+    identities = [_identity(record) for _, record in placed]
     usual = _usual_augmentations([*runs, *filter(None, identities)])
     models = [item.model for item in (*runs, *filter(None, identities)) if item.model]
     small = sum("-small" in model for model in models) * 2 >= len(models)
@@ -252,14 +260,32 @@ def _identity(record: ResultRecord) -> _Identity | None:
         objective = "untrained"
     if objective not in OBJECTIVES[:5]:
         return None
-    model = stated.get("model") or name.partition(".")[0]
-    seed = stated.get("seed") or (card.seed if card else None) or settings.get("weights_seed") or 0
+    # A folder of weights may have any name; the card then names the architecture by its twin.
+    model = (card.twin if card else None) or stated.get("model") or name.partition(".")[0]
+    seeds = (stated.get("seed"), card.seed if card else None, settings.get("weights_seed"), 0)
+    seed = next(one for one in seeds if one is not None)
     augmentation = stated.get("augmentation") or (card.augmentation if card else None) or "none"
-    # The card of a masked training names both: "physical + 75 % of the steps masked".
+    # The card of a masked training names both: "physical + 75% masking".
     augmentation = augmentation.partition(" + ")[0]
     masking = (card.training.get("masking") if card else None) or float(stated.get("masked") or 0) / 100
     masking = float(masking) if isinstance(masking, (int, float)) and math.isfinite(masking) else 0.0
     return _Identity(model, objective, augmentation, masking, int(seed))
+
+
+def _completed(record: ResultRecord, known: Mapping[_Identity, Training]) -> ResultRecord:
+    """Return a record whose card states the accuracies of its training, and of its twin, where it does not."""
+    identity = _identity(record)
+    line = known.get(identity) if identity else None
+    if line is None or record.card is None or not line.finished:
+        return record
+    stated: dict[str, Any] = {"parameters": line.parameters}
+    if (found := line.evaluation) is not None:
+        interval = wilson_interval(found.top1 * found.count, found.count, over="sweeps")
+        stated |= {"top1": found.top1, "top5": found.top5, "collapsed": found.collapsed, "accuracy_interval": interval}
+    if line.twin_evaluation is not None:
+        stated["twin_top1"] = line.twin_evaluation.top1
+    missing = {name: value for name, value in stated.items() if getattr(record.card, name) is None}
+    return replace(record, card=replace(record.card, **missing))
 
 
 def _usual_augmentations(runs: Sequence[_Identity]) -> dict[str, str]:

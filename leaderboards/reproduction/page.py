@@ -73,10 +73,11 @@ def _trained(campaign: Campaign) -> str:
     if epochs := sorted({line.epochs for line in lines if line.epochs}):
         parts.append(f"of {'/'.join(map(str, epochs))} epochs")
     data = next((line.data for line in lines if line.data.get("hash")), {})
+    hashes = sorted({str(line.data["hash"]) for line in lines if line.data.get("hash")})
     text = ", ".join(parts) + "."
     if data:
         stated = [f"{data[name]:,} to {verb}" for name, verb in _USES if isinstance(data.get(name), int)]
-        text += f" Data {data['hash']}: {data.get('classes', '?')} classes; sweeps: {', '.join(stated)}."
+        text += f" Data {' and '.join(hashes)}: {data.get('classes', '?')} classes; sweeps: {', '.join(stated)}."
     return text
 
 
