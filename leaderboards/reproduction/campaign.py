@@ -114,6 +114,8 @@ class Campaign:
     """Names of records that say neither objective nor architecture."""
     other_sizes: tuple[str, ...] = ()
     """Names of networks of another size than most; they enter no comparison."""
+    other_trainings: tuple[Training, ...] = ()
+    """Trainings of these."""
 
     @property
     def trainings(self) -> list[Training]:
@@ -218,6 +220,7 @@ def join_campaign(trainings: Sequence[Training], records: Sequence[ResultRecord]
         boards,
         tuple(sorted({r.score.name for (_, r), one in zip(placed, identities, strict=True) if one is None})),
         tuple(others),
+        tuple(line for line in trainings if line.model in others),
     )
 
 
@@ -289,9 +292,8 @@ def _completed(record: ResultRecord, known: Mapping[_Identity, Training]) -> Res
 
 
 def _usual_augmentations(runs: Sequence[_Identity]) -> dict[str, str]:
-    """Return the augmentation that most unmasked trainings of each objective used."""
+    """Return the augmentation that most trainings of each objective used, unmasked ones before masked ones."""
     counts: dict[str, Counter[str]] = defaultdict(Counter)
     for run in runs:
-        if not run.masking:
-            counts[run.objective][run.augmentation] += 1
+        counts[run.objective][run.augmentation] += 1 if run.masking else len(runs)
     return {name: min(count, key=lambda one: (-count[one], one != "physical")) for name, count in counts.items()}

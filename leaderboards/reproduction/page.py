@@ -170,9 +170,24 @@ def _network_rows(campaign: Campaign) -> list[tuple[str, ...]]:
                 _remarks(network),
             )
         )
-    lines = [(name, _plain(first.baselines[name]), _plain(item)) for name, item in five.baselines.items()]
-    empty = [""] * (3 + len(scores))
-    return rows + [(f"{name} (linear probe)", "", "", one, other, *empty) for name, one, other in lines]
+    empty = [""] * (1 + len(scores))
+    for line in campaign.other_trainings:
+        one, other = _alone(line, "top1"), _alone(line, "top5")
+        known = theirs.get(NetworkKey.of(line.model, line.objective))
+        told = number(known.value) if known else ""
+        name, remark = f"{line.model}.{line.objective}", ["of another size than most, so it enters no comparison"]
+        rows.append((name, str(line.seed), str(line.epochs or ""), one, other, "", told, *empty[1:], *remark))
+    for name, item in five.baselines.items():
+        told = (_plain(first.baselines[name]), _plain(item))
+        rows.append((f"{name} (linear probe)", "", "", *told, "", "", *empty))
+    return rows
+
+
+def _alone(line: Training, name: str) -> str:
+    result = line.evaluation if line.finished else None
+    return (
+        _plain(Observed(line.name, {0: getattr(result, name)}, line.objective, result.count)) if result else line.status
+    )
 
 
 def _mean(measured: Measured, key: NetworkKey) -> str:
@@ -204,5 +219,7 @@ def _remarks(network: Network) -> str:
 
 
 def _left_out(campaign: Campaign) -> list[str]:
-    found = [f"{name}: of another size than most, so it enters no comparison" for name in campaign.other_sizes]
+    listed = {line.model for line in campaign.other_trainings}
+    others = [name for name in campaign.other_sizes if name not in listed]
+    found = [f"{name}: of another size than most, so it enters no comparison" for name in others]
     return found + [f"{name}: the record names neither architecture nor objective" for name in campaign.unmatched]
