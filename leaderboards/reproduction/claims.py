@@ -145,7 +145,7 @@ def seed_agreement(measured: Measured, objective: str | None = None) -> list[tup
     for one, other in combinations(sorted({seed for seeds in items for seed in seeds}), 2):
         pairs = [(seeds[one], seeds[other]) for seeds in items if one in seeds and other in seeds]
         if len(pairs) > 2:
-            found.append((one, other, len(pairs), float(kendalltau(*zip(*pairs, strict=True)).statistic)))
+            found.append((one, other, len(pairs), float(np.array(kendalltau(*zip(*pairs, strict=True)))[0])))
     return found
 
 

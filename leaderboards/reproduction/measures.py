@@ -11,6 +11,8 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from brainbench.core.records import ResultRecord, Score
 from leaderboards.boards import RAW_INPUT
 from leaderboards.ranking import Sample
@@ -145,7 +147,7 @@ def _order(record: ResultRecord, part: str) -> float:
     from scipy.stats import kendalltau
 
     values = [item.value for item in record.score.layers if item.layer.startswith(part) and math.isfinite(item.value)]
-    return float(kendalltau(range(len(values)), values).statistic) if len(values) > 2 else math.nan
+    return float(np.array(kendalltau(range(len(values)), values))[0]) if len(values) > 2 else math.nan
 
 
 __all__ = [
