@@ -104,15 +104,22 @@ def _effect(effect: Effect | None) -> str:
 
 
 def _accuracy_row(item: Judgement) -> tuple[str, ...]:
-    effect, published_effect = item.effect, item.published_effect
     return (
         item.claim.claim,
         _published(item),
-        number(published_effect.value) if published_effect else "–",
-        _effect(effect),
-        f"{effect.positive} of {effect.comparisons} above" if effect and item.claim.measure == "accuracy" else "–",
+        number(item.published_effect.value) if item.published_effect else "–",
+        _effect(item.effect),
+        _above(item) or "–",
         _verdict(item),
     )
+
+
+def _above(item: Judgement) -> str:
+    """Return how many comparisons lie above the neutral value; empty where the effect is no mean of comparisons."""
+    if item.effect is None or item.claim.measure not in ("accuracy", "fit", "layers", "blocks"):
+        return ""
+    effect = item.effect
+    return f"{effect.positive} of {effect.comparisons} above" if effect.comparisons > 1 else ""
 
 
 def _published(item: Judgement) -> str:
@@ -126,7 +133,7 @@ def _verdict(item: Judgement) -> str:
 def _fit_row(items: Sequence[Judgement], scored: bool) -> tuple[str, ...]:
     """Return the row of one claim, with what the rule says on each board; the verdict is that of the first."""
     first = items[0]
-    cells = [_effect(one.effect) + (f", {one.rule}" if one.effect else "") for one in items if scored]
+    cells = [", ".join(filter(None, (_effect(one.effect), _above(one), one.rule))) for one in items if scored]
     return (first.claim.claim, _published(first), *cells, _verdict(first))
 
 
@@ -135,8 +142,14 @@ def _seed_rows(campaign: Campaign) -> list[tuple[str, ...]]:
     measured += [(f"fit on {board_name(board)}", fits(campaign, i)) for i, board in enumerate(campaign.boards)]
     rows = []
     for name, one in measured:
-        for kind, objective in (("supervised", "supervised"), ("all trained", None)):
-            if found := seed_agreement(one, objective):
+        agreements = {
+            "supervised": seed_agreement(one, "supervised"),
+            "all trained": seed_agreement(one),
+        }
+        if agreements["all trained"] == agreements["supervised"]:  # nothing else was repeated
+            del agreements["all trained"]
+        for kind, found in agreements.items():
+            if found:
                 mean = sum(tau for *_, tau in found) / len(found)
                 told = ", ".join(f"{a} and {b}: {number(tau, 2)} ({count})" for a, b, count, tau in found)
                 rows.append((f"{name}, {kind}", told, number(mean, 2), "reached" if mean >= GOAL else "not reached"))
