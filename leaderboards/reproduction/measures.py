@@ -14,10 +14,10 @@ from typing import Any
 import numpy as np
 
 from brainbench.core.records import ResultRecord, Score
-from leaderboards.boards import RAW_INPUT
 from leaderboards.ranking import Sample
-from leaderboards.reproduction.campaign import Campaign, NetworkKey, Training
+from leaderboards.reproduction.campaign import Campaign, NetworkKey
 from leaderboards.reproduction.contrasts import Observed
+from leaderboards.reproduction.trainings import Training
 
 ANIMALS = "animal-to-animal"
 RANDOM_FEATURES = "random features"
@@ -148,9 +148,3 @@ def _order(record: ResultRecord, part: str) -> float:
 
     values = [item.value for item in record.score.layers if item.layer.startswith(part) and math.isfinite(item.value)]
     return float(np.array(kendalltau(range(len(values)), values))[0]) if len(values) > 2 else math.nan
-
-
-__all__ = [
-    "ANIMALS", "RANDOM_FEATURES", "RAW_INPUT", "Measured", "accuracies", "fits", "layer_orders", "parameters",
-    "published", "published_accuracy",
-]  # fmt: skip

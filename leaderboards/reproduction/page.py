@@ -14,10 +14,11 @@ from brainbench.core.statistics import is_finite, wilson_interval
 from leaderboards.figures.charts import board_figures
 from leaderboards.figures.plots import Figure
 from leaderboards.figures.svg import standalone
-from leaderboards.reproduction.campaign import TRAININGS, Campaign, Network, NetworkKey, Training, board_name
+from leaderboards.reproduction.campaign import Campaign, Network, NetworkKey, board_name
 from leaderboards.reproduction.claims import GOAL, Judgement, judge_accuracy, judge_fit, seed_agreement
 from leaderboards.reproduction.contrasts import Effect, Matched, Observed, contrast
 from leaderboards.reproduction.measures import Measured, accuracies, fits, published, published_accuracy
+from leaderboards.reproduction.trainings import TRAININGS, Training
 from leaderboards.site.page import render_markdown
 from leaderboards.text import number, plural, span
 

@@ -9,12 +9,12 @@ import pytest
 
 from leaderboards.reproduction.campaign import NetworkKey, join_campaign
 from leaderboards.reproduction.claims import (
-    COMPARISONS,
     judge_accuracy,
     judge_fit,
     published_claims,
     seed_agreement,
 )
+from leaderboards.reproduction.comparisons import COMPARISONS
 from leaderboards.reproduction.measures import accuracies, published, published_accuracy
 from tests.factories.campaigns import draw_campaign
 
