@@ -70,11 +70,11 @@ def rdm_lines(board: Board) -> Figure:
     Pairs stand in the order of the brain's dissimilarity; many pairs are averaged in groups of equal size.
     """
     key, title = "rdm-lines", "Flattened dissimilarity matrices (as figure 3.5 e)"
-    *models, brain = [(name, np.asarray(pairs, dtype=np.float64)) for name, _, pairs in _picked(board)] or [("", None)]
-    if brain[0] != "brain" or brain[1] is None or not models:
+    picked = {name: np.asarray(pairs, dtype=np.float64) for name, _, pairs in _picked(board)}
+    truth = picked.pop("brain", np.empty(0))
+    models = [(name, pairs) for name, pairs in picked.items() if pairs.shape == truth.shape]
+    if not models:
         return Figure(key, title, lacking="no record holds the RDMs of a model and of the brain")
-    truth = brain[1]
-    models = [(name, pairs) for name, pairs in models if pairs.shape == truth.shape]
     known = np.isfinite([truth, *(pairs for _, pairs in models)]).all(axis=0)
     if known.sum() < 3:
         return Figure(key, title, lacking="fewer than 3 pairs of stimuli are defined in all RDMs")

@@ -1,6 +1,7 @@
 """A campaign of trainings held against the published study: which of its headlines hold on our stimuli.
 
-:mod:`campaign` reads trainings and records and joins them, :mod:`contrasts` estimates differences of networks with
-their intervals, :mod:`claims` judges every published claim by a rule, :mod:`figures` draws figures 3.3 to 3.8 and
-:mod:`page` writes it all down. The published numbers stand in ``published.json``.
+:mod:`trainings` reads the lines of a campaign and :mod:`campaign` joins them with records; :mod:`measures` takes
+accuracy, fit and order of layers from them, :mod:`contrasts` estimates differences with their intervals,
+:mod:`comparisons` says what each published claim compares, :mod:`claims` judges it by a rule and :mod:`page` writes it
+all down, with the figures of the board. The published numbers stand in ``published.json``.
 """

@@ -7,26 +7,23 @@ agree. A record says these on its model card; where the card does not, its name 
 
 from __future__ import annotations
 
-import json
 import math
 import os
 import re
 from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import msgspec
-
-from brainbench.core.errors import DataError, DataFileNotFoundError, check_name
+from brainbench.core.errors import DataError, DataFileNotFoundError
 from brainbench.core.records import ResultRecord
+from brainbench.core.statistics import wilson_interval
 from leaderboards.boards import Board, rank
+from leaderboards.reproduction.trainings import OBJECTIVES, TRAININGS, Training, read_trainings
 from leaderboards.store import read_records
 
-TRAININGS = "trainings.jsonl"
 RECORDS = "records"
-OBJECTIVES = ("supervised", "simclr", "simsiam", "ae", "untrained", "baseline")
 _NAME = re.compile(
     r"(?P<model>[^.]+)\.(?P<objective>supervised|simclr|simsiam|ae|untrained)"
     r"(?:\.(?P<augmentation>physical|image|none|thesis))?(?:\.masked(?P<masked>\d+))?(?:\.seed(?P<seed>\d+))?"
@@ -56,37 +53,6 @@ class NetworkKey(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Accuracy:
-    """Accuracy on the test sweeps, as :class:`brainbench.models.training.evaluation.Evaluation` states it."""
-
-    top1: float
-    top5: float
-    count: int
-    collapsed: bool = False
-    reason: str = ""
-
-
-@dataclass(frozen=True)
-class Training:
-    """One line of ``trainings.jsonl``: a network trained once, an untrained one, or a baseline."""
-
-    name: str
-    objective: str
-    model: str = ""
-    seed: int = 0
-    augmentation: str = "none"
-    masking: float = 0.0
-    epochs: int | None = None
-    learning_rate: float | None = None
-    evaluation: Accuracy | None = None
-    """None for a training that diverged or is not finished."""
-    twin_evaluation: Accuracy | None = None
-    parameters: int | None = None
-    status: str = "finished"
-    data: Mapping[str, Any] = field(default_factory=dict)
-
-
-@dataclass(frozen=True)
 class Network:
     """A network with all that is known of it, by seed."""
 
@@ -108,6 +74,8 @@ class Campaign:
     """Names of records that say neither objective nor architecture."""
     other_sizes: tuple[str, ...] = ()
     """Names of networks of another size than most; they enter no comparison."""
+    other_trainings: tuple[Training, ...] = ()
+    """Trainings of these."""
 
     @property
     def trainings(self) -> list[Training]:
@@ -120,7 +88,7 @@ def read_campaign(folder: str | os.PathLike[str]) -> Campaign:
 
     Raises:
         DataFileNotFoundError: the folder holds neither.
-        DataError: a line or a record is damaged, two lines are of one training, or trainings used other data.
+        DataError: a line or a record is damaged, two lines are of one training, or trainings had other classes.
     """
     folder = Path(folder)
     lines, records = folder / TRAININGS, folder / RECORDS
@@ -135,51 +103,18 @@ def read_campaign(folder: str | os.PathLike[str]) -> Campaign:
     return join_campaign(trainings, [item.record for item in stored if item.record is not None])
 
 
-def read_trainings(path: Path) -> list[Training]:
-    """Read the lines of a campaign, each checked.
-
-    Raises:
-        DataError: a line is not JSON, lacks a field, holds an impossible value, or stands there twice.
-    """
-    found: dict[str, Training] = {}
-    for number, line in enumerate(path.read_text(encoding="utf-8", errors="replace").splitlines(), start=1):
-        if not line.strip():
-            continue
-        place = f"Line {number} of {path.name!r}"
-        try:
-            training = msgspec.convert(json.loads(line), Training)
-        except ValueError as error:  # msgspec's is one too
-            raise DataError(f"{place} is not a training: {error}; write the line again or delete it.") from error
-        check_name(f"objective in line {number} of {path.name!r}", training.objective, OBJECTIVES)
-        for result in filter(None, (training.evaluation, training.twin_evaluation)):
-            if not 0 <= result.top1 <= result.top5 <= 1 or result.count < 1:
-                raise DataError(
-                    f"{place} ({training.name!r}) has top-1 {result.top1}, top-5 {result.top5} of {result.count} "
-                    "sweeps; expected 0 ≤ top-1 ≤ top-5 ≤ 1 of at least one."
-                )
-        if training.objective != "baseline" and not training.model:
-            raise DataError(f"{place} ({training.name!r}) names no model; give the registry name as 'model'.")
-        if found.setdefault(training.name, training) is not training:
-            raise DataError(f"{place} repeats {training.name!r}; keep one line for each training.")
-    hashes = {item.data["hash"] for item in found.values() if item.evaluation and item.data.get("hash")}
-    if len(hashes) > 1:
-        raise DataError(
-            f"The trainings of {path.name!r} used different data ({', '.join(sorted(map(str, hashes)))}), so their "
-            "accuracies cannot be compared; keep one campaign in a file."
-        )
-    return list(found.values())
-
-
 def join_campaign(trainings: Sequence[Training], records: Sequence[ResultRecord]) -> Campaign:
     """Join trainings and records by network and seed.
 
     Raises:
         DataError: two trainings are of the same network and seed.
     """
-    boards = tuple(sorted(rank(records), key=lambda board: (bool(board.lacks), "ridge" in board_name(board))))
-    identities = [_identity(record) for board in boards for record in _records(board)]
-    placed = [(place, record) for place, board in enumerate(boards) for record in _records(board)]
     runs = [_Identity(item.model, item.objective, item.augmentation, item.masking, item.seed) for item in trainings]
+    known = dict(zip(runs, trainings, strict=True))
+    completed = [_completed(record, known) for record in records]
+    boards = tuple(sorted(rank(completed), key=lambda board: (bool(board.lacks), "ridge" in board_name(board))))
+    placed = [(place, record) for place, board in enumerate(boards) for record in _records(board)]
+    identities = [_identity(record) for _, record in placed]
     usual = _usual_augmentations([*runs, *filter(None, identities)])
     models = [item.model for item in (*runs, *filter(None, identities)) if item.model]
     small = sum("-small" in model for model in models) * 2 >= len(models)
@@ -210,6 +145,7 @@ def join_campaign(trainings: Sequence[Training], records: Sequence[ResultRecord]
         boards,
         tuple(sorted({r.score.name for (_, r), one in zip(placed, identities, strict=True) if one is None})),
         tuple(others),
+        tuple(line for line in trainings if line.model in others),
     )
 
 
@@ -252,20 +188,37 @@ def _identity(record: ResultRecord) -> _Identity | None:
         objective = "untrained"
     if objective not in OBJECTIVES[:5]:
         return None
-    model = stated.get("model") or name.partition(".")[0]
-    seed = stated.get("seed") or (card.seed if card else None) or settings.get("weights_seed") or 0
+    # A folder of weights may have any name; the card then names the architecture by its twin.
+    model = (card.twin if card else None) or stated.get("model") or name.partition(".")[0]
+    seeds = (stated.get("seed"), card.seed if card else None, settings.get("weights_seed"), 0)
+    seed = next(one for one in seeds if one is not None)
     augmentation = stated.get("augmentation") or (card.augmentation if card else None) or "none"
-    # The card of a masked training names both: "physical + 75 % of the steps masked".
+    # The card of a masked training names both: "physical + 75% masking".
     augmentation = augmentation.partition(" + ")[0]
     masking = (card.training.get("masking") if card else None) or float(stated.get("masked") or 0) / 100
     masking = float(masking) if isinstance(masking, (int, float)) and math.isfinite(masking) else 0.0
     return _Identity(model, objective, augmentation, masking, int(seed))
 
 
+def _completed(record: ResultRecord, known: Mapping[_Identity, Training]) -> ResultRecord:
+    """Return a record whose card states the accuracies of its training, and of its twin, where it does not."""
+    identity = _identity(record)
+    line = known.get(identity) if identity else None
+    if line is None or record.card is None or not line.finished:
+        return record
+    stated: dict[str, Any] = {"parameters": line.parameters}
+    if (found := line.evaluation) is not None:
+        interval = wilson_interval(found.top1 * found.count, found.count, over="sweeps")
+        stated |= {"top1": found.top1, "top5": found.top5, "collapsed": found.collapsed, "accuracy_interval": interval}
+    if line.twin_evaluation is not None:
+        stated["twin_top1"] = line.twin_evaluation.top1
+    missing = {name: value for name, value in stated.items() if getattr(record.card, name) is None}
+    return replace(record, card=replace(record.card, **missing))
+
+
 def _usual_augmentations(runs: Sequence[_Identity]) -> dict[str, str]:
-    """Return the augmentation that most unmasked trainings of each objective used."""
+    """Return the augmentation that most trainings of each objective used, unmasked ones before masked ones."""
     counts: dict[str, Counter[str]] = defaultdict(Counter)
     for run in runs:
-        if not run.masking:
-            counts[run.objective][run.augmentation] += 1
+        counts[run.objective][run.augmentation] += 1 if run.masking else len(runs)
     return {name: min(count, key=lambda one: (-count[one], one != "physical")) for name, count in counts.items()}

@@ -4,17 +4,20 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from brainbench.core.records import ResultRecord, Score
-from leaderboards.boards import RAW_INPUT
 from leaderboards.ranking import Sample
-from leaderboards.reproduction.campaign import Campaign, NetworkKey, Training
+from leaderboards.reproduction.campaign import Campaign, NetworkKey
 from leaderboards.reproduction.contrasts import Observed
+from leaderboards.reproduction.trainings import Training
 
 ANIMALS = "animal-to-animal"
 RANDOM_FEATURES = "random features"
@@ -69,7 +72,8 @@ def accuracies(campaign: Campaign, *, top1: bool = False) -> Measured:
     for key, network in campaign.networks.items():
         for seed, training in network.trainings.items():
             twin = NetworkKey(key.encoder, key.attender, "untrained")
-            for name, result in ((key, training.evaluation), (twin, training.twin_evaluation)):
+            own = training.evaluation if training.finished else None
+            for name, result in ((key, own), (twin, training.twin_evaluation)):
                 if result is not None:
                     # An untrained network's own line comes before what trainings say of their twin.
                     first = name == key and key.objective == "untrained"
@@ -80,7 +84,7 @@ def accuracies(campaign: Campaign, *, top1: bool = False) -> Measured:
         key: Observed(key.name, {seed: value for seed, (value, _) in told.items()}, key.objective, _sweeps(told))
         for key, told in values.items()
     }
-    lines = {name.replace("-", " "): line for name, line in campaign.baselines.items()}
+    lines = {re.sub("[-_]", " ", name): line for name, line in campaign.baselines.items()}
     return Measured(networks, {name: _baseline(name, line, top1) for name, line in lines.items() if line.evaluation})
 
 
@@ -88,7 +92,8 @@ def fits(campaign: Campaign, place: int) -> Measured:
     """Return the fits on one board, scaled between chance (0) and all that is reliable (1); reliable ones only."""
     networks = {}
     for key, network in campaign.networks.items():
-        scores = {seed: record.score for seed, record in network.records.get(place, {}).items()}
+        lost = {seed for seed, line in network.trainings.items() if not line.finished}
+        scores = {seed: one.score for seed, one in network.records.get(place, {}).items() if seed not in lost}
         if item := _fit(key.name, scores, key.objective):
             networks[key] = item
     baselines = {item.name: item.score for item in campaign.boards[place].baselines}
@@ -142,10 +147,4 @@ def _order(record: ResultRecord, part: str) -> float:
     from scipy.stats import kendalltau
 
     values = [item.value for item in record.score.layers if item.layer.startswith(part) and math.isfinite(item.value)]
-    return float(kendalltau(range(len(values)), values).statistic) if len(values) > 2 else math.nan
-
-
-__all__ = [
-    "ANIMALS", "RANDOM_FEATURES", "RAW_INPUT", "Measured", "accuracies", "fits", "layer_orders", "parameters",
-    "published", "published_accuracy",
-]  # fmt: skip
+    return float(np.array(kendalltau(range(len(values)), values))[0]) if len(values) > 2 else math.nan

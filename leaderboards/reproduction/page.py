@@ -14,10 +14,11 @@ from brainbench.core.statistics import is_finite, wilson_interval
 from leaderboards.figures.charts import board_figures
 from leaderboards.figures.plots import Figure
 from leaderboards.figures.svg import standalone
-from leaderboards.reproduction.campaign import TRAININGS, Campaign, Network, NetworkKey, Training, board_name
+from leaderboards.reproduction.campaign import Campaign, Network, NetworkKey, board_name
 from leaderboards.reproduction.claims import GOAL, Judgement, judge_accuracy, judge_fit, seed_agreement
 from leaderboards.reproduction.contrasts import Effect, Matched, Observed, contrast
 from leaderboards.reproduction.measures import Measured, accuracies, fits, published, published_accuracy
+from leaderboards.reproduction.trainings import TRAININGS, Training
 from leaderboards.site.page import render_markdown
 from leaderboards.text import number, plural, span
 
@@ -73,10 +74,11 @@ def _trained(campaign: Campaign) -> str:
     if epochs := sorted({line.epochs for line in lines if line.epochs}):
         parts.append(f"of {'/'.join(map(str, epochs))} epochs")
     data = next((line.data for line in lines if line.data.get("hash")), {})
+    hashes = sorted({str(line.data["hash"]) for line in lines if line.data.get("hash")})
     text = ", ".join(parts) + "."
     if data:
         stated = [f"{data[name]:,} to {verb}" for name, verb in _USES if isinstance(data.get(name), int)]
-        text += f" Data {data['hash']}: {data.get('classes', '?')} classes; sweeps: {', '.join(stated)}."
+        text += f" Data {' and '.join(hashes)}: {data.get('classes', '?')} classes; sweeps: {', '.join(stated)}."
     return text
 
 
@@ -103,15 +105,22 @@ def _effect(effect: Effect | None) -> str:
 
 
 def _accuracy_row(item: Judgement) -> tuple[str, ...]:
-    effect, published_effect = item.effect, item.published_effect
     return (
         item.claim.claim,
         _published(item),
-        number(published_effect.value) if published_effect else "–",
-        _effect(effect),
-        f"{effect.positive} of {effect.comparisons} above" if effect and item.claim.measure == "accuracy" else "–",
+        number(item.published_effect.value) if item.published_effect else "–",
+        _effect(item.effect),
+        _above(item) or "–",
         _verdict(item),
     )
+
+
+def _above(item: Judgement) -> str:
+    """Return how many comparisons lie above the neutral value; empty where the effect is no mean of comparisons."""
+    if item.effect is None or item.claim.measure not in ("accuracy", "fit", "layers", "blocks"):
+        return ""
+    effect = item.effect
+    return f"{effect.positive} of {effect.comparisons} above" if effect.comparisons > 1 else ""
 
 
 def _published(item: Judgement) -> str:
@@ -125,7 +134,7 @@ def _verdict(item: Judgement) -> str:
 def _fit_row(items: Sequence[Judgement], scored: bool) -> tuple[str, ...]:
     """Return the row of one claim, with what the rule says on each board; the verdict is that of the first."""
     first = items[0]
-    cells = [_effect(one.effect) + (f", {one.rule}" if one.effect else "") for one in items if scored]
+    cells = [", ".join(filter(None, (_effect(one.effect), _above(one), one.rule))) for one in items if scored]
     return (first.claim.claim, _published(first), *cells, _verdict(first))
 
 
@@ -134,8 +143,14 @@ def _seed_rows(campaign: Campaign) -> list[tuple[str, ...]]:
     measured += [(f"fit on {board_name(board)}", fits(campaign, i)) for i, board in enumerate(campaign.boards)]
     rows = []
     for name, one in measured:
-        for kind, objective in (("supervised", "supervised"), ("all trained", None)):
-            if found := seed_agreement(one, objective):
+        agreements = {
+            "supervised": seed_agreement(one, "supervised"),
+            "all trained": seed_agreement(one),
+        }
+        if agreements["all trained"] == agreements["supervised"]:  # nothing else was repeated
+            del agreements["all trained"]
+        for kind, found in agreements.items():
+            if found:
                 mean = sum(tau for *_, tau in found) / len(found)
                 told = ", ".join(f"{a} and {b}: {number(tau, 2)} ({count})" for a, b, count, tau in found)
                 rows.append((f"{name}, {kind}", told, number(mean, 2), "reached" if mean >= GOAL else "not reached"))
@@ -169,9 +184,24 @@ def _network_rows(campaign: Campaign) -> list[tuple[str, ...]]:
                 _remarks(network),
             )
         )
-    lines = [(name, _plain(first.baselines[name]), _plain(item)) for name, item in five.baselines.items()]
-    empty = [""] * (3 + len(scores))
-    return rows + [(f"{name} (linear probe)", "", "", one, other, *empty) for name, one, other in lines]
+    empty = [""] * (1 + len(scores))
+    for line in campaign.other_trainings:
+        one, other = _alone(line, "top1"), _alone(line, "top5")
+        known = theirs.get(NetworkKey.of(line.model, line.objective))
+        told = number(known.value) if known else ""
+        name, remark = f"{line.model}.{line.objective}", ["of another size than most, so it enters no comparison"]
+        rows.append((name, str(line.seed), str(line.epochs or ""), one, other, "", told, *empty[1:], *remark))
+    for name, item in five.baselines.items():
+        told = (_plain(first.baselines[name]), _plain(item))
+        rows.append((f"{name} (linear probe)", "", "", *told, "", "", *empty))
+    return rows
+
+
+def _alone(line: Training, name: str) -> str:
+    result = line.evaluation if line.finished else None
+    return (
+        _plain(Observed(line.name, {0: getattr(result, name)}, line.objective, result.count)) if result else line.status
+    )
 
 
 def _mean(measured: Measured, key: NetworkKey) -> str:
@@ -203,5 +233,7 @@ def _remarks(network: Network) -> str:
 
 
 def _left_out(campaign: Campaign) -> list[str]:
-    found = [f"{name}: of another size than most, so it enters no comparison" for name in campaign.other_sizes]
+    listed = {line.model for line in campaign.other_trainings}
+    others = [name for name in campaign.other_sizes if name not in listed]
+    found = [f"{name}: of another size than most, so it enters no comparison" for name in others]
     return found + [f"{name}: the record names neither architecture nor objective" for name in campaign.unmatched]

@@ -12,7 +12,8 @@ import msgspec
 import numpy as np
 
 from brainbench.core.records import LayerScore, ModelCard, ResultRecord
-from leaderboards.reproduction.campaign import Campaign, Training, join_campaign
+from leaderboards.reproduction.campaign import Campaign, join_campaign
+from leaderboards.reproduction.trainings import Training
 from leaderboards.store import write_record
 from tests.factories.records import draw_board
 

@@ -82,7 +82,7 @@ def test_unreliable_scores_are_left_out():
         ({"evaluation": {"top1": 0.5, "top5": 0.4, "count": 10}}, "top-5 0.4"),
         ({"evaluation": {"top1": "high", "top5": 0.4, "count": 10}}, "top1"),
         ({"model": ""}, "model"),
-        ({"data": {"hash": "other"}}, "other"),
+        ({"data": {"hash": "abcd", "classes": 7}}, "'7'"),
         ({"seed": "first"}, "seed"),
     ],
 )
@@ -119,3 +119,19 @@ def test_a_damaged_record_is_refused(tmp_path):
     path.write_text(path.read_text().replace('"ok"', '"OK"', 1))
     with pytest.raises(DataError, match=r"OK|edited"):
         read_campaign(folder)
+
+
+def test_a_folder_of_weights_is_known_by_its_card_and_gets_the_accuracies_of_its_training():
+    record = next(one for one in draw_records(1) if one.score.name == "zhuang-gru-small+gpt.supervised")
+    card = replace(record.card, top1=None, top5=None, augmentation="physical + 75% masking", training={"masking": 0.75})
+    moved = replace(record, card=card, score=replace(record.score, name="local-dir:/runs/17/best"))
+    key = NetworkKey("zhuang-gru", "gpt", "supervised")
+    line = draw_campaign(1).networks[key].trainings[card.seed]
+    twin = replace(line.evaluation, top1=0.05, top5=0.1)
+    campaign = join_campaign([replace(line, masking=0.75, twin_evaluation=twin)], [moved])
+    assert list(campaign.networks) == [key._replace(variant="masked")]
+    (entry,) = campaign.boards[0].entries
+    assert (entry.card.top5, entry.card.twin_top1) == (line.evaluation.top5, 0.05)
+    lost = join_campaign([replace(line, masking=0.75, status="diverged")], [moved])
+    assert lost.boards[0].entries[0].card.top5 is None
+    assert not fits(lost, 0).networks

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -66,10 +67,13 @@ def test_the_page_of_the_documentation_is_that_of_the_campaign_beside_the_code(t
 
 def test_a_campaign_without_records_or_of_nothing_gives_a_page(tmp_path):
     lines = draw_campaign(1).trainings
+    lines.append(replace(lines[0], name="full", model="zhuang+gpt"))
     text = write_page(join_campaign(lines, []), tmp_path)[0][0].read_text(encoding="utf-8")
     assert "No network has been scored yet" in text
     assert "| Trained networks fit better than the raw input |" in text
     assert "not scored yet" in text
+    assert "| zhuang+gpt." in next(line for line in text.splitlines() if "another size" in line)
+    assert all(len({len(row) for row in table}) == 1 for table in _tables(text))
     text = write_page(join_campaign([], []), tmp_path)[0][0].read_text(encoding="utf-8")
     assert "not trained yet" in text
     assert "Figures 3.3 to 3.8" in text
