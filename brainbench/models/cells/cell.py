@@ -100,7 +100,8 @@ class TimeDecay(Cell):
     """Leaky trace: s ← x + τ s, y = s, with one scalar τ that starts at ``tau``, on any [B, C, ...].
 
     Training changes τ if it is ``trainable``. There is no gate to normalise, so ``layer_norm`` normalises the output
-    (y = LN(s)); the trace itself stays as it is, or it would forget how strong the stimulus was. ``kernel_size`` is unused.
+    (y = LN(s)); the trace itself stays as it is, or it would forget how strong the stimulus was.
+    ``kernel_size`` is unused.
 
     Raises:
         UsageError: the numbers of channels differ.

@@ -24,7 +24,7 @@ LOCAL, HUB = "local-dir:", "hf-hub:"
 PREFIXES = (LOCAL, HUB)
 """Beginnings of a model's name that is a folder or a repository instead of a registry name."""
 DTYPES = ("float32", "float16", "bfloat16")
-FOREIGN, SETTINGS = "*.ckpt", "config.yaml"
+FOREIGN, SCORED, SETTINGS = "*.ckpt", "val_best.ckpt", "config.yaml"
 foreign_importers: list[Callable[[Path, Path | None], Path]] = []
 """What makes a model's folder of a foreign file and its settings, if there are any; entered by the package."""
 
@@ -182,7 +182,9 @@ def _imported(folder: Path, source: str) -> Path:
     """Return a folder of ours as it is, and that of its import for one with a foreign checkpoint."""
     if (folder / CONFIG).is_file():
         return folder
-    found = sorted(folder.rglob(FOREIGN) if source.startswith(HUB) else folder.glob(FOREIGN))
+    found = sorted(folder.glob(FOREIGN)) or (sorted(folder.rglob(FOREIGN)) if source.startswith(HUB) else [])
+    # Of the files of one run, the study scored this one.
+    found = [path for path in found if path == folder / SCORED] or found
     if len(found) > 1:
         raise UsageError(
             f"{source!r} holds {listing([os.fspath(path.relative_to(folder)) for path in found])}; name the folder of "

@@ -94,8 +94,12 @@ def test_a_folder_with_one_such_file_is_a_model(file, original):
     name = f"local-dir:{file.parent}"
     torch.testing.assert_close(load_model(name)(x), original(x), atol=1e-4, rtol=1e-4)
     assert describe_model(name).trained["objective"] == "simclr"
-    (file.parent / "last.ckpt").write_bytes(file.read_bytes())
-    with pytest.raises(UsageError, match=r"'last\.ckpt', 'val_best\.ckpt'"):
+    for other in ("last.ckpt", "lin_ft_linear/val_best.ckpt"):
+        (file.parent / other).parent.mkdir(exist_ok=True)
+        (file.parent / other).write_bytes(b"")
+    torch.testing.assert_close(load_model(name)(x), original(x), atol=1e-4, rtol=1e-4)
+    file.rename(file.with_name("first.ckpt"))
+    with pytest.raises(UsageError, match=r"'first\.ckpt', 'last\.ckpt'"):
         load_model(name)
 
 

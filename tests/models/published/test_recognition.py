@@ -35,6 +35,11 @@ def test_every_network_of_the_study_is_recognised_and_every_entry_accounted_for(
         buffers = {theirs for ours, theirs in published_names(model).items() if ours in dict(model.named_buffers())}
         count = sum(value.numel() for entry, value in used.items() if entry not in buffers)
         assert count == network["model_parameters"]
+        # SimSiam stores its head twice, under loss. and loss.neck.; running averages are no parameters.
+        averages = ("running_mean", "running_var", "num_batches_tracked")
+        head = {left for left in state if left.startswith("loss.") and not left.endswith(averages)}
+        head = {left for left in head if left.replace("loss.neck.", "loss.") not in head - {left}}
+        assert sum(state[left].numel() for left in head) == network["loss_parameters"]
 
 
 @pytest.mark.shared
