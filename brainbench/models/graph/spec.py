@@ -160,8 +160,7 @@ class Node:
         """Return the shapes after the operation, after the pool and after each step of the chain."""
         shapes = [shape if self.operation is None else self.operation.output_shape(shape)]
         for step in (self.pool, *self.chain):
-            same = step is None or isinstance(step, str)
-            shapes.append(shapes[-1] if same else step.output_shape(shapes[-1]))
+            shapes.append(step.output_shape(shapes[-1]) if isinstance(step, (Pool, Operation)) else shapes[-1])
         return shapes
 
 

@@ -125,7 +125,7 @@ class TemporalGraph(nn.Module):
             for index, step in enumerate(node.steps):
                 if isinstance(operation := getattr(step, "operation", None), (Conv2d, Linear)):
                     owner = f"{name}._post_memory.sequential_mem.{index}"
-                    renamed |= _tnn_operation(owner, operation, cast(nn.Sequential, step).before)
+                    renamed |= _tnn_operation(owner, operation, step.get_submodule("before"))
             if node.memory is not None:
                 cell = node.memory.tnn_parameters()
                 renamed.update({f"{name}._recurrent_cell.{key}": value for key, value in cell.items()})
@@ -334,7 +334,7 @@ class TemporalGraph(nn.Module):
 def _tnn_operation(owner: str, operation: nn.Module, after: nn.Module) -> dict[str, torch.Tensor]:
     """Return the entries of an operation and of the batch norm after it under PyTorchTNN's names."""
     kind = "lin" if isinstance(operation, Linear) else "conv"
-    found = {f"{owner}.{kind}.{key}": value for key, value in operation.named_parameters()}
+    found: dict[str, torch.Tensor] = {f"{owner}.{kind}.{key}": value for key, value in operation.named_parameters()}
     norm = after[0].state_dict(keep_vars=True) if isinstance(after, nn.Sequential) else {}
     return found | {f"{owner}.bn.{key}": value for key, value in norm.items()}
 

@@ -69,10 +69,9 @@ def published_names(model: EncoderAttenderDecoder) -> dict[str, str]:
     graph = model.encoder.tnn_parameters() if isinstance(model.encoder, TemporalGraph) else {}
     nodes = {id(value): f"TG.{name}" for name, value in graph.items()}
     found = {}
-    for part in ("encoder", "attender", "decoder"):
-        module = getattr(model, part)
-        state = module.state_dict(keep_vars=True) if module is not None else {}
-        for name, value in state.items():
+    for part, module in model.named_children():
+        entries = module.state_dict(keep_vars=True) if part != "normaliser" else {}
+        for name, value in entries.items():
             theirs = nodes[id(value)] if nodes and part == "encoder" else _renamed(module, name)
             found[f"{part}.{name}"] = f"model.{part}.{theirs}"
     return found

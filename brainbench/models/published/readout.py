@@ -25,6 +25,7 @@ from brainbench.models.encoders.s4 import S4Encoder
 from brainbench.models.graph.temporal_graph import TemporalGraph
 from brainbench.models.heads.decoders import AllStepsDecoder
 from brainbench.models.network import EncoderAttenderDecoder
+from brainbench.models.parts import Attender
 
 Named = dict[str, torch.Tensor]
 
@@ -96,7 +97,7 @@ def _encoder(model: EncoderAttenderDecoder, x: torch.Tensor) -> tuple[torch.Tens
     raise UsageError(f"The published readout does not know the encoder {type(encoder).__name__}.")
 
 
-def _attender(attender: nn.Module, x: torch.Tensor) -> tuple[torch.Tensor, Named]:
+def _attender(attender: Attender, x: torch.Tensor) -> tuple[torch.Tensor, Named]:
     found: Named = {}
     if isinstance(attender, GPTAttender):
         stream = found["att_gpt_emb"] = attender.tokens(x, 0)
