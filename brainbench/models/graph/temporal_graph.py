@@ -64,14 +64,14 @@ class TemporalGraph(nn.Module):
     def from_config(
         cls, source: Mapping[str, Any] | str | os.PathLike[str], *, input_shape: tuple[int, int, int] | None = None
     ) -> TemporalGraph:
-        """Build a graph from PyTorchTNN's configuration: a mapping or the path of a JSON file.
+        """Build a graph from PyTorchTNN's configuration: a mapping or the path of a JSON or TOML file.
 
         ``input_shape`` (C, H, W) overrides the configuration's. PyTorchTNN's published files declare shapes that its
         callers override, so without this argument the declared shape is a default: :meth:`load_tnn_state` gives it up
         if the weights were made for another.
 
         Raises:
-            DataError: the file is missing or not JSON, or a key is missing or unsupported.
+            DataError: the file is missing or not JSON or TOML, or a key is missing or unsupported.
             UsageError: the graph is not valid.
         """
         spec = read_graph(source)

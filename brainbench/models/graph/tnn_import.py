@@ -11,7 +11,7 @@ from graphlib import CycleError, TopologicalSorter
 from typing import Any
 
 from brainbench.core.errors import DataError, check_name, listing, unknown_name
-from brainbench.core.files import read_json
+from brainbench.core.files import read_json, read_mapping
 from brainbench.models.graph.spec import Convolution, Dense, Edge, GraphSpec, Memory, Node, Operation, Pool
 
 _MEMORIES = {
@@ -71,7 +71,9 @@ class _Section:
 
 
 def read_graph(source: Mapping[str, Any] | str | os.PathLike[str]) -> GraphSpec:
-    """Build a graph description from a configuration or the path of its JSON file.
+    """Build a graph description from a configuration or the path of its JSON or TOML file.
+
+    TOML has no null: a key is left out instead, and an activation may be ``Identity``.
 
     Feedback is what leads back in ``ff_order`` if that is given, else in the listed order of the nodes;
     without cycles nothing is feedback. ``num_timesteps`` is not needed and ignored.
@@ -80,7 +82,7 @@ def read_graph(source: Mapping[str, Any] | str | os.PathLike[str]) -> GraphSpec:
         DataError: the file is missing or not JSON, or a key is missing or unsupported.
         UsageError: the graph itself is not valid.
     """
-    config = _Section(source if isinstance(source, Mapping) else read_json(source), "the top level")
+    config = _Section(source if isinstance(source, Mapping) else _read(source), "the top level")
     nodes = tuple(_node(item) for item in config.take("nodes"))
     ends = []
     for item in config.take("edges"):
@@ -109,6 +111,10 @@ def read_graph(source: Mapping[str, Any] | str | os.PathLike[str]) -> GraphSpec:
     return GraphSpec(nodes, edges, inputs, output, (*shape,))
 
 
+def _read(path: str | os.PathLike[str]) -> Any:
+    return read_mapping(path) if os.fspath(path).endswith(".toml") else read_json(path)
+
+
 def _node(item: Any) -> Node:
     node = _Section(item, "a node")
     name = str(node.take("name"))
@@ -122,7 +128,9 @@ def _node(item: Any) -> Node:
     operation = _operation(_Section(node.take("pre_memory"), f"the pre-memory of {name!r}"))
     memory = _memory(_Section(node.take("recurrent_cell"), f"the recurrent cell of {name!r}"))
     activation, pool, chain = _after(_Section(node.take("post_memory"), f"the post-memory of {name!r}"))
-    built = Node(name, operation, memory, activation, pool, chain, node.take("shape_from"), policy == "ResizeConcat")
+    built = Node(
+        name, operation, memory, activation, pool, chain, node.take("shape_from", None), policy == "ResizeConcat"
+    )
     node.done()
     made = {Convolution: "channels", Dense: "features"}.get(type(operation))
     if made is not None and getattr(operation, made) != channels:

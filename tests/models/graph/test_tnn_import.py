@@ -141,11 +141,23 @@ def test_an_incomplete_order_is_refused():
         read_graph(_config(ff_order=["a"]))
 
 
+def _toml(value):
+    if isinstance(value, dict):
+        return "{" + ", ".join(f"{key} = {_toml(item)}" for key, item in value.items()) + "}"
+    return json.dumps(value)
+
+
 def test_a_file_is_read_and_a_bad_one_named(tmp_path):
     good, bad = tmp_path / "good.json", tmp_path / "bad.json"
     good.write_text(json.dumps(_config()))
     bad.write_text("{")
     assert read_graph(good) == read_graph(_config())
+    toml = tmp_path / "good.toml"
+    lines = ['edges = [{from = "a", to = "b"}]', 'input_nodes = ["a"]', 'output_node = "b"', "input_shape = [3, 5, 7]"]
+    for node in _config()["nodes"]:
+        lines += ["[[nodes]]", *(f"{key} = {_toml(value)}" for key, value in node.items() if value is not None)]
+    toml.write_text("\n".join(lines))
+    assert read_graph(toml) == read_graph(_config())
     with pytest.raises(DataError, match=r"bad\.json' .*JSON"):
         read_graph(bad)
     with pytest.raises(DataError, match=r"/none\.json'"):
