@@ -66,7 +66,8 @@ def computation(record: ResultRecord) -> tuple[Any, ...]:
         *(
             str(origin.settings.get(name))
             for name in (
-                "time", "seed", "layers", "layer", "units_reliability", "normalize", "whiskers", "estimator_version"
+                "time", "seed", "layers", "layer", "units_reliability", "normalize", "whiskers", "estimator_version",
+                "readout",
             )
         ),
         *(str(origin.recordings.get(name)) for name in ("window", "selection")),

@@ -91,6 +91,30 @@ def show(
     emit(data, facts(shown), as_json=as_json)
 
 
+@app.command("import")
+def import_(
+    file: Annotated[Path, typer.Argument(help="Lightning .ckpt, state dict of PyTorch, or .safetensors.")],
+    architecture: Annotated[str | None, typer.Option(help="Registry name, where the file leaves a choice.")] = None,
+    config: Annotated[Path | None, typer.Option(help="The run's settings: config.yaml, or its graph in JSON.")] = None,
+    out: Annotated[Path | None, typer.Option("--out", "-o", help="Folder to write.")] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Turn weights of the published study into a model that can be scored; nothing in the file is executed."""
+    from brainbench.models.published.importing import import_checkpoint
+
+    made = import_checkpoint(file, architecture=architecture, config=config, out=out)
+    left = ", ".join(f"{part} ({count} entries)" for part, count in made.not_imported.items())
+    shown = {
+        "architecture": made.architecture,
+        "decoder": made.decoder or "not in the file: drawn from seed 0",
+        "objective": made.objective or "not told by the file",
+        "parameters in the file": f"{made.parameters:,}",
+        "not part of the network": left or "nothing",
+        "score it with": f"brainbench score {made.name}",
+    }
+    emit(made, facts(shown), as_json=as_json)
+
+
 def export(
     model: Annotated[str, typer.Argument(help="A registry name, or local-dir:FOLDER of a trained model.")],
     format: Annotated[str, typer.Option(help="onnx, or torch (an exported program).")] = "onnx",

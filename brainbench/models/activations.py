@@ -25,6 +25,8 @@ _log = logging.getLogger(__name__)
 
 OUTPUT = "output"
 """Layer name of a user model's own output."""
+READOUTS = ("default", "published")
+"""Ways to read a network's layers."""
 
 
 class Activations(dict[str, np.ndarray]):
@@ -43,6 +45,7 @@ def extract(
     layers: Collection[str] | None = None,
     chunk: int = 16,
     folder: str | os.PathLike[str] | None = None,
+    readout: str = "default",
 ) -> Activations:
     """Return the activations of a model's layers.
 
@@ -63,6 +66,8 @@ def extract(
         chunk: Stimuli processed at once.
         folder: Keep every layer as ``<folder>/<layer>.npy``, which replaces an earlier one, and return them mapped
             into memory.
+        readout: ``published`` reads a network of the study by its layer names and steps there; the mean of axis 1 is
+            then what was scored (:mod:`brainbench.models.published.readout`).
 
     Raises:
         UsageError: a layer does not exist or gives nothing per stimulus, no layer does, or the model cannot
@@ -78,7 +83,9 @@ def extract(
             f"{list(values.shape)} and chunk {chunk}."
         )
     like = next((p for p in model.parameters() if p.is_floating_point()), torch.zeros(()))
-    reader = _named_reader(model, layers) or partial(_hooked_run, model, _hooked(model, layers), layers is not None)
+    check_name("readout", readout, READOUTS)
+    reader = _published_reader(model, layers) if readout == "published" else _named_reader(model, layers)
+    reader = reader or partial(_hooked_run, model, _hooked(model, layers), layers is not None)
     result = Activations()
     with evaluating(model), torch.no_grad():
         for start, stop in _chunks(len(values), chunk, avoid=values.shape[1]):
@@ -167,6 +174,15 @@ def _run(reader: Any, part: torch.Tensor, model: nn.Module, stimuli: torch.Tenso
 
 class _LayerError(UsageError):
     """A layer, not the stimulus, is what does not fit."""
+
+
+def _published_reader(model: nn.Module, layers: Collection[str] | None) -> Any:
+    from brainbench.models.published.readout import published_activations, published_layers
+
+    names = published_layers(model)
+    for name in layers or ():
+        check_name("published layer", name, names)
+    return lambda part: published_activations(model, part, layers)
 
 
 def _named_reader(model: nn.Module, layers: Collection[str] | None) -> Any:

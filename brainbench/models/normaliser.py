@@ -13,6 +13,8 @@ FORCE_SCALE = 1e-4
 """N that become 1: the order of a whisker's base force in contact."""
 MOMENT_SCALE = 1e-6
 """N·m that become 1."""
+PUBLISHED_FORCE_SCALE = 1e-3
+"""N that become 1 in the published networks, which saw mN and µN·m."""
 
 
 class Normaliser(nn.Module):
@@ -32,9 +34,9 @@ class Normaliser(nn.Module):
         self.register_buffer("offset", torch.tensor(offset or [0.0] * len(scale)).view(-1, 1, 1))
 
     @classmethod
-    def physical(cls, sub_steps: int = 5) -> Normaliser:
+    def physical(cls, sub_steps: int = 5, force: float = FORCE_SCALE) -> Normaliser:
         """Return the fixed scale of untrained models: forces / 1e-4 N, moments / 1e-6 N·m, sub-step-major."""
-        return cls([FORCE_SCALE if name.startswith("F") else MOMENT_SCALE for name in CHANNELS] * sub_steps)
+        return cls([force if name.startswith("F") else MOMENT_SCALE for name in CHANNELS] * sub_steps)
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         """Return the normalised stimulus, same shape."""

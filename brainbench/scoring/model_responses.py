@@ -78,6 +78,13 @@ class ResolvedModel:
         card, labels, origin, model_input = self.card, self.labels, self.origin, None
         card, shown = replace(card, layer=options.layer or card.layer), None
         names = getattr(self.module, "layers", None) if self.module is not None else self.activations
+        if options.readout == "published":
+            from brainbench.models.published.readout import published_layers
+
+            if self.module is None:
+                raise UsageError("The published readout needs a network; these are features computed elsewhere.")
+            # A committed layer goes by our names; theirs are other arrays, so only the caller can commit to one.
+            card, names = replace(card, layer=options.layer), published_layers(self.module)
         if card.layer is not None and names is not None and card.layer not in (options.layers or names):
             raise unknown_name("layer", card.layer, options.layers or names)
         if labels is None:
@@ -96,7 +103,7 @@ class ResolvedModel:
             from brainbench.models.activations import extract
 
             values, comparable, note = _network_input(self.module, shown, options.normalize)
-            activations = extract(self.module, values, layers=options.layers)
+            activations = extract(self.module, values, layers=options.layers, readout=options.readout)
             card = replace(card, input=note)
             steps = comparable if comparable.ndim > 2 else comparable[:, None, :]
             model_input = steps.reshape(*steps.shape[:2], -1)
@@ -171,7 +178,7 @@ def _trained(config: Mapping[str, Any] | None) -> dict[str, Any]:
     found, twin = config.get("evaluation") or {}, config.get("twin_evaluation") or {}
     # Networks that came with the package before twins were hashed name theirs alone.
     start = config.get("twin")
-    stated = {name: config.get(name) for name in ("epochs", "published_epochs", "best_epoch", "licence")}
+    stated = {name: config.get(name) for name in ("epochs", "published_epochs", "best_epoch", "licence", "version")}
     stated |= {f"{name} top-1": item.get("top1") for name, item in (config.get("baselines") or {}).items()}
     options = {name: value for name, value in (config.get("training") or {}).items() if name not in ("model", "seed")}
     return {

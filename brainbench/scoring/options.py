@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from brainbench.stimuli import Fidelity, Stimuli
 
 TIME_RULES = ("mean", "concatenate")
+READOUTS = ("default", "published")
 TIME_BIN = 0.05
 """Bin width of scores over time, seconds."""
 
@@ -35,7 +36,7 @@ class ScoreOptions:
     """Options of scoring a model against recordings.
 
     Raises:
-        UsageError: an unknown rule for time, or a reliability outside (−1, 1).
+        UsageError: an unknown rule for time or readout, or a reliability outside (−1, 1).
     """
 
     recordings: str | os.PathLike[str] | Sequence[str | os.PathLike[str]] | xr.Dataset = "demo"
@@ -79,6 +80,8 @@ class ScoreOptions:
     """Seed of untrained weights, of split halves and of random features."""
     weights_seed: int | None = None
     """Seed of untrained weights alone; --seed then keeps that of the statistics."""
+    readout: str = "default"
+    """Layers and steps of a network of the study: default (ours), or published (its names, its steps, its averages)."""
     explain: bool = False
     """Also walk from the published estimator to the default one, fault by fault (RSA only); MODEL may then be an .npz
     of stored splits (arrays r_xy, r_yy and r_xx)."""
@@ -87,6 +90,10 @@ class ScoreOptions:
         """Refuse what no score can be made with, before anything is loaded."""
         if self.time not in TIME_RULES:
             raise unknown_name("time rule", self.time, TIME_RULES)
+        if self.readout not in READOUTS:
+            raise unknown_name("readout", self.readout, READOUTS)
+        if self.readout == "published" and (self.time != "mean" or self.over_time):
+            raise UsageError("The published readout averages time by its own rule; leave out --time and --over-time.")
         if self.units_reliability is not None and not -1 < self.units_reliability < 1:
             raise UsageError(
                 f"A reliability of units lies between −1 and 1, such as 0.5; received {self.units_reliability}."

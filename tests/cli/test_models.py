@@ -1,5 +1,10 @@
 import json
 
+import torch
+
+from brainbench.models.registry import load_model
+from tests.factories.published_files import lightning_state
+
 
 def test_models_are_listed_with_size_cost_and_published_objectives(run):
     listed = run("models", "list", "resnet18*")
@@ -33,3 +38,14 @@ def test_an_unknown_model_is_answered_in_one_line(run):
     outcome = run("models", "show", "resnet81")
     assert outcome.status == 2
     assert "did you mean 'resnet18'" in outcome.err
+
+
+def test_published_weights_are_imported_by_name(run, tmp_path):
+    torch.save(lightning_state(load_model("zhuang-gru-ln-small")), tmp_path / "x.ckpt")
+    given = ("models", "import", str(tmp_path / "x.ckpt"), "--out", str(tmp_path / "made"))
+    refused = run(*given)
+    assert refused.status != 0
+    assert "expected [96, 30, 2, 2]" in refused.err
+    made = json.loads(run(*given, "--architecture", "zhuang-gru-ln-small", "--json").out)
+    assert made["parameters"] == sum(p.numel() for p in load_model(made["name"]).parameters())
+    assert "brainbench score local-dir:" in run(*given, "--architecture", "zhuang-gru-ln-small").out

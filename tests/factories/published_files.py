@@ -1,46 +1,75 @@
-"""Small files in the layout of the published recordings: rates in slots, zeros elsewhere, NaN padding."""
+"""Files of the published study: the reference lists filled by their rule, and small ones in the same layout."""
 
-from __future__ import annotations
-
-from collections.abc import Sequence
-from pathlib import Path
+import json
+import re
+from functools import cached_property
 
 import numpy as np
+import torch
+
+from brainbench.models.published.names import published_names, stored_readout
+
+STEPS = 22
 
 
-def make_zero_filled(
-    lengths: Sequence[int], units: int = 6, *, seed: int = 0, order: Sequence[Sequence[int]] = ()
-) -> tuple[np.ndarray, list[np.ndarray]]:
-    """Return one animal's array [max trials, 6, units of all sessions], and each session's slots [R].
+class PublishedReference:
+    """The folder ``published`` of the reference data."""
 
-    Every session shows six stimuli of fixed mean rates in random order; slots follow their first appearance, or the
-    sequence of stimuli that ``order`` gives for each session.
-    """
-    rng = np.random.default_rng(seed)
-    array = np.full((max(lengths), 6, units * len(lengths)), np.nan)
-    slots = []
-    for index, length in enumerate(lengths):
-        shown = np.array(order[index]) if order else rng.permutation(np.resize(np.arange(6), length))
-        seen = list(dict.fromkeys(shown.tolist()))
-        own = np.array([seen.index(stimulus) for stimulus in shown])
-        tuning = rng.uniform(2, 30, size=(6, units))
-        block = np.zeros((length, 6, units))
-        block[np.arange(length), own] = rng.poisson(tuning[shown]) + 0.5
-        array[:length, :, index * units : (index + 1) * units] = block
-        slots.append(own)
-    return array, slots
+    def __init__(self, folder):
+        self.folder = folder
+        rule = re.search(r"```python\n(.*?)```", (folder / "fill_rule.md").read_text(encoding="utf-8"), re.DOTALL)
+        names = {}
+        exec(rule[1], names)  # the rule is published as code
+        self.fill, self._stimulus = names["fill"], names["stimulus"]
+
+    @cached_property
+    def networks(self):
+        return json.loads((self.folder / "state_dicts.json").read_text(encoding="utf-8"))["networks"]
+
+    @cached_property
+    def outputs(self):
+        """{network: {what: array}}."""
+        found = {}
+        with np.load(self.folder / "outputs.npz", allow_pickle=False) as arrays:
+            for key in arrays.files:
+                network, what = key.split("|")
+                found.setdefault(network, {})[what] = arrays[key]
+        return found
+
+    def stimulus(self, batch):
+        """Sweeps in SI of which the authors' networks see the rule's numbers in mN and µN·m."""
+        scale = torch.tensor(([1e-3] * 3 + [1e-6] * 3) * 5, dtype=torch.float64)[:, None, None]
+        return (torch.from_numpy(self._stimulus(batch)).double() * scale).float()
+
+    def state(self, network):
+        """Every entry of a network's file."""
+        return {name: self._value(name, shape, dtype) for name, shape, dtype in self.networks[network]["state_dict"]}
+
+    def _value(self, name, shape, dtype):
+        value = self.fill(name, tuple(shape))
+        if value is None and name.endswith(".attn.bias"):
+            value = np.tril(np.ones(shape))
+        elif value is None:
+            value = np.full(shape, STEPS if name.endswith("l_kernel") else 0)
+        return torch.from_numpy(np.array(value)).to(getattr(torch, dtype))
 
 
-def write_published(path: Path, *, stray: bool = True, **animals: np.ndarray) -> Path:
-    """Write arrays as the authors do; ``stray`` as numpy before 2.2 does."""
-    more = {"allow_pickle": np.array(True)} if stray else {}
-    arrays = {name.replace("_", "-"): array for name, array in animals.items()}
-    with path.open("wb") as stream:
-        np.savez(stream, **arrays)
-    if more:
-        # numpy from 2.2 on takes the name for its keyword, so the entry is added by hand.
-        import zipfile
-
-        with zipfile.ZipFile(path, "a") as archive, archive.open("allow_pickle.npy", "w") as entry:
-            np.lib.format.write_array(entry, more["allow_pickle"])
-    return path
+def lightning_state(model, **others):
+    """A network of ours as the authors' file would hold it, with S4's stored form and the axes of length one."""
+    state = {}
+    values = model.state_dict()
+    for ours, theirs in published_names(model).items():
+        value = values[ours].clone()
+        if theirs.endswith(".kernel.A_imag"):
+            value = -value
+        elif theirs.endswith(".kernel.C"):
+            memory = model.get_submodule(ours.rpartition(".")[0])
+            value = stored_readout(memory.transition(), value, STEPS, undo=False).float()[None]
+        elif theirs.endswith((".kernel.B", ".kernel.P", ".layer.D")):
+            value = value[None]
+        elif theirs.endswith(".inv_dt") or theirs.endswith("output_linear.0.weight"):
+            value = value[..., None]
+        state[theirs] = value
+        if theirs.endswith(".kernel.C"):
+            state[theirs.replace(".C", ".l_kernel")] = torch.tensor(STEPS)
+    return state | others

@@ -15,7 +15,7 @@ from brainbench.metrics.published import (
     score_published,
     score_published_animals,
 )
-from tests.factories.published_files import make_zero_filled
+from tests.factories.published_recordings import make_zero_filled
 
 SPLITS = 60
 STIMULI = [str(number) for number in range(6)]

@@ -37,6 +37,14 @@ def test_settings_of_a_record_give_the_options_again():
     assert ScoreOptions.stated_in({**options.settings, "estimator_version": 1, "layers": ["conv1"]}) == options
 
 
+def test_the_published_readout_averages_time_itself():
+    with pytest.raises(UsageError, match="did you mean 'published'"):
+        ScoreOptions(readout="publishd")
+    for other in ({"time": "concatenate"}, {"over_time": True}):
+        with pytest.raises(UsageError, match="--time"):
+            ScoreOptions(readout="published", **other)
+
+
 def test_options_are_written_as_flags():
     assert as_flags(SCORE, ScoreOptions(), SCORE_FLAGS) == []
     options = replace(ScoreOptions(), layers=("a", "b"), normalize=False, explain=True, weights_seed=1)

@@ -223,6 +223,23 @@ def test_a_plain_module_is_scored_on_arrays_without_registration(recordings: xr.
     assert record.card.input == "as given"
 
 
+def test_the_published_readout_scores_the_layers_of_the_study(recordings: xr.Dataset, tmp_path: Path):
+    import h5py
+
+    values = 1e-4 * np.random.default_rng(2).normal(size=(6, 9, 30, 5, 7)).astype(np.float32)
+    with h5py.File(tmp_path / "sweeps.h5", "w") as file:
+        file["stimuli"] = values
+        file["labels"] = np.array(LABELS, dtype=h5py.string_dtype())
+    given = {"recordings": recordings, "stimuli": str(tmp_path / "sweeps.h5"), "readout": "published"}
+    record = score_record("s4-small", **given)
+    assert [item.layer for item in record.score.layers][1:3] == ["enc_s4_l0", "enc_s4_l1"]
+    assert record.score.provenance.settings["readout"] == "published"
+    with pytest.raises(UsageError, match="received _Tiny"):
+        score_record(_Tiny(), **given)
+    with pytest.raises(UsageError, match="computed elsewhere"):
+        score_record({"fc": np.ones((6, 2))}, **given)
+
+
 def test_a_model_whose_input_does_not_fit_says_what_it_was_given(recordings: xr.Dataset, arrays: Path):
     with pytest.raises(UsageError, match=r"cannot process stimuli of shape \[6, 4, 2, 2, 2\]"):
         brainbench.score(nn.Linear(3, 2), recordings=recordings, stimuli=str(arrays))

@@ -145,7 +145,7 @@ class GPTAttender(nn.Module):
         Raises:
             UsageError: the context is full.
         """
-        stream = self._tokens(x[:, None], state.tokens)
+        stream = self.tokens(x[:, None], state.tokens)
         keys, values = [], []
         for block, *past in zip(self.blocks, state.keys, state.values, strict=True):
             stream, (key, value) = block(stream, past)
@@ -155,7 +155,7 @@ class GPTAttender(nn.Module):
 
     def forward(self, x: torch.Tensor, *, return_activations: bool | Collection[str] = False) -> Any:
         """Return the answers [B, T, width], with activations also those at the action tokens of named layers."""
-        stream = self._tokens(x, 0)
+        stream = self.tokens(x, 0)
         names = wanted(self.layers, return_activations)
         activations = {}
         for name, block in zip(self.layers, self.blocks, strict=False):
@@ -167,7 +167,12 @@ class GPTAttender(nn.Module):
             activations["lm_head"] = y
         return y if return_activations is False else (y, activations)
 
-    def _tokens(self, x: torch.Tensor, start: int) -> torch.Tensor:
+    def tokens(self, x: torch.Tensor, start: int) -> torch.Tensor:
+        """Return what the blocks see of features [B, T, F]: two tokens per step [B, 2 T, width], from ``start`` on.
+
+        Raises:
+            UsageError: they exceed the context.
+        """
         batch, steps, features = x.shape
         if start + 2 * steps > self.context:
             raise UsageError(

@@ -97,10 +97,11 @@ class Cell(nn.Module):
 
 
 class TimeDecay(Cell):
-    """Leaky trace: s ← x + τ s, y = s, with one trainable scalar τ that starts at ``tau``. Works on any [B, C, ...].
+    """Leaky trace: s ← x + τ s, y = s, with one scalar τ that starts at ``tau``, on any [B, C, ...].
 
-    There is no gate to normalise, so ``layer_norm`` normalises the output (y = LN(s)); the trace itself
-    stays as it is, or it would forget how strong the stimulus was. ``kernel_size`` is unused.
+    Training changes τ if it is ``trainable``. There is no gate to normalise, so ``layer_norm`` normalises the output
+    (y = LN(s)); the trace itself stays as it is, or it would forget how strong the stimulus was.
+    ``kernel_size`` is unused.
 
     Raises:
         UsageError: the numbers of channels differ.
@@ -117,9 +118,10 @@ class TimeDecay(Cell):
         kernel_size: Any = None,
         layer_norm: bool = False,
         tau: float = 0.0,
+        trainable: bool = True,
     ) -> None:
         super().__init__(in_channels, out_channels)
-        self.tau = nn.Parameter(torch.tensor(float(tau)))
+        self.tau = nn.Parameter(torch.tensor(float(tau)), requires_grad=trainable)
         self.norm = ChannelNorm(out_channels) if layer_norm else nn.Identity()
 
     def forward(self, x: torch.Tensor, state: torch.Tensor | None = None, projected: Projected = ()) -> CellStep:

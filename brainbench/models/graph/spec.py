@@ -29,10 +29,16 @@ class Operation:
     """Initial bias; None draws it within 1/√fan_in."""
     dropout: float = 0.0
     """Share dropped while training."""
+    batch_norm: bool = False
+    """Normalise each channel over the batch, before the activation; in training step by step."""
     activation: str | None = None
     """Applied before the memory."""
     initialiser: Mapping[str, Any] | None = None
     """``{"method": name in torch.nn.init, **options}``; None is the He-uniform of this package."""
+
+    def output_shape(self, shape: Shape) -> Shape:
+        """Return the shape of the output for an input (C, H, W) or (F,)."""
+        raise NotImplementedError
 
 
 @dataclass(frozen=True)
@@ -88,6 +94,8 @@ class Memory:
     """Normalise each gate over channels."""
     tau: float = 0.0
     """Initial time decay; other kinds ignore it."""
+    trainable: bool = True
+    """Let training change the time decay; other kinds ignore it."""
 
     def __post_init__(self) -> None:
         check_name("memory", self.kind, MEMORIES)
@@ -136,6 +144,8 @@ class Node:
     memory: Memory | None = None
     activation: str | None = "relu"
     pool: Pool | None = None
+    chain: tuple[str | Pool | Operation, ...] = ()
+    """Further steps after the pool, in order; a text is an activation."""
     shape_from: str | None = None
     """Predecessor whose grid size the inputs are resized to; None: the stimulus for an input node, else
     the latest feedforward predecessor."""
@@ -144,9 +154,14 @@ class Node:
 
     def output_shape(self, shape: Shape) -> Shape:
         """Return the node's output shape for its concatenated input."""
-        if self.operation is not None:
-            shape = self.operation.output_shape(shape)
-        return self.pool.output_shape(shape) if self.pool is not None else shape
+        return self.stages(shape)[-1]
+
+    def stages(self, shape: Shape) -> list[Shape]:
+        """Return the shapes after the operation, after the pool and after each step of the chain."""
+        shapes = [shape if self.operation is None else self.operation.output_shape(shape)]
+        for step in (self.pool, *self.chain):
+            shapes.append(step.output_shape(shapes[-1]) if isinstance(step, (Pool, Operation)) else shapes[-1])
+        return shapes
 
 
 @dataclass(frozen=True)

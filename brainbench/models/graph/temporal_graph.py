@@ -64,14 +64,14 @@ class TemporalGraph(nn.Module):
     def from_config(
         cls, source: Mapping[str, Any] | str | os.PathLike[str], *, input_shape: tuple[int, int, int] | None = None
     ) -> TemporalGraph:
-        """Build a graph from PyTorchTNN's configuration: a mapping or the path of a JSON file.
+        """Build a graph from PyTorchTNN's configuration: a mapping or the path of a JSON or TOML file.
 
         ``input_shape`` (C, H, W) overrides the configuration's. PyTorchTNN's published files declare shapes that its
         callers override, so without this argument the declared shape is a default: :meth:`load_tnn_state` gives it up
         if the weights were made for another.
 
         Raises:
-            DataError: the file is missing or not JSON, or a key is missing or unsupported.
+            DataError: the file is missing or not JSON or TOML, or a key is missing or unsupported.
             UsageError: the graph is not valid.
         """
         spec = read_graph(source)
@@ -118,10 +118,14 @@ class TemporalGraph(nn.Module):
         copy_named(self.tnn_parameters(), state)
 
     def tnn_parameters(self) -> dict[str, torch.Tensor]:
-        """Return the parameters under PyTorchTNN's names."""
+        """Return the parameters, and the running averages of batch norms, under PyTorchTNN's names."""
         renamed: dict[str, torch.Tensor] = {}
         for name, node in self.named_nodes():
-            renamed.update({f"{_tnn_owner(name, node)}.{key}": p for key, p in node.operation.named_parameters()})
+            renamed |= _tnn_operation(f"{name}._pre_memory", node.operation, node.before)
+            for index, step in enumerate(node.steps):
+                if isinstance(operation := getattr(step, "operation", None), (Conv2d, Linear)):
+                    owner = f"{name}._post_memory.sequential_mem.{index}"
+                    renamed |= _tnn_operation(owner, operation, step.get_submodule("before"))
             if node.memory is not None:
                 cell = node.memory.tnn_parameters()
                 renamed.update({f"{name}._recurrent_cell.{key}": value for key, value in cell.items()})
@@ -185,6 +189,9 @@ class TemporalGraph(nn.Module):
                 total += node.operation.weight.numel() * places
             if node.memory is not None:
                 total += sum(m.weight.numel() for m in node.memory.modules() if isinstance(m, Conv2d)) * places
+            for step, shape in zip(node.steps, node.node.stages((1, *node.grid))[2:], strict=True):
+                weights = sum(m.weight.numel() for m in step.modules() if isinstance(m, (Conv2d, Linear)))
+                total += weights * math.prod(shape[1:])
         return total
 
     def init_state(self, batch: int) -> GraphState:
@@ -280,13 +287,29 @@ class TemporalGraph(nn.Module):
             x = x.flatten(0, 1).to(memory_format=torch.channels_last).unflatten(0, x.shape[:2])
         output = self.spec.output
         whole, final = (asked, {output}) if last else (asked | {output}, set())
-        steps = needed_steps(self.spec, unroll, x.shape[1], whole=whole, last=final)
-        kept = UnrolledSweep(self, x, unroll, steps).run(whole | final)
+        if self._norms_batches:
+            kept = self._stepwise(x, unroll, whole | final)
+        else:
+            steps = needed_steps(self.spec, unroll, x.shape[1], whole=whole, last=final)
+            kept = UnrolledSweep(self, x, unroll, steps).run(whole | final)
         y = kept[output][1]
         y = y[:, -1] if last else y
         if return_activations is False:
             return y
         return y, {name: kept[name][1] for name in self.layers if name in asked}
+
+    def _stepwise(self, x: torch.Tensor, unroll: Unroll, names: set[str]) -> dict[str, tuple[int, torch.Tensor]]:
+        """Compute every step of every node in turn: each batch norm then sees one step of all stimuli, as published."""
+        state, outputs = self.init_state(len(x)), {name: [] for name in names}
+        for t in range(x.shape[1]):
+            _, state = self.step(x[:, t], state, unroll=unroll)
+            for name in names:
+                outputs[name].append(state.outputs[name])
+        return {name: (0, torch.stack(values, 1)) for name, values in outputs.items()}
+
+    @property
+    def _norms_batches(self) -> bool:
+        return self.training and any(isinstance(m, (nn.BatchNorm1d, nn.BatchNorm2d)) for m in self.modules())
 
     def activations(self, x: torch.Tensor, layers: Collection[str] | None = None) -> dict[str, torch.Tensor]:
         """Return ``{node: [B, T, ...]}`` of the biological unrolling for the nodes asked for (all by default)."""
@@ -306,6 +329,14 @@ class TemporalGraph(nn.Module):
     def named_nodes(self) -> list[tuple[str, NodeModule]]:
         """Return the names and modules of the nodes in feedforward order."""
         return [(name, self.node(name)) for name in self.layers]
+
+
+def _tnn_operation(owner: str, operation: nn.Module, after: nn.Module) -> dict[str, torch.Tensor]:
+    """Return the entries of an operation and of the batch norm after it under PyTorchTNN's names."""
+    kind = "lin" if isinstance(operation, Linear) else "conv"
+    found: dict[str, torch.Tensor] = {f"{owner}.{kind}.{key}": value for key, value in operation.named_parameters()}
+    norm = after[0].state_dict(keep_vars=True) if isinstance(after, nn.Sequential) else {}
+    return found | {f"{owner}.bn.{key}": value for key, value in norm.items()}
 
 
 def _tnn_owner(name: str, node: NodeModule) -> str:

@@ -11,8 +11,8 @@ from graphlib import CycleError, TopologicalSorter
 from typing import Any
 
 from brainbench.core.errors import DataError, check_name, listing, unknown_name
-from brainbench.core.files import read_json
-from brainbench.models.graph.spec import Convolution, Dense, Edge, GraphSpec, Memory, Node, Pool
+from brainbench.core.files import read_json, read_mapping
+from brainbench.models.graph.spec import Convolution, Dense, Edge, GraphSpec, Memory, Node, Operation, Pool
 
 _MEMORIES = {
     "TimeDecayRecurrentCell": "time-decay",
@@ -71,7 +71,9 @@ class _Section:
 
 
 def read_graph(source: Mapping[str, Any] | str | os.PathLike[str]) -> GraphSpec:
-    """Build a graph description from a configuration or the path of its JSON file.
+    """Build a graph description from a configuration or the path of its JSON or TOML file.
+
+    TOML has no null: a key is left out instead, and an activation may be ``Identity``.
 
     Feedback is what leads back in ``ff_order`` if that is given, else in the listed order of the nodes;
     without cycles nothing is feedback. ``num_timesteps`` is not needed and ignored.
@@ -80,7 +82,7 @@ def read_graph(source: Mapping[str, Any] | str | os.PathLike[str]) -> GraphSpec:
         DataError: the file is missing or not JSON, or a key is missing or unsupported.
         UsageError: the graph itself is not valid.
     """
-    config = _Section(source if isinstance(source, Mapping) else read_json(source), "the top level")
+    config = _Section(source if isinstance(source, Mapping) else _read(source), "the top level")
     nodes = tuple(_node(item) for item in config.take("nodes"))
     ends = []
     for item in config.take("edges"):
@@ -89,7 +91,8 @@ def read_graph(source: Mapping[str, Any] | str | os.PathLike[str]) -> GraphSpec:
         edge.done()
     inputs, output = tuple(config.take("input_nodes")), config.take("output_node")
     shape, order = tuple(config.take("input_shape")), config.take("ff_order", None)
-    config.done("num_timesteps")
+    # The number of steps is that of the stimulus; the decoder stands beside the graph.
+    config.done("num_timesteps", "sep_num", "addnet")
     if not isinstance(output, str):
         raise DataError(f"The graph configuration names the output nodes {output!r}; exactly one is supported.")
     names = [node.name for node in nodes]
@@ -108,6 +111,10 @@ def read_graph(source: Mapping[str, Any] | str | os.PathLike[str]) -> GraphSpec:
     return GraphSpec(nodes, edges, inputs, output, (*shape,))
 
 
+def _read(path: str | os.PathLike[str]) -> Any:
+    return read_mapping(path) if os.fspath(path).endswith(".toml") else read_json(path)
+
+
 def _node(item: Any) -> Node:
     node = _Section(item, "a node")
     name = str(node.take("name"))
@@ -120,8 +127,10 @@ def _node(item: Any) -> Node:
     harbor.done(*_OVERWRITTEN)
     operation = _operation(_Section(node.take("pre_memory"), f"the pre-memory of {name!r}"))
     memory = _memory(_Section(node.take("recurrent_cell"), f"the recurrent cell of {name!r}"))
-    activation, pool = _after(_Section(node.take("post_memory"), f"the post-memory of {name!r}"))
-    built = Node(name, operation, memory, activation, pool, node.take("shape_from"), policy == "ResizeConcat")
+    activation, pool, chain = _after(_Section(node.take("post_memory"), f"the post-memory of {name!r}"))
+    built = Node(
+        name, operation, memory, activation, pool, chain, node.take("shape_from", None), policy == "ResizeConcat"
+    )
     node.done()
     made = {Convolution: "channels", Dense: "features"}.get(type(operation))
     if made is not None and getattr(operation, made) != channels:
@@ -143,8 +152,11 @@ def _operation(part: _Section) -> Convolution | Dense | None:
         "activation": part.take("activation", "ReLU" if kind == "FullyConnected" else None),
         "initialiser": _initialiser(part),
     }
-    part.only(activation_func_kwargs=({}, None), batchnorm=None, batchnorm_timevary=False)
-    channels = part.take("out_channels")
+    part.only(activation_func_kwargs=({}, None), batchnorm_timevary=False)
+    channels, norm = part.take("out_channels"), part.take("batchnorm", None)
+    if norm is not None and kind == "Conv2dCell" and norm != channels:
+        raise DataError(f"The batch norm in {part.where} has {norm} channels, its convolution {channels}.")
+    common["batch_norm"] = norm is not None
     if kind == "FullyConnected":
         operation: Convolution | Dense = Dense(channels, **common)
     else:
@@ -176,8 +188,7 @@ def _memory(part: _Section) -> Memory | None:
     check_name(f"cell in {part.where}", kind, ("IdentityCell", *_MEMORIES))
     part.only(init_dict=None)
     if kind == "TimeDecayRecurrentCell":
-        part.only(trainable=True)
-        memory = Memory("time-decay", tau=part.take("tau", 0.0))
+        memory = Memory("time-decay", tau=part.take("tau", 0.0), trainable=bool(part.take("trainable", True)))
     else:
         part.only(stride=1, padding="same", dilation=1, groups=1, padding_mode="zeros")
         part.only(use_bias=True, forget_bias=1.0, activation="Tanh", activation_func_kwargs={})
@@ -188,9 +199,24 @@ def _memory(part: _Section) -> Memory | None:
     return memory
 
 
-def _after(part: _Section) -> tuple[str | None, Pool | None]:
+def _after(part: _Section) -> tuple[str | None, Pool | None, tuple[str | Pool | Operation, ...]]:
+    if part.data.get("name") != "Sequential":
+        return (*_layer(part), ())
+    part.take("name")
+    chain: list[str | Pool | Operation] = []
+    for index, item in enumerate(part.take("list_of_func_kwargs")):
+        step = _Section(item, f"step {index} of {part.where}")
+        found = [_operation(step)] if step.data.get("name") in ("Conv2dCell", "FullyConnected") else _layer(step)
+        # Every step keeps its place, from which the names of its parameters are made.
+        chain.append(next((value for value in found if value is not None), "identity"))
+    part.done(*_OVERWRITTEN, "out_channels")
+    return None, None, tuple(chain)
+
+
+def _layer(part: _Section) -> tuple[str | None, Pool | None]:
     kind = part.take("name")
-    check_name(f"module in {part.where}", kind, ("ActivationLayer", "MaxPool", "AdaptiveAvgPool", "Identity"))
+    known = ("ActivationLayer", "MaxPool", "AdaptiveAvgPool", "Identity", "Sequential")
+    check_name(f"module in {part.where}", kind, known)
     activation, pool = None, None
     if kind == "ActivationLayer":
         activation = part.take("activation", "ReLU")

@@ -29,6 +29,7 @@ _MANY_WEIGHTS = 1 << 18
 ACTIVATIONS: Mapping[str, type[nn.Module]] = {
     "elu": nn.ELU,
     "gelu": nn.GELU,
+    "identity": nn.Identity,
     "leakyrelu": nn.LeakyReLU,
     "relu": nn.ReLU,
     "sigmoid": nn.Sigmoid,

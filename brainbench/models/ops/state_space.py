@@ -103,6 +103,14 @@ class StateSpace(nn.Module):
         parts = (2 * inverse - 1, 2 * left, row, step[:, None] * driven, readout)
         return System(*(torch.view_as_real(part).to(self.skip.dtype) for part in parts))
 
+    def transition(self) -> torch.Tensor:
+        """Return Ā [H, 2 N, 2 N] of all states, the conjugate ones last, complex in double precision."""
+        poles, low_rank, _, _, step = self._double()
+        column = torch.cat((low_rank, low_rank.conj()), 1)
+        a = torch.diag_embed(torch.cat((poles, poles.conj()), 1)) - column[:, :, None] * column[:, None].conj()
+        half, one = step[:, None, None] / 2 * a, torch.eye(column.shape[1], dtype=a.dtype, device=a.device)
+        return torch.linalg.solve(one - half, one + half)
+
     def init_state(self, batch: int) -> tuple[torch.Tensor, System]:
         """Return the empty memory [batch, H, N, 2] and the discretised system."""
         return self.skip.new_zeros(batch, *self.readout.shape), self.system()

@@ -7,11 +7,11 @@ options it was built with; weights may be stored in half precision and are alway
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from brainbench.core.errors import DataError, DataFileNotFoundError, UsageError, check_name, missing_dependency
+from brainbench.core.errors import DataError, DataFileNotFoundError, UsageError, check_name, listing, missing_dependency
 from brainbench.models.architecture import Architecture
 
 if TYPE_CHECKING:
@@ -24,6 +24,9 @@ LOCAL, HUB = "local-dir:", "hf-hub:"
 PREFIXES = (LOCAL, HUB)
 """Beginnings of a model's name that is a folder or a repository instead of a registry name."""
 DTYPES = ("float32", "float16", "bfloat16")
+FOREIGN, SCORED, SETTINGS = "*.ckpt", "val_best.ckpt", "config.yaml"
+foreign_importers: list[Callable[[Path, Path | None], Path]] = []
+"""What makes a model's folder of a foreign file and its settings, if there are any; entered by the package."""
 
 
 def save_checkpoint(
@@ -134,12 +137,13 @@ def load_weights(model: nn.Module, path: str | os.PathLike[str], *, what: str) -
 
 
 def find_folder(source: str) -> Path:
-    """Return the folder that ``local-dir:PATH`` or ``hf-hub:OWNER/NAME[@REVISION]`` names.
+    """Return the folder that ``local-dir:PATH`` or ``hf-hub:OWNER/NAME[/FOLDER][@REVISION]`` names.
 
-    The hub is asked only for a name with its prefix; what it sends is kept in its own cache.
+    The hub is asked only for a name with its prefix; what it sends is kept in its own cache. A folder with one foreign
+    checkpoint (:data:`FOREIGN`) instead of ours is imported into our cache.
 
     Raises:
-        UsageError: the name has another form.
+        UsageError: the name has another form, or there are several foreign checkpoints.
         DataFileNotFoundError: there is no such folder or repository.
         MissingDependencyError: ``huggingface_hub`` is not installed.
     """
@@ -147,19 +151,49 @@ def find_folder(source: str) -> Path:
         folder = Path(source.removeprefix(LOCAL)).expanduser()
         if not folder.is_dir():
             raise DataFileNotFoundError(f"There is no folder {os.fspath(folder)!r}.")
-        return folder
-    repository, _, revision = source.removeprefix(HUB).partition("@")
-    if not source.startswith(HUB) or repository.count("/") != 1 or not all(repository.split("/")):
-        raise UsageError(f"A model's folder is local-dir:PATH or hf-hub:OWNER/NAME[@REVISION]; received {source!r}.")
+        return _imported(folder, source)
+    place, _, revision = source.removeprefix(HUB).partition("@")
+    owner, name, *inner = place.split("/") if "/" in place else ("", "")
+    if not source.startswith(HUB) or not all((owner, name, *inner)):
+        raise UsageError(
+            f"A model's folder is local-dir:PATH or hf-hub:OWNER/NAME[/FOLDER][@REVISION]; received {source!r}."
+        )
     try:
         from huggingface_hub import snapshot_download
     except ImportError as error:
         raise missing_dependency("huggingface_hub", extra="hub", purpose="Loading a model from a hub") from error
-    try:
-        return Path(snapshot_download(repository, revision=revision or None, allow_patterns=[WEIGHTS, CONFIG, CARD]))
-    except Exception as error:
-        reason = str(error).strip().partition("\n")[0] or type(error).__name__
-        raise DataFileNotFoundError(f"{repository!r} could not be had from the hub: {reason}") from error
+
+    def download(*names: str) -> Path:
+        patterns = ["/".join((*inner, item)) for item in names]
+        repository = f"{owner}/{name}"
+        try:
+            root = snapshot_download(repository, revision=revision or None, allow_patterns=patterns)
+        except Exception as error:
+            reason = str(error).strip().partition("\n")[0] or type(error).__name__
+            raise DataFileNotFoundError(f"{repository!r} could not be had from the hub: {reason}") from error
+        return Path(root).joinpath(*inner)
+
+    folder = download(WEIGHTS, CONFIG, CARD)
+    # Foreign checkpoints are large, so they are asked for only where there is none of ours.
+    return folder if (folder / CONFIG).is_file() else _imported(download(FOREIGN, SETTINGS), source)
+
+
+def _imported(folder: Path, source: str) -> Path:
+    """Return a folder of ours as it is, and that of its import for one with a foreign checkpoint."""
+    if (folder / CONFIG).is_file():
+        return folder
+    found = sorted(folder.glob(FOREIGN)) or (sorted(folder.rglob(FOREIGN)) if source.startswith(HUB) else [])
+    # Of the files of one run, the study scored this one.
+    found = [path for path in found if path == folder / SCORED] or found
+    if len(found) > 1:
+        raise UsageError(
+            f"{source!r} holds {listing([os.fspath(path.relative_to(folder)) for path in found])}; name the folder of "
+            "one of them, or import it with: brainbench models import FILE"
+        )
+    if not found or not foreign_importers:
+        return folder
+    settings = found[0].with_name(SETTINGS)
+    return foreign_importers[0](found[0], settings if settings.is_file() else None)
 
 
 def shipped() -> dict[str, Path]:

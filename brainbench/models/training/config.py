@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass, fields, replace
 from typing import Any
 
 from brainbench.core.errors import UsageError, check_name, unknown_name
-from brainbench.models.architecture import OBJECTIVES
+from brainbench.models.architecture import OBJECTIVES, Architecture, is_path
 from brainbench.models.recipes import BATCH_SIZE, EPOCHS, recipe_for
 from brainbench.models.training.checkpoints import DTYPES
 
@@ -133,7 +133,10 @@ class TrainingConfig:
     def identity(self) -> dict[str, Any]:
         """Options that must be equal for a run to be resumed: all but how often and how exactly results are stored."""
         free = ("checkpoint_seconds", "weights_dtype")
-        return {name: value for name, value in asdict(self).items() if name not in free}
+        stated = {name: value for name, value in asdict(self).items() if name not in free}
+        version = 1 if is_path(self.model) else Architecture.parse(self.model).version
+        # A run that was begun before its architecture changed must not go on with the new one.
+        return stated if version == 1 else stated | {"version": version}
 
 
 def config_warnings(config: TrainingConfig, model: Any) -> list[str]:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from brainbench.datasets import check
-from tests.factories.published_files import make_zero_filled, write_published
+from tests.factories.published_recordings import make_zero_filled, write_published
 
 
 def _finding(checkup, name, word):

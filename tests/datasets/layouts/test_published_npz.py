@@ -8,7 +8,7 @@ import pytest
 from brainbench.core.errors import DataError, UsageError
 from brainbench.datasets import inspect, open_recordings
 from brainbench.datasets.layouts.published_npz import SILENT, read_published
-from tests.factories.published_files import make_zero_filled, write_published
+from tests.factories.published_recordings import make_zero_filled, write_published
 
 
 @pytest.fixture

@@ -2,6 +2,9 @@ import copy
 import json
 
 import pytest
+import torch
+from torch import nn
+from torch.nn import functional
 
 from brainbench.core.errors import DataError, UsageError
 from brainbench.models.graph.spec import Convolution, Dense, Memory, Pool
@@ -103,7 +106,8 @@ def test_an_unsupported_node_is_refused_in_one_sentence(change, message):
 @pytest.mark.parametrize(
     ("key", "value", "message"),
     [
-        ("batchnorm", 4, r"'batchnorm': 4 .*'a'; .*None"),
+        ("batchnorm", 5, r"batch norm in the pre-memory of 'a' has 5 channels, its convolution 4"),
+        ("batchnorm_timevary", True, r"'batchnorm_timevary': True .*'a'"),
         ("dilation", 2, "'dilation': 2"),
         ("ksize", "3", r"'ksize' .*'a' .*'3'"),
         ("padding", "reflect", "Unknown padding in the pre-memory of 'a' 'reflect'"),
@@ -137,12 +141,94 @@ def test_an_incomplete_order_is_refused():
         read_graph(_config(ff_order=["a"]))
 
 
+def _toml(value):
+    if isinstance(value, dict):
+        return "{" + ", ".join(f"{key} = {_toml(item)}" for key, item in value.items()) + "}"
+    return json.dumps(value)
+
+
 def test_a_file_is_read_and_a_bad_one_named(tmp_path):
     good, bad = tmp_path / "good.json", tmp_path / "bad.json"
     good.write_text(json.dumps(_config()))
     bad.write_text("{")
     assert read_graph(good) == read_graph(_config())
+    toml = tmp_path / "good.toml"
+    lines = ['edges = [{from = "a", to = "b"}]', 'input_nodes = ["a"]', 'output_node = "b"', "input_shape = [3, 5, 7]"]
+    for node in _config()["nodes"]:
+        lines += ["[[nodes]]", *(f"{key} = {_toml(value)}" for key, value in node.items() if value is not None)]
+    toml.write_text("\n".join(lines))
+    assert read_graph(toml) == read_graph(_config())
     with pytest.raises(DataError, match=r"bad\.json' .*JSON"):
         read_graph(bad)
     with pytest.raises(DataError, match=r"/none\.json'"):
         read_graph(tmp_path / "none.json")
+
+
+NORMED = {"name": "Conv2dCell", "out_channels": 4, "ksize": 3, "padding": 1, "activation": "ReLU", "batchnorm": 4}
+POOLED = {
+    "name": "Sequential",
+    "list_of_func_kwargs": [
+        {"name": "MaxPool", "ksize": 2, "stride": 1},
+        {"name": "Identity"},
+        {"name": "AdaptiveAvgPool", "output_size": [2, 2]},
+        {"name": "FullyConnected", "out_channels": 6, "activation": "Tanh", "batchnorm": True},
+    ],
+}
+
+
+def _chained(memory="IdentityCell"):
+    cell = {"name": memory} | ({"tau": 0.5, "trainable": False} if memory != "IdentityCell" else {})
+    node = _node("a", None, pre_memory=NORMED, recurrent_cell=cell, post_memory=POOLED)
+    return TemporalGraph.from_config(_config(node, edges=(), addnet={"l0": {}}, sep_num=22))
+
+
+def test_batch_norms_and_chains_have_the_names_of_pytorchtnn():
+    norm = ["weight", "bias", "running_mean", "running_var", "num_batches_tracked"]
+    last = "a._post_memory.sequential_mem.3"
+    assert list(_chained("TimeDecayRecurrentCell").tnn_parameters()) == [
+        *("a._pre_memory.conv.weight", "a._pre_memory.conv.bias", *(f"a._pre_memory.bn.{key}" for key in norm)),
+        *(f"{last}.lin.weight", f"{last}.lin.bias", *(f"{last}.bn.{key}" for key in norm)),
+        "a._recurrent_cell.tau",
+    ]
+
+
+def _by_hand(state, x, training):
+    """The same node of PyTorch's own modules, step by step; returns outputs [B, T, 6] and the first running mean."""
+    norms = nn.BatchNorm2d(4), nn.BatchNorm1d(6)
+    last = "a._post_memory.sequential_mem.3."
+    for norm, begin in zip(norms, ("a._pre_memory.", last), strict=True):
+        norm.load_state_dict({key: state[f"{begin}bn.{key}"].clone() for key in norm.state_dict()})
+        norm.train(training)
+    outputs = []
+    for t in range(x.shape[1]):
+        y = functional.conv2d(x[:, t], state["a._pre_memory.conv.weight"], state["a._pre_memory.conv.bias"], padding=1)
+        y = functional.adaptive_avg_pool2d(functional.max_pool2d(norms[0](y).relu(), 2, 1), 2).flatten(1)
+        outputs.append(norms[1](functional.linear(y, state[f"{last}lin.weight"], state[f"{last}lin.bias"])).tanh())
+    return torch.stack(outputs, 1), norms[0].running_mean
+
+
+@pytest.mark.parametrize("training", [False, True])
+@torch.no_grad()
+def test_batch_norms_and_chains_compute_what_pytorch_does(training):
+    graph, x = _chained().train(training), torch.randn(5, 3, 3, 5, 7)
+    state = {name: torch.rand(value.shape).to(value.dtype) for name, value in graph.tnn_parameters().items()}
+    graph.load_tnn_state(state)
+    expected, mean = _by_hand(state, x, training)
+    torch.testing.assert_close(graph(x), expected, atol=1e-5, rtol=1e-4)
+    torch.testing.assert_close(graph.tnn_parameters()["a._pre_memory.bn.running_mean"], mean)
+    # 27 weights of 4 kernels at 35 places, and a dense layer of 16 inputs.
+    assert graph.multiply_adds() == 4 * 27 * 35 + 6 * 16
+
+
+def test_a_time_constant_that_does_not_train_stays():
+    graph = _chained("TimeDecayRecurrentCell").train()
+    tau = graph.tnn_parameters()["a._recurrent_cell.tau"]
+    assert not tau.requires_grad
+    graph(torch.randn(4, 3, 3, 5, 7)).square().sum().backward()
+    assert tau.grad is None
+    assert graph.tnn_parameters()["a._pre_memory.conv.weight"].grad.any()
+
+
+def test_a_chain_before_the_memory_is_refused():
+    with pytest.raises(UsageError, match="pre-memory of 'a' 'Sequential'"):
+        read_graph(_config(_node("a", None, pre_memory={"name": "Sequential"}), edges=()))

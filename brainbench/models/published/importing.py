@@ -1,0 +1,177 @@
+"""A published file of weights as a checkpoint of ours, with its card."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, cast
+
+import torch
+
+from brainbench.core.errors import DataError
+from brainbench.core.files import cache_dir, file_hash, provenance
+from brainbench.models.encoders.s4 import S4Encoder
+from brainbench.models.network import EncoderAttenderDecoder
+from brainbench.models.normaliser import PUBLISHED_FORCE_SCALE, Normaliser
+from brainbench.models.ops.parameters import check_named, copy_named
+from brainbench.models.published.files import ForeignWeights, read_settings, read_weights
+from brainbench.models.published.names import published_names, stored_readout
+from brainbench.models.published.recognition import Recognised, recognise
+from brainbench.models.registry import load_model
+from brainbench.models.training.checkpoints import CONFIG, save_checkpoint
+
+
+@dataclass(frozen=True)
+class ImportedModel:
+    """A checkpoint made of a published file."""
+
+    folder: Path
+    name: str
+    """What :func:`brainbench.load_model` takes: ``local-dir:FOLDER``."""
+    architecture: str
+    decoder: str | None
+    """None: the file has none."""
+    objective: str | None
+    parameters: int
+    """Parameters of the network in the file."""
+    not_imported: Mapping[str, int]
+    """What is no part of the network → how many entries of the file."""
+    sha256: str
+
+
+def import_checkpoint(
+    path: str | os.PathLike[str],
+    *,
+    architecture: str | None = None,
+    config: str | os.PathLike[str] | None = None,
+    out: str | os.PathLike[str] | None = None,
+) -> ImportedModel:
+    """Write a published file of weights as a checkpoint of ours.
+
+    Args:
+        path: A Lightning checkpoint (``.ckpt``), a state dict of PyTorch, or safetensors.
+        architecture: Registry name where names and shapes leave a choice.
+        config: The run's settings, which may decide it too.
+        out: Folder; by default ``ARCHITECTURE-HASH`` where the command runs.
+
+    Raises:
+        DataError: the file cannot be read, or is no network of the study.
+        UsageError: its architecture is ambiguous, or there is none of that name.
+    """
+    settings = None if config is None else read_settings(config)
+    weights = read_weights(path)
+    found = recognise(weights.state, settings, architecture)
+    model, used = build_published(weights.state, found)
+    others = _others(weights.state, used)
+    parts = {
+        "self-supervised head": [name for name in others if name.startswith("loss.")],
+        "attention masks and kernel lengths": [name for name in others if not name.startswith("loss.")],
+    }
+    drawn = {name for name, _ in model.named_parameters() if found.decoder is None and name.startswith("decoder.")}
+    facts = {
+        "objective": found.objective,
+        "origin": {"file": weights.path.name, "sha256": weights.sha256, "epoch": weights.epoch, "step": weights.step},
+        "not_imported": {part: names for part, names in parts.items() if names},
+        "decoder_in_file": found.decoder is not None,
+        "twin": None,
+        "provenance": provenance(),
+    }
+    folder = Path(out) if out is not None else Path(f"{found.architecture}-{weights.sha256[:8]}")
+    options = {"classes": found.classes, "decoder": found.decoder or "linear"}
+    save_checkpoint(
+        folder, model, architecture=found.architecture, options=options, info=facts, card=_card(weights, found, facts)
+    )
+    count = sum(value.numel() for name, value in model.named_parameters() if name not in drawn)
+    counts = {part: len(names) for part, names in parts.items() if names}
+    return ImportedModel(
+        folder, f"local-dir:{folder}", found.architecture, found.decoder, found.objective, count, counts, weights.sha256
+    )
+
+
+def import_to_cache(path: Path, config: Path | None = None) -> Path:
+    """Import a file into the cache, once for each content, and return its folder."""
+    folder = cache_dir("imported") / file_hash(path)
+    return folder if (folder / CONFIG).is_file() else import_checkpoint(path, config=config, out=folder).folder
+
+
+def build_published(state: Mapping[str, torch.Tensor], found: Recognised) -> tuple[EncoderAttenderDecoder, set[str]]:
+    """Build a recognised network with its weights; return it with the names of the entries that it took.
+
+    Raises:
+        DataError: entries are missing or unexpected, or shapes differ.
+    """
+    name = found.architecture
+    model = load_model(name, classes=found.classes, decoder=found.decoder or "linear")
+    if not isinstance(model, EncoderAttenderDecoder):
+        raise DataError(f"{name!r} is no architecture of the study, so published weights cannot be read into it.")
+    targets = matched_entries(state, model, found)
+    copy_named(targets, {key: state[key].reshape(target.shape) for key, target in targets.items()})
+    if isinstance(model.encoder, S4Encoder):
+        _adapt_s4(model.encoder, state)
+    model.normaliser.load_state_dict(Normaliser.physical(force=PUBLISHED_FORCE_SCALE).state_dict())
+    return model, set(targets)
+
+
+def matched_entries(
+    state: Mapping[str, torch.Tensor], model: EncoderAttenderDecoder, found: Recognised
+) -> dict[str, torch.Tensor]:
+    """Return the entries of a file that are a network's weights, each with its place in ours.
+
+    Raises:
+        DataError: entries are missing or unexpected, or shapes differ.
+    """
+    places, names = model.state_dict(), published_names(model)
+    if found.decoder is None:
+        names = {ours: theirs for ours, theirs in names.items() if not ours.startswith("decoder.")}
+    targets = {theirs: places[ours] for ours, theirs in names.items()}
+    # Axes of length one are the authors' layout; all else must agree.
+    shapes = {theirs: _squeezed(target) for theirs, target in targets.items()}
+    others = _others(state, set(targets))
+    given = {key: value.reshape(_squeezed(value)) for key, value in state.items() if key not in others}
+    check_named(shapes, given, what=f"the architecture {found.architecture!r}")
+    return targets
+
+
+def _adapt_s4(encoder: S4Encoder, state: Mapping[str, torch.Tensor]) -> None:
+    """Turn the stored form of S4's poles and readout into ours."""
+    with torch.no_grad():
+        for index, block in enumerate(encoder.blocks):
+            memory = cast(Any, block).memory
+            memory.frequency.neg_()  # theirs are the poles with negative frequency
+            steps = state.get(f"model.encoder.s4_layers.{index}.layer.kernel.l_kernel")
+            if steps is not None and int(steps) > 0:
+                plain = stored_readout(memory.transition(), memory.readout, int(steps), undo=True)
+                memory.readout.copy_(plain)
+
+
+def _others(state: Mapping[str, torch.Tensor], used: set[str]) -> list[str]:
+    """Return entries that are no weights of the network: heads, masks, lengths."""
+    return [
+        name
+        for name in state
+        if name not in used and (name.startswith("loss.") or name.endswith((".attn.bias", ".kernel.l_kernel")))
+    ]
+
+
+def _squeezed(value: torch.Tensor) -> tuple[int, ...]:
+    return tuple(size for size in value.shape if size != 1)
+
+
+def _card(weights: ForeignWeights, found: Recognised, facts: Mapping[str, Any]) -> str:
+    """Return the text of the model card, in Markdown."""
+    left = facts["not_imported"]
+    rows = {
+        "architecture": found.architecture,
+        "objective": found.objective or "not told by the file",
+        "origin": f"{weights.path.name}, SHA-256 {weights.sha256}",
+        "trained for": f"{weights.epoch} epochs, {weights.step} steps (as the file says)" if weights.epoch else None,
+        "input": "sweeps [B, T, 30, 5, 7] in N and N·m; the network itself sees mN and µN·m, as published",
+        "decoder": found.decoder or "not in the file: a linear one with weights drawn from seed 0",
+        "not imported": "; ".join(f"{part}: {len(names)} entries" for part, names in left.items()) or "nothing",
+        "untrained twin": "unknown",
+        "licence": "that of the file's authors",
+    }
+    table = "".join(f"| {name} | {told} |\n" for name, told in rows.items() if told)
+    return f"# {found.architecture}\n\nPublished weights, imported by brainbench.\n\n| | |\n|---|---|\n{table}"
