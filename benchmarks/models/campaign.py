@@ -16,6 +16,7 @@ import argparse
 import json
 import logging
 import os
+import shutil
 import subprocess
 import sys
 import tarfile
@@ -24,11 +25,13 @@ import time
 from pathlib import Path
 from typing import Any
 
-from benchmarks.models.campaign_jobs import Job, campaign
+from benchmarks.models.campaign_jobs import SHIPPED, Job, campaign
 
 _log = logging.getLogger("campaign")
 ROOT = Path(__file__).resolve().parents[2]
 DONE = ROOT / "leaderboards" / "reproduction" / "trainings.jsonl"
+WEIGHTS = ROOT / "brainbench" / "models" / "weights"
+BASELINES = ("raw-input", "random-features")
 MEMBERS = 150
 """Objects of each of the 54 families: 16 sweeps each, eight tenths of them to train."""
 TAR_BYTES, TARS = 15 * 2**20, 4
@@ -291,6 +294,25 @@ def install(folder: Path) -> None:
             line["twin_evaluation"] = twin["evaluation"]
     write_text(DONE, "".join(json.dumps(line) + "\n" for line in lines))
     _log.info("%s lists %d results", DONE.relative_to(ROOT), len(lines))
+    for name in SHIPPED:
+        source = folder / "unpacked" / "jobs" / f"{name}.seed0" / "best"
+        if source.is_dir():
+            ship(source, WEIGHTS / name, known)
+
+
+def ship(source: Path, target: Path, known: dict[str, dict[str, Any]]) -> None:
+    """Put a checkpoint into the package, with its controls in its configuration and its card."""
+    from brainbench.core.files import read_json, write_json, write_text
+    from brainbench.models.training.card import model_card
+    from brainbench.models.training.config import TrainingConfig
+
+    shutil.rmtree(target, ignore_errors=True)
+    shutil.copytree(source, target)
+    info = read_json(target / "config.json")
+    info["baselines"] = {name: known[name]["evaluation"] for name in BASELINES}
+    info["twin_evaluation"] = known[f"{info['twin']['name']}.untrained.seed{info['seed']}"]["evaluation"]
+    write_json(target / "config.json", info)
+    write_text(target / "README.md", model_card(TrainingConfig.from_mapping(info["training"]), info))
 
 
 def lines_of(result: dict[str, Any]) -> list[dict[str, Any]]:

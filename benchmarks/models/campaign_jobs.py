@@ -29,6 +29,12 @@ SEEDS = 3
 FULL_SIZE = ("zhuang+gpt", "zhuang-intersection-ln+gpt")
 VARIED = "zhuang-intersection-ln"
 """Architecture with which augmentations and masking are compared."""
+SHIPPED = (
+    "resnet18-small.supervised", "resnet18-small+gpt.supervised", "resnet18-small+gpt.simclr",
+    "s4-small+gpt.supervised", "zhuang-small.supervised", "zhuang-small.simclr",
+    "zhuang-intersection-ln-small.supervised", "zhuang-intersection-ln-small.simclr",
+)  # fmt: skip
+"""Networks of seed 0 that come with the package, 15 MB in all."""
 _MILLISECONDS = {"zhuang": 16, "ugrnn": 24, "intersection": 24, "gru": 30, "lstm": 30, "resnet18": 4, "s4": 8}
 _ATTENDER = {None: 0, "gpt": 13, "mamba": 32}
 """A step of 1,024 sweeps on one H200 takes about the sum of both."""

@@ -6,7 +6,6 @@ from collections.abc import Iterator
 from functools import partial
 from typing import TYPE_CHECKING, cast
 
-from brainbench.core.errors import UsageError
 from brainbench.models.architecture import Architecture
 from brainbench.models.registry import register_model
 
@@ -75,7 +74,6 @@ def build(
     classes: int = 117,
     decoder: str = "linear",
     unroll: Unroll = "biological",
-    version: int | None = None,
 ) -> EncoderAttenderDecoder:
     """Build the network with new random weights.
 
@@ -84,7 +82,6 @@ def build(
         classes: Number of outputs.
         decoder: ``linear``, ``mlp`` or ``all-steps``.
         unroll: ``biological`` or ``full``, for a Zhuang encoder.
-        version: 1 for weights of an older :attr:`Architecture.version`; None is the newest.
 
     Raises:
         UsageError: an option does not exist or does not fit.
@@ -93,11 +90,8 @@ def build(
     from brainbench.models.network import EncoderAttenderDecoder
     from brainbench.models.ops.layers import draw_silent_biases
 
-    if version not in (None, 1, item.version):
-        raise UsageError(f"The versions of {item} are 1 to {item.version}; received {version!r}.")
-    older = version is not None and version < item.version
-    encoder = _encoder(item, older)
-    attender = _attender(item, encoder.features, older)
+    encoder = _encoder(item)
+    attender = _attender(item, encoder.features)
     # Before the decoder, so that features do not depend on the number of classes; here, so that the model by name is
     # the network that training starts from.
     for part in (encoder, attender):
@@ -107,7 +101,7 @@ def build(
     return EncoderAttenderDecoder(encoder, attender, make_decoder(decoder, features, classes), unroll=unroll)
 
 
-def _encoder(item: Architecture, older: bool) -> Encoder:
+def _encoder(item: Architecture) -> Encoder:
     if item.encoder == "resnet18":
         from brainbench.models.encoders.resnet import ResNet18Encoder
 
@@ -115,7 +109,7 @@ def _encoder(item: Architecture, older: bool) -> Encoder:
     if item.encoder == "s4":
         from brainbench.models.encoders.s4 import S4Encoder
 
-        return S4Encoder(small=item.small, norm_first=older, dropout=0.0 if older else 0.2)
+        return S4Encoder(small=item.small)
     from brainbench.models.encoders.zhuang import zhuang_graph
     from brainbench.models.graph.temporal_graph import TemporalGraph
 
@@ -124,13 +118,12 @@ def _encoder(item: Architecture, older: bool) -> Encoder:
     return TemporalGraph(zhuang_graph(cell, item.layer_norm, item.small, feedforward=feedforward))
 
 
-def _attender(item: Architecture, features: int, older: bool) -> Attender | None:
+def _attender(item: Architecture, features: int) -> Attender | None:
     if item.attender == "gpt":
         from brainbench.models.attenders.gpt import GPTAttender
 
         # As published, the ResNet's transformer is half as wide as its features.
-        width = features // 2 if item.encoder == "resnet18" else features
-        return GPTAttender(features, width, gelu="none" if older else "tanh")
+        return GPTAttender(features, features // 2 if item.encoder == "resnet18" else features)
     if item.attender == "mamba":
         from brainbench.models.attenders.mamba import MambaAttender
 

@@ -41,11 +41,10 @@ class GPTBlock(nn.Module):
     """Pre-norm attention and a four times wider MLP, each added to the stream [B, tokens, width].
 
     ``dropout`` is the share of the attention weights and of the added values that is dropped while training; what each
-    of ``depth`` blocks adds is scaled by 1/√(2 depth). ``gelu`` is ``tanh``, as published, or ``none`` for the exact
-    form.
+    of ``depth`` blocks adds is scaled by 1/√(2 depth).
     """
 
-    def __init__(self, width: int, heads: int, dropout: float, depth: int, gelu: str = "tanh") -> None:
+    def __init__(self, width: int, heads: int, dropout: float, depth: int) -> None:
         super().__init__()
         self.heads = heads
         self.dropout = dropout
@@ -55,8 +54,9 @@ class GPTBlock(nn.Module):
         self.query_key_value = Linear(width, 3 * width)
         self.project = Linear(width, width, gain=residual)
         self.norm_mlp = nn.LayerNorm(width)
+        # The tanh form of GELU, as published.
         self.mlp = nn.Sequential(
-            Linear(width, 4 * width), nn.GELU(gelu), Linear(4 * width, width, gain=residual), nn.Dropout(dropout)
+            Linear(width, 4 * width), nn.GELU("tanh"), Linear(4 * width, width, gain=residual), nn.Dropout(dropout)
         )
         self.residual_dropout = nn.Dropout(dropout)
 
@@ -83,8 +83,7 @@ class GPTBlock(nn.Module):
 class GPTAttender(nn.Module):
     """Map features [B, T, F] to [B, T, width], causally, for at most ``context // 2`` steps.
 
-    ``context`` counts tokens, two per step and one over; ``dropout`` is the share dropped while training; ``gelu`` is
-    as for :class:`GPTBlock`.
+    ``context`` counts tokens, two per step and one over; ``dropout`` is the share dropped while training.
     25,778,688 parameters for 512 → 512; 6,532,608 for 512 → 256.
 
     Raises:
@@ -100,7 +99,6 @@ class GPTAttender(nn.Module):
         heads: int = 4,
         context: int = 65,
         dropout: float = 0.1,
-        gelu: str = "tanh",
     ) -> None:
         super().__init__()
         if width % heads:
@@ -111,7 +109,7 @@ class GPTAttender(nn.Module):
         self.embed = Linear(features, width)
         self.positions = nn.Parameter(torch.empty(context, width))
         self.dropout = nn.Dropout(dropout)
-        self.blocks: Any = nn.ModuleList(GPTBlock(width, heads, dropout, blocks, gelu) for _ in range(blocks))
+        self.blocks: Any = nn.ModuleList(GPTBlock(width, heads, dropout, blocks) for _ in range(blocks))
         self.norm = nn.LayerNorm(width)
         self.lm_head = Linear(width, width, use_bias=False)
         for tokens in (self.action, self.positions):

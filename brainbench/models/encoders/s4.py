@@ -26,13 +26,11 @@ S4State = tuple[tuple[torch.Tensor, System], ...]
 class S4Block(nn.Module):
     """LayerNorm(x + GLU(GELU(state space(x)))), [B, T, width], as published.
 
-    With ``norm_first`` x + GLU(GELU(state space(LayerNorm(x)))). ``dropout`` is the share dropped while training, both
-    after the GELU and of what is added.
+    ``dropout`` is the share dropped while training, both after the GELU and of what is added.
     """
 
-    def __init__(self, width: int, *, norm_first: bool = False, dropout: float = 0.2) -> None:
+    def __init__(self, width: int, dropout: float) -> None:
         super().__init__()
-        self.norm_first = norm_first
         self.norm = nn.LayerNorm(width)
         self.memory = StateSpace(width)
         self.mix = Linear(width, 2 * width)
@@ -40,27 +38,24 @@ class S4Block(nn.Module):
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         """Process a sweep [B, T, width]."""
-        return self._added(x, self.memory(self._seen(x)))
+        return self._added(x, self.memory(x))
 
     def step(self, x: torch.Tensor, memory: torch.Tensor, system: System) -> tuple[torch.Tensor, torch.Tensor]:
         """Advance by one step [B, width]; return the answer and the next memory."""
-        y, memory = self.memory.step(self._seen(x), memory, system)
+        y, memory = self.memory.step(x, memory, system)
         return self._added(x, y), memory
-
-    def _seen(self, x: torch.Tensor) -> torch.Tensor:
-        return self.norm(x) if self.norm_first else x
 
     def _added(self, x: torch.Tensor, y: torch.Tensor) -> torch.Tensor:
         # State spaces keep channels apart; the gated linear unit mixes them at every step.
         y = self.dropout(functional.glu(self.mix(self.dropout(functional.gelu(y))), -1))
-        return x + y if self.norm_first else self.norm(x + y)
+        return self.norm(x + y)
 
 
 class S4Encoder(nn.Module):
     """Features [B, T, F] of a sweep [B, T, C, H, W], causally.
 
-    With ``small`` all widths × 3/16 (F = 96 instead of 512; 0.3 M parameters). ``norm_first`` and ``dropout`` are as
-    for :class:`S4Block`.
+    With ``small`` all widths × 3/16 (F = 96 instead of 512; 0.3 M parameters). ``dropout`` is as for
+    :class:`S4Block`.
     """
 
     layers: tuple[str, ...] = ("embed", "block1", "block2", "block3", "block4", "fc")
@@ -68,13 +63,11 @@ class S4Encoder(nn.Module):
     latency: int = 0
     receptive_field: int | None = None
 
-    def __init__(self, *, small: bool = False, norm_first: bool = False, dropout: float = 0.2) -> None:
+    def __init__(self, *, small: bool = False, dropout: float = 0.2) -> None:
         super().__init__()
         self.features = small_width(512) if small else 512
         self.embed = Linear(math.prod(self.input_shape), self.features, gain=RECTIFIER_GAIN)
-        self.blocks: Any = nn.ModuleList(
-            S4Block(self.features, norm_first=norm_first, dropout=dropout) for _ in range(len(self.layers) - 2)
-        )
+        self.blocks: Any = nn.ModuleList(S4Block(self.features, dropout) for _ in range(len(self.layers) - 2))
         self.fc = Linear(self.features, self.features)
 
     def multiply_adds(self) -> int:

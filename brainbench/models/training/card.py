@@ -64,7 +64,6 @@ def model_card(config: TrainingConfig, info: Mapping[str, Any]) -> str:
     if found is not None:
         low, high = found["interval"]["low"], found["interval"]["high"]
         read = "linear probe on the frozen network" if config.objective != "supervised" else "its own decoder"
-        read += ", fitted anew to the trained features" if info.get("refit_decoder") else ""
         rows |= {
             "top-1": f"{found['top1']:.3f} [{low:.3f}, {high:.3f}] on {found['count']} sweeps ({read})",
             "top-5": f"{found['top5']:.3f}",

@@ -76,7 +76,7 @@ def save_checkpoint(
     if card:
         write_text(folder / CARD, card)
     stated = {"brainbench_model": FORMAT, "architecture": architecture, "options": dict(options), "dtype": dtype}
-    stated["version"] = options.get("version", Architecture.parse(architecture).version)
+    stated["version"] = Architecture.parse(architecture).version
     write_json(folder / CONFIG, {**(info or {}), **stated})
     return folder
 
@@ -104,14 +104,11 @@ def read_config(folder: str | os.PathLike[str]) -> dict[str, Any]:
     if not isinstance(config.get("architecture"), str) or not isinstance(config.get("options"), dict):
         raise DataError(f"{os.fspath(path)!r} lacks the name 'architecture' or the mapping 'options'.")
     version, known = config.get("version", 1), Architecture.parse(config["architecture"]).version
-    if version not in (1, known):
+    if version != known:
         raise DataError(
             f"{os.fspath(folder)!r} holds version {version!r} of {config['architecture']!r}; this brainbench computes "
-            f"versions up to {known}: train anew with brainbench train, or install the brainbench that made it."
+            f"version {known}: train anew with brainbench train, or install the brainbench that made it."
         )
-    if version != known:
-        # Weights of version 1 still compute what they were trained for, by an option of the architecture.
-        config["options"] = {**config["options"], "version": version}
     return config
 
 
