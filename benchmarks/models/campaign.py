@@ -2,7 +2,8 @@
 
     python -m benchmarks.models.campaign --work /tmp/campaign --minutes 20 &    # makes the data, trains
     python -m benchmarks.models.campaign --work /tmp/campaign --pack 0 --out $OUT   # the first 60 MB of what is done
-    python -m benchmarks.models.campaign --install FOLDER_OF_TARS                # here: results enter the repository
+    python -m benchmarks.models.campaign --install FOLDER   # here: results of its tars enter the repository
+    python -m benchmarks.models.campaign --score FOLDER     # here: networks and twins are scored
 
 Jobs are in ``campaign_jobs.py``, the most valuable first. Those that ``leaderboards/reproduction/trainings.jsonl``
 lists are done; a session takes the next ones that it has time for. A few processes per GPU, each with all sweeps in the
@@ -13,6 +14,7 @@ together.
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import json
 import logging
 import os
@@ -30,8 +32,11 @@ from benchmarks.models.campaign_jobs import SHIPPED, Job, campaign
 _log = logging.getLogger("campaign")
 ROOT = Path(__file__).resolve().parents[2]
 DONE = ROOT / "leaderboards" / "reproduction" / "trainings.jsonl"
+CURVES = DONE.with_name("curves.jsonl")
 WEIGHTS = ROOT / "brainbench" / "models" / "weights"
 BASELINES = ("raw-input", "random-features")
+BOARDS = (("demo", "rsa"), ("demo-rodgers", "rsa"), ("demo", "ridge"))
+"""Recordings and metrics that every network is scored with."""
 MEMBERS = 150
 """Objects of each of the 54 families: 16 sweeps each, eight tenths of them to train."""
 TAR_BYTES, TARS = 15 * 2**20, 4
@@ -52,6 +57,7 @@ def parser() -> argparse.ArgumentParser:
     told.add_argument("--pack", type=int, help="write the n-th part of the results to --out")
     told.add_argument("--out", type=Path, default=Path("campaign-out"))
     told.add_argument("--install", type=Path, help="enter the results of tar files into the repository")
+    told.add_argument("--score", type=Path, help="score the networks of a folder that --install unpacked")
     told.add_argument("--worker", type=int, help=argparse.SUPPRESS)
     told.add_argument("--shards", help=argparse.SUPPRESS)
     return told
@@ -62,6 +68,8 @@ def main() -> None:
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s", datefmt="%H:%M:%S")
     if args.install:
         install(args.install)
+    elif args.score:
+        score(args)
     elif args.pack is not None:
         pack(args)
     elif args.shards:
@@ -294,6 +302,11 @@ def install(folder: Path) -> None:
             line["twin_evaluation"] = twin["evaluation"]
     write_text(DONE, "".join(json.dumps(line) + "\n" for line in lines))
     _log.info("%s lists %d results", DONE.relative_to(ROOT), len(lines))
+    new = {path.parent.name: path.read_text(encoding="utf-8") for path in folder.glob("unpacked/jobs/*/log.jsonl")}
+    old = CURVES.read_text(encoding="utf-8").splitlines() if CURVES.is_file() else []
+    kept = [line for line in old if json.loads(line)["job"] not in new]
+    # A log whose job did not end is no curve.
+    write_text(CURVES, "\n".join([*kept, *(text.strip() for name, text in new.items() if name in known)]) + "\n")
     for name in SHIPPED:
         source = folder / "unpacked" / "jobs" / f"{name}.seed0" / "best"
         if source.is_dir():
@@ -313,6 +326,35 @@ def ship(source: Path, target: Path, known: dict[str, dict[str, Any]]) -> None:
     info["twin_evaluation"] = known[f"{info['twin']['name']}.untrained.seed{info['seed']}"]["evaluation"]
     write_json(target / "config.json", info)
     write_text(target / "README.md", model_card(TrainingConfig.from_mapping(info["training"]), info))
+
+
+def score(args: argparse.Namespace) -> None:
+    """Score networks and untrained twins on the boards of :data:`BOARDS`; what is scored already is left alone."""
+    from brainbench.core.files import write_text
+    from brainbench.scoring.scores import score_record
+
+    os.chdir(args.score / "unpacked" / "jobs")
+    for job in campaign():
+        done = (job.objective != "baseline") and Path(job.name, "result.json").is_file()
+        if not done or (args.only and args.only not in job.name):
+            continue
+        for recordings, metric in BOARDS:
+            path = DONE.parent / "records" / f"{job.name}--{recordings}-{metric}.json"
+            if path.is_file():
+                continue
+            name = f"local-dir:{job.name}/best" if job.trained else job.model
+            seeded = {} if job.trained else {"weights_seed": job.seed}
+            record = score_record(name, recordings=recordings, metric=metric, **seeded)
+            # The page draws no RDMs, which are nine tenths of a record.
+            bare = {"model_rdm": (), "brain_rdm": ()}
+            record = dataclasses.replace(
+                record,
+                score=dataclasses.replace(record.score, **bare),
+                animal_to_animal=record.animal_to_animal and dataclasses.replace(record.animal_to_animal, **bare),
+                baselines={name: dataclasses.replace(value, **bare) for name, value in record.baselines.items()},
+            )
+            write_text(path, json.dumps(json.loads(record.to_json())) + "\n")
+            _log.info("%s on %s by %s: %.3f", job.name, recordings, metric, record.score.scaled)
 
 
 def lines_of(result: dict[str, Any]) -> list[dict[str, Any]]:
