@@ -24,6 +24,7 @@ import sys
 import tarfile
 import threading
 import time
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -334,27 +335,25 @@ def score(args: argparse.Namespace) -> None:
     from brainbench.scoring.scores import score_record
 
     os.chdir(args.score / "unpacked" / "jobs")
-    for job in campaign():
-        done = (job.objective != "baseline") and Path(job.name, "result.json").is_file()
-        if not done or (args.only and args.only not in job.name):
+    done = [job for job in campaign() if job.objective != "baseline" and Path(job.name, "result.json").is_file()]
+    chosen = [job for job in done if not args.only or args.only in job.name]
+    for (recordings, metric), job in product(BOARDS, chosen):
+        path = DONE.parent / "records" / f"{job.name}--{recordings}-{metric}.json"
+        if path.is_file():
             continue
-        for recordings, metric in BOARDS:
-            path = DONE.parent / "records" / f"{job.name}--{recordings}-{metric}.json"
-            if path.is_file():
-                continue
-            name = f"local-dir:{job.name}/best" if job.trained else job.model
-            seeded = {} if job.trained else {"weights_seed": job.seed}
-            record = score_record(name, recordings=recordings, metric=metric, **seeded)
-            # The page draws no RDMs, which are nine tenths of a record.
-            bare = {"model_rdm": (), "brain_rdm": ()}
-            record = dataclasses.replace(
-                record,
-                score=dataclasses.replace(record.score, **bare),
-                animal_to_animal=record.animal_to_animal and dataclasses.replace(record.animal_to_animal, **bare),
-                baselines={name: dataclasses.replace(value, **bare) for name, value in record.baselines.items()},
-            )
-            write_text(path, json.dumps(json.loads(record.to_json())) + "\n")
-            _log.info("%s on %s by %s: %.3f", job.name, recordings, metric, record.score.scaled)
+        name = f"local-dir:{job.name}/best" if job.trained else job.model
+        seeded = {} if job.trained else {"weights_seed": job.seed}
+        record = score_record(name, recordings=recordings, metric=metric, **seeded)
+        # The page draws no RDMs, which are nine tenths of a record.
+        bare = {"model_rdm": (), "brain_rdm": ()}
+        record = dataclasses.replace(
+            record,
+            score=dataclasses.replace(record.score, **bare),
+            animal_to_animal=record.animal_to_animal and dataclasses.replace(record.animal_to_animal, **bare),
+            baselines={name: dataclasses.replace(value, **bare) for name, value in record.baselines.items()},
+        )
+        write_text(path, json.dumps(json.loads(record.to_json())) + "\n")
+        _log.info("%s on %s by %s: %.3f", job.name, recordings, metric, record.score.scaled)
 
 
 def lines_of(result: dict[str, Any]) -> list[dict[str, Any]]:
