@@ -331,19 +331,20 @@ def ship(source: Path, target: Path, known: dict[str, dict[str, Any]]) -> None:
 
 def score(args: argparse.Namespace) -> None:
     """Score networks and untrained twins on the boards of :data:`BOARDS`; what is scored already is left alone."""
-    from brainbench.core.files import write_text
+    from brainbench.scoring.demo import DEMOS
     from brainbench.scoring.scores import score_record
+    from leaderboards.store import write_record
 
     os.chdir(args.score / "unpacked" / "jobs")
     done = [job for job in campaign() if job.objective != "baseline" and Path(job.name, "result.json").is_file()]
     chosen = [job for job in done if not args.only or args.only in job.name]
+    folder = DONE.parent / "records"
+    known = {_subject(path) for path in folder.glob("*.json")}
     for (recordings, metric), job in product(BOARDS, chosen):
-        path = DONE.parent / "records" / f"{job.name}--{recordings}-{metric}.json"
-        if path.is_file():
-            continue
         name = f"local-dir:{job.name}/best" if job.trained else job.model
-        seeded = {} if job.trained else {"weights_seed": job.seed}
-        record = score_record(name, recordings=recordings, metric=metric, **seeded)
+        if (name, DEMOS[recordings], metric, 0 if job.trained else job.seed) in known:
+            continue
+        record = score_record(name, recordings=recordings, metric=metric, weights_seed=0 if job.trained else job.seed)
         # The page draws no RDMs, which are nine tenths of a record.
         bare = {"model_rdm": (), "brain_rdm": ()}
         record = dataclasses.replace(
@@ -352,8 +353,15 @@ def score(args: argparse.Namespace) -> None:
             animal_to_animal=record.animal_to_animal and dataclasses.replace(record.animal_to_animal, **bare),
             baselines={name: dataclasses.replace(value, **bare) for name, value in record.baselines.items()},
         )
-        write_text(path, json.dumps(json.loads(record.to_json())) + "\n")
+        write_record(record, folder)
         _log.info("%s on %s by %s: %.3f", job.name, recordings, metric, record.score.scaled)
+
+
+def _subject(path: Path) -> tuple[str, str, str, int]:
+    """Return what a record is of: the model's name, the recordings' stimuli, the metric and the seed of the weights."""
+    found = json.loads(path.read_text(encoding="utf-8"))["score"]
+    settings = found["provenance"]["settings"]
+    return found["name"], str(settings["stimuli"]), str(settings["metric"]), int(settings["weights_seed"] or 0)
 
 
 def lines_of(result: dict[str, Any]) -> list[dict[str, Any]]:
