@@ -98,7 +98,9 @@ def _of_animal(array: NDArray[np.float64], sessions: Sequence[ZeroFilledSession]
         yield Finding("warning", "labels", message, "The metric 'rsa' leaves them out; 'rsa-correlation' needs two.")
     if padded := int(np.isnan(array[-1, 0]).sum()):
         message = f"{share(padded, array.shape[2])} units are padded with NaN to {len(array)} trials"
-        yield Finding("note", "padding", message, "Rows of different sessions share a number without belonging together.")
+        yield Finding(
+            "note", "padding", message, "Rows of different sessions share a number without belonging together."
+        )
 
 
 def _trials_of_slots(session: ZeroFilledSession) -> NDArray[np.int64]:
