@@ -17,7 +17,7 @@ from leaderboards.figures.svg import standalone
 from leaderboards.reproduction.campaign import Campaign, Network, NetworkKey, board_name
 from leaderboards.reproduction.claims import GOAL, Judgement, judge_accuracy, judge_fit, seed_agreement
 from leaderboards.reproduction.contrasts import Effect, Matched, Observed, contrast
-from leaderboards.reproduction.measures import Measured, accuracies, fits, published, published_accuracy
+from leaderboards.reproduction.measures import Measured, accuracies, fits, observed, published, published_accuracy
 from leaderboards.reproduction.trainings import TRAININGS, Training
 from leaderboards.site.page import render_markdown
 from leaderboards.text import number, plural, span
@@ -158,7 +158,7 @@ def _seed_rows(campaign: Campaign) -> list[tuple[str, ...]]:
 
 
 def _network_rows(campaign: Campaign) -> list[tuple[str, ...]]:
-    first, five = accuracies(campaign, top1=True), accuracies(campaign)
+    first, five = accuracies(campaign, "top1"), accuracies(campaign)
     scores = [fits(campaign, place) for place in range(len(campaign.boards))]
     theirs = published_accuracy().networks
     expected = {NetworkKey.of(run["model"], run["objective"]) for run in published()["runs"]}
@@ -199,9 +199,7 @@ def _network_rows(campaign: Campaign) -> list[tuple[str, ...]]:
 
 def _alone(line: Training, name: str) -> str:
     result = line.evaluation if line.finished else None
-    return (
-        _plain(Observed(line.name, {0: getattr(result, name)}, line.objective, result.count)) if result else line.status
-    )
+    return _plain(observed(line.name, {0: result}, name, line.objective)) if result else line.status
 
 
 def _mean(measured: Measured, key: NetworkKey) -> str:
