@@ -10,12 +10,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from brainbench import __version__
-from brainbench.core.contracts import CHANNELS, check_stimulus_set
+from brainbench.core.contracts import check_stimulus_set
 from brainbench.core.errors import DataError, listing
 from brainbench.core.files import to_json
 from brainbench.stimuli.scenes.frames import Frames
-from brainbench.stimuli.stimulus_set import hash_stimulus_set
+from brainbench.stimuli.stimulus_set import hash_stimulus_set, new_stimulus_set
 from brainbench.stimuli.whiskers.selection import ROWS
 
 if TYPE_CHECKING:
@@ -59,8 +58,6 @@ def assemble_stimulus_set(
     Raises:
         DataError: two stimuli have the same label.
     """
-    import xarray as xr
-
     labels = [source["label"] for source in sources]
     if twice := [label for label, count in Counter(labels).items() if count > 1]:
         raise DataError(f"Several stimuli are called {listing(twice)}; each needs a name of its own.")
@@ -78,33 +75,21 @@ def assemble_stimulus_set(
     shown = short if len(set(short)) == len(short) else list(names)
     values = {name: where.sum(axis=(1, 2, 3)).tolist() for name, where in faults.items()}
     told = {label: {name: n for name, found in values.items() if (n := found[i])} for i, label in enumerate(labels)}
-    dataset = xr.Dataset(
+    dataset = new_stimulus_set(
+        labels,
+        [(one, ROWS.index(name[1]), int(name[2:]), _SIDES[name[0]]) for one, name in zip(shown, names, strict=True)],
+        frames,
         {
             "wrench": ((*over_time, "channel"), wrench.astype(np.float32), {"units": "N (F), N m (M)"}),
             "frame_status": (over_time, marked, {"meaning": ", ".join(FRAME_STATUSES)}),
             "status": (grid, np.where(unstable, "unstable", "ok").astype(object)),
             "reason": (grid, reasons),
         },
-        coords={
-            "stimulus": np.array(labels, dtype=object),
-            "time": ("time", frames.times, {"units": "s"}),
-            "whisker": np.array(shown, dtype=object),
-            "row": ("whisker", [ROWS.index(name[1]) for name in names]),
-            "col": ("whisker", [int(name[2:]) for name in names]),
-            "side": ("whisker", np.array(sides, dtype=object)),
-            "channel": np.array(CHANNELS, dtype=object),
-        },
-        attrs={
+        {
             "array": text({"species": "not stated", "side": " and ".join(dict.fromkeys(sides)), "whiskers": shown}),
             "scene": text([{"label": source["label"], "frames": frames.config(), **source} for source in sources]),
             "fidelity": text({}),
-            # Contracts ask for the field; what was drawn elsewhere is not known.
-            "seed": 0,
             "backend": "whiskit",
-            "version": __version__,
-            "frame": "world axes; action of the whisker on its base, about the base point",
-            "axes": "world",
-            "readout": frames.describe(),
             "faults": text({label: found for label, found in told.items() if found}),
             **about,
         },

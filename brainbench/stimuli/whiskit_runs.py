@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import math
 import os
-import re
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -21,11 +20,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brainbench.core.contracts import CHANNELS, GRID_SHAPE
-from brainbench.core.errors import DataError, DataFileNotFoundError, UsageError, listing, unknown_name
+from brainbench.core.errors import DataError, UsageError, listing, unknown_name
 from brainbench.stimuli.external import FRAME_STATUSES, assemble_stimulus_set
 from brainbench.stimuli.motion.recorded import read_numbers
 from brainbench.stimuli.scenes.frames import Frames
 from brainbench.stimuli.whiskers.selection import ROWS
+from brainbench.stimuli.whiskit import read_names
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -71,7 +71,7 @@ def read_run(folder: str | os.PathLike[str]) -> WhiskitRun:
         DataError: a file is missing, the files do not fit together, or a whisker has no name of WHISKiT's.
     """
     root = Path(folder)
-    names = _names(root)
+    names = _names(root / "whisker_ID.csv")
     tables = {name: read_numbers(root / "dynamics" / f"{name}.csv") for name in CHANNELS}
     rows = Counter(map(len, tables.values())).most_common(1)[0][0]
     for name, table in tables.items():
@@ -171,12 +171,8 @@ def _frames(rows: int, cleaning: Cleaning, rate: float | None) -> Frames:
     return _ROWS[rows] if rate is None else Frames(first=0.0, interval=1 / rate, count=rows)
 
 
-def _names(root: Path) -> tuple[str, ...]:
-    path = root / "whisker_ID.csv"
-    if not path.is_file():
-        raise DataFileNotFoundError(f"There is no file {str(path)!r}; it names the columns of a WHISKiT run.")
-    lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
-    names = [name for line in lines for name in re.split(r"[,\s]+", line.strip()) if name]
+def _names(path: Path) -> tuple[str, ...]:
+    names = read_names(path)
     for name in names:
         if name not in _NAMES:
             raise DataError(str(unknown_name(f"whisker in {str(path)!r}:", name, _NAMES)))
