@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, cast
@@ -125,7 +125,7 @@ def matched_entries(
     targets = {theirs: places[ours] for ours, theirs in names.items()}
     # Axes of length one are the authors' layout; all else must agree.
     shapes = {theirs: _squeezed(target) for theirs, target in targets.items()}
-    others = _others(state, set(targets))
+    others = _others(state, targets)
     given = {key: value.reshape(_squeezed(value)) for key, value in state.items() if key not in others}
     check_named(shapes, given, what=f"the architecture {found.architecture!r}")
     return targets
@@ -137,19 +137,14 @@ def _adapt_s4(encoder: S4Encoder, state: Mapping[str, torch.Tensor]) -> None:
         for index, block in enumerate(encoder.blocks):
             memory = cast(Any, block).memory
             memory.frequency.neg_()  # theirs are the poles with negative frequency
-            steps = state.get(f"model.encoder.s4_layers.{index}.layer.kernel.l_kernel")
-            if steps is not None and int(steps) > 0:
-                plain = stored_readout(memory.transition(), memory.readout, int(steps), undo=True)
-                memory.readout.copy_(plain)
+            if steps := int(state.get(f"model.encoder.s4_layers.{index}.layer.kernel.l_kernel", 0)):
+                memory.readout.copy_(stored_readout(memory.transition(), memory.readout, steps, undo=True))
 
 
-def _others(state: Mapping[str, torch.Tensor], used: set[str]) -> list[str]:
+def _others(state: Mapping[str, torch.Tensor], used: Iterable[str]) -> list[str]:
     """Return entries that are no weights of the network: heads, masks, lengths."""
-    return [
-        name
-        for name in state
-        if name not in used and (name.startswith("loss.") or name.endswith((".attn.bias", ".kernel.l_kernel")))
-    ]
+    no_weights = (name for name in state if name.startswith("loss.") or name.endswith((".attn.bias", ".l_kernel")))
+    return [name for name in no_weights if name not in used]
 
 
 def _squeezed(value: torch.Tensor) -> tuple[int, ...]:
