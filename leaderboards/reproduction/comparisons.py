@@ -45,7 +45,7 @@ def _swap(change: Mapping[str, str] | Callable[[NetworkKey], NetworkKey], sign: 
     return matched
 
 
-def _each(baseline: str | None, objective: str | None) -> _Choice:
+def each(baseline: str | None, objective: str | None) -> _Choice:
     """Return the choice that holds every network against a baseline, or by itself."""
 
     def matched(measured: Measured) -> _Chosen:
@@ -122,12 +122,12 @@ COMPARISONS: dict[str, _Choice] = {
     "trained-accuracy": _to_untrained,
     "tactile-image-accuracy": _image,
     "masking-accuracy": _masked,
-    "raw-accuracy": _each(RAW_INPUT, "supervised"),
-    "random-accuracy": _each(RANDOM_FEATURES, "supervised"),
+    "raw-accuracy": each(RAW_INPUT, "supervised"),
+    "random-accuracy": each(RANDOM_FEATURES, "supervised"),
     "best-fit": _best(NetworkKey(_INTERSECTION, "none", "simclr"), None),
     "saturation": _saturation,
-    "raw-fit": _each(RAW_INPUT, None),
-    "untrained-fit": _each(None, "untrained"),
+    "raw-fit": each(RAW_INPUT, None),
+    "untrained-fit": each(None, "untrained"),
     "trained-fit": _to_untrained,
     "convrnn-resnet-fit": _encoders(_recurrent, _is("resnet18"), None),
     "convrnn-s4-fit": _encoders(_recurrent, _is("s4"), None),

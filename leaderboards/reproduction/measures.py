@@ -102,16 +102,22 @@ def layer_orders(campaign: Campaign, place: int, part: str = "") -> Measured:
     return Measured(found)
 
 
-def parameters(campaign: Campaign, place: int | None = None) -> dict[NetworkKey, int]:
-    """Return the parameters of the networks, from trainings or else from the cards of the records of a board."""
+def parameters(campaign: Campaign, place: int | None = None) -> dict[NetworkKey, float]:
+    """Return log10 of the parameters of the networks, from trainings or else from the cards of a board's records."""
     found = {}
     for key, network in campaign.networks.items():
-        counts = [line.parameters for line in network.trainings.values()]
         records = network.records.get(place, {}) if place is not None else {}
+        counts = [line.parameters for line in network.trainings.values()]
         counts += [record.card.parameters for record in records.values() if record.card]
         if count := next(filter(None, counts), None):
-            found[key] = count
+            found[key] = math.log10(count)
     return found
+
+
+def published_parameters() -> dict[NetworkKey, float]:
+    """Return log10 of the published numbers of parameters."""
+    runs = [(NetworkKey.of(run["model"], run["objective"]), run["parameters"]) for run in published()["runs"]]
+    return {key: math.log10(count) for key, count in runs if count}
 
 
 def _fit(name: str, scores: Mapping[int, Score], objective: str = "") -> Observed | None:
