@@ -121,6 +121,7 @@ class SweepTree:
     def open_shard(self, split: str) -> FileShard:
         """Return the sweeps of one split as a shard."""
         mine = np.flatnonzero(self.split == split)
+        doubtful = self.listed.faults[mine][:, [[*FAULTS].index(name) for name in DOUBTFUL]]
         return FileShard(
             path=self.folder / split,
             offset=0,
@@ -130,7 +131,7 @@ class SweepTree:
             labels=self.listed.label[mine].astype(np.int32),
             objects=self.listed.shape[mine],
             indices=mine,
-            broken=self.listed.faults[mine][:, [[*FAULTS].index(name) for name in DOUBTFUL]].any(axis=1),
+            broken=doubtful.sum(axis=1) > 0,
             empty=np.zeros(len(mine), dtype=bool),
             content_hash=self.content_hash,
             tree=self,
@@ -152,9 +153,10 @@ class FileShard(Shard):
 
     def verify(self) -> None:
         """Compare every file with what it was when it was listed; a difference is a :class:`DataError`."""
-        for index in self.indices.tolist():
-            path = self.tree.folder / self.tree.listed.path[index]
-            if file_hash(path) != self.tree.listed.digest[index]:
+        listed = self.tree.listed
+        for name, digest in zip(listed.path[self.indices].tolist(), listed.digest[self.indices], strict=True):
+            path = self.tree.folder / name
+            if file_hash(path) != digest:
                 raise DataError(f"{str(path)!r} changed since it was listed; start again.")
 
 

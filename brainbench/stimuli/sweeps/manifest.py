@@ -13,7 +13,7 @@ from brainbench.core.contracts import SWEEPS_FORMAT, SWEEPS_SCHEMA
 from brainbench.core.errors import DataError
 from brainbench.core.files import content_hash, provenance
 from brainbench.stimuli.sweeps.plan import GenerationPlan, PlannedShard
-from brainbench.stimuli.sweeps.shards import UNUSABLE
+from brainbench.stimuli.sweeps.shards import COUNTS, UNUSABLE
 from brainbench.stimuli.sweeps.split import SPLITS
 
 if TYPE_CHECKING:
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 MANIFEST = "manifest.json"
 
-_COUNTS = ("steps", "steps_in_full", "retried", "unstable", "unusable")
+_COUNTS = (*COUNTS, "unstable", "unusable")
 
 
 def is_complete(path: Path, task: PlannedShard) -> bool:

@@ -30,7 +30,7 @@ OK, UNSTABLE, UNUSABLE = 0, 1, 2
 ALIGNMENT = 4096
 """The forces begin at a multiple of this, so that pages of memory and of the file coincide."""
 
-COUNTS = ("steps", "steps_in_full", "retried")
+COUNTS: tuple[str, ...] = ("steps", "steps_in_full", "retried")
 """Attributes that say how much was simulated."""
 _CONDITIONS = tuple(item.name for item in fields(Sweep))
 
@@ -87,7 +87,7 @@ def simulate_shard(task: ShardTask, prepared: PreparedShard, workers: int | None
     contact = np.zeros((len(task), whiskers), dtype=np.float32)
     status = np.full((len(task), whiskers), UNUSABLE, dtype=np.uint8)
     reasons = [prepared.reasons[owner] for owner in task.owner.tolist()]
-    counts = dict.fromkeys(COUNTS, 0)
+    counts: dict[str, int] = dict.fromkeys(COUNTS, 0)
     wrench = np.empty((0, *shape[1:]), dtype=np.float32)
     if len(chosen):
         named = {task.objects[owner].name: solid for owner in place if (solid := prepared.solids[owner])}
