@@ -115,7 +115,8 @@ def _data_set(source: Path, out: Path) -> dict[str, Any]:
     with progress_bar() as progress:
         manifest = convert_sweeps(table, out, progress=progress)
     about = ("sweeps", "splits", "left_out", "faults", "unstable", "content_hash", "config_hash")
-    return {"kind": "data set", "rate_hz": tree.rate, **{name: manifest[name] for name in about}}
+    known = {"rate_hz": tree.rate, "classes": len(tree.classes), **_frames(tree.times)}
+    return {"kind": "data set", **known, **{name: manifest[name] for name in about}}
 
 
 def _sweep_set(paths: list[Path]) -> xr.Dataset:
@@ -152,7 +153,7 @@ def _write_set(dataset: xr.Dataset, out: Path) -> dict[str, Any]:
     return {
         "kind": "stimulus set",
         "stimuli": [str(label) for label in dataset["stimulus"].values],
-        "frames": dataset.sizes["time"],
+        **_frames(dataset["time"].values),
         "whiskers": dataset.sizes["whisker"],
         "units": f"N and N·m; {dataset.attrs['frame']}",
         "faults": json.loads(dataset.attrs["faults"]),
@@ -172,6 +173,13 @@ def _run(source: Path, out: Path, **options: Any) -> dict[str, Any]:
         save_run(dataset, Path(temporary) / "run", **options).rename(out)
     units = "mN and µN·m; action of the whisker on its base, world axes"
     return {"kind": "run", "frames": dataset.sizes["time"], "whiskers": dataset.sizes["whisker"], "units": units}
+
+
+def _frames(times: Any) -> dict[str, Any]:
+    """Return number, first time and interval of frames."""
+    first, last = 1e3 * times[0], 1e3 * times[-1]
+    interval = (last - first) / max(1, len(times) - 1)
+    return {"frames": len(times), "first_ms": round(first, 4), "interval_ms": round(interval, 4)}
 
 
 def _told(value: Any) -> str:
