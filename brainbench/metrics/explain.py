@@ -33,7 +33,12 @@ from brainbench.metrics.layers import held_out
 from brainbench.metrics.measures.rsa import RSA
 from brainbench.metrics.rdms.comparison import compare
 from brainbench.metrics.rdms.pairs import Floats, rdm_stack, stimulus_count
-from brainbench.metrics.reliability.noise_correction import RELIABILITY_GATE, THESIS_FILTER, spearman_brown
+from brainbench.metrics.reliability.noise_correction import (
+    RELIABILITY_GATE,
+    THESIS_FILTER,
+    corrected_splits,
+    spearman_brown,
+)
 from brainbench.metrics.reliability.subject_rdm import SubjectRDM, is_flat
 
 
@@ -96,15 +101,11 @@ def corrected_value(
         sides = [float(spearman_brown(side[keep].mean())) for side in (halves, others)]
         value = float(raw[keep].mean()) / math.sqrt(math.prod(sides)) if min(sides) > 0 else math.nan
         return value, int(keep.sum())
-    # Thesis, equation 3.4, for every split; a negative product has no real root.
-    first, second = spearman_brown(halves[keep]), spearman_brown(others[keep])
-    real = first * second > 0
-    if not switches.negative_pairs:
-        real &= first > 0
-    if not real.any():
+    ratios, _ = corrected_splits(raw[keep], halves[keep], others[keep])
+    real = ratios[np.isfinite(ratios) & (switches.negative_pairs | (halves[keep] > 0))]
+    if not real.size:
         return math.nan, 0
-    ratios = raw[keep][real] / np.sqrt(first[real] * second[real])
-    return float(np.median(ratios) if switches.median else ratios.mean()), int(real.sum())
+    return float(np.median(real) if switches.median else real.mean()), real.size
 
 
 def explain_file(path: str | Path) -> tuple[Step, ...]:

@@ -16,12 +16,12 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from brainbench.core.errors import UsageError
 from brainbench.core.provenance import Provenance
 from brainbench.core.records import LayerScore, Score, SubjectScore
 from brainbench.metrics.animals import recorded_rdm
 from brainbench.metrics.inference.permutation import EXACT_STIMULI, make_test, permuted_values
 from brainbench.metrics.rdms.comparison import compare
+from brainbench.metrics.rdms.distances import correlation_distances
 from brainbench.metrics.rdms.pairs import Floats
 from brainbench.metrics.reliability.noise_correction import THESIS_FILTER, noise_corrected
 
@@ -51,21 +51,15 @@ def make_targets(arrays: Mapping[str, Floats], *, splits: int = SPLITS) -> tuple
     Args:
         arrays: Animal → rates [R, K, U], NaN where a unit's session had fewer trials.
         splits: Random halves.
-
-    Raises:
-        UsageError: no animals.
     """
-    if not arrays:
-        raise UsageError("There are no animals to score against; give at least one array [trials, stimuli, units].")
     named = dict(arrays) if len(arrays) == 1 else {**arrays, POOL: concatenate(list(arrays.values()))}
     return tuple(_target(name, array, splits) for name, array in named.items())
 
 
 def concatenate(arrays: Sequence[Floats]) -> Floats:
     """Return the units of all animals side by side, padded with NaN to the most trials."""
-    most = max(len(array) for array in arrays)
-    padding = [((0, most - len(array)), (0, 0), (0, 0)) for array in arrays]
-    padded = [np.pad(array, width, constant_values=np.nan) for array, width in zip(arrays, padding, strict=True)]
+    most = max(map(len, arrays))
+    padded = [np.pad(one, ((0, most - len(one)), (0, 0), (0, 0)), constant_values=np.nan) for one in arrays]
     return np.concatenate(padded, axis=2)
 
 
@@ -73,13 +67,13 @@ def _target(name: str, array: Floats, splits: int) -> Target:
     trials, count, units = array.shape
     flat = array.reshape(trials, -1)
     seen = np.isfinite(flat).astype(np.float64)
-    flat = np.where(seen > 0, flat, 0.0)
+    flat = np.nan_to_num(flat)
 
     def distances(member: Floats) -> Floats:
         """Return the RDMs [S, P] of the mean rates over the trials in ``member`` [S, R]."""
         with np.errstate(invalid="ignore", divide="ignore"):
             # A unit without a trial among them is 0/0 = NaN, and so is then the whole RDM.
-            return _distances((member @ flat / (member @ seen)).reshape(-1, count, units))
+            return correlation_distances((member @ flat / (member @ seen)).reshape(-1, count, units))
 
     found = np.empty(splits)
     step = max(1, _CHUNK // (8 * count * units))
@@ -90,30 +84,15 @@ def _target(name: str, array: Floats, splits: int) -> Target:
     return Target(name, distances(np.ones((1, trials)))[0], found, units, trials)
 
 
-def _distances(patterns: Floats) -> Floats:
-    """Return correlation distances [..., P] of patterns [..., K, U]; NaN where a pattern is constant or missing."""
-    centred = patterns - patterns.mean(axis=-1, keepdims=True)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        centred = centred / np.linalg.norm(centred, axis=-1, keepdims=True)
-    rows, columns = np.triu_indices(patterns.shape[-2], 1)
-    found = 1 - (centred @ centred.swapaxes(-1, -2))[..., rows, columns]
-    return np.where(np.isfinite(found).all(axis=-1, keepdims=True), found, np.nan)
-
-
 def _correlations(first: Floats, second: Floats) -> Floats:
     """Return Pearson's r [S]; NaN where either RDM lacks a pair."""
-    known = np.isfinite(first).all(axis=-1) & np.isfinite(second).all(axis=-1)
-    found = np.full(known.shape, np.nan)
-    found[known] = compare(first[known], second[known])
-    return found
+    return np.where(np.isfinite(first + second).all(axis=-1), compare(first, second), np.nan)
 
 
 def first_half(trials: int, seed: int) -> NDArray[np.bool_]:
     """Return which trials [R] the published code puts into the first half: the smaller one of an odd number."""
-    order = list(range(trials))
     # Their generator: numpy keeps the stream of RandomState as it is.
-    np.random.RandomState(seed).shuffle(order)
-    return np.isin(np.arange(trials), order[: trials // 2])
+    return np.isin(np.arange(trials), np.random.RandomState(seed).permutation(trials)[: trials // 2])
 
 
 def score_published(
@@ -123,7 +102,6 @@ def score_published(
     name: str,
     stimuli: Sequence[str],
     estimator: str = "thesis",
-    seed: int = 0,
 ) -> Score:
     """Score a model as published; the value is a maximum over layers and targets, and so never ``ok``.
 
@@ -136,22 +114,20 @@ def score_published(
         stimuli: Names of the K stimuli.
         estimator: ``thesis``, or ``thesis-input`` (the bar of the raw input: the last target alone, median over all
             splits).
-        seed: Seed of random orders (more than 8 stimuli).
     """
     targets = targets[-1:] if estimator == "thesis-input" else targets
-    rdms = {layer: _distances(np.asarray(values, dtype=np.float64)) for layer, values in features.items()}
+    rdms = {layer: correlation_distances(np.asarray(values, dtype=float)) for layer, values in features.items()}
     names = [layer for layer, values in rdms.items() if np.ptp(values) > 0]
     corrected = {target.name: noise_corrected(1.0, target.split_half_r, estimator=estimator) for target in targets}
     used = [item for item in targets if np.isfinite(corrected[item.name].value) and np.isfinite(item.rdm).all()]
-    lost = [item.name for item in targets if item not in used]
-    told = (f"left out, no split counts (raw correlation of halves below {THESIS_FILTER}): {', '.join(lost)}",)
-    told = told if lost else ()
+    lost = ", ".join(item.name for item in targets if item not in used)
+    told = (f"left out, no split counts (raw correlation of halves below {THESIS_FILTER}): {lost}",) if lost else ()
     about = {
         "name": name,
         "estimator": estimator,
         "stimuli": tuple(map(str, stimuli)),
         "metric": "RSA: correlation RDM of mean rates with their zeros, pearson comparison",
-        "provenance": Provenance.of({"splits": len(targets[0].split_half_r), "seed": seed}),
+        "provenance": Provenance.of({"splits": len(targets[0].split_half_r), "seed": 0}),
     }
     if not names or not used:
         return Score(value=math.nan, status="undefined", reasons=told or ("no layer has an RDM",), **about)
@@ -160,9 +136,8 @@ def score_published(
     raw = compare(layers[:, None], brain[None])
     values = raw * factors
     best, place = np.unravel_index(int(values.argmax()), values.shape)
-    null = permuted_values(layers, brain, lambda r: (r * factors).max(axis=(-2, -1)), seed=seed)
+    null = permuted_values(layers, brain, lambda r: (r * factors).max(axis=(-2, -1)), seed=0)
     test = make_test(null, exact=len(stimuli) <= EXACT_STIMULI)
-    rows, columns = values.argmax(axis=0), values.argmax(axis=1)
     return Score(
         value=float(values.max()),
         status="unreliable",
@@ -183,20 +158,11 @@ def score_published(
         best_layer_value=float(values.max()),
         layers=tuple(
             LayerScore(layer, float(values[row, column]), float(raw[row, column]), "unreliable")
-            for row, (layer, column) in enumerate(zip(names, columns, strict=True))
+            for row, (layer, column) in enumerate(zip(names, values.argmax(axis=1), strict=True))
         ),
         subjects=tuple(
-            SubjectScore(
-                item.name,
-                float(values[row, column]),
-                float(raw[row, column]),
-                corrected[item.name].reliability,
-                "unreliable",
-                item.units,
-                item.trials,
-                names[row],
-            )
-            for column, (item, row) in enumerate(zip(used, rows, strict=True))
+            _part(item, values[row, column], raw[row, column], corrected[item.name].reliability, names[row])
+            for column, (item, row) in enumerate(zip(used, values.argmax(axis=0), strict=True))
         ),
         model_rdm=recorded_rdm(layers[best]),
         brain_rdm=recorded_rdm(brain[place]),
@@ -206,20 +172,22 @@ def score_published(
     )
 
 
+def _part(item: Target, value: float, r: float, reliability: float, layer: str | None = None) -> SubjectScore:
+    status = "undefined" if math.isnan(value) else "unreliable"
+    return SubjectScore(item.name, float(value), float(r), reliability, status, item.units, item.trials, layer)
+
+
 def score_published_animals(arrays: Mapping[str, Floats], *, stimuli: Sequence[str], splits: int = SPLITS) -> Score:
     """Score every animal against the units of all others, both sides corrected; the value is the mean over animals."""
     parts = []
-    for name, array in arrays.items():
-        others = [other for label, other in arrays.items() if label != name]
-        if not others:
-            break
-        animal, rest = _target(name, array, splits), _target(POOL, concatenate(others), splits)
+    for name, array in arrays.items() if len(arrays) > 1 else ():
+        others = concatenate([other for label, other in arrays.items() if label != name])
+        animal, rest = _target(name, array, splits), _target(POOL, others, splits)
         # As for models: a split counts where both sides' halves correlate by .5 or more.
         kept = np.where(rest.split_half_r >= THESIS_FILTER, animal.split_half_r, np.nan)
-        r = float(_correlations(animal.rdm[None], rest.rdm[None])[0])
+        r = float(_correlations(animal.rdm, rest.rdm))
         found = noise_corrected(r, kept, estimator="thesis", other_split_half_r=rest.split_half_r)
-        status = "undefined" if math.isnan(found.value) else "unreliable"
-        parts.append(SubjectScore(name, found.value, r, found.reliability, status, animal.units, animal.trials))
+        parts.append(_part(animal, found.value, r, found.reliability))
     known = [item for item in parts if math.isfinite(item.value)]
     return Score(
         name="animal-to-animal",

@@ -84,8 +84,13 @@ def extract(
         )
     like = next((p for p in model.parameters() if p.is_floating_point()), torch.zeros(()))
     check_name("readout", readout, READOUTS)
-    reader = _published_reader(model, layers) if readout == "published" else _named_reader(model, layers)
-    reader = reader or partial(_hooked_run, model, _hooked(model, layers), layers is not None)
+    if readout == "published":
+        from brainbench.models.published.readout import published_activations
+
+        reader = partial(published_activations, model, layers=layers)
+    else:
+        reader = _named_reader(model, layers)
+        reader = reader or partial(_hooked_run, model, _hooked(model, layers), layers is not None)
     result = Activations()
     with evaluating(model), torch.no_grad():
         for start, stop in _chunks(len(values), chunk, avoid=values.shape[1]):
@@ -174,15 +179,6 @@ def _run(reader: Any, part: torch.Tensor, model: nn.Module, stimuli: torch.Tenso
 
 class _LayerError(UsageError):
     """A layer, not the stimulus, is what does not fit."""
-
-
-def _published_reader(model: nn.Module, layers: Collection[str] | None) -> Any:
-    from brainbench.models.published.readout import published_activations, published_layers
-
-    names = published_layers(model)
-    for name in layers or ():
-        check_name("published layer", name, names)
-    return lambda part: published_activations(model, part, layers)
 
 
 def _named_reader(model: nn.Module, layers: Collection[str] | None) -> Any:

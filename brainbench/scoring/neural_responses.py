@@ -83,7 +83,8 @@ class NeuralResponses:
         if self.dataset.attrs.get("layout") != LAYOUT.name:
             return None
         slots = [self.vocabulary.index(label) for label in kept]
-        return {name: array[:, slots] for name, array in read_arrays(Path(self.dataset.attrs["source"])).items()}
+        arrays, _ = read_arrays(Path(self.dataset.attrs["source"]))
+        return {name: array[:, slots] for name, array in arrays.items()}
 
     def animals(self, kept: tuple[str, ...], metric: Metric, options: ScoreOptions) -> tuple[Any, ...]:
         """Prepare every animal by a metric over the labels ``kept``, in that order."""

@@ -157,11 +157,8 @@ def _compare(
     arrays = None if options.estimator == "default" else brain.zero_filled(kept)
     if arrays is None:
         how |= {"seed": options.seed}
-        layers = [layer, *(None for _ in range(len(named) - 1))]
-        scores = [
-            metric.score(features, animals, name=name, layer=chosen, **how)
-            for (name, features), chosen in zip(named.items(), layers, strict=True)
-        ]
+        chosen = {next(iter(named)): layer}
+        scores = [metric.score(one, animals, name=name, layer=chosen.get(name), **how) for name, one in named.items()]
         between = metric.score_animals(animals, **how) if agreement else None
     else:
         from brainbench.metrics.published import make_targets, score_published, score_published_animals

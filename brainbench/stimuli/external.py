@@ -10,12 +10,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from brainbench import __version__
-from brainbench.core.contracts import CHANNELS, check_stimulus_set
+from brainbench.core.contracts import check_stimulus_set
 from brainbench.core.errors import DataError, listing
 from brainbench.core.files import to_json
 from brainbench.stimuli.scenes.frames import Frames
-from brainbench.stimuli.stimulus_set import hash_stimulus_set
+from brainbench.stimuli.stimulus_set import hash_stimulus_set, new_stimulus_set
 from brainbench.stimuli.whiskers.selection import ROWS
 
 if TYPE_CHECKING:
@@ -30,81 +29,69 @@ _SIDES = {"R": "right", "L": "left"}
 
 
 def assemble_stimulus_set(
-    labels: Sequence[str],
     wrench: NDArray[np.floating],
     names: Sequence[str],
     frames: Frames,
+    sources: Sequence[Mapping[str, Any]],
+    faults: Mapping[str, NDArray[np.bool_]],
     *,
-    backend: str,
-    frame_status: NDArray[np.uint8],
+    frame_status: NDArray[np.uint8] | None = None,
     contact: NDArray[np.bool_] | None = None,
-    sources: Sequence[Mapping[str, Any]] | None = None,
-    about: Mapping[str, Any],
+    **about: str,
 ) -> xr.Dataset:
     """Make a stimulus set.
 
-    ``status`` [stimulus, whisker] is ``unstable`` where a value is missing or too large, and ``reason`` counts frames.
+    ``frame_status`` [stimulus, time, whisker] is an index into :data:`FRAME_STATUSES`, ``status`` [stimulus, whisker]
+    is ``unstable`` where a value is missing or too large, ``reason`` counts frames, and the attribute ``faults`` (JSON)
+    values.
 
     Args:
-        labels: of the stimuli, all different.
         wrench: [stimulus, time, whisker, channel] in N and N·m, world axes, action of the whisker on its base.
         names: whiskers with their side, such as ``RC2``.
         frames: times of the frames.
-        backend: what simulated them.
-        frame_status: [stimulus, time, whisker] index into :data:`FRAME_STATUSES`.
+        sources: what is known of each stimulus: its ``label``, different from all others, and more.
+        faults: status → where [stimulus, time, whisker, channel] a value has this fault; a later one wins.
+        frame_status: statuses that hold where there is no fault.
         contact: [stimulus, time, whisker] whether a whisker touches, where that is known.
-        sources: what else is known of each stimulus.
-        about: further attributes; mappings become JSON.
+        about: further attributes.
 
     Raises:
         DataError: two stimuli have the same label.
     """
-    import xarray as xr
-
+    labels = [source["label"] for source in sources]
     if twice := [label for label, count in Counter(labels).items() if count > 1]:
         raise DataError(f"Several stimuli are called {listing(twice)}; each needs a name of its own.")
     text = functools.partial(to_json, indent=None)
     grid, over_time = ("stimulus", "whisker"), ("stimulus", "time", "whisker")
-    counts = {name: (frame_status == code).sum(axis=1) for code, name in enumerate(FRAME_STATUSES) if code}
+    marked = np.zeros(wrench.shape[:3], dtype=np.uint8) if frame_status is None else frame_status.copy()
+    for name, where in faults.items():
+        marked[where.any(axis=-1)] = FRAME_STATUSES.index(name)
+    counts = {name: (marked == code).sum(axis=1) for code, name in enumerate(FRAME_STATUSES) if code}
     unstable = np.any([counts[name] > 0 for name in _DOUBTFUL], axis=0)
     reasons = np.empty((len(labels), len(names)), dtype=object)
     for place in np.ndindex(*reasons.shape):
         reasons[place] = ", ".join(f"frames {name}: {n}" for name, count in counts.items() if (n := count[place]))
-    sides = [_SIDES[name[0]] for name in names]
-    short = [name[1:] for name in names]
+    sides, short = [_SIDES[name[0]] for name in names], [name[1:] for name in names]
     shown = short if len(set(short)) == len(short) else list(names)
-    known = sources or [{}] * len(labels)
-    scenes = [
-        {"label": label, "frames": frames.config(), **source} for label, source in zip(labels, known, strict=True)
-    ]
-    dataset = xr.Dataset(
+    values = {name: where.sum(axis=(1, 2, 3)).tolist() for name, where in faults.items()}
+    told = {label: {name: n for name, found in values.items() if (n := found[i])} for i, label in enumerate(labels)}
+    dataset = new_stimulus_set(
+        labels,
+        [(one, ROWS.index(name[1]), int(name[2:]), _SIDES[name[0]]) for one, name in zip(shown, names, strict=True)],
+        frames,
         {
             "wrench": ((*over_time, "channel"), wrench.astype(np.float32), {"units": "N (F), N m (M)"}),
-            "frame_status": (over_time, frame_status, {"meaning": ", ".join(FRAME_STATUSES)}),
+            "frame_status": (over_time, marked, {"meaning": ", ".join(FRAME_STATUSES)}),
             "status": (grid, np.where(unstable, "unstable", "ok").astype(object)),
             "reason": (grid, reasons),
         },
-        coords={
-            "stimulus": np.array(labels, dtype=object),
-            "time": ("time", frames.times, {"units": "s"}),
-            "whisker": np.array(shown, dtype=object),
-            "row": ("whisker", [ROWS.index(name[1]) for name in names]),
-            "col": ("whisker", [int(name[2:]) for name in names]),
-            "side": ("whisker", np.array(sides, dtype=object)),
-            "channel": np.array(CHANNELS, dtype=object),
-        },
-        attrs={
+        {
             "array": text({"species": "not stated", "side": " and ".join(dict.fromkeys(sides)), "whiskers": shown}),
-            "scene": text(scenes),
+            "scene": text([{"label": source["label"], "frames": frames.config(), **source} for source in sources]),
             "fidelity": text({}),
-            # Contracts ask for the field; what was drawn elsewhere is not known.
-            "seed": 0,
-            "backend": backend,
-            "version": __version__,
-            "frame": "world axes; action of the whisker on its base, about the base point",
-            "axes": "world",
-            "readout": frames.describe(),
-            **{key: value if isinstance(value, str) else text(value) for key, value in about.items()},
+            "backend": "whiskit",
+            "faults": text({label: found for label, found in told.items() if found}),
+            **about,
         },
     )
     if contact is not None:

@@ -15,8 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from brainbench import __version__
-from brainbench.core.contracts import CHANNELS, check_stimulus_set
+from brainbench.core.contracts import check_stimulus_set
 from brainbench.core.errors import BrainbenchError, DataError, UsageError
 from brainbench.core.files import cache_dir, content_hash, to_json
 from brainbench.core.progress import Progress
@@ -28,7 +27,7 @@ from brainbench.stimuli.explain import ATTRIBUTE, SECONDS, explain
 from brainbench.stimuli.readout import ORIENTATION, turn
 from brainbench.stimuli.scenes.frames import clip_wrenches
 from brainbench.stimuli.scenes.scene import Scene
-from brainbench.stimuli.stimulus_set import hash_stimulus_set, read_stimulus_set, write_stimulus_set
+from brainbench.stimuli.stimulus_set import hash_stimulus_set, new_stimulus_set, read_stimulus_set, write_stimulus_set
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -172,8 +171,6 @@ def simulate_uncached(
 def _assemble(
     scenes: Sequence[Scene], traces: Sequence[Sequence[Trace]], fidelity: Fidelity, backend: str
 ) -> xr.Dataset:
-    import xarray as xr
-
     names, mounts, array, frames = scenes[0].names, scenes[0].mounts, scenes[0].array, scenes[0].frames
     grid, over_time = ("stimulus", "whisker"), ("stimulus", "time", "whisker")
     text = functools.partial(to_json, indent=None)
@@ -202,7 +199,10 @@ def _assemble(
         "first_contact": {"units": "s", "long_name": "time of the first reading with contact"},
         "penetration": {"units": "m", "long_name": "deepest overlap of whisker and object"},
     }
-    dataset = xr.Dataset(
+    dataset = new_stimulus_set(
+        [scene.label for scene in scenes],
+        [(name, mount.row, mount.col, mount.side) for name, mount in zip(names, mounts, strict=True)],
+        frames,
         {
             "wrench": ((*over_time, "channel"), wrench, {"units": "N (F), N m (M)"}),
             "contact": (over_time, readings("contact").any(axis=2)),
@@ -212,26 +212,11 @@ def _assemble(
             "status": (grid, of("status")),
             "reason": (grid, of("reason")),
         },
-        coords={
-            "stimulus": np.array([scene.label for scene in scenes], dtype=object),
-            "time": ("time", frames.times, {"units": "s"}),
-            "whisker": np.array(names, dtype=object),
-            "row": ("whisker", [mount.row for mount in mounts]),
-            "col": ("whisker", [mount.col for mount in mounts]),
-            "side": ("whisker", np.array([mount.side for mount in mounts], dtype=object)),
-            "channel": np.array(CHANNELS, dtype=object),
-        },
-        attrs={
+        {
             "array": text({**about, "hash": content_hash([scene.mounts for scene in scenes])}),
             "scene": text([scene.config() for scene in scenes]),
             "fidelity": text(fidelity),
-            # The simulation draws no random number; the contract asks for the field.
-            "seed": 0,
             "backend": backend,
-            "version": __version__,
-            "frame": f"{frames.axes} axes; action of the whisker on its base, about the base point",
-            "axes": frames.axes,
-            "readout": frames.describe(),
         },
     )
     if orientation is not None:

@@ -3,15 +3,55 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
-from brainbench.core.contracts import check_stimulus_set
+import numpy as np
+
+from brainbench import __version__
+from brainbench.core.contracts import CHANNELS, check_stimulus_set
 from brainbench.core.errors import DataError, DataFileNotFoundError
 from brainbench.core.files import atomic_path, content_hash
 
 if TYPE_CHECKING:
     import xarray as xr
+
+    from brainbench.stimuli.scenes.frames import Frames
+
+
+def new_stimulus_set(
+    labels: Sequence[str],
+    whiskers: Sequence[tuple[str, int, int, str]],
+    frames: Frames,
+    variables: Mapping[str, Any],
+    attributes: Mapping[str, Any],
+) -> xr.Dataset:
+    """Return variables over named stimuli, frames and whiskers (name, row, col, side), not yet hashed or checked."""
+    import xarray as xr
+
+    names, rows, cols, sides = zip(*whiskers, strict=True)
+    return xr.Dataset(
+        dict(variables),
+        coords={
+            "stimulus": np.array(labels, dtype=object),
+            "time": ("time", frames.times, {"units": "s"}),
+            "whisker": np.array(names, dtype=object),
+            "row": ("whisker", list(rows)),
+            "col": ("whisker", list(cols)),
+            "side": ("whisker", np.array(sides, dtype=object)),
+            "channel": np.array(CHANNELS, dtype=object),
+        },
+        attrs={
+            **attributes,
+            # Nothing random is drawn, or what was drawn elsewhere is not known; the contract asks for the field.
+            "seed": 0,
+            "version": __version__,
+            "frame": f"{frames.axes} axes; action of the whisker on its base, about the base point",
+            "axes": frames.axes,
+            "readout": frames.describe(),
+        },
+    )
 
 
 def hash_stimulus_set(dataset: xr.Dataset) -> str:

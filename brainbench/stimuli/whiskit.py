@@ -51,7 +51,7 @@ def load_parameters(folder: str | os.PathLike[str], *, species: str = "whiskit")
         DataError: a file is missing, or the tables do not fit together.
     """
     root = Path(folder)
-    names = _names(root)
+    names = read_names(root / "param_name.csv")
     columns = {"side_row_col": 3, "s_a": 2, "bp_pos": 3, "bp_angles": 3}
     tables = [_table(root, f"param_{name}", len(names), count).tolist() for name, count in columns.items()]
     mounts = []
@@ -79,7 +79,7 @@ def load_parameters(folder: str | os.PathLike[str], *, species: str = "whiskit")
 
 def load_bends(folder: str | os.PathLike[str]) -> NDArray[np.float64]:
     """Read ``param_angles``: the bend [whisker, link] (rad) of each link against the one before; errors as above."""
-    return _table(Path(folder), "param_angles", len(_names(Path(folder))), None)
+    return _table(Path(folder), "param_angles", len(read_names(Path(folder) / "param_name.csv")), None)
 
 
 def bends(array: WhiskerArray, links: int = BENDS) -> NDArray[np.float64]:
@@ -213,16 +213,14 @@ def _write(path: Path, lines: Iterable[Iterable[float | str]], end: str = "\n", 
     write_text(path, "".join(",".join(line) + end for line in cells))
 
 
-def _names(root: Path) -> list[str]:
-    path = root / "param_name.csv"
+def read_names(path: Path) -> list[str]:
+    """Return the names in a file, one a line or with commas between them; a :class:`DataError` without any."""
+    if not path.is_file():
+        raise DataFileNotFoundError(f"There is no file {os.fspath(path)!r}, which names the whiskers.")
     try:
-        text = path.read_text(encoding="utf-8")
-    except FileNotFoundError as error:
-        message = f"There is no file {os.fspath(path)!r}; a WHISKiT parameter folder has one."
-        raise DataFileNotFoundError(message) from error
+        return path.read_text(encoding="utf-8").replace(",", " ").split()
     except UnicodeDecodeError as error:
         raise DataError(f"{os.fspath(path)!r} is not a text file ({error}).") from error
-    return [line.strip().rstrip(",") for line in text.splitlines() if line.strip()]
 
 
 def _table(root: Path, name: str, lines: int, columns: int | None) -> NDArray[np.float64]:

@@ -10,10 +10,9 @@ from __future__ import annotations
 
 import math
 import os
-import re
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, get_args
 
@@ -21,11 +20,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brainbench.core.contracts import CHANNELS, GRID_SHAPE
-from brainbench.core.errors import DataError, DataFileNotFoundError, UsageError, listing, nearest, unknown_name
+from brainbench.core.errors import DataError, UsageError, listing, unknown_name
 from brainbench.stimuli.external import FRAME_STATUSES, assemble_stimulus_set
 from brainbench.stimuli.motion.recorded import read_numbers
 from brainbench.stimuli.scenes.frames import Frames
 from brainbench.stimuli.whiskers.selection import ROWS
+from brainbench.stimuli.whiskit import read_names
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -49,8 +49,6 @@ _KEPT = Frames(first=0.001, interval=0.009, count=110)
 class WhiskitRun:
     """One run as its files hold it."""
 
-    label: str
-    """Name of the folder; in a set of several, its path below what they have in common."""
     names: tuple[str, ...]
     """Whiskers with their side: ``RC2``."""
     dynamics: NDArray[np.float64]
@@ -72,21 +70,18 @@ def read_run(folder: str | os.PathLike[str]) -> WhiskitRun:
     Raises:
         DataError: a file is missing, the files do not fit together, or a whisker has no name of WHISKiT's.
     """
-    root = Path(folder).absolute()
-    names = _names(root)
-    tables = {name: _table(root, name) for name in CHANNELS}
-    shapes = {name: table.shape for name, table in tables.items()}
-    for axis, what in enumerate(("rows", "columns")):
-        sizes = {name: shape[axis] for name, shape in shapes.items()}
-        needed = len(names) if axis else Counter(sizes.values()).most_common(1)[0][0]
-        if odd := [name for name, size in sizes.items() if size != needed]:
-            reason = "whisker_ID.csv has as many names" if axis else "as most of its components have"
-            raise DataError(
-                f"'dynamics/{odd[0]}.csv' of the run {str(root)!r} has {sizes[odd[0]]} {what}; it needs {needed}, "
-                f"{reason}."
-            )
-    dynamics = np.stack(list(tables.values()), axis=-1)
-    return WhiskitRun(root.name, names, dynamics, _contacts(root, names, len(dynamics)))
+    root = Path(folder)
+    names = _names(root / "whisker_ID.csv")
+    tables = {name: read_numbers(root / "dynamics" / f"{name}.csv") for name in CHANNELS}
+    rows = Counter(map(len, tables.values())).most_common(1)[0][0]
+    for name, table in tables.items():
+        for size, needed, what in zip(table.shape, (rows, len(names)), ("rows", "columns"), strict=True):
+            if size != needed:
+                raise DataError(
+                    f"'dynamics/{name}.csv' of the run {str(root)!r} has {size} {what}; it needs {needed}, as most "
+                    "components have rows and whisker_ID.csv has names."
+                )
+    return WhiskitRun(names, np.stack(list(tables.values()), axis=-1), _contacts(root, names, rows))
 
 
 def published_cleaning(dynamics: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -111,9 +106,8 @@ def read_runs(
 ) -> xr.Dataset:
     """Read runs as one stimulus set in SI units, a stimulus per run.
 
-    ``frame_status`` [stimulus, time, whisker] says of every frame of a whisker whether it can be trusted
-    (:data:`~brainbench.stimuli.external.FRAME_STATUSES`), ``status`` and ``reason`` [stimulus, whisker] sum that up,
-    and the attribute ``faults`` counts the values (JSON). With ``cleaning="published"`` they tell what was replaced.
+    What cannot be trusted is marked and counted by :func:`~brainbench.stimuli.external.assemble_stimulus_set`; with
+    ``cleaning="published"`` that tells what was replaced.
 
     Args:
         folders: one or more runs with the same whiskers and as many rows.
@@ -126,50 +120,41 @@ def read_runs(
     """
     if cleaning not in get_args(Cleaning):
         raise unknown_name("cleaning", cleaning, get_args(Cleaning))
-    runs = [read_run(folder) for folder in folders]
-    if not runs:
+    paths = [Path(folder).absolute() for folder in folders]
+    if not paths:
         raise DataError("There is no run of WHISKiT (whisker_ID.csv and dynamics/) to be read.")
-    if len(runs) > 1:
-        # Runs of several objects have the same names; their paths differ.
-        paths = [Path(folder).absolute() for folder in folders]
-        common = os.path.commonpath(paths)
-        runs = [replace(run, label=path.relative_to(common).as_posix()) for run, path in zip(runs, paths, strict=True)]
+    # Runs of several objects have the same names; their paths differ.
+    common = os.path.commonpath(paths) if len(paths) > 1 else paths[0].parent
+    labels = [path.relative_to(common).as_posix() for path in paths]
+    runs = [read_run(path) for path in paths]
     first = runs[0]
-    for run in runs[1:]:
+    for label, run in zip(labels, runs, strict=True):
         if (run.names, len(run.dynamics)) != (first.names, len(first.dynamics)):
             raise DataError(
-                f"The runs {first.label!r} and {run.label!r} differ in whiskers or rows ({len(first.names)} and "
+                f"The runs {labels[0]!r} and {label!r} differ in whiskers or rows ({len(first.names)} and "
                 f"{len(run.names)} whiskers, {len(first.dynamics)} and {len(run.dynamics)} rows); convert them apart."
             )
     raw = np.stack([run.dynamics for run in runs])
-    frames = _frames(len(first.dynamics), cleaning, rate)
-    rows = slice(1, 983, 9) if frames is _KEPT else slice(None)
-    bad = {"missing": np.isnan(raw), "too large": np.abs(raw) > LARGEST}
+    frames = _frames(raw.shape[1], cleaning, rate)
+    kept = slice(1, 983, 9) if frames is _KEPT else slice(None)
+    faults = {"missing": np.isnan(raw), "too large": np.abs(raw) > LARGEST}
+    bad = faults["missing"] | faults["too large"]
+    values = np.where(bad, math.nan, raw)
     if cleaning == "published":
         values = np.stack([published_cleaning(run.dynamics) for run in runs])
-    else:
-        values = np.where(bad["missing"] | bad["too large"], math.nan, raw)
-    frame_status = np.zeros(raw.shape[:3], dtype=np.uint8)
-    frame_status[:, 0] = FRAME_STATUSES.index("unwritten")
-    for name, where in bad.items():
-        frame_status[where.any(axis=-1)] = FRAME_STATUSES.index(name)
+    row = np.zeros(raw.shape, dtype=bool)
+    row[:, 0] = True
+    faults = {"unwritten": row & (raw != 0) & ~bad, **faults}
     touching = [run.contact for run in runs if run.contact is not None]
-    if rows == slice(None):
-        bad["unwritten"] = np.zeros(raw.shape, dtype=bool)
-        bad["unwritten"][:, 0] = (raw[:, 0] != 0) & (np.abs(raw[:, 0]) <= LARGEST)
-    counted = {name: where[:, rows].sum(axis=(1, 2, 3)).tolist() for name, where in bad.items()}
-    faults = {
-        run.label: {name: counts[i] for name, counts in counted.items() if counts[i]} for i, run in enumerate(runs)
-    }
     return assemble_stimulus_set(
-        [run.label for run in runs],
         values * _SCALE,
         first.names,
         frames,
-        backend="whiskit",
-        frame_status=frame_status[:, rows],
-        contact=np.stack(touching)[:, rows] if len(touching) == len(runs) else None,
-        about={"cleaning": cleaning, "faults": faults},
+        [{"label": label} for label in labels],
+        {name: where[:, kept] for name, where in faults.items()},
+        frame_status=(row[:, kept, :, 0] * FRAME_STATUSES.index("unwritten")).astype(np.uint8),
+        contact=np.stack(touching)[:, kept] if len(touching) == len(runs) else None,
+        cleaning=cleaning,
     )
 
 
@@ -186,32 +171,14 @@ def _frames(rows: int, cleaning: Cleaning, rate: float | None) -> Frames:
     return _ROWS[rows] if rate is None else Frames(first=0.0, interval=1 / rate, count=rows)
 
 
-def _names(root: Path) -> tuple[str, ...]:
-    path = root / "whisker_ID.csv"
-    try:
-        lines = path.read_text(encoding="utf-8").splitlines()
-    except FileNotFoundError as error:
-        message = f"There is no file {str(path)!r}; it names the columns of a WHISKiT run."
-        raise DataFileNotFoundError(message) from error
-    except UnicodeDecodeError as error:
-        raise DataError(f"{str(path)!r} is not a text file ({error}).") from error
-    names = [name for line in lines for name in re.split(r"[,\s]+", line.strip()) if name]
+def _names(path: Path) -> tuple[str, ...]:
+    names = read_names(path)
     for name in names:
         if name not in _NAMES:
-            guess = nearest(name, _NAMES)
-            hint = f"; did you mean {guess!r}?" if guess else "."
-            raise DataError(f"{str(path)!r} names a whisker {name!r}; a name is side, row and column such as RC2{hint}")
+            raise DataError(str(unknown_name(f"whisker in {str(path)!r}:", name, _NAMES)))
     if not names or len(set(names)) < len(names):
         raise DataError(f"{str(path)!r} must name each whisker once; it has {listing(names)}.")
     return tuple(names)
-
-
-def _table(root: Path, name: str) -> NDArray[np.float64]:
-    path = root / "dynamics" / f"{name}.csv"
-    if not path.is_file():
-        needed = ", ".join(f"{channel}.csv" for channel in CHANNELS)
-        raise DataFileNotFoundError(f"There is no file {str(path)!r}; the dynamics of a WHISKiT run are {needed}.")
-    return read_numbers(path)
 
 
 def _contacts(root: Path, names: Sequence[str], rows: int) -> NDArray[np.bool_] | None:

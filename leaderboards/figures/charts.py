@@ -28,12 +28,7 @@ from leaderboards.figures.plots import (
 )
 from leaderboards.figures.rdms import rdm_lines, rdm_panel
 from leaderboards.figures.record import PARTS
-from leaderboards.figures.scatter import (
-    accuracy_against_fit,
-    parameters_against_accuracy,
-    parameters_against_fit,
-    supervised_accuracy_against_fit,
-)
+from leaderboards.figures.scatter import accuracy_against_fit, parameters_against_accuracy, parameters_against_fit
 from leaderboards.figures.svg import Drawing, Scale, scale_of, tick_text
 from leaderboards.standing import DOUBTFUL
 from leaderboards.text import number, span
@@ -49,7 +44,7 @@ def board_figures(board: Board) -> list[Figure]:
         rdm_lines(board),
         accuracy(entries),
         accuracy_against_fit(entries),
-        supervised_accuracy_against_fit(entries),
+        accuracy_against_fit(entries, supervised=True),
         parameters_against_fit(entries),
         parameters_against_accuracy(entries),
         _ablation("augmentation", "Augmentation ablation (as figure 3.8 c)", entries, _augmentation, _any_masking),

@@ -101,6 +101,20 @@ def row_chart(
     return drawing
 
 
+def left_axis(drawing: Drawing, up: Scale, left: float, right: float) -> None:
+    """Draw the grid of a vertical axis with its ticks."""
+    for tick in up.ticks:
+        drawing.line(left, up.at(tick), right, up.at(tick), "one" if tick == 1 else "grid")
+        drawing.text(left - 8, up.at(tick) + 4, tick_text(tick), "end quiet")
+
+
+def legend(drawing: Drawing, marks: Iterable[tuple[str, str, str]], x: float, y: float = 24.0) -> None:
+    """Draw names, each behind its shape and colour, below one another."""
+    for place, (name, shape, kind) in enumerate(marks):
+        drawing.mark(x, y - 4 + 17 * place, shape, kind, size=4)
+        drawing.text(x + 12, y + 17 * place, cut(name, 26), "small")
+
+
 def colours(names: Iterable[str]) -> dict[str, str]:
     """Give each name a colour class, ``untrained`` grey, in the order in which they come."""
     found: dict[str, str] = {}

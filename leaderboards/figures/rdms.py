@@ -14,8 +14,8 @@ from itertools import combinations
 import numpy as np
 
 from leaderboards.boards import RAW_INPUT, Board
-from leaderboards.figures.plots import WIDTH, Figure, cut
-from leaderboards.figures.svg import Drawing, Scale, scale_of, tick_text
+from leaderboards.figures.plots import WIDTH, Figure, cut, left_axis, legend
+from leaderboards.figures.svg import Drawing, Scale, scale_of
 from leaderboards.standing import DOUBTFUL
 from leaderboards.text import number
 
@@ -90,15 +90,12 @@ def rdm_lines(board: Board) -> Figure:
     means = [np.array([values[group].mean() for group in groups]) for _, values in lines]
     across = Scale(0, len(groups) - 1, 56, WIDTH - 170)
     up = scale_of(np.concatenate(means).tolist(), 262, 16, floor=None)
-    for tick in up.ticks:
-        drawing.line(56, up.at(tick), WIDTH - 170, up.at(tick), "grid")
-        drawing.text(48, up.at(tick) + 4, tick_text(tick), "end quiet")
+    left_axis(drawing, up, 56, WIDTH - 170)
     drawing.text((56 + WIDTH - 170) / 2, 286, "pairs of stimuli, by the brain's dissimilarity", "mid")
-    for place, ((name, _), values) in enumerate(zip(lines, means, strict=True)):
+    for place, values in enumerate(means):
         points = "L".join(f"{across.at(i):.1f} {up.at(value):.1f}" for i, value in enumerate(values))
         drawing.path(f"M{points}", f"trace c{place}")
-        drawing.mark(WIDTH - 156, 20 + 18 * place, "square", f"c{place}", size=4)
-        drawing.text(WIDTH - 144, 24 + 18 * place, cut(name, 24), "small")
+    legend(drawing, [(name, "square", f"c{place}") for place, (name, _) in enumerate(lines)], WIDTH - 156)
     few = f" in {len(groups)} groups" if len(groups) < known.sum() else ""
     caption = (
         f"{known.sum()} pairs of stimuli{few} in the order of the brain's dissimilarity; the other matrices are scaled "

@@ -9,7 +9,7 @@ import numpy as np
 
 from brainbench.core.records import Interval
 from leaderboards.entries import Entry
-from leaderboards.figures.plots import WIDTH, Figure, colours, cut
+from leaderboards.figures.plots import WIDTH, Figure, colours, left_axis, legend
 from leaderboards.figures.svg import Drawing, Scale, scale_of, tick_text
 from leaderboards.standing import DOUBTFUL
 from leaderboards.text import number, span
@@ -19,16 +19,19 @@ _LEAST_VARIANCE = 1e-100
 _SHAPES = {"supervised": "square", "simclr": "cross", "simsiam": "up", "ae": "down", "untrained": "dot"}
 
 
-def accuracy_against_fit(entries: Sequence[Entry]) -> Figure:
-    """Draw the task accuracy against the neural fit, with regression and its interval (figure 3.8 a)."""
-    return _accuracy_fit("accuracy-fit", "Task accuracy against neural fit (as figure 3.8 a)", entries)
-
-
-def supervised_accuracy_against_fit(entries: Sequence[Entry]) -> Figure:
-    """Draw the same of supervised networks alone (figure 3.8 b)."""
-    supervised = [entry for entry in entries if entry.card.objective == "supervised"]
-    title = "Accuracy of supervised networks against neural fit (as figure 3.8 b)"
-    return _accuracy_fit("supervised-fit", title, supervised, "supervised ")
+def accuracy_against_fit(entries: Sequence[Entry], *, supervised: bool = False) -> Figure:
+    """Draw the task accuracy against the neural fit, with its regression (figure 3.8 a; b: supervised ones alone)."""
+    key, title, kind = "accuracy-fit", "Task accuracy against neural fit (as figure 3.8 a)", ""
+    if supervised:
+        entries = [entry for entry in entries if entry.card.objective == "supervised"]
+        key, kind = "supervised-fit", "supervised "
+        title = "Accuracy of supervised networks against neural fit (as figure 3.8 b)"
+    label, read = _accuracy_of(entries)
+    points = [(value, e.scaled, e) for e in entries if (value := read(e)) is not None and _trusted(e)]
+    if len(points) < 3:
+        lacking = f"{len(points)} {kind}records state both a task accuracy and a trusted score; at least 3 are needed"
+        return Figure(key, title, lacking=lacking)
+    return scatter(key, title, points, label, fit=True)
 
 
 def parameters_against_fit(entries: Sequence[Entry]) -> Figure:
@@ -49,15 +52,6 @@ def parameters_against_accuracy(entries: Sequence[Entry]) -> Figure:
     if len(points) < 2:
         return Figure(key, title, lacking="fewer than 2 records state both parameters and a task accuracy")
     return scatter(key, title, points, "parameters", up_label=label, log=True)
-
-
-def _accuracy_fit(key: str, title: str, entries: Sequence[Entry], kind: str = "") -> Figure:
-    label, read = _accuracy_of(entries)
-    points = [(value, e.scaled, e) for e in entries if (value := read(e)) is not None and _trusted(e)]
-    if len(points) < 3:
-        lacking = f"{len(points)} {kind}records state both a task accuracy and a trusted score; at least 3 are needed"
-        return Figure(key, title, lacking=lacking)
-    return scatter(key, title, points, label, fit=True)
 
 
 def _accuracy_of(entries: Sequence[Entry]) -> tuple[str, Callable[[Entry], float | None]]:
@@ -109,9 +103,7 @@ def scatter(
     else:
         across = scale_of(xs, left, WIDTH - 190)
     up = scale_of(ys, bottom, 16, floor=None)
-    for tick in up.ticks:
-        drawing.line(left, up.at(tick), WIDTH - 190, up.at(tick), "one" if tick == 1 else "grid")
-        drawing.text(left - 8, up.at(tick) + 4, tick_text(tick), "end quiet")
+    left_axis(drawing, up, left, WIDTH - 190)
     for tick in across.ticks:
         drawing.line(across.at(tick), 16, across.at(tick), bottom, "grid")
         drawing.text(across.at(tick), bottom + 18, tick_text(tick), "mid quiet")
@@ -124,13 +116,10 @@ def scatter(
         shape = _SHAPES.get(entry.card.objective or "", "diamond")
         drawing.mark(across.at(x), up.at(y), shape, kind, f"{entry.name}: {label} {x:g}, {up_label} {number(y)}", 4.5)
     objectives = dict.fromkeys(entry.card.objective or "not stated" for *_, entry in points)
-    legend = [(name, "dot", kind) for name, kind in colour.items()]
-    legend += [(name, _SHAPES.get(name, "diamond"), "c0") for name in objectives]
-    for place, (name, shape, kind) in enumerate(legend):
-        y = 24.0 + 17 * place + (8 if place >= len(colour) else 0)
-        drawing.mark(WIDTH - 172, y - 4, shape, kind, size=4)
-        drawing.text(WIDTH - 160, y, cut(name, 26), "small")
-    drawing.height = max(height, 36.0 + 17 * len(legend))
+    legend(drawing, [(name, "dot", kind) for name, kind in colour.items()], WIDTH - 172)
+    shapes = [(name, _SHAPES.get(name, "diamond"), "c0") for name in objectives]
+    legend(drawing, shapes, WIDTH - 172, 32.0 + 17 * len(colour))
+    drawing.height = max(height, 36.0 + 17 * (len(colour) + len(shapes)))
     caption += "Colours are encoders, shapes are objectives; untrained models are means over their seeds."
     return Figure(key, title, caption, drawing)
 

@@ -7,7 +7,6 @@ Drawn on the server side so that one drawing serves the site, the reports and a 
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from html import escape
@@ -29,13 +28,8 @@ svg.figure{font:12px system-ui,-apple-system,"Segoe UI",Roboto,"Helvetica Neue",
 """
 """Colours of a drawing that stands alone; the pages bring their own for light and dark."""
 
-_DARK = {
-    "#fff": "#10151c", "#17202b": "#e7ebf1", "#566373": "#a5b0be", "#8a95a3": "#7d8997", "#e3e8ee": "#2b3541",
-    "#f4f6f9": "#18202a", "#b7c1cd": "#3b4653", "#2b7a3d": "#6ccb82", "#5b6472": "#a9b4c2", "#0a5ca8": "#69b1ff",
-    "#c2410c": "#fb923c", "#0f766e": "#2dd4bf", "#7c3aed": "#b79bfb", "#a16207": "#e2b93b", "#be185d": "#f472b6",
-    "#4d7c0f": "#a3d65c", "#0369a1": "#38bdf8",
-}  # fmt: skip
-"""Colour of :data:`STYLE` → colour on a dark ground, as the pages have them."""
+_DARK = "@media (prefers-color-scheme:dark){svg.figure{filter:invert(1) hue-rotate(180deg)}}"
+"""The same on a dark ground: light and dark change places, hues stay."""
 
 COLOURS = 8
 """Classes ``c1`` to ``c8``; ``c0`` is grey."""
@@ -110,13 +104,9 @@ def standalone(drawing: Drawing, *, follow: bool = False) -> str:
 
     With ``follow`` it turns dark where the page around it, or the reader's system, is dark.
     """
-    ground = f'<rect width="{_n(drawing.width)}" height="{_n(drawing.height)}" class="ground"/>'
+    ground = f'<rect width="{_n(drawing.width)}" height="{_n(drawing.height)}" fill="#fff"/>'
     copy = Drawing(drawing.width, drawing.height, drawing.title, [ground, *drawing.parts])
-    style = STYLE + ".figure .ground{fill:#fff}"
-    if follow:
-        dark = re.sub(r"#[0-9a-f]{3,6}", lambda match: _DARK[match[0]], style)
-        style += f"@media (prefers-color-scheme:dark){{{dark}}}"
-    return copy.render(style=style)
+    return copy.render(style=STYLE + _DARK * follow)
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ import os
 import re
 from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -52,13 +52,11 @@ class NetworkKey(NamedTuple):
         return cls(encoder.removesuffix("-small"), attender or "none", objective, variant)
 
 
-@dataclass(frozen=True)
-class Network:
-    """A network with all that is known of it, by seed."""
+class Network(NamedTuple):
+    """All that is known of a network, by seed."""
 
-    key: NetworkKey
-    trainings: Mapping[int, Training] = field(default_factory=dict)
-    records: Mapping[int, Mapping[int, ResultRecord]] = field(default_factory=dict)
+    trainings: dict[int, Training]
+    records: dict[int, dict[int, ResultRecord]]
     """Place of the board in :attr:`Campaign.boards` → seed → record."""
 
 
@@ -67,14 +65,14 @@ class Campaign:
     """A campaign, of whatever is there of it."""
 
     networks: Mapping[NetworkKey, Network]
-    baselines: Mapping[str, Training] = field(default_factory=dict)
-    boards: tuple[Board, ...] = ()
+    baselines: Mapping[str, Training]
+    boards: tuple[Board, ...]
     """Boards with enough animals and stimuli for tests first, of those the one of most networks."""
-    unmatched: tuple[str, ...] = ()
+    unmatched: tuple[str, ...]
     """Names of records that say neither objective nor architecture."""
-    other_sizes: tuple[str, ...] = ()
+    other_sizes: tuple[str, ...]
     """Names of networks of another size than most; they enter no comparison."""
-    other_trainings: tuple[Training, ...] = ()
+    other_trainings: tuple[Training, ...]
     """Trainings of these."""
 
     @property
@@ -111,39 +109,34 @@ def join_campaign(trainings: Sequence[Training], records: Sequence[ResultRecord]
     """
     runs = [_Identity(item.model, item.objective, item.augmentation, item.masking, item.seed) for item in trainings]
     known = dict(zip(runs, trainings, strict=True))
-    completed = [_completed(record, known) for record in records]
-    boards = tuple(sorted(rank(completed), key=lambda board: (bool(board.lacks), "ridge" in board_name(board))))
-    placed = [(place, record) for place, board in enumerate(boards) for record in _records(board)]
-    identities = [_identity(record) for _, record in placed]
-    usual = _usual_augmentations([*runs, *filter(None, identities)])
-    models = [item.model for item in (*runs, *filter(None, identities)) if item.model]
+    boards = rank([_completed(record, known) for record in records])
+    boards = tuple(sorted(boards, key=lambda board: (bool(board.lacks), "ridge" in board_name(board))))
+    placed = [(place, one, _identity(one)) for place, board in enumerate(boards) for one in _records(board)]
+    everyone = [*runs, *(identity for *_, identity in placed if identity)]
+    usual = _usual_augmentations(everyone)
+    models = [run.model for run in everyone if run.model]
     small = sum("-small" in model for model in models) * 2 >= len(models)
     others = sorted({model for model in models if ("-small" in model) is not small})
-    by_seed: dict[NetworkKey, dict[int, Training]] = defaultdict(dict)
-    baselines: dict[str, Training] = {}
+    networks: dict[NetworkKey, Network] = defaultdict(lambda: Network({}, {}))
     for training, run in zip(trainings, runs, strict=True):
-        if training.objective == "baseline":
-            baselines[training.name] = training
-        elif training.model not in others:
-            held = by_seed[run.key(usual)].setdefault(training.seed, training)
+        if training.objective != "baseline" and training.model not in others:
+            held = networks[run.key(usual)].trainings.setdefault(training.seed, training)
             if held is not training:
                 raise DataError(
                     f"{held.name!r} and {training.name!r} are the same network and seed; keep one of the two lines."
                 )
-    scored: dict[NetworkKey, dict[int, dict[int, ResultRecord]]] = defaultdict(lambda: defaultdict(dict))
-    for (place, record), identity in zip(placed, identities, strict=True):
+    for place, record, identity in placed:
         if identity is not None and identity.model not in others:
-            seeds = scored[identity.key(usual)][place]
+            seeds = networks[identity.key(usual)].records.setdefault(place, {})
             # Of one network and seed the newest record counts, as on the board.
             old = seeds.get(identity.seed)
             if old is None or old.score.provenance.time < record.score.provenance.time:
                 seeds[identity.seed] = record
-    keys = sorted({*by_seed, *scored})
     return Campaign(
-        {key: Network(key, by_seed.get(key, {}), scored.get(key, {})) for key in keys},
-        baselines,
+        {key: networks[key] for key in sorted(networks)},
+        {line.name: line for line in trainings if line.objective == "baseline"},
         boards,
-        tuple(sorted({r.score.name for (_, r), one in zip(placed, identities, strict=True) if one is None})),
+        tuple(sorted({record.score.name for _, record, identity in placed if identity is None})),
         tuple(others),
         tuple(line for line in trainings if line.model in others),
     )
@@ -159,8 +152,7 @@ def _records(board: Board) -> list[ResultRecord]:
     return [record for entry in board.entries for record in entry.records]
 
 
-@dataclass(frozen=True)
-class _Identity:
+class _Identity(NamedTuple):
     """What tells one training from another."""
 
     model: str
@@ -182,22 +174,18 @@ def _identity(record: ResultRecord) -> _Identity | None:
     card, settings = record.card, record.score.provenance.settings
     name = record.score.name.removeprefix("local-dir:").rstrip("/").rpartition("/")[2]
     told = _NAME.fullmatch(name)
-    stated = told.groupdict() if told else {}
-    objective = (card.objective if card else None) or stated.get("objective")
-    if objective is None and "." not in name:
-        objective = "untrained"
+    stated: dict[str, Any] = told.groupdict() if told else {}
+    objective = (card and card.objective) or stated.get("objective") or (None if "." in name else "untrained")
     if objective not in OBJECTIVES[:5]:
         return None
     # A folder of weights may have any name; the card then names the architecture by its twin.
-    model = (card.twin if card else None) or stated.get("model") or name.partition(".")[0]
-    seeds = (stated.get("seed"), card.seed if card else None, settings.get("weights_seed"), 0)
-    seed = next(one for one in seeds if one is not None)
-    augmentation = stated.get("augmentation") or (card.augmentation if card else None) or "none"
+    model = (card and card.twin) or stated.get("model") or name.partition(".")[0]
+    seeds = (stated.get("seed"), card and card.seed, settings.get("weights_seed"), 0)
     # The card of a masked training names both: "physical + 75% masking".
-    augmentation = augmentation.partition(" + ")[0]
-    masking = (card.training.get("masking") if card else None) or float(stated.get("masked") or 0) / 100
+    augmentation = (stated.get("augmentation") or (card and card.augmentation) or "none").partition(" + ")[0]
+    masking = (card and card.training.get("masking")) or float(stated.get("masked") or 0) / 100
     masking = float(masking) if isinstance(masking, (int, float)) and math.isfinite(masking) else 0.0
-    return _Identity(model, objective, augmentation, masking, int(seed))
+    return _Identity(model, objective, augmentation, masking, int(next(one for one in seeds if one is not None)))
 
 
 def _completed(record: ResultRecord, known: Mapping[_Identity, Training]) -> ResultRecord:

@@ -8,7 +8,7 @@ effect.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
 from itertools import combinations
 
@@ -18,8 +18,8 @@ from brainbench.core.statistics import wilson_interval
 from leaderboards.figures.scatter import regression
 from leaderboards.ranking import lacking
 from leaderboards.reproduction.campaign import Campaign, NetworkKey
-from leaderboards.reproduction.comparisons import COMPARISONS
-from leaderboards.reproduction.contrasts import Effect, Matched, Verdict, contrast, judge
+from leaderboards.reproduction.comparisons import COMPARISONS, each
+from leaderboards.reproduction.contrasts import Effect, Verdict, contrast, judge
 from leaderboards.reproduction.measures import (
     Measured,
     accuracies,
@@ -28,6 +28,7 @@ from leaderboards.reproduction.measures import (
     parameters,
     published,
     published_accuracy,
+    published_parameters,
 )
 
 SYNTHETIC_REASON = "the animals are synthetic"
@@ -78,60 +79,56 @@ def published_claims() -> list[PublishedClaim]:
 def judge_accuracy(campaign: Campaign) -> list[Judgement]:
     """Judge the claims on accuracy and training, and those that no record can test."""
     ours, theirs = accuracies(campaign), published_accuracy()
-    sizes, published_sizes = parameters(campaign), _published_parameters()
     found = []
     for claim in published_claims():
+        effect = other = None
         if claim.measure == "accuracy":
             effect, other = _compare(claim, ours), _compare(claim, theirs)
         elif claim.measure == "parameters-accuracy":
-            effect, other = (
-                _sizes_against(sizes, ours, "supervised"),
-                _sizes_against(published_sizes, theirs, "supervised"),
-            )
+            effect = _correlate(parameters(campaign), ours, "supervised")
+            other = _correlate(published_parameters(), theirs, "supervised")
         elif claim.measure == "divergence":
-            effect, other = _divergence(campaign), None
-        elif claim.measure == "none":
-            verdict: Verdict = "cannot be tested here"
-            found.append(Judgement(claim, None, verdict, verdict, claim.reason))
+            effect = _divergence(campaign)
+        elif claim.measure != "none":
             continue
-        else:
-            continue
-        verdict = judge(effect, claim.direction, margin=claim.margin, neutral=claim.neutral)
-        found.append(Judgement(claim, effect, verdict, verdict, _unknown(effect), other))
+        verdict = _untestable if claim.measure == "none" else _judged(claim, effect)
+        found.append(Judgement(claim, effect, verdict, verdict, claim.reason or _unknown(effect), other))
     return found
 
 
 def judge_fit(campaign: Campaign, place: int) -> list[Judgement]:
     """Judge the claims on neural fit on one board; without any board all are of networks not trained yet."""
+    claims = [claim for claim in published_claims() if claim.measure in FIT_MEASURES]
     if not campaign.boards:
-        claims = [claim for claim in published_claims() if claim.measure in FIT_MEASURES]
         return [Judgement(claim, None, "not trained yet", "not trained yet") for claim in claims]
     board, fit = campaign.boards[place], fits(campaign, place)
-    lacks = lacking(
-        max((len(entry.score.subjects) for entry in board.entries), default=0),
-        len(board.conditions),
-    )
+    lacks = lacking(max((len(entry.score.subjects) for entry in board.entries), default=0), len(board.conditions))
+    accuracy = {key: item.value for key, item in accuracies(campaign).networks.items()}
     measured: dict[str, Callable[[PublishedClaim], Effect | None]] = {
         "fit": lambda claim: _compare(claim, fit),
-        "accuracy-fit": lambda claim: _accuracy_fit(accuracies(campaign), fit),
-        "parameters-fit": lambda claim: _sizes_against(parameters(campaign, place), fit, None),
-        "layers": lambda claim: _each(layer_orders(campaign, place)),
-        "blocks": lambda claim: _each(layer_orders(campaign, place, "attender.block")),
+        "accuracy-fit": lambda claim: _correlate(accuracy, fit, "supervised"),
+        "parameters-fit": lambda claim: _correlate(parameters(campaign, place), fit, None),
+        "layers": lambda claim: _compare(claim, layer_orders(campaign, place)),
+        "blocks": lambda claim: _compare(claim, layer_orders(campaign, place, "attender.block")),
     }
     found = []
-    for claim in published_claims():
-        if claim.measure not in measured:
-            continue
+    for claim in claims:
         effect = measured[claim.measure](claim)
-        rule = judge(effect, claim.direction, margin=claim.margin, neutral=claim.neutral)
-        reason = _unknown(effect)
+        rule, reason = _judged(claim, effect), _unknown(effect)
         if lacks and effect is not None:
             rule, reason = "undecided", f"the rule needs {lacks}"
         verdict = rule
         if board.synthetic and effect is not None:
-            verdict, reason = "cannot be tested here", "; ".join(filter(None, (SYNTHETIC_REASON, reason)))
+            verdict, reason = _untestable, "; ".join(filter(None, (SYNTHETIC_REASON, reason)))
         found.append(Judgement(claim, effect, verdict, rule, reason))
     return found
+
+
+_untestable: Verdict = "cannot be tested here"
+
+
+def _judged(claim: PublishedClaim, effect: Effect | None) -> Verdict:
+    return judge(effect, claim.direction, margin=claim.margin, neutral=claim.neutral)
 
 
 def seed_agreement(measured: Measured, objective: str | None = None) -> list[tuple[int, int, int, float]]:
@@ -154,36 +151,18 @@ def _unknown(effect: Effect | None) -> str:
 
 
 def _compare(claim: PublishedClaim, measured: Measured) -> Effect | None:
-    """Return the effect of a claim that compares networks."""
-    comparisons, detail, level = COMPARISONS[claim.key](measured)
+    """Return the effect of a claim that compares networks, or is about each of them."""
+    comparisons, detail, level = COMPARISONS.get(claim.key, each(None, None))(measured)
     return contrast(comparisons, measured.networks.values(), paired=claim.paired, level=level, detail=detail)
 
 
-def _each(measured: Measured) -> Effect | None:
-    return contrast([Matched((item,)) for item in measured.find().values()], measured.networks.values())
-
-
-def _correlation(points: Sequence[tuple[float, float]]) -> Effect | None:
+def _correlate(x: Mapping[NetworkKey, float], measured: Measured, objective: str | None) -> Effect | None:
     """Return Pearson's r over networks with Fisher's interval; None below four networks or of constant values."""
+    points = [(x[key], item.value) for key, item in measured.find(objective=objective).items() if key in x]
     if len(points) < 4:
         return None
     _, _, r, interval = regression(*(list(values) for values in zip(*points, strict=True)))
     return None if math.isnan(r) else Effect(r, interval, len(points), 0, f"{len(points)} networks")
-
-
-def _accuracy_fit(accuracy: Measured, fit: Measured) -> Effect | None:
-    found = accuracy.find(objective="supervised")
-    return _correlation([(found[key].value, item.value) for key, item in fit.networks.items() if key in found])
-
-
-def _sizes_against(sizes: dict[NetworkKey, int], measured: Measured, objective: str | None) -> Effect | None:
-    found = measured.find(objective=objective)
-    return _correlation([(float(np.log10(sizes[key])), item.value) for key, item in found.items() if key in sizes])
-
-
-def _published_parameters() -> dict[NetworkKey, int]:
-    runs = [run for run in published()["runs"] if run["parameters"]]
-    return {NetworkKey.of(run["model"], run["objective"]): run["parameters"] for run in runs}
 
 
 def _divergence(campaign: Campaign) -> Effect | None:

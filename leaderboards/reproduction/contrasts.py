@@ -68,9 +68,8 @@ class Matched:
         """Return the mean of one side minus that of the other, over the same seeds where these are paired."""
         if paired and (found := self.paired_seeds):
             return float(np.mean(found))
-        return float(np.mean([item.value for item in self.one])) - float(
-            np.mean([item.value for item in self.other]) if self.other else 0.0
-        )
+        one, other = ([item.value for item in side] or [0.0] for side in (self.one, self.other))
+        return float(np.mean(one)) - float(np.mean(other))
 
 
 @dataclass(frozen=True)
@@ -115,20 +114,17 @@ def contrast(
             for member in side:
                 weights[member.name] += sign / (len(side) * len(comparisons))
                 members[member.name] = member
-    parts = [_training(comparisons, values, weights, members, list(pool), paired), _test(weights, members)]
-    mean, positive = float(np.mean(values)), sum(value > 0 for value in values)
-    if not all(math.isfinite(variance) for variance, _ in parts):
-        return Effect(mean, None, len(values), positive, detail)
+    parts = [_training(comparisons, values, weights, members, pool, paired), _test(weights, members)]
+    mean, interval = float(np.mean(values)), None
     total = sum(variance for variance, _ in parts)
-    spent = sum(variance**2 / freedom for variance, freedom in parts if variance > 0)
-    half = (
-        float(stdtrit(total**2 / spent, (1 + level) / 2)) * math.sqrt(total) if spent > 0 else math.sqrt(total) * 1.96
-    )
-    over = f"{len(values)} comparisons" if len(values) >= FEWEST_COMPARISONS else "seeds"
-    kind = "animals and stimuli" if any(item.sample for item in members.values()) else "test sweeps"
-    return Effect(
-        mean, Interval(mean - half, mean + half, level, f"t over {over} and {kind}"), len(values), positive, detail
-    )
+    if math.isfinite(total):
+        spent = sum(variance**2 / freedom for variance, freedom in parts if variance > 0)
+        factor = float(stdtrit(total**2 / spent, (1 + level) / 2)) if spent > 0 else 1.96
+        half = factor * math.sqrt(total)
+        over = f"{len(values)} comparisons" if len(values) >= FEWEST_COMPARISONS else "seeds"
+        kind = "animals and stimuli" if any(item.sample for item in members.values()) else "test sweeps"
+        interval = Interval(mean - half, mean + half, level, f"t over {over} and {kind}")
+    return Effect(mean, interval, len(values), sum(value > 0 for value in values), detail)
 
 
 def judge(effect: Effect | None, direction: int, *, margin: float = 0.0, neutral: float = 0.0) -> Verdict:
@@ -159,7 +155,7 @@ def _training(
     values: Sequence[float],
     weights: Mapping[str, float],
     members: Mapping[str, Observed],
-    pool: Sequence[Observed],
+    pool: Iterable[Observed],
     paired: bool,
 ) -> tuple[float, float]:
     """Return the variance that training adds to the mean, and its degrees of freedom; NaN where it is unknown."""
@@ -190,17 +186,13 @@ def _pooled(groups: Sequence[Sequence[float]]) -> tuple[float, float]:
 def _test(weights: Mapping[str, float], members: Mapping[str, Observed]) -> tuple[float, float]:
     """Return the variance that test sweeps, or animals and stimuli, add to the mean, and its degrees of freedom."""
     if samples := {name: item.sample for name, item in members.items() if item.sample is not None}:
-        shared = set.intersection(*({*sample.animals} for sample in samples.values()))
-        animals = [
-            sum(weights[name] * one.animals[animal] for name, one in samples.items()) for animal in sorted(shared)
-        ]
+        shared = sorted(set.intersection(*({*sample.animals} for sample in samples.values())))
+        animals = [sum(weights[name] * one.animals[animal] for name, one in samples.items()) for animal in shared]
         if len({len(sample.without_stimulus) for sample in samples.values()}) > 1:
             return math.nan, 1.0
         stimuli = sum(weights[name] * sample.without_stimulus for name, sample in samples.items())
         error, freedom = two_factor_error(animals, np.asarray(stimuli))
         return float(error) ** 2, float(freedom)
-    return sum(
-        weights[name] ** 2 * item.value * (1 - item.value) / item.sweeps
-        for name, item in members.items()
-        if item.sweeps
-    ), math.inf
+    counted = {name: item for name, item in members.items() if item.sweeps}
+    parts = [weights[name] ** 2 * item.value * (1 - item.value) / item.sweeps for name, item in counted.items()]
+    return sum(parts), math.inf

@@ -17,7 +17,7 @@ from brainbench.core.records import ResultRecord, Score
 from leaderboards.ranking import Sample
 from leaderboards.reproduction.campaign import Campaign, NetworkKey
 from leaderboards.reproduction.contrasts import Observed
-from leaderboards.reproduction.trainings import Training
+from leaderboards.reproduction.trainings import Accuracy
 
 ANIMALS = "animal-to-animal"
 RANDOM_FEATURES = "random features"
@@ -31,19 +31,13 @@ class Measured:
     baselines: Mapping[str, Observed] = field(default_factory=dict)
 
     def find(
-        self,
-        *,
-        encoder: str | None = None,
-        attender: str | None = None,
-        objective: str | None = None,
-        variant: str = "",
+        self, *, attender: str | None = None, objective: str | None = None, variant: str = ""
     ) -> dict[NetworkKey, Observed]:
         """Return the networks with these properties; None allows any, and of objectives any but untrained."""
         return {
             key: item
             for key, item in self.networks.items()
             if key.variant == variant
-            and encoder in (None, key.encoder)
             and attender in (None, key.attender)
             and (key.objective == objective if objective else key.objective != "untrained")
         }
@@ -57,35 +51,32 @@ def published() -> dict[str, Any]:
 
 def published_accuracy() -> Measured:
     """Return the published top-5 accuracies, one run of each network."""
-    found = {}
-    for run in published()["runs"]:
-        if run["top5"] is None:
-            continue
-        key = NetworkKey.of(run["model"], run["objective"])
-        found[key] = Observed(key.name, {0: run["top5"]}, run["objective"], published()["test_sweeps"])
-    return Measured(found)
+    runs = [(NetworkKey.of(run["model"], run["objective"]), run["top5"]) for run in published()["runs"]]
+    sweeps = published()["test_sweeps"]
+    return Measured({key: Observed(key.name, {0: top5}, key.objective, sweeps) for key, top5 in runs if top5})
 
 
-def accuracies(campaign: Campaign, *, top1: bool = False) -> Measured:
-    """Return the top-5 (or top-1) accuracies, those of untrained twins and of the baselines among them."""
-    values: dict[NetworkKey, dict[int, tuple[float, int]]] = {}
+def accuracies(campaign: Campaign, name: str = "top5") -> Measured:
+    """Return the top-5 (or ``top1``) accuracies, those of untrained twins and of the baselines among them."""
+    values: dict[NetworkKey, dict[int, Accuracy]] = {}
     for key, network in campaign.networks.items():
         for seed, training in network.trainings.items():
             twin = NetworkKey(key.encoder, key.attender, "untrained")
             own = training.evaluation if training.finished else None
-            for name, result in ((key, own), (twin, training.twin_evaluation)):
-                if result is not None:
-                    # An untrained network's own line comes before what trainings say of their twin.
-                    first = name == key and key.objective == "untrained"
-                    told = values.setdefault(name, {})
-                    if first or seed not in told:
-                        told[seed] = (result.top1 if top1 else result.top5, result.count)
-    networks = {
-        key: Observed(key.name, {seed: value for seed, (value, _) in told.items()}, key.objective, _sweeps(told))
-        for key, told in values.items()
-    }
-    lines = {re.sub("[-_]", " ", name): line for name, line in campaign.baselines.items()}
-    return Measured(networks, {name: _baseline(name, line, top1) for name, line in lines.items() if line.evaluation})
+            for owner, result in ((key, own), (twin, training.twin_evaluation)):
+                # An untrained network's own line comes before what trainings say of their twin.
+                first = owner == key and key.objective == "untrained"
+                if result is not None and (first or seed not in values.get(owner, {})):
+                    values.setdefault(owner, {})[seed] = result
+    networks = {key: observed(key.name, told, name, key.objective) for key, told in values.items()}
+    lines = {re.sub("[-_]", " ", title): line.evaluation for title, line in campaign.baselines.items()}
+    return Measured(networks, {title: observed(title, {0: told}, name) for title, told in lines.items() if told})
+
+
+def observed(name: str, results: Mapping[int, Accuracy], which: str, objective: str = "") -> Observed:
+    """Return one of the accuracies of a network by seed."""
+    values = {seed: getattr(found, which) for seed, found in results.items()}
+    return Observed(name, values, objective, min(found.count for found in results.values()))
 
 
 def fits(campaign: Campaign, place: int) -> Measured:
@@ -94,11 +85,11 @@ def fits(campaign: Campaign, place: int) -> Measured:
     for key, network in campaign.networks.items():
         lost = {seed for seed, line in network.trainings.items() if not line.finished}
         scores = {seed: one.score for seed, one in network.records.get(place, {}).items() if seed not in lost}
-        if item := _fit(key.name, scores, key.objective):
-            networks[key] = item
-    baselines = {item.name: item.score for item in campaign.boards[place].baselines}
-    found = {name: _fit(name, {0: score}) for name, score in baselines.items()}
-    return Measured(networks, {name: item for name, item in found.items() if item is not None})
+        networks[key] = _fit(key.name, scores, key.objective)
+    baselines = {item.name: _fit(item.name, {0: item.score}) for item in campaign.boards[place].baselines}
+    return Measured(
+        {key: item for key, item in networks.items() if item}, {name: item for name, item in baselines.items() if item}
+    )
 
 
 def layer_orders(campaign: Campaign, place: int, part: str = "") -> Measured:
@@ -111,36 +102,28 @@ def layer_orders(campaign: Campaign, place: int, part: str = "") -> Measured:
     return Measured(found)
 
 
-def parameters(campaign: Campaign, place: int | None = None) -> dict[NetworkKey, int]:
-    """Return the parameters of the networks, from trainings or else from the cards of the records of a board."""
+def parameters(campaign: Campaign, place: int | None = None) -> dict[NetworkKey, float]:
+    """Return log10 of the parameters of the networks, from trainings or else from the cards of a board's records."""
     found = {}
     for key, network in campaign.networks.items():
-        counts = [line.parameters for line in network.trainings.values()]
         records = network.records.get(place, {}) if place is not None else {}
+        counts = [line.parameters for line in network.trainings.values()]
         counts += [record.card.parameters for record in records.values() if record.card]
         if count := next(filter(None, counts), None):
-            found[key] = count
+            found[key] = math.log10(count)
     return found
 
 
-def _sweeps(told: Mapping[int, tuple[float, int]]) -> int:
-    return min(count for _, count in told.values())
-
-
-def _baseline(name: str, line: Training, top1: bool) -> Observed:
-    assert line.evaluation is not None  # the caller's filter
-    return Observed(name, {0: line.evaluation.top1 if top1 else line.evaluation.top5}, "", line.evaluation.count)
+def published_parameters() -> dict[NetworkKey, float]:
+    """Return log10 of the published numbers of parameters."""
+    runs = [(NetworkKey.of(run["model"], run["objective"]), run["parameters"]) for run in published()["runs"]]
+    return {key: math.log10(count) for key, count in runs if count}
 
 
 def _fit(name: str, scores: Mapping[int, Score], objective: str = "") -> Observed | None:
-    good = {
-        seed: score for seed, score in sorted(scores.items()) if score.status == "ok" and math.isfinite(score.scaled)
-    }
-    if not good:
-        return None
-    return Observed(
-        name, {seed: score.scaled for seed, score in good.items()}, objective, sample=Sample.of(list(good.values()))
-    )
+    good = {seed: one for seed, one in sorted(scores.items()) if one.status == "ok" and math.isfinite(one.scaled)}
+    values = {seed: score.scaled for seed, score in good.items()}
+    return Observed(name, values, objective, sample=Sample.of(list(good.values()))) if good else None
 
 
 def _order(record: ResultRecord, part: str) -> float:

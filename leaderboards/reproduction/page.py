@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import re
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +17,7 @@ from leaderboards.figures.svg import standalone
 from leaderboards.reproduction.campaign import Campaign, Network, NetworkKey, board_name
 from leaderboards.reproduction.claims import GOAL, Judgement, judge_accuracy, judge_fit, seed_agreement
 from leaderboards.reproduction.contrasts import Effect, Matched, Observed, contrast
-from leaderboards.reproduction.measures import Measured, accuracies, fits, published, published_accuracy
+from leaderboards.reproduction.measures import Measured, accuracies, fits, observed, published, published_accuracy
 from leaderboards.reproduction.trainings import TRAININGS, Training
 from leaderboards.site.page import render_markdown
 from leaderboards.text import number, plural, span
@@ -41,7 +41,7 @@ def write_page(campaign: Campaign, out: str | os.PathLike[str]) -> tuple[list[Pa
     values = {
         "synthetic": any(board.synthetic for board in campaign.boards),
         "trained": _trained(campaign),
-        "counts": _counts(accuracy, fit),
+        "counts": [_counts("Accuracy and training", accuracy), _counts("Neural fit", fit[0])],
         "accuracy": [_accuracy_row(item) for item in accuracy],
         "boards": [board_name(board) for board in campaign.boards],
         "fit": [_fit_row(items, bool(campaign.boards)) for items in zip(*fit, strict=True)],
@@ -70,31 +70,22 @@ def _trained(campaign: Campaign) -> str:
     lines = [item for item in campaign.trainings if item.objective != "untrained"]
     if not lines:
         return f"Nothing stands in {TRAININGS} yet."
-    parts = [f"Here {plural(len(lines), 'training')} of {len({_title(line) for line in lines})} networks are compared"]
+    titles = {(line.model, line.objective, line.augmentation, line.masking) for line in lines}
+    text = f"Here {plural(len(lines), 'training')} of {len(titles)} networks are compared"
     if epochs := sorted({line.epochs for line in lines if line.epochs}):
-        parts.append(f"of {'/'.join(map(str, epochs))} epochs")
-    data = next((line.data for line in lines if line.data.get("hash")), {})
-    hashes = sorted({str(line.data["hash"]) for line in lines if line.data.get("hash")})
-    text = ", ".join(parts) + "."
-    if data:
-        stated = [f"{data[name]:,} to {verb}" for name, verb in _USES if isinstance(data.get(name), int)]
-        text += f" Data {' and '.join(hashes)}: {data.get('classes', '?')} classes; sweeps: {', '.join(stated)}."
+        text += f", of {'/'.join(map(str, epochs))} epochs"
+    text += "."
+    if known := [line.data for line in lines if line.data.get("hash")]:
+        hashes, data = " and ".join(sorted({str(one["hash"]) for one in known})), known[0]
+        uses = {"train": "train", "validation": "validate", "test": "test on unseen objects"}
+        stated = [f"{data[name]:,} to {verb}" for name, verb in uses.items() if isinstance(data.get(name), int)]
+        text += f" Data {hashes}: {data.get('classes', '?')} classes; sweeps: {', '.join(stated)}."
     return text
 
 
-_USES = (("train", "train"), ("validation", "validate"), ("test", "test on unseen objects"))
-
-
-def _title(line: Training) -> tuple[str, str, str, float]:
-    return line.model, line.objective, line.augmentation, line.masking
-
-
-def _counts(accuracy: Sequence[Judgement], fit: Sequence[Sequence[Judgement]]) -> list[str]:
-    def told(name: str, verdicts: Iterable[str]) -> str:
-        return f"{name}: " + ", ".join(f"{verdict} {count}" for verdict, count in Counter(verdicts).most_common())
-
-    lines = [told("Accuracy and training", (item.verdict for item in accuracy))]
-    return [*lines, told("Neural fit", (item.verdict for item in fit[0]))]
+def _counts(name: str, judged: Sequence[Judgement]) -> str:
+    counts = Counter(item.verdict for item in judged).most_common()
+    return f"{name}: " + ", ".join(f"{verdict} {count}" for verdict, count in counts)
 
 
 def _effect(effect: Effect | None) -> str:
@@ -139,17 +130,13 @@ def _fit_row(items: Sequence[Judgement], scored: bool) -> tuple[str, ...]:
 
 
 def _seed_rows(campaign: Campaign) -> list[tuple[str, ...]]:
-    measured: list[tuple[str, Measured]] = [("top-5 accuracy", accuracies(campaign))]
-    measured += [(f"fit on {board_name(board)}", fits(campaign, i)) for i, board in enumerate(campaign.boards)]
+    measured = {"top-5 accuracy": accuracies(campaign)}
+    measured |= {f"fit on {board_name(board)}": fits(campaign, i) for i, board in enumerate(campaign.boards)}
     rows = []
-    for name, one in measured:
-        agreements = {
-            "supervised": seed_agreement(one, "supervised"),
-            "all trained": seed_agreement(one),
-        }
-        if agreements["all trained"] == agreements["supervised"]:  # nothing else was repeated
-            del agreements["all trained"]
-        for kind, found in agreements.items():
+    for name, one in measured.items():
+        supervised, every = seed_agreement(one, "supervised"), seed_agreement(one)
+        # Where both are equal, nothing else was repeated.
+        for kind, found in (("supervised", supervised), ("all trained", every if every != supervised else [])):
             if found:
                 mean = sum(tau for *_, tau in found) / len(found)
                 told = ", ".join(f"{a} and {b}: {number(tau, 2)} ({count})" for a, b, count, tau in found)
@@ -158,50 +145,38 @@ def _seed_rows(campaign: Campaign) -> list[tuple[str, ...]]:
 
 
 def _network_rows(campaign: Campaign) -> list[tuple[str, ...]]:
-    first, five = accuracies(campaign, top1=True), accuracies(campaign)
+    first, five = accuracies(campaign, "top1"), accuracies(campaign)
     scores = [fits(campaign, place) for place in range(len(campaign.boards))]
-    theirs = published_accuracy().networks
+    theirs = {key: number(item.value) for key, item in published_accuracy().networks.items()}
     expected = {NetworkKey.of(run["model"], run["objective"]) for run in published()["runs"]}
+    expected = {key for key in expected if key.objective != "untrained"}
     rows = []
     for key in sorted({*campaign.networks, *expected}, key=lambda key: (key.objective, key)):
-        if key.objective == "untrained" and key not in campaign.networks:
-            continue
-        network = campaign.networks.get(key, Network(key))
+        network = campaign.networks.get(key, Network({}, {}))
+        seeds = {*network.trainings, *(seed for one in network.records.values() for seed in one)}
+        epochs = {line.epochs for line in network.trainings.values() if line.epochs}
         twin = five.networks.get(NetworkKey(key.encoder, key.attender, "untrained"))
-        known = theirs.get(key)
-        rows.append(
-            (
-                key.name,
-                ", ".join(
-                    map(str, sorted({*network.trainings, *(s for one in network.records.values() for s in one)}))
-                ),
-                "/".join(map(str, sorted({line.epochs for line in network.trainings.values() if line.epochs}))),
-                _mean(first, key),
-                _mean(five, key),
-                number(twin.value) if twin and key.objective != "untrained" else "",
-                number(known.value) if known else "",
-                *(_mean(one, key) for one in scores),
-                _remarks(network),
-            )
-        )
-    empty = [""] * (1 + len(scores))
+        told = (number(twin.value) if twin and key.objective != "untrained" else "", theirs.get(key, ""))
+        about = (", ".join(map(str, sorted(seeds))), "/".join(map(str, sorted(epochs))))
+        means = (_mean(first, key), _mean(five, key), *told, *(_mean(one, key) for one in scores))
+        rows.append((key.name, *about, *means, _remarks(network)))
+    empty = [""] * len(scores)
     for line in campaign.other_trainings:
-        one, other = _alone(line, "top1"), _alone(line, "top5")
-        known = theirs.get(NetworkKey.of(line.model, line.objective))
-        told = number(known.value) if known else ""
-        name, remark = f"{line.model}.{line.objective}", ["of another size than most, so it enters no comparison"]
-        rows.append((name, str(line.seed), str(line.epochs or ""), one, other, "", told, *empty[1:], *remark))
+        about = (f"{line.model}.{line.objective}", str(line.seed), str(line.epochs or ""))
+        told = ("", theirs.get(NetworkKey.of(line.model, line.objective), ""), *empty, _OTHER_SIZE)
+        rows.append((*about, _alone(line, "top1"), _alone(line, "top5"), *told))
     for name, item in five.baselines.items():
         told = (_plain(first.baselines[name]), _plain(item))
-        rows.append((f"{name} (linear probe)", "", "", *told, "", "", *empty))
+        rows.append((f"{name} (linear probe)", "", "", *told, "", "", *empty, ""))
     return rows
+
+
+_OTHER_SIZE = "of another size than most, so it enters no comparison"
 
 
 def _alone(line: Training, name: str) -> str:
     result = line.evaluation if line.finished else None
-    return (
-        _plain(Observed(line.name, {0: getattr(result, name)}, line.objective, result.count)) if result else line.status
-    )
+    return _plain(observed(line.name, {0: result}, name, line.objective)) if result else line.status
 
 
 def _mean(measured: Measured, key: NetworkKey) -> str:
@@ -234,6 +209,5 @@ def _remarks(network: Network) -> str:
 
 def _left_out(campaign: Campaign) -> list[str]:
     listed = {line.model for line in campaign.other_trainings}
-    others = [name for name in campaign.other_sizes if name not in listed]
-    found = [f"{name}: of another size than most, so it enters no comparison" for name in others]
+    found = [f"{name}: {_OTHER_SIZE}" for name in campaign.other_sizes if name not in listed]
     return found + [f"{name}: the record names neither architecture nor objective" for name in campaign.unmatched]

@@ -68,16 +68,17 @@ def read_trainings(path: Path) -> list[Training]:
         except ValueError as error:  # msgspec's is one too
             raise DataError(f"{place} is not a training: {error}; write the line again or delete it.") from error
         check_name(f"objective in line {number} of {path.name!r}", training.objective, OBJECTIVES)
-        for result in filter(None, (training.evaluation, training.twin_evaluation)):
-            if not 0 <= result.top1 <= result.top5 <= 1 or result.count < 1:
-                raise DataError(
-                    f"{place} ({training.name!r}) has top-1 {result.top1}, top-5 {result.top5} of {result.count} "
-                    "sweeps; expected 0 ≤ top-1 ≤ top-5 ≤ 1 of at least one."
-                )
+        faults = [
+            f"has top-1 {one.top1}, top-5 {one.top5} of {one.count} sweeps; 0 ≤ top-1 ≤ top-5 ≤ 1 is needed"
+            for one in (training.evaluation, training.twin_evaluation)
+            if one and not (0 <= one.top1 <= one.top5 <= 1 and one.count)
+        ]
         if training.objective != "baseline" and not training.model:
-            raise DataError(f"{place} ({training.name!r}) names no model; give the registry name as 'model'.")
+            faults.append("names no model; give the registry name as 'model'")
         if found.setdefault(training.name, training) is not training:
-            raise DataError(f"{place} repeats {training.name!r}; keep one line for each training.")
+            faults.append("repeats an earlier line; keep one line for each training")
+        if faults:
+            raise DataError(f"{place} ({training.name!r}) {faults[0]}.")
     classes = {item.data["classes"] for item in found.values() if item.data.get("classes")}
     if len(classes) > 1:
         raise DataError(

@@ -4,17 +4,17 @@ from __future__ import annotations
 
 import json
 import tempfile
-from collections import Counter
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from brainbench.cli.output import JsonOption, emit, facts, progress_bar
 from brainbench.core.errors import DataError, DataFileNotFoundError, UsageError, listing
 
-_SET_ENDINGS = (".h5", ".hdf5", ".nc")
+if TYPE_CHECKING:
+    import xarray as xr
 
 
 def convert(
@@ -51,55 +51,54 @@ def convert(
     Numbers become N and N·m, or mN and µN·m in a run; axes and signs are alike. What cannot be trusted is counted.
     """
     from brainbench.datasets.whisking.sweep_tree import is_sweep_tree
-    from brainbench.stimuli.whiskit_runs import find_runs
+    from brainbench.stimuli.whiskit_runs import find_runs, read_runs
 
     if not source.exists():
         raise DataFileNotFoundError(f"There is no file or folder {str(source)!r}.")
-    of_runs = {"cleaning": cleaning, "rate": rate}
-    of_sets: dict[str, Any] = {"stimulus": stimulus, "dialect": dialect}
+    of_runs: dict[str, Any] = {"cleaning": cleaning, "rate": rate}
+    of_sets = {"stimulus": stimulus, "dialect": dialect}
     if source.is_dir() and is_sweep_tree(source):
-        _refuse("a folder of sweeps", of_runs | of_sets)
-        made, text = _data_set(source, out)
+        _check("a folder of sweeps", of_runs | of_sets, out, "a data set, which is a folder", not _is_set(out))
+        made = _data_set(source, out)
     elif sweeps := [source] if source.suffix == ".npz" else sorted(source.glob("*.npz")):
-        _refuse("sweeps", of_runs | of_sets)
-        _check_set_name(out, source)
-        made, text = _write_set(_sweep_set(sweeps), out)
+        _check("sweeps without splits", of_runs | of_sets, out, _SET, _is_set(out))
+        made = _write_set(_sweep_set(sweeps), out)
     elif source.is_file():
-        _refuse("a stimulus set", of_runs)
-        made, text = _run(source, out, stimulus=stimulus, dialect=dialect or "thesis")
+        free = not out.is_file() and not (out.is_dir() and any(out.iterdir()))
+        _check("a stimulus set", of_runs, out, "a run, which is a new folder", free)
+        made = _run(source, out, stimulus=stimulus, dialect=dialect or "thesis")
     elif runs := find_runs(source):
-        _refuse("runs", of_sets)
-        _check_set_name(out, source)
-        from brainbench.stimuli.whiskit_runs import read_runs
-
-        made, text = _write_set(read_runs(runs, cleaning=cleaning or "mark", rate=rate), out)  # type: ignore[arg-type]
+        _check("runs", of_sets, out, _SET, _is_set(out))
+        made = _write_set(read_runs(runs, cleaning=cleaning or "mark", rate=rate), out)  # type: ignore[arg-type]
     else:
         raise DataError(
             f"{str(source)!r} holds nothing to convert: no folders train, validate and test, no sweeps (.npz) and no "
             "WHISKiT runs (whisker_ID.csv and dynamics/)."
         )
-    emit({"source": source, "out": out, **made}, text, as_json=as_json)
+    made = {"source": source, "out": out, **made}
+    text = {name.replace("_", " "): _told(value) for name, value in made.items()}
+    emit(made, facts(text), as_json=as_json)
 
 
-def _refuse(what: str, options: dict[str, Any]) -> None:
-    if given := [f"--{name}" for name, value in options.items() if value is not None]:
+_SET = "a stimulus set, a file that ends in .h5, .hdf5 or .nc"
+
+
+def _is_set(out: Path) -> bool:
+    return out.suffix in (".h5", ".hdf5", ".nc") and not out.is_dir()
+
+
+def _check(what: str, refused: Mapping[str, Any], out: Path, becomes: str, fits: bool) -> None:
+    """Refuse options that belong to another conversion, and an ``out`` that cannot be what the source becomes."""
+    if given := [f"--{name}" for name, value in refused.items() if value is not None]:
         raise UsageError(f"{' and '.join(given)} cannot be used when {what} is converted; leave it out.")
+    if not fits:
+        raise UsageError(f"The source is {what} and becomes {becomes}; received {str(out)!r}.")
 
 
-def _check_set_name(out: Path, source: Path) -> None:
-    if out.suffix not in _SET_ENDINGS:
-        raise UsageError(
-            f"{str(source)!r} has no folders train, validate and test and becomes a stimulus set, a file that ends in "
-            f"{listing(_SET_ENDINGS)}; received {str(out)!r}."
-        )
-
-
-def _data_set(source: Path, out: Path) -> tuple[dict[str, Any], str]:
+def _data_set(source: Path, out: Path) -> dict[str, Any]:
     from brainbench.datasets.whisking.sweep_tree import open_sweep_tree
     from brainbench.stimuli.sweeps.conversion import SweepTable, convert_sweeps
 
-    if out.is_file() or out.suffix in _SET_ENDINGS:
-        raise UsageError(f"A folder of sweeps becomes a data set, which is a folder; received {str(out)!r}.")
     tree = open_sweep_tree(source)
     table = SweepTable(
         label=tree.listed.label,
@@ -116,100 +115,75 @@ def _data_set(source: Path, out: Path) -> tuple[dict[str, Any], str]:
     with progress_bar() as progress:
         manifest = convert_sweeps(table, out, progress=progress)
     about = ("sweeps", "splits", "left_out", "faults", "unstable", "content_hash", "config_hash")
-    made = {"kind": "data set", "rate_hz": tree.rate, **{name: manifest[name] for name in about}}
-    classes = len(set(table.label.tolist()))
-    rows = {
-        "sweeps": ", ".join(f"{name} {split['sweeps']:,}" for name, split in manifest["splits"].items()),
-        "classes": f"{classes} of {len(tree.classes)} labels have sweeps",
-        "frames": f"110 from {tree.times[0] * 1e3:g} ms every {(tree.times[1] - tree.times[0]) * 1e3:.4g} ms",
-        "left out": f"{manifest['left_out']:,} without a label",
-        "faults": _told(manifest["faults"]),
-        "unstable": f"{manifest['unstable']:,} sweeps with values that are missing or too large",
-        "hash": manifest["content_hash"],
-        "data set": str(out),
-    }
-    return made, facts(rows)
+    known = {"rate_hz": tree.rate, "classes": len(tree.classes), **_frames(tree.times)}
+    return {"kind": "data set", **known, **{name: manifest[name] for name in about}}
 
 
-def _sweep_set(paths: list[Path]) -> Any:
+def _sweep_set(paths: list[Path]) -> xr.Dataset:
     """Return a stimulus set of sweep files, which are called as the files are."""
     import numpy as np
 
     from brainbench.core.contracts import GRID_SHAPE
-    from brainbench.datasets.whisking.sweep_files import CELLS, CONDITIONS, FRAME_TIMES, FRAMES, read_sweep
+    from brainbench.datasets.whisking.sweep_files import CELLS, CONDITIONS, FAULTS, FRAME_TIMES, FRAMES, read_sweep
     from brainbench.stimuli import Frames
-    from brainbench.stimuli.external import FRAME_STATUSES, assemble_stimulus_set
+    from brainbench.stimuli.external import assemble_stimulus_set
 
     sweeps = [read_sweep(path) for path in paths]
     if len(rates := {sweep.rate for sweep in sweeps}) > 1:
         raise DataError(f"The sweeps have {listing(map(str, sorted(rates)))} Hz; convert those of each rate apart.")
-    status = np.zeros((len(sweeps), FRAMES, len(CELLS)), dtype=np.uint8)
-    faults: dict[str, dict[str, int]] = {}
-    for place, (path, sweep) in enumerate(zip(paths, sweeps, strict=True)):
-        for name, where in sweep.faulty().items():
-            status[place][where.any(axis=-1)] = FRAME_STATUSES.index(name)
-            if where.any():
-                faults.setdefault(path.stem, {})[name] = int(where.sum())
     first, interval = FRAME_TIMES[rates.pop()]
+    faults = [sweep.faulty() for sweep in sweeps]
     return assemble_stimulus_set(
-        [path.stem for path in paths],
         np.stack([sweep.wrench() for sweep in sweeps]),
         [f"R{'ABCDE'[cell // GRID_SHAPE[1]]}{cell % GRID_SHAPE[1]}" for cell in CELLS.tolist()],
         Frames(first=first, interval=interval, count=FRAMES),
-        backend="whiskit",
-        frame_status=status,
-        sources=[
-            {"shape": sweep.shape, "class": sweep.label, **dict(zip(CONDITIONS, sweep.conditions, strict=True))}
-            for sweep in sweeps
+        [
+            {"label": path.stem, "shape": sweep.shape, "class": sweep.label}
+            | dict(zip(CONDITIONS, sweep.conditions, strict=True))
+            for path, sweep in zip(paths, sweeps, strict=True)
         ],
-        about={"faults": faults},
+        {name: np.stack([found[name] for found in faults]) for name in FAULTS},
     )
 
 
-def _write_set(dataset: Any, out: Path) -> tuple[dict[str, Any], str]:
+def _write_set(dataset: xr.Dataset, out: Path) -> dict[str, Any]:
     from brainbench.stimuli import write_stimulus_set
 
     write_stimulus_set(dataset, out)
-    faults = json.loads(dataset.attrs["faults"])
-    total = sum((Counter(counts) for counts in faults.values()), Counter())
-    unstable = int((dataset["status"].values != "ok").sum())
-    times = dataset["time"].values * 1e3
-    made = {
+    return {
         "kind": "stimulus set",
         "stimuli": [str(label) for label in dataset["stimulus"].values],
-        "frames": len(times),
+        **_frames(dataset["time"].values),
         "whiskers": dataset.sizes["whisker"],
-        "faults": faults,
-        "unstable": unstable,
+        "units": f"N and N·m; {dataset.attrs['frame']}",
+        "faults": json.loads(dataset.attrs["faults"]),
+        "unstable": int((dataset["status"].values != "ok").sum()),
         "content_hash": dataset.attrs["content_hash"],
     }
-    rows = {
-        "stimuli": f"{len(made['stimuli'])} of {made['whiskers']} whiskers",
-        "frames": f"{len(times)} from {times[0]:g} ms to {times[-1]:.4g} ms",
-        "units": "N and N·m; action of the whisker on its base, world axes",
-        "faults": _told(total),
-        "unstable": f"{unstable} whiskers (status and frame_status say which and when)",
-        "hash": made["content_hash"],
-        "stimulus set": str(out),
-    }
-    return made, facts(rows)
 
 
-def _run(source: Path, out: Path, **options: Any) -> tuple[dict[str, Any], str]:
+def _run(source: Path, out: Path, **options: Any) -> dict[str, Any]:
     from brainbench.stimuli import read_stimulus_set
     from brainbench.stimuli.whiskit import save_run
 
-    if out.is_file() or (out.is_dir() and any(out.iterdir())):
-        raise UsageError(f"A stimulus set becomes the folder of a run; {str(out)!r} is there already: name a new one.")
     dataset = read_stimulus_set(source)
     out.parent.mkdir(parents=True, exist_ok=True)
     # A run is many files: they appear together, or not at all.
     with tempfile.TemporaryDirectory(dir=out.parent, prefix=".run-") as temporary:
         save_run(dataset, Path(temporary) / "run", **options).rename(out)
-    shape = f"{dataset.sizes['time']} rows of {dataset.sizes['whisker']} whiskers"
     units = "mN and µN·m; action of the whisker on its base, world axes"
-    return {"kind": "run"}, facts({"run": shape, "units": units, "folder": str(out)})
+    return {"kind": "run", "frames": dataset.sizes["time"], "whiskers": dataset.sizes["whisker"], "units": units}
 
 
-def _told(faults: Mapping[str, int]) -> str:
-    return ", ".join(f"{count:,} values {name}" for name, count in faults.items() if count) or "none"
+def _frames(times: Any) -> dict[str, Any]:
+    """Return number, first time and interval of frames."""
+    first, last = 1e3 * times[0], 1e3 * times[-1]
+    interval = (last - first) / max(1, len(times) - 1)
+    return {"frames": len(times), "first_ms": round(first, 4), "interval_ms": round(interval, 4)}
+
+
+def _told(value: Any) -> str:
+    """Return a value for people: nested counts as ``name: count``, without zeros."""
+    if isinstance(value, Mapping):
+        return "; ".join(f"{name}: {_told(item)}" for name, item in value.items() if item) or "none"
+    return ", ".join(value) if isinstance(value, list) else f"{value:,}" if isinstance(value, int) else str(value)

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -63,19 +64,11 @@ class ZeroFilledSession:
     """[R] slot of each trial, from 0; −1 where no unit fired (or, in a window of no length, none has a rate)."""
     rates: NDArray[np.float64] = field(repr=False)
     """[R, U] spikes/s."""
-    split_by: str = "trials"
-    """What parts it from the session before: ``trials`` (their number) or ``slots`` (contradicting ones)."""
 
     @property
     def units(self) -> int:
         """Number of units."""
         return self.rates.shape[1]
-
-    @property
-    def by_first_appearance(self) -> bool:
-        """Whether slots appear for the first time in the order of their numbers."""
-        seen = self.slots[self.slots >= 0].tolist()
-        return (order := list(dict.fromkeys(seen))) == sorted(order)
 
 
 def is_published(path: Path, layout: RecordingLayout | None = None) -> bool:
@@ -95,32 +88,23 @@ def recover_sessions(subject: str, array: NDArray[np.float64]) -> list[ZeroFille
     lengths = (~np.isnan(array).all(axis=1)).sum(axis=0)
     # One slot at most is not 0. A rate that is NaN there (a window of no length) stays missing.
     rates = array.sum(axis=1)
-    borders: list[tuple[int, str]] = []
-    known = slots[:, 0]
-    for unit in range(array.shape[2]):
+    firsts, known = [0], slots[:, 0]
+    for unit in range(1, array.shape[2]):
         own = slots[:, unit]
-        contradicts = bool(((own >= 0) & (known >= 0) & (own != known)).any())
-        if unit == 0 or lengths[unit] != lengths[unit - 1] or contradicts:
-            borders.append((unit, "slots" if unit and lengths[unit] == lengths[unit - 1] else "trials"))
+        if lengths[unit] != lengths[unit - 1] or ((own >= 0) & (known >= 0) & (own != known)).any():
+            firsts.append(unit)
             known = own
         known = np.where(own >= 0, own, known)
-    ends = [*(first for first, _ in borders[1:]), array.shape[2]]
-    return [
-        ZeroFilledSession(
-            subject,
-            f"{number:02d}",
-            first,
-            slots[: lengths[first], first:last].max(axis=1),
-            rates[: lengths[first], first:last],
-            split_by,
-        )
-        for number, ((first, split_by), last) in enumerate(zip(borders, ends, strict=True), 1)
-    ]
+    sessions = []
+    for number, (first, last) in enumerate(pairwise([*firsts, array.shape[2]]), 1):
+        place = (slice(lengths[first]), slice(first, last))
+        sessions.append(ZeroFilledSession(subject, f"{number:02d}", first, slots[place].max(axis=1), rates[place]))
+    return sessions
 
 
 def read_published(path: Path) -> Iterator[ZeroFilledSession]:
     """Yield the sessions of all animals of a file; raises as :func:`read_arrays`."""
-    for name, array in read_arrays(path).items():
+    for name, array in read_arrays(path)[0].items():
         yield from recover_sessions(name, array)
 
 
@@ -137,18 +121,15 @@ def open_published(path: Path, **options: object) -> xr.Dataset:
             f"cannot apply (received {', '.join(given)}); leave them out, or open the original files (DANDI 000231)."
         )
     sessions = list(read_published(path))
-    touch = "touch_to_choice" in path.stem
-    reading = ReadingOptions(
-        LAYOUT.conditions, SLOTS, LAYOUT.selection, Window(FIRST_CONTACT if touch else "start", stop="choice")
-    )
+    start = FIRST_CONTACT if "touch_to_choice" in path.stem else "start"
+    reading = ReadingOptions(LAYOUT.conditions, SLOTS, LAYOUT.selection, Window(start, stop="choice"))
     parts = [_session_counts(item, path) for item in sessions]
     dataset = join_sessions(parts, reading, source=str(path), layout=LAYOUT.name, notes=list(LAYOUT.remarks[1:]))
-    animals = len({item.subject for item in sessions})
-    total, told = sum(len(item.slots) for item in sessions), dataset.sizes["trial"]
+    total, animals = sum(len(item.slots) for item in sessions), len({item.subject for item in sessions})
     dataset.attrs["label_doubt"] = (
         f"labels cannot be trusted: every session of {path.name} numbers its stimuli by their first appearance and "
         "their names are not stored, so slots taken as stimuli in the file's order are a guess (recovered: the slot of "
-        f"{told} of {total} trials, {len(sessions)} sessions of {animals} animal{'s' * (animals > 1)})"
+        f"{dataset.sizes['trial']} of {total} trials; sessions: {len(sessions)}, animals: {animals})"
     )
     return dataset
 

@@ -11,18 +11,15 @@ from __future__ import annotations
 
 import math
 import os
-import tokenize
-import zipfile
-import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from brainbench.core.contracts import CHANNELS, GRID_SHAPE
-from brainbench.core.errors import DataError, DataFileNotFoundError
+from brainbench.core.errors import DataError
+from brainbench.datasets.npz import read_npz
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -41,14 +38,15 @@ FRAME_TIMES = {1000: (0.001, 0.009), 110: (0.0, 1 / 110)}
 """Time of the first frame and interval [s]: of 1000 rows 1, 10, … 982 are kept, of 110 all."""
 CONDITIONS = ("speed", "height", "rotation", "distance", "size")
 """Conditions of a sweep, in m/s, m, rad, m and m; what a file does not say is that of table 3.1 of the thesis."""
-FAULTS = ("repeated", "too large", "missing", "unwritten")
-"""Values that equal those of the frame before in a channel that moves (so the published cleaning fills gaps), beyond
-:data:`LARGEST`, not a number, and other than 0 in row 0 at 110 Hz, which is memory that nothing has written."""
-_UNREADABLE = (
-    OSError, ValueError, TypeError, AttributeError, EOFError, MemoryError, RuntimeError, SyntaxError, SystemError,
-    tokenize.TokenError, zipfile.BadZipFile, zlib.error,
-)  # fmt: skip
-"""Errors that numpy and zipfile raise on damaged archives and on what is none (found by changing bytes at random)."""
+FAULTS = {
+    "repeated": "equal those of the frame before in a channel that moves, as the published cleaning fills gaps",
+    "too large": "are beyond 1000 mN or µN·m",
+    "missing": "are missing",
+    "unwritten": "of row 0 at 110 Hz come from memory that nothing has written",
+}
+"""Known faults of values → what they are."""
+DOUBTFUL = ("too large", "missing")
+"""Faults of values that are not used."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,48 +87,34 @@ def read_sweep(path: str | os.PathLike[str]) -> SweepFile:
     Raises:
         DataError: the file is missing, damaged or another one; the message says what it holds.
     """
-    name = os.fspath(path)
-    fields = {"shape", "label", *RATES[1000], *RATES[110]}
-    try:
-        # Opened here, because numpy leaves damaged archives open.
-        with Path(path).open("rb") as stream, np.load(stream, allow_pickle=False) as file:
-            held = tuple(file.files)
-            texts = {key: str(file[key]) for key in held if key in fields}
-            data = np.asarray(file["data"] if "data" in held else ())
-    except FileNotFoundError as error:
-        raise DataFileNotFoundError(f"There is no sweep file {name!r}.") from error
-    except _UNREADABLE as error:
-        reason = str(error).split(".")[0] or type(error).__name__
-        raise DataError(
-            f"{name!r} cannot be read as a sweep: a file of arrays (.npz) without objects is needed ({reason})."
-        ) from error
-    rates = [rate for rate, needed in RATES.items() if {"data", "shape", *needed} <= {*held}]
-    if not rates:
+    name, held = os.fspath(path), read_npz(path, "a whisker sweep")
+    rate = next((rate for rate, needed in RATES.items() if {"data", "shape", *needed} <= held.keys()), None)
+    if rate is None:
         raise DataError(
             f"{name!r} is no sweep of the published study: it holds {', '.join(held) or 'nothing'}; needed are data, "
             "shape, label and h, d, t (1000 Hz) or h, to, t, v, s (110 Hz)."
         )
     try:
-        told = {key: float(texts[key]) for key in RATES[rates[0]]}
+        told = {key: float(str(held[key])) for key in RATES[rate]}
     except ValueError as error:
         raise DataError(f"{name!r} has a condition that is no number ({error}).") from error
-    return SweepFile(_whiskers(data, name), _label(texts.get("label", "")), texts["shape"], rates[0], _conditions(told))
+    label = _label(str(held.get("label", "")))
+    return SweepFile(_whiskers(held["data"], name), label, str(held["shape"]), rate, _conditions(told))
 
 
 def _whiskers(data: NDArray[Any], name: str) -> NDArray[np.float64]:
     """Return the 30 whiskers of an array of 35 cells, or of the whiskers alone."""
-    grid, alone = (FRAMES, GRID_SHAPE[0] * GRID_SHAPE[1], len(CHANNELS)), (FRAMES, len(CELLS), len(CHANNELS))
-    if data.dtype.kind not in "fiu" or data.shape not in (grid, alone):
+    grid, alone = [FRAMES, GRID_SHAPE[0] * GRID_SHAPE[1], len(CHANNELS)], [FRAMES, len(CELLS), len(CHANNELS)]
+    if data.dtype.kind not in "fiu" or [*data.shape] not in (grid, alone):
         raise DataError(
-            f"'data' in {name!r} is {list(data.shape)} of {data.dtype}; a published sweep has numbers {list(grid)} "
-            f"(frame, cell, channel), or {list(alone)} for the whiskers alone."
+            f"'data' in {name!r} is {[*data.shape]} of {data.dtype}; a published sweep has numbers {grid} "
+            f"(frame, cell, channel), or {alone} for the whiskers alone."
         )
-    if data.shape == grid and np.any(data[:, EMPTY_CELLS]):
-        raise DataError(
-            f"'data' in {name!r} has forces in cells {', '.join(map(str, EMPTY_CELLS))}, where the published grid has "
-            "no whisker; its cells are in another order."
-        )
-    return np.asarray(data if data.shape == alone else data[:, CELLS], dtype=np.float64)
+    if [*data.shape] == grid:
+        if np.any(data[:, EMPTY_CELLS]):
+            raise DataError(f"'data' in {name!r} has forces in the cells {EMPTY_CELLS}, which have no whisker.")
+        data = data[:, CELLS]
+    return np.asarray(data, dtype=np.float64)
 
 
 def _label(text: str) -> int | None:

@@ -10,7 +10,7 @@ import functools
 import logging
 import os
 from collections import Counter, defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,7 +23,15 @@ from brainbench.core.devices import usable_processors
 from brainbench.core.errors import DataError
 from brainbench.core.files import atomic_path, cache_dir, content_hash, file_hash, read_json
 from brainbench.datasets.whisking.files import Shard
-from brainbench.datasets.whisking.sweep_files import CELLS, CONDITIONS, FAULTS, FRAME_TIMES, FRAMES, read_sweep
+from brainbench.datasets.whisking.sweep_files import (
+    CELLS,
+    CONDITIONS,
+    DOUBTFUL,
+    FAULTS,
+    FRAME_TIMES,
+    FRAMES,
+    read_sweep,
+)
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -80,12 +88,6 @@ class SweepTree:
         return np.asarray(first + interval * np.arange(FRAMES), dtype=np.float64)
 
     @property
-    def broken(self) -> NDArray[np.bool_]:
-        """[sweep] true where a value is missing or too large to be trusted."""
-        large, missing = (self.listed.faults[:, FAULTS.index(name)] for name in ("too large", "missing"))
-        return large + missing > 0
-
-    @property
     def faults(self) -> dict[str, int]:
         """Values with each known fault, in all sweeps."""
         return dict(zip(FAULTS, self.listed.faults.sum(axis=0).tolist(), strict=True))
@@ -119,6 +121,7 @@ class SweepTree:
     def open_shard(self, split: str) -> FileShard:
         """Return the sweeps of one split as a shard."""
         mine = np.flatnonzero(self.split == split)
+        doubtful = self.listed.faults[mine][:, [[*FAULTS].index(name) for name in DOUBTFUL]]
         return FileShard(
             path=self.folder / split,
             offset=0,
@@ -128,7 +131,7 @@ class SweepTree:
             labels=self.listed.label[mine].astype(np.int32),
             objects=self.listed.shape[mine],
             indices=mine,
-            broken=self.broken[mine],
+            broken=doubtful.sum(axis=1) > 0,
             empty=np.zeros(len(mine), dtype=bool),
             content_hash=self.content_hash,
             tree=self,
@@ -142,24 +145,19 @@ class FileShard(Shard):
     tree: SweepTree
 
     def forces(self) -> Any:
-        """Return what gives the forces [frame, whisker, channel] (N, N·m) of one sweep by its number."""
-        return _Forces(self)
+        """Return what gives the forces [frame, whisker, channel] (N, N·m) of one sweep by its number: the shard."""
+        return self
+
+    def __getitem__(self, row: int) -> NDArray[np.float32]:
+        return self.tree.wrenches([self.indices[row]])[0]
 
     def verify(self) -> None:
         """Compare every file with what it was when it was listed; a difference is a :class:`DataError`."""
-        for path, digest in zip(
-            self.tree.listed.path[self.indices], self.tree.listed.digest[self.indices], strict=True
-        ):
-            if file_hash(self.tree.folder / path) != digest:
-                raise DataError(f"{str(self.tree.folder / path)!r} changed since it was listed; start again.")
-
-
-@dataclass(frozen=True, eq=False)
-class _Forces:
-    shard: FileShard
-
-    def __getitem__(self, row: int) -> NDArray[np.float32]:
-        return self.shard.tree.wrenches([self.shard.indices[row]])[0]
+        listed = self.tree.listed
+        for name, digest in zip(listed.path[self.indices].tolist(), listed.digest[self.indices], strict=True):
+            path = self.tree.folder / name
+            if file_hash(path) != digest:
+                raise DataError(f"{str(path)!r} changed since it was listed; start again.")
 
 
 def is_sweep_tree(folder: str | os.PathLike[str]) -> bool:
@@ -182,49 +180,30 @@ def open_sweep_tree(folder: str | os.PathLike[str]) -> SweepTree:
     root = Path(folder).absolute()
     paths = [path for name in FOLDERS for path in sorted((root / name).glob("*.npz"))]
     if not paths:
-        raise DataError(f"The folders {', '.join(_present(root))} of {str(folder)!r} hold no sweeps (*.npz).")
-    return _open(root, tuple(_stamp(root, path) for path in paths))
+        present = [name for name in FOLDERS if (root / name).is_dir()]
+        raise DataError(f"The folders {', '.join(present)} of {str(folder)!r} hold no sweeps (*.npz).")
+    states = [(path.relative_to(root).as_posix(), path.stat()) for path in paths]
+    return _open(root, tuple((name, state.st_size, state.st_mtime_ns) for name, state in states))
 
 
 @functools.lru_cache(maxsize=2)
 def _open(root: Path, stamps: tuple[tuple[str, int, int], ...]) -> SweepTree:
     every = _list(root, stamps)
-    if len(rates := np.unique(every.rate)) > 1:
-        first = [str(every.path[np.flatnonzero(every.rate == rate)[0]]) for rate in rates]
-        raise DataError(
-            f"{str(root)!r} mixes sweeps of 110 and 1000 Hz ({first[0]!r} and {first[1]!r}), whose frames lie 9.09 and "
-            "9 ms apart; put each set into a folder of its own."
-        )
+    rates, first = np.unique(every.rate, return_index=True)
+    if len(rates) > 1:
+        mixed = " and ".join(f"{rate} Hz ({every.path[place]!s})" for rate, place in zip(rates, first, strict=True))
+        raise DataError(f"{str(root)!r} mixes sweeps of {mixed}; put each set into a folder of its own.")
     kept = np.flatnonzero(every.label >= 0)
     if not len(kept):
         raise DataError(f"None of the {len(every.path)} sweeps of {str(root)!r} has a label; training needs classes.")
     listed = Listed._make(column[kept] for column in every)
     split = np.array([FOLDERS[path.partition("/")[0]] for path in listed.path.tolist()])
-    left_out = len(every.path) - len(kept)
-    tree = SweepTree(root, listed, split, _classes(root, listed), left_out)
-    _report(tree)
+    tree = SweepTree(root, listed, split, _classes(root, listed), len(every.path) - len(kept))
+    told = [f"{count} values {FAULTS[name]}" for name, count in tree.faults.items() if count]
+    told += [f"{tree.left_out} sweeps have no label and are left out"] * (tree.left_out > 0)
+    if told:
+        _LOG.warning("%s, %d sweeps: %s", root, len(split), "; ".join(told))
     return tree
-
-
-def _report(tree: SweepTree) -> None:
-    told = {
-        "values equal those of the frame before, as the published cleaning fills gaps": tree.faults["repeated"],
-        "values are beyond 1000 mN or µN·m": tree.faults["too large"],
-        "values are missing": tree.faults["missing"],
-        "values of row 0 come from memory that nothing has written": tree.faults["unwritten"],
-        "sweeps have no label and are left out": tree.left_out,
-    }
-    if found := [f"{count} {what}" for what, count in told.items() if count]:
-        _LOG.warning("%s, %d sweeps: %s", tree.folder, len(tree.split), "; ".join(found))
-
-
-def _present(root: Path) -> list[str]:
-    return [name for name in FOLDERS if (root / name).is_dir()]
-
-
-def _stamp(root: Path, path: Path) -> tuple[str, int, int]:
-    state = path.stat()
-    return path.relative_to(root).as_posix(), state.st_size, state.st_mtime_ns
 
 
 def _list(root: Path, stamps: Sequence[tuple[str, int, int]]) -> Listed:
@@ -242,8 +221,7 @@ def _list(root: Path, stamps: Sequence[tuple[str, int, int]]) -> Listed:
             parts.append(Listed._make(map(np.array, zip(*rows, strict=True))))
             with atomic_path(kept) as temporary:
                 np.savez(temporary, **parts[-1]._asdict())
-            if len(stamps) > _TOGETHER:
-                _LOG.info("%d of %d sweep files are listed", first + len(part), len(stamps))
+            _LOG.info("%d of %d sweep files are listed", first + len(part), len(stamps))
     return Listed._make(np.concatenate(columns) for columns in zip(*parts, strict=True))
 
 
@@ -267,13 +245,11 @@ def _classes(root: Path, listed: Listed) -> tuple[str, ...]:
         shapes[number].add(shape)
     if max(shapes) >= MOST_CLASSES:
         raise DataError(f"A sweep of {str(root)!r} has the label {max(shapes)}; labels are 0 to {MOST_CLASSES - 1}.")
-    categories = {number: {shape.partition("/")[0] for shape in found} for number, found in shapes.items()}
-    owners = Counter(name for found in categories.values() for name in found)
-    return tuple(_name(number, categories.get(number), shapes.get(number), owners) for number in range(max(shapes) + 1))
-
-
-def _name(number: int, categories: set[str] | None, shapes: set[str] | None, owners: Mapping[str, int]) -> str:
-    for names in (categories or (), shapes or ()):
-        if len(names) == 1 and owners[name := next(iter(names))] <= 1:
-            return name
-    return f"class-{number}"
+    owners = Counter(name for found in shapes.values() for name in {shape.partition("/")[0] for shape in found})
+    names = []
+    for number in range(max(shapes) + 1):
+        categories = {shape.partition("/")[0] for shape in shapes[number]}
+        choices = [*categories] if len(categories) == 1 else []
+        choices = [name for name in choices if owners[name] == 1] + [*shapes[number]] * (len(shapes[number]) == 1)
+        names.append(choices[0] if choices else f"class-{number}")
+    return tuple(names)

@@ -75,47 +75,42 @@ def read_settings(path: str | os.PathLike[str]) -> Settings:
         DataError: it cannot be read, or says nothing that is known here.
         MissingDependencyError: it is YAML and no reader is installed.
     """
-    values = _read_yaml(Path(path)) if Path(path).suffix.lower() in (".yaml", ".yml") else read_mapping(path)
+    path = Path(path)
+    values = _read_yaml(path) if path.suffix.lower() in (".yaml", ".yml") else read_mapping(path)
     if "nodes" in values:
         memory = next((node.memory for node in read_graph(values).nodes if node.memory is not None), None)
         return Settings(memory and memory.kind + ("-ln" if memory.layer_norm else ""))
-    encoder = _inner(values, "model", "encoder", "model_config_file")
-    objective = _inner(values, "train", "ssl")
-    cell = None
-    if isinstance(encoder, str):
-        words = Path(encoder).stem.removeprefix("rnn_fdb_converted_modern").strip("_").split("_")
-        kind = words[0] if words[0] in _CELLS else "time-decay"
-        cell = kind + ("-ln" if "ln" in words else "")
-    if cell is None and objective not in _OBJECTIVES:
+    cell, objective = None, _OBJECTIVES.get(str(_inner(values, "train", "ssl")))
+    if graph := _inner(values, "model", "encoder", "model_config_file"):
+        words = Path(str(graph)).stem.removeprefix("rnn_fdb_converted_modern").strip("_").split("_")
+        cell = (words[0] if words[0] in _CELLS else "time-decay") + ("-ln" if "ln" in words else "")
+    if cell is None and objective is None:
         raise DataError(
             f"{os.fspath(path)!r} says nothing of a network: expected 'model.encoder.model_config_file', 'train.ssl' "
             f"or a graph's 'nodes'; found {listing(values) if values else 'nothing'}."
         )
-    return Settings(cell, _OBJECTIVES.get(objective) if isinstance(objective, str) else None)
+    return Settings(cell, objective)
 
 
 def _read(path: Path) -> Mapping[str, Any]:
-    cut = f"{os.fspath(path)!r} is not a readable file of weights, or it is cut short; get it again"
-    if path.suffix == ".safetensors":
-        from safetensors import SafetensorError
-        from safetensors.torch import load_file
+    from safetensors import SafetensorError
+    from safetensors.torch import load_file
 
-        try:
-            return load_file(path)
-        except SafetensorError as error:
-            raise DataError(f"{cut} ({error}).") from error
+    name = os.fspath(path)
     try:
+        if path.suffix == ".safetensors":
+            return load_file(path)
         content = torch.load(path, map_location="cpu", weights_only=True)
-    except pickle.UnpicklingError as error:
+    except (pickle.UnpicklingError, SafetensorError, RuntimeError, EOFError, ValueError, OSError, KeyError) as error:
         # PyTorch writes zip archives; only in a sound one is an object in the way, and not a torn file.
-        if zipfile.is_zipfile(path):
+        if isinstance(error, pickle.UnpicklingError) and zipfile.is_zipfile(path):
             raise DataError(
-                f"{os.fspath(path)!r} holds objects that only pickle could load, which may run code; save its "
-                "'state_dict' alone with torch.save, or as safetensors."
+                f"{name!r} holds objects that only pickle could load, which may run code; save its 'state_dict' alone "
+                "with torch.save, or as safetensors."
             ) from error
-        raise DataError(f"{cut}.") from error
-    except (RuntimeError, EOFError, ValueError, OSError, KeyError, zipfile.BadZipFile) as error:
-        raise DataError(f"{cut} ({type(error).__name__}).") from error
+        raise DataError(
+            f"{name!r} is not a readable file of weights, or it is cut short ({type(error).__name__}); get it again."
+        ) from error
     return content if isinstance(content, Mapping) else {}
 
 

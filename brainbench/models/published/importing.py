@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, cast
@@ -64,30 +64,27 @@ def import_checkpoint(
     weights = read_weights(path)
     found = recognise(weights.state, settings, architecture)
     model, used = build_published(weights.state, found)
-    others = _others(weights.state, used)
-    parts = {
-        "self-supervised head": [name for name in others if name.startswith("loss.")],
-        "attention masks and kernel lengths": [name for name in others if not name.startswith("loss.")],
-    }
-    drawn = {name for name, _ in model.named_parameters() if found.decoder is None and name.startswith("decoder.")}
+    left: dict[str, list[str]] = {}
+    for name in _others(weights.state, used):
+        part = "self-supervised head" if name.startswith("loss.") else "attention masks and kernel lengths"
+        left.setdefault(part, []).append(name)
     facts = {
         "objective": found.objective,
         "origin": {"file": weights.path.name, "sha256": weights.sha256, "epoch": weights.epoch, "step": weights.step},
-        "not_imported": {part: names for part, names in parts.items() if names},
+        "not_imported": left,
         "decoder_in_file": found.decoder is not None,
         "twin": None,
         "provenance": provenance(),
     }
     folder = Path(out) if out is not None else Path(f"{found.architecture}-{weights.sha256[:8]}")
     options = {"classes": found.classes, "decoder": found.decoder or "linear"}
-    save_checkpoint(
-        folder, model, architecture=found.architecture, options=options, info=facts, card=_card(weights, found, facts)
-    )
-    count = sum(value.numel() for name, value in model.named_parameters() if name not in drawn)
-    counts = {part: len(names) for part, names in parts.items() if names}
-    return ImportedModel(
-        folder, f"local-dir:{folder}", found.architecture, found.decoder, found.objective, count, counts, weights.sha256
-    )
+    counts = {part: len(names) for part, names in left.items()}
+    card = _card(weights, found, counts)
+    save_checkpoint(folder, model, architecture=found.architecture, options=options, info=facts, card=card)
+    in_file = [value for name, value in model.named_parameters() if found.decoder or not name.startswith("decoder.")]
+    parameters = sum(value.numel() for value in in_file)
+    told = (found.architecture, found.decoder, found.objective, parameters, counts, weights.sha256)
+    return ImportedModel(folder, f"local-dir:{folder}", *told)
 
 
 def import_to_cache(path: Path, config: Path | None = None) -> Path:
@@ -128,7 +125,7 @@ def matched_entries(
     targets = {theirs: places[ours] for ours, theirs in names.items()}
     # Axes of length one are the authors' layout; all else must agree.
     shapes = {theirs: _squeezed(target) for theirs, target in targets.items()}
-    others = _others(state, set(targets))
+    others = _others(state, targets)
     given = {key: value.reshape(_squeezed(value)) for key, value in state.items() if key not in others}
     check_named(shapes, given, what=f"the architecture {found.architecture!r}")
     return targets
@@ -140,28 +137,22 @@ def _adapt_s4(encoder: S4Encoder, state: Mapping[str, torch.Tensor]) -> None:
         for index, block in enumerate(encoder.blocks):
             memory = cast(Any, block).memory
             memory.frequency.neg_()  # theirs are the poles with negative frequency
-            steps = state.get(f"model.encoder.s4_layers.{index}.layer.kernel.l_kernel")
-            if steps is not None and int(steps) > 0:
-                plain = stored_readout(memory.transition(), memory.readout, int(steps), undo=True)
-                memory.readout.copy_(plain)
+            if steps := int(state.get(f"model.encoder.s4_layers.{index}.layer.kernel.l_kernel", 0)):
+                memory.readout.copy_(stored_readout(memory.transition(), memory.readout, steps, undo=True))
 
 
-def _others(state: Mapping[str, torch.Tensor], used: set[str]) -> list[str]:
+def _others(state: Mapping[str, torch.Tensor], used: Iterable[str]) -> list[str]:
     """Return entries that are no weights of the network: heads, masks, lengths."""
-    return [
-        name
-        for name in state
-        if name not in used and (name.startswith("loss.") or name.endswith((".attn.bias", ".kernel.l_kernel")))
-    ]
+    no_weights = (name for name in state if name.startswith("loss.") or name.endswith((".attn.bias", ".l_kernel")))
+    return [name for name in no_weights if name not in used]
 
 
 def _squeezed(value: torch.Tensor) -> tuple[int, ...]:
     return tuple(size for size in value.shape if size != 1)
 
 
-def _card(weights: ForeignWeights, found: Recognised, facts: Mapping[str, Any]) -> str:
+def _card(weights: ForeignWeights, found: Recognised, left: Mapping[str, int]) -> str:
     """Return the text of the model card, in Markdown."""
-    left = facts["not_imported"]
     rows = {
         "architecture": found.architecture,
         "objective": found.objective or "not told by the file",
@@ -169,7 +160,7 @@ def _card(weights: ForeignWeights, found: Recognised, facts: Mapping[str, Any]) 
         "trained for": f"{weights.epoch} epochs, {weights.step} steps (as the file says)" if weights.epoch else None,
         "input": "sweeps [B, T, 30, 5, 7] in N and N·m; the network itself sees mN and µN·m, as published",
         "decoder": found.decoder or "not in the file: a linear one with weights drawn from seed 0",
-        "not imported": "; ".join(f"{part}: {len(names)} entries" for part, names in left.items()) or "nothing",
+        "not imported": "; ".join(f"{part}: {count} entries" for part, count in left.items()) or "nothing",
         "untrained twin": "unknown",
         "licence": "that of the file's authors",
     }

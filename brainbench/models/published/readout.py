@@ -28,6 +28,7 @@ from brainbench.models.network import EncoderAttenderDecoder
 from brainbench.models.parts import Attender
 
 Named = dict[str, torch.Tensor]
+Layers = list[tuple[str, Callable[[torch.Tensor], torch.Tensor]]]
 
 
 def published_layers(model: nn.Module) -> tuple[str, ...]:
@@ -36,19 +37,21 @@ def published_layers(model: nn.Module) -> tuple[str, ...]:
     Raises:
         UsageError: the network is of another kind.
     """
-    model = _checked(model)
-    encoder, attender = model.encoder, model.attender
-    names: list[str] = list(encoder.layers) if isinstance(encoder, TemporalGraph) else []
-    if isinstance(encoder, S4Encoder):
+    if not isinstance(model, EncoderAttenderDecoder):
+        raise UsageError(
+            f"The published readout knows the networks of the study; received {type(model).__name__}. Leave "
+            "readout='default' for other models."
+        )
+    encoder = model.encoder
+    if isinstance(encoder, TemporalGraph):
+        names = list(encoder.layers)
+    elif isinstance(encoder, S4Encoder):
         names = ["enc_s4_emb", *(f"enc_s4_l{index}" for index in range(len(encoder.blocks))), "enc_s4_dec"]
     elif isinstance(encoder, ResNet18Encoder):
         names = [name for name, _ in _resnet_layers(encoder)]
-    if isinstance(attender, GPTAttender):
-        names += ["att_gpt_emb", *(f"att_gpt_b{index}" for index in range(len(attender.blocks)))]
-        names += ["att_gpt_ln", "att_gpt_lm_head"]
-    elif isinstance(attender, MambaAttender):
-        names += [*(f"att_mamba_l{index}" for index in range(len(attender.blocks))), "att_mamba_norm"]
-    return (*names, *(f"dec_mlp_l{index}" for index in range(len(_decoder_layers(model)))))
+    else:
+        raise UsageError(f"The published readout does not know the encoder {type(encoder).__name__}.")
+    return (*names, *(name for name, _ in (*_attender_layers(model.attender), *_decoder_layers(model.decoder))))
 
 
 def published_activations(model: nn.Module, x: torch.Tensor, layers: Collection[str] | None = None) -> Named:
@@ -60,97 +63,75 @@ def published_activations(model: nn.Module, x: torch.Tensor, layers: Collection[
     names = published_layers(model)
     for name in layers or ():
         check_name("published layer", name, names)
-    model = _checked(model)
-    features, found = _encoder(model, model.normaliser(x))
-    if model.attender is not None:
-        features, attended = _attender(model.attender, features)
-        found |= attended
-    y = features if isinstance(model.decoder, AllStepsDecoder) else features[:, -1]
-    for index, layer in enumerate(_decoder_layers(model)):
-        y = layer(y)
-        found[f"dec_mlp_l{index}"] = y[:, None]
+    assert isinstance(model, EncoderAttenderDecoder)
+    features, found = _encode(model, model.normaliser(x), names)
+    attended, stream = _through(features, _attender_layers(model.attender))
+    if isinstance(model.attender, MambaAttender):
+        # What a block adds to the stream, without the stream itself.
+        streams = [features, *attended.values()]
+        for name, before, after in zip(list(attended)[:-1], streams, streams[1:], strict=False):
+            attended[name] = after - before
+    elif isinstance(model.attender, GPTAttender):
+        stream = stream[:, 1::2]
+    read, _ = _through(
+        stream if isinstance(model.decoder, AllStepsDecoder) else stream[:, -1], _decoder_layers(model.decoder)
+    )
+    found |= attended | {name: value[:, None] for name, value in read.items()}
     return {name: found[name].flatten(2) for name in names if layers is None or name in layers}
 
 
-def _checked(model: nn.Module) -> EncoderAttenderDecoder:
-    if not isinstance(model, EncoderAttenderDecoder):
-        raise UsageError(
-            f"The published readout knows the networks of the study; received {type(model).__name__}. Leave "
-            "readout='default' for other models."
-        )
-    return model
-
-
-def _encoder(model: EncoderAttenderDecoder, x: torch.Tensor) -> tuple[torch.Tensor, Named]:
+def _encode(model: EncoderAttenderDecoder, x: torch.Tensor, names: Iterable[str]) -> tuple[torch.Tensor, Named]:
     encoder = model.encoder
+    if isinstance(encoder, ResNet18Encoder):
+        maps, y = _through(x.flatten(0, 1), _resnet_layers(encoder))
+        return y.unflatten(0, x.shape[:2]), {name: value.unflatten(0, x.shape[:2]) for name, value in maps.items()}
     if isinstance(encoder, TemporalGraph):
         y, nodes = encoder(x, unroll=model.unroll, return_activations=True)
         return y, {name: value[:, _first_step(name, value.shape[1]) :] for name, value in nodes.items()}
-    if isinstance(encoder, ResNet18Encoder):
-        y, maps = _through(x.flatten(0, 1), _resnet_layers(encoder))
-        return y.unflatten(0, x.shape[:2]), {name: value.unflatten(0, x.shape[:2]) for name, value in maps.items()}
-    if isinstance(encoder, S4Encoder):
-        y, activations = encoder(x, return_activations=True)
-        first, *blocks, last = activations.values()
-        found = {f"enc_s4_l{index}": value.transpose(1, 2) for index, value in enumerate(blocks)}
-        return y, {"enc_s4_emb": first, **found, "enc_s4_dec": last}
-    raise UsageError(f"The published readout does not know the encoder {type(encoder).__name__}.")
+    y, activations = encoder(x, return_activations=True)
+    found = dict(zip(names, activations.values(), strict=False))
+    return y, {name: value.transpose(1, 2) if "_l" in name else value for name, value in found.items()}
 
 
-def _attender(attender: Attender, x: torch.Tensor) -> tuple[torch.Tensor, Named]:
-    found: Named = {}
+def _attender_layers(attender: Attender | None) -> Layers:
     if isinstance(attender, GPTAttender):
-        stream = found["att_gpt_emb"] = attender.tokens(x, 0)
-        for index, block in enumerate(attender.blocks):
-            stream, _ = block(stream)
-            found[f"att_gpt_b{index}"] = stream
-        found["att_gpt_ln"] = attender.norm(stream)
-        found["att_gpt_lm_head"] = attender.lm_head(found["att_gpt_ln"])
-        return found["att_gpt_lm_head"][:, 1::2], found
+        blocks = [(f"att_gpt_b{i}", lambda x, block=block: block(x)[0]) for i, block in enumerate(attender.blocks)]
+        embed = ("att_gpt_emb", lambda x: attender.tokens(x, 0))
+        return [embed, *blocks, ("att_gpt_ln", attender.norm), ("att_gpt_lm_head", attender.lm_head)]
     if isinstance(attender, MambaAttender):
-        for index, block in enumerate(attender.blocks):
-            # What a block adds to the stream, without the stream itself.
-            after = block(x)
-            found[f"att_mamba_l{index}"], x = after - x, after
-        y = found["att_mamba_norm"] = attender.norm(x)
-        return y, found
-    raise UsageError(f"The published readout does not know the attender {type(attender).__name__}.")
+        blocks = [(f"att_mamba_l{index}", block) for index, block in enumerate(attender.blocks)]
+        return [*blocks, ("att_mamba_norm", attender.norm)]
+    if attender is not None:
+        raise UsageError(f"The published readout does not know the attender {type(attender).__name__}.")
+    return []
 
 
-def _resnet_layers(encoder: ResNet18Encoder) -> list[tuple[str, nn.Module]]:
+def _resnet_layers(encoder: ResNet18Encoder) -> Layers:
     stem, fc = list(encoder.conv1), list(encoder.fc)
     blocks = [
         (f"layer{index}.{place}", block)
         for index in range(1, 5)
         for place, block in enumerate(encoder.get_submodule(f"layer{index}").children())
     ]
-    return [
-        ("relu", nn.Sequential(*stem[:3])),
-        ("maxpool", stem[3]),
-        *blocks,
-        ("avgpool", fc[0]),
-        ("fc", nn.Sequential(*fc[1:])),
-    ]
+    ends = [("avgpool", fc[0]), ("fc", nn.Sequential(*fc[1:]))]
+    return [("relu", nn.Sequential(*stem[:3])), ("maxpool", stem[3]), *blocks, *ends]
 
 
-def _decoder_layers(model: EncoderAttenderDecoder) -> list[Callable[[torch.Tensor], torch.Tensor]]:
+def _decoder_layers(decoder: nn.Module) -> Layers:
     """Return the linear layers, each with the rectifier that follows it."""
-    decoder = model.decoder
+    modules = list(decoder.children()) or [decoder]
     if isinstance(decoder, AllStepsDecoder):
-        relu, second, again, last = decoder.rest
-        first = nn.Sequential(nn.Flatten(1), decoder.first, relu)
-        return [first, nn.Sequential(second, again), last]
-    if isinstance(decoder, nn.Linear):
-        return [decoder]
-    modules = list(decoder.children())
-    return [nn.Sequential(*modules[start : start + 2]) for start in range(0, len(modules), 2)]
+        relu, *rest = decoder.rest
+        modules = [nn.Sequential(nn.Flatten(1), decoder.first), relu, *rest]
+    pairs = [nn.Sequential(*modules[start : start + 2]) for start in range(0, len(modules), 2)]
+    return [(f"dec_mlp_l{index}", pair) for index, pair in enumerate(pairs)]
 
 
-def _through(x: torch.Tensor, layers: Iterable[tuple[str, nn.Module]]) -> tuple[torch.Tensor, Named]:
+def _through(x: torch.Tensor, layers: Layers) -> tuple[Named, torch.Tensor]:
     found: Named = {}
     for name, layer in layers:
         x = found[name] = layer(x)
-    return x, found
+    return found, x
 
 
 def _first_step(name: str, steps: int) -> int:

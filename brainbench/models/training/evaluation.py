@@ -231,35 +231,28 @@ def _check_repeatable(batches: Iterable[Any], what: str) -> None:
 
 
 class RawInput(nn.Module):
-    """Network without weights: its features [B, T·S·C·H·W] are the whole sweep, in the normaliser's units."""
+    """Network without weights: its features [B, F] are the whole sweep, in the normaliser's units.
 
-    def encode(self, x: torch.Tensor, *, last: bool = False) -> torch.Tensor:
-        """Return the features [B, F] of sweeps [B, T, S·C, H, W] in SI, or without ``last`` [B, 1, F]."""
-        normaliser = Normaliser.physical(x.shape[2] // len(CHANNELS)).to(x.device)
-        features = self.read(normaliser(x.float()).flatten(1))
-        return features if last else features[:, None]
+    With a number of ``features`` they are that many fixed random projections of it, rectified (Rahimi & Recht 2008).
+    """
 
-    def read(self, x: torch.Tensor) -> torch.Tensor:
-        """Return the features of flat sweeps [B, T·S·C·H·W]."""
-        return x
-
-
-class RandomFeatures(RawInput):
-    """Fixed random projection of the whole sweep, rectified: [B, T, S·C, H, W] → [B, F] (Rahimi & Recht 2008)."""
-
-    def __init__(self, features: int, *, seed: int = 0) -> None:
+    def __init__(self, features: int | None = None, *, seed: int = 0) -> None:
         super().__init__()
         self.features, self.seed = features, seed
         self.weight: torch.Tensor | None = None
 
-    def read(self, x: torch.Tensor) -> torch.Tensor:
-        """Return the features of flat sweeps."""
-        if self.weight is None:
-            # On the CPU, so that every device has the same. Variance 2/fan_in keeps the scale behind a rectifier.
-            generator = torch.Generator().manual_seed(self.seed)
-            weight = torch.randn(x.shape[1], self.features, generator=generator) * math.sqrt(2 / x.shape[1])
-            self.weight = weight.to(x.device)
-        return functional.relu(x @ self.weight)
+    def encode(self, x: torch.Tensor, *, last: bool = False) -> torch.Tensor:
+        """Return the features [B, F] of sweeps [B, T, S·C, H, W] in SI, or without ``last`` [B, 1, F]."""
+        normaliser = Normaliser.physical(x.shape[2] // len(CHANNELS)).to(x.device)
+        flat = normaliser(x.float()).flatten(1)
+        if self.features is not None:
+            if self.weight is None:
+                # On the CPU, so that every device has the same. Variance 2/fan_in keeps the scale behind a rectifier.
+                generator = torch.Generator().manual_seed(self.seed)
+                weight = torch.randn(flat.shape[1], self.features, generator=generator)
+                self.weight = (weight * math.sqrt(2 / flat.shape[1])).to(x.device)
+            flat = functional.relu(flat @ self.weight)
+        return flat if last else flat[:, None]
 
 
 def baselines(
@@ -299,7 +292,7 @@ def baselines(
     for batches in (train, test):
         _check_repeatable(batches, "sweeps of a baseline")
     found = {}
-    for name, reader in ((RAW, RawInput()), (RANDOM, RandomFeatures(features, seed=seed))):
+    for name, reader in ((RAW, RawInput()), (RANDOM, RawInput(features, seed=seed))):
         fit_probe(reader, train, classes=classes, epochs=epochs, seed=seed, device=device, memory=memory)
         found[name] = evaluate(reader, test, device=device)
     return found

@@ -6,7 +6,7 @@ Where the sweeps come from is the caller's: a table says what is known of each, 
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
 from pathlib import Path
@@ -23,8 +23,9 @@ from brainbench.core.progress import Progress
 from brainbench.stimuli.objects.collections import NamedObject
 from brainbench.stimuli.objects.solid import Solid
 from brainbench.stimuli.sweeps.generation import write_data_set
-from brainbench.stimuli.sweeps.plan import USUAL_SHARD, shard_bytes, shard_name
+from brainbench.stimuli.sweeps.plan import USUAL_SHARD, PlannedShard
 from brainbench.stimuli.sweeps.shards import (
+    COUNTS,
     OK,
     UNSTABLE,
     ShardContent,
@@ -65,6 +66,7 @@ class SweepTable:
     trusted) of the 30 whiskers of the mouse's right side, in the order of that array."""
     notes: Mapping[str, Any]
     """Further entries of the manifest, such as counts of faults."""
+    shard_size: int = USUAL_SHARD
 
     def __post_init__(self) -> None:
         names, owner = np.unique(self.object, return_inverse=True)
@@ -74,44 +76,10 @@ class SweepTable:
             labels = pairs[pairs[:, 0] == twice, 1].tolist()
             raise DataError(f"The object {str(names[twice])!r} has the labels {labels}; an object has one label.")
 
-
-@dataclass(frozen=True, eq=False)
-class ConvertedShard:
-    """The sweeps of one shard."""
-
-    name: str
-    split: str
-    objects: tuple[NamedObject, ...]
-    index: NDArray[np.int64]
-    """Numbers of the sweeps in the table."""
-    config_hash: str
-    bytes: int
-
-    def __len__(self) -> int:
-        return len(self.index)
-
-
-@dataclass(frozen=True, eq=False)
-class ConversionPlan:
-    """The shards of a data set, in the order of the table within each split."""
-
-    table: SweepTable
-    shard_size: int = USUAL_SHARD
-
-    @property
-    def classes(self) -> tuple[str, ...]:
-        """Class labels."""
-        return self.table.classes
-
     @property
     def sweeps(self) -> int:
         """Number of sweeps."""
-        return len(self.table.label)
-
-    @property
-    def notes(self) -> Mapping[str, Any]:
-        """Further entries of the manifest."""
-        return self.table.notes
+        return len(self.label)
 
     @cached_property
     def array(self) -> WhiskerArray:
@@ -124,8 +92,8 @@ class ConversionPlan:
         return {
             "format": SWEEPS_FORMAT,
             "schema": SWEEPS_SCHEMA,
-            "recipe": self.table.source,
-            "source": self.table.source_hash,
+            "recipe": self.source,
+            "source": self.source_hash,
             "whiskers": {"names": list(self.array.names)},
             "classes": list(self.classes),
             "shard_size": self.shard_size,
@@ -140,40 +108,46 @@ class ConversionPlan:
     @cached_property
     def objects(self) -> dict[str, NamedObject]:
         """The objects by name; only their names are known."""
-        names, first = np.unique(self.table.object, return_index=True)
-        pairs = zip(names.tolist(), self.table.label[first].tolist(), strict=True)
+        names, first = np.unique(self.object, return_index=True)
+        pairs = zip(names.tolist(), self.label[first].tolist(), strict=True)
         return {
-            name: NamedObject(name, self.classes[label], self.table.source, partial(_no_solid, name))
-            for name, label in pairs
+            name: NamedObject(name, self.classes[label], self.source, partial(_no_solid, name)) for name, label in pairs
         }
 
     @cached_property
-    def shards(self) -> tuple[ConvertedShard, ...]:
-        """The shards, those of training first."""
-        found = []
+    def shards(self) -> tuple[PlannedShard, ...]:
+        """The shards, those of training first, in the order of the table."""
+        parts = []
         for split in SPLITS:
-            mine = np.flatnonzero(self.table.split == split)
-            for place, first in enumerate(range(0, len(mine), self.shard_size)):
-                index = mine[first : first + self.shard_size]
-                objects = tuple(self.objects[name] for name in np.unique(self.table.object[index]).tolist())
-                size = shard_bytes(len(index), len(self.array), len(self.table.times))
-                name = shard_name(split, place)
-                found.append(ConvertedShard(name, split, objects, index, self.config_hash, size))
-        return tuple(found)
+            mine = np.flatnonzero(self.split == split)
+            starts = range(0, len(mine), self.shard_size)
+            parts += [(split, place, mine[first : first + self.shard_size]) for place, first in enumerate(starts)]
+        return tuple(
+            PlannedShard(
+                split=split,
+                place=place,
+                objects=tuple(self.objects[name] for name in np.unique(self.object[index]).tolist()),
+                index=index,
+                frames=len(self.times),
+                config=self.config,
+                config_hash=self.config_hash,
+            )
+            for split, place, index in parts
+        )
 
-    def read(self, shard: ConvertedShard) -> ShardContent:
+    def content(self, shard: PlannedShard) -> ShardContent:
         """Read the sweeps of a shard; a whisker with missing values is marked as unstable."""
-        table, index = self.table, shard.index
-        wrench = np.ascontiguousarray(table.read(index), dtype="<f4")
+        index = shard.index
+        wrench = np.ascontiguousarray(self.read(index), dtype="<f4")
         bad = ~np.isfinite(wrench)
         status = np.where(bad.any(axis=(1, 3)), UNSTABLE, OK).astype(np.uint8)
         names = [item.name for item in shard.objects]
         arrays = {
-            **shard_tables(self.array, table.times, self.classes, shard.objects, [""] * len(names)),
+            **shard_tables(shard, self.array, self.times, [""] * len(names)),
             "sweep": index.astype(np.int64),
-            "label": table.label[index].astype(np.int32),
-            "owner": np.searchsorted(names, table.object[index]).astype(np.int32),
-            **{name: np.asarray(values[index], dtype=np.float64) for name, values in table.conditions.items()},
+            "label": self.label[index].astype(np.int32),
+            "owner": np.searchsorted(names, self.object[index]).astype(np.int32),
+            **{name: np.asarray(values[index], dtype=np.float64) for name, values in self.conditions.items()},
             "draw": np.zeros(len(index), dtype=np.int32),
             # Which whiskers touch is in no file of theirs.
             "contact": np.full(status.shape, np.nan, dtype=np.float32),
@@ -181,15 +155,11 @@ class ConversionPlan:
             "reason": encode_texts(f"{n} values cannot be trusted" if n else "" for n in bad.sum(axis=(1, 2, 3))),
             "wrench": wrench,
         }
-        return ShardContent(shard, arrays, shard_attributes(shard, self.config, "world", status, {}))
+        return ShardContent(shard, arrays, shard_attributes(shard, "world", status, dict.fromkeys(COUNTS, 0)))
 
 
 def convert_sweeps(
-    table: SweepTable,
-    out: str | os.PathLike[str],
-    *,
-    shard_size: int = USUAL_SHARD,
-    progress: Progress | None = None,
+    table: SweepTable, out: str | os.PathLike[str], *, progress: Progress | None = None
 ) -> dict[str, Any]:
     """Write a data set of sweeps, one shard in memory at a time, and return its manifest.
 
@@ -199,13 +169,12 @@ def convert_sweeps(
         UsageError: the folder holds another data set, or another process is writing it.
         DataError: a file cannot be read, or the disk is too small; finished shards are kept.
     """
-    plan = ConversionPlan(table, shard_size)
 
-    def run(missing: Any, folder: Path, done: Callable[[int], None]) -> None:
+    def run(missing: Sequence[PlannedShard], folder: Path, done: Callable[[int], None]) -> None:
         for shard in missing:
-            done(write_shard(plan.read(shard), folder))
+            done(write_shard(table.content(shard), folder))
 
-    return write_data_set(plan, out, run, what="converting sweeps", progress=progress)
+    return write_data_set(table, out, run, what="converting sweeps", progress=progress)
 
 
 def _no_solid(name: str) -> Solid:

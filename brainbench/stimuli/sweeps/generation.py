@@ -20,11 +20,10 @@ from brainbench.core.progress import Progress
 from brainbench.stimuli.engines import get_engine
 from brainbench.stimuli.sweeps import running
 from brainbench.stimuli.sweeps.manifest import MANIFEST, is_complete, make_manifest
-from brainbench.stimuli.sweeps.plan import GenerationPlan, ShardTask
+from brainbench.stimuli.sweeps.plan import GenerationPlan, PlannedShard
 
 if TYPE_CHECKING:
-    from brainbench.stimuli.sweeps.conversion import ConversionPlan, ConvertedShard
-
+    from brainbench.stimuli.sweeps.conversion import SweepTable
 
 _LOG = logging.getLogger(__name__)
 
@@ -80,7 +79,7 @@ def generate(
 
 
 def write_data_set(
-    plan: GenerationPlan | ConversionPlan,
+    plan: GenerationPlan | SweepTable,
     out: str | os.PathLike[str],
     run: Callable[[Sequence[Any], Path, Callable[[int], None]], None],
     *,
@@ -149,7 +148,7 @@ def _locked(folder: Path) -> Iterator[None]:
         os.close(handle)
 
 
-def _check_config(plan: GenerationPlan | ConversionPlan, folder: Path) -> None:
+def _check_config(plan: GenerationPlan | SweepTable, folder: Path) -> None:
     """Refuse to go on with what was begun otherwise; note what is begun."""
     path, config = folder / CONFIG, to_plain(plan.config)
     if not path.exists():
@@ -180,7 +179,7 @@ def _clean(folder: Path) -> None:
             item.unlink(missing_ok=True)
 
 
-def _check_space(missing: Sequence[ShardTask | ConvertedShard], folder: Path) -> None:
+def _check_space(missing: Sequence[PlannedShard], folder: Path) -> None:
     needed = sum(task.bytes for task in missing)
     free = shutil.disk_usage(folder).free
     if needed + _SPARE > free:

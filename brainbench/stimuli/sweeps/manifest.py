@@ -12,20 +12,19 @@ import numpy as np
 from brainbench.core.contracts import SWEEPS_FORMAT, SWEEPS_SCHEMA
 from brainbench.core.errors import DataError
 from brainbench.core.files import content_hash, provenance
-from brainbench.stimuli.sweeps.plan import GenerationPlan, ShardTask
-from brainbench.stimuli.sweeps.shards import UNUSABLE
+from brainbench.stimuli.sweeps.plan import GenerationPlan, PlannedShard
+from brainbench.stimuli.sweeps.shards import COUNTS, UNUSABLE
 from brainbench.stimuli.sweeps.split import SPLITS
 
 if TYPE_CHECKING:
-    from brainbench.stimuli.sweeps.conversion import ConversionPlan, ConvertedShard
-
+    from brainbench.stimuli.sweeps.conversion import SweepTable
 
 MANIFEST = "manifest.json"
 
-_COUNTS = ("steps", "steps_in_full", "retried", "unstable", "unusable")
+_COUNTS = (*COUNTS, "unstable", "unusable")
 
 
-def is_complete(path: Path, task: ShardTask | ConvertedShard) -> bool:
+def is_complete(path: Path, task: PlannedShard) -> bool:
     """Return whether the file of a shard is there and complete; a shard of another data set is a :class:`DataError`."""
     import h5py
 
@@ -44,7 +43,7 @@ def is_complete(path: Path, task: ShardTask | ConvertedShard) -> bool:
     return shape[0] == len(task) and path.stat().st_size >= end
 
 
-def make_manifest(plan: GenerationPlan | ConversionPlan, folder: str | os.PathLike[str]) -> dict[str, Any]:
+def make_manifest(plan: GenerationPlan | SweepTable, folder: str | os.PathLike[str]) -> dict[str, Any]:
     """Put together the manifest of a finished data set from what its shards say.
 
     Equal data sets have equal manifests on one machine: there is no time in it.
@@ -77,7 +76,7 @@ def make_manifest(plan: GenerationPlan | ConversionPlan, folder: str | os.PathLi
     }
 
 
-def _read(path: Path, task: ShardTask | ConvertedShard, objects: dict[str, dict[str, Any]]) -> dict[str, Any]:
+def _read(path: Path, task: PlannedShard, objects: dict[str, dict[str, Any]]) -> dict[str, Any]:
     """Return what the manifest says of a shard, and add what the shard says to its ``objects``."""
     import h5py
 

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from functools import cached_property
 from importlib import metadata
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,16 +27,6 @@ SHARD_SIZES = {"mujoco": 32, "bullet": 8}
 USUAL_SHARD = 512
 GPU_SHARD = 2048
 """Sweeps per shard on a GPU, which takes thousands at a time."""
-
-
-def shard_name(split: str, place: int) -> str:
-    """Return the file name of a shard."""
-    return f"{split}-{place:05d}.h5"
-
-
-def shard_bytes(sweeps: int, whiskers: int, frames: int) -> int:
-    """Return about how large a shard becomes."""
-    return sweeps * (whiskers * (24 * frames + 5) + 200) + 40_000
 
 
 @dataclass(frozen=True)
@@ -82,36 +72,52 @@ class GenerationSettings:
         return self.shard_size or SHARD_SIZES.get(self.backend, usual)
 
 
-@dataclass(frozen=True, eq=False)
-class ShardTask:
-    """Everything that makes one shard, small enough to be sent to another process or machine."""
+@dataclass(frozen=True, eq=False, kw_only=True)
+class PlannedShard:
+    """The sweeps of one shard of a data set."""
 
-    name: str
-    """File name."""
     split: str
-    grid: SweepGrid
-    whiskers: str
+    place: int
+    """Number among the shards of its split."""
     objects: tuple[NamedObject, ...]
     """The objects of this shard, in the order of their sweeps."""
-    owner: NDArray[np.int64]
-    """[sweep] index into ``objects``, ascending."""
-    within: NDArray[np.int64]
-    """[sweep] which sweep of its object."""
     index: NDArray[np.int64]
-    """[sweep] number among all sweeps of the grid over all objects."""
-    classes: tuple[str, ...]
-    """Class labels of the whole data set, sorted."""
-    settings: GenerationSettings
+    """[sweep] number among all sweeps of the data set's source."""
+    frames: int
     config: Mapping[str, Any]
+    """Plain values that determine every byte of the data set, with its classes and its whiskers."""
     config_hash: str
 
     def __len__(self) -> int:
         return len(self.index)
 
     @property
+    def name(self) -> str:
+        """File name."""
+        return f"{self.split}-{self.place:05d}.h5"
+
+    @property
+    def classes(self) -> Sequence[str]:
+        """Class labels of the whole data set."""
+        return self.config["classes"]
+
+    @property
     def bytes(self) -> int:
         """About how large the file becomes."""
-        return shard_bytes(len(self), len(self.config["whiskers"]["names"]), self.grid.frames.count)
+        return len(self) * (len(self.config["whiskers"]["names"]) * (24 * self.frames + 5) + 200) + 40_000
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ShardTask(PlannedShard):
+    """Everything that makes one shard, small enough to be sent to another process or machine."""
+
+    grid: SweepGrid
+    whiskers: str
+    owner: NDArray[np.int64]
+    """[sweep] index into ``objects``, ascending."""
+    within: NDArray[np.int64]
+    """[sweep] which sweep of its object."""
+    settings: GenerationSettings
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,10 +136,8 @@ class GenerationPlan:
         if not self.objects:
             raise UsageError("A data set of sweeps needs at least one object.")
 
-    @property
-    def notes(self) -> Mapping[str, Any]:
-        """Further entries of the manifest: none."""
-        return {}
+    notes: ClassVar[Mapping[str, Any]] = {}
+    """Further entries of the manifest: none."""
 
     @cached_property
     def array(self) -> WhiskerArray:
@@ -216,18 +220,18 @@ class GenerationPlan:
                 local = {owner: index for index, owner in enumerate(used)}
                 shards.append(
                     ShardTask(
-                        name=shard_name(split, place),
                         split=split,
-                        grid=self.grid,
-                        whiskers=self.whiskers,
+                        place=place,
                         objects=tuple(items[owner] for owner in used),
-                        owner=np.array([local[owner] for owner in owners[part].tolist()]),
-                        within=within[part],
                         index=owners[part] * count + within[part],
-                        classes=self.classes,
-                        settings=self.settings,
+                        frames=self.grid.frames.count,
                         config=self.config,
                         config_hash=self.config_hash,
+                        grid=self.grid,
+                        whiskers=self.whiskers,
+                        owner=np.array([local[owner] for owner in owners[part].tolist()]),
+                        within=within[part],
+                        settings=self.settings,
                     )
                 )
         return tuple(shards)

@@ -9,7 +9,7 @@ import os
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,17 +17,12 @@ from numpy.typing import NDArray
 from brainbench.core.contracts import CHANNELS, SWEEPS_FORMAT, SWEEPS_SCHEMA
 from brainbench.core.errors import DataError, UsageError
 from brainbench.core.files import atomic_path, content_hash, hash_arrays, to_json
-from brainbench.stimuli.objects.collections import NamedObject
 from brainbench.stimuli.objects.solid import Solid
 from brainbench.stimuli.sweeps.grid import Sweep
-from brainbench.stimuli.sweeps.plan import ShardTask
+from brainbench.stimuli.sweeps.plan import PlannedShard, ShardTask
 from brainbench.stimuli.sweeps.simulation import simulate_sweeps
 from brainbench.stimuli.sweeps.sweep_scenes import SweepScenes
 from brainbench.stimuli.whiskers.array import WhiskerArray
-
-if TYPE_CHECKING:
-    from brainbench.stimuli.sweeps.conversion import ConvertedShard
-
 
 OK, UNSTABLE, UNUSABLE = 0, 1, 2
 """Values of ``status``: fine; the simulation failed; the object could not be built."""
@@ -35,6 +30,8 @@ OK, UNSTABLE, UNUSABLE = 0, 1, 2
 ALIGNMENT = 4096
 """The forces begin at a multiple of this, so that pages of memory and of the file coincide."""
 
+COUNTS: tuple[str, ...] = ("steps", "steps_in_full", "retried")
+"""Attributes that say how much was simulated."""
 _CONDITIONS = tuple(item.name for item in fields(Sweep))
 
 
@@ -42,7 +39,7 @@ _CONDITIONS = tuple(item.name for item in fields(Sweep))
 class ShardContent:
     """Content of a shard's file."""
 
-    task: ShardTask | ConvertedShard
+    task: PlannedShard
     arrays: Mapping[str, NDArray[Any]]
     """By name, in the order of the file; ``wrench`` is last."""
     attributes: Mapping[str, Any]
@@ -76,7 +73,7 @@ def prepare_shard(task: ShardTask) -> PreparedShard:
     solids, reasons = zip(*built, strict=True)
     hashes = ["" if solid is None else _hash_solid(solid) for solid in solids]
     array = WhiskerArray.of(task.grid.species).select(task.whiskers)
-    tables = shard_tables(array, task.grid.frames.times, task.classes, task.objects, hashes)
+    tables = shard_tables(task, array, task.grid.frames.times, hashes)
     return PreparedShard(solids, reasons, {**tables, **_conditions(task)})
 
 
@@ -90,7 +87,7 @@ def simulate_shard(task: ShardTask, prepared: PreparedShard, workers: int | None
     contact = np.zeros((len(task), whiskers), dtype=np.float32)
     status = np.full((len(task), whiskers), UNUSABLE, dtype=np.uint8)
     reasons = [prepared.reasons[owner] for owner in task.owner.tolist()]
-    counts: dict[str, int] = dict.fromkeys(("steps", "steps_in_full", "retried"), 0)
+    counts: dict[str, int] = dict.fromkeys(COUNTS, 0)
     wrench = np.empty((0, *shape[1:]), dtype=np.float32)
     if len(chosen):
         named = {task.objects[owner].name: solid for owner in place if (solid := prepared.solids[owner])}
@@ -120,15 +117,11 @@ def simulate_shard(task: ShardTask, prepared: PreparedShard, workers: int | None
         "reason": encode_texts(reasons),
         "wrench": np.ascontiguousarray(wrench, dtype="<f4"),
     }
-    return ShardContent(task, arrays, shard_attributes(task, task.config, frames.axes, status, counts))
+    return ShardContent(task, arrays, shard_attributes(task, frames.axes, status, counts))
 
 
 def shard_attributes(
-    task: ShardTask | ConvertedShard,
-    config: Mapping[str, Any],
-    axes: str,
-    status: NDArray[np.uint8],
-    counts: Mapping[str, int],
+    task: PlannedShard, axes: str, status: NDArray[np.uint8], counts: Mapping[str, int]
 ) -> dict[str, Any]:
     """Return the attributes of a shard: what it belongs to, its axes, and counts of steps and failures."""
     return {
@@ -137,9 +130,8 @@ def shard_attributes(
         "split": task.split,
         "axes": axes,
         # An attribute has room for 64 kB; thousands of classes stand in the table of that name.
-        "config": to_json({key: item for key, item in config.items() if key != "classes"}, indent=None),
+        "config": to_json({key: item for key, item in task.config.items() if key != "classes"}, indent=None),
         "config_hash": task.config_hash,
-        **dict.fromkeys(("steps", "steps_in_full", "retried"), 0),
         **counts,
         "unstable": int((status == UNSTABLE).any(axis=1).sum()),
         "unusable": int((status == UNUSABLE).any(axis=1).sum()),
@@ -168,11 +160,7 @@ def write_shard(content: ShardContent, folder: str | os.PathLike[str]) -> int:
 
 
 def shard_tables(
-    array: WhiskerArray,
-    times: NDArray[np.float64],
-    classes: Sequence[str],
-    objects: Sequence[NamedObject],
-    hashes: Sequence[str],
+    task: PlannedShard, array: WhiskerArray, times: NDArray[np.float64], hashes: Sequence[str]
 ) -> dict[str, NDArray[Any]]:
     """Return the names behind the numbers: times, whiskers, channels, classes and objects."""
     return {
@@ -181,9 +169,9 @@ def shard_tables(
         "row": np.array([mount.row for mount in array], dtype=np.int16),
         "col": np.array([mount.col for mount in array], dtype=np.int16),
         "channel": encode_texts(CHANNELS),
-        "class": encode_texts(classes),
-        "object": encode_texts(item.name for item in objects),
-        "object_class": np.array([classes.index(item.label) for item in objects], dtype=np.int32),
+        "class": encode_texts(task.classes),
+        "object": encode_texts(item.name for item in task.objects),
+        "object_class": np.array([task.classes.index(item.label) for item in task.objects], dtype=np.int32),
         "object_hash": encode_texts(hashes),
     }
 

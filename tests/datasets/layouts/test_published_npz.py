@@ -87,7 +87,7 @@ def test_a_trial_whose_window_has_no_length_is_missing(tmp_path):
 def test_sessions_of_equal_length_are_parted_where_their_slots_contradict(tmp_path):
     array, slots = make_zero_filled([24, 24])
     found = list(read_published(write_published(tmp_path / "a.npz", m1=array)))
-    assert [(item.first, item.units, item.split_by) for item in found] == [(0, 6, "trials"), (6, 6, "slots")]
+    assert [(item.first, item.units) for item in found] == [(0, 6), (6, 6)]
     for item, true in zip(found, slots, strict=True):
         np.testing.assert_array_equal(item.slots, true)
 

@@ -68,7 +68,7 @@ def test_a_label_is_a_number_or_nothing(tmp_path, label, number):
         ({"data": np.zeros((110, 29, 6))}, r"\[110, 29, 6\]"),
         ({"data": np.full((110, 35, 6), "1")}, "<U1"),
         ({"data": np.ones((110, 35, 6))}, "5, 6, 12, 13, 34"),
-        ({"data": np.array([None, 1])}, "Object arrays"),
+        ({"data": np.array([None, 1])}, "Python objects"),
         ({"h": "low"}, "'low'"),
         ({"leave_out": ("data",)}, "shape, label, h, d, t"),
         ({"leave_out": ("d",)}, "data, shape, label, h, t"),

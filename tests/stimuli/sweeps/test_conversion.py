@@ -40,8 +40,8 @@ def make_table(read=forces, **changed):
 def test_the_files_hold_what_the_table_says(tmp_path):
     import xarray as xr
 
-    table = make_table()
-    manifest = convert_sweeps(table, tmp_path, shard_size=3)
+    table = make_table(shard_size=3)
+    manifest = convert_sweeps(table, tmp_path)
     assert (manifest["sweeps"], manifest["left_out"], manifest["unstable"]) == (14, 5, 0)
     assert {name: split["sweeps"] for name, split in manifest["splits"].items()} == {
         "train": 8,
@@ -79,12 +79,12 @@ def die(done, total, what):
     if done >= 6:
         os.kill(os.getpid(), 9)
 
-convert_sweeps(make_table(), sys.argv[1], shard_size=3, progress=die)
+convert_sweeps(make_table(shard_size=3), sys.argv[1], progress=die)
 """
 
 
 def test_a_killed_conversion_goes_on_and_ends_with_the_same_bytes(tmp_path):
-    convert_sweeps(make_table(), tmp_path / "unbroken", shard_size=3)
+    convert_sweeps(make_table(shard_size=3), tmp_path / "unbroken")
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     command = [sys.executable, "-c", CODE, str(tmp_path / "set")]
     assert subprocess.run(command, cwd=ROOT, env=environment, check=False).returncode == -9
@@ -95,7 +95,7 @@ def test_a_killed_conversion_goes_on_and_ends_with_the_same_bytes(tmp_path):
         read.extend(np.asarray(sweeps).tolist())
         return forces(sweeps)
 
-    convert_sweeps(make_table(noted), tmp_path / "set", shard_size=3)
+    convert_sweeps(make_table(noted, shard_size=3), tmp_path / "set")
     assert read == list(range(6, 14))
     assert files_of(tmp_path / "set") == files_of(tmp_path / "unbroken")
 

@@ -118,7 +118,7 @@ def test_sweeps_of_an_object_that_cannot_be_built_are_marked_and_the_others_are_
 def test_thousands_of_classes_fit_into_a_shard(tmp_path):
     task = small_plan(("brick:1",), limit=1).shards[0]
     classes = ("brick", *(f"a class of its own, number {number}" for number in range(5000)))
-    task = dataclasses.replace(task, classes=classes, config={**task.config, "classes": list(classes)})
+    task = dataclasses.replace(task, config={**task.config, "classes": list(classes)})
     make_shard(task, str(tmp_path))
     with h5py.File(tmp_path / task.name) as file:
         assert tuple(file["class"].asstr()[:]) == classes
