@@ -46,14 +46,14 @@ class DeployedPolicy:
         """
         contract = self.contract
         found = {
-            name: f"{math.prod(shape)} numbers, {_MEANINGS.get(name, _PRIVILEGED)}"
+            name: f"{list(shape)}, {_MEANINGS.get(name, _PRIVILEGED)}"
             for name, shape in self.groups.items()
             if name not in ("proprio", "tactile")
         }
         chains = hands.load(contract.hand).fingers
         tips = {chain[-1] for finger, chain in chains.items() if fingers is None or finger in fingers}
         if blind := [link for link in contract.links if contract.observe not in REAL_TYPES or link not in tips]:
-            found["tactile"] = f"{contract.observe!r} of {listing(blind)}"
+            found["tactile"] = f"{contract.observe!r} of {listing(blind, limit=3)}"
         return found
 
     def require(self, given: Collection[str], fingers: Sequence[str] | None = None) -> dict[str, str]:

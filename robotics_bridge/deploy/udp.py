@@ -102,7 +102,7 @@ class UdpDriver:
             return False
         ours, theirs = welcome.body[: frames.NONCE], welcome.body[frames.NONCE :]
         if ours != self._nonce or now - self._greeted > GREET_EVERY:
-            self.counters.replayed += 1
+            self.counters.stale += 1
             return True
         self._send_key, key = frames.session_keys(self._key, ours, theirs)
         self._nonce = b""  # a greeting begins one session

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+import warnings
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 
 from brainbench.core.errors import BrainbenchError, DataError
 from brainbench.models.export import onnx_session, require_onnx
+from robotics_bridge.policies.schema import require_finite
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -58,12 +60,6 @@ def read_policy(
     return run
 
 
-def _require_finite(path: str | Path, weights: Iterable[tuple[str, NDArray[Any]]]) -> None:
-    for name, value in weights:
-        if value.dtype.kind == "f" and not np.isfinite(value).all():
-            raise DataError(f"The weights {name[:80]!r} of {str(path)!r} are not finite; export the policy again.")
-
-
 class _OnnxRunner:
     def __init__(self, path: str | Path, shapes: Mapping[str, tuple[int, ...]], threads: int | None) -> None:
         import onnx
@@ -72,7 +68,7 @@ class _OnnxRunner:
         graph = onnx.load(str(path), load_external_data=False).graph
         if any(item.external_data for item in graph.initializer):
             raise DataError(f"{str(path)!r} keeps weights in other files; export the policy again.")
-        _require_finite(path, ((item.name, onnx.numpy_helper.to_array(item)) for item in graph.initializer))
+        require_finite(Path(path), {item.name: onnx.numpy_helper.to_array(item) for item in graph.initializer})
         self.session = onnx_session(path, threads)
         inputs = {item.name: item.shape for item in self.session.get_inputs()}
         missing = sorted({*shapes, "h_in"} - set(inputs))
@@ -94,9 +90,12 @@ class _OnnxRunner:
 
 class _JitRunner:
     def __init__(self, path: str | Path, shapes: Mapping[str, tuple[int, ...]]) -> None:
-        self.module = torch.jit.load(str(path))
+        with warnings.catch_warnings():
+            # PyTorch announces the end of TorchScript; the user who exported to it knows.
+            warnings.simplefilter("ignore")
+            self.module = torch.jit.load(str(path))
         self.names = tuple(shapes)
-        _require_finite(path, ((name, value.numpy()) for name, value in self.module.state_dict().items()))
+        require_finite(Path(path), self.module.state_dict())
 
     def __call__(self, obs: Mapping[str, NDArray[np.float32]], forget: bool = False) -> NDArray[np.float32]:
         if forget:

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import MISSING, dataclass, fields
 from pathlib import Path
 from typing import Any
 
-from brainbench.core.errors import DataError
+import numpy as np
+
+from brainbench.core.errors import DataError, check_name
 from brainbench.core.files import read_json
 
 _LARGEST_FILE = 4_000_000
@@ -118,7 +120,55 @@ class Values:
         found = self.get(name, good, "a list of [group, shape], each group once")
         return {key: self.shape(f"{name}.{key}", shape, most) for key, shape in found}
 
+    def fields(self, kind: type) -> dict[str, Any]:
+        """Return all values as those of a dataclass's fields, by the annotation of each.
+
+        Raises:
+            UsageError: the dataclass has no field of a name.
+        """
+        known = {item.name: str(item.type) for item in fields(kind)}
+        for name in self.values:
+            check_name(f"setting in {self.where!r}", str(name)[:_SHOWN], known)
+        required = {item.name for item in fields(kind) if item.default is item.default_factory is MISSING}
+        if missing := sorted(required - set(self.values)):
+            raise self.error(missing[0], known[missing[0]], _ABSENT)
+        found = {}
+        for name, annotation in ((name, known[name]) for name in self.values):
+            plain, _, optional = annotation.partition(" | ")
+            good = _KINDS.get(plain, _KINDS["str"])
+            found[name] = self.get(
+                name, lambda value, g=good, o=optional: g(value) or (o and value is None), annotation
+            )
+        return found
+
+
+def require_finite(path: Path, weights: Mapping[str, Any]) -> None:
+    """Raise :class:`DataError` if arrays or tensors of weights hold values that are not finite."""
+    for name, value in weights.items():
+        array = np.asarray(value.float() if hasattr(value, "float") else value)
+        if array.dtype.kind == "f" and not np.isfinite(array).all():
+            raise DataError(f"The weights {str(name)[:_SHOWN]!r} of {str(path)!r} are not finite.")
+
 
 def _within(value: Any, low: float, high: float) -> bool:
     # Every comparison with NaN is false; True and False are no numbers here.
     return type(value) in (int, float) and low <= value <= high
+
+
+_KINDS: dict[str, Callable[[Any], bool]] = {
+    "str": lambda value: isinstance(value, str) and len(value) <= 400,
+    "bool": lambda value: isinstance(value, bool),
+    "int": lambda value: type(value) is int and abs(value) <= 10**12,
+    "float": lambda value: _within(value, -1e12, 1e12),
+    "Mapping[str, Any]": lambda value: isinstance(value, dict),
+    "HandCalibration": lambda value: value is None or isinstance(value, dict),
+    "tuple[int, ...]": lambda value: (
+        isinstance(value, list)
+        and 0 < len(value) <= 32
+        and all(type(item) is int and 0 < item <= 65536 for item in value)
+    ),
+    "tuple[float, float]": lambda value: (
+        isinstance(value, list) and len(value) == 2 and all(_within(item, -1e12, 1e12) for item in value)
+    ),
+}
+"""Annotation of a field → whether a JSON value is of its kind; literals are texts, which their class checks."""

@@ -8,9 +8,12 @@ from typing import Any
 import torch
 from tensordict import TensorDict
 
+from brainbench.core.files import write_json
 from robotics_bridge import hands
 from robotics_bridge.policies.export import export_policy
 from robotics_bridge.policies.student import TactilePolicy
+from robotics_bridge.policies.training.distill_config import DistillConfig
+from robotics_bridge.policies.training.student_files import build_student, save_student
 
 
 def contract_of() -> dict[str, Any]:
@@ -43,3 +46,22 @@ def export_small(folder: Path, *, format: str = "onnx") -> Path:
         "links": list(hand.layout("med", "tips")), "task": "hold",
     }  # fmt: skip
     return export_policy(policy, folder / "policy", format=format, deployment=deployment).path
+
+
+def student_folder(folder: Path) -> Path:
+    """Write the folder of a small untrained student of the XHand1, as ``brainbench policy distill`` does."""
+    config = DistillConfig(
+        task="in_palm_rotate", observe="agg_force", placement="tips", encoder="mlp", hidden=(8,), num_envs=2
+    )
+    shapes = {"proprio": (8,), "goal": (1,), "tactile": (5, 5, 3)}
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        student = build_student(config, shapes, list(shapes), 2)
+    described = {
+        "brainbench_student": 1, "distill": config.plain(), "network": student.config,
+        "groups": [[name, list(shape)] for name, shape in shapes.items()], "actions": 2,
+        "deployment": contract_of()["deployment"],
+    }  # fmt: skip
+    write_json(folder / "config.json", described)
+    save_student(folder / "model.safetensors", student)
+    return folder

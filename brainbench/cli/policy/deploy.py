@@ -24,7 +24,7 @@ def export(
 ) -> None:
     """Write a student with normalisers, taxel grid, encoder and head in one file, and compare it step by step."""
     from robotics_bridge.policies.export import STEPS, SUFFIXES, export_policy
-    from robotics_bridge.policies.training.distill import load_student
+    from robotics_bridge.policies.training.student_files import load_student
 
     student, described = load_student(run)
     suffix = SUFFIXES.get(format, "")
@@ -87,7 +87,10 @@ def deploy(
     given = _inputs(deployed, goal, inputs or [])
     remote = None if driver == "sim" else _remote(driver, key, deployed)
     # What is missing is said before a hand is started or greeted.
-    told = deployed.require({*given, *(("tactile",) if shadow else ())})
+    told = {
+        name: f"{what}: {'simulated beside the hand' if shadow and name == 'tactile' else 'constant'}"
+        for name, what in deployed.require({*given, *(("tactile",) if shadow else ())}).items()
+    }
     with contextlib.ExitStack() as stack:
         ends = remote or stack.enter_context(simulated_hand(contract.hand, faults=faults, seconds=seconds + 60))
         address, joints, fingers, secret = ends
