@@ -23,8 +23,10 @@ from brainbench.core.errors import DataError, DataFileNotFoundError
 MAGIC = b"BBH2"
 HELLO, WELCOME, START, STATE, COMMAND, STOP = range(1, 7)
 """Kinds: the controller asks for a session, the hand offers one, the controller takes it; then states and commands."""
-LARGEST = 4096
-"""Bytes of the largest datagram that is received; longer ones are not read further."""
+LARGEST = 8192
+"""Bytes of the largest datagram that is read: more than a state of :data:`MOST` joints and fingers."""
+MOST = 255
+"""Most joints and fingers of a hand."""
 NONCE, KEY = 16, 32
 """Bytes of a nonce and of a key."""
 _HEADER = struct.Struct("<4sBBBxId")

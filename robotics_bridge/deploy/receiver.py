@@ -11,6 +11,8 @@ Verdict = Literal["new", "late", "replayed", "stale"]
 """``late``: came after a newer one for the first time; ``replayed``: again; ``stale``: too old, by number or time."""
 MAX_AGE = 0.25
 """Oldest frame that has an effect (s); as long as a hand without commands moves on."""
+MOST_AGE = 5.0
+"""Longest age that may be allowed (s)."""
 
 
 class SequenceWindow:

@@ -18,7 +18,7 @@ from brainbench.core.errors import UsageError
 from robotics_bridge.deploy import frames
 from robotics_bridge.deploy.driver import HandReading, LinkCounters
 from robotics_bridge.deploy.frames import Frame
-from robotics_bridge.deploy.receiver import MAX_AGE, Receiver
+from robotics_bridge.deploy.receiver import MAX_AGE, MOST_AGE, Receiver
 from robotics_bridge.deploy.safety import ClockOffset
 
 LOOPBACK = "127.0.0.1"
@@ -41,7 +41,7 @@ class UdpDriver:
         max_age: Oldest report that is used (s).
 
     Raises:
-        UsageError: there is no such host or port.
+        UsageError: there is no such host or port, or a number is out of range.
     """
 
     def __init__(
@@ -53,6 +53,15 @@ class UdpDriver:
         *,
         max_age: float = MAX_AGE,
     ) -> None:
+        if not 0 < len(joints) <= frames.MOST or len(fingers) > frames.MOST:
+            raise UsageError(
+                f"A hand has 1 to {frames.MOST} joints and at most {frames.MOST} fingers; received {len(joints)} and "
+                f"{len(fingers)}."
+            )
+        if not 0 < max_age <= MOST_AGE:
+            raise UsageError(
+                f"The oldest report that is used is above 0 s, at most {MOST_AGE:g} s; received {max_age!r}."
+            )
         self.address, self.joints, self.fingers = (address[0] or LOOPBACK, address[1]), joints, fingers
         self.counters = LinkCounters()
         self._key, self._max_age = key, max_age
