@@ -73,8 +73,8 @@ def main() -> None:
         for model, fault, ahead in runs:
             seconds = options.seconds if fault == "none" else 5.0
             with (
-                simulated_hand(faults=Faults(**FAULTS[fault]), seconds=seconds + 60) as (address, joints, fingers),
-                UdpDriver(address, joints, fingers) as link,
+                simulated_hand(faults=Faults(**FAULTS[fault]), seconds=seconds + 60) as ends,
+                UdpDriver(*ends) as link,
                 realtime() if ahead else contextlib.nullcontext(),
             ):
                 # A shared machine may lose time; what is measured here is the tick.

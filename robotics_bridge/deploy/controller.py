@@ -21,10 +21,13 @@ from robotics_bridge.deploy.safety import ClockOffset, SafetyLimits
 from robotics_bridge.deploy.timing import LatencyHistogram, RateMonitor
 from robotics_bridge.envs import ActionMap
 from robotics_bridge.envs.observations import VELOCITY
-from robotics_bridge.policies.export import Runner
+from robotics_bridge.policies.contract import RATE, PolicyContract
+from robotics_bridge.policies.runners import Runner
 
 _log = logging.getLogger(__name__)
 
+LONGEST = 86400.0
+"""Seconds of the longest session."""
 Source = Callable[["HandReading"], "NDArray[np.floating]"]
 """A group of observations for a report: touch, or the goal."""
 
@@ -53,21 +56,10 @@ class Actuation:
     """Joint → position (rad) of those that actions do not move."""
 
     @classmethod
-    def of(cls, deployment: Mapping[str, Any]) -> Actuation:
-        """Return the actuation of a contract's ``deployment``.
-
-        Raises:
-            UsageError: a part is missing, as in files that were not made from a trained run.
-        """
-        try:
-            mapping = deployment["action_map"]
-            arrays = {key: np.asarray(mapping[key], dtype=float) for key in ("default", "scale", "low", "high")}
-            actions = ActionMap(tuple(mapping["names"]), **arrays)
-            return cls(tuple(deployment["joints"]), actions, dict(deployment["frozen"]))
-        except (KeyError, TypeError) as error:
-            raise UsageError(
-                f"The contract of the policy lacks {error} in 'deployment'; export it with brainbench policy export."
-            ) from error
+    def of(cls, contract: PolicyContract) -> Actuation:
+        """Return the actuation of a contract."""
+        arrays = {name: np.array(values) for name, values in contract.action_map.items()}
+        return cls(contract.joints, ActionMap(contract.moved, **arrays), contract.frozen)
 
     def targets(self, action: NDArray[np.floating]) -> dict[str, float]:
         """Return joint → target (rad) of an action [A]."""
@@ -101,6 +93,12 @@ class Report:
     """Counters of the driver."""
 
 
+def check_duration(seconds: float) -> None:
+    """Raise :class:`UsageError` unless a session can last so long (s)."""
+    if not 0 < seconds <= LONGEST:
+        raise UsageError(f"A session lasts more than 0 s, at most {LONGEST:g} s; received {seconds!r}.")
+
+
 class Controller:
     """Runs a policy on a hand.
 
@@ -117,7 +115,7 @@ class Controller:
         record: Called after each tick with (reading, groups, action, targets [J]).
 
     Raises:
-        UsageError: a group has no source, or the hand lacks a joint.
+        UsageError: a group has no source, the hand lacks a joint, or the rate is out of range.
     """
 
     def __init__(
@@ -134,6 +132,10 @@ class Controller:
         record: Callable[..., None] | None = None,
     ) -> None:
         self.run_policy, self.driver, self.actuation, self.limits = run, driver, actuation, limits
+        if not RATE[0] <= rate <= RATE[1]:
+            raise UsageError(
+                f"A policy runs at {RATE[0]:g} to {RATE[1]:g} control steps per second; received {rate!r}."
+            )
         self.rate, self.sources, self.clock, self.record = rate, dict(sources or {}), clock or Clock(), record
         if missing := [name for name in groups if name not in {"proprio", *self.sources}]:
             raise UsageError(f"The policy reads the group {missing[0]!r}, and nothing here gives it.")
@@ -148,7 +150,12 @@ class Controller:
         self.limited = self.overruns = self.ticks = 0
 
     def run(self, seconds: float) -> Report:
-        """Control for so many seconds, or until something is wrong; the hand is told to hold in the end."""
+        """Control for so many seconds, or until something is wrong; the hand is told to hold in the end.
+
+        Raises:
+            UsageError: the time is not a positive number.
+        """
+        check_duration(seconds)
         begun = self.clock()
         reason: str | None = "the control loop was interrupted"
         try:
@@ -190,7 +197,7 @@ class Controller:
         reading = self.driver.read()
         if reading is None:
             return "the hand gave no report"
-        reason = self.limits.fault(reading, self._offset.age(reading, now))
+        reason = self.limits.fault(reading, self._offset.age(reading.time, reading.arrived, now))
         rate = self._monitor.tick(now)
         if reason is None and rate < self.limits.rate_share * self.rate:
             reason = f"control runs at {rate:.1f} Hz instead of {self.rate:g}"
@@ -200,10 +207,15 @@ class Controller:
         if fault := next((name for name, value in obs.items() if not np.isfinite(value).all()), None):
             return f"the observation {fault!r} holds values that are no numbers"
         action = np.asarray(self.run_policy(obs, self.ticks == 0))
+        if action.shape != self._action.shape:
+            return f"the policy gave actions of shape {action.shape} instead of {self._action.shape}"
         if not np.isfinite(action).all():
             return "the policy gave values that are no numbers"
         self._action = action.astype(np.float32)
         targets = self._limit(self.actuation.targets(action), reading)
+        # The last look before anything moves, whatever the parts before it did.
+        if not self.limits.allows(targets):
+            return "a command would be no numbers or beyond the joints' limits"
         self.driver.send(targets)
         self.latency.append(self.clock() - now)
         self.processor.append(time.thread_time() - busy)

@@ -36,8 +36,12 @@ class LinkCounters:
     """Numbers that were skipped and did not come later."""
     late: int = 0
     """Came after a newer one, and were not used."""
+    stale: int = 0
+    """Older than allowed, by time or number, and not used."""
+    replayed: int = 0
+    """Authentic but sent again by somebody, and not used."""
     damaged: int = 0
-    """Not readable, and not used."""
+    """Not readable, forged, or of another session, and not used."""
     errors: list[str] = field(default_factory=list)
     """First errors of the connection."""
 

@@ -11,6 +11,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -138,6 +139,21 @@ class SessionRecorder:
         )
 
 
+def check_folder(folder: Path, fps: float) -> None:
+    """Check that a data set can be written, before it is recorded.
+
+    Raises:
+        UsageError: the folder is not empty or no folder, or LeRobot knows no such rate.
+        MissingDependencyError: pyarrow is not installed.
+    """
+    if find_spec("pyarrow") is None:
+        raise missing_dependency("pyarrow", extra="board", purpose="Writing a LeRobot data set")
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        raise UsageError(f"{str(folder)!r} is not empty; a data set is written into a folder of its own.")
+    if not fps > 0 or fps != round(fps):
+        raise UsageError(f"A data set has a whole number of frames per second; received {fps!r}.")
+
+
 def write_lerobot(
     folder: str | Path,
     episodes: Sequence[Episode],
@@ -161,15 +177,12 @@ def write_lerobot(
         UsageError: the folder is not empty, or an episode does not fit.
         MissingDependencyError: pyarrow is not installed.
     """
-    try:
-        import pyarrow
-    except ImportError as error:
-        raise missing_dependency("pyarrow", extra="board", purpose="Writing a LeRobot data set") from error
     folder = Path(folder)
-    if folder.exists() and any(folder.iterdir()):
-        raise UsageError(f"{str(folder)!r} is not empty; a data set is written into a folder of its own.")
-    if not episodes or fps != round(fps):
-        raise UsageError(f"A data set needs episodes and a whole number of frames per second; received {fps!r}.")
+    check_folder(folder, fps)
+    import pyarrow
+
+    if not episodes:
+        raise UsageError("A data set needs episodes; received none.")
     shapes = {
         "observation.state": (len(joints),), "observation.velocity": (len(joints),), "action": (len(joints),),
         "observation.tactile": (len(points.link), 6), "observation.wrench": (6,),

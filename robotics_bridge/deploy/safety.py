@@ -8,9 +8,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from brainbench.core.errors import UsageError
+from brainbench.core.errors import UsageError, check_name
 from robotics_bridge.deploy.driver import HandReading
 from robotics_bridge.hands import Hand
+
+LIMITS = {
+    "pressure": 1000.0, "margin": 1.0, "timeout": 2.0, "start_timeout": 60.0, "rate_share": 1.0, "rate_window": 60.0,
+}  # fmt: skip
+"""Largest value of each limit: a hand must not run on for longer, or press harder, because of a slip of the keys."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,19 +48,22 @@ class SafetyLimits:
     def __post_init__(self) -> None:
         if not (len(self.low) == len(self.high) == len(self.speed)):
             raise UsageError("Limits of position and speed need one number per joint each.")
-        if not ((np.asarray(self.low) < self.high).all() and (np.asarray(self.speed) > 0).all()):
-            raise UsageError("Every joint needs a lower limit below its upper one and a positive speed.")
-        for name in ("pressure", "margin", "timeout", "start_timeout", "rate_share", "rate_window"):
+        ends = np.array([self.low, self.high, self.speed], float)
+        if not (np.isfinite(ends).all() and (ends[0] < ends[1]).all() and (ends[2] > 0).all()):
+            raise UsageError("Every joint needs a finite lower limit below its upper one and a finite positive speed.")
+        for name, most in LIMITS.items():
             value = getattr(self, name)
-            if not (math.isfinite(value) and value > 0):
-                raise UsageError(f"The safety limit {name!r} is a positive number; received {value!r}.")
+            if not (isinstance(value, (int, float)) and 0 < value <= most):
+                raise UsageError(
+                    f"The safety limit {name!r} is a number above 0, at most {most:g}; received {value!r}."
+                )
 
     @classmethod
     def of_hand(cls, hand: Hand, joints: tuple[str, ...], **changes: float) -> SafetyLimits:
         """Return the limits of a hand's joints, in a given order.
 
         Raises:
-            UsageError: the hand lacks a joint.
+            UsageError: the hand lacks a joint, or there is no such limit.
         """
         model = hand.model
         names = {model.joint(index).name: index for index in range(model.njnt)}
@@ -63,6 +71,8 @@ class SafetyLimits:
             raise UsageError(f"The hand {hand.name!r} has no joint {missing[0]!r}.")
         ranges = np.array([model.jnt_range[names[name]] for name in joints])
         speeds = {joint.name: joint.velocity for joint in hand.spec.joints} if hand.spec is not None else {}
+        for name in changes:
+            check_name("safety limit", name, LIMITS)
         return cls(ranges[:, 0], ranges[:, 1], np.array([speeds.get(name, 5.0) for name in joints]), **changes)
 
     def fault(self, reading: HandReading, age: float) -> str | None:
@@ -93,6 +103,12 @@ class SafetyLimits:
         # Speed first, position last: whatever the targets before were, the outcome lies within the joint's range.
         return np.clip(np.clip(targets, before - step, before + step), self.low, self.high)
 
+    def allows(self, targets: NDArray[np.float64]) -> bool:
+        """Return whether targets [J] are finite numbers within the limits of position."""
+        # As the joints get them, in single precision; a comparison with NaN is false.
+        single = np.asarray(targets, np.float32)
+        return bool(np.all((single >= np.float32(self.low)) & (single <= np.float32(self.high))))
+
 
 class ClockOffset:
     """Lateness of reports, although the hand's clock and ours have different zeros.
@@ -103,8 +119,14 @@ class ClockOffset:
     def __init__(self) -> None:
         self._least = math.inf
 
-    def age(self, reading: HandReading, now: float) -> float:
-        """Return how long ago a report was measured (s), beyond the shortest way seen."""
+    def age(self, stamp: float, arrived: float, now: float) -> float:
+        """Return how long ago something was sent (s), beyond the shortest way seen.
+
+        Args:
+            stamp: Time of the sender's clock (s).
+            arrived: Time of arrival (s).
+            now: The present (s).
+        """
         # The offset of the clocks is not known. Least of all differences: the way of the fastest report counts as none.
-        self._least = min(self._least, reading.arrived - reading.time)
-        return now - reading.time - self._least
+        self._least = min(self._least, arrived - stamp)
+        return now - stamp - self._least

@@ -2,21 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from brainbench.core.errors import DataError, DataFileNotFoundError, UsageError
-from brainbench.core.files import read_json
+from brainbench.core.errors import DataError, DataFileNotFoundError, UsageError, listing
+from brainbench.core.files import file_hash
 from robotics_bridge import hands
 from robotics_bridge.deploy.controller import Actuation, Controller, Source
 from robotics_bridge.deploy.driver import Driver
 from robotics_bridge.deploy.safety import SafetyLimits
-from robotics_bridge.deploy.touch import Fallback, PressureCalibration, RealTouch
-from robotics_bridge.policies.export import read_policy
+from robotics_bridge.deploy.touch import REAL_TYPES, Fallback, PressureCalibration, RealTouch
+from robotics_bridge.policies.contract import PolicyContract
+from robotics_bridge.policies.runners import read_policy
+
+LARGEST_INPUT = 1e6
+"""Largest magnitude of a constant in place of an observation."""
+_MEANINGS = {"goal": "in training measured from the object's pose", "thermal": "temperatures of the skin"}
+_PRIVILEGED = "known to the simulation alone"
 
 
 @dataclass(frozen=True)
@@ -24,21 +31,44 @@ class DeployedPolicy:
     """An exported policy with what a robot needs to run it."""
 
     path: Path
-    format: str
-    groups: Mapping[str, tuple[int, ...]]
-    """Group → shape of what it reads."""
-    deployment: Mapping[str, Any]
-    """Rate, hand, joints, links, from actions to targets."""
+    contract: PolicyContract
 
     @property
-    def rate(self) -> float:
-        """Control steps per second."""
-        return float(self.deployment["rate"])
+    def groups(self) -> Mapping[str, tuple[int, ...]]:
+        """Group → shape of what it reads."""
+        return self.contract.inputs
 
-    @property
-    def hand(self) -> str:
-        """Name of the hand that it was trained on."""
-        return str(self.deployment["hand"])
+    def unmeasured(self, fingers: Sequence[str] | None = None) -> dict[str, str]:
+        """Return group → what a hand cannot measure of it, in words; empty if it measures all.
+
+        Args:
+            fingers: Fingers with a sensing tip; None for all of the hand that it was trained on.
+        """
+        contract = self.contract
+        found = {
+            name: f"{list(shape)}, {_MEANINGS.get(name, _PRIVILEGED)}"
+            for name, shape in self.groups.items()
+            if name not in ("proprio", "tactile")
+        }
+        chains = hands.load(contract.hand).fingers
+        tips = {chain[-1] for finger, chain in chains.items() if fingers is None or finger in fingers}
+        if blind := [link for link in contract.links if contract.observe not in REAL_TYPES or link not in tips]:
+            found["tactile"] = f"{contract.observe!r} of {listing(blind, limit=3)}"
+        return found
+
+    def require(self, given: Collection[str], fingers: Sequence[str] | None = None) -> dict[str, str]:
+        """Return :meth:`unmeasured`.
+
+        Raises:
+            UsageError: one of them is not among the groups that something else gives.
+        """
+        found = self.unmeasured(fingers)
+        if missing := [f"{name} ({what})" for name, what in found.items() if name not in given]:
+            raise UsageError(
+                f"The policy was trained with what the hand cannot measure: {'; '.join(missing)}. Give each a constant "
+                "with --input NAME=NUMBER,NUMBER… (touch also with --shadow)."
+            )
+        return found
 
     def controller(
         self,
@@ -56,29 +86,29 @@ class DeployedPolicy:
         Args:
             driver: The hand.
             limits: Changes of :class:`~robotics_bridge.deploy.safety.SafetyLimits`, such as ``timeout``.
-            sources: Group → what gives it, such as the goal.
+            sources: Group → what gives it, for every group but ``tactile`` of :attr:`unmeasured`.
             calibration: Of the hand's pressure.
-            fallback: Simulated touch where the hand senses nothing.
+            fallback: Simulated or constant touch where the hand senses nothing.
             threads: Of the network's computations.
             **settings: Further arguments of :class:`~robotics_bridge.deploy.controller.Controller`.
 
         Raises:
             UsageError: the hand or the sources do not fit the policy.
         """
-        body = hands.load(self.hand)
-        sources = dict(sources or {})
+        contract, body, sources = self.contract, hands.load(self.contract.hand), dict(sources or {})
+        self.require({*sources, *(("tactile",) if fallback is not None else ())}, driver.fingers)
         if "tactile" in self.groups:
             slots, items, channels = self.groups["tactile"]
             tips = {chain[-1]: finger for finger, chain in body.fingers.items()}
             sources["tactile"] = RealTouch(
-                str(self.deployment["observe"]), tuple(self.deployment["links"]), (slots, items, channels), tips=tips,
-                fingers=driver.fingers, calibration=calibration, fallback=fallback,
+                contract.observe, contract.links, (slots, items, channels), tips=tips, fingers=driver.fingers,
+                calibration=calibration, fallback=fallback,
             )  # fmt: skip
         safe = SafetyLimits.of_hand(body, driver.joints, **dict(limits or {}))
-        run = read_policy(self.path, self.groups, format=self.format, threads=threads)
+        run = read_policy(self.path, self.groups, format=contract.format, threads=threads, actions=len(contract.moved))
         return Controller(
-            run, driver, Actuation.of(self.deployment), safe, groups=tuple(self.groups), rate=self.rate,
-            sources=sources, **settings,
+            run, driver, Actuation.of(contract), safe, groups=tuple(self.groups), rate=contract.rate, sources=sources,
+            **settings,
         )  # fmt: skip
 
 
@@ -87,7 +117,7 @@ def read_deployed(path: str | Path) -> DeployedPolicy:
 
     Raises:
         DataFileNotFoundError: the file or its contract is missing.
-        DataError: the contract is of another kind.
+        DataError: the contract is of another kind or of another file, or a value is out of range.
         UsageError: the contract does not say what a hand needs; export the policy from a trained run.
     """
     path = Path(path)
@@ -97,26 +127,28 @@ def read_deployed(path: str | Path) -> DeployedPolicy:
             raise DataFileNotFoundError(
                 f"There is no file {str(file)!r}; brainbench policy export writes a policy and its contract."
             )
-    found = read_json(contract)
-    if not isinstance(found, dict) or not {"inputs", "format", "deployment"} <= set(found):
-        raise DataError(f"{str(contract)!r} is not the contract of a policy.")
-    groups = {name: tuple(int(size) for size in shape) for name, shape in found["inputs"]}
-    missing = {"rate", "hand", "joints", "action_map", "frozen"} - set(found["deployment"])
-    if missing:
-        raise UsageError(
-            f"The contract {contract.name!r} does not say {sorted(missing)[0]!r}, so no hand can run the policy; "
-            "export it from a trained run."
-        )
-    return DeployedPolicy(path, str(found["format"]), groups, found["deployment"])
+    found = PolicyContract.read(contract)
+    if found.sha256 and found.sha256 != file_hash(path, length=64):
+        raise DataError(f"{str(path)!r} is not the file that its contract describes; export the policy again.")
+    return DeployedPolicy(path, found)
 
 
-def constant(values: Any, size: int) -> Source:
+def constant(name: str, values: Sequence[float], shape: tuple[int, ...]) -> Source:
     """Return a source that always gives the same numbers, such as a goal that does not change.
 
+    Args:
+        name: The group, for errors.
+        values: One number for all of the group, or one for each.
+        shape: Of the group.
+
     Raises:
-        UsageError: there are not as many numbers as the policy reads.
+        UsageError: there are not as many numbers as the policy reads, or one is not finite.
     """
-    array = np.asarray(values, np.float32).reshape(-1)
-    if len(array) != size:
-        raise UsageError(f"The policy reads {size} numbers here; received {len(array)}.")
+    size, given = math.prod(shape), np.asarray(values, np.float64).reshape(-1)
+    if len(given) not in (1, size) or not (np.abs(given) <= LARGEST_INPUT).all():
+        raise UsageError(
+            f"The policy reads {size} numbers of {name!r}, from {-LARGEST_INPUT:g} to {LARGEST_INPUT:g}: give one for "
+            f"all, or {size}; received {str(list(values))[:80]}."
+        )
+    array = np.broadcast_to(given if len(given) == 1 else given.reshape(shape), shape).astype(np.float32)
     return lambda reading: array

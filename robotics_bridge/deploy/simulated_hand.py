@@ -19,8 +19,10 @@ from numpy.typing import NDArray
 from brainbench.core.errors import DataError, UsageError
 from robotics_bridge import hands
 from robotics_bridge.deploy.driver import HandReading
+from robotics_bridge.deploy.frames import new_key
+from robotics_bridge.deploy.hand_link import HandLink
 from robotics_bridge.deploy.touch import PressureCalibration
-from robotics_bridge.deploy.udp import COMMAND, STATE, STOP, decode, encode
+from robotics_bridge.deploy.udp import LOOPBACK
 from robotics_bridge.hands.observations import observation_type, observe, sensors_for
 from robotics_bridge.hands.scenes import OBJECT, holding
 from robotics_bridge.physics import MujocoEngine
@@ -194,64 +196,42 @@ class ShadowTouch:
         return np.stack(felt)
 
 
-def serve(hand: SimulatedHand, link: socket.socket, faults: Faults, seconds: float = 3600.0) -> None:
-    """Simulate in real time and answer on a bound UDP socket until the time is over."""
-    link.setblocking(False)
+def serve(hand: SimulatedHand, link: HandLink, faults: Faults, seconds: float = 3600.0) -> None:
+    """Simulate in real time and answer until the time is over."""
     random = np.random.default_rng(faults.seed)
-    joints, fingers, start = len(hand.joints), len(hand.fingers), time.monotonic()
-    peer: Any = ()
+    start = time.monotonic()
     waiting: list[tuple[float, bytes]] = []
-    heard, stopped, held, sequence, tick, newest = start, False, True, 0, 0, -1
+    heard, held, tick = start, True, 0
     frozen: tuple[NDArray[np.float64], float] | None = None
     hand.hold()
     while (now := time.monotonic()) - start < seconds:
-        with contextlib.suppress(BlockingIOError, ConnectionError):
-            while True:
-                data, sender = link.recvfrom(4096)
-                message = decode(data)
-                if message is None or message.kind != COMMAND:
-                    continue
-                peer = sender
-                if message.joints != joints:
-                    # A greeting: a new session, which begins in the posture of the last.
-                    stopped, newest = False, -1
-                elif message.flags & STOP:
-                    stopped = True
-                    hand.hold()
-                elif not stopped and message.sequence > newest and np.isfinite(message.values).all():
-                    hand.drive(message.values)
-                    heard, held, newest = now, False, message.sequence
-        if not held and now - heard > HOLD_AFTER:
+        stamp = now - start
+        targets = link.receive(stamp)
+        if targets is not None:
+            hand.drive(targets)
+            heard, held = now, False
+        elif not held and (link.stopped or now - heard > HOLD_AFTER):
             hand.hold()
             held = True
         hand.step()
-        sequence += 1
-        values, stamp = hand.report(), now - start
+        values = hand.report()
         if faults.frozen_after and stamp > faults.frozen_after:
             frozen = frozen or (values, stamp)
             values, stamp = frozen
-        if peer and not (faults.silent_after and now - start > faults.silent_after):
+        if link.peer and not (faults.silent_after and now - start > faults.silent_after):
             late = faults.delay if now - start >= faults.delay_after else 0.0
             # Each report waits by itself, so that jitter longer than a report's interval also changes their order.
             due = now + late + faults.jitter * random.random()
-            spoiled = _spoil(values, faults, random, joints, fingers, sequence, stamp)
-            waiting.extend((due, data) for data in spoiled)
+            waiting.extend((due, data) for data in _spoil(values, faults, random, len(hand.joints), link, stamp))
         for due, data in [item for item in waiting if item[0] <= now]:
             waiting.remove((due, data))
-            with contextlib.suppress(OSError):
-                link.sendto(data, peer)
+            link.send(data)
         tick += 1
         time.sleep(max(0.0, start + tick / hand.rate - time.monotonic()))
 
 
 def _spoil(
-    values: NDArray[np.float64],
-    faults: Faults,
-    random: np.random.Generator,
-    joints: int,
-    fingers: int,
-    sequence: int,
-    stamp: float,
+    values: NDArray[np.float64], faults: Faults, random: np.random.Generator, joints: int, link: HandLink, stamp: float
 ) -> Iterator[bytes]:
     drop, damage, absurd, nan = random.random(4)
     values = values.copy()
@@ -259,33 +239,34 @@ def _spoil(
         values[int(random.integers(joints))] = 1000.0
     if nan < faults.nan:
         values[int(random.integers(joints))] = np.nan
-    data = bytearray(encode(STATE, values, joints=joints, fingers=fingers, sequence=sequence, time=stamp))
+    data = bytearray(link.report(values, stamp))
     if damage < faults.damage:
         data[int(random.integers(len(data)))] ^= 0xFF
     if drop >= faults.drop:
         yield bytes(data)
 
 
-def _process(name: str, rate: float, faults: Faults, seconds: float, ready: Any) -> None:
+def _process(name: str, rate: float, faults: Faults, seconds: float, key: bytes, ready: Any) -> None:
     hand = SimulatedHand(name, rate)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as link:
-        link.bind(("127.0.0.1", 0))
+        link.bind((LOOPBACK, 0))
         ready.send((link.getsockname()[1], hand.joints, hand.fingers))
-        serve(hand, link, faults, seconds)
+        serve(hand, HandLink(link, key, len(hand.joints), len(hand.fingers)), faults, seconds)
 
 
 @contextlib.contextmanager
 def simulated_hand(
     hand: str = "xhand1", *, rate: float = 200.0, faults: Faults | None = None, seconds: float = 600.0
-) -> Iterator[tuple[tuple[str, int], tuple[str, ...], tuple[str, ...]]]:
-    """Run a simulated hand in a process of its own; yield its address, joints and fingers.
+) -> Iterator[tuple[tuple[str, int], tuple[str, ...], tuple[str, ...], bytes]]:
+    """Run a simulated hand in a process of its own; yield its address, joints, fingers and key.
 
     Raises:
         DataError: the process did not start.
     """
     context = multiprocessing.get_context("spawn")
     ours, theirs = context.Pipe()
-    process = context.Process(target=_process, args=(hand, rate, faults or Faults(), seconds, theirs), daemon=True)
+    key = new_key()
+    process = context.Process(target=_process, args=(hand, rate, faults or Faults(), seconds, key, theirs), daemon=True)
     process.start()
     theirs.close()
     try:
@@ -295,7 +276,7 @@ def simulated_hand(
             port, joints, fingers = ours.recv()
         except EOFError:
             raise DataError("The simulated hand ended while it started.") from None
-        yield ("127.0.0.1", port), joints, fingers
+        yield (LOOPBACK, port), joints, fingers, key
     finally:
         process.terminate()
         process.join(5)

@@ -18,6 +18,8 @@ from robotics_bridge.deploy.driver import HandReading
 
 REAL_TYPES = ("agg_bool", "agg_force")
 """Observation types that a real hand can measure."""
+LARGEST_SCALE = 1e6
+"""Largest scale or threshold of a pressure calibration."""
 Fallback = Callable[["HandReading"], "NDArray[np.floating]"]
 """A simulated tactile group [S, N, C] for a report."""
 
@@ -40,8 +42,12 @@ class PressureCalibration:
     """Contact pressure, in the maker's unit, above which a finger touches (η_real of 4.31)."""
 
     def __post_init__(self) -> None:
-        if not (np.isfinite([self.scale, *self.per_finger.values(), *self.axes]).all() and self.threshold > 0):
-            raise UsageError("A pressure calibration needs finite scales and a positive threshold.")
+        factors = np.abs([self.scale, *self.per_finger.values(), *self.axes])
+        if not ((factors > 0) & (factors <= LARGEST_SCALE)).all() or not 0 < self.threshold <= LARGEST_SCALE:
+            raise UsageError(
+                f"A pressure calibration has scales and axes of ±{LARGEST_SCALE:g} at most and not 0, and a threshold "
+                f"above 0; received {self}."
+            )
 
     def force(self, fingers: tuple[str, ...], pressure: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the simulator's ``agg_force`` [F, 3] of pressures [F, 3]."""

@@ -1,156 +1,175 @@
-"""Datagrams between a controller and a hand, and the driver that speaks them over a local or remote UDP socket.
+"""The driver of a hand behind a UDP socket, local or remote; frames are authenticated with a key that both sides hold.
 
-A message is one datagram, little-endian, with a checksum. Header: 4 bytes ``BBH1``, kind (u8), joints J (u8), fingers F
-(u8), flags (u8), sequence (u32), time (f64, s). A state carries positions f32[J], velocities f32[J] and pressures
-f32[F·3]; a command f32[J] targets. CRC-32 of all ends it.
+A session begins with three frames: greeting, welcome, start. Its keys come from the shared key and a fresh nonce of
+either side (:mod:`~robotics_bridge.deploy.frames`).
 """
 
 from __future__ import annotations
 
 import contextlib
+import secrets
 import socket
-import struct
 import time
-import zlib
-from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from brainbench.core.errors import UsageError
+from robotics_bridge.deploy import frames
 from robotics_bridge.deploy.driver import HandReading, LinkCounters
+from robotics_bridge.deploy.frames import Frame
+from robotics_bridge.deploy.receiver import MAX_AGE, MOST_AGE, Receiver
+from robotics_bridge.deploy.safety import ClockOffset
 
-MAGIC = b"BBH1"
-STATE, COMMAND = 1, 2
-STOP = 1
-"""Flag of a command: hold, and refuse what follows."""
-_HEADER = struct.Struct("<4sBBBBId")
-_END = struct.Struct("<I")
-_LARGEST = 4096
-_MOST = 256
+LOOPBACK = "127.0.0.1"
+GREET_EVERY = 0.2
+"""Seconds from one greeting to the next, until the hand reports. An answer that takes longer is not accepted."""
+MOST_AT_ONCE = 256
 """Datagrams read at once; a flood must not hold the control loop up."""
 _ERRORS = 8
 """Errors of the connection that are kept."""
 
 
-@dataclass(frozen=True, eq=False)
-class Message:
-    """A datagram that was read."""
-
-    kind: int
-    """:data:`STATE` or :data:`COMMAND`."""
-    joints: int
-    """J."""
-    fingers: int
-    """F."""
-    flags: int
-    """:data:`STOP`, or 0."""
-    sequence: int
-    """Number of the message; goes on from 0 after 2³²."""
-    time: float
-    """Time of the sender's clock (s)."""
-    values: NDArray[np.float64]
-    """Positions (rad), velocities (rad/s) and pressures of a state, targets (rad) of a command, one after another."""
-
-
-def encode(
-    kind: int, values: ArrayLike, *, joints: int, fingers: int = 0, sequence: int = 0, time: float = 0.0, flags: int = 0
-) -> bytes:
-    """Return the bytes of a message."""
-    head = _HEADER.pack(MAGIC, kind, joints, fingers, flags, sequence & 0xFFFFFFFF, time)
-    body = head + np.asarray(values, dtype="<f4").tobytes()
-    return body + _END.pack(zlib.crc32(body))
-
-
-def decode(data: bytes) -> Message | None:
-    """Return what a datagram says; None when it is damaged, cut short or of another kind."""
-    if len(data) < _HEADER.size + _END.size:
-        return None
-    body, (checksum,) = data[: -_END.size], _END.unpack(data[-_END.size :])
-    magic, kind, joints, fingers, flags, sequence, time = _HEADER.unpack(body[: _HEADER.size])
-    count = {STATE: 2 * joints + 3 * fingers, COMMAND: joints}.get(kind)
-    if magic != MAGIC or count is None or zlib.crc32(body) != checksum or len(body) != _HEADER.size + 4 * count:
-        return None
-    values = np.frombuffer(body, dtype="<f4", offset=_HEADER.size).astype(np.float64)
-    return Message(kind, joints, fingers, flags, sequence, time, values)
-
-
 class UdpDriver:
-    """Speaks to a hand that sends its state to whoever last sent it a command.
+    """Speaks to a hand that holds the same key.
 
     Args:
-        address: Host and port of the hand.
+        address: Host and port of the hand; without a host, this computer.
         joints: Names of its joints, in its order.
         fingers: Names of its sensing fingers, in its order.
+        key: Shared key (:func:`~robotics_bridge.deploy.frames.read_key`).
+        max_age: Oldest report that is used (s).
+
+    Raises:
+        UsageError: there is no such host or port, or a number is out of range.
     """
 
-    def __init__(self, address: tuple[str, int], joints: tuple[str, ...], fingers: tuple[str, ...]) -> None:
-        self.address, self.joints, self.fingers = address, joints, fingers
+    def __init__(
+        self,
+        address: tuple[str, int],
+        joints: tuple[str, ...],
+        fingers: tuple[str, ...],
+        key: bytes,
+        *,
+        max_age: float = MAX_AGE,
+    ) -> None:
+        if not 0 < len(joints) <= frames.MOST or len(fingers) > frames.MOST:
+            raise UsageError(
+                f"A hand has 1 to {frames.MOST} joints and at most {frames.MOST} fingers; received {len(joints)} and "
+                f"{len(fingers)}."
+            )
+        if not 0 < max_age <= MOST_AGE:
+            raise UsageError(
+                f"The oldest report that is used is above 0 s, at most {MOST_AGE:g} s; received {max_age!r}."
+            )
+        self.address, self.joints, self.fingers = (address[0] or LOOPBACK, address[1]), joints, fingers
         self.counters = LinkCounters()
-        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        self._socket.setblocking(False)
+        self._key, self._max_age = key, max_age
+        self._nonce, self._greeted = b"", -np.inf
+        self._send_key = b""
+        self._receiver: Receiver | None = None
         self._newest: HandReading | None = None
         self._sequence = 0
         self._stopped = False
-        # An empty greeting tells the hand where to send its state, and moves nothing.
-        self._send(encode(COMMAND, [], joints=0))
+        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._socket.setblocking(False)
+        try:
+            # Connected: the system binds it to the one interface on the way and drops what other sources send.
+            self._socket.connect(self.address)
+        except (OSError, OverflowError, UnicodeError) as error:
+            self._socket.close()
+            raise UsageError(f"There is no way to a hand at {self.address[0]}:{self.address[1]} ({error}).") from error
+        self._greet(time.monotonic())
 
     def read(self) -> HandReading | None:
         """Return the newest report, the same one again if nothing came, or None before the first."""
-        for _ in range(_MOST):
+        for _ in range(MOST_AT_ONCE):
             try:
-                data = self._socket.recv(_LARGEST)
+                data = self._socket.recv(frames.LARGEST + 1)
             except BlockingIOError:
                 break
             except OSError as error:  # nobody listens there (any more): silence, which the watchdog hears
                 self._note(error)
                 break
-            self._take(data)
+            now = time.monotonic()
+            if not (self._take(data, now) or self._welcomed(data, now)):
+                self.counters.damaged += 1
+        if self._newest is None and not self._stopped and time.monotonic() - self._greeted > GREET_EVERY:
+            self._greet(time.monotonic())
         return self._newest
 
-    def _take(self, data: bytes) -> None:
-        message, counters = decode(data), self.counters
+    def _greet(self, now: float) -> None:
+        # A new nonce each time, so that the answer is as young as its greeting.
+        self._nonce, self._greeted = secrets.token_bytes(frames.NONCE), now
+        hello = Frame(frames.HELLO, len(self.joints), len(self.fingers), 0, now, self._nonce)
+        self._send(frames.encode(hello, self._key))
+
+    def _welcomed(self, data: bytes, now: float) -> bool:
+        """Begin the session that the hand offers; return False where the datagram offers none."""
+        welcome = frames.decode(data, self._key)
+        if welcome is None or welcome.kind != frames.WELCOME:
+            return False
+        ours, theirs = welcome.body[: frames.NONCE], welcome.body[frames.NONCE :]
+        if ours != self._nonce or now - self._greeted > GREET_EVERY:
+            self.counters.stale += 1
+            return True
+        self._send_key, key = frames.session_keys(self._key, ours, theirs)
+        self._nonce = b""  # a greeting begins one session
+        # The welcome was under way for at most GREET_EVERY: later reports cannot all be much older unnoticed.
+        offset = ClockOffset()
+        offset.age(welcome.time, now, now)
+        self._receiver, self._sequence = Receiver(key, self._max_age, offset), 0
+        self._command(frames.START)
+        return True
+
+    def _take(self, data: bytes, now: float) -> bool:
+        """Take a report; return False where the datagram is none of this session and hand."""
+        frame = frames.decode(data, self._receiver.key) if self._receiver is not None else None
         joints, fingers = len(self.joints), len(self.fingers)
-        if message is None or (message.kind, message.joints, message.fingers) != (STATE, joints, fingers):
-            counters.damaged += 1
-            return
-        last = self._newest.sequence if self._newest is not None else message.sequence - 1
-        # UDP may change the order: an older report that comes late is dropped, and was counted as lost before.
-        if message.sequence <= last:
-            counters.late += 1
-            counters.lost = max(0, counters.lost - 1)
-            return
+        if frame is None or self._receiver is None or frame.kind != frames.STATE:
+            return False
+        if (frame.joints, frame.fingers) != (joints, fingers):
+            return False
+        counters = self.counters
+        verdict, skipped = self._receiver.judge(frame, now)
+        counters.lost += skipped
+        if verdict != "new":
+            setattr(counters, verdict, getattr(counters, verdict) + 1)
+            # UDP may change the order: an older report that comes late was counted as lost before.
+            counters.lost = max(0, counters.lost - (verdict == "late"))
+            return True
         counters.received += 1
-        counters.lost += message.sequence - last - 1
-        position, velocity, pressure = np.split(message.values, [joints, 2 * joints])
-        self._newest = HandReading(
-            message.sequence, message.time, time.monotonic(), position, velocity, pressure.reshape(fingers, 3)
-        )
+        position, velocity, pressure = np.split(frame.values, [joints, 2 * joints])
+        self._newest = HandReading(frame.sequence, frame.time, now, position, velocity, pressure.reshape(fingers, 3))
+        return True
 
     def send(self, targets: NDArray[np.float64]) -> None:
         """Ask the position drives for targets [J] (rad).
 
         Raises:
-            UsageError: there are not as many targets as joints.
+            UsageError: there are not as many targets as joints, or one is not finite; the hand was told to hold.
         """
-        if np.shape(targets) != (len(self.joints),):
-            raise UsageError(f"A command has {len(self.joints)} targets; received {np.shape(targets)}.")
+        body = frames.pack_values(targets) if np.shape(targets) == (len(self.joints),) else b""
+        # As they would be sent: a large double is infinite as a float.
+        if not (body and np.isfinite(np.frombuffer(body, "<f4")).all()):
+            self.stop()
+            raise UsageError(f"A command is {len(self.joints)} finite targets (rad); received {str(targets)[:80]}.")
         if not self._stopped:
-            self._send(self._command(targets))
+            self._command(frames.COMMAND, body)
 
     def stop(self) -> None:
         """Hold where the hand is, and refuse targets until it is connected anew."""
         self._stopped = True
-        where = self._newest.position if self._newest is not None else np.zeros(len(self.joints))
-        message = self._command(where, STOP)
-        # The one message that must not be lost; the hand's own watchdog is behind it.
+        # The one frame that must not be lost; the hand's own watchdog is behind it.
         for _ in range(5):
-            self._send(message)
+            self._command(frames.STOP)
 
-    def _command(self, targets: NDArray[np.float64], flags: int = 0) -> bytes:
+    def _command(self, kind: int, body: bytes = b"") -> None:
+        if not self._send_key:
+            return  # no session yet: nothing can move
         self._sequence += 1
-        facts = {"sequence": self._sequence, "time": time.monotonic(), "flags": flags}
-        return encode(COMMAND, targets, joints=len(self.joints), **facts)
+        frame = Frame(kind, len(self.joints), len(self.fingers), self._sequence, time.monotonic(), body)
+        self._send(frames.encode(frame, self._send_key))
 
     def close(self) -> None:
         """End the connection."""
@@ -166,7 +185,7 @@ class UdpDriver:
 
     def _send(self, data: bytes) -> None:
         try:
-            self._socket.sendto(data, self.address)
+            self._socket.send(data)
         except OSError as error:
             self._note(error)
 

@@ -9,6 +9,7 @@ from typing import Any
 from brainbench.core.devices import pick_device
 from brainbench.core.errors import UsageError, unknown_name
 from robotics_bridge.hands.observations import observation_type
+from robotics_bridge.physics.state import MOST_ENVS
 
 ENGINES = ("mujoco", "warp")
 
@@ -52,8 +53,8 @@ class EnvOptions:
     """
 
     def __post_init__(self) -> None:
-        if self.num_envs < 1:
-            raise UsageError(f"There must be at least one environment; received {self.num_envs}.")
+        if not 1 <= self.num_envs <= MOST_ENVS:
+            raise UsageError(f"There are 1 to {MOST_ENVS:,} environments; received {self.num_envs}.")
         object.__setattr__(self, "engine", self.engine or ("mujoco" if self.device == "cpu" else "warp"))
         if self.engine not in ENGINES:
             raise unknown_name("engine", self.engine or "", ENGINES)

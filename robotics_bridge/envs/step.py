@@ -107,13 +107,16 @@ def compute_step(state: EnvState, reset: EpisodeReset) -> StepResult:
 
 def isolate_diverged(state: EnvState) -> torch.Tensor:
     """Return which environments [B] diverged, and put numbers back into them until they are reset."""
-    simulation = state.simulation
+    simulation, action = state.simulation, state.episode.action
     # A sum times zero is NaN as soon as one of its terms is NaN or infinite: one number per environment to look at.
     flaw = (simulation.qpos.sum(dim=1) * 0 + simulation.qvel.sum(dim=1) * 0).isnan()
+    # The engine may have ignored targets of no numbers; rewards and observations would pass the action on.
+    flaw |= (action.sum(dim=1) * 0).isnan()
     diverged = flaw | (simulation.qvel.abs() > _DIVERGED_SPEED).any(dim=1)
     column = diverged.unsqueeze(1)
     simulation.qpos.copy_(torch.where(column, simulation.start, simulation.qpos))
     simulation.qvel.masked_fill_(column, 0.0)
+    action.masked_fill_(column, 0.0)
     state.actuators.power.copy_(torch.nan_to_num(state.actuators.power) * ~column)
     state.contacts.forces.masked_fill_(column.unsqueeze(2), 0.0)
     return diverged

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from brainbench.core.devices import mujoco_module
 from brainbench.core.errors import UsageError
 from robotics_bridge.physics.scene import TouchScene
-from robotics_bridge.physics.state import HandState
+from robotics_bridge.physics.state import MOST_ENVS, HandState
 from robotics_bridge.physics.variants import check_fields
 
 mujoco = mujoco_module()
@@ -49,8 +49,8 @@ class MujocoEngine:
         assignment: Sequence[int] = (),
         contacts: int = 64,
     ) -> None:
-        if num_envs < 1:
-            raise UsageError(f"An engine needs at least one environment; received {num_envs}.")
+        if not 1 <= num_envs <= MOST_ENVS:
+            raise UsageError(f"An engine has 1 to {MOST_ENVS:,} environments; received {num_envs}.")
         models = list(model) if isinstance(model, (list, tuple)) else [model]
         self.model: Any = models[0]
         """The model, or the first of its variants."""

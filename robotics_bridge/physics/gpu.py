@@ -15,7 +15,7 @@ from brainbench.core.devices import pick_device, warp
 from brainbench.core.errors import MissingDependencyError, UsageError, unknown_name
 from robotics_bridge.physics.kernels.state import fill_contacts, fill_links
 from robotics_bridge.physics.scene import TouchScene
-from robotics_bridge.physics.state import HandState
+from robotics_bridge.physics.state import MOST_ENVS, HandState
 from robotics_bridge.physics.variants import check_fields, differing_fields
 
 _DERIVED = ("dof_length",)
@@ -54,8 +54,8 @@ class MujocoWarpEngine:
         constraints: int | None = None,
     ) -> None:
         self._engine = _mujoco_warp()
-        if num_envs < 1:
-            raise UsageError(f"An engine needs at least one environment; received {num_envs}.")
+        if not 1 <= num_envs <= MOST_ENVS:
+            raise UsageError(f"An engine has 1 to {MOST_ENVS:,} environments; received {num_envs}.")
         wp = warp()
         self._device = pick_device(device)
         models = list(model) if isinstance(model, (list, tuple)) else [model]

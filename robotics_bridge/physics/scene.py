@@ -26,6 +26,9 @@ KINDS = ("plane", "sphere", "capsule", "ellipsoid", "cylinder", "box", "mesh", "
 _MUJOCO_KINDS = {0: "plane", 2: "sphere", 3: "capsule", 4: "ellipsoid", 5: "cylinder", 6: "box", 7: "mesh"}
 _SIZES = {"plane": 0, "sphere": 1, "capsule": 2, "ellipsoid": 3, "cylinder": 2, "box": 3, "mesh": 0, "other": 0}
 
+LONGEST_STEP = 0.1
+"""Longest time step of an engine (s); contacts of hands need a hundredth of it."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class Geometry:
@@ -198,8 +201,12 @@ class TouchScene:
             assignment: variant of each environment, as in :class:`Variants`; empty means each in turn.
 
         Raises:
-            UsageError: the variants have different links or geometries.
+            UsageError: the variants have different links or geometries, or the time step is no sensible time.
         """
+        if not 0 < (timestep := float(model.opt.timestep)) <= LONGEST_STEP:
+            raise UsageError(
+                f"A step of the engine lasts more than 0 s, at most {LONGEST_STEP:g} s; received {timestep}."
+            )
         links = tuple(_name(model, 1, index) for index in range(model.nbody))
         geometries = _geometries(model, links)
         variants: dict[int, Variants] = {}

@@ -22,6 +22,8 @@ DIVERGED = 1
 """Bit of :attr:`HandState.status`: a pose or velocity of the environment is not a finite number."""
 CROWDED = 2
 """Bit of :attr:`HandState.status`: contacts were lost because there was no room for them."""
+MOST_ENVS = 1_000_000
+"""Most environments at once; more is a slip of the keys that would fill the memory."""
 
 
 @dataclass(eq=False)
@@ -62,11 +64,11 @@ class HandState:
             device: ``cpu`` or ``cuda``.
 
         Raises:
-            UsageError: fewer than one environment or link, or negative room.
+            UsageError: no or too many environments, no link, or negative room.
         """
-        if num_envs < 1 or num_links < 1 or contacts < 0:
+        if not 1 <= num_envs <= MOST_ENVS or num_links < 1 or contacts < 0:
             raise UsageError(
-                "A state needs at least one environment and one link and no negative room for contacts; received "
+                f"A state needs 1 to {MOST_ENVS:,} environments, one link and no negative room for contacts; received "
                 f"{num_envs}, {num_links} and {contacts}."
             )
         wp, device = warp(), pick_device(device)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,24 +13,21 @@ import numpy as np
 import torch
 
 from brainbench.core.errors import DataError, unknown_name
-from brainbench.core.files import atomic_path, provenance, write_json
+from brainbench.core.files import atomic_path, file_hash, provenance, write_json
 from brainbench.models.activations import evaluating
-from brainbench.models.export import onnx_session, require_onnx
+from brainbench.models.export import require_onnx
+from robotics_bridge.policies.contract import FORMATS, check_contract
+from robotics_bridge.policies.runners import Runner, read_policy
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
     from robotics_bridge.policies.student import TactilePolicy
 
-SUFFIXES = {"onnx": ".onnx", "jit": ".pt"}
+SUFFIXES = dict(zip(FORMATS, (".onnx", ".pt"), strict=True))
 """Formats and their suffixes: ONNX, and TorchScript."""
 TOLERANCE = 1e-4
 """Largest difference of an action between file and policy, relative to the largest action."""
 STEPS = 60
 """Steps of the comparison; rows are reset on the way."""
-
-Runner = Callable[[Mapping[str, "NDArray[np.float32]"], bool], "NDArray[np.float32]"]
-"""(groups of one row [n…], forget first) → actions [A]."""
 
 
 @dataclass(frozen=True)
@@ -67,12 +64,25 @@ def export_policy(
     Raises:
         UsageError: there is no such format.
         MissingDependencyError: a package of the extra ``export`` is missing, for ``onnx``.
-        DataError: the file does not compute what the policy does.
+        DataError: the file does not compute what the policy does, or the contract has values out of range.
     """
     if format not in SUFFIXES:
         raise unknown_name("format of a policy", format, SUFFIXES)
     target = Path(path)
     target = target if target.suffix else target.with_suffix(SUFFIXES[format])
+    contract = {
+        "policy": name or type(policy).__name__,
+        "format": format,
+        "file": target.name,
+        # A list: the order counts, and JSON keeps that of lists alone.
+        "inputs": [[key, list(shape)] for key, shape in policy.shapes.items()],
+        "state": policy.core.state_size,
+        "reset": "a state of zeros is the one before the first step" if format == "onnx" else "call reset()",
+        "network": policy.config,
+        "deployment": dict(deployment or {}),
+        "provenance": provenance(),
+    }
+    check_contract(contract, target.name)
     with atomic_path(target) as temporary, warnings.catch_warnings():
         # The exporters warn of their own parts' deprecations, which nobody here can act on.
         warnings.simplefilter("ignore")
@@ -84,20 +94,10 @@ def export_policy(
                 f"The exported file differs from the policy by {difference:.2g} of the largest action (allowed "
                 f"{TOLERANCE:g}), so it was not kept."
             )
-    contract = {
-        "policy": name or type(policy).__name__,
-        "format": format,
-        "file": target.name,
-        # A list: the order counts, and JSON keeps that of lists alone.
-        "inputs": [[key, list(shape)] for key, shape in policy.shapes.items()],
-        "state": policy.core.state_size,
-        "reset": "a state of zeros is the one before the first step" if format == "onnx" else "call reset()",
-        "network": policy.config,
-        "difference": difference,
-        "deployment": dict(deployment or {}),
-        "provenance": provenance(),
-    }
-    file = write_json(target.with_name(f"{target.name}.json"), contract)
+    file = write_json(
+        target.with_name(f"{target.name}.json"),
+        {**contract, "difference": difference, "sha256": file_hash(target, length=64)},
+    )
     return PolicyExport(target, file, format, policy.core.state_size, difference)
 
 
@@ -117,62 +117,6 @@ def _write(policy: TactilePolicy, path: Path, format: str) -> None:
     if program is None:
         raise DataError("PyTorch gave no ONNX program for this policy.")
     program.save(str(path), external_data=False)
-
-
-def read_policy(
-    path: str | Path, shapes: Mapping[str, tuple[int, ...]], *, format: str = "onnx", threads: int | None = None
-) -> Runner:
-    """Return an exported policy as a function of one step of one hand that remembers.
-
-    Args:
-        path: The file.
-        shapes: Group → shape, in the order of the contract's ``inputs``.
-        format: ``onnx`` or ``jit``.
-        threads: Threads that ONNX Runtime computes with; its own choice if None.
-
-    Raises:
-        DataError: the file cannot be read, or has other inputs.
-    """
-    if format == "jit":
-        return _JitRunner(path, shapes)
-    return _OnnxRunner(path, shapes, threads)
-
-
-class _OnnxRunner:
-    def __init__(self, path: str | Path, shapes: Mapping[str, tuple[int, ...]], threads: int | None) -> None:
-        try:
-            self.session = onnx_session(path, threads)
-        except Exception as error:  # ONNX Runtime's own classes of errors have no common public base
-            raise DataError(f"{str(path)!r} cannot be read as an ONNX policy ({error}).") from error
-        inputs = {item.name: item.shape for item in self.session.get_inputs()}
-        missing = sorted({*shapes, "h_in"} - set(inputs))
-        if missing:
-            raise DataError(
-                f"The exported policy has no input {missing[0]!r} (it has {', '.join(inputs)}), so a part of the "
-                "policy was lost on the way."
-            )
-        self.names, self.size = tuple(shapes), int(inputs["h_in"][1])
-        self.state = np.zeros((1, self.size), np.float32)
-
-    def __call__(self, obs: Mapping[str, NDArray[np.float32]], forget: bool = False) -> NDArray[np.float32]:
-        if forget:
-            self.state = np.zeros((1, self.size), np.float32)
-        feed = {name: np.asarray(obs[name], np.float32)[None] for name in self.names}
-        actions, self.state = self.session.run(["actions", "h_out"], {**feed, "h_in": self.state})
-        return np.asarray(actions)[0]
-
-
-class _JitRunner:
-    def __init__(self, path: str | Path, shapes: Mapping[str, tuple[int, ...]]) -> None:
-        self.module = torch.jit.load(str(path))
-        self.names = tuple(shapes)
-
-    def __call__(self, obs: Mapping[str, NDArray[np.float32]], forget: bool = False) -> NDArray[np.float32]:
-        if forget:
-            self.module.reset()
-        flat = np.concatenate([np.asarray(obs[name], np.float32).reshape(-1) for name in self.names])
-        with torch.no_grad():
-            return self.module(torch.from_numpy(flat)[None])[0].numpy()
 
 
 def compare(policy: TactilePolicy, run: Runner) -> float:

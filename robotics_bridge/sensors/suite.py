@@ -13,7 +13,7 @@ from brainbench.core.cuda_graphs import record_launches
 from brainbench.core.devices import pick_device, warp
 from brainbench.core.errors import UsageError, unknown_name
 from robotics_bridge.physics.scene import TouchScene
-from robotics_bridge.physics.state import DIVERGED, HandState
+from robotics_bridge.physics.state import DIVERGED, MOST_ENVS, HandState
 from robotics_bridge.sensors.context import ReadoutSlice, SuiteContext, UpdateClock
 from robotics_bridge.sensors.fidelity import SensorFidelity
 from robotics_bridge.sensors.probes.runtime import DistanceRuntime
@@ -80,8 +80,8 @@ class SensorSuite:
         if fidelity is not None:
             sensors, resolution = fidelity.apply(sensors), resolution or fidelity.resolution
         resolution = resolution or 64
-        if num_envs < 1:
-            raise UsageError(f"A suite serves at least one environment; received {num_envs}.")
+        if not 1 <= num_envs <= MOST_ENVS:
+            raise UsageError(f"A suite serves 1 to {MOST_ENVS:,} environments; received {num_envs}.")
         self.scene, self.sensors = scene, dict(sensors)
         self.num_envs, self.device = num_envs, pick_device(device)
         groups: dict[Any, dict[str, Sensor]] = {}

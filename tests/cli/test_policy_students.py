@@ -5,17 +5,13 @@ from __future__ import annotations
 import json
 
 import pytest
-import torch
-from tensordict import TensorDict
 from typer.testing import CliRunner
 
 from brainbench.cli import app
-from brainbench.core.errors import UsageError
+from brainbench.core.errors import BrainbenchError, UsageError
 from brainbench.core.files import write_json
-from robotics_bridge import hands
-from robotics_bridge.policies.export import export_policy
-from robotics_bridge.policies.student import TactilePolicy
 from robotics_bridge.policies.training.distill_config import DistillConfig
+from tests.factories.policies import export_small
 
 
 def _run(*arguments: object, code: int = 0) -> str:
@@ -68,36 +64,19 @@ def test_report_tests_students_against_each_other_beyond_the_spread_of_seeds(tmp
         _run("report", next(tmp_path.glob("*none_seed0")), "--differences")
 
 
-def _exported(folder):
-    """A policy of the XHand1 as brainbench policy export writes it."""
-    hand = hands.load("xhand1")
-    joints = hand.joints
-    obs = TensorDict(
-        {"proprio": torch.zeros(1, 36), "goal": torch.zeros(1, 1), "tactile": torch.zeros(1, 5, 5, 3)}, [1]
-    )
-    with torch.random.fork_rng():
-        torch.manual_seed(0)
-        tactile = {"name": "mlp", "observe": "agg_force", "placement": "tips"}
-        policy = TactilePolicy(obs, {"s": ["proprio", "goal", "tactile"]}, "s", 12, hidden_dims=(16,), tactile=tactile)
-    limits = hand.model.jnt_range
-    mapping = {"names": joints, "default": [0.3] * 12, "scale": [0.1] * 12, "low": limits[:, 0], "high": limits[:, 1]}
-    links = list(hand.layout("med", "tips"))
-    deployment = {
-        "rate": 40, "hand": "xhand1", "observe": "agg_force", "joints": joints, "action_map": mapping, "frozen": {},
-        "links": links, "task": "hold",
-    }  # fmt: skip
-    return export_policy(policy, folder / "policy", deployment=deployment).path
+SHORT = ("--seconds", 2, "--goal", 0.5)
 
 
 @pytest.mark.slow
 def test_deploy_runs_on_the_simulated_hand_and_stops_it_when_readings_are_absurd(tmp_path) -> None:
-    path = _exported(tmp_path)
-    found = json.loads(_run("deploy", path, "--seconds", 2, "--timeout", 1, "--record", tmp_path / "ep", "--json"))
+    path = export_small(tmp_path)
+    found = json.loads(_run("deploy", path, *SHORT, "--timeout", 1, "--record", tmp_path / "ep", "--json"))
     assert found["status"] == "finished", found["reason"]
+    assert list(found["unmeasured"]) == ["goal"]
     assert found["ticks"] > 40
     info = json.loads((tmp_path / "ep" / "meta" / "info.json").read_text())
     assert info["total_frames"] == found["ticks"]
-    stopped = json.loads(_run("deploy", path, "--seconds", 2, "--fault", "absurd=0.5", "--json", code=1))
+    stopped = json.loads(_run("deploy", path, *SHORT, "--fault", "absurd=0.5", "--json", code=1))
     assert "beyond its limits" in stopped["reason"]
 
 
@@ -110,6 +89,36 @@ def test_deploy_refuses_files_without_a_contract_and_unknown_faults(tmp_path) ->
     write_json(tmp_path / "policy.onnx.json", contract)
     with pytest.raises(UsageError, match="does not say 'action_map'"):
         _run("deploy", path)
+
+
+def test_deploy_asks_for_what_is_missing_before_a_hand_is_started(tmp_path, monkeypatch) -> None:
+    path = export_small(tmp_path)
+
+    def started(*_: object, **__: object) -> None:
+        pytest.fail("a hand was started")
+
+    monkeypatch.setattr("robotics_bridge.deploy.simulated_hand.simulated_hand", started)
+    monkeypatch.setattr("robotics_bridge.deploy.udp.UdpDriver", started)
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full" / "file").touch()
+    refused = [
+        ((), r"goal \("),
+        (("--input", "gaol=1"), "'goal'"),
+        (("--input", "goal"), "'goal'"),
+        (("--input", "goal=nan"), "nan"),
+        (("--goal", "inf"), "inf"),
+        (("--goal", 1, "--goal", 2), "2.0"),
+        (("--goal", 1, "--seconds", "nan"), "nan"),
+        (("--goal", 1, "--seconds", -1), "-1"),
+        (("--goal", 1, "--record", tmp_path / "full"), "full"),
+        (("--goal", 1, "--driver", "hand"), "'hand'"),
+        (("--goal", 1, "--driver", "hand:99999999"), "99999999"),
+        (("--goal", 1, "--driver", ":5000"), "--key"),
+        (("--goal", 1, "--driver", ":5000", "--key", tmp_path / "none.key"), r"none\.key"),
+    ]
+    for words, culprit in refused:
+        with pytest.raises(BrainbenchError, match=culprit):
+            _run("deploy", path, *words)
 
 
 @pytest.mark.slow

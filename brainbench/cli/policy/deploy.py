@@ -24,7 +24,7 @@ def export(
 ) -> None:
     """Write a student with normalisers, taxel grid, encoder and head in one file, and compare it step by step."""
     from robotics_bridge.policies.export import STEPS, SUFFIXES, export_policy
-    from robotics_bridge.policies.training.distill import load_student
+    from robotics_bridge.policies.training.student_files import load_student
 
     student, described = load_student(run)
     suffix = SUFFIXES.get(format, "")
@@ -41,13 +41,20 @@ def deploy(
     policy: Annotated[Path, typer.Argument(help="A file of brainbench policy export; its contract lies beside it.")],
     driver: Annotated[
         str,
-        typer.Option(help="sim: a simulated hand of its own process; or HOST:PORT of a hand that speaks its protocol."),
+        typer.Option(
+            help="sim: a simulated hand of its own process; HOST:PORT, or :PORT on this computer, of another."
+        ),
     ] = "sim",
+    key: Annotated[Path | None, typer.Option(help="File with the key that a hand behind a socket holds too.")] = None,
     seconds: Annotated[float, typer.Option(help="How long.")] = 10.0,
     fault: Annotated[
         list[str] | None, typer.Option(help="Of the simulated hand: drop=0.2, jitter=0.03, silent-after=2, …")
     ] = None,
     goal: Annotated[list[float] | None, typer.Option(help="Numbers of the group 'goal', once for each.")] = None,
+    inputs: Annotated[
+        list[str] | None,
+        typer.Option("--input", help="Constant for what the hand cannot measure: NAME=NUMBER or NAME=NUMBER,…"),
+    ] = None,
     timeout: Annotated[float, typer.Option(help="Oldest report to act upon (s).")] = 0.1,
     pressure: Annotated[float, typer.Option(help="Largest force of a finger tip, in the maker's unit.")] = 30.0,
     shadow: Annotated[
@@ -65,45 +72,51 @@ def deploy(
     Exit status 1: it was stopped for safety.
     """
     from robotics_bridge.deploy import session
-    from robotics_bridge.deploy.episodes import SessionRecorder
+    from robotics_bridge.deploy.controller import check_duration
+    from robotics_bridge.deploy.episodes import SessionRecorder, check_folder
     from robotics_bridge.deploy.simulated_hand import Faults, simulated_hand
     from robotics_bridge.deploy.timing import realtime
     from robotics_bridge.deploy.udp import UdpDriver
 
     deployed = session.read_deployed(policy)
+    contract = deployed.contract
+    check_duration(seconds)
+    if record is not None:
+        check_folder(record, contract.rate)
     faults = Faults.parse(fault or [])
-    sources = {}
-    if "goal" in deployed.groups:
-        size = deployed.groups["goal"][0]
-        sources["goal"] = session.constant(goal if goal is not None else [0.0] * size, size)
+    given = _inputs(deployed, goal, inputs or [])
+    remote = None if driver == "sim" else _remote(driver, key, deployed)
+    # What is missing is said before a hand is started or greeted.
+    told = {
+        name: f"{what}: {'simulated beside the hand' if shadow and name == 'tactile' else 'constant'}"
+        for name, what in deployed.require({*given, *(("tactile",) if shadow else ())}).items()
+    }
     with contextlib.ExitStack() as stack:
-        if driver == "sim":
-            address, joints, fingers = stack.enter_context(
-                simulated_hand(deployed.hand, faults=faults, seconds=seconds + 60)
-            )
-        else:
-            address, joints, fingers = _remote(driver, deployed)
-        link = stack.enter_context(UdpDriver(address, joints, fingers))
-        task = str(deployed.deployment.get("task", "deployed policy"))
-        recorder = SessionRecorder(deployed.hand, deployed.rate, task) if record is not None else None
-        fallback = _shadow(deployed, joints) if shadow else None
+        ends = remote or stack.enter_context(simulated_hand(contract.hand, faults=faults, seconds=seconds + 60))
+        address, joints, fingers, secret = ends
+        link = stack.enter_context(UdpDriver(address, joints, fingers, secret))
+        task = str(contract.more.get("task", "deployed policy"))
+        recorder = SessionRecorder(contract.hand, contract.rate, task) if record is not None else None
+        fallback = _shadow(deployed, joints) if shadow else given.pop("tactile", None)
         controller = deployed.controller(
-            link, limits={"timeout": timeout, "pressure": pressure}, sources=sources, fallback=fallback,
+            link, limits={"timeout": timeout, "pressure": pressure}, sources=given, fallback=fallback,
             threads=threads, record=recorder,
         )  # fmt: skip
         with realtime() if ahead else contextlib.nullcontext():
             report = controller.run(seconds)
-    facts: dict[str, Any] = {**vars(report)}
+    facts: dict[str, Any] = {**vars(report), "unmeasured": told}
     if record is not None and recorder is not None and recorder.episode.state:
         facts["episode"] = str(recorder.write(record, joints))
     reason = f" ({report.reason})" if report.reason else ""
     latency = report.latency
+    unmeasured = "".join(f"not measured by the hand: {name} ({what})\n" for name, what in told.items())
     text = (
-        f"{report.status}{reason}: {report.ticks} ticks in {report.seconds:.1f} s\n"
+        f"{unmeasured}{report.status}{reason}: {report.ticks} ticks in {report.seconds:.1f} s\n"
         f"control tick: p50 {latency['p50']:.2f} ms, p99 {latency['p99']:.2f} ms, max {latency['max']:.2f} ms; "
         f"{report.overruns} longer than a control step\n"
         f"reports: {report.link['received']} received, {report.link['lost']} lost, {report.link['late']} late, "
-        f"{report.link['damaged']} damaged; targets limited in {report.limited} ticks\n"
+        f"{report.link['stale']} stale, {report.link['replayed']} replayed, {report.link['damaged']} damaged "
+        f"or forged; targets limited in {report.limited} ticks\n"
         f"{controller.latency.text()}"
     )
     emit(facts, text, as_json=as_json)
@@ -111,20 +124,47 @@ def deploy(
         raise typer.Exit(1)
 
 
-def _remote(text: str, deployed: DeployedPolicy) -> tuple[tuple[str, int], tuple[str, ...], tuple[str, ...]]:
+def _inputs(deployed: DeployedPolicy, goal: list[float] | None, words: list[str]) -> dict[str, Any]:
+    """Return group → its constant, as --goal and --input give them."""
+    from brainbench.core.errors import UsageError, check_name
+    from robotics_bridge.deploy.session import constant
+
+    wanted = [name for name in deployed.groups if name != "proprio"]
+    found: dict[str, Any] = {} if goal is None else {"goal": goal}
+    for word in words:
+        name, _, text = word.partition("=")
+        try:
+            found[name] = [float(number) for number in text.split(",")]
+        except ValueError:
+            raise UsageError(f"An input is NAME=NUMBER or NAME=NUMBER,NUMBER…; received {word[:80]!r}.") from None
+    for name in found:
+        check_name("input that the policy reads and a constant can replace", name, wanted)
+    return {name: constant(name, values, deployed.groups[name]) for name, values in found.items()}
+
+
+def _remote(text: str, key: Path | None, deployed: DeployedPolicy) -> tuple[Any, Any, Any, bytes]:
     from brainbench.core.errors import UsageError
     from robotics_bridge import hands
+    from robotics_bridge.deploy.frames import read_key
 
     host, _, port = text.rpartition(":")
-    if not host or not port.isdigit():
-        raise UsageError(f"A driver is 'sim' or HOST:PORT; received {text!r}.")
-    hand = hands.load(deployed.hand)
-    return (host, int(port)), hand.joints, tuple(hand.fingers)
+    if not (port.isascii() and port.isdigit() and 0 < int(port[:6]) < 65536):
+        raise UsageError(f"A driver is 'sim', HOST:PORT, or :PORT on this computer; received {text[:80]!r}.")
+    if key is None:
+        raise UsageError("A hand behind a socket needs --key FILE: the key that its computer holds too.")
+    hand = hands.load(deployed.contract.hand)
+    return (host, int(port)), hand.joints, tuple(hand.fingers), read_key(key)
 
 
 def _shadow(deployed: DeployedPolicy, joints: tuple[str, ...]) -> Any:
+    from brainbench.core.errors import UsageError
     from robotics_bridge.deploy.simulated_hand import ShadowTouch
 
-    facts = deployed.deployment
-    names = (str(facts[key]) for key in ("observe", "placement", "resolution"))
-    return ShadowTouch(deployed.hand, *names, joints=joints, rate=deployed.rate, sub_steps=int(facts["sub_steps"]))
+    contract = deployed.contract
+    facts = {"observe": contract.observe, **contract.more}
+    if missing := {"placement", "resolution", "sub_steps"} - set(facts):
+        raise UsageError(
+            f"The contract does not say {sorted(missing)[0]!r}, so no touch can be simulated beside the hand."
+        )
+    names = (facts[name] for name in ("observe", "placement", "resolution"))
+    return ShadowTouch(contract.hand, *names, joints=joints, rate=contract.rate, sub_steps=facts["sub_steps"])

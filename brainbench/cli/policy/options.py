@@ -51,7 +51,7 @@ def agent_of(name: str, env: Env, *, seed: int = 0) -> Any:
     if name not in known and not Path(name).exists():
         raise unknown_name("agent", name, known, hint="Or give the folder of a training run.")
     if _student(name):
-        from robotics_bridge.policies.training.distill import load_student
+        from robotics_bridge.policies.training.student_files import load_student
 
         student, _ = load_student(name, device=str(env.device))
         return evaluate.Policy(student)
@@ -60,11 +60,11 @@ def agent_of(name: str, env: Env, *, seed: int = 0) -> Any:
 
 def _student(name: str) -> dict[str, Any]:
     """Return what the configuration of a student's run says; nothing for other agents."""
-    from brainbench.core.files import read_json
+    from robotics_bridge.policies.schema import Values
     from robotics_bridge.policies.shipped import FOLDER
 
     folder = FOLDER / name if not Path(name).exists() and (FOLDER / name).is_dir() else Path(name)
-    facts = read_json(folder / "config.json") if (folder / "config.json").is_file() else {}
+    facts = dict(Values.read(folder / "config.json").values) if (folder / "config.json").is_file() else {}
     return facts if facts.get("brainbench_student") else {}
 
 
@@ -75,11 +75,13 @@ def touch_of(names: list[str]) -> dict[str, Any]:
         UsageError: students with different senses are asked for at once.
     """
     from brainbench.core.errors import UsageError
+    from robotics_bridge.policies.schema import Values
+    from robotics_bridge.policies.training.distill_config import DistillConfig
 
     found: dict[str, dict[str, Any]] = {}
     for name in names:
         if facts := _student(name):
-            kept = facts.get("distill", facts)
+            kept = Values("config.json", facts).part("distill").fields(DistillConfig)
             found[name] = {key: kept[key] for key in TOUCH if key in kept}
     if any(senses != next(iter(found.values())) for senses in found.values()):
         raise UsageError(f"The students {', '.join(found)} feel differently; evaluate them one at a time.")

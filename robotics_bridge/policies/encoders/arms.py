@@ -37,7 +37,11 @@ _COUNTED = 1 << 24
 
 @dataclass(frozen=True, kw_only=True)
 class EncoderConfig:
-    """A tactile encoder and what it reads; plain values only, so that it can stand in a file."""
+    """A tactile encoder and what it reads; plain values only, so that it can stand in a file.
+
+    Raises:
+        UsageError: a size is out of range.
+    """
 
     name: str = AUTO
     """An arm (:data:`ARMS`), or the name of a network."""
@@ -62,6 +66,14 @@ class EncoderConfig:
     """Options of the builder of a network, such as ``{"unroll": "full"}``."""
     calibration: HandCalibration = field(default_factory=HandCalibration)
     """Force and moment that are one unit to a network."""
+
+    def __post_init__(self) -> None:
+        for name, most in (("slots", 1000), ("features", 8192)):
+            value = getattr(self, name)
+            if type(value) is not int or not 1 <= value <= most:
+                raise UsageError(
+                    f"{name!r} of a tactile encoder is a whole number from 1 to {most}; received {value!r}."
+                )
 
     @classmethod
     def of(cls, value: Mapping[str, Any] | EncoderConfig) -> EncoderConfig:

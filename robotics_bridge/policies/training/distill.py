@@ -11,7 +11,6 @@ from aggregated ones, together with decoders of what the teacher knows (thesis, 
 
 from __future__ import annotations
 
-import json
 import logging
 import math
 import time
@@ -21,26 +20,23 @@ from pathlib import Path
 from typing import Any, Literal
 
 import torch
-from safetensors import SafetensorError
-from safetensors.torch import load_file, save_file
-from tensordict import TensorDict
 from torch import nn
 
-from brainbench.core.errors import DataError, UsageError
-from brainbench.core.files import atomic_path, provenance, read_json, to_plain, write_json
+from brainbench.core.errors import UsageError
+from brainbench.core.files import provenance, read_json, to_plain, write_json
 from brainbench.core.progress import Progress
 from brainbench.models.training.run_folder import RunLog, load_state, save_state
 from robotics_bridge.policies.encoders.arms import perceptron
 from robotics_bridge.policies.evaluate import Policy
-from robotics_bridge.policies.shipped import policy_path
 from robotics_bridge.policies.student import TACTILE, TactilePolicy
 from robotics_bridge.policies.training.cuda_graph_step import ChunkStep
 from robotics_bridge.policies.training.distill_config import DistillConfig
 from robotics_bridge.policies.training.rollouts import Recorder, Rollout
+from robotics_bridge.policies.training.student_files import CONFIG, MODEL, build_student, save_student
 
 _log = logging.getLogger(__name__)
 
-CONFIG, MODEL, STATE = "config.json", "model.safetensors", "state.safetensors"
+STATE = "state.safetensors"
 _LEAST_VARIANCE = 1e-4
 
 
@@ -339,28 +335,6 @@ class _Run:
         ]
 
 
-def build_student(
-    config: DistillConfig, shapes: Mapping[str, tuple[int, ...]], groups: list[str], actions: int
-) -> TactilePolicy:
-    """Return a student with new weights (the global random state).
-
-    Args:
-        config: What is distilled.
-        shapes: Group → shape per environment.
-        groups: What the student reads.
-        actions: A.
-
-    Raises:
-        UsageError: the shapes do not fit the tactile encoder.
-    """
-    example = TensorDict({name: torch.zeros(1, *shapes[name]) for name in groups}, batch_size=[1])
-    tactile = config.tactile
-    return TactilePolicy(
-        example, {"student": groups}, "student", actions, hidden_dims=config.hidden, embedder=config.embedder,
-        tactile=tactile.plain() if tactile is not None else None,
-    )  # fmt: skip
-
-
 def describe_run(config: DistillConfig, student: TactilePolicy, env: Any) -> dict[str, Any]:
     """Return what a run's ``config.json`` holds: the student, its input, and what a robot needs to run it."""
     actions = env.action_map
@@ -386,38 +360,3 @@ def describe_run(config: DistillConfig, student: TactilePolicy, env: Any) -> dic
         },
         "provenance": provenance(),
     }
-
-
-def save_student(path: Path, student: TactilePolicy) -> None:
-    """Write a student's weights and normalisers."""
-    state = {name: value.detach().cpu().contiguous().clone() for name, value in student.state_dict().items()}
-    with atomic_path(path) as temporary:
-        save_file(state, temporary)
-
-
-def load_student(folder: str | Path, *, device: str = "cpu") -> tuple[TactilePolicy, dict[str, Any]]:
-    """Return a distilled student in evaluation mode, and its run's configuration.
-
-    Args:
-        folder: Of a run, or a name of :func:`~robotics_bridge.policies.shipped.list_policies`.
-        device: Of its weights.
-
-    Raises:
-        UsageError: there is no such folder or name.
-        DataError: the folder holds no student, or its weights are damaged.
-    """
-    folder = policy_path("student", folder)
-    described = read_json(folder / CONFIG)
-    if not isinstance(described, dict) or described.get("brainbench_student") != 1:
-        raise DataError(f"{str(folder)!r} holds no student; brainbench policy distill makes one.")
-    if not (folder / MODEL).is_file():
-        raise DataError(f"The student in {str(folder)!r} has no weights yet; its run was interrupted early.")
-    config = DistillConfig.of(described["distill"])
-    shapes = {name: tuple(shape) for name, shape in described["groups"]}
-    with torch.random.fork_rng(devices=[]):
-        student = build_student(config, shapes, list(shapes), int(described["actions"]))
-    try:
-        student.load_state_dict(load_file(folder / MODEL))
-    except (SafetensorError, RuntimeError, json.JSONDecodeError) as error:
-        raise DataError(f"The weights in {str(folder)!r} are damaged or of another student ({error}).") from error
-    return student.to(device).eval(), described

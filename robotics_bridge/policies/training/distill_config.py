@@ -14,6 +14,8 @@ from robotics_bridge.tasks.settings import StudentSettings
 
 LOSSES = ("mse", "inv_var_mse")
 """``inv_var_mse``: each action's squared error over the variance of the teacher's action in the rollout."""
+MOST = {"learning_rate": 1.0, "clip": 100.0, "max_grad_norm": 1e6}
+"""Largest value of settings that are numbers above 0."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -90,6 +92,10 @@ class DistillConfig:
                 raise unknown_name(name, value, allowed)
         if not 0 <= self.teacher_share <= 1:
             raise UsageError(f"The teacher's share lies between 0 and 1; received {self.teacher_share!r}.")
+        for name in ("learning_rate", "clip", "max_grad_norm"):
+            value = getattr(self, name)
+            if value is not None and not (isinstance(value, (int, float)) and 0 < value <= MOST[name]):
+                raise UsageError(f"{name} is a number above 0, at most {MOST[name]:g}; received {value!r}.")
         positive = {"num_envs", "steps_per_env", "save_interval", "iterations", "epochs", "gradient_length"}
         for name in (*sorted(positive), "teacher_iterations", "aggregate", "seed"):
             value, least = getattr(self, name), int(name in positive)

@@ -76,5 +76,5 @@ def load(path: str | os.PathLike[str], device: str = "cpu") -> Any:
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
             metadata = file.metadata() or {}
         return restore(json.loads(metadata["tree"]), tensors)
-    except (SafetensorError, KeyError, json.JSONDecodeError) as error:
-        raise DataError(f"{str(path)!r} is damaged or not one of ours: {error}.") from error
+    except (SafetensorError, LookupError, ValueError, TypeError, AttributeError, RecursionError, OSError) as error:
+        raise DataError(f"{str(path)!r} is damaged or not one of ours: {str(error)[:80]}.") from error

@@ -19,8 +19,9 @@ from robotics_bridge.policies.encoders.taxel_grid import TaxelGrid
 from robotics_bridge.policies.evaluate import Policy, evaluate
 from robotics_bridge.policies.report import EVALUATION, GRADED
 from robotics_bridge.policies.shipped import list_policies
-from robotics_bridge.policies.training.distill import CONFIG, DistillResult, distill, load_student
+from robotics_bridge.policies.training.distill import DistillResult, distill
 from robotics_bridge.policies.training.distill_config import DistillConfig
+from robotics_bridge.policies.training.student_files import CONFIG, load_student
 from robotics_bridge.policies.training.teacher import load_teacher
 
 _log = logging.getLogger(__name__)

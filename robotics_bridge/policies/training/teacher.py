@@ -23,6 +23,7 @@ from brainbench.core.errors import DataError, DataFileNotFoundError, UsageError,
 from brainbench.core.files import file_hash, provenance, read_json, write_json
 from robotics_bridge.envs.rsl_rl import RslRlEnv
 from robotics_bridge.policies.evaluate import Policy
+from robotics_bridge.policies.schema import Values, require_finite
 from robotics_bridge.policies.shipped import policy_path
 from robotics_bridge.policies.training import state_tree
 from robotics_bridge.tasks.settings import TeacherSettings
@@ -333,7 +334,8 @@ def newest(run: Path) -> Path:
     Raises:
         DataFileNotFoundError: the folder holds no model.
     """
-    found = sorted(run.glob("model_*.safetensors"), key=lambda path: int(path.stem.split("_")[1]))
+    numbered = [path for path in run.glob("model_*.safetensors") if path.stem.removeprefix("model_").isdecimal()]
+    found = sorted(numbered, key=lambda path: int(path.stem.removeprefix("model_")))
     if not found:
         raise DataFileNotFoundError(f"{str(run)!r} holds no trained policy (model_<iteration>.safetensors).")
     return found[-1]
@@ -364,18 +366,21 @@ def load_teacher(run: str | Path, env: Env) -> Policy:
     """
     path = Path(run)
     file = model_file(path)
-    facts = read_json(file.parent / "config.json")
-    settings = replace(env.task.teacher, **_plain(facts["settings"]))
+    facts = Values.read(file.parent / "config.json")
+    settings = replace(env.task.teacher, **_plain(facts.part("settings").fields(TeacherSettings)))
     # To learn, a trainer seeds random numbers and spreads the first episodes; who only acts finds all as it was.
     ages = env.episode_length_buf.clone()
     with torch.random.fork_rng(devices=[env.device] if env.device.type == "cuda" else []):
         trainer = Trainer(env, settings)
     env.episode_length_buf.copy_(ages)
     try:
-        trainer.algorithm.get_policy().load_state_dict(state_tree.load(file)["actor"])
-    except RuntimeError as error:
+        weights = state_tree.load(file)["actor"]
+        require_finite(file, weights)
+        trainer.algorithm.get_policy().load_state_dict(weights)
+    except (RuntimeError, TypeError, KeyError, AttributeError) as error:
+        task, hand = (str(facts.values.get(name))[:80] for name in ("task", "hand"))
         raise DataError(
-            f"The policy of {str(path)!r} was trained on {facts['task']!r} with hand {facts['hand']!r} and does not "
+            f"The policy of {str(path)!r} was trained on {task!r} with hand {hand!r} and does not "
             f"fit this environment ({env.task.name!r}, {env.hand.name!r})."
         ) from error
     return Policy(trainer.algorithm.get_policy().to(env.device))

@@ -12,7 +12,7 @@ from brainbench.core.files import read_json
 from robotics_bridge import tasks
 from robotics_bridge.policies.evaluate import Policy
 from robotics_bridge.policies.shipped import FOLDER, list_policies, policy_path
-from robotics_bridge.policies.training.distill import load_student
+from robotics_bridge.policies.training.student_files import load_student
 from robotics_bridge.policies.training.teacher import Trainer, load_teacher
 
 

@@ -10,8 +10,9 @@ import torch
 
 from brainbench.core.errors import DataError, UsageError
 from robotics_bridge.policies.evaluate import Policy
-from robotics_bridge.policies.training.distill import distill, load_student
+from robotics_bridge.policies.training.distill import distill
 from robotics_bridge.policies.training.distill_config import DistillConfig
+from robotics_bridge.policies.training.student_files import load_student
 from tests.factories.task_worlds import Follower, TouchWorld
 
 

@@ -9,8 +9,9 @@ from robotics_bridge import tasks
 from robotics_bridge.deploy.session import read_deployed
 from robotics_bridge.policies.evaluate import Policy
 from robotics_bridge.policies.export import export_policy
-from robotics_bridge.policies.training.distill import distill, load_student
+from robotics_bridge.policies.training.distill import distill
 from robotics_bridge.policies.training.distill_config import DistillConfig
+from robotics_bridge.policies.training.student_files import load_student
 
 SETTINGS = {"task": "in_palm_rotate", "observe": "agg_force", "placement": "tips"}
 
@@ -63,8 +64,8 @@ def test_an_exported_student_knows_its_hand(tmp_path) -> None:
     found = export_policy(student, tmp_path / "policy", deployment=described["deployment"])
     deployed = read_deployed(found.path)
     assert list(deployed.groups) == ["proprio", "goal", "tactile"]
-    assert (deployed.rate, deployed.hand) == (40, "xhand1")
-    assert len(deployed.deployment["links"]) == 5
+    assert (deployed.contract.rate, deployed.contract.hand) == (40, "xhand1")
+    assert len(deployed.contract.links) == 5
     env = tasks.make("in_palm_rotate", num_envs=2, observe="agg_force", placement="tips")
     policy = Policy(student)
     observations = env.reset()

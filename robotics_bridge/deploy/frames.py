@@ -1,0 +1,119 @@
+"""Datagrams between a controller and a hand: their layout, and the keys that authenticate them.
+
+A frame is one datagram, little-endian. Header: 4 bytes ``BBH2``, kind, joints J, fingers F, 0 (u8 each), sequence
+(u32), time of the sender's clock (f64, s). A state carries positions f32[J], velocities f32[J] and pressures f32[F·3];
+a command f32[J] targets; a greeting the controller's nonce (16 bytes), a welcome the controller's and the hand's.
+HMAC-SHA256 (RFC 2104) of all of it ends the frame, 32 bytes.
+"""
+
+from __future__ import annotations
+
+import hmac
+import os
+import secrets
+import struct
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from brainbench.core.errors import DataError, DataFileNotFoundError
+
+MAGIC = b"BBH2"
+HELLO, WELCOME, START, STATE, COMMAND, STOP = range(1, 7)
+"""Kinds: the controller asks for a session, the hand offers one, the controller takes it; then states and commands."""
+LARGEST = 8192
+"""Bytes of the largest datagram that is read: more than a state of :data:`MOST` joints and fingers."""
+MOST = 255
+"""Most joints and fingers of a hand."""
+NONCE, KEY = 16, 32
+"""Bytes of a nonce and of a key."""
+_HEADER = struct.Struct("<4sBBBxId")
+_TAG = 32
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """An authentic datagram."""
+
+    kind: int
+    """:data:`HELLO` to :data:`STOP`."""
+    joints: int
+    """J."""
+    fingers: int
+    """F."""
+    sequence: int
+    """Number of the frame in its session and direction; goes on from 0 after 2³² − 1."""
+    time: float
+    """Time of the sender's clock (s)."""
+    body: bytes = b""
+    """Nonces, or values as f32."""
+
+    @property
+    def values(self) -> NDArray[np.float64]:
+        """Positions (rad), velocities (rad/s) and pressures of a state, targets (rad) of a command, in this order."""
+        return np.frombuffer(self.body, dtype="<f4").astype(np.float64)
+
+
+def pack_values(values: ArrayLike) -> bytes:
+    """Return values as the body of a frame; what is too large for it becomes infinite."""
+    with np.errstate(over="ignore"):
+        return np.asarray(values, dtype="<f4").tobytes()
+
+
+def encode(frame: Frame, key: bytes) -> bytes:
+    """Return the bytes of a frame, authenticated by a key."""
+    head = _HEADER.pack(MAGIC, frame.kind, frame.joints, frame.fingers, frame.sequence & 0xFFFFFFFF, frame.time)
+    return head + frame.body + hmac.digest(key, head + frame.body, "sha256")
+
+
+def decode(data: bytes, key: bytes) -> Frame | None:
+    """Return what a datagram says; None if it has another size or form, or was not made with this key."""
+    if not _HEADER.size + _TAG <= len(data) <= LARGEST:
+        return None
+    signed, tag = data[:-_TAG], data[-_TAG:]
+    if not hmac.compare_digest(hmac.digest(key, signed, "sha256"), tag):
+        return None
+    magic, kind, joints, fingers, sequence, time = _HEADER.unpack_from(signed)
+    sizes = {HELLO: NONCE, WELCOME: 2 * NONCE, START: 0, STATE: 4 * (2 * joints + 3 * fingers), COMMAND: 4 * joints}
+    size = {**sizes, STOP: 0}.get(kind)
+    if magic != MAGIC or len(signed) - _HEADER.size != size or not np.isfinite(time):
+        return None
+    return Frame(kind, joints, fingers, sequence, time, signed[_HEADER.size :])
+
+
+def session_keys(key: bytes, controller: bytes, hand: bytes) -> tuple[bytes, bytes]:
+    """Return the keys (to the hand, to the controller) of a session from the shared key and both nonces."""
+    # Both sides add a fresh nonce, so frames of an earlier session fit no later one; one key per direction, so that no
+    # frame can be sent back to its sender.
+    first, second = (hmac.digest(key, label + controller + hand, "sha256") for label in (b"to hand", b"to controller"))
+    return first, second
+
+
+def new_key() -> bytes:
+    """Return a new random key."""
+    return secrets.token_bytes(KEY)
+
+
+def read_key(path: str | os.PathLike[str]) -> bytes:
+    """Read a key from a file of 64 hexadecimal digits that nobody but its owner can read.
+
+    Raises:
+        DataFileNotFoundError: there is no such file.
+        DataError: it holds no key, or others can read it.
+    """
+    path = Path(path)
+    hint = f"Make one with: (umask 077; openssl rand -hex {KEY} > hand.key), and copy it to the hand's computer."
+    if not path.is_file():
+        raise DataFileNotFoundError(f"There is no key file {str(path)!r}. {hint}")
+    if os.name == "posix" and path.stat().st_mode & 0o077:
+        raise DataError(f"Other users of this computer can read the key {str(path)!r}; run: chmod 600 {path.name}")
+    try:
+        with path.open("rb") as stream:
+            key = bytes.fromhex(stream.read(LARGEST).decode("ascii"))
+    except (OSError, ValueError):
+        key = b""
+    if len(key) != KEY:
+        raise DataError(f"{str(path)!r} holds no key of {2 * KEY} hexadecimal digits. {hint}")
+    return key

@@ -1,0 +1,105 @@
+"""Exported policies as functions of one step of one hand; a file is tried before it may move anything."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+
+from brainbench.core.errors import BrainbenchError, DataError
+from brainbench.models.export import onnx_session, require_onnx
+from robotics_bridge.policies.schema import require_finite
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+Runner = Callable[[Mapping[str, "NDArray[np.float32]"], bool], "NDArray[np.float32]"]
+"""(groups of one row [n…], forget first) → actions [A]."""
+
+
+def read_policy(
+    path: str | Path,
+    shapes: Mapping[str, tuple[int, ...]],
+    *,
+    format: str = "onnx",
+    threads: int | None = None,
+    actions: int | None = None,
+) -> Runner:
+    """Return an exported policy as a function of one step of one hand that remembers.
+
+    Args:
+        path: The file.
+        shapes: Group → shape, in the order of the contract's ``inputs``.
+        format: ``onnx`` or ``jit``.
+        threads: Threads that ONNX Runtime computes with; its own choice if None.
+        actions: A; not checked if None.
+
+    Raises:
+        DataError: the file cannot be read, has other inputs or actions, or holds weights that are not finite.
+        MissingDependencyError: a package of the extra ``export`` is missing, for ``onnx``.
+    """
+    if format == "onnx":
+        require_onnx()
+    try:
+        run: Runner = _JitRunner(path, shapes) if format == "jit" else _OnnxRunner(path, shapes, threads)
+        # A step of zeros shows here, and not with a hand in motion, what a file computes.
+        tried = run({name: np.zeros(shape, np.float32) for name, shape in shapes.items()}, True)
+    except BrainbenchError:
+        raise
+    except Exception as error:  # ONNX, ONNX Runtime and TorchScript have no common public base of errors
+        first = str(error).strip().partition("\n")[0][:80]
+        raise DataError(f"{str(path)!r} cannot be read as a policy in the format {format!r} ({first}).") from error
+    if tried.ndim != 1 or (actions is not None and len(tried) != actions):
+        raise DataError(f"{str(path)!r} gives actions of shape {tried.shape}; its contract has {actions}.")
+    if not np.isfinite(tried).all():
+        raise DataError(f"{str(path)!r} gives actions that are not finite; export the policy again.")
+    return run
+
+
+class _OnnxRunner:
+    def __init__(self, path: str | Path, shapes: Mapping[str, tuple[int, ...]], threads: int | None) -> None:
+        import onnx
+
+        # Weights in other files are refused: a policy is one file, and it must not make us open others.
+        graph = onnx.load(str(path), load_external_data=False).graph
+        if any(item.external_data for item in graph.initializer):
+            raise DataError(f"{str(path)!r} keeps weights in other files; export the policy again.")
+        require_finite(Path(path), {item.name: onnx.numpy_helper.to_array(item) for item in graph.initializer})
+        self.session = onnx_session(path, threads)
+        inputs = {item.name: item.shape for item in self.session.get_inputs()}
+        missing = sorted({*shapes, "h_in"} - set(inputs))
+        if missing:
+            raise DataError(
+                f"The exported policy has no input {missing[0]!r} (it has {', '.join(inputs)}), so a part of the "
+                "policy was lost on the way."
+            )
+        self.names, self.size = tuple(shapes), int(inputs["h_in"][1])
+        self.state = np.zeros((1, self.size), np.float32)
+
+    def __call__(self, obs: Mapping[str, NDArray[np.float32]], forget: bool = False) -> NDArray[np.float32]:
+        if forget:
+            self.state = np.zeros((1, self.size), np.float32)
+        feed = {name: np.asarray(obs[name], np.float32)[None] for name in self.names}
+        actions, self.state = self.session.run(["actions", "h_out"], {**feed, "h_in": self.state})
+        return np.asarray(actions)[0]
+
+
+class _JitRunner:
+    def __init__(self, path: str | Path, shapes: Mapping[str, tuple[int, ...]]) -> None:
+        with warnings.catch_warnings():
+            # PyTorch announces the end of TorchScript; the user who exported to it knows.
+            warnings.simplefilter("ignore")
+            self.module = torch.jit.load(str(path))
+        self.names = tuple(shapes)
+        require_finite(Path(path), self.module.state_dict())
+
+    def __call__(self, obs: Mapping[str, NDArray[np.float32]], forget: bool = False) -> NDArray[np.float32]:
+        if forget:
+            self.module.reset()
+        flat = np.concatenate([np.asarray(obs[name], np.float32).reshape(-1) for name in self.names])
+        with torch.no_grad():
+            return self.module(torch.from_numpy(flat)[None])[0].numpy()

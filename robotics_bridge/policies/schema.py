@@ -1,0 +1,174 @@
+"""Values of a JSON file, read one at a time with their kind and range; errors name the place in the file."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import MISSING, dataclass, fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from brainbench.core.errors import DataError, check_name
+from brainbench.core.files import read_json
+
+_LARGEST_FILE = 4_000_000
+_SHOWN = 80
+_ABSENT = object()
+
+
+@dataclass(frozen=True)
+class Values:
+    """Names and values somewhere in a file. Every method raises :class:`DataError` where a value is not as asked."""
+
+    where: str
+    """The file."""
+    values: Mapping[str, Any]
+    prefix: str = ""
+    """Place in the file, with a dot at its end."""
+
+    @classmethod
+    def read(cls, path: Path) -> Values:
+        """Read a file of at most 4 MB.
+
+        Raises:
+            DataError: it cannot be read, or holds no names and values.
+        """
+        try:
+            small = path.is_file() and path.stat().st_size <= _LARGEST_FILE
+            found = read_json(path) if small else None
+        except (ValueError, RecursionError, OSError) as error:
+            raise DataError(f"{str(path)!r} cannot be read as JSON ({str(error)[:_SHOWN]}).") from error
+        if not isinstance(found, dict):
+            raise DataError(f"{str(path)!r} is no JSON file of names and values with at most {_LARGEST_FILE:,} bytes.")
+        return cls(path.name, found)
+
+    def error(self, name: str, allowed: str, received: Any) -> DataError:
+        """Return the error for a value, of which 80 characters are shown."""
+        shown = "missing" if received is _ABSENT else repr(received)
+        shown = shown if len(shown) <= _SHOWN else f"{shown[:_SHOWN]}…"
+        return DataError(f"{self.prefix + str(name)[:_SHOWN]!r} in {self.where!r} is {shown}; allowed: {allowed}.")
+
+    def get(self, name: str, good: Callable[[Any], bool], allowed: str) -> Any:
+        """Return a value for which ``good`` holds."""
+        value = self.values.get(name, _ABSENT)
+        if not good(value):
+            raise self.error(name, allowed, value)
+        return value
+
+    def part(self, name: str) -> Values:
+        """Return names and values that stand under a name."""
+        found = self.get(name, lambda value: isinstance(value, dict), "names and values")
+        return Values(self.where, found, f"{self.prefix}{name}.")
+
+    def text(self, name: str, options: Iterable[str] = ()) -> str:
+        """Return a text, one of the options if there are any."""
+        known = tuple(options)
+
+        def good(value: Any) -> bool:
+            return isinstance(value, str) and (value in known if known else 0 < len(value) <= 4096)
+
+        return self.get(name, good, ", ".join(known) or "a text of at most 4096 characters")
+
+    def texts(self, name: str, most: int) -> tuple[str, ...]:
+        """Return different texts, at least one."""
+
+        def good(value: Any) -> bool:
+            texts = isinstance(value, list) and all(isinstance(item, str) and item for item in value)
+            return texts and 0 < len(value) <= most and len(set(value)) == len(value)
+
+        return tuple(self.get(name, good, f"1 to {most} different names"))
+
+    def whole(self, name: str, low: int, high: int) -> int:
+        """Return a whole number."""
+
+        def good(value: Any) -> bool:
+            return type(value) is int and low <= value <= high
+
+        return self.get(name, good, f"a whole number from {low} to {high}")
+
+    def number(self, name: str, low: float, high: float) -> float:
+        """Return a finite number."""
+        return float(self.get(name, lambda value: _within(value, low, high), f"a number from {low:.4g} to {high:.4g}"))
+
+    def numbers(self, name: str, count: int, low: float, high: float) -> tuple[float, ...]:
+        """Return so many finite numbers."""
+
+        def good(value: Any) -> bool:
+            return isinstance(value, list) and len(value) == count and all(_within(item, low, high) for item in value)
+
+        return tuple(map(float, self.get(name, good, f"{count} numbers from {low:.4g} to {high:.4g}")))
+
+    def shape(self, name: str, received: Any, most: int) -> tuple[int, ...]:
+        """Return a shape of one to three axes with at most so many numbers, given as a list."""
+        sizes = received if isinstance(received, list) and 0 < len(received) <= 3 else [0]
+        count = 1
+        for size in sizes:
+            count *= min(size, most + 1) if type(size) is int and size > 0 else 0
+        if not 0 < count <= most:
+            raise self.error(name, f"one to three sizes, together at most {most:,} numbers", received)
+        return tuple(sizes)
+
+    def shapes(self, name: str, most: int) -> dict[str, tuple[int, ...]]:
+        """Return group → shape of a list of [group, shape], each group once."""
+
+        def good(value: Any) -> bool:
+            rows = isinstance(value, list) and all(isinstance(row, list) and len(row) == 2 for row in value)
+            names = [row[0] for row in value] if rows else []
+            return all(isinstance(key, str) and key for key in names) and len(set(names)) == len(names) > 0
+
+        found = self.get(name, good, "a list of [group, shape], each group once")
+        return {key: self.shape(f"{name}.{key}", shape, most) for key, shape in found}
+
+    def fields(self, kind: type) -> dict[str, Any]:
+        """Return all values as those of a dataclass's fields, by the annotation of each.
+
+        Raises:
+            UsageError: the dataclass has no field of a name.
+        """
+        known = {item.name: str(item.type) for item in fields(kind)}
+        for name in self.values:
+            check_name(f"setting in {self.where!r}", str(name)[:_SHOWN], known)
+        required = {item.name for item in fields(kind) if item.default is item.default_factory is MISSING}
+        if missing := sorted(required - set(self.values)):
+            raise self.error(missing[0], known[missing[0]], _ABSENT)
+        found = {}
+        for name, annotation in ((name, known[name]) for name in self.values):
+            plain, _, optional = annotation.partition(" | ")
+            good = _KINDS.get(plain, _KINDS["str"])
+            found[name] = self.get(
+                name, lambda value, g=good, o=optional: g(value) or (o and value is None), annotation
+            )
+        return found
+
+
+def require_finite(path: Path, weights: Mapping[str, Any]) -> None:
+    """Raise :class:`DataError` if arrays or tensors of weights hold values that are not finite."""
+    for name, value in weights.items():
+        array = np.asarray(value.float() if hasattr(value, "float") else value)
+        if array.dtype.kind == "f" and not np.isfinite(array).all():
+            raise DataError(f"The weights {str(name)[:_SHOWN]!r} of {str(path)!r} are not finite.")
+
+
+def _within(value: Any, low: float, high: float) -> bool:
+    # Every comparison with NaN is false; True and False are no numbers here.
+    return type(value) in (int, float) and low <= value <= high
+
+
+_KINDS: dict[str, Callable[[Any], bool]] = {
+    "str": lambda value: isinstance(value, str) and len(value) <= 400,
+    "bool": lambda value: isinstance(value, bool),
+    "int": lambda value: type(value) is int and abs(value) <= 10**12,
+    "float": lambda value: _within(value, -1e12, 1e12),
+    "Mapping[str, Any]": lambda value: isinstance(value, dict),
+    "HandCalibration": lambda value: value is None or isinstance(value, dict),
+    "tuple[int, ...]": lambda value: (
+        isinstance(value, list)
+        and 0 < len(value) <= 32
+        and all(type(item) is int and 0 < item <= 65536 for item in value)
+    ),
+    "tuple[float, float]": lambda value: (
+        isinstance(value, list) and len(value) == 2 and all(_within(item, -1e12, 1e12) for item in value)
+    ),
+}
+"""Annotation of a field → whether a JSON value is of its kind; literals are texts, which their class checks."""

@@ -1,0 +1,101 @@
+"""The files of a student's run: its configuration and weights, written, read and checked."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import load_file, save_file
+from tensordict import TensorDict
+
+from brainbench.core.errors import BrainbenchError, DataError
+from brainbench.core.files import atomic_path
+from robotics_bridge.policies.contract import JOINTS, MOST_NUMBERS
+from robotics_bridge.policies.encoders.arms import EncoderConfig
+from robotics_bridge.policies.schema import Values, require_finite
+from robotics_bridge.policies.shipped import policy_path
+from robotics_bridge.policies.student import TACTILE, TactilePolicy
+from robotics_bridge.policies.training.distill_config import DistillConfig
+
+CONFIG, MODEL = "config.json", "model.safetensors"
+
+
+def build_student(
+    config: DistillConfig, shapes: Mapping[str, tuple[int, ...]], groups: list[str], actions: int
+) -> TactilePolicy:
+    """Return a student with new weights (the global random state).
+
+    Args:
+        config: What is distilled.
+        shapes: Group → shape per environment.
+        groups: What the student reads.
+        actions: A.
+
+    Raises:
+        UsageError: the shapes do not fit the tactile encoder.
+    """
+    example = TensorDict({name: torch.zeros(1, *shapes[name]) for name in groups}, batch_size=[1])
+    tactile = config.tactile
+    return TactilePolicy(
+        example, {"student": groups}, "student", actions, hidden_dims=config.hidden, embedder=config.embedder,
+        tactile=tactile.plain() if tactile is not None else None,
+    )  # fmt: skip
+
+
+def save_student(path: Path, student: TactilePolicy) -> None:
+    """Write a student's weights and normalisers."""
+    state = {name: value.detach().cpu().contiguous().clone() for name, value in student.state_dict().items()}
+    with atomic_path(path) as temporary:
+        save_file(state, temporary)
+
+
+def load_student(folder: str | Path, *, device: str = "cpu") -> tuple[TactilePolicy, dict[str, Any]]:
+    """Return a distilled student in evaluation mode, and its run's configuration.
+
+    Args:
+        folder: Of a run, or a name of :func:`~robotics_bridge.policies.shipped.list_policies`.
+        device: Of its weights.
+
+    Raises:
+        UsageError: there is no such folder or name.
+        DataError: the folder holds no student, or a value or weight is damaged, out of range or not finite.
+    """
+    folder = policy_path("student", folder)
+    described = Values.read(folder / CONFIG)
+    if described.values.get("brainbench_student") != 1:
+        raise DataError(f"{str(folder)!r} holds no student; brainbench policy distill makes one.")
+    if not (folder / MODEL).is_file():
+        raise DataError(f"The student in {str(folder)!r} has no weights yet; its run was interrupted early.")
+    given = described.part("distill")
+    config = DistillConfig.of(given.fields(DistillConfig))
+    if config.encoder_settings:
+        given.part("encoder_settings").fields(EncoderConfig)
+    shapes, actions = described.shapes("groups", MOST_NUMBERS), described.whole("actions", 1, JOINTS)
+    described.part("deployment")
+    try:
+        _require_sizes(folder / MODEL, config, shapes)
+        with torch.random.fork_rng(devices=[]):
+            student = build_student(config, shapes, list(shapes), actions)
+        weights = load_file(folder / MODEL)
+        student.load_state_dict(weights)
+    except BrainbenchError:
+        raise
+    except (SafetensorError, RuntimeError, ValueError, TypeError, LookupError, OSError) as error:
+        first = " ".join(str(error).split())[:120]
+        raise DataError(f"The weights in {str(folder)!r} are damaged or of another student ({first}).") from error
+    require_finite(folder / MODEL, weights)
+    return student.to(device).eval(), dict(described.values)
+
+
+def _require_sizes(path: Path, config: DistillConfig, shapes: Mapping[str, tuple[int, ...]]) -> None:
+    """Compare the sizes that a configuration states with the file's, before networks of that size take memory."""
+    with safe_open(path, "pt") as file:
+        sizes = {name: file.get_slice(name).get_shape() for name in file.keys()}  # noqa: SIM118
+    flat = sum(shape[0] for name, shape in shapes.items() if name != TACTILE)
+    widths = [sizes.get(f"mlp.{2 * index}.bias") for index in range(len(config.hidden))]
+    mean = sizes.get("obs_normalizer._mean", [1, flat])
+    if mean != [1, flat] or widths != [[width] for width in config.hidden]:
+        raise DataError(f"The weights in {str(path.parent)!r} are of another student than {CONFIG} describes.")

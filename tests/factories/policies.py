@@ -1,0 +1,67 @@
+"""Contracts and small exported policies."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import torch
+from tensordict import TensorDict
+
+from brainbench.core.files import write_json
+from robotics_bridge import hands
+from robotics_bridge.policies.export import export_policy
+from robotics_bridge.policies.student import TactilePolicy
+from robotics_bridge.policies.training.distill_config import DistillConfig
+from robotics_bridge.policies.training.student_files import build_student, save_student
+
+
+def contract_of() -> dict[str, Any]:
+    """Return the contract of a hand with three joints, of which actions move two."""
+    mapping = {
+        "names": ["a", "c"], "default": [0.1, 0.2], "scale": [0.5, -0.5], "low": [-1.0, 0.0], "high": [1.0, 0.4],
+    }  # fmt: skip
+    deployment = {
+        "rate": 40, "hand": "xhand1", "joints": ["a", "b", "c"], "action_map": mapping, "frozen": {"b": 0.3},
+        "links": ["l", "m"], "observe": "agg_force", "task": "hold", "sub_steps": 5,
+    }  # fmt: skip
+    inputs = [["proprio", [8]], ["goal", [1]], ["tactile", [5, 2, 3]]]
+    return {"format": "onnx", "file": "policy.onnx", "inputs": inputs, "state": 0, "deployment": deployment}
+
+
+def export_small(folder: Path, *, format: str = "onnx") -> Path:
+    """Write an untrained policy of the XHand1, all of whose joints move, as ``brainbench policy export`` does."""
+    hand = hands.load("xhand1")
+    joints = hand.joints
+    shapes = {"proprio": (36,), "goal": (1,), "tactile": (5, 5, 3)}
+    obs = TensorDict({name: torch.zeros(1, *shape) for name, shape in shapes.items()}, [1])
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        tactile = {"name": "mlp", "observe": "agg_force", "placement": "tips"}
+        policy = TactilePolicy(obs, {"s": list(shapes)}, "s", 12, hidden_dims=(16,), tactile=tactile)
+    limits = hand.model.jnt_range
+    mapping = {"names": joints, "default": [0.3] * 12, "scale": [0.1] * 12, "low": limits[:, 0], "high": limits[:, 1]}
+    deployment = {
+        "rate": 40, "hand": "xhand1", "observe": "agg_force", "joints": joints, "action_map": mapping, "frozen": {},
+        "links": list(hand.layout("med", "tips")), "task": "hold",
+    }  # fmt: skip
+    return export_policy(policy, folder / "policy", format=format, deployment=deployment).path
+
+
+def student_folder(folder: Path) -> Path:
+    """Write the folder of a small untrained student of the XHand1, as ``brainbench policy distill`` does."""
+    config = DistillConfig(
+        task="in_palm_rotate", observe="agg_force", placement="tips", encoder="mlp", hidden=(8,), num_envs=2
+    )
+    shapes = {"proprio": (8,), "goal": (1,), "tactile": (5, 5, 3)}
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        student = build_student(config, shapes, list(shapes), 2)
+    described = {
+        "brainbench_student": 1, "distill": config.plain(), "network": student.config,
+        "groups": [[name, list(shape)] for name, shape in shapes.items()], "actions": 2,
+        "deployment": contract_of()["deployment"],
+    }  # fmt: skip
+    write_json(folder / "config.json", described)
+    save_student(folder / "model.safetensors", student)
+    return folder

@@ -1,0 +1,97 @@
+"""Exported files that are damaged are refused before anything can move."""
+
+from __future__ import annotations
+
+import shutil
+
+import numpy as np
+import onnx
+import pytest
+import torch
+from onnx import numpy_helper
+
+from brainbench.core.errors import BrainbenchError, DataError
+from robotics_bridge.deploy.session import read_deployed
+from robotics_bridge.policies.runners import read_policy
+from tests.factories.mutations import mutate_text
+from tests.factories.policies import export_small
+
+SHAPES = {"proprio": (36,), "goal": (1,), "tactile": (5, 5, 3)}
+
+
+@pytest.fixture(scope="module")
+def exported(tmp_path_factory):
+    return {format: export_small(tmp_path_factory.mktemp(format), format=format) for format in ("onnx", "jit")}
+
+
+def _check_mutants(path, folder, format: str, cases: int) -> None:
+    whole, refused = path.read_bytes(), 0
+    target = folder / path.name
+    shutil.copy(path.with_name(f"{path.name}.json"), folder)
+    for seed in range(cases):
+        target.write_bytes(mutate_text(whole, seed))
+        if target.read_bytes() != whole:
+            with pytest.raises(DataError, match=path.name):
+                read_deployed(target)
+        try:
+            run = read_policy(target, SHAPES, format=format, threads=1, actions=12)
+        except BrainbenchError as error:
+            refused += 1
+            assert "\n" not in str(error)  # noqa: PT017 - of many cases, most raise
+            continue
+        # With other input, weights of 1e35 may still overflow; the control loop looks at each action.
+        assert np.isfinite(run({name: np.zeros(shape, np.float32) for name, shape in SHAPES.items()}, True)).all()
+    assert refused > cases // 4
+
+
+@pytest.mark.parametrize("format", ["onnx", "jit"])
+def test_damaged_files_are_refused_or_compute_finite_actions(exported, tmp_path, format) -> None:
+    _check_mutants(exported[format], tmp_path, format, 30)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("format", ["onnx", "jit"])
+def test_many_damaged_files_are_refused_or_compute_finite_actions(exported, tmp_path, format) -> None:
+    _check_mutants(exported[format], tmp_path, format, 500)
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_weights_that_are_not_finite_are_refused_by_name(exported, tmp_path, value) -> None:
+    model = onnx.load(exported["onnx"])
+    weight = next(item for item in model.graph.initializer if "mlp.0.weight" in item.name)
+    array = numpy_helper.to_array(weight).copy()
+    array.flat[0] = value
+    weight.CopyFrom(numpy_helper.from_array(array, weight.name))
+    onnx.save(model, tmp_path / "policy.onnx")
+    with pytest.raises(DataError, match=r"mlp\.0\.weight"):
+        read_policy(tmp_path / "policy.onnx", SHAPES)
+    with pytest.warns(DeprecationWarning, match="load"):
+        module = torch.jit.load(str(exported["jit"]))
+    with torch.no_grad():
+        next(iter(module.parameters())).view(-1)[0] = value
+    module.save(str(tmp_path / "policy.pt"))
+    with pytest.raises(DataError, match="not finite"):
+        read_policy(tmp_path / "policy.pt", SHAPES, format="jit")
+
+
+def test_weights_in_other_files_are_not_opened(exported, tmp_path) -> None:
+    model = onnx.load(exported["onnx"])
+    onnx.save(model, tmp_path / "policy.onnx", save_as_external_data=True, location="elsewhere", size_threshold=0)
+    with pytest.raises(DataError, match="other files"):
+        read_policy(tmp_path / "policy.onnx", SHAPES)
+
+
+def test_files_that_fit_another_contract_are_refused(exported, tmp_path) -> None:
+    for path, format in ((exported["onnx"], "onnx"), (exported["jit"], "jit")):
+        with pytest.raises(DataError, match=r"\(12,\)"):
+            read_policy(path, SHAPES, format=format, actions=5)
+        for shapes in ({**SHAPES, "goal": (2,)}, {**SHAPES, "tactile": (5, 5)}, {"proprio": (36,)}):
+            with pytest.raises(DataError, match=path.name):
+                read_policy(path, shapes, format=format)
+    with pytest.raises(DataError, match="'thermal'"):
+        read_policy(exported["onnx"], {**SHAPES, "thermal": (3,)})
+    (tmp_path / "empty.onnx").touch()
+    for path in (tmp_path, tmp_path / "empty.onnx", tmp_path / "none.onnx"):
+        for format in ("onnx", "jit"):
+            with pytest.raises(DataError, match=path.name):
+                read_policy(path, SHAPES, format=format)
