@@ -24,8 +24,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from brainbench.core.contracts import CHANNELS, check_stimulus_set
-from brainbench.core.errors import DataError, DataFileNotFoundError, UsageError, unknown_name
+from brainbench.core.errors import DataError, UsageError, unknown_name
 from brainbench.core.files import write_text
+from brainbench.core.reading.texts import read_text
 from brainbench.stimuli.motion.recorded import read_numbers
 from brainbench.stimuli.whiskers.array import MountedWhisker, WhiskerArray, published_whisker
 from brainbench.stimuli.whiskers.selection import ROWS
@@ -215,13 +216,7 @@ def _write(path: Path, lines: Iterable[Iterable[float | str]], end: str = "\n", 
 
 def _names(root: Path) -> list[str]:
     path = root / "param_name.csv"
-    try:
-        text = path.read_text(encoding="utf-8")
-    except FileNotFoundError as error:
-        message = f"There is no file {os.fspath(path)!r}; a WHISKiT parameter folder has one."
-        raise DataFileNotFoundError(message) from error
-    except UnicodeDecodeError as error:
-        raise DataError(f"{os.fspath(path)!r} is not a text file ({error}).") from error
+    text = read_text(path, "table of a WHISKiT parameter folder")
     return [line.strip().rstrip(",") for line in text.splitlines() if line.strip()]
 
 
