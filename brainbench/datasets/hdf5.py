@@ -144,7 +144,9 @@ def read_counts(file: h5py.File, path: Path) -> xr.Dataset:
         dataset = xr.Dataset(variables, coordinates, attributes)
     except ValueError as error:
         raise DataError(f"{path} does not hold a consistent recordings data set ({error}).") from error
-    counts, duration, time = (np.asarray(dataset[name].values, dtype=float) for name in ("counts", "duration", "time"))
+    counts, duration, time = (dataset[name].values for name in ("counts", "duration", "time"))
+    if any(array.dtype.kind not in "fiu" for array in (counts, duration, time)):
+        raise DataError(f"{path} has counts, durations or times that are no numbers.")
     # NaN in the counts means that a unit was not recorded; fmin and fmax pass over it without a copy.
     if counts.size and not (np.fmin.reduce(counts, None) >= 0 and np.fmax.reduce(counts, None) < np.inf):
         raise DataError(f"{path} has counts below 0 or without end, or none at all; a count is 0 or more, or NaN.")

@@ -20,7 +20,7 @@ def check_number(
 ) -> None:
     """Raise a :class:`UsageError` unless ``value`` is a finite number within all bounds, and whole if asked for."""
     kind = isinstance(value, int if whole else (int, float)) and not isinstance(value, bool)
-    if kind and math.isfinite(value) and least <= value <= most and above < value < below:
+    if kind and -math.inf < value < math.inf and least <= value <= most and above < value < below:
         return
     bounds = {"at least": least, "at most": most, "above": above, "below": below}
     told = " and ".join(f"{word} {bound:g}" for word, bound in bounds.items() if math.isfinite(bound))
