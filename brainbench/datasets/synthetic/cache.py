@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from brainbench.core.errors import DataError
-from brainbench.core.files import cache_dir, content_hash, file_hash, read_json
+from brainbench.core.files import cache_dir, check_folder, content_hash, file_hash, read_json
 from brainbench.datasets.synthetic.truth import TRUTH
 
 _ABANDONED = 24 * 3600.0
@@ -34,6 +34,8 @@ def ensure_recordings(name: str, *key: object, make: Callable[[Path], object]) -
     if not _complete(target):
         if (target / TRUTH).exists():
             _log.warning("The %s recordings in %s are damaged and are replaced.", name, target)
+        # Before the stimuli are simulated, which is slow.
+        check_folder(target, "The cache")
         make(target)
         # What a killed process left; a younger file may be one that is being written.
         for item in target.glob(".*"):
