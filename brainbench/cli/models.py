@@ -8,6 +8,7 @@ from typing import Annotated
 
 import typer
 
+from brainbench.cli.destinations import out_file, out_folder
 from brainbench.cli.output import JsonOption, emit, facts, table_of
 from brainbench.core.files import to_plain
 
@@ -96,7 +97,7 @@ def import_(
     file: Annotated[Path, typer.Argument(help="Lightning .ckpt, state dict of PyTorch, or .safetensors.")],
     architecture: Annotated[str | None, typer.Option(help="Registry name, where the file leaves a choice.")] = None,
     config: Annotated[Path | None, typer.Option(help="The run's settings: config.yaml, or its graph in JSON.")] = None,
-    out: Annotated[Path | None, typer.Option("--out", "-o", help="Folder to write.")] = None,
+    out: Annotated[Path | None, typer.Option("--out", "-o", callback=out_folder, help="Folder to write.")] = None,
     as_json: JsonOption = False,
 ) -> None:
     """Turn weights of the published study into a model that can be scored; nothing in the file is executed."""
@@ -118,7 +119,7 @@ def import_(
 def export(
     model: Annotated[str, typer.Argument(help="A registry name, or local-dir:FOLDER of a trained model.")],
     format: Annotated[str, typer.Option(help="onnx, or torch (an exported program).")] = "onnx",
-    out: Annotated[Path | None, typer.Option("--out", "-o", help="File to write.")] = None,
+    out: Annotated[Path | None, typer.Option("--out", "-o", callback=out_file, help="File to write.")] = None,
     seed: Annotated[int, typer.Option(help="Seed of untrained weights.")] = 0,
     as_json: JsonOption = False,
 ) -> None:

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from brainbench.cli.destinations import out_folder
 from brainbench.cli.options import SCORE, option, with_options
 from brainbench.cli.output import JsonOption, emit, progress_bar, table, table_of
 
@@ -122,7 +123,7 @@ def export(
 @app.command("fetch")
 def fetch(
     name: Annotated[str, typer.Argument(help="A layout ('rodgers') or the six digits of a dandiset.")],
-    out: Annotated[Path, typer.Option("--out", "-o", help="Folder to put it in.")] = Path(),
+    out: Annotated[Path, typer.Option("--out", "-o", callback=out_folder, help="Folder to put it in.")] = Path(),
     assets: Annotated[str | None, typer.Option(help="Glob of the files wanted, e.g. 'sub-231CR/*'.")] = None,
     as_json: JsonOption = False,
 ) -> None:

@@ -11,6 +11,7 @@ from typing import Annotated, Any
 
 import typer
 
+from brainbench.cli import destinations
 from brainbench.cli.options import SCORE, SCORE_FLAGS, with_options
 from brainbench.cli.output import JsonOption, emit, progress_bar, table, table_of
 from brainbench.core.files import to_plain
@@ -35,12 +36,17 @@ def score(
         ),
     ],
     options: ScoreOptions,
-    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the record and the report.")] = Path(
-        "brainbench-results"
-    ),
+    out: Annotated[
+        Path,
+        typer.Option("--out", "-o", callback=destinations.out_folder, help="Folder of record and report."),
+    ] = Path("brainbench-results"),
     report_file: Annotated[
         Path | None,
-        typer.Option("--report", help="Also write a report for a paper: FILE.md, FILE.html or FILE.pdf."),
+        typer.Option(
+            "--report",
+            callback=destinations.report_file,
+            help="Also write a report for a paper: FILE.md, FILE.html or FILE.pdf.",
+        ),
     ] = None,
     as_json: JsonOption = False,
 ) -> None:

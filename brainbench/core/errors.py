@@ -29,8 +29,30 @@ class DataFileNotFoundError(DataError, FileNotFoundError):
     exit_code = 2
 
 
+class FileWriteError(DataError, OSError):
+    """A file or a folder cannot be written: no permission, no space, or a file where a folder is needed."""
+
+
 class MissingDependencyError(BrainbenchError, ImportError):
     """An optional package is needed for what was asked."""
+
+
+def shown(value: object, *, quoted: bool = True, most: int = 80) -> str:
+    """Return a value for a message, cut after ``most`` characters; the end of a path is what tells it apart.
+
+    >>> shown("a" * 100, most=10)
+    "'aaaaaaaaaa…'"
+    """
+    if getattr(value, "ndim", None) == 0:
+        value = value.item()  # type: ignore[attr-defined] # of NumPy, whose repr names its type
+    if not isinstance(value, str):
+        value = type(value).__name__ if isinstance(value, int) and value.bit_length() > 999 else repr(value)
+        quoted = False
+    if len(value) > most and "/" in value[-most:] and "\n" not in value:
+        value = value if len(value) <= 4 * most else f"…{value[-most:]}"
+    elif len(value) > most:
+        value = f"{value[:most]}…"
+    return repr(value) if quoted else value
 
 
 def nearest(name: str, options: Iterable[str]) -> str | None:
@@ -59,26 +81,26 @@ def listing(options: Iterable[str], *, limit: int = 12) -> str:
     "'a', 'b' and 1 more"
     """
     choices = list(options)
-    shown = ", ".join(repr(choice) for choice in choices[:limit])
+    text = ", ".join(shown(choice) for choice in choices[:limit])
     if len(choices) > limit:
-        shown += f" and {len(choices) - limit} more"
-    return shown or "none"
+        text += f" and {len(choices) - limit} more"
+    return text or "none"
 
 
-def unknown_name(kind: str, name: str, options: Iterable[str], *, hint: str = "") -> UsageError:
+def unknown_name(kind: str, name: object, options: Iterable[str], *, hint: str = "") -> UsageError:
     """Build the error for a name that is not among ``options``, with the nearest valid one.
 
     >>> str(unknown_name("backend", "mujocco", ["mujoco", "bullet"]))
     "Unknown backend 'mujocco'; did you mean 'mujoco'? Allowed: 'mujoco', 'bullet'."
     """
-    choices = list(options)
-    guess = nearest(name, choices)
+    choices = [str(option) for option in options]
+    guess = nearest(name, choices) if isinstance(name, str) and len(name) < 200 else None
     suggestion = f"; did you mean {guess!r}?" if guess else "."
-    text = f"Unknown {kind} {name!r}{suggestion} Allowed: {listing(choices)}."
+    text = f"Unknown {kind} {shown(name)}{suggestion} Allowed: {listing(choices)}."
     return UsageError(f"{text} {hint}".rstrip())
 
 
-def check_name(kind: str, name: str, options: Iterable[str], *, hint: str = "") -> None:
+def check_name(kind: str, name: object, options: Iterable[str], *, hint: str = "") -> None:
     """Raise the error of :func:`unknown_name` unless a name is among the options."""
     if name not in (choices := list(options)):
         raise unknown_name(kind, name, choices, hint=hint)

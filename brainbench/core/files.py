@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import hashlib
 import json
 import math
@@ -13,10 +14,15 @@ from dataclasses import fields, is_dataclass
 from pathlib import Path
 from typing import Any
 
-from brainbench.core.errors import DataError, DataFileNotFoundError
+from brainbench.core.errors import FileWriteError, UsageError, shown
+from brainbench.core.reading.texts import read_json, read_mapping  # noqa: F401 - also imported from here
 
 CACHE_VARIABLE = "BRAINBENCH_CACHE"
 """Environment variable that overrides the platform's cache folder."""
+_UNWRITABLE = (
+    errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.ENOTDIR, errno.EEXIST,
+    errno.EISDIR, errno.ENAMETOOLONG,
+)  # fmt: skip
 
 
 def cache_dir(*parts: str) -> Path:
@@ -27,8 +33,32 @@ def cache_dir(*parts: str) -> Path:
 
         root = platformdirs.user_cache_dir("brainbench", appauthor=False)
     path = Path(root).expanduser().joinpath(*parts)
-    path.mkdir(parents=True, exist_ok=True)
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise FileWriteError(
+            f"The cache folder {shown(str(path))} cannot be made ({error.strerror}); name a folder that can be written "
+            f"with the environment variable {CACHE_VARIABLE}."
+        ) from error
     return path
+
+
+def check_folder(path: str | os.PathLike[str], option: str) -> None:
+    """Check before slow work that files can be written into a folder, which is made later.
+
+    Args:
+        path: the folder.
+        option: what names it, for the message.
+
+    Raises:
+        UsageError: it, or what it shall stand in, is no folder or may not be written.
+    """
+    place = Path(path).expanduser().absolute()
+    while not os.path.lexists(place):
+        place = place.parent
+    fault = "is no folder" if not place.is_dir() else "may not be written by this user"
+    if not (place.is_dir() and os.access(place, os.W_OK | os.X_OK)):
+        raise UsageError(f"{option} names {shown(os.fspath(path))}, and {shown(str(place))} {fault}; choose another.")
 
 
 @contextlib.contextmanager
@@ -36,19 +66,27 @@ def atomic_path(target: str | os.PathLike[str]) -> Iterator[Path]:
     """Yield a temporary path beside ``target`` that replaces it on success and vanishes on error.
 
     The temporary name keeps the target's suffix, so libraries that choose a format by suffix work.
+
+    Raises:
+        FileWriteError: the folder cannot be made or written, or the disk is full.
     """
     target = Path(target)
-    target.parent.mkdir(parents=True, exist_ok=True)
-    temporary = target.with_name(f".{target.stem}-{secrets.token_hex(8)}{target.suffix}")
-    # Made by hand: tempfile's files are private, and to read the umask is not safe among threads.
-    os.close(os.open(temporary, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
+    temporary = target.with_name(f".{target.stem[:200]}-{secrets.token_hex(8)}{target.suffix}")
     try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        # Made by hand: tempfile's files are private, and to read the umask is not safe among threads.
+        os.close(os.open(temporary, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
         yield temporary
         with temporary.open("rb") as stream:
             os.fsync(stream.fileno())
         temporary.replace(target)
+    except OSError as error:
+        if error.errno not in _UNWRITABLE:
+            raise
+        raise FileWriteError(f"{shown(str(target))} cannot be written ({os.strerror(error.errno)}).") from error
     finally:
-        temporary.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):
+            temporary.unlink(missing_ok=True)
 
 
 def _is_default(value: Any, default: Any) -> bool:
@@ -103,44 +141,6 @@ def write_text(path: str | os.PathLike[str], text: str) -> Path:
 def write_json(path: str | os.PathLike[str], value: Any) -> Path:
     """Write ``value`` as deterministic JSON, atomically."""
     return write_text(path, to_json(value) + "\n")
-
-
-def read_json(path: str | os.PathLike[str]) -> Any:
-    """Read JSON.
-
-    Raises:
-        DataError: the file is missing or is not JSON.
-    """
-    try:
-        return json.loads(Path(path).read_text(encoding="utf-8"))
-    except FileNotFoundError as error:
-        raise DataError(f"There is no file {os.fspath(path)!r}.") from error
-    except (UnicodeDecodeError, json.JSONDecodeError) as error:
-        raise DataError(f"{os.fspath(path)!r} is not valid JSON ({error}).") from error
-
-
-def read_mapping(path: str | os.PathLike[str]) -> dict[str, Any]:
-    """Read names and values from a TOML or JSON file, which its ending tells apart.
-
-    Raises:
-        DataFileNotFoundError: there is no such file.
-        DataError: it cannot be parsed or holds no mapping.
-    """
-    import tomllib
-
-    path = Path(path)
-    if not path.is_file():
-        raise DataFileNotFoundError(f"There is no file {str(path)!r}.")
-    if path.suffix.lower() == ".json":
-        values = read_json(path)
-    else:
-        try:
-            values = tomllib.loads(path.read_text(encoding="utf-8"))
-        except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-            raise DataError(f"{str(path)!r} is not valid TOML ({error}).") from error
-    if not isinstance(values, dict):
-        raise DataError(f"{str(path)!r} holds a {type(values).__name__}, not names and values.")
-    return values
 
 
 def content_hash(*values: Any, length: int = 16) -> str:

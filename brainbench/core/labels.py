@@ -61,7 +61,8 @@ def read_match(path: str | os.PathLike[str]) -> dict[str, str | None]:
     """
     import csv
 
-    from brainbench.core.files import read_mapping
+    from brainbench.core.reading.regular import readable
+    from brainbench.core.reading.texts import read_mapping, read_text
 
     path = Path(path)
     if not path.is_file():
@@ -70,8 +71,9 @@ def read_match(path: str | os.PathLike[str]) -> dict[str, str | None]:
     if kind in (".json", ".toml"):
         pairs = read_mapping(path)
     elif kind == ".csv":
-        with path.open(newline="", encoding="utf-8") as stream:
-            rows = [row for row in csv.reader(stream) if row]
+        lines = read_text(path, "match file").splitlines()
+        with readable(path, "a table of labels"):
+            rows = [row for row in csv.reader(lines) if row]
         if any(len(row) != 2 for row in rows):
             raise UsageError(f"{str(path)!r} must have two columns: recording label, stimulus label.")
         pairs = dict(rows)

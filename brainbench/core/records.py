@@ -5,7 +5,6 @@ Letters: K stimulus, P = K(K−1)/2 RDM pair.
 
 from __future__ import annotations
 
-import json
 import math
 import re
 import unicodedata
@@ -19,6 +18,7 @@ import msgspec
 from brainbench.core.errors import DataError, listing
 from brainbench.core.files import content_hash, to_json, to_plain
 from brainbench.core.provenance import Provenance
+from brainbench.core.reading.texts import parse_json
 
 Status = Literal["ok", "unreliable", "undefined"]
 """``ok``: can be trusted; ``unreliable``: computed, but the data are too noisy or too few to trust
@@ -123,10 +123,7 @@ class _Document:
         Raises:
             DataError: a field is missing, unknown or of the wrong kind, or the schema version is not read here.
         """
-        try:
-            data = json.loads(source) if isinstance(source, str) else source
-        except json.JSONDecodeError as error:
-            raise DataError(f"This is not valid JSON ({error}).") from error
+        data = parse_json(source, "This text") if isinstance(source, str) else source
         return _convert(cls, cls._migrated(data))
 
     @classmethod

@@ -29,7 +29,6 @@ Any HDF5 library can write it. Readers refuse versions they do not know.
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Iterable
 from pathlib import Path
@@ -38,8 +37,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from brainbench.core.contracts import check_recordings
-from brainbench.core.errors import DataError, UsageError
+from brainbench.core.errors import DataError, UsageError, shown
 from brainbench.core.files import atomic_path, to_json
+from brainbench.core.reading.texts import parse_json
 from brainbench.datasets.sessions import SPIKES, Session, SessionTable, decode, text
 
 if TYPE_CHECKING:
@@ -89,10 +89,11 @@ def holds_counts(file: h5py.File, path: Path) -> bool:
         return False
     version, kind = file.attrs.get("version"), text(file.attrs.get("kind", ""))
     if version != VERSION or kind not in ("spikes", "counts"):
-        newer = isinstance(version, (int, np.integer)) and version > VERSION
+        later = isinstance(version, (int, np.integer)) and version > VERSION
+        newer = " A newer brainbench wrote it: update this one." if later else ""
         raise DataError(
-            f"{path} is {FORMAT} version {version}, kind {kind!r}; this brainbench reads version {VERSION}, kinds "
-            f"'spikes' and 'counts'.{' A newer brainbench wrote it: update this one.' if newer else ''}"
+            f"{path} is {FORMAT} version {shown(version)}, kind {shown(kind)}; this brainbench reads "
+            f"version {VERSION}, kinds 'spikes' and 'counts'.{newer}"
         )
     return kind == "counts"
 
@@ -137,12 +138,20 @@ def read_counts(file: h5py.File, path: Path) -> xr.Dataset:
         for name, values in _need(file, dimension, path).items():
             coordinates[name] = (dimension, decode(values[...]))
     try:
-        attributes = json.loads(text(_need(file, "attributes", path)[()]))
+        attributes = parse_json(text(_need(file, "attributes", path)[()]), f"{path}/attributes")
         dims = {"counts": ("trial", "time", "unit"), "duration": ("trial", "time")}
         variables = {name: (own, _need(file, name, path)[...]) for name, own in dims.items()}
         dataset = xr.Dataset(variables, coordinates, attributes)
     except ValueError as error:
         raise DataError(f"{path} does not hold a consistent recordings data set ({error}).") from error
+    counts, duration, time = (dataset[name].values for name in ("counts", "duration", "time"))
+    if any(array.dtype.kind not in "fiu" for array in (counts, duration, time)):
+        raise DataError(f"{path} has counts, durations or times that are no numbers.")
+    # NaN in the counts means that a unit was not recorded; fmin and fmax pass over it without a copy.
+    if counts.size and not (np.fmin.reduce(counts, None) >= 0 and np.fmax.reduce(counts, None) < np.inf):
+        raise DataError(f"{path} has counts below 0 or without end, or none at all; a count is 0 or more, or NaN.")
+    if not (np.isfinite(time).all() and np.isfinite(duration).all() and (duration >= 0).all()):
+        raise DataError(f"{path} has times that are not finite or durations below 0.")
     return check_recordings(dataset)
 
 

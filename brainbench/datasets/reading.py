@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from brainbench.core.errors import DataError, DataFileNotFoundError, UsageError, nearest, unknown_name
+from brainbench.core.reading.hdf5 import open_hdf5
 from brainbench.datasets import hdf5, nwb
 from brainbench.datasets.layouts.registry import detect_layout, get_layout, is_name, list_layouts, load_layout
 from brainbench.datasets.trials.selection import DEFAULT, EVERYTHING, Selection
@@ -91,33 +92,13 @@ def open_file(path: Path) -> Iterator[h5py.File]:
     Raises:
         DataError: the file is not HDF5, is truncated or is damaged.
     """
-    import h5py
-
-    if not os.access(path, os.R_OK):
-        raise DataError(f"{path} may not be read by this user; change its permissions.")
     if path.suffix.lower() == ".npz":
         raise DataError(
             f"{path} is an .npz file: published recordings are opened one at a time and without a layout, to be "
             "inspected, checked and scored; they hold no spike times to join or copy."
         )
-    if not h5py.is_hdf5(path):
-        raise DataError(
-            f"{path} is not an HDF5 file{_why_not(path)}; brainbench reads NWB 2.x and its own HDF5 layout."
-        )
-    try:
-        with h5py.File(path, "r") as file:
-            yield file
-    except (OSError, RuntimeError) as error:
-        if isinstance(error, DataError):
-            raise
-        reason = str(error).strip().splitlines()[0]
-        if "unable to lock" in reason:
-            raise DataError(f"{path} is open for writing in another program ({reason}); close it there.") from error
-        if "truncated" in reason:
-            raise DataError(
-                f"{path} is truncated: the file is shorter than its HDF5 header says; copy it again."
-            ) from error
-        raise DataError(f"{path} cannot be read, it seems damaged ({reason}); copy it again.") from error
+    with open_hdf5(path, "recording", "brainbench reads NWB 2.x and its own HDF5 layout.") as file:
+        yield file
 
 
 def each_session(
@@ -177,14 +158,3 @@ def _expand(source: str) -> list[Path]:
 
 def _visible(path: Path, root: Path) -> bool:
     return path.is_file() and not any(part.startswith(".") for part in path.relative_to(root).parts)
-
-
-def _why_not(path: Path) -> str:
-    size = path.stat().st_size
-    if size == 0:
-        return " (it is empty)"
-    with path.open("rb") as stream:
-        head = stream.read(64)
-    if head.startswith((b"version https://git-lfs", b"/annex/", b"../../.git/annex")):
-        return " but a pointer that git-lfs or git-annex left in its place; fetch the content first"
-    return ""

@@ -18,7 +18,8 @@ from typing import Any, Literal
 import numpy as np
 
 from brainbench.core.errors import DataError, UsageError, missing_dependency, unknown_name
-from brainbench.core.files import atomic_path, cache_dir, content_hash
+from brainbench.core.files import cache_dir, content_hash
+from brainbench.core.reading.sealed import read_sealed, write_sealed
 from brainbench.geometry.distance import Deviation, deviation, hausdorff
 from brainbench.geometry.mesh import Mesh, convex_hull
 
@@ -232,31 +233,19 @@ def _key(unit: Mesh, settings: DecompositionSettings) -> str:
 
 
 def _read(path: Path | None, name: str) -> tuple[tuple[Mesh, ...], Any] | None:
-    import zipfile
-
-    if path is None or not path.exists():
+    if path is None or (stored := read_sealed(path, "decomposition")) is None:
         return None
-    try:
-        with np.load(path, allow_pickle=False) as stored:
-            vertices = np.split(stored["vertices"], np.cumsum(stored["vertex_counts"])[:-1])
-            faces = np.split(stored["faces"], np.cumsum(stored["face_counts"])[:-1])
-            numbers = stored["numbers"]
-        return tuple(Mesh(v, f, name) for v, f in zip(vertices, faces, strict=True)), numbers
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
-        _LOG.warning("the cached decomposition %s is damaged and is made again (%s)", path.name, error)
-        return None
+    vertices = np.split(stored["vertices"], np.cumsum(stored["vertex_counts"])[:-1])
+    faces = np.split(stored["faces"], np.cumsum(stored["face_counts"])[:-1])
+    return tuple(Mesh(v, f, name) for v, f in zip(vertices, faces, strict=True)), stored["numbers"]
 
 
 def _write(path: Path, pieces: Sequence[Mesh], numbers: np.ndarray) -> None:
-    try:
-        with atomic_path(path) as temporary:
-            np.savez_compressed(
-                temporary,
-                vertices=np.concatenate([piece.vertices for piece in pieces]),
-                vertex_counts=[len(piece.vertices) for piece in pieces],
-                faces=np.concatenate([piece.faces for piece in pieces]),
-                face_counts=[len(piece.faces) for piece in pieces],
-                numbers=numbers,
-            )
-    except OSError as error:
-        _LOG.warning("the decomposition could not be kept in the cache (%s)", error)
+    arrays = {
+        "vertices": np.concatenate([piece.vertices for piece in pieces]),
+        "vertex_counts": [len(piece.vertices) for piece in pieces],
+        "faces": np.concatenate([piece.faces for piece in pieces]),
+        "face_counts": [len(piece.faces) for piece in pieces],
+        "numbers": numbers,
+    }
+    write_sealed(path, "decomposition", arrays, compress=True)

@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from brainbench.core.errors import DataError, DataFileNotFoundError, UsageError, unknown_name
+from brainbench.core.errors import DataError, UsageError, unknown_name
+from brainbench.core.reading.regular import check_file, readable
 
 if TYPE_CHECKING:
     import trimesh
@@ -209,18 +210,17 @@ def load_mesh(path: str | os.PathLike[str], *, unit: str) -> Mesh:
 
     if unit not in UNITS:
         raise unknown_name("length unit", unit, UNITS)
-    path = Path(path)
-    if not path.is_file():
-        raise DataFileNotFoundError(f"There is no mesh file {os.fspath(path)!r}.")
-    try:
+    path = check_file(path, "mesh file")
+    with readable(path, "a mesh"):
         loaded: Any = trimesh.load(path, force="mesh", process=False)
-    except Exception as error:
-        raise DataError(f"{os.fspath(path)!r} cannot be read as a mesh ({error}).") from error
-    if not isinstance(loaded, trimesh.Trimesh) or not len(loaded.faces):
-        raise DataError(f"{os.fspath(path)!r} holds no triangles.")
-    # Exactly equal vertices only: a tolerance would depend on the unit.
-    vertices, merged = np.unique(np.asarray(loaded.vertices, dtype=np.float64), axis=0, return_inverse=True)
-    return Mesh(vertices * UNITS[unit], merged.reshape(-1)[np.asarray(loaded.faces)], path.stem)
+        if not isinstance(loaded, trimesh.Trimesh) or not len(loaded.faces):
+            raise DataError(f"{os.fspath(path)!r} holds no triangles.")
+        # Exactly equal vertices only: a tolerance would depend on the unit.
+        vertices, merged = np.unique(np.asarray(loaded.vertices, dtype=np.float64), axis=0, return_inverse=True)
+        faces = np.asarray(loaded.faces)
+        if faces.min() < 0 or faces.max() >= len(merged.reshape(-1)):
+            raise DataError(f"{os.fspath(path)!r} has faces that name missing vertices.")
+        return Mesh(vertices * UNITS[unit], merged.reshape(-1)[faces], path.stem)
 
 
 def save_mesh(path: str | os.PathLike[str], mesh: Mesh, *, unit: str) -> Path:

@@ -14,7 +14,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from brainbench.core.errors import DataError, DataFileNotFoundError, listing
+from brainbench.core.errors import DataError, listing, shown
+from brainbench.core.reading.hdf5 import open_hdf5
 
 if TYPE_CHECKING:
     import h5py
@@ -62,15 +63,7 @@ def read_features(path: str | Path) -> Features:
     import h5py
 
     path = Path(path)
-    if not path.is_file():
-        raise DataFileNotFoundError(f"There is no file {str(path)!r}.")
-    try:
-        file = h5py.File(path, "r")
-    except OSError as error:
-        raise DataError(
-            f"{str(path)!r} cannot be read as HDF5: it is truncated or of another kind ({error})."
-        ) from error
-    with file:
+    with open_hdf5(path, "file of activations") as file:
         labels, group = file.get("labels"), file.get("activations")
         if not isinstance(labels, h5py.Dataset) or not isinstance(group, h5py.Group):
             raise DataError(
@@ -99,6 +92,8 @@ def _layers(group: h5py.Group, rows: int, path: str) -> dict[str, NDArray[np.flo
         if not np.issubdtype(item.dtype, np.number):
             raise DataError(f"Layer {name!r} of {path!r} has type {item.dtype}; activations must be numbers.")
         values = item.astype(np.float64 if item.dtype == np.float64 else np.float32)[()]
+        if not np.isfinite(values).all():
+            raise DataError(f"Layer {shown(name)} of {path!r} has values that are not finite.")
         layers[name.replace("\N{DIVISION SLASH}", "/")] = values[:, None, :] if values.ndim == 2 else values
 
     group.visititems(visit)

@@ -12,7 +12,8 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from brainbench.core.errors import UsageError, unknown_name
+from brainbench.core.errors import UsageError, shown, unknown_name
+from brainbench.core.reading.ranges import check_number
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -27,6 +28,10 @@ READOUTS = ("default", "published")
 TIME_BIN = 0.05
 """Bin width of scores over time, seconds."""
 
+_NO_NUMBERS = (
+    "recordings", "stimuli", "match", "select", "window", "whiskers", "fidelity", "metric", "layer", "estimator",
+)  # fmt: skip
+"""Fields that take much in Python, and a number nowhere; a batch file can hold one."""
 _ELSEWHERE = ("recordings", "match", "explain")
 """Fields whose effect stands in other entries of the provenance: ``recordings``, ``pairs`` and ``statistics``."""
 
@@ -88,16 +93,25 @@ class ScoreOptions:
 
     def __post_init__(self) -> None:
         """Refuse what no score can be made with, before anything is loaded."""
+        for name in ("over_time", "explain", "normalize"):
+            if not isinstance(getattr(self, name), bool):
+                raise UsageError(f"{name} must be true or false; received {shown(getattr(self, name))}.")
+        for name in _NO_NUMBERS:
+            if isinstance(getattr(self, name), (int, float)):
+                raise UsageError(f"{name} must be a text; received {shown(getattr(self, name))}.")
+        check_number("seed", self.seed, least=0, whole=True)
+        if self.weights_seed is not None:
+            check_number("weights_seed", self.weights_seed, least=0, whole=True)
+        if self.bin is not None:
+            check_number("bin", self.bin, above=0)
         if self.time not in TIME_RULES:
             raise unknown_name("time rule", self.time, TIME_RULES)
         if self.readout not in READOUTS:
             raise unknown_name("readout", self.readout, READOUTS)
         if self.readout == "published" and (self.time != "mean" or self.over_time):
             raise UsageError("The published readout averages time by its own rule; leave out --time and --over-time.")
-        if self.units_reliability is not None and not -1 < self.units_reliability < 1:
-            raise UsageError(
-                f"A reliability of units lies between −1 and 1, such as 0.5; received {self.units_reliability}."
-            )
+        if self.units_reliability is not None:
+            check_number("units_reliability", self.units_reliability, above=-1, below=1)
 
     @classmethod
     def of(cls, values: Mapping[str, Any]) -> ScoreOptions:
@@ -111,6 +125,10 @@ class ScoreOptions:
             if name not in known:
                 raise unknown_name("option of a score", name, known)
         layers = values.get("layers")
+        if layers is not None and not (
+            isinstance(layers, (list, tuple)) and all(isinstance(name, str) for name in layers)
+        ):
+            raise UsageError(f"layers must be a list of names; received {shown(layers)}.")
         return cls(**{**values, "layers": tuple(layers) if layers else None})
 
     @classmethod

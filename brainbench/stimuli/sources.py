@@ -12,9 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brainbench.core.contracts import check_stimulus_set
-from brainbench.core.errors import BrainbenchError, DataError, DataFileNotFoundError, UsageError, listing, unknown_name
+from brainbench.core.errors import BrainbenchError, DataError, UsageError, listing, unknown_name
 from brainbench.core.files import content_hash
 from brainbench.core.progress import Progress
+from brainbench.core.reading.hdf5 import open_hdf5
+from brainbench.core.reading.regular import readable
 from brainbench.stimuli.engines import DEFAULT_ENGINE
 from brainbench.stimuli.readout import to_grid
 from brainbench.stimuli.scenes.recipes import get_recipe, is_recipe, list_recipes
@@ -137,18 +139,13 @@ def _from_dataset(dataset: xr.Dataset, whiskers: str, description: str) -> Stimu
 
 
 def _from_hdf5(path: Path, whiskers: str) -> Stimuli:
-    import h5py
-
     name = os.fspath(path)
-    if not path.is_file():
-        raise DataFileNotFoundError(f"There is no stimulus file {name!r}.")
-    try:
-        with h5py.File(path, "r") as file:
-            if "wrench" not in file:
-                return _from_arrays(file, name, whiskers)
-    except OSError as error:
-        raise DataError(f"{name!r} cannot be read as HDF5: it is damaged or of another format ({error}).") from error
-    return _from_dataset(read_stimulus_set(path), whiskers, f"stimulus set {path.name}")
+    with open_hdf5(path, "stimulus file") as file:
+        if "wrench" not in file:
+            return _from_arrays(file, name, whiskers)
+    dataset = read_stimulus_set(path)
+    with readable(path, "stimulus set"):
+        return _from_dataset(dataset, whiskers, f"stimulus set {path.name}")
 
 
 def _from_arrays(file: Any, name: str, whiskers: str) -> Stimuli:

@@ -11,8 +11,9 @@ import numpy as np
 
 from brainbench import __version__
 from brainbench.core.contracts import CHANNELS, check_stimulus_set
-from brainbench.core.errors import DataError, DataFileNotFoundError
+from brainbench.core.errors import DataError
 from brainbench.core.files import atomic_path, content_hash
+from brainbench.core.reading.hdf5 import open_hdf5
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -88,14 +89,8 @@ def read_stimulus_set(path: str | os.PathLike[str]) -> xr.Dataset:
     import xarray as xr
 
     name = os.fspath(path)
-    if not Path(path).is_file():
-        raise DataFileNotFoundError(f"There is no stimulus-set file {name!r}.")
-    try:
-        with xr.open_dataset(path, engine="h5netcdf") as stored:
-            dataset = stored.load()
-    except (OSError, KeyError, ValueError, RuntimeError) as error:
-        raise DataError(f"{name!r} cannot be read as a stimulus set ({error}).") from error
-    check_stimulus_set(dataset)
+    with open_hdf5(path, "stimulus set"), xr.open_dataset(path, engine="h5netcdf") as stored:
+        dataset = check_stimulus_set(stored.load())
     if hash_stimulus_set(dataset) != dataset.attrs["content_hash"]:
         raise DataError(
             f"The numbers in {name!r} do not match the content hash in the file: it was damaged or edited;"

@@ -6,10 +6,8 @@ instant it shows, and kept in the cache.
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,12 +15,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from brainbench.core.errors import UsageError
 from brainbench.core.progress import Progress
+from brainbench.core.reading.sealed import read_sealed, write_sealed
 from brainbench.stimuli.engines import DEFAULT_ENGINE, get_engine
 from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.engines.protocol import Job, WhiskerEngine
 from brainbench.stimuli.scenes.scene import Scene
-
-_LOG = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,11 +70,14 @@ def record(
     path = None
     if cache and isinstance(backend, str):
         path = cache_path([scene], fidelity, engine, times, folder="shapes").with_suffix(".npz")
-    local = None if path is None else _read(path, len(jobs))
-    if local is None:
+    names = [f"whisker{index}" for index in range(len(jobs))]
+    kept = None if path is None else read_sealed(path, "shapes of whiskers")
+    if kept is not None:
+        local: list[NDArray[np.float64]] = [kept[name].astype(float) for name in names]
+    else:
         local = _simulate(jobs, fidelity, engine, progress)
         if path is not None:
-            _write(path, local)
+            write_sealed(path, "shapes of whiskers", dict(zip(names, local, strict=True)), compress=True)
     moments = tuple(bending_moments(job, points) for job, points in zip(jobs, local, strict=True))
     # Jobs stand in the frame of their array as it was at t = 0.
     origins = [part.head.position for part in scene.split() for _ in part.array]
@@ -127,28 +127,3 @@ def _simulate(
             f"The backend {engine.name!r} reports no whisker shapes, so nothing can be drawn; use 'rod' or 'mujoco'."
         )
     return shapes
-
-
-def _read(path: Path, count: int) -> list[NDArray[np.float64]] | None:
-    """Return the shapes in a cache file; None when there are none or they are damaged."""
-    import zipfile
-
-    if not path.is_file():
-        return None
-    try:
-        with path.open("rb") as file, np.load(file, allow_pickle=False) as stored:
-            return [stored[f"whisker{index}"].astype(float) for index in range(count)]
-    except (OSError, ValueError, KeyError, zipfile.BadZipFile) as error:
-        _LOG.warning("cached shapes are damaged and are simulated again: %s", error)
-        return None
-
-
-def _write(path: Path, shapes: Sequence[NDArray[np.float64]]) -> None:
-    from brainbench.core.files import atomic_path
-
-    try:
-        with atomic_path(path) as temporary:
-            named: dict[str, Any] = {f"whisker{index}": shape for index, shape in enumerate(shapes)}
-            np.savez_compressed(temporary, **named)
-    except OSError as error:
-        _LOG.warning("the shapes could not be kept in the cache (%s)", error)

@@ -24,8 +24,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from brainbench.core.contracts import CHANNELS, check_stimulus_set
-from brainbench.core.errors import DataError, DataFileNotFoundError, UsageError, unknown_name
+from brainbench.core.errors import DataError, UsageError, unknown_name
 from brainbench.core.files import write_text
+from brainbench.core.reading.texts import read_text
 from brainbench.stimuli.motion.recorded import read_numbers
 from brainbench.stimuli.whiskers.array import MountedWhisker, WhiskerArray, published_whisker
 from brainbench.stimuli.whiskers.selection import ROWS
@@ -215,12 +216,7 @@ def _write(path: Path, lines: Iterable[Iterable[float | str]], end: str = "\n", 
 
 def read_names(path: Path) -> list[str]:
     """Return the names in a file, one a line or with commas between them; a :class:`DataError` without any."""
-    if not path.is_file():
-        raise DataFileNotFoundError(f"There is no file {os.fspath(path)!r}, which names the whiskers.")
-    try:
-        return path.read_text(encoding="utf-8").replace(",", " ").split()
-    except UnicodeDecodeError as error:
-        raise DataError(f"{os.fspath(path)!r} is not a text file ({error}).") from error
+    return read_text(path, "file of the whiskers' names").replace(",", " ").split()
 
 
 def _table(root: Path, name: str, lines: int, columns: int | None) -> NDArray[np.float64]:

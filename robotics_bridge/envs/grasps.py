@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 
 from brainbench.core.devices import mujoco_module
 from brainbench.core.errors import DataError
-from brainbench.core.files import atomic_path, cache_dir, content_hash
+from brainbench.core.files import cache_dir, content_hash
+from brainbench.core.reading.sealed import read_sealed, write_sealed
 from robotics_bridge.hands import Hand
 from robotics_bridge.tasks.scenes import TaskModel
 from robotics_bridge.tasks.task import Task
@@ -72,15 +73,13 @@ def grasps_for(task: Task, hand: Hand, model: TaskModel, *, seed: int = 0) -> di
         asdict(settings), task.name, seed, *(np.round(n, 6).tolist() for n in numbers), model.rest.tolist()
     )
     path = cache_dir("grasps") / f"{hand.name}-{key}.npz"
-    if path.is_file():
-        with np.load(path, allow_pickle=False) as found:
-            return dict(found)
+    if (found := read_sealed(path, "grasps")) is not None:
+        return found
     each = max(settings.count // len(model.models), 1)
     parts = [sample(task, hand, model, index, each, settings, seed) for index in range(len(model.models))]
     grasps = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
     grasps["rows"] = np.arange(each * len(parts), dtype=float).reshape(len(parts), each)
-    with atomic_path(path) as target, target.open("wb") as file:
-        np.savez(file, **grasps)  # type: ignore[arg-type]
+    write_sealed(path, "grasps", grasps)
     return grasps
 
 

@@ -224,7 +224,7 @@ def test_damaged_files_are_refused_with_the_reason(tmp_path):
     whole = write(tmp_path / "a.h5").read_bytes()
     cases = {
         "cut.h5": (whole[: len(whole) // 2], "is truncated"),
-        "text.nwb": (b"subject,trial\n", "is not an HDF5 file; brainbench reads NWB 2.x"),
+        "text.nwb": (b"subject,trial\n", "is not an HDF5 file.*NWB 2.x"),
         "empty.nwb": (b"", r"is not an HDF5 file \(it is empty\)"),
         "lfs.nwb": (b"version https://git-lfs.github.com/spec/v1\n", "pointer that git-lfs"),
     }
@@ -242,9 +242,9 @@ def test_damage_inside_a_file_names_the_file(tmp_path, use):
     with path.open("r+b") as stream:
         stream.seek(chunk.byte_offset)
         stream.write(bytes(chunk.size))
-    with pytest.raises(DataError, match=r"a\.h5 .* damaged"):
+    with pytest.raises(DataError, match=r"a\.h5. .*damaged"):
         use(path)
-    assert "seems damaged" in check(path).findings[0].message
+    assert "damaged" in check(path).findings[0].message
 
 
 def test_foreign_hdf5_is_refused_with_what_it_holds(tmp_path):

@@ -10,9 +10,11 @@ from pathlib import Path
 from typing import Any
 
 from brainbench.cli.options import SCORE, SCORE_FLAGS, as_flags
-from brainbench.core.errors import DataError, UsageError, unknown_name
+from brainbench.core.errors import DataError, UsageError, listing, shown, unknown_name
 from brainbench.core.files import to_plain
 from brainbench.core.progress import Progress
+from brainbench.core.reading.ranges import check_number
+from brainbench.core.reading.texts import read_toml
 from brainbench.core.records import ESTIMATOR_VERSION, ResultRecord
 from brainbench.scoring.options import ScoreOptions
 
@@ -198,7 +200,7 @@ def parse_seeds(text: str) -> tuple[int, ...]:
                 raise ValueError("a range that ends before it begins")
             seeds += found
     except ValueError as error:
-        raise UsageError(f"Seeds are numbers and ranges such as 0-4 or 0,3; received {text!r}.") from error
+        raise UsageError(f"Seeds are numbers and ranges such as 0-4 or 0,3; received {shown(text)}.") from error
     return tuple(dict.fromkeys(seeds))
 
 
@@ -211,16 +213,21 @@ def read_batch(path: Path) -> list[ScoringJob]:
         DataError: the file is missing or of another kind.
         UsageError: an option does not exist.
     """
-    import tomllib
-
-    try:
-        data = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-        raise DataError(f"{str(path)!r} is not a readable batch file ({error}).") from error
-    options = vars(ScoreOptions.of(data.get("options", {})))
+    data = read_toml(path, "batch file")
+    given, entries = data.get("options", {}), data.get("entries", [])
+    if set(data) - {"options", "entries"} or not isinstance(given, dict) or not isinstance(entries, list):
+        raise DataError(f"{str(path)!r} has a table [options] and lists [[entries]]; received {listing(data)}.")
+    options = vars(ScoreOptions.of(given))
     jobs = []
-    for entry in data.get("entries", []):
-        if set(entry) - {"models", "seeds"} or "models" not in entry:
-            raise DataError(f"An entry of {str(path)!r} has 'models' and maybe 'seeds'; received {sorted(entry)}.")
-        jobs += jobs_of(entry["models"], entry.get("seeds", [0]), options)
+    for entry in entries:
+        if not isinstance(entry, dict) or set(entry) - {"models", "seeds"} or "models" not in entry:
+            raise DataError(f"An entry of {str(path)!r} has 'models' and maybe 'seeds'; received {shown(entry)}.")
+        models, seeds = entry["models"], entry.get("seeds", [0])
+        if not isinstance(models, list) or not all(isinstance(name, str) for name in models):
+            raise DataError(f"'models' of {str(path)!r} is a list of names; received {shown(models)}.")
+        if not isinstance(seeds, list):
+            raise DataError(f"'seeds' of {str(path)!r} is a list of whole numbers; received {shown(seeds)}.")
+        for seed in seeds:
+            check_number("A seed of a batch", seed, least=0, whole=True)
+        jobs += jobs_of(models, seeds, options)
     return jobs

@@ -8,6 +8,7 @@ from typing import Annotated, Any
 
 import typer
 
+from brainbench.cli.destinations import out_folder
 from brainbench.cli.options import part_of, with_options
 from brainbench.cli.output import JsonOption, emit, facts, progress_bar, table
 from brainbench.cli.policy.options import (
@@ -28,7 +29,8 @@ def train(
     task: TaskArgument,
     options: Any,
     out: Annotated[
-        Path | None, typer.Option("--out", "-o", help="Folder of the run; started again, it goes on.")
+        Path | None,
+        typer.Option("--out", "-o", callback=out_folder, help="Folder of the run; started again, it goes on."),
     ] = None,
     envs: Annotated[int | None, typer.Option("--envs", help="Environments at once (published: 8192).")] = None,
     hand: HandOption = "xhand1",

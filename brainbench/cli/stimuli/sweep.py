@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from brainbench.cli.destinations import out_folder
 from brainbench.cli.options import SchedulerOption, WorkersOption, with_options
 from brainbench.cli.output import JsonOption, emit, facts, progress_bar
 from brainbench.cli.stimuli.scenes import BackendOption, FidelityOption, WhiskersOption
@@ -39,7 +40,8 @@ def sweep(
         ),
     ] = None,
     out: Annotated[
-        Path | None, typer.Option("--out", "-o", help="Simulate, into shards and a manifest in this folder.")
+        Path | None,
+        typer.Option("--out", "-o", callback=out_folder, help="Simulate, into shards and a manifest in this folder."),
     ] = None,
     options: Any = None,
     workers: WorkersOption = None,

@@ -5,11 +5,12 @@ from __future__ import annotations
 import contextlib
 import logging
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import Any
 
 from brainbench.core.errors import DataError
-from brainbench.core.files import cache_dir, content_hash, read_json
+from brainbench.core.files import cache_dir, check_folder, content_hash, file_hash, read_json
 from brainbench.datasets.synthetic.truth import TRUTH
 
 _ABANDONED = 24 * 3600.0
@@ -22,7 +23,7 @@ def ensure_recordings(name: str, *key: object, make: Callable[[Path], object]) -
     """Return the folder of synthetic recordings, making them if this machine has none.
 
     Two processes may ask at once and either may be killed: every file is written whole, the truth comes last, and
-    a folder without it, or with files missing or of another size, is made again.
+    a folder without it, or with files missing or of another size or hash, is made again.
 
     Args:
         name: begin of the folder's name.
@@ -33,6 +34,8 @@ def ensure_recordings(name: str, *key: object, make: Callable[[Path], object]) -
     if not _complete(target):
         if (target / TRUTH).exists():
             _log.warning("The %s recordings in %s are damaged and are replaced.", name, target)
+        # Before the stimuli are simulated, which is slow.
+        check_folder(target, "The cache")
         make(target)
         # What a killed process left; a younger file may be one that is being written.
         for item in target.glob(".*"):
@@ -42,9 +45,13 @@ def ensure_recordings(name: str, *key: object, make: Callable[[Path], object]) -
     return target
 
 
+def _is_whole(path: Path, stated: Mapping[str, Any]) -> bool:
+    return path.stat().st_size == stated["bytes"] and file_hash(path) == stated["hash"]
+
+
 def _complete(folder: Path) -> bool:
     try:
         files = read_json(folder / TRUTH)["files"]
-        return all((folder / name).stat().st_size == item["bytes"] for name, item in files.items())
+        return all(_is_whole(folder / name, item) for name, item in files.items())
     except (DataError, OSError, KeyError, TypeError, AttributeError):
         return False

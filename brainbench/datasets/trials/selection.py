@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
@@ -10,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from brainbench.core.errors import UsageError
+from brainbench.core.errors import UsageError, shown
 from brainbench.datasets.sessions import SessionTable, as_labels
 
 _TRUTH = {"true": ("true", "1"), "false": ("false", "0")}
@@ -108,8 +109,8 @@ class Selection:
             match = _RULE.match(part)
             if match is None:
                 raise UsageError(
-                    f"The selection rule {part!r} cannot be read; write COLUMN=a|b, COLUMN!=a|b or COLUMN=low..high, "
-                    f"with units. before columns of the units table, and ';' between rules."
+                    f"The selection rule {shown(part)} cannot be read; write COLUMN=a|b, COLUMN!=a|b or "
+                    f"COLUMN=low..high, with units. before columns of the units table, and ';' between rules."
                 )
             column, values = match["column"], match["values"]
             if column == "min_spikes":
@@ -180,12 +181,14 @@ def _values(source: str) -> tuple[str, ...]:
 
 def _number(source: str) -> float | None:
     try:
+        if source and not math.isfinite(float(source)):
+            raise ValueError("not finite")
         return float(source) if source else None
     except ValueError as error:
-        raise UsageError(f"{source!r} is not a number; a range is written low..high.") from error
+        raise UsageError(f"{shown(source)} is not a number; a range is written low..high.") from error
 
 
 def _integer(source: str) -> int:
-    if not source.isdigit():
-        raise UsageError(f"min_spikes is a whole number from 0; received {source!r}.")
+    if not (source.isdecimal() and len(source) < 16):
+        raise UsageError(f"min_spikes is a whole number from 0; received {shown(source)}.")
     return int(source)

@@ -16,12 +16,12 @@ from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args
 
-import msgspec
 import numpy as np
 
 from brainbench.core.contracts import CHANNELS, GRID_SHAPE
 from brainbench.core.errors import DataError, UsageError, check_name, listing
-from brainbench.core.files import cache_dir, content_hash, read_json, write_json
+from brainbench.core.files import cache_dir, content_hash
+from brainbench.core.reading.sealed import read_sealed, write_sealed
 from brainbench.datasets.whisking.files import Buffers, most_open, open_shard, read_manifest
 from brainbench.datasets.whisking.sweep_tree import is_sweep_tree, open_sweep_tree
 
@@ -283,9 +283,10 @@ class WhiskingDataset:
         All of them are read once; the result is kept in the cache.
         """
         key = content_hash([self.manifest["content_hash"], self.split, self.unstable], length=24)
-        path = cache_dir("whisking") / f"{key}.json"
-        if path.exists():
-            return msgspec.convert(read_json(path), ChannelStatistics)
+        path = cache_dir("whisking") / f"{key}.npz"
+        if (kept := read_sealed(path, "statistics of channels")) is not None:
+            mean, std, largest = (tuple(kept[name].tolist()) for name in ("mean", "std", "largest"))
+            return ChannelStatistics(mean, std, largest, int(kept["values"]))
         channels = len(CHANNELS)
         total, squares, largest, values = np.zeros(channels), np.zeros(channels), np.zeros(channels), 0
         for first in range(0, self.sweeps, _BLOCK):
@@ -297,7 +298,7 @@ class WhiskingDataset:
         mean = total / values
         std = np.sqrt(np.maximum(squares / values - mean**2, 0.0))
         found = ChannelStatistics(tuple(mean.tolist()), tuple(std.tolist()), tuple(largest.tolist()), values)
-        write_json(path, found)
+        write_sealed(path, "statistics of channels", vars(found))
         return found
 
     def _identity(self) -> dict[str, Any]:

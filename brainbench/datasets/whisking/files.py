@@ -12,13 +12,17 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from brainbench.core.contracts import CHANNELS, GRID_SHAPE, SWEEPS_FORMAT, SWEEPS_SCHEMA
-from brainbench.core.errors import DataError, DataFileNotFoundError
+from brainbench.core.errors import DataError, DataFileNotFoundError, shown
 from brainbench.core.files import hash_arrays, read_json
+from brainbench.core.reading.hdf5 import open_hdf5
+from brainbench.core.reading.ranges import check_number
+from brainbench.core.reading.regular import readable
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 _UNUSABLE = 2
+_AGAIN = "Remove it and give the command that made the data set again."
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,16 +54,11 @@ class Shard:
 
     def verify(self) -> None:
         """Compare what the shard holds with the hash in the manifest; a difference is a :class:`DataError`."""
-        import h5py
-
-        try:
-            opened: Any = h5py.File(self.path, "r")
-            with opened as file:
-                arrays = {name: file[name][()] for name in file if name != "wrench"}
-        except (OSError, KeyError) as error:
-            raise DataError(f"The shard {str(self.path)!r} is damaged ({error}); generate it again.") from error
-        arrays["wrench"] = self.forces()
-        if hash_arrays(arrays) != self.content_hash:
+        with open_hdf5(self.path, "shard", _AGAIN) as opened:
+            file: Any = opened
+            arrays = {name: file[name][()] for name in file if name != "wrench"}
+            found = hash_arrays({**arrays, "wrench": self.forces()})
+        if found != self.content_hash:
             raise DataError(
                 f"The numbers in {str(self.path)!r} do not match the hash in the manifest: it was damaged or edited; "
                 "remove it and give the command that made the data set again."
@@ -90,6 +89,17 @@ def read_manifest(folder: Path) -> Mapping[str, Any]:
             f"{str(path)!r} has format {found[0]!r} version {found[1]!r}; this brainbench reads {SWEEPS_FORMAT!r} "
             f"version {SWEEPS_SCHEMA}: generate the data again or use the version that wrote it."
         )
+    with readable(path, "the manifest of a data set", _AGAIN):
+        for name, kind in (("classes", list), ("splits", dict), ("shards", list), ("config_hash", str)):
+            if not isinstance(manifest[name], kind):
+                raise DataError(f"{name!r} in {str(path)!r} is no {kind.__name__}; received {shown(manifest[name])}.")
+        for entry in (*manifest["splits"].values(), *manifest["shards"]):
+            check_number(f"'sweeps' in {str(path)!r}", entry["sweeps"], least=0, whole=True)
+        for entry in manifest["shards"]:
+            # A name with a folder in it could lead out of the data set.
+            plain = Path(entry["name"]).name == entry["name"] and isinstance(entry["content_hash"], str)
+            if not plain or entry["split"] not in manifest["splits"]:
+                raise DataError(f"{str(path)!r} has a shard without a plain name, a split and a hash: {shown(entry)}.")
     return manifest
 
 
@@ -99,37 +109,32 @@ def open_shard(path: Path, entry: Mapping[str, Any], manifest: Mapping[str, Any]
     Raises:
         DataError: the file is missing, damaged, or another one.
     """
-    import h5py
-
     again = "remove it and give the command that made the data set again"
     if not path.is_file():
         raise DataFileNotFoundError(f"The shard {str(path)!r} of the manifest is missing; {again}.")
-    try:
-        opened: Any = h5py.File(path, "r")
-        with opened as file:
-            wrench = file["wrench"]
-            sweeps, *rest = wrench.shape
-            offset = wrench.id.get_offset()
-            end = offset + wrench.size * 4
-            channels = tuple(file["channel"].asstr()[:])
-            names = file["object"].asstr()[:].astype(str)
-            status = file["status"][:]
-            shard = Shard(
-                path=path,
-                offset=offset,
-                sweeps=sweeps,
-                shape=(rest[0], rest[1], rest[2]),
-                cells=file["row"][:].astype(np.int64) * GRID_SHAPE[1] + file["col"][:],
-                labels=file["label"][:],
-                objects=names[file["owner"][:]],
-                indices=file["sweep"][:],
-                broken=(status != 0).any(axis=1),
-                empty=(status == _UNUSABLE).all(axis=1),
-                content_hash=str(entry["content_hash"]),
-            )
-            config = str(file.attrs["config_hash"])
-    except (OSError, KeyError, ValueError, IndexError) as error:
-        raise DataError(f"The shard {str(path)!r} is damaged ({error}); {again}.") from error
+    with open_hdf5(path, "shard", _AGAIN) as opened:
+        file: Any = opened
+        wrench = file["wrench"]
+        sweeps, *rest = wrench.shape
+        offset = wrench.id.get_offset()
+        end = offset + wrench.size * 4
+        channels = tuple(file["channel"].asstr()[:])
+        names = file["object"].asstr()[:].astype(str)
+        status = file["status"][:]
+        shard = Shard(
+            path=path,
+            offset=offset,
+            sweeps=sweeps,
+            shape=(rest[0], rest[1], rest[2]),
+            cells=file["row"][:].astype(np.int64) * GRID_SHAPE[1] + file["col"][:],
+            labels=file["label"][:],
+            objects=names[file["owner"][:]],
+            indices=file["sweep"][:],
+            broken=(status != 0).any(axis=1),
+            empty=(status == _UNUSABLE).all(axis=1),
+            content_hash=str(entry["content_hash"]),
+        )
+        config = str(file.attrs["config_hash"])
     if path.stat().st_size < end:
         raise DataError(f"The shard {str(path)!r} is damaged: it ends before its last force; {again}.")
     if config != manifest["config_hash"] or sweeps != entry["sweeps"] or channels != CHANNELS:

@@ -10,8 +10,9 @@ from collections.abc import Mapping
 from graphlib import CycleError, TopologicalSorter
 from typing import Any
 
-from brainbench.core.errors import DataError, check_name, listing, unknown_name
-from brainbench.core.files import read_json, read_mapping
+from brainbench.core.errors import DataError, check_name, listing, shown, unknown_name
+from brainbench.core.reading.regular import readable
+from brainbench.core.reading.texts import read_json, read_mapping
 from brainbench.models.graph.spec import Convolution, Dense, Edge, GraphSpec, Memory, Node, Operation, Pool
 
 _MEMORIES = {
@@ -22,6 +23,8 @@ _MEMORIES = {
     "LSTMCell": "lstm",
 }
 _REQUIRED = object()
+_LARGEST = 10**6
+"""Largest number of channels, features, rows or columns."""
 # Keys that PyTorchTNN accepts and overwrites while it builds the graph.
 _OVERWRITTEN = ("in_channels", "input_in_channels", "input_shape", "num_timesteps", "state_shape")
 
@@ -31,7 +34,7 @@ class _Section:
 
     def __init__(self, data: Any, where: str) -> None:
         if not isinstance(data, Mapping):
-            raise DataError(f"The graph configuration needs an object for {where}; found {data!r}.")
+            raise DataError(f"The graph configuration needs an object for {where}; found {shown(data)}.")
         self.data = dict(data)
         self.where = where
 
@@ -48,7 +51,8 @@ class _Section:
             value = self.data.pop(key, choices[0])
             if value not in choices:
                 raise DataError(
-                    f"The graph configuration has {key!r}: {value!r} in {self.where}; only {choices[0]!r} is supported."
+                    f"The graph configuration has {key!r}: {shown(value)} in {self.where}; only "
+                    f"{choices[0]!r} is supported."
                 )
 
     def size(self, key: str, default: Any = _REQUIRED, *, or_else: tuple[Any, ...] = ()) -> Any:
@@ -58,9 +62,13 @@ class _Section:
             return value
         if or_else and isinstance(value, str):
             raise unknown_name(f"{key} in {self.where}", value, or_else)
-        numbers = [value, value] if isinstance(value, int) and not isinstance(value, bool) else value
-        if not isinstance(numbers, (list, tuple)) or len(numbers) != 2 or not all(isinstance(n, int) for n in numbers):
-            raise DataError(f"{key!r} in {self.where} must be a whole number or a pair of them; found {value!r}.")
+        numbers = [value, value] if type(value) is int else value
+        least = 0 if key == "padding" else 1
+        if not isinstance(numbers, (list, tuple)) or len(numbers) != 2 or not all(_is_size(n, least) for n in numbers):
+            raise DataError(
+                f"{key!r} in {self.where} must be a whole number from {least} to {_LARGEST:,}, or a pair of them; "
+                f"found {shown(value)}."
+            )
         return (numbers[0], numbers[1])
 
     def done(self, *ignored: str) -> None:
@@ -68,6 +76,10 @@ class _Section:
         left = [key for key in self.data if key not in ignored]
         if left:
             raise DataError(f"The graph configuration has the unsupported key {listing(left)} in {self.where}.")
+
+
+def _is_size(value: Any, least: int = 1) -> bool:
+    return type(value) is int and least <= value <= _LARGEST
 
 
 def read_graph(source: Mapping[str, Any] | str | os.PathLike[str]) -> GraphSpec:
@@ -82,7 +94,14 @@ def read_graph(source: Mapping[str, Any] | str | os.PathLike[str]) -> GraphSpec:
         DataError: the file is missing or not JSON, or a key is missing or unsupported.
         UsageError: the graph itself is not valid.
     """
-    config = _Section(source if isinstance(source, Mapping) else _read(source), "the top level")
+    if isinstance(source, Mapping):
+        return _graph(source)
+    with readable(source, "a graph configuration"):
+        return _graph(read_mapping(source) if os.fspath(source).endswith(".toml") else read_json(source))
+
+
+def _graph(source: Mapping[str, Any]) -> GraphSpec:
+    config = _Section(source, "the top level")
     nodes = tuple(_node(item) for item in config.take("nodes"))
     ends = []
     for item in config.take("edges"):
@@ -91,6 +110,8 @@ def read_graph(source: Mapping[str, Any] | str | os.PathLike[str]) -> GraphSpec:
         edge.done()
     inputs, output = tuple(config.take("input_nodes")), config.take("output_node")
     shape, order = tuple(config.take("input_shape")), config.take("ff_order", None)
+    if not all(map(_is_size, shape)):
+        raise DataError(f"'input_shape' must be whole numbers from 1 to {_LARGEST:,}; found {shown(shape)}.")
     # The number of steps is that of the stimulus; the decoder stands beside the graph.
     config.done("num_timesteps", "sep_num", "addnet")
     if not isinstance(output, str):
@@ -111,16 +132,14 @@ def read_graph(source: Mapping[str, Any] | str | os.PathLike[str]) -> GraphSpec:
     return GraphSpec(nodes, edges, inputs, output, (*shape,))
 
 
-def _read(path: str | os.PathLike[str]) -> Any:
-    return read_mapping(path) if os.fspath(path).endswith(".toml") else read_json(path)
-
-
 def _node(item: Any) -> Node:
     node = _Section(item, "a node")
     name = str(node.take("name"))
     node.where = f"node {name!r}"
     node.only(residual=(None, False))
     channels = node.take("out_channels")
+    if not _is_size(channels):
+        raise DataError(f"Node {name!r} needs 'out_channels' from 1 to {_LARGEST:,}; found {shown(channels)}.")
     harbor = _Section(node.take("harbor_policy"), f"the harbor policy of {name!r}")
     policy = harbor.take("name")
     check_name(f"harbor policy of node {name!r}", policy, ("ResizeConcat", "Identity"))

@@ -15,7 +15,6 @@ from brainbench.core.errors import DataError, DataFileNotFoundError, UsageError,
 from brainbench.models.architecture import Architecture
 
 if TYPE_CHECKING:
-    import torch
     from torch import nn
 
 FORMAT = 1
@@ -119,17 +118,10 @@ def load_weights(model: nn.Module, path: str | os.PathLike[str], *, what: str) -
         DataFileNotFoundError: there is no such file.
         DataError: it cannot be read, or does not fit the model.
     """
-    from safetensors import SafetensorError
-    from safetensors.torch import load_file
-
+    from brainbench.core.reading.archives import read_tensors
     from brainbench.models.ops.parameters import load_named
 
-    if not Path(path).is_file():
-        raise DataFileNotFoundError(f"There is no file of weights {os.fspath(path)!r} for {what!r}.")
-    try:
-        state: dict[str, torch.Tensor] = load_file(path)
-    except SafetensorError as error:
-        raise DataError(f"{os.fspath(path)!r} is not a readable safetensors file ({error}).") from error
+    state = read_tensors(path, f"file of weights for {what!r} (safetensors)")
     load_named(model.state_dict(), state, what=f"the model {what!r}")
 
 

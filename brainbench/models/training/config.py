@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields, replace
 from typing import Any
 
-from brainbench.core.errors import UsageError, check_name, unknown_name
+from brainbench.core.errors import UsageError, check_name, shown, unknown_name
+from brainbench.core.reading.ranges import check_number
 from brainbench.models.architecture import OBJECTIVES, Architecture, is_path
 from brainbench.models.recipes import BATCH_SIZE, EPOCHS, recipe_for
 from brainbench.models.training.checkpoints import DTYPES
@@ -77,14 +77,13 @@ class TrainingConfig:
             ("augmentation", self.augmentation, AUGMENTATIONS),
         ):
             check_name(kind, value, allowed)
-        for name, smallest in (("epochs", 1), ("batch_size", 2), ("probe_epochs", 0), ("warmup_epochs", 0)):
-            if getattr(self, name) < smallest:
-                raise UsageError(f"{name} must be at least {smallest}; received {getattr(self, name)!r}.")
-        if not (math.isfinite(self.learning_rate) and self.learning_rate > 0) or not self.clip >= 0:
-            raise UsageError(
-                "The learning rate must be positive and the clipping norm 0 or more; received "
-                f"{self.learning_rate!r} and {self.clip!r}."
-            )
+        whole = (("epochs", 1), ("batch_size", 2), ("probe_epochs", 0), ("warmup_epochs", 0), ("seed", 0))
+        for name, smallest in whole:
+            check_number(name, getattr(self, name), least=smallest, most=2**31 - 1, whole=True)
+        check_number("learning_rate", self.learning_rate, above=0)
+        check_number("clip", self.clip, least=0)
+        check_number("masking", self.masking, least=0, below=1)
+        check_number("checkpoint_seconds", self.checkpoint_seconds, least=0)
 
     @classmethod
     def published(cls, model: str, objective: str = "supervised", **changes: Any) -> TrainingConfig:
@@ -117,7 +116,7 @@ class TrainingConfig:
             check_name("training option", name, known)
             kinds = {"str": str, "int": int, "float": (int, float)}[known[name]]
             if not isinstance(value, kinds) or isinstance(value, bool):
-                raise UsageError(f"The training option {name!r} is a {known[name]}; received {value!r}.")
+                raise UsageError(f"The training option {name!r} is a {known[name]}; received {shown(value)}.")
         if "model" not in values:
             raise UsageError("A training configuration needs the option 'model'.")
         return cls(**values)

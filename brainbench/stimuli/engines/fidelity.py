@@ -12,7 +12,7 @@ from functools import cache
 from importlib import resources
 from typing import Any, Literal
 
-from brainbench.core.errors import UsageError, unknown_name
+from brainbench.core.errors import UsageError, shown, unknown_name
 from brainbench.core.tradeoffs import TradeoffPoint, cheapest
 from brainbench.stimuli.engines import DEFAULT_ENGINE
 from brainbench.stimuli.whiskers.chain import Chain
@@ -41,7 +41,7 @@ class Fidelity:
 
     def __post_init__(self) -> None:
         if not 2 <= self.links <= MOST_LINKS:
-            raise UsageError(f"links must lie between 2 and {MOST_LINKS}; received {self.links!r}.")
+            raise UsageError(f"links must lie between 2 and {MOST_LINKS}; received {shown(self.links)}.")
         if self.links_per_mm is not None and not (math.isfinite(self.links_per_mm) and self.links_per_mm > 0):
             raise UsageError(f"links_per_mm must be positive or None; received {self.links_per_mm!r}.")
         if not 1e-7 <= self.time_step <= 5e-3:
@@ -139,7 +139,7 @@ def _value(name: str, text: str) -> Any:
         return int(text) if name == "links" else float(text)
     except ValueError as error:
         kind = "a whole number" if name == "links" else "a number"
-        raise UsageError(f"{name} takes {kind}; received {text!r}.") from error
+        raise UsageError(f"{name} takes {kind}; received {shown(text)}.") from error
 
 
 PRECISIONS = ("single", "double")

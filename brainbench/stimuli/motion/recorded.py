@@ -20,13 +20,13 @@ import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from brainbench.core.errors import DataError, DataFileNotFoundError, UsageError, listing, unknown_name
+from brainbench.core.errors import DataError, UsageError, listing, unknown_name
+from brainbench.core.reading.texts import read_numbers
 from brainbench.stimuli.engines.protocol import base_rotation
 from brainbench.stimuli.motion.hinge_angles import follow_angles
 from brainbench.stimuli.motion.trajectories import ROTATIONS, Rotations, Vector
@@ -246,6 +246,8 @@ def load_initial_angles(path: str | os.PathLike[str], *, layout: str | None = No
         raise DataError(
             f"{os.fspath(path)!r} has {table.shape[1]} numbers per line; starting angles are three (θ, φ, ζ)."
         )
+    if not np.isfinite(table).all():
+        raise DataError(f"{os.fspath(path)!r} has starting angles that are not finite numbers.")
     names = _names(path, len(table), layout)
     return {name: (float(a), float(b), float(c)) for name, (a, b, c) in zip(names, table, strict=True)}
 
@@ -265,22 +267,3 @@ def _names(path: str | os.PathLike[str], lines: int, layout: str | None) -> tupl
     if layout not in fitting:
         raise DataError(f"{os.fspath(path)!r} has {lines} lines; the layout {layout!r} has {len(LAYOUTS[layout])}.")
     return LAYOUTS[layout]
-
-
-def read_numbers(path: str | os.PathLike[str]) -> NDArray[np.float64]:
-    """Return the numbers [line, column] of a comma-separated file; lines may end with a comma.
-
-    Raises:
-        DataError: there is no such file, something is no number, or lines differ in length.
-    """
-    if not Path(path).is_file():
-        raise DataFileNotFoundError(f"There is no file {os.fspath(path)!r}.")
-    try:
-        lines = Path(path).read_text(encoding="utf-8").split("\n")
-        rows = [[float(cell) for cell in line.rstrip(",\r ").split(",")] for line in lines if line.strip()]
-        table = np.array(rows, dtype=float)
-    except (UnicodeDecodeError, ValueError) as error:
-        raise DataError(f"{os.fspath(path)!r} is not a table of comma-separated numbers ({error}).") from error
-    if table.ndim != 2 or not len(table):
-        raise DataError(f"{os.fspath(path)!r} holds no table of numbers.")
-    return table

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from brainbench.core.errors import DataError, DataFileNotFoundError, UsageError, listing
-from brainbench.core.files import read_json
+from brainbench.core.reading.texts import read_json, read_text
 from brainbench.stimuli.objects.mesh_solids import mesh_solid
 from brainbench.stimuli.objects.solid import Solid
 
@@ -143,7 +143,7 @@ def read_ids(path: str | os.PathLike[str]) -> tuple[str, ...]:
         DataError: the file is missing, or is not text.
         UsageError: a line is not such a name, or occurs twice.
     """
-    lines = [line.partition("#")[0].strip() for line in _text(path).splitlines()]
+    lines = [line.partition("#")[0].strip() for line in read_text(path).splitlines()]
     return _checked((line for line in lines if line), repr(os.fspath(path)))
 
 
@@ -161,7 +161,7 @@ def read_categories(path: str | os.PathLike[str]) -> dict[str, str]:
         if not isinstance(data, dict) or not all(isinstance(label, str) for label in data.values()):
             raise DataError(f"{os.fspath(path)!r} must be one JSON object from names to labels (texts).")
         return data
-    rows = [row for row in csv.reader(_text(path).splitlines()) if row]
+    rows = [row for row in csv.reader(read_text(path).splitlines()) if row]
     for number, row in enumerate(rows, start=1):
         if len(row) != 2:
             raise DataError(f"Row {number} of {os.fspath(path)!r} must be a name and a label; it is {','.join(row)!r}.")
@@ -187,12 +187,3 @@ def _checked(names: Iterable[str], where: str) -> tuple[str, ...]:
 
 def _is_name(synset: str) -> bool:
     return len(synset) == 8 and synset.isdigit()
-
-
-def _text(path: str | os.PathLike[str]) -> str:
-    try:
-        return Path(path).read_text(encoding="utf-8")
-    except FileNotFoundError as error:
-        raise DataFileNotFoundError(f"There is no file {os.fspath(path)!r}.") from error
-    except (OSError, UnicodeDecodeError) as error:
-        raise DataError(f"{os.fspath(path)!r} cannot be read as text ({error}).") from error

@@ -55,13 +55,14 @@ names: ``brainbench stimuli objects``). A decomposition takes ``method`` = "coac
 from __future__ import annotations
 
 import os
-import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from brainbench.core.errors import BrainbenchError, DataError, DataFileNotFoundError, UsageError
+from brainbench.core.errors import BrainbenchError, UsageError
+from brainbench.core.reading.regular import readable
+from brainbench.core.reading.texts import read_toml
 from brainbench.stimuli.scenes.frames import Frames
 from brainbench.stimuli.scenes.motion_tables import read_head_motion, read_whisking
 from brainbench.stimuli.scenes.object_tables import PLACE, read_object
@@ -109,14 +110,10 @@ def load_scene(path: str | os.PathLike[str], *, whiskers: str = "all") -> Recipe
         DataError: the file is missing or is not TOML.
     """
     path = Path(path)
+    data = read_toml(path, "scene file")
     try:
-        data = tomllib.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError as error:
-        raise DataFileNotFoundError(f"There is no scene file {os.fspath(path)!r}.") from error
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-        raise DataError(f"The scene file {os.fspath(path)!r} cannot be read as TOML ({error}).") from error
-    try:
-        return _recipe(path, data, whiskers)
+        with readable(path, "scene file"):
+            return _recipe(path, data, whiskers)
     except BrainbenchError as error:
         raise type(error)(f"{os.fspath(path)}: {error}") from error
 

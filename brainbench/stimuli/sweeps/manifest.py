@@ -12,6 +12,7 @@ import numpy as np
 from brainbench.core.contracts import SWEEPS_FORMAT, SWEEPS_SCHEMA
 from brainbench.core.errors import DataError
 from brainbench.core.files import content_hash, provenance
+from brainbench.core.reading.hdf5 import open_hdf5
 from brainbench.stimuli.sweeps.plan import GenerationPlan, PlannedShard
 from brainbench.stimuli.sweeps.shards import COUNTS, UNUSABLE
 from brainbench.stimuli.sweeps.split import SPLITS
@@ -78,19 +79,12 @@ def make_manifest(plan: GenerationPlan | SweepTable, folder: str | os.PathLike[s
 
 def _read(path: Path, task: PlannedShard, objects: dict[str, dict[str, Any]]) -> dict[str, Any]:
     """Return what the manifest says of a shard, and add what the shard says to its ``objects``."""
-    import h5py
-
-    try:
-        opened: Any = h5py.File(path, "r")
-        with opened as file:
-            counts = {name: int(file.attrs[name]) for name in _COUNTS}
-            digest = str(file.attrs["content_hash"])
-            hashes = [value.decode() for value in file["object_hash"][:]]
-            owner, status, reasons = file["owner"][:], file["status"][:], file["reason"][:]
-    except (OSError, KeyError) as error:
-        raise DataError(
-            f"The shard {str(path)!r} is missing or damaged ({error}); run the same command again."
-        ) from error
+    with open_hdf5(path, "shard", "Run the same command again.") as opened:
+        file: Any = opened
+        counts = {name: int(file.attrs[name]) for name in _COUNTS}
+        digest = str(file.attrs["content_hash"])
+        hashes = [value.decode() for value in file["object_hash"][:]]
+        owner, status, reasons = file["owner"][:], file["status"][:], file["reason"][:]
     for index, item in enumerate(task.objects):
         mine, entry = np.flatnonzero(owner == index), objects[item.name]
         if entry["hash"] not in (None, hashes[index]):

@@ -15,7 +15,8 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.sparse.linalg import eigsh
 
 from brainbench.core.errors import UsageError, unknown_name
-from brainbench.core.files import cache_dir, content_hash, read_json, to_plain, write_json
+from brainbench.core.files import cache_dir, content_hash, to_plain
+from brainbench.core.reading.sealed import read_sealed, write_sealed
 from brainbench.geometry import Mesh
 from robotics_bridge.sensors.audio import tetrahedra
 from robotics_bridge.sensors.audio.materials import ElasticMaterial, Modes, elastic_material
@@ -87,10 +88,9 @@ def find_modes(
     chosen = elastic_material(material)
     shape = (solid.shape, list(solid.size), None if solid.mesh is None else solid.mesh.content_hash)
     points = [None if point is None else np.asarray(point, float).tolist() for point in (strike, hear)]
-    path = cache_dir("modes") / f"{content_hash(_VERSION, shape, to_plain(chosen), count, cells, points)}.json"
-    if cache and path.exists():
-        kept = read_json(path)
-        return Modes(tuple(kept["frequency"]), tuple(kept["decay"]), tuple(kept["gain"]))
+    path = cache_dir("modes") / f"{content_hash(_VERSION, shape, to_plain(chosen), count, cells, points)}.npz"
+    if cache and (kept := read_sealed(path, "modes of a solid")) is not None:
+        return Modes(*(tuple(kept[name].tolist()) for name in ("frequency", "decay", "gain")))
     frequency, normal, place = solve(solid.tetrahedra(cells), chosen, count)
     weights = []
     for point in (strike, hear):
@@ -101,7 +101,7 @@ def find_modes(
     decay = tuple(chosen.decay(f) for f in frequency)
     modes = Modes(tuple(frequency.tolist()), decay, tuple((weights[0] * weights[1]).tolist()))
     if cache:
-        write_json(path, modes)
+        write_sealed(path, "modes of a solid", vars(modes))
     return modes
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,11 +10,11 @@ from numpy.typing import NDArray
 
 from brainbench.core.devices import warp
 from brainbench.core.errors import UsageError
-from brainbench.core.files import atomic_path, cache_dir
+from brainbench.core.files import cache_dir
+from brainbench.core.reading.sealed import read_sealed, write_sealed
 from brainbench.geometry import Mesh
 from robotics_bridge.sensors.queries.kernels import distance
 
-_log = logging.getLogger(__name__)
 _FORMAT = 3
 
 
@@ -51,17 +50,12 @@ def sample_field(mesh: Mesh, resolution: int = 64, device: Any = "cpu") -> Field
     counts = np.ceil((high - low) / spacing).astype(int) + 1 + 2 * max(4, -(-resolution // 4))
     # Samples lie symmetrically about the middle of the box, so that a symmetric mesh has a symmetric field.
     origin = (0.5 * (low + high) - 0.5 * spacing * (counts - 1)).astype(np.float32)
-    path = cache_dir("fields") / f"{mesh.content_hash}-{resolution}-{_FORMAT}.npy"
-    if path.is_file():
-        try:
-            values = np.load(path, allow_pickle=False)
-            if values.shape == tuple(counts):
-                return Field(values, origin, spacing)
-        except (OSError, ValueError) as error:
-            _log.warning("The cached distance field %s cannot be read (%s); it is sampled again.", path, error)
+    path = cache_dir("fields") / f"{mesh.content_hash}-{resolution}-{_FORMAT}.npz"
+    kept = read_sealed(path, "distance field")
+    if kept is not None and kept["values"].shape == tuple(counts):
+        return Field(kept["values"], origin, spacing)
     values = _sample(mesh, origin, spacing, counts, device)
-    with atomic_path(path) as temporary:
-        np.save(temporary, values)
+    write_sealed(path, "distance field", {"values": values})
     return Field(values, origin, spacing)
 
 

@@ -185,7 +185,7 @@ def test_verification_finds_one_changed_byte(copy):
 def test_missing_and_damaged_shards_are_named(copy):
     path = copy / "train-00001.h5"
     os.truncate(path, path.stat().st_size - 2000)
-    with pytest.raises(DataError, match=r"train-00001.h5' is damaged"):
+    with pytest.raises(DataError, match=r"train-00001.h5' is truncated"):
         WhiskingDataset(copy)
     WhiskingDataset(copy, split="test")
     path.unlink()

@@ -1,0 +1,47 @@
+"""What a command will write, checked when the command line is read: before anything slow."""
+
+from __future__ import annotations
+
+from importlib.util import find_spec
+from pathlib import Path
+
+from brainbench.core.errors import UsageError, missing_dependency, shown, unknown_name
+from brainbench.core.files import check_folder
+
+
+def out_folder(path: Path | None) -> Path | None:
+    """Return the folder of ``--out`` if files can be written into it; else a :class:`UsageError`."""
+    if path is not None:
+        check_folder(path, "--out")
+    return path
+
+
+def out_file(path: Path | None) -> Path | None:
+    """Return the file of ``--out`` if it can be written; else a :class:`UsageError`."""
+    return None if path is None else _file(path, "--out")
+
+
+def report_file(path: Path | None) -> Path | None:
+    """Return the file of ``--report`` if it can be written and its ending is that of a format which can be made.
+
+    Raises:
+        UsageError: there is no such format, or nothing can be written there.
+        MissingDependencyError: the format is PDF, and WeasyPrint is not installed.
+    """
+    from leaderboards.report.paper import FORMATS
+
+    if path is None:
+        return None
+    kind = path.suffix.removeprefix(".").lower()
+    if kind not in FORMATS:
+        raise unknown_name("report format", kind, FORMATS, hint="The ending of --report chooses it.")
+    if kind == "pdf" and find_spec("weasyprint") is None:
+        raise missing_dependency("weasyprint", extra="board", purpose="A report as PDF")
+    return _file(path, "--report")
+
+
+def _file(path: Path, option: str) -> Path:
+    if path.is_dir():
+        raise UsageError(f"{option} names {shown(str(path))}, which is a folder; name a file in it.")
+    check_folder(path.parent, option)
+    return path

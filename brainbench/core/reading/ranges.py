@@ -1,0 +1,29 @@
+"""Ranges of options and numbers, checked before anything slow."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+from brainbench.core.errors import UsageError, shown
+
+
+def check_number(
+    name: str,
+    value: Any,
+    *,
+    least: float = -math.inf,
+    most: float = math.inf,
+    above: float = -math.inf,
+    below: float = math.inf,
+    whole: bool = False,
+) -> None:
+    """Raise a :class:`UsageError` unless ``value`` is a finite number within all bounds, and whole if asked for."""
+    kind = isinstance(value, int if whole else (int, float)) and not isinstance(value, bool)
+    if kind and -math.inf < value < math.inf and least <= value <= most and above < value < below:
+        return
+    bounds = {"at least": least, "at most": most, "above": above, "below": below}
+    told = " and ".join(f"{word} {bound:g}" for word, bound in bounds.items() if math.isfinite(bound))
+    raise UsageError(
+        f"{name} must be a {'whole' if whole else 'finite'} number{told and ' '}{told}; received {shown(value)}."
+    )

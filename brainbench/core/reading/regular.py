@@ -1,0 +1,76 @@
+"""What may be opened: a regular file of bounded size; and how the failure of a library is told in one sentence."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import stat
+from collections.abc import Iterator
+from pathlib import Path
+
+from brainbench.core.errors import BrainbenchError, DataError, DataFileNotFoundError, shown
+
+MOST_TEXT = 64 << 20
+"""Bytes of a text file that is parsed; nested lists take about twenty times as much memory."""
+MOST_TABLE = 256 << 20
+"""Bytes of a table of comma-separated numbers."""
+
+
+def check_file(path: str | os.PathLike[str], kind: str = "file", *, most: int | None = None) -> Path:
+    """Return the path of a regular file that can be opened without waiting.
+
+    Args:
+        path: what the user named.
+        kind: what it shall be, in words.
+        most: largest size in bytes.
+
+    Raises:
+        DataFileNotFoundError: there is nothing of this name.
+        DataError: it is a folder, a pipe, a device or a loop of links, is too large, or may not be read.
+    """
+    name = shown(os.fspath(path))
+    try:
+        found = Path(path).expanduser().stat()
+    except (FileNotFoundError, NotADirectoryError) as error:
+        raise DataFileNotFoundError(f"There is no {kind} {name}.") from error
+    except (OSError, ValueError, RuntimeError) as error:
+        raise DataError(f"The {kind} {name} cannot be opened ({reason(error)}).") from error
+    if stat.S_ISDIR(found.st_mode):
+        raise DataError(f"{name} is a folder; a {kind} is needed: name a file in it.")
+    # To open a FIFO waits for a writer, and some devices never end.
+    if not stat.S_ISREG(found.st_mode):
+        raise DataError(f"{name} is a pipe or a device; a {kind} is needed: copy its content into a file.")
+    if most is not None and found.st_size > most:
+        raise DataError(f"{name} has {found.st_size:,} bytes; a {kind} of at most {most:,} bytes is read.")
+    if not os.access(Path(path).expanduser(), os.R_OK):
+        raise DataError(f"{name} may not be read by this user; change its permissions.")
+    return Path(path).expanduser()
+
+
+def reason(error: BaseException) -> str:
+    """Return why something failed: the first line of an error, short, with its type unless it is about the file."""
+    if isinstance(error, OSError) and error.strerror and error.errno:
+        return error.strerror
+    text = next(iter(str(error).strip().splitlines()), "")
+    own = isinstance(error, (OSError, UnicodeDecodeError)) or type(error).__name__.endswith("DecodeError")
+    told = text if own else f"{type(error).__name__}: {text}"
+    return shown(told.removesuffix(": "), quoted=False, most=160)
+
+
+@contextlib.contextmanager
+def readable(path: str | os.PathLike[str], kind: str, hint: str = "") -> Iterator[None]:
+    """Turn every failure inside the block into one :class:`DataError` that names the file.
+
+    Libraries raise anything at all on damaged input; our own errors pass as they are, and the cause is kept.
+    """
+    name = shown(os.fspath(path))
+    try:
+        yield
+    except BrainbenchError:
+        raise
+    except MemoryError as error:
+        raise DataError(f"{name} declares more data than there is memory; it is damaged or no {kind}.") from error
+    except RecursionError as error:
+        raise DataError(f"{name} is nested too deeply for a {kind}.") from error
+    except Exception as error:
+        raise DataError(f"{name} cannot be read as {kind} ({reason(error)}).{hint and ' ' + hint}") from error

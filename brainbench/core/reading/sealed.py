@@ -1,0 +1,47 @@
+"""Entries of the cache with the hash of what they hold: a damaged one is noticed and made again."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from brainbench.core.errors import DataError
+from brainbench.core.files import atomic_path, hash_arrays
+from brainbench.core.reading.archives import read_npz
+
+_HASH = "sha256"
+_LOG = logging.getLogger(__name__)
+
+
+def read_sealed(path: Path, what: str) -> dict[str, NDArray[Any]] | None:
+    """Return the arrays of an entry of the cache; None, with a warning, if it is damaged, and None without one.
+
+    Args:
+        path: its file, written by :func:`write_sealed`.
+        what: what it holds, for the warning.
+    """
+    if not path.exists():
+        return None
+    try:
+        arrays: dict[str, NDArray[Any]] = dict(read_npz(path, "entry of the cache"))
+        if str(arrays.pop(_HASH, "none")) != hash_arrays(arrays):
+            raise DataError("its numbers do not match its hash")
+    except DataError as error:
+        _LOG.warning("The %s in the cache, %s, is damaged and is made again (%s)", what, path, error)
+        return None
+    return arrays
+
+
+def write_sealed(path: Path, what: str, arrays: Mapping[str, Any], *, compress: bool = False) -> None:
+    """Keep arrays in the cache, as ``.npz``; where nothing can be written, a warning says so and work goes on."""
+    values = {name: np.asarray(value) for name, value in arrays.items()}
+    try:
+        with atomic_path(path) as temporary:
+            (np.savez_compressed if compress else np.savez)(temporary, **values, **{_HASH: hash_arrays(values)})
+    except OSError as error:
+        _LOG.warning("The %s could not be kept in the cache (%s)", what, error)

@@ -1,0 +1,53 @@
+import time
+
+import h5py
+import numpy as np
+import pytest
+
+from brainbench.core.errors import DataError, DataFileNotFoundError
+from brainbench.core.reading import hdf5
+
+
+def _write(path):
+    with h5py.File(path, "w") as file:
+        file["a"] = np.arange(3)
+    return path
+
+
+def test_a_good_file_is_opened_and_failures_inside_name_it(tmp_path):
+    path = _write(tmp_path / "a.h5")
+    with hdf5.open_hdf5(path) as file:
+        assert file["a"][2] == 2
+    with pytest.raises(DataError, match=r"a\.h5.*'b'"), hdf5.open_hdf5(path) as file:
+        file["b"]
+    with pytest.raises(DataFileNotFoundError), hdf5.open_hdf5(tmp_path / "none.h5"):
+        pass
+
+
+def test_a_declared_shape_takes_no_memory(tmp_path):
+    path = tmp_path / "a.h5"
+    with h5py.File(path, "w") as file:
+        file.create_dataset("huge", shape=(2**40,), dtype="f8", chunks=True)
+    with pytest.raises(DataError, match="huge"), hdf5.open_hdf5(path):
+        pass
+
+
+def test_a_link_into_a_device_is_refused(tmp_path):
+    path = _write(tmp_path / "a.h5")
+    with h5py.File(path, "a") as file:
+        file["out"] = h5py.ExternalLink("/dev/zero", "/x")
+    with pytest.raises(DataError, match="/dev/zero"), hdf5.open_hdf5(path):
+        pass
+
+
+def test_a_file_that_the_library_never_returns_from_is_refused_and_the_next_one_is_read(tmp_path, monkeypatch):
+    slow, good = _write(tmp_path / "slow.h5"), _write(tmp_path / "good.h5")
+    ask = hdf5._Worker.ask
+    # No time at all: the worker is stopped as it is when the library loops for ever.
+    monkeypatch.setattr(hdf5, "SECONDS", -1e6)
+    began = time.monotonic()
+    with pytest.raises(DataError, match=r"slow\.h5"), hdf5.open_hdf5(slow):
+        pass
+    assert time.monotonic() - began < 5
+    monkeypatch.undo()
+    assert ask(str(good), 8.0) == ""

@@ -1,0 +1,133 @@
+"""One attempt to read a damaged file, within bounds of time and memory, and what became of it."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import math
+import resource
+import shutil
+import signal
+import tempfile
+import warnings
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from brainbench.core.errors import BrainbenchError
+from tests.factories.damage import damage, remove
+
+SECONDS = 10.0
+"""Time after which a reader hangs."""
+MEMORY = 2 << 30
+"""Address space [bytes] that a reader may take beyond what the process has."""
+LONGEST = 1000
+"""Characters of one sentence to a user."""
+
+
+class HangError(BaseException):
+    """Raised into a reader that takes too long; no handler of errors catches it."""
+
+
+@dataclass(frozen=True)
+class Surface:
+    """One reader of users' files."""
+
+    name: str
+    make: Callable[[Path], Path]
+    """Writes a good input into a folder and returns the file to be damaged."""
+    read: Callable[[Path], Any]
+    """Reads it, given the path of that file."""
+    faults: Callable[[Any], bool]
+    """True for a result that holds a number which is not finite or out of range."""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What became of one case.
+
+    ``refused`` in one sentence, or ``wordy`` in more than :data:`LONGEST` characters; ``accepted``; or one of the
+    failures ``traceback``, ``memory``, ``hang`` and ``silent``.
+    """
+
+    kind: str
+    what: str
+    """The damage."""
+    detail: str = ""
+
+
+def attempt(surface: Surface, good: Path, seed: int) -> Outcome:
+    """Damage a copy of the folder of ``good`` and read it."""
+    with tempfile.TemporaryDirectory() as folder:
+        copy = Path(folder) / "case"
+        shutil.copytree(good.parent, copy)
+        path = copy / good.name
+        what = damage(path, seed)
+        try:
+            with warnings.catch_warnings(), _bounds():
+                warnings.simplefilter("ignore")
+                value = surface.read(path)
+                faulty = surface.faults(value)
+        except BrainbenchError as error:
+            text = str(error)
+            return Outcome("wordy" if len(text) > LONGEST else "refused", what, text[:LONGEST])
+        except HangError:
+            return Outcome("hang", what)
+        except MemoryError as error:
+            return Outcome("memory", what, str(error))
+        except Exception as error:  # noqa: BLE001 - to find them is the purpose
+            return Outcome("traceback", what, f"{type(error).__name__}: {str(error)[:200]}")
+        finally:
+            remove(path)
+        return Outcome("silent" if faulty else "accepted", what)
+
+
+@contextlib.contextmanager
+def _bounds() -> Iterator[None]:
+    def stop(*_: object) -> None:
+        raise HangError
+
+    used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+    before, handler = resource.getrlimit(resource.RLIMIT_AS), signal.signal(signal.SIGALRM, stop)
+    resource.setrlimit(resource.RLIMIT_AS, (used + MEMORY + (1 << 28), before[1]))
+    signal.setitimer(signal.ITIMER_REAL, SECONDS)
+    try:
+        yield
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0)
+        signal.signal(signal.SIGALRM, handler)
+        resource.setrlimit(resource.RLIMIT_AS, before)
+
+
+def numbers(value: Any, *, depth: int = 12) -> Iterator[float]:
+    """Yield the numbers in nested data, the least and the greatest of each array."""
+    if depth == 0 or isinstance(value, (str, bytes, bool, type(None))):
+        return
+    if isinstance(value, (int, float, np.number)):
+        yield float(min(max(value, -1e308), 1e308)) if isinstance(value, int) else float(value)
+    elif isinstance(value, xr.Dataset):
+        for name in (*value.data_vars, *value.coords):
+            yield from numbers(value[name].values)
+    elif hasattr(value, "detach"):
+        yield from numbers(value.detach().float().numpy())
+    elif isinstance(value, np.ndarray):
+        if value.dtype.kind in "fiu" and value.size:
+            yield from (float(value.min()), float(value.max()))
+    elif isinstance(value, Mapping):
+        for item in value.values():
+            yield from numbers(item, depth=depth - 1)
+    elif isinstance(value, (list, tuple, set, frozenset)):
+        for item in value:
+            yield from numbers(item, depth=depth - 1)
+    elif dataclasses.is_dataclass(value):
+        for item in dataclasses.fields(value):
+            yield from numbers(getattr(value, item.name, None), depth=depth - 1)
+
+
+def not_finite(value: Any) -> bool:
+    """Return whether nested data holds a number that is not finite."""
+    return any(not math.isfinite(number) for number in numbers(value))
