@@ -17,8 +17,8 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from brainbench.core.errors import DataError, DataFileNotFoundError
-from brainbench.core.files import write_text
 from brainbench.core.records import RECORD_SCHEMA, Interval, ResultRecord, Score, record_identity
+from leaderboards.writing import write_files
 
 _MAKE_ONE = "make one with: brainbench score MODEL --out FOLDER"
 
@@ -42,16 +42,25 @@ def write_record(record: ResultRecord, folder: str | os.PathLike[str]) -> Path:
     there is left as it is (with its first time and machine); a damaged file of that name is replaced.
 
     Raises:
-        DataError: the record contradicts itself (:func:`read_record` would refuse it).
+        DataError: the record contradicts itself (:func:`read_record` would refuse it), or cannot be written.
     """
-    path = Path(folder) / record.file_name
-    text = record.to_json() + "\n"
-    _parse(text, path)
+    path, text = Path(folder) / record.file_name, record_text(record)
     try:
         read_record(path)
     except DataError:  # absent, damaged or edited
-        write_text(path, text)
+        write_files({path: text})
     return path
+
+
+def record_text(record: ResultRecord) -> str:
+    """Return the content of a record's file.
+
+    Raises:
+        DataError: the record contradicts itself.
+    """
+    text = record.to_json() + "\n"
+    _parse(text, Path(record.file_name))
+    return text
 
 
 def read_record(path: str | os.PathLike[str]) -> ResultRecord:
