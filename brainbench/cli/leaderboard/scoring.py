@@ -11,7 +11,7 @@ from typing import Any
 
 from brainbench.cli.options import SCORE, SCORE_FLAGS, as_flags
 from brainbench.core.errors import DataError, UsageError, unknown_name
-from brainbench.core.files import to_plain
+from brainbench.core.files import to_json, to_plain
 from brainbench.core.progress import Progress
 from brainbench.core.records import ESTIMATOR_VERSION, ResultRecord
 from brainbench.scoring.options import ScoreOptions
@@ -96,12 +96,12 @@ def refuse_foreign_code(record: ResultRecord, *, trusted: bool) -> None:
     from brainbench.models.training.checkpoints import shipped
 
     settings = record.score.provenance.settings
-    known = {"model": {*list_models(), *shipped()}, "metric": {*list_metrics()}}
+    known = {"model": [*list_models(), *shipped()], "metric": list_metrics()}
     for what, names in known.items():
         if not trusted and settings.get(what) not in names:
             raise UsageError(
-                f"The {what} {settings.get(what)!r} of the record is not in the registry and does not come with this "
-                "package; read its code, then run it with --trust-code."
+                f"The {what} {str(settings.get(what))[:80]!r} of the record is not in the registry and does not come "
+                "with this package; read its code, then run it with --trust-code."
             )
 
 
@@ -152,19 +152,19 @@ def missing(jobs: Sequence[ScoringJob], records: Iterable[ResultRecord]) -> list
             source = options.stimuli or brain.stimuli or DEFAULT_STIMULI
             shown = load_stimuli(source, whiskers=options.whiskers, fidelity=options.fidelity)
             inputs[key] = [brain.origin["content_hash"], shown.config_hash or shown.content_hash]
-    known = []
+    known = set()
     for record in records:
         origin = record.score.provenance
         hashes = origin.stimuli.get("config_hash") or origin.stimuli.get("content_hash")
         versions = [origin.version, origin.settings.get("estimator_version")]
         weights = record.card.weights if record.card else None
         made = [record.score.name, weights, origin.recordings.get("content_hash"), hashes, *versions]
-        known.append([*made, full_settings(origin.settings, without=_IN_HASHES)])
+        known.add(to_json([*made, full_settings(origin.settings, without=_IN_HASHES)]))
     found = []
     for job in jobs:
         weights = resolve_model(job.model, seed=job.options.model_seed).card.weights
         wanted = [job.model, weights, *inputs[_asked_for(job.options)], __version__, ESTIMATOR_VERSION]
-        if [*wanted, full_settings(job.options.settings, without=_IN_HASHES)] not in known:
+        if to_json([*wanted, full_settings(job.options.settings, without=_IN_HASHES)]) not in known:
             found.append(job)
     return found
 
