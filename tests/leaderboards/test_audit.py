@@ -9,7 +9,7 @@ import pytest
 
 from brainbench.core import records
 from leaderboards import audit
-from leaderboards.audit import conflicting, remarks
+from leaderboards.audit import MOST_NAMED, conflicting, remarks
 from leaderboards.store import StoredRecord
 
 
@@ -61,6 +61,11 @@ def test_the_same_computation_with_other_numbers_is_a_conflict_on_both_sides(mak
     assert set(found) == {one.identity, other.identity}
     assert f"0.5000 here and 0.6000 in the record {other.identity}" in found[one.identity][0]
     assert list(conflicting(one, [one, other, unrelated])) == [other]
+
+
+def test_many_contradicting_records_name_a_few_of_one_another(make_record, tmp_path):
+    found = remarks([_stored(make_record("a", 0.01 * k), tmp_path) for k in range(30)])
+    assert {len(sentences) for sentences in found.values()} == {MOST_NAMED}
 
 
 def test_last_digits_and_other_options_are_no_conflict(make_record, tmp_path):
