@@ -7,7 +7,9 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, TypedDict
+
+import msgspec
 
 from brainbench.cli.options import SCORE, SCORE_FLAGS, as_flags
 from brainbench.core.errors import DataError, UsageError, unknown_name
@@ -18,6 +20,37 @@ from brainbench.scoring.options import ScoreOptions
 
 _IN_HASHES = ("stimuli", "conditions", "select", "window", "bin", "fidelity", "whiskers")
 """Settings that the hashes of recordings and stimuli hold."""
+
+
+_Text = str | None
+_Width = Annotated[float, msgspec.Meta(gt=0, le=1e6)] | None
+_Seed = Annotated[int, msgspec.Meta(ge=0)] | None
+
+
+class _StatedSettings(TypedDict, total=False):
+    """Kinds of the settings that a record may state: anyone may have written it."""
+
+    model: _Text
+    stimuli: _Text
+    conditions: _Text
+    select: _Text
+    window: _Text
+    whiskers: _Text
+    fidelity: str | dict[str, Any] | None
+    layers: list[str] | None
+    layer: _Text
+    time: _Text
+    bin: _Width
+    over_time: bool | None
+    estimator: _Text
+    metric: _Text
+    units_reliability: float | None
+    normalize: bool | None
+    seed: _Seed
+    weights_seed: _Seed
+    readout: _Text
+    pairs: dict[str, str | None]
+    source: _Text | list[str]
 
 
 @dataclass(frozen=True)
@@ -73,14 +106,20 @@ def score_again(
 
     origin = record.score.provenance
     model, source = origin.settings.get("model"), origin.recordings.get("source")
+    try:
+        msgspec.convert({**origin.settings, "pairs": origin.pairs, "source": source}, _StatedSettings)
+    except msgspec.ValidationError as error:
+        raise DataError(f"The settings of the record of {record.score.name[:80]!r} cannot be used: {error}.") from error
     if not isinstance(model, str):
         raise DataError(
             f"The record of {record.score.name!r} does not name a model that can be loaded (a module in memory or a "
             "record of an earlier layout); score the model again."
         )
     refuse_foreign_code(record, trusted=trust_code)
-    if recordings is None and source not in DEMOS:
-        raise UsageError(f"The record was made with the recordings {source!r}; give them with --recordings PATH.")
+    if recordings is None and (not isinstance(source, str) or source not in DEMOS):
+        raise UsageError(
+            f"The record was made with the recordings {str(source)[:80]!r}; give them with --recordings PATH."
+        )
     options = ScoreOptions.stated_in(origin.settings, recordings=recordings or source, match=origin.pairs or None)
     return score_record(model, options, progress=progress)
 
