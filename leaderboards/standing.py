@@ -23,6 +23,10 @@ MEANINGS: dict[Standing, str] = {
 STANDINGS = tuple(MEANINGS)
 DOUBTFUL: tuple[Standing, ...] = ("unreliable", "undefined")
 """Standings of scores that no conclusion is drawn from."""
+BUILT_IN_METRICS = (
+    "rsa", "rsa-correlation", "rsa-crossnobis", "rsa-partial", "cka", "decoding", "procrustes", "ridge"
+)  # fmt: skip
+"""Names of the metrics that come with the package (this package cannot import them)."""
 
 
 def standing_of(score: Score, *, above_raw: bool) -> Standing:
@@ -48,4 +52,7 @@ def not_repeatable(record: ResultRecord) -> str:
         return "its features were computed elsewhere"
     if card.family == "user module":
         return "its code is not in the registry"
+    metric = record.score.provenance.settings.get("metric")
+    if card.family != "policy" and metric is not None and metric not in BUILT_IN_METRICS:
+        return "its metric does not come with the package"
     return "its weights do not come with the package" if name.startswith(("local-dir:", "hf-hub:")) else ""

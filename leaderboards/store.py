@@ -17,9 +17,15 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from brainbench.core.errors import DataError, DataFileNotFoundError
-from brainbench.core.files import write_text
 from brainbench.core.records import RECORD_SCHEMA, Interval, ResultRecord, Score, record_identity
+from leaderboards.writing import write_files
 
+MOST_BYTES = 64 << 20
+"""Largest record file: dissimilarities of some 600 stimuli, with baselines."""
+_DEEPEST = 32
+_ROUNDING = 1e-6
+_LARGEST = 1e100
+"""Largest absolute number of a score: squares and sums of such are still finite."""
 _MAKE_ONE = "make one with: brainbench score MODEL --out FOLDER"
 
 
@@ -42,16 +48,25 @@ def write_record(record: ResultRecord, folder: str | os.PathLike[str]) -> Path:
     there is left as it is (with its first time and machine); a damaged file of that name is replaced.
 
     Raises:
-        DataError: the record contradicts itself (:func:`read_record` would refuse it).
+        DataError: the record contradicts itself (:func:`read_record` would refuse it), or cannot be written.
     """
-    path = Path(folder) / record.file_name
-    text = record.to_json() + "\n"
-    _parse(text, path)
+    path, text = Path(folder) / record.file_name, record_text(record)
     try:
         read_record(path)
     except DataError:  # absent, damaged or edited
-        write_text(path, text)
+        write_files({path: text})
     return path
+
+
+def record_text(record: ResultRecord) -> str:
+    """Return the content of a record's file.
+
+    Raises:
+        DataError: the record contradicts itself.
+    """
+    text = record.to_json() + "\n"
+    _parse(text, Path(record.file_name))
+    return text
 
 
 def read_record(path: str | os.PathLike[str]) -> ResultRecord:
@@ -68,17 +83,23 @@ def read_record(path: str | os.PathLike[str]) -> ResultRecord:
 def _read(path: Path) -> tuple[ResultRecord, int]:
     """Return a record and the schema version of its file."""
     try:
+        # Asked before it is opened: a pipe or a device would never end.
+        if path.exists() and not path.is_file():
+            raise DataError(f"{os.fspath(path)!r} is no regular file, so it is no result record.")
+        if path.stat().st_size > MOST_BYTES:
+            raise DataError(
+                f"{path.name!r} has {path.stat().st_size:,} bytes; a result record has at most {MOST_BYTES:,}."
+            )
         text = path.read_text(encoding="utf-8")
     except FileNotFoundError as error:
         raise DataFileNotFoundError(f"There is no result record {os.fspath(path)!r}.") from error
     except (OSError, UnicodeDecodeError) as error:
+        if isinstance(error, DataError):
+            raise
         raise DataError(f"{os.fspath(path)!r} cannot be read as UTF-8 text ({error}).") from error
-    try:
-        record, data = _parse(text, path)
-        # The hash is that of what the file says: a field that an earlier writer did not know is not in it.
-        identity = record_identity(data)
-    except RecursionError as error:
-        raise DataError(f"{path.name!r} is nested too deeply to be a result record.") from error
+    record, data = _parse(text, path)
+    # The hash is that of what the file says: a field that an earlier writer did not know is not in it.
+    identity = record_identity(data)
     named = path.stem.rpartition("--")[2]
     if named != identity:
         raise DataError(
@@ -123,17 +144,20 @@ def read_records(source: str | os.PathLike[str] | Iterable[str | os.PathLike[str
 
 def _parse(text: str, path: Path) -> tuple[ResultRecord, dict[str, Any]]:
     try:
-        data = json.loads(text, parse_constant=_refuse_constant)
+        data = json.loads(text, parse_constant=_refuse_constant, parse_float=_finite, parse_int=_bounded)
+        _check_text(data, _DEEPEST)
+    except RecursionError as error:
+        raise DataError(f"{path.name!r} is nested too deeply to be a result record.") from error
     except ValueError as error:
         raise DataError(f"{path.name!r} is not valid JSON ({error}).") from error
     try:
         record = ResultRecord.from_json(data)
     except DataError as error:
-        raise DataError(f"{path.name!r} is not a result record: {error}") from error
+        raise DataError(f"{path.name!r} is not a result record: {str(error)[:400]}") from error
     for score in (record.score, record.animal_to_animal, *record.baselines.values()):
         contradiction = _contradiction(score) if score else None
         if score and contradiction:
-            raise DataError(f"{path.name!r} contradicts itself: in the score {score.name!r}, {contradiction}.")
+            raise DataError(f"{path.name!r} contradicts itself: in the score {score.name[:80]!r}, {contradiction}.")
     return record, data
 
 
@@ -141,17 +165,62 @@ def _refuse_constant(name: str) -> NoReturn:
     raise ValueError(f"{name} is not JSON; a number without value is null")
 
 
+def _finite(digits: str) -> float:
+    if math.isinf(value := float(digits)):
+        raise ValueError(f"{digits[:80]} is larger than any number of 64 bits")
+    return value
+
+
+def _bounded(digits: str) -> int:
+    if len(digits) > 19:  # msgspec's integers have 64 bits
+        raise ValueError(f"{digits[:80]} is larger than any integer of 64 bits")
+    return int(digits)
+
+
+def _check_text(data: Any, left: int) -> None:
+    """Refuse what JSON may hold and a page or a file cannot: deep nesting, and halves of surrogate pairs."""
+    if isinstance(data, str):
+        data.encode()  # UnicodeEncodeError is a ValueError
+    elif isinstance(data, (dict, list)):
+        if not left:
+            raise RecursionError
+        for item in (*data, *data.values()) if isinstance(data, dict) else data:
+            if not isinstance(item, (float, int)):
+                _check_text(item, left - 1)
+
+
 def _contradiction(score: Score) -> str | None:
     """Return what cannot be true at once, or None. These rules are beyond what JSON Schema can say."""
     if math.isnan(score.value) != (score.status == "undefined"):
         return f"the status is {score.status!r} but the value is {score.value}"
-    pairs = len(score.stimuli) * (len(score.stimuli) - 1) // 2
-    for name in ("model_rdm", "brain_rdm"):
+    count = len(score.stimuli)
+    pairs = count * (count - 1) // 2
+    for name, wanted in (("model_rdm", pairs), ("brain_rdm", pairs), ("without_stimulus", count)):
         length = len(getattr(score, name))
-        if length not in (0, pairs):
-            return f"{name} has {length} pairs but {len(score.stimuli)} stimuli make {pairs}"
+        if length not in (0, wanted):
+            what = "values" if name == "without_stimulus" else "pairs"
+            return f"{name} has {length} {what} but {count} stimuli make {wanted}"
     for name in ("interval", "reliability_interval"):
         interval: Interval | None = getattr(score, name)
         if interval and interval.low > interval.high:
             return f"{name} runs from {interval.low} down to {interval.high}"
-    return None
+    return _out_of_range(score)
+
+
+def _out_of_range(score: Score) -> str | None:
+    """Return the first number that no score can have, in words, or None; NaN is a number without value."""
+    if score.p < score.p_smallest * (1 - 1e-9):
+        return f"p is {score.p} but the smallest possible is {score.p_smallest}"
+    if score.reliability > 1 + _ROUNDING or any(one.reliability > 1 + _ROUNDING for one in score.subjects):
+        return "a reliability is above 1"
+    if str(score.provenance.settings.get("metric")).startswith("rsa"):  # correlations
+        ends = (score.ceiling.lower, score.ceiling.upper) if score.ceiling else ()
+        compared = (score.r, *ends, *(one.r for one in (*score.subjects, *score.layers)))
+        if any(abs(r) > 1 + _ROUNDING for r in compared):
+            return "a raw comparison (r, or its ceiling) is outside -1 to 1"
+    intervals = [score.interval, score.reliability_interval, *(layer.interval for layer in score.layers)]
+    numbers = [score.value, score.r, score.chance, score.attainable, score.best_layer_value, *score.without_stimulus]
+    numbers += [*score.model_rdm, *score.brain_rdm, *(one.value for one in (*score.subjects, *score.layers))]
+    numbers += [end for one in intervals if one for end in (one.low, one.high)]
+    largest = max((abs(number) for number in numbers if math.isfinite(number)), default=0.0)
+    return f"a number is as large as {largest}" if largest > _LARGEST else None

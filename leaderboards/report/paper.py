@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any
 
 from brainbench.core.errors import DataError, missing_dependency, unknown_name
-from brainbench.core.files import atomic_path, write_text
 from brainbench.core.records import ResultRecord
 from leaderboards import text as words
 from leaderboards.boards import Board, rank
@@ -27,6 +26,7 @@ from leaderboards.report.citations import references
 from leaderboards.site.page import render, render_markdown
 from leaderboards.site.table import board_label
 from leaderboards.store import StoredRecord
+from leaderboards.writing import write_files
 
 FORMATS = ("md", "html", "pdf")
 _WORDY = ("model", "baseline", "animal", "statement", "stated", "layer", "standing")
@@ -55,8 +55,9 @@ def write_paper(
 ) -> list[Path]:
     """Write a report and return its files, the main one first.
 
-    Markdown comes with a folder of SVG files and the citations as ``.bib``; HTML and PDF hold their figures, and
-    bring a ``.bib`` too. A single record gives the report of that model, with its architecture and layers.
+    All files appear together. Markdown comes with a folder of SVG files and the citations as ``.bib``; HTML and PDF
+    hold their figures, and bring a ``.bib`` too. A single record gives the report of that model, with its
+    architecture and layers.
 
     Args:
         records: What :func:`leaderboards.read_records` returned, or records in memory.
@@ -66,7 +67,7 @@ def write_paper(
 
     Raises:
         UsageError: there is no such format.
-        DataError: there is no usable record.
+        DataError: there is no usable record, the PDF engine failed, or the files cannot be written. All are unchanged.
         MissingDependencyError: WeasyPrint, which makes PDF, is not installed.
     """
     path = Path(path)
@@ -79,39 +80,39 @@ def write_paper(
         raise DataError("There are no usable result records for a report; make one with: brainbench score MODEL")
     boards = rank(usable)
     cited = references(usable)
-    bib = write_text(path.with_suffix(".bib"), "\n\n".join(item.bibtex for item in cited) + "\n")
+    bib = {path.with_suffix(".bib"): "\n\n".join(item.bibtex for item in cited) + "\n"}
     paper = {
         "title": title,
         "synthetic": any(board.synthetic for board in boards),
         "sections": [_section(board, place, path) for place, board in enumerate(boards, start=1)],
         "references": cited,
         "commands": list(dict.fromkeys(text for record in usable if (text := record.score.provenance.command))),
-        "bib": bib.name,
+        "bib": path.with_suffix(".bib").name,
     }
     if kind == "md":
         drawn = [figure for section in paper["sections"] for figure in section["figures"]]
-        files = [write_text(place, standalone(figure.drawing)) for figure, place in drawn]
-        return [write_text(path, render_markdown("paper.md.j2", **paper)), bib, *files]
+        figures = {place: standalone(figure.drawing) for figure, place in drawn}
+        return write_files({path: render_markdown("paper.md.j2", **paper), **bib, **figures})
     text = render("paper.html.j2", **paper, style_of_figures=STYLE)
-    if kind == "html":
-        return [write_text(path, text), bib]
-    _write_pdf(text, path)
-    return [path, bib]
+    return write_files({path: text if kind == "html" else _pdf(text, path), **bib})
 
 
-def _write_pdf(text: str, path: Path) -> None:
+def _pdf(text: str, path: Path) -> bytes:
     """Print a page that needs nothing from elsewhere."""
+    instead = f"write {path.with_suffix('.html').name} and print it from a browser"
     try:
         import weasyprint  # pyright: ignore[reportMissingImports]
     except (ImportError, OSError) as error:  # OSError: its system libraries are missing
-        purpose = f"Writing PDF (or write {path.with_suffix('.html').name} and print it from a browser)"
-        raise missing_dependency("weasyprint", extra="board", purpose=purpose) from error
+        raise missing_dependency("weasyprint", extra="board", purpose=f"Writing PDF (or {instead})") from error
 
     def refuse(url: str, *_: object, **__: object) -> dict[str, object]:
         raise ValueError(f"A report loads nothing from elsewhere; asked for {url}.")
 
-    with atomic_path(path) as temporary:
-        weasyprint.HTML(string=text, url_fetcher=refuse).write_pdf(temporary)
+    try:
+        return weasyprint.HTML(string=text, url_fetcher=refuse).write_pdf()
+    except Exception as error:
+        why = f"{type(error).__name__}: {str(error)[:80]}"
+        raise DataError(f"WeasyPrint could not print {str(path)!r} ({why}); {instead}.") from error
 
 
 def _section(board: Board, place: int, path: Path) -> dict[str, Any]:

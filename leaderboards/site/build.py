@@ -10,12 +10,12 @@ from __future__ import annotations
 import io
 import os
 import zipfile
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from brainbench.core.errors import DataError, UsageError
-from brainbench.core.files import atomic_path, write_json, write_text
+from brainbench.core.errors import BrainbenchError, DataError
+from brainbench.core.files import to_json
 from brainbench.core.records import ResultRecord
 from leaderboards import text as words
 from leaderboards.audit import remarks
@@ -23,13 +23,20 @@ from leaderboards.boards import Board, rank
 from leaderboards.conclusions import conclusions
 from leaderboards.figures.charts import board_figures
 from leaderboards.schema import record_schema
+from leaderboards.site.folder import rebuilt
 from leaderboards.site.page import render, script_json
 from leaderboards.site.score_page import model_page
 from leaderboards.site.table import COLUMNS, board_label, page_data, table_csv, table_rows
-from leaderboards.store import StoredRecord, write_record
+from leaderboards.store import StoredRecord, record_text
 
 PAGE = 50
 """Rows of the table shown at once."""
+DOWNLOADS = {
+    "data/leaderboard.csv": "Table (CSV)",
+    "data/leaderboard.json": "Table (JSON)",
+    "data/records.zip": "All records (JSON files, zip)",
+    "data/record.schema.json": "JSON Schema of a record",
+}
 
 
 def build_leaderboard(
@@ -40,42 +47,70 @@ def build_leaderboard(
 ) -> Path:
     """Write the site into ``folder`` and return its first page.
 
-    Every file appears whole or not at all, the first page last; files of an earlier build that are no
-    longer needed are removed if they are of this site. Equal records give equal files.
+    The files appear together, the first page last, and none if there is an error. A manifest lists them, and files of
+    an earlier build that are no longer needed are removed if they are as the manifest says. Equal records give equal
+    files.
 
     Args:
-        records: What :func:`leaderboards.read_records` returned, or records in memory. Files with problems
+        records: What :func:`leaderboards.read_records` returned, or records in memory. Those with problems
             are listed on the first page and left out of the boards.
         folder: Folder of the site; made if it is not there.
         title: Heading of the first page.
 
     Raises:
-        DataError: there is nothing to show, or a record in memory contradicts itself.
-        UsageError: ``folder`` is a file, or a folder that holds something else.
+        DataError: there is nothing to show, or the site cannot be written.
+        UsageError: ``folder`` is a file, or holds something that no build wrote or that was changed since.
     """
-    stored = [StoredRecord(Path(), item) if isinstance(item, ResultRecord) else item for item in records]
+    stored = [_stored(item) if isinstance(item, ResultRecord) else item for item in records]
     if not stored:
         raise DataError(
             "There are no result records to build a leaderboard from; make one with: "
             "brainbench score MODEL --out FOLDER"
         )
-    root = _folder(Path(folder))
+    root = Path(folder)
+    try:
+        _write(stored, root, title)
+    except BrainbenchError:
+        raise
+    except Exception:
+        # Whatever a record may hold that no check foresaw: it is found by itself and left out, and the site is built.
+        shown = [_tried(item) for item in stored]
+        if shown == stored:
+            raise
+        _write(shown, root, title)
+    return root / "index.html"
+
+
+def _stored(record: ResultRecord) -> StoredRecord:
+    path = Path(record.file_name)
+    try:
+        record_text(record)
+    except DataError as error:
+        return StoredRecord(path, None, str(error))
+    return StoredRecord(path, record)
+
+
+def _tried(item: StoredRecord) -> StoredRecord:
+    try:
+        for _ in _pages([item], ""):
+            pass
+    except Exception as error:  # noqa: BLE001 - see build_leaderboard
+        return StoredRecord(item.path, None, f"cannot be shown ({type(error).__name__}: {str(error)[:80]})")
+    return item
+
+
+def _write(stored: Sequence[StoredRecord], root: Path, title: str) -> None:
+    with rebuilt(root) as stage:
+        for name, content in _pages(stored, title):
+            stage(name, content)
+
+
+def _pages(stored: Sequence[StoredRecord], title: str) -> Iterator[tuple[str, str | bytes]]:
+    """Yield each file of the site with its content, the first page first."""
     boards = rank([item.record for item in stored if item.record is not None], remarks(stored))
-    kept, downloads = _write_models(root, boards), _write_data(root, boards)
     synthetic = any(board.synthetic for board in boards)
-    shown = []
-    for place, board in enumerate(boards, start=1):
-        figures = board_figures(board)
-        if len(boards) > 1:
-            figures = [replace(figure, key=f"{figure.key}-{place}") for figure in figures]
-        shown.append({"label": board_label(board), "figures": figures})
-    write_text(
-        root / "figures.html",
-        render("board_figures.html.j2", title="Figures", boards=shown, synthetic=synthetic, here="figures", root=""),
-    )
-    _sweep(root, kept | downloads.keys())
-    return write_text(
-        root / "index.html",
+    yield (
+        "index.html",
         render(
             "index.html.j2",
             title=title,
@@ -85,24 +120,31 @@ def build_leaderboard(
             concluded=[conclusions(board) for board in boards],
             synthetic=synthetic,
             problems=[item for item in stored if item.record is None],
-            downloads=[(path.relative_to(root).as_posix(), label) for path, label in downloads.items()],
+            downloads=DOWNLOADS.items(),
             data=script_json({"boards": page_data(boards), "columns": COLUMNS, "page": PAGE}),
             here="table",
             root="",
         ),
     )
-
-
-def _folder(root: Path) -> Path:
-    ours = root / "index.html"
-    if root.is_file() or root.suffix.lower() in (".html", ".htm"):
-        raise UsageError(
-            f"A leaderboard is a folder; received {str(root)!r}. For a single page use: brainbench leaderboard report"
-        )
-    if root.is_dir() and any(root.iterdir()) and not ours.is_file() and not (root / "data").is_dir():
-        raise UsageError(f"The folder {str(root)!r} holds something else; give a new folder or an earlier build.")
-    root.mkdir(parents=True, exist_ok=True)
-    return root
+    shown = []
+    for place, board in enumerate(boards, start=1):
+        figures = board_figures(board)
+        if len(boards) > 1:
+            figures = [replace(figure, key=f"{figure.key}-{place}") for figure in figures]
+        shown.append({"label": board_label(board), "figures": figures})
+    yield (
+        "figures.html",
+        render("board_figures.html.j2", title="Figures", boards=shown, synthetic=synthetic, here="figures", root=""),
+    )
+    for entry in (entry for board in boards for entry in board.entries):
+        yield f"models/{entry.page}", model_page(entry)
+    texts = {
+        record.file_name: record_text(record) for board in boards for entry in board.entries for record in entry.records
+    }
+    yield from ((f"records/{name}", text) for name, text in texts.items())
+    rows = [row for board in boards for row in table_rows(board)]
+    data = (table_csv(rows), to_json(rows) + "\n", _records_zip(texts), to_json(record_schema()) + "\n")
+    yield from zip(DOWNLOADS, data, strict=True)
 
 
 def _count(boards: Sequence[Board]) -> str:
@@ -113,43 +155,12 @@ def _count(boards: Sequence[Board]) -> str:
     return text + (f" on {words.plural(len(boards), 'board')}." if len(boards) != 1 else ".")
 
 
-def _write_models(root: Path, boards: Sequence[Board]) -> set[Path]:
-    kept = set()
-    for entry in (entry for board in boards for entry in board.entries):
-        kept.add(write_text(root / "models" / entry.page, model_page(entry)))
-        kept |= {write_record(record, root / "records") for record in entry.records}
-    return kept
-
-
-def _write_data(root: Path, boards: Sequence[Board]) -> dict[Path, str]:
-    """Write the downloads and return each file with its label."""
-    data, rows = root / "data", [row for board in boards for row in table_rows(board)]
-    offered = {
-        write_text(data / "leaderboard.csv", table_csv(rows)): "Table (CSV)",
-        write_json(data / "leaderboard.json", rows): "Table (JSON)",
-    }
-    with atomic_path(data / "records.zip") as temporary:
-        temporary.write_bytes(_records_zip(boards))
-    offered[data / "records.zip"] = "All records (JSON files, zip)"
-    offered[write_json(data / "record.schema.json", record_schema())] = "JSON Schema of a record"
-    return offered
-
-
-def _records_zip(boards: Sequence[Board]) -> bytes:
+def _records_zip(texts: Mapping[str, str]) -> bytes:
     """Return the record files under their content-hash names: unpacking into a folder merges them."""
     stream = io.BytesIO()
     with zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED, compresslevel=9) as archive:
-        records = [record for board in boards for entry in board.entries for record in entry.records]
-        for record in sorted(records, key=lambda record: record.file_name):
-            entry = zipfile.ZipInfo(record.file_name)  # its fixed date of 1980 keeps the bytes equal
+        for name, text in sorted(texts.items()):
+            entry = zipfile.ZipInfo(name)  # its fixed date of 1980 keeps the bytes equal
             entry.compress_type = zipfile.ZIP_DEFLATED
-            archive.writestr(entry, record.to_json() + "\n")
+            archive.writestr(entry, text)
     return stream.getvalue()
-
-
-def _sweep(root: Path, kept: set[Path]) -> None:
-    """Remove pages, records and tables of an earlier build."""
-    for folder, pattern in (("models", "*--*.html"), ("records", "*--*.json"), ("data", "leaderboard.*")):
-        for path in (root / folder).glob(pattern):
-            if path not in kept:
-                path.unlink()

@@ -14,7 +14,6 @@ from itertools import combinations
 from pathlib import Path
 from typing import Any
 
-from brainbench.core.files import write_text
 from brainbench.core.records import ResultRecord
 from leaderboards import text
 from leaderboards.boards import RAW_INPUT
@@ -26,6 +25,7 @@ from leaderboards.figures.time_course import draw_time_course
 from leaderboards.ranking import compare, lacking
 from leaderboards.site.page import render
 from leaderboards.standing import not_repeatable, standing_of
+from leaderboards.writing import write_files
 
 _MOST_PAIRS = 100
 """An RDM with more pairs than this is shown as a picture only; its numbers are in the record."""
@@ -41,7 +41,8 @@ def write_report(record: ResultRecord, path: str | os.PathLike[str]) -> Path:
     # Base64, so that nothing in the record can be read as markup.
     embedded = base64.b64encode((record.to_json() + "\n").encode()).decode()
     link = f"data:application/json;base64,{embedded}"
-    return write_text(path, render("report.html.j2", **_score_view(record), record_link=link))
+    page = render("report.html.j2", **_score_view(record), record_link=link)
+    return write_files({Path(path): page})[0]
 
 
 def model_page(entry: Entry) -> str:

@@ -110,3 +110,16 @@ def test_code_that_a_record_names_is_not_run(run, tmp_path):
         assert result.status == 1
         assert "--trust-code" in result.out
     assert not (tmp_path / "ran").exists()
+
+
+@pytest.mark.parametrize(
+    "odd", [{"seed": "x"}, {"layers": 3}, {"time": 4}, {"bin": -1}, {"units_reliability": [2]}, {"metric": ["rsa"]}]
+)
+def test_settings_of_other_kinds_are_named_and_not_repeated(run, tmp_path, odd):
+    record = make_record("s4-small")
+    settings = {"model": "s4-small", "metric": "rsa", **odd}
+    origin = {**record.score.provenance, "settings": settings, "recordings": {"source": "demo"}}
+    path = write_record(replace(record, score=replace(record.score, provenance=origin)), tmp_path)
+    (result,) = json.loads(run("leaderboard", "verify", str(path), "--json").out)
+    assert result["verdict"] == "not repeated"
+    assert f"$.{next(iter(odd))}" in result["problem"]

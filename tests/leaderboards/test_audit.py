@@ -9,7 +9,7 @@ import pytest
 
 from brainbench.core import records
 from leaderboards import audit
-from leaderboards.audit import conflicting, remarks
+from leaderboards.audit import MOST_NAMED, conflicting, remarks
 from leaderboards.store import StoredRecord
 
 
@@ -60,7 +60,12 @@ def test_the_same_computation_with_other_numbers_is_a_conflict_on_both_sides(mak
     found = remarks([_stored(record, tmp_path) for record in (one, other, unrelated)])
     assert set(found) == {one.identity, other.identity}
     assert f"0.5000 here and 0.6000 in the record {other.identity}" in found[one.identity][0]
-    assert conflicting(one, [one, other, unrelated]) == [other]
+    assert list(conflicting(one, [one, other, unrelated])) == [other]
+
+
+def test_many_contradicting_records_name_a_few_of_one_another(make_record, tmp_path):
+    found = remarks([_stored(make_record("a", 0.01 * k), tmp_path) for k in range(30)])
+    assert {len(sentences) for sentences in found.values()} == {MOST_NAMED}
 
 
 def test_last_digits_and_other_options_are_no_conflict(make_record, tmp_path):
@@ -80,5 +85,5 @@ def test_a_record_is_hashed_once_however_many_rivals_ask_for_its_identity(make_r
     hashed = []
     monkeypatch.setattr(records, "record_identity", lambda data: hashed.append(data) or str(len(hashed)))
     one, other = make_record(value=0.5), make_record(value=0.7)
-    assert conflicting(one, [other] * 20) == [other] * 20
+    assert list(conflicting(one, [other] * 20)) == [other] * 20
     assert len(hashed) == 2

@@ -9,8 +9,9 @@ from dataclasses import replace
 import pytest
 
 from brainbench.core.records import ModelCard
+from brainbench.metrics import list_metrics
 from leaderboards import standing as module
-from leaderboards.standing import STANDINGS, not_repeatable, standing_of
+from leaderboards.standing import BUILT_IN_METRICS, STANDINGS, not_repeatable, standing_of
 
 
 @pytest.mark.parametrize(
@@ -45,6 +46,16 @@ def test_only_what_comes_with_the_package_can_be_repeated(make_record, name, fam
     record = make_record(name)
     record = replace(record, card=ModelCard(name, family=family))
     assert (not_repeatable(record) == "") is repeatable
+
+
+def test_a_metric_of_a_user_leaves_a_record_without_a_rank(make_record):
+    def scored_by(metric):
+        return make_record("s4-small", provenance={"settings": {"metric": metric}})
+
+    assert set(BUILT_IN_METRICS) == set(list_metrics())
+    assert not any(not_repeatable(scored_by(metric)) for metric in BUILT_IN_METRICS)
+    for metric in ("mine", "mine.py:Mine", ["rsa"], 3):
+        assert "metric" in not_repeatable(scored_by(metric))
 
 
 def test_the_examples_hold():

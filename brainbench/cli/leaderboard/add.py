@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
+from collections.abc import Hashable
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -11,8 +13,11 @@ from brainbench.cli.leaderboard.scoring import ScoringJob, full_settings, jobs_o
 from brainbench.cli.options import SCORE, SCORE_FLAGS, SchedulerOption, with_options
 from brainbench.cli.output import JsonOption, emit, progress_bar
 from brainbench.core.errors import DataFileNotFoundError, UsageError
+from brainbench.core.files import to_json
 from brainbench.core.records import ResultRecord
+from leaderboards.audit import computation, conflicting, remarks
 from leaderboards.store import StoredRecord, read_records, write_record
+from leaderboards.writing import in_one_sentence, locked, sweep
 
 OFFERED = (
     "recordings", "conditions", "select", "window", "stimuli", "fidelity", "whiskers", "metric", "estimator", "time"
@@ -89,7 +94,9 @@ def _files(sources: list[Path]) -> list[Path]:
 
 def _take_in(paths: list[Path], to: Path, *, keep_both: bool) -> list[dict[str, Any]]:
     """Take in files one after the other; what one brought counts for the next."""
-    present = {record.identity: record for _, record in _present(to)} if paths else {}
+    present: dict[Hashable, dict[str, ResultRecord]] = defaultdict(dict)
+    for record in (record for _, record in (_present(to) if paths else [])):
+        present[computation(record)][record.identity] = record
     done = []
     for path in paths:
         (stored,) = read_records(path)
@@ -98,42 +105,43 @@ def _take_in(paths: list[Path], to: Path, *, keep_both: bool) -> list[dict[str, 
 
 
 def _take_in_one(
-    stored: StoredRecord, to: Path, present: dict[str, ResultRecord], *, keep_both: bool
+    stored: StoredRecord, to: Path, present: dict[Hashable, dict[str, ResultRecord]], *, keep_both: bool
 ) -> dict[str, Any]:
-    from leaderboards.audit import conflicting, remarks
-
     record = stored.record
     if record is None:
         return {"state": "refused", "model": None, "note": f": {stored.problem}"}
-    rivals = conflicting(record, present.values())
-    if rivals and not keep_both:
+    alike = present[computation(record)]
+    rival = None if keep_both else next(conflicting(record, alike.values()), None)
+    if rival is not None:
         note = (
-            f": the same computation gave {rivals[0].score.value:.4f} in a record that is there "
-            f"({rivals[0].identity}) and {record.score.value:.4f} here; see which holds with: "
+            f": the same computation gave {rival.score.value:.4f} in a record that is there "
+            f"({rival.identity}) and {record.score.value:.4f} here; see which holds with: "
             f"brainbench leaderboard verify {stored.path}"
         )
         return {"state": "refused", "model": record.score.name, "note": note}
-    state = "known" if record.identity in present else "added"
+    state = "known" if record.identity in alike else "added"
     written = write_record(record, to)
-    present[record.identity] = record
+    alike[record.identity] = record
     note = "".join(f"\n          {doubt}" for doubt in remarks([stored]).get(record.identity, ()))
     return {"state": state, "record": written.name, "model": record.score.name, "note": note}
 
 
 def _present(to: Path) -> list[tuple[Path, ResultRecord]]:
-    if not to.is_dir() or not any(to.rglob("*.json")):
+    """Return the records of a folder; what killed writers left there is removed."""
+    if not to.is_dir():
+        return []
+    with in_one_sentence(to), locked(to) as alone:
+        if alone:
+            sweep(to, lambda name: name.endswith(".json"))
+    if not any(to.rglob("*.json")):
         return []
     return [(item.path, item.record) for item in read_records(to) if item.record is not None]
 
 
-def _replaces(new: ResultRecord, old: ResultRecord) -> bool:
-    """Return whether two records answer the same question, the old one with what has since changed."""
-
-    def question(record: ResultRecord) -> tuple[Any, ...]:
-        origin = record.score.provenance
-        return record.score.name, origin.recordings.get("source"), full_settings(origin.settings)
-
-    return question(new) == question(old)
+def _question(record: ResultRecord) -> str:
+    """Return what two records share when they answer the same question, the old one with what has since changed."""
+    origin = record.score.provenance
+    return to_json([record.score.name, origin.recordings.get("source"), full_settings(origin.settings)])
 
 
 def _score(
@@ -146,17 +154,21 @@ def _score(
     done: list[dict[str, Any]] = []
     with progress_bar() as progress:
         present = _present(to)
+        asked: dict[str, list[Path]] = defaultdict(list)
+        for old, record in present if prune else ():
+            asked[_question(record)].append(old)
         open_jobs = missing(jobs, [record for _, record in present])
+        open_ones = {id(job) for job in open_jobs}
         done += [
             {"state": "known", "record": None, "model": f"{job.model} seed {job.options.model_seed}", "note": ""}
             for job in jobs
-            if job not in open_jobs
+            if id(job) not in open_ones
         ]
         scored = run_jobs(ScoringJob.run, open_jobs, workers=workers, scheduler=scheduler)
         for index, (place, record) in enumerate(scored, start=1):
             progress(index, len(open_jobs), "models scored")
             path = write_record(record, to)
-            replaced = [old for old, said in present if prune and old != path and _replaces(record, said)]
+            replaced = [old for old in (asked[_question(record)] if prune else ()) if old != path]
             for old in replaced:
                 old.unlink(missing_ok=True)
             note = "".join(f"\n          replaces {old.name}" for old in replaced)

@@ -7,11 +7,18 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, TypedDict
+
+import msgspec
 
 from brainbench.cli.options import SCORE, SCORE_FLAGS, as_flags
+<<<<<<< HEAD
 from brainbench.core.errors import DataError, UsageError, listing, shown, unknown_name
 from brainbench.core.files import to_plain
+=======
+from brainbench.core.errors import DataError, UsageError, unknown_name
+from brainbench.core.files import to_json, to_plain
+>>>>>>> 2c6b80ca04ef308b999bef3c57b95dd8e45c9af2
 from brainbench.core.progress import Progress
 from brainbench.core.reading.ranges import check_number
 from brainbench.core.reading.texts import read_toml
@@ -20,6 +27,37 @@ from brainbench.scoring.options import ScoreOptions
 
 _IN_HASHES = ("stimuli", "conditions", "select", "window", "bin", "fidelity", "whiskers")
 """Settings that the hashes of recordings and stimuli hold."""
+
+
+_Text = str | None
+_Width = Annotated[float, msgspec.Meta(gt=0, le=1e6)] | None
+_Seed = Annotated[int, msgspec.Meta(ge=0)] | None
+
+
+class _StatedSettings(TypedDict, total=False):
+    """Kinds of the settings that a record may state: anyone may have written it."""
+
+    model: _Text
+    stimuli: _Text
+    conditions: _Text
+    select: _Text
+    window: _Text
+    whiskers: _Text
+    fidelity: str | dict[str, Any] | None
+    layers: list[str] | None
+    layer: _Text
+    time: _Text
+    bin: _Width
+    over_time: bool | None
+    estimator: _Text
+    metric: _Text
+    units_reliability: float | None
+    normalize: bool | None
+    seed: _Seed
+    weights_seed: _Seed
+    readout: _Text
+    pairs: dict[str, str | None]
+    source: _Text | list[str]
 
 
 @dataclass(frozen=True)
@@ -75,14 +113,20 @@ def score_again(
 
     origin = record.score.provenance
     model, source = origin.settings.get("model"), origin.recordings.get("source")
+    try:
+        msgspec.convert({**origin.settings, "pairs": origin.pairs, "source": source}, _StatedSettings)
+    except msgspec.ValidationError as error:
+        raise DataError(f"The settings of the record of {record.score.name[:80]!r} cannot be used: {error}.") from error
     if not isinstance(model, str):
         raise DataError(
             f"The record of {record.score.name!r} does not name a model that can be loaded (a module in memory or a "
             "record of an earlier layout); score the model again."
         )
     refuse_foreign_code(record, trusted=trust_code)
-    if recordings is None and source not in DEMOS:
-        raise UsageError(f"The record was made with the recordings {source!r}; give them with --recordings PATH.")
+    if recordings is None and (not isinstance(source, str) or source not in DEMOS):
+        raise UsageError(
+            f"The record was made with the recordings {str(source)[:80]!r}; give them with --recordings PATH."
+        )
     options = ScoreOptions.stated_in(origin.settings, recordings=recordings or source, match=origin.pairs or None)
     return score_record(model, options, progress=progress)
 
@@ -98,12 +142,12 @@ def refuse_foreign_code(record: ResultRecord, *, trusted: bool) -> None:
     from brainbench.models.training.checkpoints import shipped
 
     settings = record.score.provenance.settings
-    known = {"model": {*list_models(), *shipped()}, "metric": {*list_metrics()}}
+    known = {"model": [*list_models(), *shipped()], "metric": list_metrics()}
     for what, names in known.items():
         if not trusted and settings.get(what) not in names:
             raise UsageError(
-                f"The {what} {settings.get(what)!r} of the record is not in the registry and does not come with this "
-                "package; read its code, then run it with --trust-code."
+                f"The {what} {str(settings.get(what))[:80]!r} of the record is not in the registry and does not come "
+                "with this package; read its code, then run it with --trust-code."
             )
 
 
@@ -154,19 +198,19 @@ def missing(jobs: Sequence[ScoringJob], records: Iterable[ResultRecord]) -> list
             source = options.stimuli or brain.stimuli or DEFAULT_STIMULI
             shown = load_stimuli(source, whiskers=options.whiskers, fidelity=options.fidelity)
             inputs[key] = [brain.origin["content_hash"], shown.config_hash or shown.content_hash]
-    known = []
+    known = set()
     for record in records:
         origin = record.score.provenance
         hashes = origin.stimuli.get("config_hash") or origin.stimuli.get("content_hash")
         versions = [origin.version, origin.settings.get("estimator_version")]
         weights = record.card.weights if record.card else None
         made = [record.score.name, weights, origin.recordings.get("content_hash"), hashes, *versions]
-        known.append([*made, full_settings(origin.settings, without=_IN_HASHES)])
+        known.add(to_json([*made, full_settings(origin.settings, without=_IN_HASHES)]))
     found = []
     for job in jobs:
         weights = resolve_model(job.model, seed=job.options.model_seed).card.weights
         wanted = [job.model, weights, *inputs[_asked_for(job.options)], __version__, ESTIMATOR_VERSION]
-        if [*wanted, full_settings(job.options.settings, without=_IN_HASHES)] not in known:
+        if to_json([*wanted, full_settings(job.options.settings, without=_IN_HASHES)]) not in known:
             found.append(job)
     return found
 

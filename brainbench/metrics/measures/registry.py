@@ -51,6 +51,8 @@ def get_metric(name: str | Metric) -> Metric:
     # A class has the names of its instances, so it must be told from an instance first.
     made: Any = found() if isinstance(found, type) or (not hasattr(found, "title") and callable(found)) else found
     check_metric(made)
+    if made.name in _METRICS and made is not _METRICS[made.name]:  # a record could not tell the two apart
+        raise UsageError(f"A metric named {made.name!r} exists already; give the one in {name!r} another name.")
     return made
 
 

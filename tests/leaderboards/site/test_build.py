@@ -45,15 +45,6 @@ def _seeded(record, seed: int, by: float):
     return replace(record, card=card, score=score)
 
 
-def test_a_damaged_record_of_an_earlier_build_is_written_again(make_record, tmp_path):
-    site = build([make_record()], tmp_path)
-    (record,) = (site / "records").glob("*.json")
-    whole = record.read_text()
-    record.write_text("{}")
-    build([make_record()], tmp_path)
-    assert record.read_text() == whole
-
-
 def test_every_row_says_rank_score_and_interval_and_baselines_follow(tmp_path):
     records = draw_board({"low": 0.0, "a": 0.9, "b": 0.85}, spread=0.1)
     (board,) = data(build(records, tmp_path))["boards"]
@@ -185,7 +176,7 @@ def test_nothing_to_show_and_foreign_folders_are_errors_that_say_what_to_do(make
         build_leaderboard([make_record()], tmp_path / "board.html")
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "thesis.txt").write_text("precious")
-    with pytest.raises(UsageError, match="holds something else"):
+    with pytest.raises(UsageError, match="thesis"):
         build_leaderboard([make_record()], tmp_path / "mine")
 
 
@@ -205,7 +196,12 @@ def test_hostile_text_cannot_leave_the_data_of_the_table(make_record, tmp_path, 
 def chromium():
     playwright = pytest.importorskip("playwright.sync_api")
     with playwright.sync_playwright() as api:
-        yield api.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox", "--disable-gpu"])
+        # These pages hold what strangers wrote: the browser runs in its sandbox, or the test does not run.
+        try:
+            found = api.chromium.launch(executable_path=CHROMIUM, args=["--disable-gpu"], chromium_sandbox=True)
+        except playwright.Error as error:
+            pytest.skip(f"Chromium has no sandbox here ({error.message.splitlines()[0]})")
+        yield found
 
 
 @pytest.mark.slow

@@ -1,0 +1,111 @@
+"""The folder of a built site: a build replaces and removes only what a build wrote.
+
+``build-manifest.json`` lists each file with its SHA-256 hash. While a build is under way it lists the hashes before and
+after, so that the next build also knows the files of one that was killed.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+
+import msgspec
+
+from brainbench.core.errors import DataError, UsageError
+from brainbench.core.files import atomic_path, write_json
+from leaderboards.writing import final_name, in_one_sentence, locked, sweep
+
+MANIFEST = "build-manifest.json"
+_Hashes = dict[str, list[str]]
+"""Path in the site → the hashes that a build may have given it."""
+
+
+@contextmanager
+def rebuilt(root: Path) -> Iterator[Callable[[str, str | bytes], Path]]:
+    """Yield a function that takes a file of the new site: its path there and its content.
+
+    The new files appear together when the block ends, the one given first last; after an error the old site is
+    unchanged. Another build of the same folder waits until this one has ended.
+
+    Raises:
+        UsageError: ``root`` is a file, or holds something that no build wrote or that was changed since.
+        DataError: it cannot be written.
+    """
+    check_site(root)
+    with in_one_sentence(root):
+        root.mkdir(parents=True, exist_ok=True)
+        with locked(root) as alone:
+            known, present = check_site(root)
+            if alone:
+                for folder in {root, *(path.parent for path in root.rglob(".*-*"))}:
+                    sweep(folder, lambda name: True)
+            _write(root, known)
+            new: _Hashes = {}
+            with ExitStack() as stack:
+
+                def stage(name: str, content: str | bytes) -> Path:
+                    data = content.encode() if isinstance(content, str) else content
+                    stack.enter_context(atomic_path(root / name)).write_bytes(data)
+                    new[name] = [hashlib.sha256(data).hexdigest()]
+                    return root / name
+
+                yield stage
+                both = {name: known.get(name, []) + new.get(name, []) for name in known.keys() | new.keys()}
+                _write(root, both)
+            for name in present - new.keys():
+                (root / name).unlink(missing_ok=True)
+            _write(root, new)
+
+
+def check_site(root: Path) -> tuple[_Hashes, set[str]]:
+    """Return what the manifest of a folder lists and which of it is there.
+
+    Raises:
+        UsageError: ``root`` is a file, or holds something that no build wrote or that was changed since.
+    """
+    if root.is_file() or root.suffix.lower() in (".html", ".htm"):
+        raise UsageError(
+            f"A leaderboard is a folder; received {str(root)!r}. For a single page use: brainbench leaderboard report"
+        )
+    known, present = _read(root), set()
+    for name in sorted(_files(root)):
+        path = root / name
+        temporary = (final_name(path.name) is not None and known is not None) or final_name(name) == MANIFEST
+        if name == MANIFEST or (temporary and not path.is_symlink()):
+            continue
+        listed = (known or {}).get(name, [])
+        if path.is_symlink() or not path.is_file() or _hash(path) not in listed:
+            what = "was changed since the last build" if listed else "no build of a leaderboard wrote"
+            raise UsageError(
+                f"The folder {str(root)!r} holds {name[-80:]!r}, which {what}; move it away or give a new folder."
+            )
+        present.add(name)
+    return known or {}, present
+
+
+def _files(root: Path) -> Iterator[str]:
+    """Yield the paths of all files and links below a folder; links are not followed."""
+    for folder, folders, files in os.walk(root):
+        links = [name for name in folders if (Path(folder) / name).is_symlink()]
+        yield from ((Path(folder) / name).relative_to(root).as_posix() for name in (*files, *links))
+
+
+def _read(root: Path) -> _Hashes | None:
+    """Return what the manifest lists; None without one, so that nothing counts as ours."""
+    path = root / MANIFEST
+    try:
+        return msgspec.json.decode(path.read_bytes(), type=_Hashes) if path.is_file() else None
+    except (OSError, msgspec.DecodeError) as error:
+        raise DataError(f"{str(path)!r} is no manifest of a build ({error}); give a new folder.") from error
+
+
+def _write(root: Path, hashes: _Hashes) -> None:
+    write_json(root / MANIFEST, {name: sorted(set(hashes[name])) for name in hashes})
+
+
+def _hash(path: Path) -> str:
+    with path.open("rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()

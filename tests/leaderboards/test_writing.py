@@ -1,0 +1,97 @@
+"""Files appear whole, together or not at all; a full disk is said in one sentence."""
+
+from __future__ import annotations
+
+import doctest
+import resource
+import sys
+from contextlib import contextmanager
+from types import SimpleNamespace
+
+import pytest
+
+from brainbench.core.errors import DataError
+from leaderboards import build_leaderboard, write_record, writing
+from leaderboards.report.paper import write_paper
+from leaderboards.writing import write_files
+from tests.factories.sweep_batches import files_of
+
+
+@contextmanager
+def _files_of_at_most(size: int):
+    """Let the system refuse larger files, as a full disk would."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+
+@pytest.mark.parametrize("what", ["record", "site", "md", "html"])
+def test_a_size_limit_is_one_sentence_and_the_old_files_stay(make_record, tmp_path, what):
+    write = {
+        "record": lambda record: write_record(record, tmp_path / "board"),
+        "site": lambda record: build_leaderboard([record], tmp_path / "site"),
+        "md": lambda record: write_paper([record], tmp_path / "report.md"),
+        "html": lambda record: write_paper([record], tmp_path / "report.html"),
+    }[what]
+    write(make_record("old"))
+    before = files_of(tmp_path)
+    with _files_of_at_most(3000), pytest.raises(DataError) as caught:
+        write(make_record("new", stimuli=tuple(f"{k}" * 400 for k in range(6))))
+    assert "File too large" in str(caught.value)
+    assert files_of(tmp_path) == before
+
+
+def test_a_file_in_the_way_is_one_sentence(make_record, tmp_path):
+    (tmp_path / "file").write_text("")
+    for write in (
+        lambda folder: write_record(make_record(), folder),
+        lambda folder: build_leaderboard([make_record()], folder),
+        lambda folder: write_paper([make_record()], folder / "report.md"),
+    ):
+        with pytest.raises(DataError) as caught:
+            write(tmp_path / "file" / "x")
+        assert "Not a directory" in str(caught.value)
+
+
+def test_a_failing_engine_leaves_the_old_pdf_and_its_citations(make_record, tmp_path, monkeypatch):
+    class Engine:
+        def __init__(self, **_: object) -> None: ...
+
+        def write_pdf(self) -> bytes:
+            if failing:
+                raise AssertionError("a font is missing")
+            return b"%PDF whole"
+
+    monkeypatch.setitem(sys.modules, "weasyprint", SimpleNamespace(HTML=Engine))
+    failing = False
+    write_paper([make_record("old")], tmp_path / "a.pdf")
+    before = files_of(tmp_path)
+    failing = True
+    with pytest.raises(DataError) as caught:
+        write_paper([make_record("new")], tmp_path / "a.pdf")
+    assert "a font is missing" in str(caught.value)
+    assert files_of(tmp_path) == before
+
+
+def test_all_files_or_none(tmp_path):
+    (tmp_path / "b").mkdir()
+    with pytest.raises(DataError):
+        write_files({tmp_path / "a.txt": "new", tmp_path / "b": "a folder is in the way"})
+    assert not (tmp_path / "a.txt").exists()
+    assert [path.name for path in write_files({tmp_path / "a.txt": "new", tmp_path / "c.txt": b"too"})] == [
+        "a.txt", "c.txt"
+    ]  # fmt: skip
+
+
+def test_leftovers_of_the_same_file_are_swept(tmp_path):
+    for name in (".a-0123456789abcdef.txt", ".other-0123456789abcdef.txt"):
+        (tmp_path / name).write_text("half")
+    write_files({tmp_path / "a.txt": "whole"})
+    assert {path.name for path in tmp_path.iterdir()} == {"a.txt", ".other-0123456789abcdef.txt"}
+
+
+def test_the_examples_hold():
+    assert doctest.testmod(writing).failed == 0
