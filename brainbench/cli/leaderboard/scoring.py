@@ -12,13 +12,8 @@ from typing import Annotated, Any, TypedDict
 import msgspec
 
 from brainbench.cli.options import SCORE, SCORE_FLAGS, as_flags
-<<<<<<< HEAD
 from brainbench.core.errors import DataError, UsageError, listing, shown, unknown_name
-from brainbench.core.files import to_plain
-=======
-from brainbench.core.errors import DataError, UsageError, unknown_name
 from brainbench.core.files import to_json, to_plain
->>>>>>> 2c6b80ca04ef308b999bef3c57b95dd8e45c9af2
 from brainbench.core.progress import Progress
 from brainbench.core.reading.ranges import check_number
 from brainbench.core.reading.texts import read_toml
