@@ -96,8 +96,8 @@ def _spoil(folder, name, text):
     [
         ("param_name", "RC2\nRC1\n", r"param_name .*'RC2' .*param_side_row_col .*'RC1'"),
         ("param_name", "RC1\n", r"param_side_row_col.* has shape \[2, 3\]; 1 names need \[1, 3\]"),
-        ("param_s_a", "1,2\n3\n", "not a table of"),
-        ("param_s_a", "a,2\n3,4\n", "not a table of"),
+        ("param_s_a", "1,2\n3\n", "param_s_a"),
+        ("param_s_a", "a,2\n3,4\n", "param_s_a"),
         ("param_bp_pos", "1,2\n3,4\n", r"shape \[2, 2\]; 2 names need \[2, 3\]"),
         ("param_side_row_col", "1,9,1\n1,3,2\n", r"says 'R\?1'"),
     ],
