@@ -129,8 +129,8 @@ class Gradients:
         if self.average is not None:
             self.average(vector)
         parts = vector.split([*(item.numel() for item in gradients), 1])
-        for gradient, part in zip(gradients, parts, strict=False):
-            gradient.copy_(part.view_as(gradient))
+        means = [part.view_as(item) for part, item in zip(parts, gradients, strict=False)]
+        torch._foreach_copy_(gradients, means)  # pyright: ignore[reportPrivateImportUsage] - a launch for all
         return parts[-1][0]
 
     @property
