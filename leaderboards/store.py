@@ -54,7 +54,7 @@ def write_record(record: ResultRecord, folder: str | os.PathLike[str]) -> Path:
     try:
         read_record(path)
     except DataError:  # absent, damaged or edited
-        write_files({path: text})
+        write_files({path: text}, swept=False)
     return path
 
 
