@@ -54,7 +54,7 @@ def write_record(record: ResultRecord, folder: str | os.PathLike[str]) -> Path:
     try:
         read_record(path)
     except DataError:  # absent, damaged or edited
-        write_files({path: text})
+        write_files({path: text}, swept=False)
     return path
 
 
@@ -94,8 +94,6 @@ def _read(path: Path) -> tuple[ResultRecord, int]:
     except FileNotFoundError as error:
         raise DataFileNotFoundError(f"There is no result record {os.fspath(path)!r}.") from error
     except (OSError, UnicodeDecodeError) as error:
-        if isinstance(error, DataError):
-            raise
         raise DataError(f"{os.fspath(path)!r} cannot be read as UTF-8 text ({error}).") from error
     record, data = _parse(text, path)
     # The hash is that of what the file says: a field that an earlier writer did not know is not in it.

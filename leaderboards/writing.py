@@ -15,10 +15,13 @@ _TEMPORARY = re.compile(r"\.(?P<stem>.+)-[0-9a-f]{16}(?P<suffix>\.[^.]*)?")
 """Names that :func:`brainbench.core.files.atomic_path` gives before a file is whole."""
 
 
-def write_files(files: Mapping[Path, str | bytes]) -> list[Path]:
+def write_files(files: Mapping[Path, str | bytes], *, swept: bool = True) -> list[Path]:
     """Write files so that all are whole before the first appears, and return their paths.
 
-    Temporary files of a killed process that wrote the same files are removed.
+    Args:
+        files: Path → content.
+        swept: Remove what a killed process that wrote the same files left. This lists their folders, so records, of
+            which a folder may hold thousands, go without; ``leaderboard add`` sweeps once.
 
     Raises:
         DataError: they cannot be written; what was there is still there.
@@ -27,7 +30,7 @@ def write_files(files: Mapping[Path, str | bytes]) -> list[Path]:
         stack.enter_context(in_one_sentence(next(iter(files))))
         for folder in sorted({path.parent for path in files}):
             folder.mkdir(parents=True, exist_ok=True)
-            if stack.enter_context(locked(folder)):
+            if stack.enter_context(locked(folder)) and swept:
                 names = {path.name for path in files if path.parent == folder}
                 sweep(folder, lambda name, names=names: name in names)
         for path, content in files.items():

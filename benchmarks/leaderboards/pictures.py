@@ -46,7 +46,8 @@ def main() -> None:
     model = sorted((asked.site / "models").glob(f"{asked.model}--*.html"))[0]
     pages = {"MODEL": model, "REPORT": asked.report}
     with sync_playwright() as api:
-        browser = api.chromium.launch(executable_path=asked.chromium, args=["--no-sandbox", "--disable-gpu"])
+        # The site may hold what strangers wrote, and its policy is lifted below.
+        browser = api.chromium.launch(executable_path=asked.chromium, args=["--disable-gpu"], chromium_sandbox=True)
         for name, (address, width, height, colours) in VIEWS.items():
             if pages.get(address, model) is None:
                 continue

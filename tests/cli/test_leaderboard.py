@@ -171,6 +171,13 @@ def test_options_of_scores_without_a_model_are_refused(run, tmp_path, option):
     assert option[0] in result.err
 
 
+def test_a_file_in_place_of_the_folder_is_refused_before_anything_is_scored(run, tmp_path):
+    (tmp_path / "file").write_text("")
+    result = run("leaderboard", "add", "--model", "s4-small", "--to", str(tmp_path / "file"))
+    assert result.status == 2
+    assert "--to" in result.err
+
+
 def test_nothing_to_add_is_an_error(run):
     result = run("leaderboard", "add")
     assert result.status == 2
