@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
-from brainbench.core.errors import DataError, DataFileNotFoundError, UsageError, missing_dependency
+from brainbench.core.errors import BrainbenchError, DataError, DataFileNotFoundError, UsageError, missing_dependency
 from brainbench.core.files import file_hash, provenance, read_json, write_json
 from robotics_bridge.envs.rsl_rl import RslRlEnv
 from robotics_bridge.policies.evaluate import Policy
@@ -380,12 +380,14 @@ def load_teacher(run: str | Path, env: Env) -> Policy:
         raise DataError(f"The weights in {str(file)!r} are of another policy than config.json describes.")
     # To learn, a trainer seeds random numbers and spreads the first episodes; who only acts finds all as it was.
     ages = env.episode_length_buf.clone()
-    with torch.random.fork_rng(devices=[env.device] if env.device.type == "cuda" else []):
-        trainer = Trainer(env, settings)
-    env.episode_length_buf.copy_(ages)
     try:
+        with torch.random.fork_rng(devices=[env.device] if env.device.type == "cuda" else []):
+            trainer = Trainer(env, settings)
+        env.episode_length_buf.copy_(ages)
         trainer.algorithm.get_policy().load_state_dict(weights)
-    except (RuntimeError, TypeError, KeyError, AttributeError) as error:
+    except (RuntimeError, TypeError, ValueError, LookupError, AttributeError) as error:
+        if isinstance(error, BrainbenchError):
+            raise
         task, hand = (str(facts.values.get(name))[:80] for name in ("task", "hand"))
         raise DataError(
             f"The policy of {str(path)!r} was trained on {task!r} with hand {hand!r} and does not "
