@@ -22,7 +22,7 @@ from robotics_bridge.policies.runners import Runner, read_policy
 if TYPE_CHECKING:
     from robotics_bridge.policies.student import TactilePolicy
 
-SUFFIXES = dict(zip(FORMATS, (".onnx", ".pt"), strict=True))
+SUFFIXES: dict[str, str] = dict(zip(FORMATS, (".onnx", ".pt"), strict=True))
 """Formats and their suffixes: ONNX, and TorchScript."""
 TOLERANCE = 1e-4
 """Largest difference of an action between file and policy, relative to the largest action."""

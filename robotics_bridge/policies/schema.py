@@ -135,10 +135,8 @@ class Values:
         found = {}
         for name, annotation in ((name, known[name]) for name in self.values):
             plain, _, optional = annotation.partition(" | ")
-            good = _KINDS.get(plain, _KINDS["str"])
-            found[name] = self.get(
-                name, lambda value, g=good, o=optional: g(value) or (o and value is None), annotation
-            )
+            good, empty = _KINDS.get(plain, _KINDS["str"]), bool(optional)
+            found[name] = self.get(name, lambda value, g=good, e=empty: g(value) or (e and value is None), annotation)
         return found
 
 

@@ -75,6 +75,9 @@ def load(path: str | os.PathLike[str], device: str = "cpu") -> Any:
         with safe_open(str(path), framework="pt", device=device) as file:
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
             metadata = file.metadata() or {}
-        return restore(json.loads(metadata["tree"]), tensors)
+        tree = restore(json.loads(metadata["tree"]), tensors)
     except (SafetensorError, LookupError, ValueError, TypeError, AttributeError, RecursionError, OSError) as error:
         raise DataError(f"{str(path)!r} is damaged or not one of ours: {str(error)[:80]}.") from error
+    if not isinstance(tree, dict):
+        raise DataError(f"{str(path)!r} is damaged or not one of ours: it holds no names and values.")
+    return tree

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
-from brainbench.core.errors import DataError, DataFileNotFoundError, UsageError, missing_dependency
+from brainbench.core.errors import BrainbenchError, DataError, DataFileNotFoundError, UsageError, missing_dependency
 from brainbench.core.files import file_hash, provenance, read_json, write_json
 from robotics_bridge.envs.rsl_rl import RslRlEnv
 from robotics_bridge.policies.evaluate import Policy
@@ -33,6 +33,8 @@ if TYPE_CHECKING:
 
 _LOG = logging.getLogger(__name__)
 RESUME = "resume.safetensors"
+_ACTOR = ("hidden", "initial_std", "std_type", "std_range")
+"""Settings of the actor's network."""
 
 
 @dataclass(frozen=True)
@@ -367,17 +369,25 @@ def load_teacher(run: str | Path, env: Env) -> Policy:
     path = Path(run)
     file = model_file(path)
     facts = Values.read(file.parent / "config.json")
-    settings = replace(env.task.teacher, **_plain(facts.part("settings").fields(TeacherSettings)))
+    found = _plain(facts.part("settings").fields(TeacherSettings))
+    # Who only acts needs the actor; other settings would take memory for learning.
+    settings = replace(env.task.teacher, **{name: found[name] for name in _ACTOR if name in found})
+    weights = state_tree.load(file).get("actor")
+    weights = weights if isinstance(weights, dict) else {}
+    require_finite(file, weights)
+    biases = [weights.get(f"mlp.{2 * layer}.bias") for layer in range(len(settings.hidden))]
+    if [list(getattr(bias, "shape", ())) for bias in biases] != [[width] for width in settings.hidden]:
+        raise DataError(f"The weights in {str(file)!r} are of another policy than config.json describes.")
     # To learn, a trainer seeds random numbers and spreads the first episodes; who only acts finds all as it was.
     ages = env.episode_length_buf.clone()
-    with torch.random.fork_rng(devices=[env.device] if env.device.type == "cuda" else []):
-        trainer = Trainer(env, settings)
-    env.episode_length_buf.copy_(ages)
     try:
-        weights = state_tree.load(file)["actor"]
-        require_finite(file, weights)
+        with torch.random.fork_rng(devices=[env.device] if env.device.type == "cuda" else []):
+            trainer = Trainer(env, settings)
+        env.episode_length_buf.copy_(ages)
         trainer.algorithm.get_policy().load_state_dict(weights)
-    except (RuntimeError, TypeError, KeyError, AttributeError) as error:
+    except (RuntimeError, TypeError, ValueError, LookupError, AttributeError) as error:
+        if isinstance(error, BrainbenchError):
+            raise
         task, hand = (str(facts.values.get(name))[:80] for name in ("task", "hand"))
         raise DataError(
             f"The policy of {str(path)!r} was trained on {task!r} with hand {hand!r} and does not "

@@ -15,14 +15,16 @@ from typing import Any
 import pytest
 import torch
 
-from brainbench.core.errors import DataError, UsageError
+from brainbench.core.errors import BrainbenchError, DataError, UsageError
 from robotics_bridge import tasks
 from robotics_bridge.envs import Env
+from robotics_bridge.policies.shipped import FOLDER
 from robotics_bridge.policies.training import state_tree
 from robotics_bridge.policies.training.teacher import RESUME, TeacherRun, Trainer, load_teacher, newest
 from robotics_bridge.policies.training.teacher import train as train_teacher
 from robotics_bridge.tasks.goals import SteppingRotation
 from robotics_bridge.tasks.settings import TeacherSettings
+from tests.factories.mutations import mutate, mutate_text
 
 SMALL = TeacherSettings(num_envs=4, steps_per_env=6, iterations=4, epochs=2, minibatches=2, hidden=(16, 16))
 
@@ -190,3 +192,30 @@ def test_trees_of_tensors_and_numbers_survive_a_file(tmp_path: Path) -> None:
     (tmp_path / "broken.safetensors").write_bytes(b"no tensors")
     with pytest.raises(DataError, match="damaged"):
         state_tree.load(tmp_path / "broken.safetensors")
+
+
+def _check_mutants(folder, cases: int) -> None:
+    whole = FOLDER / "in_palm_rotate.careful"
+    config, weights = (whole / "config.json").read_bytes(), newest(whole).read_bytes()
+    env = tasks.make("in_palm_rotate", num_envs=2, config="careful")
+    refused = 0
+    for seed in range(cases):
+        changed = json.dumps(mutate(json.loads(config), seed)).encode()
+        (folder / "config.json").write_bytes((changed, mutate_text(config, seed), config)[seed % 3])
+        (folder / newest(whole).name).write_bytes(mutate_text(weights, seed) if seed % 3 == 2 else weights)
+        try:
+            policy = load_teacher(folder, env)
+        except BrainbenchError:
+            refused += 1
+        else:
+            assert all(torch.isfinite(value).all() for value in policy.actor.state_dict().values())
+    assert refused > cases // 3
+
+
+def test_damaged_teachers_are_refused_or_sound(tmp_path) -> None:
+    _check_mutants(tmp_path, 30)
+
+
+@pytest.mark.slow
+def test_many_damaged_teachers_are_refused_or_sound(tmp_path) -> None:
+    _check_mutants(tmp_path, 500)
