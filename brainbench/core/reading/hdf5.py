@@ -87,7 +87,7 @@ class _Worker:
     def _running(cls) -> subprocess.Popen[str]:
         # A forked process must not share the pipe of its parent.
         if cls._process is None or cls._owner != os.getpid() or cls._process.poll() is not None:
-            words = [sys.executable, "-I", os.fspath(Path(__file__).with_name("hdf5_worker.py"))]
+            words = [sys.executable, "-P", os.fspath(Path(__file__).with_name("hdf5_worker.py"))]
             pipe = subprocess.PIPE
             cls._process = subprocess.Popen(words, stdin=pipe, stdout=pipe, stderr=subprocess.DEVNULL, text=True)
             cls._owner = os.getpid()
