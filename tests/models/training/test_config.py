@@ -31,7 +31,7 @@ def test_changes_win():
     ("values", "message"),
     [
         ({"epoch": 3}, "Unknown training option 'epoch'; did you mean 'epochs'"),
-        ({"epochs": 0}, "epochs .*at least 1; received 0"),
+        ({"epochs": 0}, "epochs .*at least 1 .*received 0"),
         ({"epochs": 1.5}, r"'epochs' is a int; received 1\.5"),
         ({"learning_rate": -1.0}, "learning_rate .*-1"),
         ({"precision": "fp16"}, "Unknown precision 'fp16'"),
