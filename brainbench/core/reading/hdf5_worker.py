@@ -121,6 +121,8 @@ def answer(path: str) -> None:
 if __name__ == "__main__":
     import h5py  # noqa: F401 - once, for all processes that are forked below
 
+    sys.stdout.write("ready\n")
+    sys.stdout.flush()
     for line in sys.stdin:
         if not hasattr(os, "fork"):
             answer(json.loads(line))
