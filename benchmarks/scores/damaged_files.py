@@ -36,7 +36,8 @@ def count(name: str, cases: int) -> Counter[str]:
     while (first := sum(found.values())) < cases:
         words = [sys.executable, "-m", "benchmarks.scores.damaged_files", "--only", name, "--first", str(first)]
         with subprocess.Popen([*words, "--cases", str(cases)], stdout=subprocess.PIPE, text=True) as child:
-            watch = threading.Timer(STUCK, child.kill)
+            # Before its first outcome a process starts and makes a good file.
+            watch = threading.Timer(20 * STUCK, child.kill)
             watch.start()
             for line in child.stdout or ():
                 watch.cancel()

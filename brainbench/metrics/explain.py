@@ -26,7 +26,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike
 
-from brainbench.core.errors import DataError, DataFileNotFoundError, UsageError
+from brainbench.core.errors import DataError, UsageError
+from brainbench.core.reading.archives import read_npz
 from brainbench.core.records import Status
 from brainbench.metrics.animals import gather
 from brainbench.metrics.layers import held_out
@@ -115,13 +116,7 @@ def explain_file(path: str | Path) -> tuple[Step, ...]:
         DataFileNotFoundError: there is no such file.
         DataError: it holds something else.
     """
-    if not Path(path).is_file():
-        raise DataFileNotFoundError(f"There is no file {path}.")
-    try:
-        with np.load(path, allow_pickle=False) as stored:
-            arrays = {name: stored[name] for name in stored.files}
-    except (OSError, ValueError) as error:
-        raise DataError(f"{path} is no .npz file of plain arrays ({error}).") from error
+    arrays = read_npz(path, ".npz file of plain arrays")
     if missing := {"r_xy", "r_yy"} - arrays.keys():
         raise DataError(f"{path} lacks the array {sorted(missing)[0]!r}; it has {sorted(arrays)}.")
     return explain_splits(arrays["r_xy"], arrays["r_yy"], r_xx=arrays.get("r_xx"))

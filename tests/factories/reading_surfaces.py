@@ -276,7 +276,7 @@ def _bad_graph(spec: Any) -> bool:
 
 def _bad_scene(recipe: Any) -> bool:
     scenes = list(recipe.scenes)
-    return not_finite(scenes) or any(item.friction < 0 for scene in scenes for item in scene.objects)
+    return not_finite(scenes) or any((item.friction or 0) < 0 for scene in scenes for item in scene.objects)
 
 
 def _bad_record(record: Any) -> bool:

@@ -81,12 +81,12 @@ def _array(item: Any, name: str) -> str:
 
 def _links(file: Any, path: str) -> str:
     """Return the fault of a link into what is no regular file: to follow it could wait for ever."""
-    import h5py
+    from h5py import h5l  # pyright: ignore[reportAttributeAccessIssue] - compiled
 
     found: list[str] = []
 
     def visit(name: bytes, link: Any) -> None:
-        if link.type == h5py.h5l.TYPE_EXTERNAL:
+        if link.type == h5l.TYPE_EXTERNAL:
             target = os.fsdecode(file.id.links.get_val(name)[0])
             other = Path(path).parent / target
             if other.exists() and not other.is_file():
@@ -121,6 +121,8 @@ def answer(path: str) -> None:
 if __name__ == "__main__":
     import h5py  # noqa: F401 - once, for all processes that are forked below
 
+    sys.stdout.write("ready\n")
+    sys.stdout.flush()
     for line in sys.stdin:
         if not hasattr(os, "fork"):
             answer(json.loads(line))

@@ -23,7 +23,7 @@ def check_number(
     if kind and -math.inf < value < math.inf and least <= value <= most and above < value < below:
         return
     bounds = {"at least": least, "at most": most, "above": above, "below": below}
-    told = " and ".join(f"{word} {bound:g}" for word, bound in bounds.items() if math.isfinite(bound))
+    told = " and ".join(f"{word} {bound:,}" for word, bound in bounds.items() if math.isfinite(bound))
     raise UsageError(
-        f"{name} must be a {'whole' if whole else 'finite'} number{told and ' '}{told}; received {shown(value)}."
+        f"{name} must be a {'whole' if whole else 'finite'} number{told and ', '}{told}; received {shown(value)}."
     )

@@ -42,6 +42,7 @@ def write_sealed(path: Path, what: str, arrays: Mapping[str, Any], *, compress: 
     values = {name: np.asarray(value) for name, value in arrays.items()}
     try:
         with atomic_path(path) as temporary:
-            (np.savez_compressed if compress else np.savez)(temporary, **values, **{_HASH: hash_arrays(values)})
+            sealed: dict[str, Any] = {**values, _HASH: hash_arrays(values)}
+            (np.savez_compressed if compress else np.savez)(temporary, **sealed)
     except OSError as error:
         _LOG.warning("The %s could not be kept in the cache (%s)", what, error)

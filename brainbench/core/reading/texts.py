@@ -87,7 +87,7 @@ def read_mapping(path: str | os.PathLike[str], kind: str = "file") -> dict[str, 
     return values
 
 
-def read_numbers(path: str | os.PathLike[str], kind: str = "table of numbers") -> NDArray[np.float64]:
+def read_numbers(path: str | os.PathLike[str], kind: str = "table of comma-separated numbers") -> NDArray[np.float64]:
     """Return the numbers [line, column] of a comma-separated file; lines may end with a comma.
 
     NaN and infinity are numbers here: some tables have gaps, and their readers say what these mean.
@@ -103,10 +103,10 @@ def read_numbers(path: str | os.PathLike[str], kind: str = "table of numbers") -
         try:
             rows.append(np.array(line.split(","), dtype=float))
         except ValueError as error:
-            raise DataError(f"{os.fspath(path)!r} is no {kind}: row {number} is {shown(line)}.") from error
+            raise DataError(f"{os.fspath(path)!r} is not a {kind}: row {number} is {shown(line)}.") from error
         if len(rows[-1]) != len(rows[0]):
             raise DataError(
-                f"{os.fspath(path)!r} is no {kind}: row {number} has {len(rows[-1])} columns, row 1 {len(rows[0])}."
+                f"{os.fspath(path)!r} is not a {kind}: row {number} has {len(rows[-1])} columns, row 1 {len(rows[0])}."
             )
     if not rows:
         raise DataError(f"{os.fspath(path)!r} holds no table of numbers.")

@@ -20,6 +20,7 @@ from torch import nn
 
 from brainbench.core.errors import DataError, UsageError
 from brainbench.core.files import atomic_path, read_json, write_json, write_text
+from brainbench.core.reading.regular import check_file, readable
 
 _log = logging.getLogger(__name__)
 
@@ -83,18 +84,14 @@ def load_state(path: Path, learner: nn.Module, optimizer: torch.optim.Optimizer)
     Raises:
         DataError: the file is damaged or belongs to another network.
     """
-    from safetensors import SafetensorError, safe_open
+    from safetensors import safe_open
 
-    try:
-        with safe_open(path, framework="pt") as file:
-            header = json.loads(file.metadata()["state"])
-            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - not a mapping
-    except (SafetensorError, KeyError, TypeError, json.JSONDecodeError) as error:
-        raise DataError(
-            f"{str(path)!r} is not a readable training state ({error}); delete it to start anew."
-        ) from error
+    check_file(path, "training state")
     weights: dict[str, torch.Tensor] = {}
-    entries: dict[int, dict[str, Any]] = {int(key): dict(value) for key, value in header["scalars"].items()}
+    with readable(path, "a training state", "Delete it to start anew."), safe_open(path, framework="pt") as file:
+        header = json.loads(file.metadata()["state"])
+        tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - not a mapping
+        entries: dict[int, dict[str, Any]] = {int(key): dict(value) for key, value in header["scalars"].items()}
     for name, value in tensors.items():
         owner, _, rest = name.partition(".")
         if owner == "learner":
@@ -170,5 +167,6 @@ def read_log(folder: str | Path, kind: str) -> list[dict[str, Any]]:
     path = Path(folder) / LOG
     if not path.is_file():
         raise DataError(f"There is no log {str(path)!r}.")
-    lines = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
-    return [line for line in lines if line["kind"] == kind]
+    with readable(path, "the log of a run"):
+        lines = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
+        return [line for line in lines if line["kind"] == kind]

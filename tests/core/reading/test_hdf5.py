@@ -50,4 +50,4 @@ def test_a_file_that_the_library_never_returns_from_is_refused_and_the_next_one_
         pass
     assert time.monotonic() - began < 5
     monkeypatch.undo()
-    assert ask(str(good), 8.0) == ""
+    assert ask(str(good), 5.0) == ""

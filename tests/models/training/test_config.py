@@ -31,9 +31,9 @@ def test_changes_win():
     ("values", "message"),
     [
         ({"epoch": 3}, "Unknown training option 'epoch'; did you mean 'epochs'"),
-        ({"epochs": 0}, "epochs must be at least 1; received 0"),
+        ({"epochs": 0}, "epochs .*at least 1 .*received 0"),
         ({"epochs": 1.5}, r"'epochs' is a int; received 1\.5"),
-        ({"learning_rate": -1.0}, "learning rate must be positive"),
+        ({"learning_rate": -1.0}, "learning_rate .*-1"),
         ({"precision": "fp16"}, "Unknown precision 'fp16'"),
         ({"augmentation": "tactile"}, "Unknown augmentation 'tactile'"),
         ({"objective": "simclr"}, ""),

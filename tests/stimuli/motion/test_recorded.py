@@ -217,7 +217,7 @@ def test_files_that_are_no_trajectories_are_refused(tmp_path, lines, options, er
 def test_missing_files_are_named(tmp_path):
     with pytest.raises(DataFileNotFoundError, match=r"/gone\.csv'"):
         load_trajectory(tmp_path / "gone.csv")
-    with pytest.raises(DataFileNotFoundError, match=r"no file 'gone\.csv'"):
+    with pytest.raises(DataFileNotFoundError, match=r"'gone\.csv'"):
         get_recipe("rodgers-recorded gone.csv")
 
 
