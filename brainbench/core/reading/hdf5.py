@@ -20,8 +20,8 @@ from brainbench.core.reading.regular import check_file, readable
 if TYPE_CHECKING:
     import h5py
 
-SECONDS = 5.0
-"""Time for looking through a file; more for large ones, a second per :data:`RATE`."""
+SECONDS = 8.0
+"""Time for looking through a file, after the worker's own limit; more for large ones, a second per :data:`RATE`."""
 RATE = 10 << 20
 """Bytes per second at which even a slow disk is looked through."""
 
