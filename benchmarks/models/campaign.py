@@ -219,7 +219,8 @@ class Worker:
     def _next(self) -> Job | None:
         """Claim the first job that nobody has done or claimed and that there is time for."""
         for job in campaign():
-            if job.name in self.done or (self.args.only and self.args.only not in job.name):
+            known = job.name in self.done or job.model in self.done  # baselines are listed by what is read
+            if known or (self.args.only and self.args.only not in job.name):
                 continue
             if job.trained and job.seed and self._rate(job) is None:
                 continue
