@@ -72,7 +72,7 @@ def read_match(path: str | os.PathLike[str]) -> dict[str, str | None]:
         pairs = read_mapping(path)
     elif kind == ".csv":
         lines = read_text(path, "match file").splitlines()
-        with readable(path, "a table of labels"):
+        with readable(path, "table of labels"):
             rows = [row for row in csv.reader(lines) if row]
         if any(len(row) != 2 for row in rows):
             raise UsageError(f"{str(path)!r} must have two columns: recording label, stimulus label.")

@@ -211,7 +211,7 @@ def load_mesh(path: str | os.PathLike[str], *, unit: str) -> Mesh:
     if unit not in UNITS:
         raise unknown_name("length unit", unit, UNITS)
     path = check_file(path, "mesh file")
-    with readable(path, "a mesh"):
+    with readable(path, "mesh"):
         loaded: Any = trimesh.load(path, force="mesh", process=False)
         if not isinstance(loaded, trimesh.Trimesh) or not len(loaded.faces):
             raise DataError(f"{os.fspath(path)!r} holds no triangles.")

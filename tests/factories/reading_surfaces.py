@@ -303,7 +303,8 @@ SURFACES = (
     Surface("recordings, counts", _counts, open_recordings, _bad_counts),
     Surface("stimulus set", _stimulus_set, lambda path: load_stimuli(path).input, not_finite),
     Surface("stimulus arrays", _arrays, lambda path: load_stimuli(path).input, not_finite),
-    Surface("activations", _activations, read_features, not_finite),
+    # NaN in activations is a missing value, and the score of such a layer has a status.
+    Surface("activations", _activations, read_features, lambda found: False),
     Surface("scene", _text("scene.toml", SCENE), load_scene, _bad_scene),
     *(
         Surface(f"mesh, {suffix[1:].upper()}", _mesh(suffix), lambda path: load_mesh(path, unit="mm"), not_finite)

@@ -66,7 +66,7 @@ def read_tensors(path: str | os.PathLike[str], kind: str = "safetensors file") -
     from safetensors.torch import load_file
 
     found = check_file(path, kind)
-    with readable(path, f"a readable {kind}"):
+    with readable(path, kind):
         tensors: dict[str, torch.Tensor] = load_file(found)
     check_finite(tensors, os.fspath(path))
     return tensors

@@ -73,4 +73,4 @@ def readable(path: str | os.PathLike[str], kind: str, hint: str = "") -> Iterato
     except RecursionError as error:
         raise DataError(f"{name} is nested too deeply for a {kind}.") from error
     except Exception as error:
-        raise DataError(f"{name} cannot be read as {kind} ({reason(error)}).{hint and ' ' + hint}") from error
+        raise DataError(f"{name} is not a readable {kind} ({reason(error)}).{hint and ' ' + hint}") from error

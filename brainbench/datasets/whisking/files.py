@@ -89,7 +89,7 @@ def read_manifest(folder: Path) -> Mapping[str, Any]:
             f"{str(path)!r} has format {found[0]!r} version {found[1]!r}; this brainbench reads {SWEEPS_FORMAT!r} "
             f"version {SWEEPS_SCHEMA}: generate the data again or use the version that wrote it."
         )
-    with readable(path, "the manifest of a data set", _AGAIN):
+    with readable(path, "manifest of a data set", _AGAIN):
         for name, kind in (("classes", list), ("splits", dict), ("shards", list), ("config_hash", str)):
             if not isinstance(manifest[name], kind):
                 raise DataError(f"{name!r} in {str(path)!r} is no {kind.__name__}; received {shown(manifest[name])}.")

@@ -96,7 +96,7 @@ def read_graph(source: Mapping[str, Any] | str | os.PathLike[str]) -> GraphSpec:
     """
     if isinstance(source, Mapping):
         return _graph(source)
-    with readable(source, "a graph configuration"):
+    with readable(source, "graph configuration"):
         return _graph(read_mapping(source) if os.fspath(source).endswith(".toml") else read_json(source))
 
 

@@ -88,7 +88,7 @@ def load_state(path: Path, learner: nn.Module, optimizer: torch.optim.Optimizer)
 
     check_file(path, "training state")
     weights: dict[str, torch.Tensor] = {}
-    with readable(path, "a training state", "Delete it to start anew."), safe_open(path, framework="pt") as file:
+    with readable(path, "training state", "Delete it to start anew."), safe_open(path, framework="pt") as file:
         header = json.loads(file.metadata()["state"])
         tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - not a mapping
         entries: dict[int, dict[str, Any]] = {int(key): dict(value) for key, value in header["scalars"].items()}
@@ -167,6 +167,6 @@ def read_log(folder: str | Path, kind: str) -> list[dict[str, Any]]:
     path = Path(folder) / LOG
     if not path.is_file():
         raise DataError(f"There is no log {str(path)!r}.")
-    with readable(path, "the log of a run"):
+    with readable(path, "log of a run"):
         lines = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
         return [line for line in lines if line["kind"] == kind]
