@@ -12,12 +12,16 @@ FLAT = (math.pi / 2, 0.0, -math.pi / 2)
 
 
 @dataclass(frozen=True)
-class Swing:
-    """Angles and displacement that swing out smoothly and stay: amplitude × 6u⁵ − 15u⁴ + 10u³."""
-
+class _Motion:
     angles: tuple[float, float, float] = (0.0, 0.0, 0.0)
     shift: tuple[float, float, float] = (0.0, 0.0, 0.0)
     rest: tuple[float, float, float] = FLAT
+
+
+@dataclass(frozen=True)
+class Swing(_Motion):
+    """Angles and displacement that swing out smoothly and stay: amplitude × 6u⁵ − 15u⁴ + 10u³."""
+
     duration: float = 0.04
 
     def pose(self, times):
@@ -27,12 +31,9 @@ class Swing:
 
 
 @dataclass(frozen=True)
-class Oscillation:
+class Oscillation(_Motion):
     """Sinusoidal angles (rad) about a rest pose and a sinusoidal displacement (m) at ``frequency`` (Hz)."""
 
-    angles: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    shift: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    rest: tuple[float, float, float] = FLAT
     frequency: float = 20.0
 
     def pose(self, times):
