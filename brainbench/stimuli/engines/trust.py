@@ -29,8 +29,22 @@ the converged solution (docs/stimuli.md)."""
 LARGEST_CROWDED_SHARE = 0.02
 """Share of the steps with more contacts than are solved together from which a result counts as unstable."""
 
-OK, BENT, LOST = 0, 1, 2
-"""Ends of an integration: in order, with a joint bent beyond :data:`LARGEST_BEND`, with a value that is no number."""
+LARGEST_OVERLAP = 5e-4
+"""Overlap (m) with an object from which a whisker counts as inside it. Twice the way of one step beside an object: tips
+that flick over edges in long steps overlap by some tenths of a millimetre for a step."""
+LARGEST_START_OVERLAP = 2e-5
+"""The same at the start, where nothing has moved yet: what one step undoes, far more than rounding."""
+LARGEST_STRAIN = 0.01
+"""Stretch of the base from which a base force cannot be right. A chain cannot stretch, which beyond this is a worse
+error than any preset has, and keratin yields at some 2 %. Whiskers that brush past objects reach .0003."""
+SUSPICIOUS_SHARE = 0.5
+"""Share of these limits from which a reliable whisker is suspicious."""
+LARGEST_CHANGE = 0.2
+"""Share by which the peak of the base force may change when the step is halved."""
+
+OK, BENT, LOST, STARTED_INSIDE, GOT_INSIDE, AT_BASE = range(6)
+"""Ends of an integration: in order; with a joint bent beyond :data:`LARGEST_BEND`; with a value that is no number; in
+an object from the start, or later; with an object over the base point, where contact has no lever and is not felt."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,7 +52,7 @@ class RunFacts:
     """Facts of simulated whiskers on which :func:`judge` rests: arrays of one shape, times in s."""
 
     status: NDArray[np.int32]
-    """:data:`OK`, :data:`BENT` or :data:`LOST`."""
+    """:data:`OK`, :data:`BENT`, :data:`LOST`, :data:`STARTED_INSIDE`, :data:`GOT_INSIDE` or :data:`AT_BASE`."""
     failed: NDArray[np.floating]
     """Time at which that happened."""
     strength: NDArray[np.floating]
@@ -57,6 +71,10 @@ class RunFacts:
     """Steps for some of whose contacts there was no room."""
     steps: NDArray[np.int32]
     """Steps computed."""
+    depth: NDArray[np.floating]
+    """Deepest overlap with an object (m)."""
+    peak: NDArray[np.floating]
+    """Largest base force (N)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,6 +87,8 @@ class Verdict:
     """True where finer steps may give a result that can be trusted."""
     reasons: NDArray[np.object_]
     """Fault of each whisker in words; empty for a reliable one."""
+    suspicious: NDArray[np.bool_]
+    """True where a reliable whisker is simulated again with half the step, to see whether its peak force stays."""
 
     @property
     def unstable(self) -> NDArray[np.bool_]:
@@ -88,24 +108,28 @@ def residual(miss: NDArray[np.floating], load: NDArray[np.floating]) -> NDArray[
 def judge(facts: RunFacts) -> Verdict:
     """Return which whiskers can be trusted; of several things wrong, what happens first is told.
 
-    Shorter steps mend chains that fold and contacts that are not solved; not a force that only stretching the whisker
-    could relieve, nor an object that is too fast for the search for contacts.
+    Shorter steps mend chains that fold, that get inside an object, and contacts that are not solved; not a force that
+    only stretching the whisker could relieve, an object that is too fast for the search for contacts, nor one that the
+    whisker starts in or that passes through its base.
     """
     until = np.where(facts.status == OK, np.inf, facts.failed)
-    retryable = facts.status != OK
+    retryable = np.isin(facts.status, (BENT, LOST, GOT_INSIDE))
     reasons = np.full(facts.status.shape, "", dtype=object)
 
     def blame(which: NDArray[np.bool_], words: Callable[[tuple[int, ...]], str]) -> None:
         for index in zip(*np.nonzero(which), strict=True):
             reasons[index] = words(index)
 
+    finer = "at {0:.6g} s; choose more links or a smaller time step"
     ends = {
-        BENT: f"a joint bent by more than {LARGEST_BEND:g} rad, more than a chain of links can represent",
-        LOST: "the state stopped being finite",
+        BENT: f"a joint bent by more than {LARGEST_BEND:g} rad, more than a chain of links can represent, {finer}",
+        LOST: f"the state stopped being finite, {finer}",
+        STARTED_INSIDE: "the whisker starts {1:.3g} mm deep in an object; move one of them",
+        GOT_INSIDE: "the whisker was {1:.3g} mm deep in an object at {0:.6g} s; choose a smaller time step",
+        AT_BASE: "an object reached the whisker's base point, where nothing is felt, at {0:.6g} s; move one of them",
     }
-    for status, words in ends.items():
-        text = f"{words}, at {{:.6g}} s; choose more links or a smaller time step"
-        blame(facts.status == status, lambda i, text=text: text.format(facts.failed[i]))
+    for status, text in ends.items():
+        blame(facts.status == status, lambda i, text=text: text.format(facts.failed[i], facts.depth[i] * MILLI))
     # Faults with a time: the earliest counts, and what comes before it may be used.
     strong = facts.strong_at < until
     until = np.where(strong, facts.strong_at, until)
@@ -125,7 +149,30 @@ def judge(facts: RunFacts) -> Verdict:
     blame(fast, lambda i: moved.format(facts.travel[i] * MILLI, facts.fast_at[i]))
     blame(unsolved, lambda i: missed.format(facts.residual[i]))
     blame(crowded, lambda i: many.format(facts.crowded[i], facts.steps[i]))
-    return Verdict(np.where(unsolved | crowded, -np.inf, until), (retryable & ~fast) | unsolved | crowded, reasons)
+    bad = unsolved | crowded
+    until = np.where(bad, -np.inf, until)
+    suspicious = (until == np.inf) & (
+        (facts.peak > SUSPICIOUS_SHARE * facts.strongest)
+        | (facts.depth > SUSPICIOUS_SHARE * LARGEST_OVERLAP)
+        | (facts.residual > SUSPICIOUS_SHARE * LARGEST_RESIDUAL)
+    )
+    return Verdict(until, (retryable & ~fast) | bad, reasons, suspicious)
+
+
+def halved(verdict: Verdict, peak: NDArray[np.floating], half: NDArray[np.floating], which: NDArray) -> Verdict:
+    """Return the verdict of whiskers of which some (``which``) were simulated again with half the step.
+
+    ``peak`` and ``half`` are the peaks of their base force (N); ``half`` is NaN where the finer run is not reliable.
+    """
+    change = np.abs(half - peak) / np.maximum(np.maximum(half, peak), 1e-30)
+    # NaN fails the comparison and counts as changed.
+    changed, reasons = which & ~(change <= LARGEST_CHANGE), verdict.reasons.copy()
+    for index in zip(*np.nonzero(changed), strict=True):
+        by = f"by {change[index]:.0%}" if np.isfinite(change[index]) else "beyond what can be trusted"
+        reasons[index] = f"the peak of the base force changes {by} with half the step; choose a smaller time step"
+    return Verdict(
+        np.where(changed, -np.inf, verdict.until), verdict.retryable | changed, reasons, verdict.suspicious & ~which
+    )
 
 
 class Judged(Protocol):
@@ -140,6 +187,10 @@ class Judged(Protocol):
         """Return the results with these whiskers as another simulation of them gave them."""
         ...
 
+    def compared(self, which: NDArray[np.bool_], half: Self) -> Self:
+        """Return the results with these whiskers judged by a simulation of them with half the step (:func:`halved`)."""
+        ...
+
 
 Result = TypeVar("Result", bound=Judged)
 
@@ -147,30 +198,36 @@ Result = TypeVar("Result", bound=Judged)
 def run_with_retries(simulate: Callable[[NDArray[np.bool_] | None, int], Result], retry: int) -> Result:
     """Simulate whiskers, and those that finer steps may mend again: with steps over ``retry``, then over twice that.
 
-    ``simulate`` is called with which whiskers (all when None) and the divisor. A ``retry`` of 1 leaves all as they are.
+    After each of these, suspicious whiskers are compared with half the step (:func:`halved`). ``simulate`` is called
+    with which whiskers (all when None) and the divisor. A ``retry`` of 1 leaves all as they are.
     """
     result = simulate(None, 1)
-    for finer in (retry, 2 * retry) if retry > 1 else ():
-        left = result.verdict.retryable.copy()
-        if not left.any():
-            break
-        result = result.replaced(left, simulate(left, finer))
+    left = np.ones_like(result.verdict.retryable)
+    for finer in (1, retry, 2 * retry) if retry > 1 else ():
+        if finer > 1:
+            left = result.verdict.retryable.copy()
+            if not left.any():
+                break
+            result = result.replaced(left, simulate(left, finer))
+        suspicious = result.verdict.suspicious & left
+        if suspicious.any():
+            result = result.compared(suspicious, simulate(suspicious, 2 * finer))
     return result
 
 
 def strongest_force(whisker: Whisker) -> float:
-    """Return the force (N) that would stretch a whisker's base to twice its length: far beyond what keratin bears.
+    """Return the force (N) that would stretch a whisker's base by :data:`LARGEST_STRAIN`, E A times that.
 
     A chain cannot stretch, so a contact that can only be relieved along it has any force; it counts as unstable.
     """
-    return whisker.young_modulus * np.pi * whisker.base_radius**2
+    return LARGEST_STRAIN * whisker.young_modulus * np.pi * whisker.base_radius**2
 
 
 def too_strong(force: float, strongest: float) -> str:
     """Return in words that a base force (N) cannot be right, beyond the ``strongest`` (N) that the whisker bears."""
     return (
-        f"the base force reached {force:.3g} N, and {strongest:.3g} N stretch the whisker to twice its "
-        "length: an overlap could not be resolved; choose a smaller time step or slower motion"
+        f"the base force reached {force:.3g} N, and {strongest:.3g} N stretch the whisker by {LARGEST_STRAIN:.0%}: an "
+        "overlap could not be resolved; choose a smaller time step or slower motion"
     )
 
 
