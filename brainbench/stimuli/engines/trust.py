@@ -37,14 +37,25 @@ LARGEST_START_OVERLAP = 2e-5
 LARGEST_STRAIN = 0.01
 """Stretch of the base from which a base force cannot be right. A chain cannot stretch, which beyond this is a worse
 error than any preset has, and keratin yields at some 2 %. Whiskers that brush past objects reach .0003."""
-SUSPICIOUS_SHARE = 0.5
-"""Share of these limits from which a reliable whisker is suspicious."""
+SUSPICIOUS_SHARE = 0.4
+"""Share of the largest overlap, residual and base force from which a reliable whisker is suspicious."""
 LARGEST_CHANGE = 0.2
-"""Share by which the peak of the base force may change when the step is halved."""
+"""Share by which the base force (root mean square over the readings) may change when the step is halved."""
 
 OK, BENT, LOST, STARTED_INSIDE, GOT_INSIDE, AT_BASE = range(6)
 """Ends of an integration: in order; with a joint bent beyond :data:`LARGEST_BEND`; with a value that is no number; in
 an object from the start, or later; with an object over the base point, where contact has no lever and is not felt."""
+
+
+_FINER = "at {0:.6g} s; choose more links or a smaller time step"
+_FAULTS = {
+    BENT: f"a joint bent by more than {LARGEST_BEND:g} rad, more than a chain of links can represent, {_FINER}",
+    LOST: f"the state stopped being finite, {_FINER}",
+    STARTED_INSIDE: "the whisker starts {1:.3g} mm deep in an object; move one of them",
+    GOT_INSIDE: "the whisker was {1:.3g} mm deep in an object at {0:.6g} s; choose a smaller time step",
+    AT_BASE: "an object reached the whisker's base point, where nothing is felt, at {0:.6g} s; move one of them",
+}
+"""Fault in words, given its time (s) and the deepest overlap (mm)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,7 +99,7 @@ class Verdict:
     reasons: NDArray[np.object_]
     """Fault of each whisker in words; empty for a reliable one."""
     suspicious: NDArray[np.bool_]
-    """True where a reliable whisker is simulated again with half the step, to see whether its peak force stays."""
+    """True where a reliable whisker is simulated again with half the step, to see whether its force stays."""
 
     @property
     def unstable(self) -> NDArray[np.bool_]:
@@ -102,7 +113,7 @@ def residual(miss: NDArray[np.floating], load: NDArray[np.floating]) -> NDArray[
     ``miss`` and ``load`` are sums over the steps: of the squared change in the last iteration, and of the squared
     forces.
     """
-    return np.sqrt(miss / np.maximum(load, 1e-30))
+    return np.sqrt(miss.astype(float) / np.maximum(load, 1e-30))
 
 
 def judge(facts: RunFacts) -> Verdict:
@@ -120,16 +131,8 @@ def judge(facts: RunFacts) -> Verdict:
         for index in zip(*np.nonzero(which), strict=True):
             reasons[index] = words(index)
 
-    finer = "at {0:.6g} s; choose more links or a smaller time step"
-    ends = {
-        BENT: f"a joint bent by more than {LARGEST_BEND:g} rad, more than a chain of links can represent, {finer}",
-        LOST: f"the state stopped being finite, {finer}",
-        STARTED_INSIDE: "the whisker starts {1:.3g} mm deep in an object; move one of them",
-        GOT_INSIDE: "the whisker was {1:.3g} mm deep in an object at {0:.6g} s; choose a smaller time step",
-        AT_BASE: "an object reached the whisker's base point, where nothing is felt, at {0:.6g} s; move one of them",
-    }
-    for status, text in ends.items():
-        blame(facts.status == status, lambda i, text=text: text.format(facts.failed[i], facts.depth[i] * MILLI))
+    for status in _FAULTS:
+        blame(facts.status == status, lambda i, status=status: fault(status, facts.failed[i], facts.depth[i]))
     # Faults with a time: the earliest counts, and what comes before it may be used.
     strong = facts.strong_at < until
     until = np.where(strong, facts.strong_at, until)
@@ -147,7 +150,7 @@ def judge(facts: RunFacts) -> Verdict:
     missed = "contact forces missed by {:.0%} (root mean square); choose a smaller time step"
     many = "more contacts than can be solved together in {} of {} steps"
     blame(fast, lambda i: moved.format(facts.travel[i] * MILLI, facts.fast_at[i]))
-    blame(unsolved, lambda i: missed.format(facts.residual[i]))
+    blame(unsolved, lambda i: missed.format(min(facts.residual[i], 10.0)))
     blame(crowded, lambda i: many.format(facts.crowded[i], facts.steps[i]))
     bad = unsolved | crowded
     until = np.where(bad, -np.inf, until)
@@ -159,20 +162,31 @@ def judge(facts: RunFacts) -> Verdict:
     return Verdict(until, (retryable & ~fast) | bad, reasons, suspicious)
 
 
-def halved(verdict: Verdict, peak: NDArray[np.floating], half: NDArray[np.floating], which: NDArray) -> Verdict:
+def fault(status: int, time: float, depth: float) -> str:
+    """Return in words why an integration ended (one of the constants above but ``OK``), with its overlap (m)."""
+    return _FAULTS[status].format(time, depth * MILLI)
+
+
+def halved(verdict: Verdict, change: NDArray[np.floating], which: NDArray[np.bool_]) -> Verdict:
     """Return the verdict of whiskers of which some (``which``) were simulated again with half the step.
 
-    ``peak`` and ``half`` are the peaks of their base force (N); ``half`` is NaN where the finer run is not reliable.
+    ``change`` is that of the base force (:func:`force_change`); NaN where the finer run is not reliable.
     """
-    change = np.abs(half - peak) / np.maximum(np.maximum(half, peak), 1e-30)
     # NaN fails the comparison and counts as changed.
     changed, reasons = which & ~(change <= LARGEST_CHANGE), verdict.reasons.copy()
     for index in zip(*np.nonzero(changed), strict=True):
         by = f"by {change[index]:.0%}" if np.isfinite(change[index]) else "beyond what can be trusted"
-        reasons[index] = f"the peak of the base force changes {by} with half the step; choose a smaller time step"
-    return Verdict(
-        np.where(changed, -np.inf, verdict.until), verdict.retryable | changed, reasons, verdict.suspicious & ~which
-    )
+        reasons[index] = (
+            f"the base force changes {by} (root mean square) with half the step; choose a smaller time step"
+        )
+    until = np.where(changed, -np.inf, verdict.until)
+    return Verdict(until, verdict.retryable | changed, reasons, verdict.suspicious & ~which)
+
+
+def force_change(force: NDArray[np.floating], half: NDArray[np.floating]) -> NDArray[np.floating]:
+    """Return the difference [row, column] of two forces [row, reading, column, 3] over the larger (rms)."""
+    square = [np.einsum("rtcd,rtcd->rc", x, x) for x in (half - force, force, half)]
+    return np.sqrt(square[0] / np.maximum(np.maximum(square[1], square[2]), 1e-30))
 
 
 class Judged(Protocol):

@@ -18,6 +18,7 @@ from brainbench.stimuli.engines.trust import (
     STARTED_INSIDE,
     RunFacts,
     Verdict,
+    force_change,
     halved,
     judge,
     passed_unseen,
@@ -137,9 +138,9 @@ def test_the_residual_is_what_changed_last_over_the_forces():
     ("changed", "suspicious"),
     [
         ({}, False),
-        ({"peak": 16.0}, True),
-        ({"depth": 3e-4}, True),
-        ({"residual": 0.03}, True),
+        ({"peak": 13.0}, True),
+        ({"depth": 2.1e-4}, True),
+        ({"residual": 0.021}, True),
         ({"residual": 0.06}, False),
         ({"status": BENT, "failed": 0.3, "depth": 3e-4}, False),
     ],
@@ -148,16 +149,19 @@ def test_whiskers_near_a_limit_are_suspicious_and_those_beyond_it_are_not(change
     assert judge(_facts(**changed)).suspicious.tolist() == [suspicious]
 
 
-def test_a_peak_force_that_changes_by_a_fifth_with_half_the_step_is_flagged_and_tried_again():
-    verdict = judge(_facts(depth=3e-4))
-    which = np.array([True])
-    kept = halved(verdict, np.array([0.1]), np.array([0.119]), which)
+def test_a_force_that_changes_by_a_fifth_with_half_the_step_is_flagged_and_tried_again():
+    verdict, which = judge(_facts(depth=3e-4)), np.array([True])
+    kept = halved(verdict, np.array([0.19]), which)
     assert (kept.unstable.tolist(), kept.suspicious.tolist(), kept.reasons[0]) == ([False], [False], "")
-    for half, words in ((0.13, "by 23%"), (0.07, "by 30%"), (np.nan, "beyond what can be trusted")):
-        found = halved(verdict, np.array([0.1]), np.array([half]), which)
+    for change, words in ((0.23, "by 23%"), (np.nan, "beyond what can be trusted")):
+        found = halved(verdict, np.array([change]), which)
         assert (found.until.tolist(), found.retryable.tolist()) == ([-np.inf], [True])
         assert words in found.reasons[0]
-    assert not halved(verdict, np.array([0.1]), np.array([np.nan]), ~which).unstable.any()
+    assert not halved(verdict, np.array([np.nan]), ~which).unstable.any()
+    force = np.zeros((1, 4, 2, 3))
+    force[..., 0] = 1.0
+    np.testing.assert_allclose(force_change(force, force * [[1.25], [0.8]]), [[0.2, 0.2]])
+    assert force_change(force, -force).tolist() == [[2.0, 2.0]]
 
 
 class _Runs:

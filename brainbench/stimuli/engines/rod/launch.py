@@ -17,7 +17,7 @@ from brainbench.stimuli.engines.rod.limits import FINEST, LIGHT
 from brainbench.stimuli.engines.rod.packing import PackedJobs, PackedMotions, capacity_for, pack_chains
 from brainbench.stimuli.engines.rod.scheduling import Slices, allocate, make_problems
 from brainbench.stimuli.engines.rod.shapes import PackedShapes
-from brainbench.stimuli.engines.trust import RunFacts, Verdict, halved, judge, residual, strongest_force
+from brainbench.stimuli.engines.trust import RunFacts, Verdict, force_change, halved, judge, residual, strongest_force
 from brainbench.stimuli.engines.units import MILLI
 from brainbench.stimuli.whiskers.chain import Chain
 
@@ -39,8 +39,6 @@ class LaunchResult:
     contacts there was no room (``crowded``), and steps whose contact forces did not converge (``unsolved``)."""
     depth: NDArray[np.floating]
     """[row, column] deepest overlap (m)."""
-    peak: NDArray[np.floating]
-    """[row, column] largest base force (N)."""
     residual: NDArray[np.floating]
     """[row, column] as :func:`brainbench.stimuli.engines.trust.residual`."""
     verdict: Verdict
@@ -73,7 +71,7 @@ class LaunchResult:
         for mine, theirs in ((self.counts, finer.counts), (vars(self.verdict), vars(finer.verdict))):
             for name in mine:
                 take(mine[name], theirs[name])
-        for name in ("depth", "peak", "residual"):
+        for name in ("depth", "residual"):
             take(getattr(self, name), getattr(finer, name))
         if self.points is not None and self.contact_wrench is not None:
             self.points[rows], self.contact_wrench[rows] = finer.points, finer.contact_wrench
@@ -83,9 +81,10 @@ class LaunchResult:
     def compared(self, which: NDArray[np.bool_], half: LaunchResult) -> LaunchResult:
         """Return these results, some jobs [row, column] judged by another launch, of their rows alone."""
         rows = np.flatnonzero(which.any(axis=1))
-        other = np.full(self.peak.shape, np.nan)
-        other[rows] = np.where(half.verdict.unstable, np.nan, half.peak)
-        self.verdict = halved(self.verdict, self.peak, other, which)
+        change = np.full(which.shape, np.nan)
+        found = force_change(self.wrench[rows, ..., :3], half.wrench[..., :3])
+        change[rows] = np.where(half.verdict.unstable, np.nan, found)
+        self.verdict = halved(self.verdict, change, which)
         self.counts["steps"][rows] += np.where(which[rows], half.steps, 0)
         self.retried |= which
         return self
@@ -211,7 +210,6 @@ class WhiskerSolver:
         wrench, missed = out.wrench.numpy(), table(residual(numbers["miss"], numbers["load"]))
         depth = table(numbers["depth"].astype(float)) / MILLI
         force = np.sqrt(np.einsum("...d,...d", wrench[..., :3], wrench[..., :3]))
-        peak = force.max(axis=1)
         facts = RunFacts(
             counts["status"],
             table(numbers["failed"].astype(float)) / MILLI,
@@ -222,10 +220,10 @@ class WhiskerSolver:
             crowded=counts["crowded"],
             steps=counts["steps"],
             depth=depth,
-            peak=peak,
+            peak=force.max(axis=1),
         )
         contact, again = out.contact.numpy(), np.zeros(size, dtype=bool)
-        result = LaunchResult(wrench, contact, counts, depth, peak, missed, judge(facts), again)
+        result = LaunchResult(wrench, contact, counts, depth, missed, judge(facts), again)
         result.seconds = dict(zip(("upload", "kernel"), np.diff(clock).tolist(), strict=True))
         if record_shape:
             result.points = np.moveaxis(out.points.numpy().astype(float) / MILLI, 2, 0)

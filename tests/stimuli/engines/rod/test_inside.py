@@ -1,19 +1,18 @@
 """Whiskers inside objects are found at any depth: against the winding number of the surface, in sweeps and scenes."""
 
+import itertools
+
 import numpy as np
 import pytest
 
 from brainbench.geometry import Mesh, winding_number
 from brainbench.geometry.distance import point_triangle_distance
 from brainbench.stimuli.engines.fidelity import Fidelity
-from brainbench.stimuli.engines.protocol import Job, StillFollicle, base_rotation
-from brainbench.stimuli.engines.rod.engine import RodEngine
+from brainbench.stimuli.engines.protocol import base_rotation
 from brainbench.stimuli.objects.mesh_solids import shape_solids
-from brainbench.stimuli.objects.obstacle import Box, Capsule, ConvexPart, Cylinder, Obstacle, Sphere, TriangleMesh
 from brainbench.stimuli.sweeps.grid import SweepGrid
 from brainbench.stimuli.sweeps.simulation import simulate_sweeps
 from brainbench.stimuli.sweeps.sweep_scenes import SweepScenes
-from tests.factories.whiskers import C2
 
 pytest.importorskip("warp")
 
@@ -33,7 +32,7 @@ def _depths(scene, fidelity=COARSE):
     for mount in scene.array:
         nodes = np.pad(fidelity.chain(mount.whisker).points, ((0, 0), (0, 1)))
         share = np.linspace(0, 1, 9)[:, None]
-        points = np.concatenate([a + share * (b - a) for a, b in zip(nodes, nodes[1:], strict=False)])
+        points = np.concatenate([a + share * (b - a) for a, b in itertools.pairwise(nodes)])
         local = points @ base_rotation(mount.angles).T + mount.position
         world = local @ scene.head.matrix.T + scene.head.position
         low, high = corners.min(axis=(0, 1)), corners.max(axis=(0, 1))
@@ -59,7 +58,9 @@ def test_every_whisker_that_starts_inside_an_object_of_a_data_set_is_flagged(rel
     assert (depth > 3e-3).sum() > 15
     assert (batch.unstable | (depth < 2e-5)).all()
     assert not (batch.unstable & (depth == 0)).any()
-    assert all(("deep in an object" in words) == (deep.max() > 2e-5) for words, deep in zip(batch.reasons, depth))
+    assert all(
+        ("deep in an object" in words) == (deep.max() > 2e-5) for words, deep in zip(batch.reasons, depth, strict=True)
+    )
 
 
 def test_the_depth_that_is_told_is_the_true_one(released):

@@ -161,10 +161,11 @@ def candidate_slot(
 
 
 @wp.func(inline=True)
-def judge_overlap(state: wp.ref[WhiskerState], deepest: real, base_gap: real, now: real):
+def judge_overlap(state: wp.ref[WhiskerState], deepest: real, crossing: int, base_gap: real, now: real):
     """End a whisker that lies too deep in an object, or whose base point an object reaches.
 
-    ``base_gap`` is the gap at the base point at the end of the step: a contact there has no lever and bends nothing.
+    ``crossing`` is 1 where some of its axis lies inside, which at the start no thickness excuses. ``base_gap`` is the
+    gap at the base point at the end of the step: a contact there has no lever and bends nothing.
     """
     state.depth = wp.max(state.depth, deepest)
     status = int(0)
@@ -172,7 +173,7 @@ def judge_overlap(state: wp.ref[WhiskerState], deepest: real, base_gap: real, no
         status = wp.static(AT_BASE)
     if deepest > real(wp.static(LARGEST_OVERLAP * MILLI)):
         status = wp.static(GOT_INSIDE)
-    if state.steps == 0 and deepest > real(wp.static(LARGEST_START_OVERLAP * MILLI)):
+    if state.steps == 0 and (crossing == 1 or deepest > real(wp.static(LARGEST_START_OVERLAP * MILLI))):
         status = wp.static(STARTED_INSIDE)
     if status != 0 and state.status == 0:
         state.status = status
@@ -202,6 +203,7 @@ def find_candidates(
     origin = pose.place
     count = int(0)
     deepest = zero
+    crossing = int(0)
     base_gap = zero
     query = state.first_query
     angular = pose.spin
@@ -235,7 +237,8 @@ def find_candidates(
                 proximity.leaf[i] = found.leaf
                 closest = wp.min(closest, found.clearance)
                 deepest = wp.max(deepest, found.depth)
-                if i == 0 and found.start == 1:
+                crossing = wp.max(crossing, found.crossing)
+                if i == 0 and found.start == 1 and found.start_gap < margin:
                     way = rotate(body.turn, rotate(turn_s, found.start_normal))
                     approach = wp.dot(way, pose.velocity - body.velocity - wp.cross(body.spin, origin - body.place))
                     base_gap = wp.min(base_gap, found.start_gap + h * wp.min(approach, zero))
@@ -277,5 +280,5 @@ def find_candidates(
                             candidates.object_velocity[slot] = object_velocity
                             candidates.normal[slot] = normal
             proximity.clearance[i] = closest
-    judge_overlap(state, deepest, base_gap, now)
+    judge_overlap(state, deepest, crossing, base_gap, now)
     return count

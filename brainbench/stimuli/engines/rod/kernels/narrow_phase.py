@@ -236,6 +236,9 @@ def link_shape_distance(
         found.start_gap = near[3] - ra
         found.start_normal = vec3(near[0], near[1], near[2])
         found.depth = wp.max(-nearest[1], real(0.0))
+        # Even where the whisker is thickest, its axis is inside.
+        if found.depth > wp.max(ra, rb):
+            found.crossing = 1
         found.leaf = leaf
     found.clearance = found.clearance * scale
     found.gap = found.gap * scale

@@ -361,7 +361,7 @@ class LinkDistance:
     start_gap: real
     start_normal: vec3
     crossing: wp.int32
-    """1: some of the axis lies inside a surface."""
+    """1: some of the axis lies inside."""
     depth: real
     """Deepest overlap; 0 without."""
     clearance: real
