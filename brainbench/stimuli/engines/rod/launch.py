@@ -86,7 +86,6 @@ class LaunchResult:
         change[rows] = np.where(half.verdict.unstable, np.nan, found)
         self.verdict = halved(self.verdict, change, which)
         self.counts["steps"][rows] += np.where(which[rows], half.steps, 0)
-        self.retried |= which
         return self
 
 
