@@ -171,8 +171,8 @@ def make_data(args: argparse.Namespace, gpus: int) -> None:
     used = {line["data"]["hash"] for line in finished().values()} - {manifest["content_hash"]}
     if used and gpus:
         raise SystemExit(
-            f"These sweeps are not those of the trainings done so far ({', '.join(used)}): take brainbench/stimuli from "
-            f"the commit {SOLVER}, whose solver made them."
+            f"These sweeps are not those of the trainings done so far ({', '.join(used)}): train with the code of the "
+            f"commit {SOLVER}, whose solver made them."
         )
 
 
