@@ -38,7 +38,7 @@ WEIGHTS = ROOT / "brainbench" / "models" / "weights"
 BASELINES = ("raw-input", "random-features")
 BOARDS = (("demo", "rsa"), ("demo-rodgers", "rsa"), ("demo", "ridge"))
 """Recordings and metrics that every network is scored with."""
-SOLVER = "ad20c3f"
+SOLVER = "c1a690c"
 """Commit with whose solver all sweeps are made, so that sessions train on the same."""
 MEMBERS = 150
 """Objects of each of the 54 families: 16 sweeps each, eight tenths of them to train."""
