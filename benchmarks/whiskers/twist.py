@@ -1,4 +1,4 @@
-"""Cost of twist, and what it changes in the stimuli: ``python -m benchmarks.whiskers.twist [--sweeps 24] [--write]``."""
+"""Cost of twist, and what it changes: ``python -m benchmarks.whiskers.twist [--sweeps 24] [--write]``."""
 
 from __future__ import annotations
 

@@ -55,8 +55,7 @@ class Whisker:
         ratio = self.poisson_ratio
         if not isinstance(ratio, (int, float, np.number)) or not -1 < ratio <= 0.5:
             raise UsageError(
-                f"poisson_ratio of a whisker must lie above -1 and at most at 0.5; received {ratio!r}; keratin has about"
-                " 0.4."
+                f"poisson_ratio of a whisker must lie above -1 and at most at 0.5 (default 0.4); received {ratio!r}."
             )
         if not math.isfinite(self.curvature):
             raise UsageError(f"curvature of a whisker must be a finite number (1/m); received {self.curvature!r}.")

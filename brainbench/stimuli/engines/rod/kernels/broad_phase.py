@@ -18,6 +18,7 @@ from brainbench.stimuli.engines.rod.limits import (
 from brainbench.stimuli.engines.units import MILLI
 
 from .algebra import first_axis, rotate, vec3
+from .articulated_body import ChainState, ProximityState, hinge_direction
 from .motion import BodyMotion, pose_at
 from .narrow_phase import link_shape_distance
 from .parameters import hinges, real, sliced
@@ -25,17 +26,14 @@ from .state import (
     WAIT_DISTANCES,
     WAIT_SLICE,
     ChainArrays,
-    ChainState,
     ContactCandidates,
     LinkDistance,
     MotionArrays,
     PausedWhiskers,
-    ProximityState,
     ShapeArrays,
     StepOptions,
     WhiskerJob,
     WhiskerState,
-    hinge_direction,
     most_candidates,
     row,
 )

@@ -5,17 +5,15 @@ import warp as wp
 from brainbench.stimuli.engines.rod.limits import GROUPS
 
 from .algebra import Wrench, first_axis, vec3
+from .articulated_body import ChainState, ProximityState, hinge_direction
 from .parameters import capacity, cuda, hinges, real
 from .state import (
     ChainArrays,
-    ChainState,
     ContactCandidates,
     ContactProblems,
     PausedWhiskers,
-    ProximityState,
     WhiskerJob,
     WhiskerState,
-    hinge_direction,
     most_candidates,
     row,
 )

@@ -9,6 +9,7 @@ import warp as wp
 from brainbench.stimuli.engines.rod.limits import NOTHING
 
 from .algebra import JointVector, rotate, vec3
+from .articulated_body import ChainState, ProximityState
 from .motion import pose_at
 from .narrow_phase import link_shape_distance
 from .parameters import against, hinges, real, sliced
@@ -16,10 +17,8 @@ from .state import (
     WAIT_REST,
     WAIT_SLICE,
     ChainArrays,
-    ChainState,
     MotionArrays,
     PausedWhiskers,
-    ProximityState,
     ShapeArrays,
     WhiskerJob,
     WhiskerState,

@@ -296,52 +296,6 @@ class WhiskerState:
 
 
 @wp.struct
-class ChainState:
-    """State of the joints, and what one step keeps of each link between its passes."""
-
-    angle: PerLinkJoint
-    rate: PerLinkJoint
-    axis2: PerLink3
-    """Second axis of the joint."""
-    node: PerNode3
-    """Joints and tip, from the base point."""
-    gain1_w: PerLink3
-    """U D⁻¹ of each axis (``articulated_body``), rotation and translation."""
-    gain1_v: PerLink3
-    gain2_w: PerLink3
-    gain2_v: PerLink3
-    if hinges == 3:
-        axis3: PerLink3
-        gain3_w: PerLink3
-        gain3_v: PerLink3
-    acceleration: PerLinkJoint
-    """D⁻¹u of the joint, then its accelerations."""
-
-
-@wp.func
-def hinge_direction(chain: wp.ref[ChainState], i: int) -> vec3:
-    """Return the direction of the axis normal to both bending hinges of a joint, of any length."""
-    if wp.static(hinges == 3):
-        return row(chain.axis3, i)
-    return row(chain.node, i + 1) - row(chain.node, i)
-
-
-@wp.struct
-class ProximityState:
-    """State of each link that only contact needs; without objects a kernel leaves it out."""
-
-    inverse_inertia: PerLinkInverse
-    """Inverse inertia D⁻¹ of the joint."""
-    clearance: PerLink1
-    """Lower bound of the distance from all objects; at rest, the time until which nothing can come near."""
-    leaf: PerLinkInt
-    """Leaf of the search tree where the last search ended (+ 1)."""
-    safe_until: PerLink1
-    end_speed: PerLink1
-    """Speed of the faster end."""
-
-
-@wp.struct
 class ContactCandidates:
     """Places where contact is possible within one step."""
 
