@@ -19,6 +19,7 @@ import numpy as np
 import xarray as xr
 
 from brainbench.core.errors import BrainbenchError
+from brainbench.core.files import write_json
 from tests.factories.damage import damage, remove
 
 SECONDS = 10.0
@@ -131,3 +132,40 @@ def numbers(value: Any, *, depth: int = 12) -> Iterator[float]:
 def not_finite(value: Any) -> bool:
     """Return whether nested data holds a number that is not finite."""
     return any(not math.isfinite(number) for number in numbers(value))
+
+
+def bad_counts(dataset: Any) -> bool:
+    """Return whether counts are negative or infinite (missing ones are NaN), or bins and times impossible."""
+    counts, duration = dataset["counts"].values, dataset["duration"].values
+    real = counts[~np.isnan(counts)]
+    return bool(
+        np.isinf(real).any()
+        or (real < 0).any()
+        or not (np.isfinite(duration) & (duration >= 0)).all()
+        or not np.isfinite(dataset["time"].values).all()
+    )
+
+
+def written(name: str, text: str) -> Callable[[Path], Path]:
+    """Return what writes a text into a folder."""
+
+    def make(folder: Path) -> Path:
+        path = folder / name
+        path.write_text(text, encoding="utf-8")
+        return path
+
+    return make
+
+
+def written_json(name: str, value: Any) -> Callable[[Path], Path]:
+    """Return what writes a value as JSON into a folder."""
+    return lambda folder: write_json(folder / name, value)
+
+
+def typed(read: Callable[[str], Any]) -> Callable[[Path], Any]:
+    """Return the reader of an option that a user types: any text, from a file whose damage may be no text at all."""
+
+    def of(path: Path) -> Any:
+        return read(path.read_bytes().decode(errors="replace")[:100_000] if path.is_file() else "")
+
+    return of
