@@ -15,6 +15,15 @@ from brainbench.core.progress import Progress
 JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON document on stdout, nothing else.")]
 
 
+def list_without_command(app: typer.Typer, command: Callable[[], None]) -> None:
+    """Let a group of commands run its listing when no command is named."""
+
+    @app.callback(invoke_without_command=True)
+    def run(context: typer.Context) -> None:
+        if context.invoked_subcommand is None:
+            command()
+
+
 def emit(data: Any, text: str, *, as_json: bool) -> None:
     """Print ``data`` as JSON, or ``text`` for people, on stdout."""
     print(to_json(data) if as_json else text)
@@ -43,7 +52,7 @@ def facts(values: Mapping[str, object], title: str = "") -> str:
 
 
 def table(title: str, columns: list[str], rows: list[list[str]], *, right: tuple[int, ...] = ()) -> str:
-    """Lay out a table as text; ``right`` names the columns set flush right."""
+    """Lay out a table as text; ``right`` names the columns set flush right. The first column is never folded."""
     from io import StringIO
 
     from rich.console import Console
@@ -51,7 +60,7 @@ def table(title: str, columns: list[str], rows: list[list[str]], *, right: tuple
 
     grid = Table(title=title or None, title_justify="left", box=None, pad_edge=False, header_style="bold")
     for index, column in enumerate(columns):
-        grid.add_column(column, justify="right" if index in right else "left", overflow="fold")
+        grid.add_column(column, justify="right" if index in right else "left", overflow="fold", no_wrap=not index)
     for row in rows:
         grid.add_row(*row)
     terminal = sys.stdout.isatty()

@@ -7,7 +7,15 @@ before it closes (g + h vₙ ≥ 0, gap g, approach vₙ), so nothing passes thr
 
 import warp as wp
 
-from brainbench.stimuli.engines.rod.limits import WIDEST
+from brainbench.stimuli.engines.rod.limits import (
+    AT_BASE,
+    GOT_INSIDE,
+    LARGEST_OVERLAP,
+    LARGEST_START_OVERLAP,
+    STARTED_INSIDE,
+    WIDEST,
+)
+from brainbench.stimuli.engines.units import MILLI
 
 from .algebra import first_axis, rotate, vec3
 from .motion import BodyMotion, pose_at
@@ -117,6 +125,8 @@ def query_distances(
             paused.query[place].link = i
             paused.query[place].start = row(chain.node, i) + origin
             paused.query[place].stop = row(chain.node, i + 1) + origin
+            nearer = reach.time * (row(proximity.end_speed, i) + reach.unknown_speed)
+            paused.query[place].bound = row(proximity.clearance, i) - nearer
             place = place + 1
     paused.query_time[job.index] = now
     paused.query_margin[job.index] = reach.margin
@@ -151,6 +161,26 @@ def candidate_slot(
 
 
 @wp.func(inline=True)
+def judge_overlap(state: wp.ref[WhiskerState], deepest: real, crossing: int, base_gap: real, now: real):
+    """End a whisker that lies too deep in an object, or whose base point an object reaches.
+
+    ``crossing`` is 1 where some of its axis lies inside, which at the start no thickness excuses. ``base_gap`` is the
+    gap at the base point at the end of the step: a contact there has no lever and bends nothing.
+    """
+    state.depth = wp.max(state.depth, deepest)
+    status = int(0)
+    if base_gap < real(0.0):
+        status = wp.static(AT_BASE)
+    if deepest > real(wp.static(LARGEST_OVERLAP * MILLI)):
+        status = wp.static(GOT_INSIDE)
+    if state.steps == 0 and (crossing == 1 or deepest > real(wp.static(LARGEST_START_OVERLAP * MILLI))):
+        status = wp.static(STARTED_INSIDE)
+    if status != 0 and state.status == 0:
+        state.status = status
+        state.failed_at = now
+
+
+@wp.func(inline=True)
 def find_candidates(
     chains: ChainArrays,
     motions: MotionArrays,
@@ -172,6 +202,9 @@ def find_candidates(
     sides = int(2) + wp.min(0, job.index)
     origin = pose.place
     count = int(0)
+    deepest = zero
+    crossing = int(0)
+    base_gap = zero
     query = state.first_query
     angular = pose.spin
     linear = pose.velocity
@@ -198,9 +231,17 @@ def find_candidates(
                 else:
                     a = joint + origin
                     b = row(chain.node, i + 1) + origin
-                    found = link_shape_distance(shapes, s, body, a, b, taper, margin, row(proximity.leaf, i), 0, 1)
+                    bound = row(proximity.clearance, i)
+                    leaf = row(proximity.leaf, i)
+                    found = link_shape_distance(shapes, s, body, a, b, taper, margin, bound, leaf, 0, 1)
                 proximity.leaf[i] = found.leaf
                 closest = wp.min(closest, found.clearance)
+                deepest = wp.max(deepest, found.depth)
+                crossing = wp.max(crossing, found.crossing)
+                if i == 0 and found.start == 1 and found.start_gap < margin:
+                    way = rotate(body.turn, rotate(turn_s, found.start_normal))
+                    approach = wp.dot(way, pose.velocity - body.velocity - wp.cross(body.spin, origin - body.place))
+                    base_gap = wp.min(base_gap, found.start_gap + h * wp.min(approach, zero))
                 for which in range(sides):
                     offered = found.between
                     share = found.share
@@ -212,7 +253,7 @@ def find_candidates(
                         gap = found.end_gap
                         way = found.end_normal
                     if offered == 1 and gap < margin:
-                        state.depth = wp.max(state.depth, -gap)
+                        deepest = wp.max(deepest, -gap)
                         normal = rotate(body.turn, rotate(turn_s, way))
                         radius = taper.start_radius + (taper.end_radius - taper.start_radius) * share
                         # The force acts on the skin of the whisker: its radius is the lever of friction.
@@ -239,4 +280,5 @@ def find_candidates(
                             candidates.object_velocity[slot] = object_velocity
                             candidates.normal[slot] = normal
             proximity.clearance[i] = closest
+    judge_overlap(state, deepest, crossing, base_gap, now)
     return count

@@ -103,11 +103,16 @@ def check_rest(
             end_at = at + x * link.length
             proximity.safe_until[i] = row(proximity.clearance, i)
             if fresh == 1 or row(proximity.clearance, i) < upto:
+                # At rest it is a time: the link was outside when that was found.
+                bound = one
+                if fresh == 1:
+                    bound = row(proximity.clearance, i)
                 if wp.static(sliced) and wait == WAIT_REST:
                     paused.query[place].job = job.index
                     paused.query[place].link = i
                     paused.query[place].start = at
                     paused.query[place].stop = end_at
+                    paused.query[place].bound = bound
                 else:
                     slack = real(1e30)
                     taper = chains.taper[i, job.whisker]
@@ -118,7 +123,7 @@ def check_rest(
                         for s in range(job.first_shape, job.end_shape):
                             body = pose_at(motions, shapes.track[s], before)
                             found = link_shape_distance(
-                                shapes, s, body, at, end_at, taper, -far, row(proximity.leaf, i), 0, 1
+                                shapes, s, body, at, end_at, taper, -far, bound, row(proximity.leaf, i), 0, 1
                             )
                             slack = wp.min(slack, found.clearance)
                             proximity.leaf[i] = found.leaf

@@ -356,6 +356,14 @@ class LinkDistance:
     """1: the far end is near."""
     end_gap: real
     end_normal: vec3
+    start: wp.int32
+    """1: the near end is known to be near."""
+    start_gap: real
+    start_normal: vec3
+    crossing: wp.int32
+    """1: some of the axis lies inside."""
+    depth: real
+    """Deepest overlap; 0 without."""
     clearance: real
     """Lower bound of the distance of the link's axis from the surface."""
     leaf: wp.int32
@@ -481,6 +489,8 @@ class DistanceQuery:
     link: wp.int32
     start: vec3
     stop: vec3
+    bound: real
+    """Lower bound of its distance, as far as that is known; 0 or less: it may be inside."""
 
 
 @wp.struct
