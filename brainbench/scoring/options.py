@@ -32,7 +32,7 @@ _NO_NUMBERS = (
     "recordings", "stimuli", "match", "select", "window", "whiskers", "fidelity", "metric", "layer", "estimator",
 )  # fmt: skip
 """Fields that take much in Python, and a number nowhere; a batch file can hold one."""
-_ELSEWHERE = ("recordings", "match", "explain")
+_ELSEWHERE = ("recordings", "match", "explain", "title")
 """Fields whose effect stands in other entries of the provenance: ``recordings``, ``pairs`` and ``statistics``."""
 
 
@@ -47,6 +47,8 @@ class ScoreOptions:
     recordings: str | os.PathLike[str] | Sequence[str | os.PathLike[str]] | xr.Dataset = "demo"
     """'demo' or 'demo-rodgers' (synthetic), an NWB, HDF5 or published .npz file, a folder, or a glob; in Python also a
     data set."""
+    title: str | None = None
+    """Title of the recordings in results; by default the name of their file or folder."""
     stimuli: str | os.PathLike[str] | Stimuli | xr.Dataset | None = None
     """A recipe, a scene file, a stimulus-set file, or an HDF5 array; by default what the recordings name."""
     conditions: str | None = None

@@ -13,7 +13,7 @@ from brainbench.core.cuda_graphs import record_launches
 from brainbench.core.devices import pick_device, warp
 from brainbench.core.errors import UsageError, unknown_name
 from robotics_bridge.physics.scene import TouchScene
-from robotics_bridge.physics.state import DIVERGED, MOST_ENVS, HandState
+from robotics_bridge.physics.state import DIVERGED, MOST_ENVS, UNFELT, HandState
 from robotics_bridge.sensors.context import ReadoutSlice, SuiteContext, UpdateClock
 from robotics_bridge.sensors.fidelity import SensorFidelity
 from robotics_bridge.sensors.probes.runtime import DistanceRuntime
@@ -216,6 +216,14 @@ class SensorSuite:
         if self._status is None:
             raise UsageError("Nothing was read yet; call update(state) first.")
         return (wp.to_torch(self._status) & DIVERGED) != 0
+
+    @property
+    def unfelt(self) -> torch.Tensor:
+        """Mask [B] of environments in which, at the last update, a contact on a link with taxels of ``total="engine"``
+        lay near none of them that feels it: their sum lacks its force."""
+        if self._status is None:
+            raise UsageError("Nothing was read yet; call update(state) first.")
+        return (wp.to_torch(self._status) & UNFELT) != 0
 
     @property
     def crowded(self) -> torch.Tensor:

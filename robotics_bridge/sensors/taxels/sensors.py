@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import ClassVar, Literal
+from typing import TYPE_CHECKING, ClassVar, Literal, Self
 
 from brainbench.core.errors import UsageError, unknown_name
+from brainbench.core.plugins import load_object
 from robotics_bridge.sensors.noise.model import GRID_KNOBS, TAXEL_KNOBS
 from robotics_bridge.sensors.sensor import Convention, ProbeSensor, QuerySensor
+
+if TYPE_CHECKING:
+    from robotics_bridge.sensors.context import SuiteContext
+    from robotics_bridge.sensors.runtime import Runtime
 
 CONVENTIONS = ("physical", "thesis")
 
@@ -45,14 +51,23 @@ class KinematicTaxel(QuerySensor):
     """k_ω, N·m·s."""
     convention: Convention = "physical"
     total: Literal["law", "engine"] = "law"
-    """``law``: each taxel by itself, as published. ``engine``: the field is scaled so that it pushes with just the
-    normal force that the physics engine resolved between the link and what it tracks."""
+    """``law``: each taxel by itself, as published. ``engine``: the taxels of a sensor add up to the forces, friction at
+    rest included, of the engine's contacts between its link and what it tracks. Each contact is spread over the taxels
+    that feel that body from that side, by d^α; stiffness, damping, shear and twist play no part. A taxel without such
+    a contact reads 0, and a contact with no taxel near it is felt by none (``SensorSuite.unfelt``)."""
 
     channels: ClassVar[int] = 6
     units: ClassVar[str] = "N, N m"
     knobs: ClassVar[frozenset[str]] = GRID_KNOBS
     shared: ClassVar[tuple[str, ...]] = ("query", "convention", "total")
     runtime: ClassVar[str] = "robotics_bridge.sensors.taxels.runtime:KinematicRuntime"
+
+    @classmethod
+    def build(cls, sensors: Mapping[str, Self], context: SuiteContext) -> Runtime:
+        """Return the runtime that serves these sensors (by name) together."""
+        if next(iter(sensors.values())).total == "law":
+            return super().build(sensors, context)
+        return load_object("robotics_bridge.sensors.taxels.contact_load:ContactLoadRuntime", "runtime")(sensors, context)
 
     def __post_init__(self) -> None:
         super().__post_init__()

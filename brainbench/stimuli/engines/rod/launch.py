@@ -99,6 +99,7 @@ class WhiskerSolver:
         device: Any,
         needs: int,
         *,
+        twists: bool = True,
         block: int | None = None,
         sliced: bool = False,
         **options: Any,
@@ -108,6 +109,7 @@ class WhiskerSolver:
         Args:
             chains, fidelity: whiskers, with their time step, precision and solver.
             device, needs, options: as for :func:`brainbench.stimuli.engines.rod.compilation.load_kernels`.
+            twists: False when nothing twists the whiskers: their joints then have two hinges instead of three.
             block: threads of a block on a GPU; Warp's choice when None.
             sliced: True when whiskers pause for distances and contact forces (:class:`.scheduling.Slices`).
         """
@@ -115,10 +117,11 @@ class WhiskerSolver:
         self.real = real_type(fidelity)
         self.capacity = capacity_for(max(chain.links for chain in chains))
         self.quasistatic = fidelity.solver == "quasistatic"
+        hinges = 2 + twists
         if options:
             options["sliced"] = sliced
-        self.kernels = load_kernels(device, self.real, self.capacity, needs, **options)
-        packed = pack_chains(self.capacity, self.chains, self.quasistatic)
+        self.kernels = load_kernels(device, self.real, self.capacity, needs, hinges=hinges, **options)
+        packed = pack_chains(self.capacity, self.chains, self.quasistatic, hinges)
         self.chain_arrays = to_struct(self.kernels.structs.ChainArrays, packed, device)
         self.block = {} if block is None else {"block_dim": block}
         self.steps = np.array([fidelity.step_of(chain) * MILLI for chain in self.chains])

@@ -18,19 +18,18 @@ from brainbench.stimuli.engines.rod.limits import (
 from brainbench.stimuli.engines.units import MILLI
 
 from .algebra import first_axis, rotate, vec3
+from .articulated_body import ChainState, ProximityState, hinge_direction
 from .motion import BodyMotion, pose_at
 from .narrow_phase import link_shape_distance
-from .parameters import real, sliced
+from .parameters import hinges, real, sliced
 from .state import (
     WAIT_DISTANCES,
     WAIT_SLICE,
     ChainArrays,
-    ChainState,
     ContactCandidates,
     LinkDistance,
     MotionArrays,
     PausedWhiskers,
-    ProximityState,
     ShapeArrays,
     StepOptions,
     WhiskerJob,
@@ -214,7 +213,10 @@ def find_candidates(
         link = row(chain.node, i + 1) - joint
         e2 = row(chain.axis2, i)
         # Twist of the link: what its joint adds to that of the link before.
-        spun = first_axis(e2, link, row(chain.angle, i)[1]) * rate[0] + e2 * rate[1]
+        spun = first_axis(e2, hinge_direction(chain, i), row(chain.angle, i)[1]) * rate[0] + e2 * rate[1]
+        if wp.static(hinges == 3):
+            if i % 2 == 1:
+                spun = spun + row(chain.axis3, i) * rate[2]
         angular = angular + spun
         linear = linear + wp.cross(joint, spun)
         taper = chains.taper[i, job.whisker]

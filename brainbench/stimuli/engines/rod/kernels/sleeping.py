@@ -8,18 +8,17 @@ import warp as wp
 
 from brainbench.stimuli.engines.rod.limits import NOTHING
 
-from .algebra import rotate, vec2, vec3
+from .algebra import JointVector, rotate, vec3
+from .articulated_body import ChainState, ProximityState
 from .motion import pose_at
 from .narrow_phase import link_shape_distance
-from .parameters import against, real, sliced
+from .parameters import against, hinges, real, sliced
 from .state import (
     WAIT_REST,
     WAIT_SLICE,
     ChainArrays,
-    ChainState,
     MotionArrays,
     PausedWhiskers,
-    ProximityState,
     ShapeArrays,
     WhiskerJob,
     WhiskerState,
@@ -100,6 +99,11 @@ def check_rest(
             turned = x * link.bend_cosine + y * link.bend_sine
             y = y * link.bend_cosine - x * link.bend_sine
             x = turned
+            if wp.static(hinges == 3):
+                if i % 2 == 1:
+                    turned = x * link.bend_cosine + y * link.bend_sine
+                    y = y * link.bend_cosine - x * link.bend_sine
+                    x = turned
             end_at = at + x * link.length
             proximity.safe_until[i] = row(proximity.clearance, i)
             if fresh == 1 or row(proximity.clearance, i) < upto:
@@ -161,6 +165,6 @@ def check_rest(
     # What is left of a bend (below REST) is dropped, so that rest does not drift.
     if upto <= state.safe_until:
         for i in range(job.links):
-            chain.angle[i] = vec2(zero, zero)
-            chain.rate[i] = vec2(zero, zero)
+            chain.angle[i] = JointVector()
+            chain.rate[i] = JointVector()
     return 0
