@@ -52,9 +52,7 @@ def _headline(record: ResultRecord) -> Iterator[str]:
         yield f"Score {_scaled_text(score)}{scale}{chance}"
     if record.synthetic:
         yield "Synthetic recordings: ranks on them say nothing about brains."
-    removed = score.provenance.recordings.get("removed") or {}
-    if told := removed_text(removed):
-        yield told
+    yield from left_out(score.provenance.recordings)
 
 
 def _weights(record: ResultRecord) -> str:
@@ -123,10 +121,12 @@ def _notes(record: ResultRecord) -> Iterator[str]:
         )
 
 
-def removed_text(removed: Mapping[str, int]) -> str:
-    """Return how many trials each rule removed; empty for none."""
-    told = [f"{rule.removeprefix('trials: ')} ({number:,})" for rule, number in removed.items() if number]
-    return f"Left out: {', '.join(told)}." if told else ""
+def left_out(recordings: Mapping[str, Any]) -> Iterator[str]:
+    """Yield what was not used of recordings, by their provenance: trials and units by rule, files by reason."""
+    removed = recordings.get("removed") or {}
+    if told := [f"{rule} ({number:,})" for rule, number in removed.items() if number]:
+        yield f"Left out: {'; '.join(told)}."
+    yield from (f"Skipped: {reason}" for reason in recordings.get("skipped") or ())
 
 
 def walk_text(steps: list[dict[str, Any]]) -> str:

@@ -56,6 +56,7 @@ class NeuralResponses:
         # Boards of the demo say whether the network that made it was found.
         truth = {"truth": HIDDEN_NETWORK} if self.source == "demo" and self.synthetic else {}
         truth |= {"title": self.title} if self.title else {}
+        truth |= {"skipped": skipped} if (skipped := self.dataset.attrs.get("skipped")) else {}
         return {"source": self.source, **{name: self.dataset.attrs[name] for name in names}, **truth}
 
     @property

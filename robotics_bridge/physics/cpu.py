@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import os
+import warnings
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
@@ -190,6 +191,7 @@ class _Gatherer:
         self._views = [(d.xpos, d.xquat, d.cvel, d.subtree_com) for d in data]
         self._contacts: list[tuple[NDArray[Any], ...]] = [()] * count
         self._model = model
+        self._warned = False
 
     def gather(self, env: int) -> None:
         data = self._data[env]
@@ -258,6 +260,15 @@ class _Gatherer:
             for name, column in zip(names, columns, strict=True):
                 getattr(state, f"contact_{name}").numpy()[:keep] = column
         state.contact_count.fill_(total)
+        if total > room and not self._warned:
+            self._warned = True
+            most = max(len(parts[1]) for parts in found)
+            warnings.warn(
+                f"The engine found {total} contacts and has room for {room}; the last ones are lost. Make it with "
+                f"contacts={max(most, -(-total // len(self._data)))}.",
+                RuntimeWarning,
+                stacklevel=2,
+            )
 
 
 def _with_fields(model: Any, values: Mapping[str, NDArray]) -> Any:

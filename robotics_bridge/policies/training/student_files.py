@@ -19,7 +19,7 @@ from robotics_bridge.policies.encoders.arms import EncoderConfig
 from robotics_bridge.policies.schema import Values
 from robotics_bridge.policies.shipped import policy_path
 from robotics_bridge.policies.student import TACTILE, TactilePolicy
-from robotics_bridge.policies.training.distill_config import DistillConfig
+from robotics_bridge.policies.training.distill_config import EARLIER_TWIST, DistillConfig
 
 CONFIG, MODEL = "config.json", "model.safetensors"
 
@@ -71,7 +71,7 @@ def load_student(folder: str | Path, *, device: str = "cpu") -> tuple[TactilePol
     if not (folder / MODEL).is_file():
         raise DataError(f"The student in {str(folder)!r} has no weights yet; its run was interrupted early.")
     given = described.part("distill")
-    config = DistillConfig.of(given.fields(DistillConfig))
+    config = DistillConfig.of({"twist": EARLIER_TWIST, **given.fields(DistillConfig)})
     if config.encoder_settings:
         given.part("encoder_settings").fields(EncoderConfig)
     shapes, actions = described.shapes("groups", MOST_NUMBERS), described.whole("actions", 1, JOINTS)

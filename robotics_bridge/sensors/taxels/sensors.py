@@ -15,6 +15,9 @@ if TYPE_CHECKING:
     from robotics_bridge.sensors.context import SuiteContext
     from robotics_bridge.sensors.runtime import Runtime
 
+PUBLISHED_TWIST = 2.0
+"""k_ω of the published parameters (N·m·s): that of a disc of 1.4 m, which drowns every other moment when an object
+turns."""
 CONVENTIONS = ("physical", "thesis")
 
 
@@ -33,7 +36,7 @@ class KinematicTaxel(QuerySensor):
         f = k_n d^α m + c_n d^α v_n ± k_t v_t,    τ = x × f ± k_ω (ω·m) m
 
     ``physical`` takes plus signs (friction drags the sensor along) and never pulls; ``thesis`` takes the published
-    minus signs. Defaults are the published parameters (4.10).
+    minus signs. Defaults are the published parameters (4.10), but for k_ω in the physical convention.
 
     Raises:
         UsageError: the convention or the total is unknown, or the exponent is not positive.
@@ -47,8 +50,9 @@ class KinematicTaxel(QuerySensor):
     """α."""
     shear: float = 2.0
     """k_t, N·s/m."""
-    twist: float = 2.0
-    """k_ω, N·m·s."""
+    twist: float | None = None
+    """k_ω, N·m·s. None is that of a disc of the largest sensing radius R that slips with k_t, k_t R²/2 (1.6e-5 at
+    4 mm), and with ``thesis`` :data:`PUBLISHED_TWIST`."""
     convention: Convention = "physical"
     total: Literal["law", "engine"] = "law"
     """``law``: each taxel by itself, as published. ``engine``: the taxels of a sensor add up to the forces, friction at
@@ -74,6 +78,10 @@ class KinematicTaxel(QuerySensor):
         _check_convention(self.convention)
         if self.total not in ("law", "engine"):
             raise unknown_name("total of a force field", self.total, ("law", "engine"))
+        if self.twist is None:
+            radius = float(self.probes.radius.max(initial=0.0))
+            published = self.convention == "thesis"
+            object.__setattr__(self, "twist", PUBLISHED_TWIST if published else self.shear * radius**2 / 2)
         if not self.exponent > 0:
             raise UsageError(f"The exponent of a contact law is positive; received {self.exponent!r}.")
 
