@@ -64,8 +64,9 @@ def test_collision_geometries_of_a_concave_object_are_measured_beside_the_bench_
     bench, exact, cut, hull = tradeoff.measure_tradeoff(path, chosen)
     assert exact["concave_error"] == exact["error"] == 0
     assert exact["pieces"] == 24
-    # A hull fills the hollow that the whisker moves in.
-    assert cut["error"] < 0.2 < 1 < hull["error"]
+    # A hull fills the hollow that the whisker moves in: it starts inside and cannot be trusted.
+    assert cut["error"] < 0.2
+    assert hull["error"] is None
     assert 1 < cut["pieces"] < 24
     assert hull["pieces"] == 1
     assert [point.settings["links"] for point in tradeoff.front([bench, exact, cut, hull])] == [8]
