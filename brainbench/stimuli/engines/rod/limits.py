@@ -25,10 +25,15 @@ REST = 1e-6
 """Bend (rad) and rate (rad/ms) of every joint below which a whisker without contact is at rest."""
 FAR = 3.0
 """Farthest distance (mm) that a query finds; a link further away is asked for again when it may have come nearer."""
+LONGEST_SPAN = 32.0
+"""Longest time (ms) between two places where time is kept exactly."""
 TRAVEL = 0.25
 """Longest way (mm) of any point of a whisker in one step while something is near; steps are shortened to keep it."""
 FINEST = 16
 """Most parts into which a step is split for that."""
+LISTED = 32
+"""Shapes nearest to a whisker that it looks at in each step where there are more; the others wait until it has moved
+far enough."""
 WIDEST = 0.8
 """Widest search for contacts (mm)."""
 CREVICE = 0.02
