@@ -8,7 +8,7 @@ only the nearest are looked at; a bound tells when another may have come near (`
 
 import warp as wp
 
-from brainbench.stimuli.engines.rod.limits import CAPSULE, CLOSED, CYLINDER, LISTED, WIDEST
+from brainbench.stimuli.engines.rod.limits import CAPSULE, CLOSED, CYLINDER, LISTED, STALE, WIDEST
 
 from .algebra import first_axis, rotate, vec3
 from .distances import segments
@@ -100,6 +100,13 @@ def lower_clearance(job: WhiskerJob, proximity: wp.ref[ProximityState], near: wp
     near.moved = near.moved + most
 
 
+@wp.func
+def from_segment(point: vec3, end: vec3) -> vec3:
+    """Return the way from the nearest point of the segment from the origin to ``end``."""
+    share = wp.clamp(wp.dot(point, end) / wp.length_sq(end), real(0.0), real(1.0))
+    return point - end * share
+
+
 @wp.func(inline=True)
 def list_shapes(
     motions: MotionArrays,
@@ -118,10 +125,25 @@ def list_shapes(
     near.room = real(1e20)
     near.moved = real(0.0)
     worst = int(0)
+    # All of the whisker is near the chord from base to tip.
+    chord = row(chain.node, job.links)
+    sag = real(0.0)
+    for i in range(1, job.links):
+        sag = wp.max(sag, wp.length(from_segment(row(chain.node, i), chord)))
+    body = BodyMotion()
+    last_track = int(-1)
     for s in range(job.first_shape, job.end_shape):
-        body = pose_from(motions, shapes.track[s], now, pose)
+        if shapes.track[s] != last_track:
+            last_track = shapes.track[s]
+            body = pose_from(motions, last_track, now, pose)
         centre = body.place + rotate(body.turn, shapes.place[s])
         round = shapes.radius[s]
+        full = near.count == wp.static(LISTED)
+        if full:
+            beyond = wp.length(from_segment(centre, chord)) - sag - round
+            if beyond >= row(near.distance, worst):
+                near.room = wp.min(near.room, beyond)
+                continue
         along = vec3(real(0.0), real(0.0), real(0.0))
         slender = shapes.kind[s] == wp.static(CAPSULE) or shapes.kind[s] == wp.static(CYLINDER)
         if slender:
@@ -131,14 +153,12 @@ def list_shapes(
         for i in range(job.links):
             start = row(chain.node, i)
             link = row(chain.node, i + 1) - start
-            share = wp.clamp(wp.dot(centre - start, link) / wp.length_sq(link), real(0.0), real(1.0))
-            away = start + link * share - centre
+            away = from_segment(centre - start, link)
             if slender:
                 pair = segments(start, link, centre - along, real(2.0) * along)
                 away = start + link * pair[0] - (centre + along * (real(2.0) * pair[1] - real(1.0)))
             square = wp.min(square, wp.length_sq(away))
         distance = wp.sqrt(square) - round
-        full = near.count == wp.static(LISTED)
         if full:
             near.room = wp.min(near.room, wp.max(distance, row(near.distance, worst)))
         if not full or distance < row(near.distance, worst):
@@ -245,7 +265,11 @@ def find_candidates(
     others = real(1e20)
     enough = margin + chains.taper[0, job.whisker].start_radius
     if wp.static(not sliced) and looked_at > wp.static(LISTED):
-        if near.room - near.moved <= enough:
+        stale = near.room - near.moved <= enough
+        if near.moved > real(wp.static(STALE)):
+            for place in range(near.count):
+                stale = stale or row(near.distance, place) - near.moved <= enough
+        if stale:
             list_shapes(motions, shapes, job, chain, near, pose, now)
         # More of them within the margin than are listed: all are looked at.
         if near.room - near.moved > enough:
@@ -308,7 +332,7 @@ def find_candidates(
                         approach = wp.dot(normal, linear + wp.cross(angular, point) - object_velocity)
                         # Where the gap will be: tells apart what only passes by.
                         ahead = gap + real(1.5) * h * wp.min(approach, zero)
-                        if ahead <= real(wp.static(CLOSED)):
+                        if gap + real(1.5) * job.longest_step * wp.min(approach, zero) <= real(wp.static(CLOSED)):
                             state.closes = 1
                             state.closing_speed = wp.max(state.closing_speed, shapes.speed[s])
                         slot = candidate_slot(candidates, count, point, normal, ahead, link)

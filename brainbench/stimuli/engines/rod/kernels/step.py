@@ -8,7 +8,7 @@ Units: mg, mm, ms, mN, µN·m; results are in N, N·m and m.
 
 import warp as wp
 
-from brainbench.stimuli.engines.rod.limits import FINEST, NOTHING, REST, TRAVEL
+from brainbench.stimuli.engines.rod.limits import AFTERMATH, FINEST, NOTHING, REST, TRAVEL
 
 from .algebra import SpatialAcceleration, Twist, Wrench, vec3
 from .articulated_body import articulated_inertia, forward_kinematics, integrate_joint, joint_accelerations
@@ -273,13 +273,13 @@ def run(
                     if state.closes == 1 and state.split_time <= zero:
                         if (state.top_speed + state.closing_speed) * h > real(wp.static(TRAVEL)):
                             # Too long for what comes: the same step again, split.
-                            state.split_time = job.longest_step
+                            state.split_time = real(2.0) * job.longest_step
                             state.near_speed = state.closing_speed
                             left = left_whole
                             last = int(0)
                             continue
                     if state.closes == 1:
-                        state.split_time = job.longest_step
+                        state.split_time = wp.max(state.split_time, real(2.0) * job.longest_step)
                         state.near_speed = wp.max(state.near_speed, state.closing_speed)
                     else:
                         state.split_time = wp.max(state.split_time - h, zero)
@@ -324,6 +324,8 @@ def run(
                 arc_sum = problems.solution[index].arc_sum
                 if force_sum > zero:
                     touched = 1
+                    # A whisker that slips off swings back fast.
+                    state.split_time = real(wp.static(AFTERMATH)) * job.longest_step
             # What contact did to the tip's speed, and may do again.
             state.velocity_jump = wp.max(h * wp.length(tip_acceleration), real(0.5) * state.velocity_jump)
             state.touching = state.touching + touched
