@@ -19,6 +19,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brainbench.core.errors import UsageError
+from brainbench.core.rotations import to_matrices
+from brainbench.stimuli.engines.protocol import Follicle
+from brainbench.stimuli.engines.units import MILLI
+from brainbench.stimuli.objects.obstacle import Obstacle
 
 KNOT = 1e-3
 """Length of a cell (s); one cubic piece follows whisking at 20 Hz to 1e-7 of its way."""
@@ -115,6 +119,43 @@ def cut(
     return MotionPieces(count, needed, moves)
 
 
+@dataclass(frozen=True)
+class Cutting:
+    """When motions are followed, and in which steps. Seconds."""
+
+    start: float
+    stop: float
+    step: float
+    longest_step: float
+    """Of all whiskers that may share a motion: the last step looks at the pose so far behind ``stop``."""
+
+    def follicle(self, follicle: Follicle, size: float) -> MotionPieces:
+        """Cut the motion of a base whose whisker has the arc length ``size`` (m); errors as :func:`cut`."""
+
+        def path(times: NDArray[np.float64]) -> NDArray[np.float64]:
+            position, euler = follicle.pose(times)
+            return np.concatenate([np.asarray(position), np.asarray(euler) * size], axis=1) * MILLI
+
+        return self._cut(path, follicle, "the base of a whisker")
+
+    def obstacle(self, obstacle: Obstacle, anchor: NDArray[np.float64]) -> MotionPieces:
+        """Cut the motion of an obstacle, by that of its point ``anchor`` [3] (m) and its turns; errors as above."""
+        motion = obstacle.motion
+        assert motion is not None
+        size = float(np.linalg.norm(obstacle.bounds - anchor, axis=1).max())
+
+        def path(times: NDArray[np.float64]) -> NDArray[np.float64]:
+            place, turn = motion(times)
+            turn = to_matrices(np.asarray(turn, dtype=float))
+            return np.concatenate([np.asarray(place) + turn @ anchor, turn.reshape(-1, 9) * size], axis=1) * MILLI
+
+        return self._cut(path, motion, "an object")
+
+    def _cut(self, path: Path, motion: object, what: str) -> MotionPieces:
+        finest = getattr(motion, "finest", None)
+        return cut(path, self.start, self.stop, step=self.step, tail=self.longest_step, finest=finest, what=what)
+
+
 @dataclass(frozen=True, eq=False)
 class _Sampled:
     """A motion where it is evaluated."""
@@ -139,8 +180,13 @@ class _Sampled:
         begin = self.start + KNOT * cells[:, None]
         knots = begin + KNOT * np.arange(pieces + 1) / pieces
         side = side_of(pieces)
-        before = np.maximum(knots - side, 0.0) if self.start >= 0 else knots - side
-        slope = (self.at(knots + side) - self.at(before)) / (knots + side - before)[..., None]
+        early = (self.start >= 0) & (knots < side)
+        before = np.where(early, knots, knots - side)
+        ahead = self.at(knots + side)
+        slope = (ahead - self.at(before)) / (knots + side - before)[..., None]
+        if early.any():
+            # At the very start there is no instant before: the line through two differences.
+            slope[early] = 2 * slope[early] - (self.at(knots[early] + 2 * side) - self.at(knots[early])) / (2 * side)
         x = self.at(begin + KNOT * np.arange(looks + 1) / looks)
         each = looks // pieces
         x = x[:, np.arange(pieces)[:, None] * each + np.arange(each + 1)]

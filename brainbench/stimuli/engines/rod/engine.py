@@ -16,7 +16,7 @@ from brainbench.core.devices import pick_device, usable_processors
 from brainbench.core.progress import Progress as NamedProgress
 from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.engines.job_pool import run_groups
-from brainbench.stimuli.engines.motion_pieces import KNOT
+from brainbench.stimuli.engines.motion_pieces import KNOT, Cutting
 from brainbench.stimuli.engines.protocol import Job, Progress, Trace, WhiskerEngine
 from brainbench.stimuli.engines.reach import Reach, reachable
 from brainbench.stimuli.engines.rod.compilation import load_kernels
@@ -24,7 +24,6 @@ from brainbench.stimuli.engines.rod.launch import LaunchResult, WhiskerSolver, r
 from brainbench.stimuli.engines.rod.limits import FINEST, WIDEST
 from brainbench.stimuli.engines.rod.packing import (
     GRID,
-    Cutting,
     PackedJobs,
     PackedMotions,
     Track,

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from brainbench.core import rotations
-from brainbench.stimuli.engines.motion_pieces import MotionPieces, Path, cut, side_of
+from brainbench.stimuli.engines.motion_pieces import Cutting, MotionPieces, side_of
 from brainbench.stimuli.engines.protocol import Follicle, Load, base_rotation
 from brainbench.stimuli.engines.rod.limits import LIGHT
 from brainbench.stimuli.engines.units import MICRO, MILLI
@@ -91,22 +91,6 @@ def still_knots(position: NDArray, quaternion: ArrayLike) -> NDArray[np.float64]
     return knot
 
 
-@dataclass(frozen=True)
-class Cutting:
-    """When motions are followed, and in which steps. Seconds."""
-
-    start: float
-    stop: float
-    step: float
-    longest_step: float
-    """Of all whiskers that may share a motion."""
-
-    def cut(self, path: Path, motion: object, what: str) -> MotionPieces:
-        """Cut ``path`` of a ``motion`` into pieces; errors as :func:`brainbench.stimuli.engines.motion_pieces.cut`."""
-        finest = getattr(motion, "finest", None)
-        return cut(path, self.start, self.stop, step=self.step, tail=self.longest_step, finest=finest, what=what)
-
-
 @dataclass(frozen=True, eq=False)
 class Track:
     """Motion of a base or a body as cubic pieces, from the start of a launch."""
@@ -127,29 +111,20 @@ def follicle_track(follicle: Follicle, size: float, cutting: Cutting) -> Track:
         place, euler = (np.asarray(values, dtype=float) for values in follicle.pose(np.array([cutting.start])))
         return still_track(place[0], rotations.from_matrices(base_rotation(euler))[0])
 
-    def path(times: NDArray[np.float64]) -> NDArray[np.float64]:
-        position, euler = follicle.pose(times)
-        return np.concatenate([np.asarray(position), np.asarray(euler) * size], axis=1) * MILLI
-
-    return _track(follicle.pose, base_rotation, cutting.cut(path, follicle, "the base of a whisker"), cutting.start)
+    return _track(follicle.pose, base_rotation, cutting.follicle(follicle, size), cutting.start)
 
 
 def body_track(obstacle: Obstacle, anchor: NDArray[np.float64], cutting: Cutting) -> Track:
     """Return the track of the point ``anchor`` [3] (m) of an obstacle that moves."""
     motion = obstacle.motion
     assert motion is not None
-    size = float(np.linalg.norm(obstacle.bounds - anchor, axis=1).max())
 
     def pose(times: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         place, turn = motion(times)
         turn = rotations.to_matrices(np.asarray(turn, dtype=float))
         return np.asarray(place) + turn @ anchor, turn
 
-    def path(times: NDArray[np.float64]) -> NDArray[np.float64]:
-        place, turn = pose(times)
-        return np.concatenate([place, turn.reshape(-1, 9) * size], axis=1) * MILLI
-
-    return _track(pose, np.asarray, cutting.cut(path, motion, "an object"), cutting.start)
+    return _track(pose, np.asarray, cutting.obstacle(obstacle, anchor), cutting.start)
 
 
 def still_track(place: NDArray[np.float64], quaternion: ArrayLike = (1.0, 0.0, 0.0, 0.0)) -> Track:
@@ -172,24 +147,29 @@ def _knots(
     pose: Pose, to_matrices: Callable[[NDArray], NDArray], times: NDArray, sides: NDArray
 ) -> NDArray[np.float64]:
     """Return knots [n, 16] of a pose from its places and rotations ``sides`` [n] (s) before, at and after the knots."""
+    # At the very start there is no instant before: values there are those of the line through two differences.
+    early = times[0] >= 0 and times[0] < sides[0]
     around = []
-    clipped = times[0] >= 0
     for side in (-sides, 0.0, sides):
-        place, turn = pose(np.maximum(times + side, 0.0) if clipped else times + side)
+        place, turn = pose(np.maximum(times + side, times[0]) if early else times + side)
         around.append((np.asarray(place, dtype=float), to_matrices(np.asarray(turn, dtype=float))))
     (place0, turn0), (place, turn), (place1, turn1) = around
-    # At the very start there may be no instant before: the difference is then one-sided.
-    back = np.where(clipped & (times < sides), times, sides)[:, None]
-    span = back + sides[:, None]
-    spin0, spin1 = _spin(turn0, turn) / np.maximum(back, 1e-12), _spin(turn, turn1) / sides[:, None]
-    spin0 = np.where(back > 0, spin0, spin1)
+    span = sides[:, None]
+    spin0, spin1 = _spin(turn0, turn) / span, _spin(turn, turn1) / span
+    # Central differences, whose error is of second order; m per s are mm per ms.
+    velocity = (place1 - place0) / (2 * span)
+    if early:
+        place2, turn2 = pose(times[:1] + 2 * sides[:1])
+        there = (np.asarray(place2, dtype=float) - place1[:1]) / sides[0]
+        beyond = _spin(turn1[:1], to_matrices(np.asarray(turn2, dtype=float))) / sides[0]
+        velocity[0] = (3 * (place1[0] - place[0]) / sides[0] - there[0]) / 2
+        spin0[0] = 2 * spin1[0] - beyond[0]
     knots = np.empty((len(times), 16))
     knots[:, :3] = place * MILLI
-    # Central differences, whose error is of second order; m per s are mm per ms.
-    knots[:, 3:6] = (place1 - place0) / span
+    knots[:, 3:6] = velocity
     knots[:, 6:10] = _continuous(rotations.from_matrices(turn))
-    knots[:, 10:13] = _spin(turn0, turn1) / span / MILLI
-    knots[:, 13:16] = (spin1 - spin0) / (span / 2) / MILLI**2
+    knots[:, 10:13] = (spin0 + spin1) / 2 / MILLI
+    knots[:, 13:16] = (spin1 - spin0) / span / MILLI**2
     return knots
 
 
