@@ -140,6 +140,8 @@ def _track(pose: Pose, to_matrices: Callable[[NDArray], NDArray], pieces: Motion
     sides = side_of(np.append(np.repeat(pieces.count, pieces.count), pieces.count[-1]))
     knots = _knots(pose, to_matrices, times, sides)
     straight = np.abs(np.diff(knots[:, 3:6], axis=0)).max() < 1e-9 and not knots[:, 10:13].any()
+    # Further away one straight piece would lose digits.
+    straight = straight and np.linalg.norm(knots[-1, :3] - knots[0, :3]) < 10 * GRID
     return Track(knots[:1] if straight else knots, cells, times, pieces)
 
 
