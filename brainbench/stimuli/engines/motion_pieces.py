@@ -38,8 +38,8 @@ PIECES_PER_PERIOD = 27
 """Pieces in one period of a sinusoid that are just followed: the velocity of a cubic is wrong by √3/216 (ω h)³."""
 LEAST_STEPS = 10
 """Steps per period of a motion where the fidelity names none."""
-_CHUNK = 128
-"""Cells at a time: bounds the memory."""
+_AT_ONCE = 400_000
+"""Looks at a time: bounds the memory."""
 _SLOW = 1e-6
 """Speed (mm/ms) whose errors never count."""
 _INSIDE = 16
@@ -103,8 +103,9 @@ def cut(
     looks = int(2 ** math.ceil(math.log2(min(max(wanted, 4), 4 * MOST_PIECES))))
     motion = _Sampled(path, start, what)
     errors, speed, moves = np.empty((2, cells)), 0.0, False
-    for first in range(0, cells, _CHUNK):
-        which = np.arange(first, min(first + _CHUNK, cells))
+    some = max(1, _AT_ONCE // looks)
+    for first in range(0, cells, some):
+        which = np.arange(first, min(first + some, cells))
         place, rate, fastest = motion.errors(which, 1, looks)
         errors[:, which] = place[:, 0], rate[:, 0]
         speed = max(speed, fastest)
@@ -113,9 +114,10 @@ def cut(
     count = np.ones(cells, dtype=np.int32)
     needed = count.copy()
     left = np.flatnonzero((errors[0] > PLACE_ERROR) | (errors[1] > limit))
-    for first in range(0, len(left), _CHUNK):
-        some = left[first : first + _CHUNK]
-        count[some], needed[some] = _refine(motion, some, max(looks, LOOKS), limit)
+    some = _AT_ONCE // (4 * MOST_PIECES)
+    for first in range(0, len(left), some):
+        which = left[first : first + some]
+        count[which], needed[which] = _refine(motion, which, max(looks, LOOKS), limit)
     return MotionPieces(count, needed, moves)
 
 
