@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brainbench.core.rotations import to_matrices
+from brainbench.geometry import Mesh, winding_number
 from brainbench.stimuli.objects.obstacle import Obstacle
 from brainbench.stimuli.whiskers.chain import Chain
 from brainbench.stimuli.whiskers.whisker import Whisker
@@ -56,7 +57,8 @@ def reachable(
 
     Conservative: an inextensible whisker never leaves the ball of its arc length around its base, so a
     part whose bounding box stays outside that ball at every time cannot be touched, however it bends.
-    What base and obstacle travel against one another between two times is added to the ball.
+    What base and obstacle travel against one another between two times is added to the ball. A surface around the base
+    is kept however far it is: a whisker that starts deep inside it must be flagged.
 
     With ``surfaces`` the surface of every obstacle that has one is taken, as by engines that collide meshes; otherwise
     its parts, and the surface only where there are none.
@@ -75,9 +77,10 @@ def reachable(
         elif len(obstacle.parts) > 1:
             boxes = np.stack([part.bounds() for part in obstacle.parts])
         # The bounds of what stands still have been looked at.
+        points = _in_obstacle_frame(obstacle, base, times)
         if len(boxes) > 1 or not still[index]:
-            distances = _box_distances(boxes, _in_obstacle_frame(obstacle, base, times))
-        if distances.min() > limit:
+            distances = _box_distances(boxes, points)
+        if distances.min() > limit and not _encloses(obstacle, points[0]):
             continue
         if obstacle.surface is None and distances.max() > limit:
             near = (part for part, distance in zip(obstacle.parts, distances, strict=True) if distance <= limit)
@@ -101,6 +104,14 @@ def _box_distances(boxes: NDArray[np.float64], points: NDArray[np.float64]) -> N
         outside = np.maximum(np.maximum(low - points, points - high), 0.0)
         found[first : first + some] = np.sqrt(np.einsum("bnd,bnd->bn", outside, outside)).min(axis=1)
     return np.maximum(found - between, 0.0)
+
+
+def _encloses(obstacle: Obstacle, point: NDArray[np.float64]) -> bool:
+    """Return whether a point [3] in the frame of the obstacle lies inside its surface."""
+    surface = obstacle.surface
+    if surface is None or ((point < obstacle.bounds[0]) | (point > obstacle.bounds[1])).any():
+        return False
+    return bool(winding_number(Mesh(surface.vertices, surface.faces), point)[0] > 0.5)
 
 
 def touched(obstacle: Obstacle, *, surfaces: bool) -> Obstacle:

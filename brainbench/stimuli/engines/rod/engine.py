@@ -17,6 +17,7 @@ from brainbench.core.progress import Progress as NamedProgress
 from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.engines.job_pool import run_groups
 from brainbench.stimuli.engines.motion_pieces import KNOT, Cutting
+from brainbench.stimuli.engines.planarity import stays_in_plane
 from brainbench.stimuli.engines.protocol import Job, Progress, Trace, WhiskerEngine
 from brainbench.stimuli.engines.reach import Reach, reachable
 from brainbench.stimuli.engines.rod.compilation import load_kernels
@@ -61,6 +62,7 @@ class RodEngine(WhiskerEngine):
     package = "warp-lang"
     devices = ("cpu", "cuda")
     solvers = ("dynamic", "quasistatic")
+    twists = True
     surfaces = True
     retries = True
     batches = True
@@ -76,7 +78,10 @@ class RodEngine(WhiskerEngine):
             what = f"compiling the whisker solver for {capacity} links (once; it is kept)"
             tell = progress or (lambda done, total, what: None)
             real = real_type(fidelity)
-            load_kernels(device, real, capacity, compiling=lambda begins: tell(0 if begins else 1, 1, what))
+            hinges = 2 + (fidelity.twist is not False)
+            load_kernels(
+                device, real, capacity, hinges=hinges, compiling=lambda begins: tell(0 if begins else 1, 1, what)
+            )
 
         with ThreadPoolExecutor(max_workers=max(1, len(sizes))) as pool:
             list(pool.map(load, sizes))
@@ -135,6 +140,8 @@ class _Task:
     fast: tuple[float, float]
     """When (s) an object first moves further against the whisker in the shortest step than contacts are looked for, inf
     if never, and how far (m)."""
+    twists: bool
+    """Whether it may leave its plane, and may twist at this fidelity."""
 
 
 def _simulate(
@@ -144,7 +151,7 @@ def _simulate(
     tasks: dict[int, _Task] = {}
     traces: dict[int, Trace] = {}
     bodies: dict[Any, tuple[NDArray, Track]] = {}
-    spent = []
+    spent: dict[int, float] = {}
     for index, job in jobs.items():
         started = time.thread_time()
         task = _task(job, fidelity, bodies)
@@ -152,10 +159,19 @@ def _simulate(
             traces[index] = silent_trace(job, fidelity, record_shape, time.thread_time() - started)
         else:
             tasks[index] = task
-            spent.append(time.thread_time() - started)
-    if not tasks:
-        return traces
-    given, seconds = list(tasks.values()), np.array(spent)
+            spent[index] = time.thread_time() - started
+    for twists in (False, True):
+        some = {index: task for index, task in tasks.items() if task.twists == twists}
+        seconds = np.array([spent[index] for index in some])
+        traces |= _simulate_alike(some, seconds, retry, fidelity, device, record_shape) if some else {}
+    return traces
+
+
+def _simulate_alike(
+    tasks: dict[int, _Task], seconds: NDArray, retry: int, fidelity: Fidelity, device: Any, record_shape: bool
+) -> dict[int, Trace]:
+    """Run tasks of which all or none twist in one launch; ``seconds`` [task] is the processor time of each so far."""
+    given = list(tasks.values())
 
     def launch(which: NDArray[np.bool_] | None, finer: int) -> LaunchResult:
         rows = np.arange(len(given)) if which is None else np.flatnonzero(which[:, 0])
@@ -165,7 +181,7 @@ def _simulate(
 
     result = run_with_retries(launch, retry)
     found = (_trace(result, row, task.job, fidelity, seconds[row]) for row, task in enumerate(given))
-    return traces | dict(zip(tasks, found, strict=True))
+    return dict(zip(tasks, found, strict=True))
 
 
 def _task(job: Job, fidelity: Fidelity, bodies: dict[Any, tuple[NDArray, Track]]) -> _Task | None:
@@ -214,7 +230,8 @@ def _task(job: Job, fidelity: Fidelity, bodies: dict[Any, tuple[NDArray, Track]]
     if limit is not None:
         shortest = limit[np.clip(((seen[:-1] - start) / KNOT).astype(int), 0, len(limit) - 1)]
     fast = _too_fast(job, reach, (position, euler), seen, shortest / FINEST)
-    return _Task(job, chain, base, near, names, limit, fast)
+    twists = fidelity.twist is not False and not stays_in_plane(job, reach, position, euler, seen)
+    return _Task(job, chain, base, near, names, limit, fast, twists)
 
 
 def _launch(
@@ -239,7 +256,7 @@ def _launch(
     packed = PackedJobs(whisker, scene, base, row, np.zeros_like(row), loads, limits)
     # Compiling is done once; it is no cost of a whisker.
     paused = time.thread_time()
-    solver = WhiskerSolver(list(chains.values()), fidelity, device, shapes.needs)
+    solver = WhiskerSolver(list(chains.values()), fidelity, device, shapes.needs, twists=tasks[0].twists)
     started += time.thread_time() - paused
     fast = np.array([task.fast for task in tasks])
     result = solver.launch(

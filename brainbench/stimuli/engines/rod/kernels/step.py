@@ -11,7 +11,14 @@ import warp as wp
 from brainbench.stimuli.engines.rod.limits import AFTERMATH, FINEST, NOTHING, REST, TRAVEL
 
 from .algebra import SpatialAcceleration, Twist, Wrench, vec3
-from .articulated_body import articulated_inertia, forward_kinematics, integrate_joint, joint_accelerations
+from .articulated_body import (
+    ChainState,
+    ProximityState,
+    articulated_inertia,
+    forward_kinematics,
+    integrate_joint,
+    joint_accelerations,
+)
 from .broad_phase import count_near_links, find_candidates, lower_clearance, query_distances, search_range
 from .contact_problem import any_gap_closes, queue_problem, read_solution, write_problem
 from .contact_solver import solve_contacts
@@ -24,7 +31,6 @@ from .state import (
     WAIT_FORCES,
     WAIT_SLICE,
     ChainArrays,
-    ChainState,
     ContactCandidates,
     ContactProblems,
     Instant,
@@ -32,7 +38,6 @@ from .state import (
     MotionArrays,
     NearShapes,
     PausedWhiskers,
-    ProximityState,
     ReadingArrays,
     ResultArrays,
     ShapeArrays,
