@@ -1,7 +1,7 @@
 """Measure every preset against the elastica, the slip-off depth and the Euler-Bernoulli frequencies.
 
 Run from the repository root: ``python -m benchmarks.whiskers.validation``; it rewrites its section of RESULTS.md, one
-per ``--backend``. The gates (base moment/force of pegs, slip-off, frequencies, damping ratio) are :data:`GATES`.
+per ``--backend`` and part. The gates (base moment/force of pegs, slip-off, frequencies, damping ratio) are :data:`GATES`.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from functools import partial
 import numpy as np
 
 from benchmarks.report import table, write_section
+from benchmarks.whiskers import out_of_plane
 from brainbench.core.errors import BrainbenchError
 from brainbench.stimuli.engines import list_engines
 from brainbench.stimuli.engines.fidelity import Fidelity, list_presets
@@ -149,15 +150,21 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--backend", default="mujoco", choices=list_engines())
+    parser.add_argument("--part", choices=("plane", "out-of-plane", "all"), default="all")
     arguments = parser.parse_args()
-    backend = arguments.backend
+    backend, failed = arguments.backend, False
     with ProcessPoolExecutor(arguments.workers) as pool:
-        results = dict(zip(subjects(), pool.map(partial(measure, backend=backend), subjects()), strict=True))
-    text, broken = report(results)
-    title = f"Whisker presets against mechanics ({backend})"
-    write_section(title, f"python -m benchmarks.whiskers.validation --backend {backend}", text, subject="whiskers")
-    print(text)
-    raise SystemExit(bool(broken))
+        for part in ("plane", "out-of-plane") if arguments.part == "all" else (arguments.part,):
+            if part == "plane":
+                results = dict(zip(subjects(), pool.map(partial(measure, backend=backend), subjects()), strict=True))
+                title, (text, broken) = f"Whisker presets against mechanics ({backend})", report(results)
+            else:
+                title, (text, broken) = f"Whiskers out of their plane ({backend})", out_of_plane.report(pool, backend)
+            command = f"python -m benchmarks.whiskers.validation --backend {backend} --part {part}"
+            write_section(title, command, text, subject="whiskers")
+            print(text)
+            failed |= bool(broken)
+    raise SystemExit(failed)
 
 
 if __name__ == "__main__":
