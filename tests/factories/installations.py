@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import importlib.metadata as metadata
 import tomllib
-from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
 
