@@ -211,20 +211,20 @@ def plot_tradeoff(rows: Sequence[dict[str, Any]], path: Path) -> None:
     """
     figure, axes = panels(1, 3, (10.5, 3.6))
     titles = {
-        "mesh": "distance to a mesh of 4,608 triangles,\nby method and resolution",
+        "mesh": "distance to 4,608 triangles,\nby cells of the distance field",
         "points": "proximity taxels,\nby number of surface points",
         "taxels": "pad of taxels,\nby number of taxels",
     }
     for (part, title), one in zip(titles.items(), axes[0], strict=True):
         chosen = [row for row in rows if row["part"] == part]
         one.loglog([r["cost"] for r in chosen], [r["error"] for r in chosen], "o", markersize=5)
-        for row in chosen:
-            query = f"field {row['resolution']}³" if row.get("resolution") else "each triangle"
-            label = f"{row.get('points') or row.get('taxels') or 0:,}" if part != "mesh" else query
-            # Beside a point to the right, or to the left where that would leave the panel.
-            late = row["cost"] == max(r["cost"] for r in chosen) or row.get("resolution") in RESOLUTIONS[::2]
-            place = {"xytext": (-7 if late else 7, 0), "textcoords": "offset points", "va": "center"}
-            one.annotate(label, (row["cost"], row["error"]), ha="right" if late else "left", fontsize=8.5, **place)
+        for number, row in enumerate(chosen):
+            cells = f"{row['resolution']}³" if row.get("resolution") else "no field: each triangle"
+            label = f"{row.get('points') or row.get('taxels') or 0:,}" if part != "mesh" else cells
+            # Left and right in turn, because neighbours are close; left where the panel ends.
+            left = number % 2 == 0 or number == len(chosen) - 1
+            place = {"xytext": (-7 if left else 7, 0), "textcoords": "offset points", "ha": "right" if left else "left"}
+            one.annotate(label, (row["cost"], row["error"]), va="center", fontsize=8.5, **place)
         one.set_title(title)
         one.set_xlabel("time per environment and update (µs)")
         one.set_ylabel("relative error of the force (RMS)")

@@ -63,4 +63,4 @@ def _label(axes: Any, title: str, error: str) -> None:
     axes.set(xscale="log", yscale="log", title=title, ylabel=error)
     axes.set_xlabel("processor time per second of one whisker (s/s)")
     axes.margins(x=0.12, y=0.12)
-    axes.legend(frameon=False, fontsize=8.5, loc="upper center", bbox_to_anchor=(0.5, -0.15), ncol=3)
+    axes.legend(frameon=False, fontsize=8.5, loc="upper center", bbox_to_anchor=(0.5, -0.15), ncol=2)
