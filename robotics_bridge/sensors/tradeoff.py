@@ -221,10 +221,13 @@ def plot_tradeoff(rows: Sequence[dict[str, Any]], path: Path) -> None:
         for number, row in enumerate(chosen):
             cells = f"{row['resolution']}³" if row.get("resolution") else "no field: each triangle"
             label = f"{row.get('points') or row.get('taxels') or 0:,}" if part != "mesh" else cells
-            # Left and right in turn, because neighbours are close; left where the panel ends.
-            left = number % 2 == 0 or number == len(chosen) - 1
-            place = {"xytext": (-7 if left else 7, 0), "textcoords": "offset points", "ha": "right" if left else "left"}
-            one.annotate(label, (row["cost"], row["error"]), va="center", fontsize=8.5, **place)
+            # On alternate sides, because neighbours are close: beside a column of points, else above and below.
+            side = 1 if number % 2 else -1
+            beside = part == "mesh"
+            left = side < 0 or number == len(chosen) - 1
+            place = {"xytext": (-7 if left else 7, 0) if beside else (0, -12 * side), "textcoords": "offset points"}
+            align = ("right" if left else "left") if beside else "center"
+            one.annotate(label, (row["cost"], row["error"]), ha=align, va="center", fontsize=8.5, **place)
         one.set_title(title)
         one.set_xlabel("time per environment and update (µs)")
         one.set_ylabel("relative error of the force (RMS)")
