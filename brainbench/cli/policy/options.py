@@ -76,13 +76,16 @@ def touch_of(names: list[str]) -> dict[str, Any]:
     """
     from brainbench.core.errors import UsageError
     from robotics_bridge.policies.schema import Values
-    from robotics_bridge.policies.training.distill_config import DistillConfig
+    from robotics_bridge.policies.training.distill_config import EARLIER_TWIST, DistillConfig
 
     found: dict[str, dict[str, Any]] = {}
     for name in names:
         if facts := _student(name):
             kept = Values("config.json", facts).part("distill").fields(DistillConfig)
             found[name] = {key: kept[key] for key in TOUCH if key in kept}
+            config = DistillConfig.of({"twist": EARLIER_TWIST, **kept})
+            if config.knobs and config.observe in ("force", "force_torque"):
+                found[name]["knobs"] = config.knobs
     if any(senses != next(iter(found.values())) for senses in found.values()):
         raise UsageError(f"The students {', '.join(found)} feel differently; evaluate them one at a time.")
     return next(iter(found.values()), {})
