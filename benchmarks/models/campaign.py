@@ -38,6 +38,8 @@ WEIGHTS = ROOT / "brainbench" / "models" / "weights"
 BASELINES = ("raw-input", "random-features")
 BOARDS = (("demo", "rsa"), ("demo-rodgers", "rsa"), ("demo", "ridge"))
 """Recordings and metrics that every network is scored with."""
+SOLVER = "c1a690c"
+"""Commit with whose solver all sweeps are made, so that sessions train on the same."""
 MEMBERS = 150
 """Objects of each of the 54 families: 16 sweeps each, eight tenths of them to train."""
 TAR_BYTES, TARS = 15 * 2**20, 4
@@ -53,6 +55,7 @@ def parser() -> argparse.ArgumentParser:
     told.add_argument("--places", type=int, default=3, help="processes on a GPU")
     told.add_argument("--members", type=int, default=MEMBERS, help="objects of each family")
     told.add_argument("--epochs", type=int, help="fewer epochs, for a trial")
+    told.add_argument("--data", action="store_true", help="make the data and stop")
     told.add_argument("--only", help="substring of the names of jobs to do")
     told.add_argument("--device", help="cpu for a trial; all GPUs if not given")
     told.add_argument("--pack", type=int, help="write the n-th part of the results to --out")
@@ -89,6 +92,8 @@ def run(args: argparse.Namespace) -> None:
     began = time.monotonic()
     make_data(args, gpus)
     _log.info("data after %.0f s", time.monotonic() - began)
+    if args.data:
+        return
     places = [index for _ in range(args.places) for index in range(max(1, gpus))]
     workers = [start(args, gpu if gpus else None, worker=place) for place, gpu in enumerate(places)]
     faults = 0
@@ -125,8 +130,8 @@ def start(args: argparse.Namespace, gpu: int | None, **changes: Any) -> subproce
     """Start a process of this campaign that sees one GPU, or none."""
     words = [sys.executable, "-m", "benchmarks.models.campaign"]
     for name, value in {**vars(args), **changes}.items():
-        if value is not None:
-            words += [f"--{name.replace('_', '-')}", str(value)]
+        if value is not None and value is not False:
+            words += [f"--{name.replace('_', '-')}", *([] if value is True else [str(value)])]
     threads = str(max(1, (os.cpu_count() or 1) // 16))
     seen = "" if gpu is None else str(gpu)
     return subprocess.Popen(words, env={**os.environ, "OMP_NUM_THREADS": threads, "CUDA_VISIBLE_DEVICES": seen})
@@ -156,11 +161,19 @@ def make_data(args: argparse.Namespace, gpus: int) -> None:
     wanted = plan(args, gpu=gpus > 0)
     if gpus > 1:
         write_json(folder / CONFIG, to_plain(wanted.config))
-        makers = [start(args, index, shards=f"{index}/{gpus}") for index in range(gpus)]
+        # Placing sweeps takes the processor as long as simulating them takes the GPU.
+        count = args.places * gpus
+        makers = [start(args, index % gpus, shards=f"{index}/{count}") for index in range(count)]
         if any([maker.wait() for maker in makers]):
             _log.error("a process could not make its shards; this one makes them")
     manifest = generate(wanted, folder)
     _log.info("%d sweeps, hash %s, %d unstable", manifest["sweeps"], manifest["content_hash"], manifest["unstable"])
+    used = {line["data"]["hash"] for line in finished().values()} - {manifest["content_hash"]}
+    if used and gpus:
+        raise SystemExit(
+            f"These sweeps are not those of the trainings done so far ({', '.join(used)}): train with the code of the "
+            f"commit {SOLVER}, whose solver made them."
+        )
 
 
 def make_shards(args: argparse.Namespace) -> None:

@@ -9,7 +9,7 @@ import json
 import math
 import os
 from collections.abc import Iterator, Mapping
-from dataclasses import fields, is_dataclass
+from dataclasses import Field, fields, is_dataclass
 from pathlib import Path
 from typing import Any
 
@@ -91,15 +91,16 @@ def atomic_path(target: str | os.PathLike[str]) -> Iterator[Path]:
                 temporary.unlink(missing_ok=True)
 
 
-def _is_default(value: Any, default: Any) -> bool:
-    return value is default or value == default  # NaN equals nothing
+def _is_unused(value: Any, field: Field[Any]) -> bool:
+    unused = field.metadata.get("before", field.default)
+    return value is unused or value == unused  # NaN equals nothing
 
 
 def to_plain(value: Any) -> Any:
     """Turn dataclasses, mappings, arrays and paths into JSON types; a float without value is null.
 
     A field that came later than files and hashes which exist (its metadata say ``later=True``) appears only where it
-    is used, so that those stay what they are.
+    is used, so that those stay what they are: where it differs from its default, or from ``before`` in the metadata.
     """
     # Most of a record are the numbers of its RDMs: they come first.
     if type(value) is float:
@@ -112,7 +113,7 @@ def to_plain(value: Any) -> Any:
         return {
             field.name: to_plain(getattr(value, field.name))
             for field in fields(value)
-            if not (field.metadata.get("later") and _is_default(getattr(value, field.name), field.default))
+            if not (field.metadata.get("later") and _is_unused(getattr(value, field.name), field))
         }
     if isinstance(value, (list, tuple)):
         return [to_plain(item) for item in value]

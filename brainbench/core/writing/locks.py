@@ -10,29 +10,41 @@ from pathlib import Path
 
 from brainbench.core.errors import UsageError, shown
 
+try:
+    import fcntl
+except ImportError:  # no such locks on this system
+    fcntl = None
+
 _LOG = logging.getLogger(__name__)
 
 
 @contextlib.contextmanager
-def only_writer(folder: Path) -> Iterator[None]:
-    """Hold the lock on a folder; another process that holds it is a :class:`UsageError`.
+def lock_folder(folder: Path, *, wait: bool = True) -> Iterator[bool]:
+    """Hold a lock on a folder, which the system releases when this process ends in whatever way.
 
-    A folder that is missing is made.
+    Args:
+        folder: made if it is missing.
+        wait: for another process that holds it, rather than refuse.
+
+    Yields:
+        False where there are no such locks (Windows; some network file systems, which are warned of).
+
+    Raises:
+        UsageError: another process holds it, and ``wait`` is false.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    try:
-        import fcntl
-    except ImportError:  # no such locks on this system
-        yield
+    if fcntl is None:
+        yield False
         return
-    handle = os.open(folder, os.O_RDONLY)
+    handle, held = os.open(folder, os.O_RDONLY), False
     try:
         try:
-            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            fcntl.flock(handle, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
+            held = True
         except BlockingIOError as error:
             raise UsageError(f"Another process is writing {shown(str(folder))}; wait for it, or end it.") from error
         except OSError as error:
             _LOG.warning("%s cannot be locked (%s); start no second run there", folder, error)
-        yield
+        yield held
     finally:
         os.close(handle)

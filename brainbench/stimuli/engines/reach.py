@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brainbench.core.rotations import to_matrices
+from brainbench.geometry import Mesh, winding_number
 from brainbench.stimuli.objects.obstacle import Obstacle
 from brainbench.stimuli.whiskers.chain import Chain
 from brainbench.stimuli.whiskers.whisker import Whisker
@@ -22,6 +23,8 @@ class Reach:
     """The obstacles with only what is touched of them: their reachable parts, or their surface."""
     nearest: float
     """Least distance of anything touched from the base (m); points at a smaller arc length cannot touch."""
+    indices: tuple[int, ...] = ()
+    """Which of all obstacles these are."""
 
     def __bool__(self) -> bool:
         """Return True when anything is within reach."""
@@ -54,33 +57,68 @@ def reachable(
 
     Conservative: an inextensible whisker never leaves the ball of its arc length around its base, so a
     part whose bounding box stays outside that ball at every time cannot be touched, however it bends.
-    What base and obstacle travel against one another between two times is added to the ball.
+    What base and obstacle travel against one another between two times is added to the ball. A surface around the base
+    is kept however far it is: a whisker that starts deep inside it must be flagged.
 
     With ``surfaces`` the surface of every obstacle that has one is taken, as by engines that collide meshes; otherwise
     its parts, and the surface only where there are none.
     """
     limit = whisker.arc_length + max(whisker.base_radius, whisker.tip_radius)
-    kept, nearest = [], math.inf
-    for obstacle in obstacles:
+    still = np.array([obstacle.motion is None for obstacle in obstacles], dtype=bool)
+    bounds = np.array([obstacle.bounds for obstacle, stands in zip(obstacles, still, strict=True) if stands])
+    apart = np.zeros(len(obstacles))
+    apart[still] = _box_distances(bounds.reshape(-1, 2, 3), base)
+    kept, indices, nearest = [], [], math.inf
+    for index in np.flatnonzero(apart <= limit).tolist():
+        obstacle, distances = touched(obstacles[index], surfaces=surfaces), apart[index : index + 1]
+        boxes = obstacle.bounds[None]
+        if obstacle.surface is not None:
+            boxes = obstacle.surface.boxes
+        elif len(obstacle.parts) > 1:
+            boxes = np.stack([part.bounds() for part in obstacle.parts])
+        # The bounds of what stands still have been looked at.
         points = _in_obstacle_frame(obstacle, base, times)
-        # Between two times a base is no further from one of its two places than half the way between them.
-        between = float(np.linalg.norm(np.diff(points, axis=0), axis=1).max(initial=0.0)) / 2
-        obstacle = touched(obstacle, surfaces=surfaces)
-        boxes = [part.bounds() for part in obstacle.parts] if obstacle.surface is None else obstacle.surface.boxes
-        distances = [max(0.0, float(_box_distance(box, points).min()) - between) for box in boxes]
-        if min(distances) > limit:
+        if len(boxes) > 1 or not still[index]:
+            distances = _box_distances(boxes, points)
+        if distances.min() > limit and not _encloses(obstacle, points[0]):
             continue
-        near = tuple(part for part, distance in zip(obstacle.parts, distances, strict=False) if distance <= limit)
-        kept.append(replace(obstacle, parts=near))
-        nearest = min(nearest, *distances)
-    return Reach(tuple(kept), nearest)
+        if obstacle.surface is None and distances.max() > limit:
+            near = (part for part, distance in zip(obstacle.parts, distances, strict=True) if distance <= limit)
+            obstacle = replace(obstacle, parts=tuple(near))
+        kept.append(obstacle)
+        indices.append(index)
+        nearest = min(nearest, float(distances.min()))
+    return Reach(tuple(kept), nearest, tuple(indices))
+
+
+def _box_distances(boxes: NDArray[np.float64], points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return how near each box [b, 2, 3] comes at least to a way along points [n, 3]; zero inside."""
+    if np.ptp(points, axis=0).max() == 0:
+        points = points[:1]
+    # Between two points the way is no further from one of them than half their distance.
+    between = float(np.linalg.norm(np.diff(points, axis=0), axis=1).max(initial=0.0)) / 2
+    found = np.empty(len(boxes))
+    some = max(1, 100_000 // len(points))
+    for first in range(0, len(boxes), some):
+        low, high = boxes[first : first + some, 0, None], boxes[first : first + some, 1, None]
+        outside = np.maximum(np.maximum(low - points, points - high), 0.0)
+        found[first : first + some] = np.sqrt(np.einsum("bnd,bnd->bn", outside, outside)).min(axis=1)
+    return np.maximum(found - between, 0.0)
+
+
+def _encloses(obstacle: Obstacle, point: NDArray[np.float64]) -> bool:
+    """Return whether a point [3] in the frame of the obstacle lies inside its surface."""
+    surface = obstacle.surface
+    if surface is None or ((point < obstacle.bounds[0]) | (point > obstacle.bounds[1])).any():
+        return False
+    return bool(winding_number(Mesh(surface.vertices, surface.faces), point)[0] > 0.5)
 
 
 def touched(obstacle: Obstacle, *, surfaces: bool) -> Obstacle:
     """Return the obstacle with only what an engine touches of it, its parts or its surface; see :func:`reachable`."""
-    if obstacle.surface is not None and (surfaces or not obstacle.parts):
-        return replace(obstacle, parts=())
-    return replace(obstacle, surface=None)
+    if obstacle.surface is None:
+        return obstacle
+    return replace(obstacle, parts=()) if surfaces or not obstacle.parts else replace(obstacle, surface=None)
 
 
 def distances(obstacle: Obstacle, bounds: NDArray, points: NDArray, times: NDArray) -> NDArray[np.float64]:
@@ -90,7 +128,7 @@ def distances(obstacle: Obstacle, bounds: NDArray, points: NDArray, times: NDArr
 
 def _in_obstacle_frame(obstacle: Obstacle, points: NDArray, times: NDArray) -> NDArray[np.float64]:
     if obstacle.motion is None:
-        return points[:1] if np.ptp(points, axis=0).max() == 0 else points
+        return points
     position, quaternion = obstacle.motion(times)
     # The transposed rotation: from world axes into those of the obstacle.
     return np.einsum("nji,nj->ni", to_matrices(quaternion), points - position)

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 from brainbench.core.errors import DataError, UsageError
 from brainbench.core.files import read_json, to_plain, write_json
 from brainbench.core.progress import Progress
-from brainbench.core.writing.locks import only_writer
+from brainbench.core.writing.locks import lock_folder
 from brainbench.stimuli.engines import get_engine
 from brainbench.stimuli.sweeps import running
 from brainbench.stimuli.sweeps.manifest import MANIFEST, is_complete, make_manifest
@@ -91,7 +91,7 @@ def write_data_set(
     ``run`` calls ``done`` with the number of sweeps of each shard that it wrote. Errors are those of :func:`generate`.
     """
     folder = Path(out).absolute()
-    with only_writer(folder):
+    with lock_folder(folder, wait=False):
         _check_config(plan, folder)
         _clean(folder)
         missing = [task for task in plan.shards if not is_complete(folder / task.name, task)]
