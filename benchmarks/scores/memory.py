@@ -101,7 +101,7 @@ def explain_score(folder: Path) -> None:
 
 JOBS: dict[str, Callable[[Path], None]] = {
     "score (demo, small network)": score_demo,
-    "score, time averaged": lambda folder: score_big(folder),
+    "score, time averaged": score_big,
     "score, every time step kept": lambda folder: score_big(folder, time="concatenate"),
     "score, every time step kept, crossnobis": lambda folder: score_big(
         folder, time="concatenate", metric="rsa-crossnobis"
