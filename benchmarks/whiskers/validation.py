@@ -1,8 +1,8 @@
 """Measure every preset against the elastica, the slip-off depth, the Euler-Bernoulli frequencies, and a shaken beam.
 
-Run from the repository root: ``python -m benchmarks.whiskers.validation``; it rewrites its sections of RESULTS.md, two
-per ``--backend``. The gates (base moment/force of pegs, slip-off, frequencies, damping ratio, peak moment of a base
-that is shaken or pushed) are :data:`GATES`.
+Run from the repository root: ``python -m benchmarks.whiskers.validation``; it rewrites its sections of RESULTS.md, one
+per ``--backend`` and part. The gates (base moment/force of pegs, slip-off, frequencies, damping ratio, peak moment of a
+base that is shaken or pushed) are :data:`GATES`.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from functools import partial
 import numpy as np
 
 from benchmarks.report import table, write_section
+from benchmarks.whiskers import out_of_plane
 from brainbench.core.errors import BrainbenchError
 from brainbench.stimuli.engines import list_engines
 from brainbench.stimuli.engines.fidelity import Fidelity, list_presets
@@ -25,6 +26,7 @@ from brainbench.stimuli.validation.shaken_base import shaken_base
 from brainbench.stimuli.whiskers.array import WhiskerArray
 from brainbench.stimuli.whiskers.whisker import Whisker
 
+PARTS = ("plane", "out-of-plane", "fast-bases")
 ARCS = (0.3, 0.5, 0.7, 0.8)
 OFFSETS = (0.02, 0.1, 0.2, 0.3)
 SLIPS = (0.3, 0.5, 0.8)
@@ -192,23 +194,23 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--backend", default="mujoco", choices=list_engines())
-    parser.add_argument("--fast-bases", action="store_true", help="only bases that are shaken or pushed")
+    parser.add_argument("--part", choices=(*PARTS, "all"), default="all")
     arguments = parser.parse_args()
-    backend = arguments.backend
-    command = f"python -m benchmarks.whiskers.validation --backend {backend}"
-    text, broken = report_fast_bases(backend)
-    write_section(f"Bases moved fast against a beam ({backend})", f"{command} --fast-bases", text, subject="whiskers")
-    if arguments.fast_bases:
-        print(text)
-        raise SystemExit(bool(broken))
-    shaken_broken = broken
+    backend, failed = arguments.backend, False
     with ProcessPoolExecutor(arguments.workers) as pool:
-        results = dict(zip(subjects(), pool.map(partial(measure, backend=backend), subjects()), strict=True))
-    text, broken = report(results)
-    title = f"Whisker presets against mechanics ({backend})"
-    write_section(title, command, text, subject="whiskers")
-    print(text)
-    raise SystemExit(bool(broken or shaken_broken))
+        for part in PARTS if arguments.part == "all" else (arguments.part,):
+            if part == "plane":
+                results = dict(zip(subjects(), pool.map(partial(measure, backend=backend), subjects()), strict=True))
+                title, (text, broken) = f"Whisker presets against mechanics ({backend})", report(results)
+            elif part == "out-of-plane":
+                title, (text, broken) = f"Whiskers out of their plane ({backend})", out_of_plane.report(pool, backend)
+            else:
+                title, (text, broken) = f"Bases moved fast against a beam ({backend})", report_fast_bases(backend)
+            command = f"python -m benchmarks.whiskers.validation --backend {backend} --part {part}"
+            write_section(title, command, text, subject="whiskers")
+            print(text)
+            failed |= bool(broken)
+    raise SystemExit(failed)
 
 
 if __name__ == "__main__":
