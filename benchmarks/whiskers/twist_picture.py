@@ -21,7 +21,7 @@ from brainbench.stimuli.validation.kirchhoff import KirchhoffRod, load_rod, trac
 from brainbench.stimuli.whiskers.array import WhiskerArray
 
 SIZE, SAMPLES = (1100, 620), 2
-AT, SHARE, EXAGGERATED = 0.7, 0.2, 8.0
+AT, SHARE, EXAGGERATED = 0.7, 0.15, 12.0
 """Place of the force and deflection in parts of the arc length; factor on the twist that is drawn."""
 BARS = 15
 STILL, LOADED, BAR = (0.72, 0.74, 0.78), (0.16, 0.36, 0.62), (0.85, 0.45, 0.13)
@@ -52,7 +52,7 @@ def main() -> None:
         ]
     triangles = Triangles.joined(scene)
     corners = triangles.corners.reshape(-1, 3)
-    plain = Camera((-0.5, -0.9, 0.55)).lens(corners, SIZE)
+    plain = Camera((-0.2, -0.75, 0.8)).lens(corners, SIZE)
     lens = plain.supersampled(SAMPLES)
     light = lamp(lens, SAMPLES, corners, triangles)
     ground = floor(plain, light, float(corners[:, 2].min() - 0.03 * plain.width)).repeat(SAMPLES, 0).repeat(SAMPLES, 1)

@@ -1,7 +1,7 @@
 """Measure every preset against the elastica, the slip-off depth and the Euler-Bernoulli frequencies.
 
 Run from the repository root: ``python -m benchmarks.whiskers.validation``; it rewrites its sections of RESULTS.md, one
-per ``--backend`` and ``--part``. Gates (base moment/force of pegs, slip-off, frequencies, damping ratio): :data:`GATES`.
+per ``--backend`` and ``--part``. Gates (base moment and force of pegs, slip-off, frequencies, damping): :data:`GATES`.
 """
 
 from __future__ import annotations
