@@ -7,6 +7,8 @@ import numpy as np
 import pytest
 
 from brainbench.core.errors import UsageError
+from brainbench.stimuli.engines import get_engine
+from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.engines.protocol import Job, StillFollicle
 from brainbench.stimuli.engines.reach import reachable
 from brainbench.stimuli.engines.trust import (

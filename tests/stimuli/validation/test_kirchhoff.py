@@ -45,5 +45,5 @@ def test_a_rod_without_force_keeps_its_shape():
 
 
 def test_a_rod_that_slips_off_is_told():
-    with pytest.raises(DataError, match="slips off|No equilibrium"):
+    with pytest.raises(DataError, match=r"slips off|equilibrium"):
         press_rod(KirchhoffRod.of(H), 0.019, (0, 0, 1), (0, 1, 0), 0.015, 2.5e-4)
