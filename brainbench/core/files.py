@@ -8,7 +8,6 @@ import hashlib
 import json
 import math
 import os
-import secrets
 from collections.abc import Iterator, Mapping
 from dataclasses import Field, fields, is_dataclass
 from pathlib import Path
@@ -16,6 +15,7 @@ from typing import Any
 
 from brainbench.core.errors import FileWriteError, UsageError, shown
 from brainbench.core.reading.texts import read_json, read_mapping  # noqa: F401 - also imported from here
+from brainbench.core.writing.temporaries import temporary_path
 
 CACHE_VARIABLE = "BRAINBENCH_CACHE"
 """Environment variable that overrides the platform's cache folder."""
@@ -71,9 +71,10 @@ def atomic_path(target: str | os.PathLike[str]) -> Iterator[Path]:
         FileWriteError: the folder cannot be made or written, or the disk is full.
     """
     target = Path(target)
-    temporary = target.with_name(f".{target.stem[:200]}-{secrets.token_hex(8)}{target.suffix}")
+    temporary = target
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
+        temporary = temporary_path(target)
         # Made by hand: tempfile's files are private, and to read the umask is not safe among threads.
         os.close(os.open(temporary, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
         yield temporary
@@ -85,8 +86,9 @@ def atomic_path(target: str | os.PathLike[str]) -> Iterator[Path]:
             raise
         raise FileWriteError(f"{shown(str(target))} cannot be written ({os.strerror(error.errno)}).") from error
     finally:
-        with contextlib.suppress(OSError):
-            temporary.unlink(missing_ok=True)
+        if temporary != target:
+            with contextlib.suppress(OSError):
+                temporary.unlink(missing_ok=True)
 
 
 def _is_unused(value: Any, field: Field[Any]) -> bool:

@@ -19,6 +19,7 @@ from brainbench.core.contracts import check_stimulus_set
 from brainbench.core.errors import BrainbenchError, DataError, UsageError
 from brainbench.core.files import cache_dir, content_hash, to_json
 from brainbench.core.progress import Progress
+from brainbench.core.reading.sealed import seal_file, trust_sealed
 from brainbench.stimuli.engines import DEFAULT_ENGINE, PHYSICS_VERSION, get_engine
 from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.engines.job_schedule import plan
@@ -73,6 +74,7 @@ def simulate(
     if path is not None and path.exists():
         started = time.perf_counter()
         try:
+            trust_sealed(path)
             dataset = read_stimulus_set(path)
             dataset.encoding[SECONDS] = {"read": time.perf_counter() - started}
             return dataset
@@ -83,6 +85,7 @@ def simulate(
     if path is not None:
         try:
             write_stimulus_set(dataset, path)
+            seal_file(path)
         except OSError as error:
             _LOG.warning("the stimuli could not be kept in the cache (%s)", error)
     return dataset

@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brainbench.core.errors import DataError, UsageError, listing, unknown_name
-from brainbench.core.reading.texts import read_numbers
+from brainbench.core.reading.tables import read_numbers
 from brainbench.stimuli.engines.protocol import base_rotation
 from brainbench.stimuli.motion.hinge_angles import follow_angles
 from brainbench.stimuli.motion.trajectories import ROTATIONS, Rotations, Vector
@@ -167,6 +167,11 @@ class Recorded:
     rotations: Rotations = field(default_factory=lambda: ROTATIONS["knutsen"])
     initial: Mapping[str, Vector] = field(default_factory=dict)
     """Starting angles (θ, φ, ζ) [rad] by side and name (``RC2``), as :func:`load_initial_angles` reads them."""
+
+    @property
+    def finest(self) -> float:
+        """Shortest period of anything in the motion (s): two samples."""
+        return 2 / self.trajectory.rate
 
     def line(self, mount: MountedWhisker) -> str:
         """Return the name of the line that moves ``mount`` (see the module); none is a :class:`UsageError`."""

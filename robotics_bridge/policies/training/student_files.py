@@ -8,17 +8,17 @@ from typing import Any
 
 import torch
 from safetensors import SafetensorError, safe_open
-from safetensors.torch import load_file, save_file
-from tensordict import TensorDict
+from safetensors.torch import save_file
 
 from brainbench.core.errors import BrainbenchError, DataError
 from brainbench.core.files import atomic_path
+from brainbench.core.reading.tensors import read_tensors
 from robotics_bridge.policies.contract import JOINTS, MOST_NUMBERS
 from robotics_bridge.policies.encoders.arms import EncoderConfig
-from robotics_bridge.policies.schema import Values, require_finite
+from robotics_bridge.policies.schema import Values
 from robotics_bridge.policies.shipped import policy_path
 from robotics_bridge.policies.student import TACTILE, TactilePolicy
-from robotics_bridge.policies.training.distill_config import DistillConfig
+from robotics_bridge.policies.training.distill_config import EARLIER_TWIST, DistillConfig
 
 CONFIG, MODEL = "config.json", "model.safetensors"
 
@@ -37,7 +37,7 @@ def build_student(
     Raises:
         UsageError: the shapes do not fit the tactile encoder.
     """
-    example = TensorDict({name: torch.zeros(1, *shapes[name]) for name in groups}, batch_size=[1])
+    example: Any = {name: torch.zeros(1, *shapes[name]) for name in groups}
     tactile = config.tactile
     return TactilePolicy(
         example, {"student": groups}, "student", actions, hidden_dims=config.hidden, embedder=config.embedder,
@@ -70,7 +70,7 @@ def load_student(folder: str | Path, *, device: str = "cpu") -> tuple[TactilePol
     if not (folder / MODEL).is_file():
         raise DataError(f"The student in {str(folder)!r} has no weights yet; its run was interrupted early.")
     given = described.part("distill")
-    config = DistillConfig.of(given.fields(DistillConfig))
+    config = DistillConfig.of({"twist": EARLIER_TWIST, **given.fields(DistillConfig)})
     if config.encoder_settings:
         given.part("encoder_settings").fields(EncoderConfig)
     shapes, actions = described.shapes("groups", MOST_NUMBERS), described.whole("actions", 1, JOINTS)
@@ -79,14 +79,13 @@ def load_student(folder: str | Path, *, device: str = "cpu") -> tuple[TactilePol
         _require_sizes(folder / MODEL, config, shapes)
         with torch.random.fork_rng(devices=[]):
             student = build_student(config, shapes, list(shapes), actions)
-        weights = load_file(folder / MODEL)
+        weights = read_tensors(folder / MODEL, "file of weights (safetensors)")
         student.load_state_dict(weights)
     except BrainbenchError:
         raise
     except (SafetensorError, RuntimeError, ValueError, TypeError, LookupError, OSError) as error:
         first = " ".join(str(error).split())[:120]
         raise DataError(f"The weights in {str(folder)!r} are damaged or of another student ({first}).") from error
-    require_finite(folder / MODEL, weights)
     return student.to(device).eval(), dict(described.values)
 
 
