@@ -1,7 +1,7 @@
 """Measure every preset against the elastica, the slip-off depth, the Euler-Bernoulli frequencies, and a shaken beam.
 
 Run from the repository root: ``python -m benchmarks.whiskers.validation``; it rewrites its sections of RESULTS.md, one
-per ``--backend`` and part. The gates (base moment/force of pegs, slip-off, frequencies, damping ratio, peak moment of a
+per ``--backend`` and ``--part``. Gates (base moment and force of pegs, slip-off, frequencies, damping, peak moment of a
 base that is shaken or pushed) are :data:`GATES`.
 """
 
