@@ -66,7 +66,7 @@ def check_paths(video: Path | None, strip: Path | None) -> None:
         MissingDependencyError: what writes this format is not installed.
     """
     from brainbench.core.files import check_folder
-    from brainbench.stimuli.figures.canvas import check_format
+    from brainbench.core.figures.style import check_format
     from brainbench.stimuli.figures.films import require_writer
 
     for path, endings, option in ((video, (".mp4", ".gif"), "--video"), (strip, (".png",), "--strip")):

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from brainbench.cli.tactile import figures
+from brainbench.core.figures.style import save_figure
 from brainbench.stimuli.figures.camera import Camera
-from brainbench.stimuli.figures.canvas import save_figure
 from brainbench.stimuli.figures.films import write_film
 from brainbench.stimuli.figures.raster import Triangles
 from brainbench.stimuli.figures.scenes import Style

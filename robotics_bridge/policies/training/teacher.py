@@ -22,6 +22,7 @@ import torch
 from brainbench.core.errors import BrainbenchError, DataError, DataFileNotFoundError, UsageError, missing_dependency
 from brainbench.core.files import file_hash, provenance, read_json, write_json
 from brainbench.core.reading.tensors import check_finite
+from brainbench.core.writing.locks import lock_folder
 from robotics_bridge.envs.rsl_rl import RslRlEnv
 from robotics_bridge.policies.acting import ActingModel
 from robotics_bridge.policies.evaluate import Policy
@@ -249,6 +250,17 @@ def train(
         DataError: the start does not fit.
     """
     settings, options = settings or env.task.teacher, options or TeacherRun()
+    with lock_folder(run, wait=False):
+        return _train(env, run, options, settings, progress)
+
+
+def _train(
+    env: Env,
+    run: Path,
+    options: TeacherRun,
+    settings: TeacherSettings,
+    progress: Callable[[int, int, str], None] | None,
+) -> TeacherResult:
     total = options.iterations or settings.iterations
     trainer = Trainer(env, settings, seed=options.seed)
     env.goals.start_curriculum()
@@ -256,7 +268,6 @@ def train(
     if options.start is not None and not (run / RESUME).is_file():
         trainer.begin_from(options.start, std=options.start_std)
         origin = {"file": str(model_file(options.start)), "hash": file_hash(model_file(options.start))}
-    run.mkdir(parents=True, exist_ok=True)
     facts = {
         "kind": "teacher", "task": env.task.name, "hand": env.hand.name, "hand_path": str(env.hand.path or ""),
         "num_envs": env.num_envs, "seed": options.seed, "settings": asdict(settings), "rsl_rl": trainer.config,
