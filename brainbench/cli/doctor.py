@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from brainbench.cli.output import JsonOption, emit, table
+from brainbench.core.errors import install_command
 
 OPTIONAL = {
     "pynwb": ("nwb", "checking NWB files against the schema"),
@@ -59,7 +60,7 @@ def diagnose() -> dict[str, Any]:
         "cache_bytes": sum(item.stat().st_size for item in cache.rglob("*") if item.is_file()),
         "required": {name: _version(name) for name in _required()},
         "optional": {
-            name: {"version": _version(name), "enables": purpose, "install": f"pip install 'brainbench[{extra}]'"}
+            name: {"version": _version(name), "enables": purpose, "install": install_command(extra)}
             for name, (extra, purpose) in OPTIONAL.items()
         },
     }

@@ -117,7 +117,7 @@ def test_doctor_says_what_each_missing_part_would_enable(run, monkeypatch):
     assert result.status == 0
     line = next(line for line in result.out.splitlines() if line.startswith("pynwb"))
     assert "not installed" in line
-    assert "brainbench[nwb]" in line
+    assert "-c constraints.txt '.[nwb]'" in line
     data = json.loads(run("doctor", "--json").out)
     assert data["optional"]["pynwb"]["version"] is None
     assert data["required"]["torch"]
