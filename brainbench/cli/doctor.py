@@ -34,16 +34,21 @@ OPTIONAL = {
 def doctor(as_json: JsonOption = False) -> None:
     """Show versions, devices, folders and optional parts."""
     data = diagnose()
-    rows = [[name, version or "missing: reinstall brainbench", ""] for name, version in data["required"].items()]
+    rows = [[name, version or "missing: reinstall brainbench", "", ""] for name, version in data["required"].items()]
     for name, part in data["optional"].items():
-        note = "" if part["version"] else f"enables {part['enables']}; {part['install']}"
-        rows.append([name, part["version"] or "not installed", note])
+        note = ["", ""] if part["version"] else [OPTIONAL[name][0], part["enables"]]
+        rows.append([name, part["version"] or "not installed", *note])
     head = [
         f"brainbench {data['version']}, Python {data['python']}, {data['machine']}",
         f"processors {data['processors']}, CUDA {', '.join(data['cuda']) or 'none (not needed)'}",
         f"cache {data['cache']} ({data['cache_bytes'] / 1e6:.1f} MB)",
     ]
-    emit(data, "\n".join(head) + "\n\n" + table("", ["part", "version", ""], rows), as_json=as_json)
+    told = f"\n\nAn extra is installed, in the checkout of brainbench, with: {install_command('EXTRA')}"
+    emit(
+        data,
+        "\n".join(head) + "\n\n" + table("", ["part", "version", "extra", "enables"], rows) + told,
+        as_json=as_json,
+    )
 
 
 def diagnose() -> dict[str, Any]:
