@@ -22,6 +22,7 @@ from brainbench.cli import (
     power,
     recordings,
     recovery,
+    requirements,
     score,
     stimuli,
     tactile,
@@ -51,6 +52,7 @@ app.add_typer(tactile.app, name="tactile")
 app.add_typer(policy.app, name="policy")
 app.add_typer(tradeoff.app, name="tradeoff")
 app.add_typer(leaderboard.app, name="leaderboard")
+requirements.guard(app)
 
 INTERRUPTED = 130
 """Exit status after Ctrl-C, as shells count it: 128 and the number of the signal."""
