@@ -62,10 +62,10 @@ def report(pool: Executor, backend: str) -> tuple[str, list[str]]:
                 rows.append(row)
     gates = ", ".join(f"{100 * gate:g} % at `{name}`" for name, gate in GATES.items())
     text = (
-        "Curved whiskers, Poisson's ratio .4. First the error in % of the deflection under a force across the plane that "
-        "would bend the straight whisker by d; then, of a frictionless peg (radius .25 mm) that moves by d across the "
-        f"plane, the error of force / moment at the base. Gates: {gates}; pegs at d/L .2 in brackets and not gated, — "
-        "where the rod slips off. Reference: `brainbench.stimuli.validation.kirchhoff`.\n\n"
+        "Curved whiskers, Poisson's ratio .4. First the error in % of the deflection under a force across the plane "
+        "that would bend the straight whisker by d; then, of a frictionless peg (radius .25 mm) that moves by d "
+        f"across the plane, the error of force / moment at the base. Gates: {gates}; pegs at d/L .2 in brackets and "
+        "not gated, — where the rod slips off. Reference: `brainbench.stimuli.validation.kirchhoff`.\n\n"
     )
     text += table(["whisker", "a/L", "d/L", *SETTINGS], rows)
     text += "\n\nBroken gates: " + ("none." if not broken else "\n\n" + "\n".join(f"- {line}" for line in broken))

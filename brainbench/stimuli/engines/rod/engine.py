@@ -33,7 +33,7 @@ from brainbench.stimuli.engines.rod.packing import (
     follicle_track,
     still_track,
 )
-from brainbench.stimuli.engines.rod.shapes import Body, PackedShapes
+from brainbench.stimuli.engines.rod.shapes import PackedShapes, TrackedObstacle
 from brainbench.stimuli.engines.stepping import is_silent, silent_trace
 from brainbench.stimuli.engines.sweep_batch import SweepBatch
 from brainbench.stimuli.engines.trust import check_jobs, run_with_retries, step_travel
@@ -131,7 +131,7 @@ class _Task:
     job: Job
     chain: Chain
     base: Track
-    bodies: tuple[Body, ...]
+    bodies: tuple[TrackedObstacle, ...]
     """What is in reach."""
     names: tuple[int, ...]
     """What tells these from other bodies."""
@@ -214,7 +214,7 @@ def _task(job: Job, fidelity: Fidelity, bodies: dict[Any, tuple[NDArray, Track]]
     if is_silent(job, reach, position, euler):
         return None
     near = tuple(
-        Body(obstacle, *bodies[place if obstacle.motion is None else id(job.obstacles[which])])
+        TrackedObstacle(obstacle, *bodies[place if obstacle.motion is None else id(job.obstacles[which])])
         for which, obstacle in zip(reach.indices, reach.obstacles, strict=True)
     )
     names = tuple(
