@@ -150,7 +150,7 @@ def list_contacts(
 
 @wp.kernel
 def sort_contacts(nodes: ContactNodes):
-    """Bring lists into the order of contacts, so that sums do not depend on threads. Thread: environment, link [B, L]."""
+    """Bring lists into the order of contacts, so that sums do not depend on threads. Thread: [B, L]."""
     env, link = wp.tid()
     first = int(-1)
     node = nodes.head[env, link]

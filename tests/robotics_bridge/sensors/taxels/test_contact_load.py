@@ -197,9 +197,7 @@ def test_taxels_carry_weight_and_friction_of_what_rests_on_a_slope(seed: int) ->
         sign = -1 if data.contact[index].geom1 == 0 else 1
         expected += sign * data.contact[index].frame.reshape(3, 3).T @ force[:3]
     hand = rotation_of(data.body("hand").xquat)
-    suite = SensorSuite(
-        engine.scene, {"t": KinematicTaxel(link="hand", probes=TOP, total="engine")}, num_envs=1
-    )
+    suite = SensorSuite(engine.scene, {"t": KinematicTaxel(link="hand", probes=TOP, total="engine")}, num_envs=1)
     suite.update(engine.state)
     total = hand.apply(suite.read("t").sum((0, 1, 2)).numpy()[:3])
     weight = float(model.body_mass.sum()) - float(model.body("hand").mass[0])
