@@ -17,6 +17,8 @@ import msgspec
 
 from brainbench.core.errors import DataError
 from brainbench.core.files import file_hash, read_json, write_json, write_text
+from brainbench.core.reading.ranges import check_number
+from brainbench.core.reading.texts import read_text
 
 DATA, SALT = "held-out.h5", "salt.txt"
 """Files of the secret folder."""
@@ -45,9 +47,12 @@ class Commitment:
             DataError: the file is missing or is no commitment.
         """
         try:
-            return msgspec.convert(read_json(path), cls)
+            found = msgspec.convert(read_json(path, "commitment"), cls)
         except msgspec.ValidationError as error:
             raise DataError(f"{os.fspath(path)!r} is no commitment to held-out recordings ({error}).") from error
+        for name in ("held", "kept"):
+            check_number(f"{name!r} in {os.fspath(path)!r}", getattr(found, name), least=1, whole=True)
+        return found
 
     def write(self, path: str | os.PathLike[str]) -> Path:
         """Write it as JSON, to be published."""
@@ -62,7 +67,7 @@ class Commitment:
         data, salt = Path(secret) / DATA, Path(secret) / SALT
         if not data.is_file() or not salt.is_file():
             raise DataError(f"The secret folder {os.fspath(secret)!r} lacks {DATA!r} or {SALT!r}.")
-        if digest(data, salt.read_text(encoding="utf-8").strip()) != self.digest:
+        if digest(data, read_text(salt, "salt").strip()) != self.digest:
             raise DataError(
                 f"{os.fspath(data)!r} is not the file that the published hash {self.digest[:12]}… commits to."
             )

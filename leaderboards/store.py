@@ -8,21 +8,18 @@ edits; it is no signature against someone who renames the file as well.
 
 from __future__ import annotations
 
-import json
 import math
 import os
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
 from brainbench.core.errors import DataError, DataFileNotFoundError
+from brainbench.core.reading.texts import parse_json, read_text
 from brainbench.core.records import RECORD_SCHEMA, Interval, ResultRecord, Score, record_identity
 from leaderboards.writing import write_files
 
-MOST_BYTES = 64 << 20
-"""Largest record file: dissimilarities of some 600 stimuli, with baselines."""
-_DEEPEST = 32
 _ROUNDING = 1e-6
 _LARGEST = 1e100
 """Largest absolute number of a score: squares and sums of such are still finite."""
@@ -82,20 +79,7 @@ def read_record(path: str | os.PathLike[str]) -> ResultRecord:
 
 def _read(path: Path) -> tuple[ResultRecord, int]:
     """Return a record and the schema version of its file."""
-    try:
-        # Asked before it is opened: a pipe or a device would never end.
-        if path.exists() and not path.is_file():
-            raise DataError(f"{os.fspath(path)!r} is no regular file, so it is no result record.")
-        if path.stat().st_size > MOST_BYTES:
-            raise DataError(
-                f"{path.name!r} has {path.stat().st_size:,} bytes; a result record has at most {MOST_BYTES:,}."
-            )
-        text = path.read_text(encoding="utf-8")
-    except FileNotFoundError as error:
-        raise DataFileNotFoundError(f"There is no result record {os.fspath(path)!r}.") from error
-    except (OSError, UnicodeDecodeError) as error:
-        raise DataError(f"{os.fspath(path)!r} cannot be read as UTF-8 text ({error}).") from error
-    record, data = _parse(text, path)
+    record, data = _parse(read_text(path, "result record"), path)
     # The hash is that of what the file says: a field that an earlier writer did not know is not in it.
     identity = record_identity(data)
     named = path.stem.rpartition("--")[2]
@@ -141,13 +125,7 @@ def read_records(source: str | os.PathLike[str] | Iterable[str | os.PathLike[str
 
 
 def _parse(text: str, path: Path) -> tuple[ResultRecord, dict[str, Any]]:
-    try:
-        data = json.loads(text, parse_constant=_refuse_constant, parse_float=_finite, parse_int=_bounded)
-        _check_text(data, _DEEPEST)
-    except RecursionError as error:
-        raise DataError(f"{path.name!r} is nested too deeply to be a result record.") from error
-    except ValueError as error:
-        raise DataError(f"{path.name!r} is not valid JSON ({error}).") from error
+    data = parse_json(text, path.name)
     try:
         record = ResultRecord.from_json(data)
     except DataError as error:
@@ -157,34 +135,6 @@ def _parse(text: str, path: Path) -> tuple[ResultRecord, dict[str, Any]]:
         if score and contradiction:
             raise DataError(f"{path.name!r} contradicts itself: in the score {score.name[:80]!r}, {contradiction}.")
     return record, data
-
-
-def _refuse_constant(name: str) -> NoReturn:
-    raise ValueError(f"{name} is not JSON; a number without value is null")
-
-
-def _finite(digits: str) -> float:
-    if math.isinf(value := float(digits)):
-        raise ValueError(f"{digits[:80]} is larger than any number of 64 bits")
-    return value
-
-
-def _bounded(digits: str) -> int:
-    if len(digits) > 19:  # msgspec's integers have 64 bits
-        raise ValueError(f"{digits[:80]} is larger than any integer of 64 bits")
-    return int(digits)
-
-
-def _check_text(data: Any, left: int) -> None:
-    """Refuse what JSON may hold and a page or a file cannot: deep nesting, and halves of surrogate pairs."""
-    if isinstance(data, str):
-        data.encode()  # UnicodeEncodeError is a ValueError
-    elif isinstance(data, (dict, list)):
-        if not left:
-            raise RecursionError
-        for item in (*data, *data.values()) if isinstance(data, dict) else data:
-            if not isinstance(item, (float, int)):
-                _check_text(item, left - 1)
 
 
 def _contradiction(score: Score) -> str | None:

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import contextlib
-import os
 import re
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 
 from brainbench.core.errors import BrainbenchError, DataError
-from brainbench.core.files import atomic_path
+from brainbench.core.files import atomic_path, lock_folder
 
 _TEMPORARY = re.compile(r"\.(?P<stem>.+)-[0-9a-f]{16}(?P<suffix>\.[^.]*)?")
 """Names that :func:`brainbench.core.files.atomic_path` gives before a file is whole."""
@@ -30,7 +29,7 @@ def write_files(files: Mapping[Path, str | bytes], *, swept: bool = True) -> lis
         stack.enter_context(in_one_sentence(next(iter(files))))
         for folder in sorted({path.parent for path in files}):
             folder.mkdir(parents=True, exist_ok=True)
-            if stack.enter_context(locked(folder)) and swept:
+            if stack.enter_context(lock_folder(folder)) and swept:
                 names = {path.name for path in files if path.parent == folder}
                 sweep(folder, lambda name, names=names: name in names)
         for path, content in files.items():
@@ -49,29 +48,6 @@ def in_one_sentence(place: Path) -> Iterator[None]:
     except OSError as error:
         why = error.strerror or type(error).__name__
         raise DataError(f"{str(place)!r} could not be written ({why}); nothing is half-written.") from error
-
-
-@contextlib.contextmanager
-def locked(folder: Path) -> Iterator[bool]:
-    """Wait for a lock on a folder and hold it; yield whether the system has such locks.
-
-    The system releases it when this process ends in whatever way.
-    """
-    try:
-        import fcntl
-    except ImportError:  # Windows
-        yield False
-        return
-    handle = os.open(folder, os.O_RDONLY)
-    try:
-        try:
-            fcntl.flock(handle, fcntl.LOCK_EX)
-        except OSError:  # some network file systems
-            yield False
-        else:
-            yield True
-    finally:
-        os.close(handle)
 
 
 def sweep(folder: Path, ours: Callable[[str], bool]) -> None:

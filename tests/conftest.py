@@ -30,6 +30,7 @@ def reference() -> Path:
 
 @pytest.fixture(autouse=True, scope="session")
 def _private_cache(tmp_path_factory: pytest.TempPathFactory) -> None:
-    """Keep the tests away from the user's cache (set BRAINBENCH_TEST_CACHE to reuse one between runs)."""
+    """Keep the tests away from the user's settings and cache (set BRAINBENCH_TEST_CACHE to reuse one between runs)."""
     chosen = os.environ.get("BRAINBENCH_TEST_CACHE")
     os.environ["BRAINBENCH_CACHE"] = chosen or str(tmp_path_factory.mktemp("cache"))
+    os.environ["BRAINBENCH_CONFIG"] = str(tmp_path_factory.mktemp("settings"))

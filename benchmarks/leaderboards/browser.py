@@ -107,7 +107,7 @@ def _measure(name: str, path: Path, asked: argparse.Namespace) -> str:
 
     shown, painted, filtered = [], [], []
     with sync_playwright() as api:
-        browser = api.chromium.launch(executable_path=asked.chromium, args=["--no-sandbox", "--disable-gpu"])
+        browser = api.chromium.launch(executable_path=asked.chromium, args=["--disable-gpu"], chromium_sandbox=True)
         for _ in range(asked.repeats):
             context = browser.new_context(viewport={"width": 1280, "height": 900})
             page = context.new_page()

@@ -4,44 +4,59 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from brainbench.cli.destinations import out_file, out_folder
-from brainbench.cli.output import JsonOption, emit, facts, table_of
+from brainbench.cli.model_card import model_card
+from brainbench.cli.output import JsonOption, emit, facts, list_without_command, table, table_of
 from brainbench.core.files import to_plain
 
-app = typer.Typer(no_args_is_help=True, help="List and describe the registered models.")
+if TYPE_CHECKING:
+    from brainbench.models.registry import ModelDescription
+
+app = typer.Typer(help="List and describe the registered models; add your own.")
 
 
 @app.command("list")
 def list_(
     pattern: Annotated[str, typer.Argument(help="Shell pattern, e.g. '*-ln*'.")] = "*", as_json: JsonOption = False
 ) -> None:
-    """List the registered models with their sizes and the objectives that were published for them."""
+    """List the models by name, with their sizes and what their weights are (also: brainbench models)."""
     from fnmatch import fnmatchcase
 
     from brainbench.models.architecture import Architecture
     from brainbench.models.recipes import list_recipes
     from brainbench.models.registry import describe_model, list_models
     from brainbench.models.training.checkpoints import shipped
+    from brainbench.models.user_registry import FAMILY
 
-    names = [*list_models(pattern), *(name for name in shipped() if fnmatchcase(name, pattern))]
+    here = shipped()
+    names = [*list_models(pattern), *(name for name in here if fnmatchcase(name, pattern))]
     records = [describe_model(name) for name in names]
-    tags = {
-        item.name: [str(Architecture.parse(recipe).tag) for recipe in list_recipes(f"{item.name}.*")]
+    if as_json:
+        tags = {name: [str(Architecture.parse(one).tag) for one in list_recipes(f"{name}.*")] for name in names}
+        emit([{**to_plain(item), "recipes": tags[item.name]} for item in records], "", as_json=True)
+        return
+    rows = [
+        [item.name, "trained" if item.trained else "your code" if item.family == FAMILY else "untrained", *_size(item)]
         for item in records
-    }
-    columns = {
-        "model": "{0.name}",
-        ">parameters": "{0.parameters:,}",
-        ">multiply-adds/step": lambda item: _millions(item.multiply_adds),
-        "family": "{0.family}",
-        "published with": lambda item: ", ".join(tags[item.name]),
-    }
-    data = [{**to_plain(item), "recipes": tags[item.name]} for item in records]
-    emit(data, table_of("", records, columns), as_json=as_json)
+    ]
+    sizes = dict(zip(names, map(_size, records), strict=True))
+    for name in list_recipes(pattern):
+        plain = Architecture.parse(name).untrained
+        if name not in here:
+            sizes[plain] = sizes.get(plain) or _size(describe_model(plain))
+            rows.append([name, "needs training", *sizes[plain]])
+    rows.sort(key=lambda row: ("trained", "your code", "untrained", "needs training").index(row[1]))
+    print(table("", ["model", "weights", "parameters", "MACs/step"], rows, right=(2, 3)))
+    print("\ntrained: weights come with the package; untrained: random weights, drawn from --seed;")
+    print("needs training: published, to be trained with brainbench train.")
+    print("MACs/step: multiply-adds per time step.")
+
+
+list_without_command(app, list_)
 
 
 @app.command("recipes")
@@ -80,16 +95,41 @@ def show(
     data = to_plain(record)
     if recipe:
         data["recipe"] = to_plain(recipe)
-        if not as_json:
-            data["recipe"] |= {"setting": str(recipe.setting), "search": [f"({item})" for item in recipe.search]}
     twin = (record.trained or {}).get("twin")
     if isinstance(twin, Mapping):
         from brainbench.models.training.twins import draw_twin
 
         _, told = draw_twin(twin, data["trained"]["options"])
         data["twin"] = told or f"{twin['name']} with seed {twin['seed']}, drawn here to the last bit"
-    shown = {key.replace("_", " "): _text(value) for key, value in data.items() if value is not None}
-    emit(data, facts(shown), as_json=as_json)
+    text = "" if as_json else model_card(name, record, recipe, data.get("twin"))
+    emit(data, text, as_json=as_json)
+
+
+@app.command("add")
+def add(
+    target: Annotated[str, typer.Argument(help="FILE.py:NAME or package.module:NAME, which gives a torch module.")],
+    name: Annotated[str, typer.Option(help="What to call it on the command line.")],
+    as_json: JsonOption = False,
+) -> None:
+    """Give a model of your own a name; it is kept in your settings, and the code stays where it is."""
+    from brainbench.models.registry import list_models
+    from brainbench.models.user_registry import add_user_model, settings_file
+
+    made = add_user_model(target, name, taken=list_models())
+    shown = {"model": made.name, "code": made.target, "kept in": settings_file()}
+    emit(made, f"{facts(shown)}\n\nscore it: brainbench score {made.name}", as_json=as_json)
+
+
+@app.command("remove")
+def remove(
+    name: Annotated[str, typer.Argument(help="A name that brainbench models add was given.")],
+    as_json: JsonOption = False,
+) -> None:
+    """Take the name of a model of your own away; its code stays."""
+    from brainbench.models.user_registry import remove_user_model
+
+    made = remove_user_model(name)
+    emit(made, f"{made.name} is no longer a name of {made.target}; the code was not touched.", as_json=as_json)
 
 
 @app.command("import")
@@ -138,15 +178,9 @@ def export(
     emit(made, text, as_json=as_json)
 
 
+def _size(model: ModelDescription) -> tuple[str, str]:
+    return f"{model.parameters:,}", _millions(model.multiply_adds)
+
+
 def _millions(value: int | None) -> str:
     return "–" if value is None else f"{value / 1e6:,.1f} M"
-
-
-def _text(value: object) -> str:
-    if isinstance(value, int) and not isinstance(value, bool):
-        return f"{value:,}"
-    if isinstance(value, list):
-        return ", ".join(map(_text, value))
-    if isinstance(value, dict):
-        return "; ".join(f"{key.replace('_', ' ')} {_text(item)}" for key, item in value.items())
-    return str(value)

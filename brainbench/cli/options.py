@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import ast
 import inspect
+import math
 import re
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, fields
@@ -20,7 +21,7 @@ from typing import Annotated, Any
 
 import typer
 
-from brainbench.core.errors import UsageError
+from brainbench.core.errors import UsageError, shown
 
 WorkersOption = Annotated[int | None, typer.Option(min=1, help="Processes. [default: as many as there are processors]")]
 SchedulerOption = Annotated[
@@ -171,9 +172,9 @@ def numbers(text: str, what: str, kind: Callable[[str], Any] = int, *, count: in
         values = tuple(kind(item) for item in (items(text) if count is None else re.split(r"[,x×]", text)))
     except ValueError as error:
         values, fault = (), error
-    if fault is not None or count not in (None, len(values)):
+    if fault is not None or count not in (None, len(values)) or not all(map(math.isfinite, values)):
         of = f"{count} numbers" if count is not None else "whole numbers" if kind is int else "numbers"
-        raise UsageError(f"{what} takes {of} joined by commas; received {text!r}.") from fault
+        raise UsageError(f"{what} takes {of} joined by commas; received {shown(text)}.") from fault
     return values
 
 
@@ -184,8 +185,8 @@ def part_of(text: str, what: str) -> tuple[int, int]:
         UsageError: it is something else.
     """
     number, _, count = text.partition("/")
-    if not (number.isdigit() and count.isdigit() and int(number) < int(count)):
-        raise UsageError(f"{what} NUMBER/COUNT, the number from 0, such as 0/4; received {text!r}.")
+    if not re.fullmatch(r"\d{1,9}/\d{1,9}", text) or int(number) >= int(count):
+        raise UsageError(f"{what} NUMBER/COUNT, the number from 0, such as 0/4; received {shown(text)}.")
     return int(number), int(count)
 
 

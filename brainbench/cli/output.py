@@ -3,21 +3,55 @@
 from __future__ import annotations
 
 import contextlib
+import math
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from brainbench.core.files import to_json
 from brainbench.core.progress import Progress
 
+if TYPE_CHECKING:
+    from brainbench.core.records import Interval
+
 JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON document on stdout, nothing else.")]
+
+
+def list_without_command(app: typer.Typer, command: Callable[[], None]) -> None:
+    """Let a group of commands run its listing when no command is named."""
+
+    @app.callback(invoke_without_command=True)
+    def run(context: typer.Context) -> None:
+        if context.invoked_subcommand is None:
+            command()
 
 
 def emit(data: Any, text: str, *, as_json: bool) -> None:
     """Print ``data`` as JSON, or ``text`` for people, on stdout."""
     print(to_json(data) if as_json else text)
+
+
+def spanned(value: float, interval: Interval | None, *, most: float = math.inf) -> str:
+    """Return ``value [low, high]`` with as many digits as the interval carries: two of its half-width.
+
+    Args:
+        value: NaN is shown as a dash.
+        interval: Its interval; three significant digits are shown without one.
+        most: Largest value that can exist, where the interval is cut.
+
+    >>> from brainbench.core.records import Interval
+    >>> spanned(0.14021, Interval(0.0409, 0.2391)), spanned(0.97, Interval(0.9412, 1.1), most=1.0)
+    ('0.14 [0.04, 0.24]', '0.97 [0.94, 1.00]')
+    """
+    if not math.isfinite(value):
+        return "–"
+    if interval is None or not math.isfinite(interval.high - interval.low):
+        return f"{value:.3g}"
+    half = (interval.high - interval.low) / 2
+    digits = min(max(1 - math.floor(math.log10(half)), 0), 9) if half > 0 else 3
+    return f"{value:.{digits}f} [{interval.low:.{digits}f}, {min(interval.high, most):.{digits}f}]"
 
 
 def table_of(title: str, items: Iterable[Any], columns: Mapping[str, str | Callable[[Any], object]]) -> str:
@@ -43,15 +77,22 @@ def facts(values: Mapping[str, object], title: str = "") -> str:
 
 
 def table(title: str, columns: list[str], rows: list[list[str]], *, right: tuple[int, ...] = ()) -> str:
-    """Lay out a table as text; ``right`` names the columns set flush right."""
+    """Lay out a table as text; ``right`` names the columns set flush right. The first column is never folded."""
     from io import StringIO
 
     from rich.console import Console
     from rich.table import Table
 
-    grid = Table(title=title or None, title_justify="left", box=None, pad_edge=False, header_style="bold")
+    grid = Table(
+        title=title or None,
+        show_header=any(columns),
+        title_justify="left",
+        box=None,
+        pad_edge=False,
+        header_style="bold",
+    )
     for index, column in enumerate(columns):
-        grid.add_column(column, justify="right" if index in right else "left", overflow="fold")
+        grid.add_column(column, justify="right" if index in right else "left", overflow="fold", no_wrap=not index)
     for row in rows:
         grid.add_row(*row)
     terminal = sys.stdout.isatty()

@@ -26,7 +26,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike
 
-from brainbench.core.errors import DataError, UsageError
+from brainbench.core.errors import DataError, UsageError, shown
 from brainbench.core.reading.archives import read_npz
 from brainbench.core.records import Status
 from brainbench.metrics.animals import gather
@@ -119,6 +119,14 @@ def explain_file(path: str | Path) -> tuple[Step, ...]:
     arrays = read_npz(path, ".npz file of plain arrays")
     if missing := {"r_xy", "r_yy"} - arrays.keys():
         raise DataError(f"{path} lacks the array {sorted(missing)[0]!r}; it has {sorted(arrays)}.")
+    for name in ("r_xy", "r_yy", "r_xx"):
+        found = arrays.get(name, np.zeros(()))
+        fits = found.ndim == 0 or found.shape == (arrays["r_yy"].size,)
+        if found.dtype.kind not in "fiu" or not fits or (np.abs(found) > 1 + 1e-6).any():
+            raise DataError(
+                f"{name!r} in {shown(str(path))} is {list(found.shape)} of {found.dtype}; needed are as many "
+                "correlations (-1 to 1, NaN for none) as 'r_yy' has."
+            )
     return explain_splits(arrays["r_xy"], arrays["r_yy"], r_xx=arrays.get("r_xx"))
 
 

@@ -5,11 +5,12 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass, replace
 
-from brainbench.core.errors import UsageError
+from brainbench.core.errors import UsageError, shown
 
 OBJECTIVES = ("supervised", "simclr", "simsiam", "ae")
 """Tags of trained weights: the objective they were trained with."""
 
+_NEW = re.compile(r"[a-z0-9]+([-+][a-z0-9]+)*")
 # The cell is matched lazily, so that "-ln" and "-small" at its end are not taken for a part of it.
 _NAME = re.compile(
     r"(?P<encoder>[^-+.]*)(-(?P<cell>[^+.]*?))??(?P<layer_norm>-ln)?(?P<small>-small)?"
@@ -86,3 +87,9 @@ class Architecture:
 def is_path(name: str) -> bool:
     """Return whether a text is a path or a source with a prefix rather than a model's name."""
     return name.endswith(".py") or any(mark in name for mark in "/\\:")
+
+
+def check_new_name(name: str) -> None:
+    """Raise UsageError unless a model can be registered under a name."""
+    if not _NEW.fullmatch(name):
+        raise UsageError(f"A model name is lower-case letters and digits joined by '-' or '+'; received {shown(name)}.")

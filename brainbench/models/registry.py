@@ -4,14 +4,15 @@ A name is ``<encoder>[-<cell>][-ln][-small][+<attender>][.<tag>]``. Without a ta
 its weights follow from the seed alone. ``local-dir:PATH`` and ``hf-hub:OWNER/NAME`` name a folder of trained
 weights (:mod:`~brainbench.models.training.checkpoints`). Other packages add models through the entry point group
 ``brainbench.models``: an entry point names a module (or an object in it) whose import runs
-:func:`register_model`. Importing this module imports no framework.
+:func:`register_model`; the user adds models for the command line (:mod:`~brainbench.models.user_registry`).
+Importing this module imports no framework.
 """
 
 from __future__ import annotations
 
 import inspect
+import logging
 import os
-import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields, replace
 from fnmatch import fnmatchcase
@@ -19,17 +20,18 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from brainbench.core.errors import UsageError, check_name, unknown_name
+from brainbench.core.errors import UsageError, unknown_name
 from brainbench.core.plugins import load_entry_points
-from brainbench.models.architecture import OBJECTIVES, Architecture
+from brainbench.models.architecture import OBJECTIVES, Architecture, check_new_name
 from brainbench.models.training.checkpoints import PREFIXES, WEIGHTS, find_folder, load_weights, read_config, shipped
 from brainbench.models.user_models import check_module
+from brainbench.models.user_registry import FAMILY, read_user_models
 
 if TYPE_CHECKING:
     from torch import nn
 
 ENTRY_POINTS = "brainbench.models"
-_NAME = re.compile(r"[a-z0-9]+([-+][a-z0-9]+)*")
+_LOG = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -54,6 +56,8 @@ class ModelRecord(ModelFacts):
     def source(self) -> str:
         """Top-level package that the code comes from."""
         made = self.build.func if isinstance(self.build, partial) else self.build
+        if self.family == FAMILY:
+            return "user"
         return made.__module__.partition(".")[0]
 
 
@@ -110,8 +114,7 @@ def register_model(
         >>> "tiny-linear" in list_models("tiny*")
         True
     """
-    if not _NAME.fullmatch(name):
-        raise UsageError(f"A model name is lower-case letters and digits joined by '-' or '+'; received {name!r}.")
+    check_new_name(name)
 
     def decorate(build: Factory) -> Factory:
         if name in _records:
@@ -193,7 +196,10 @@ def locate_model(name: str, pretrained: str | os.PathLike[str] | None = None) ->
     folder = find_folder(name) if is_path else given or (shipped().get(name) if pretrained is None else None)
     trained = None if folder is None else read_config(folder)
     parts, known = Architecture.parse(trained["architecture"] if is_path and trained else name), _known()
-    check_name("model", parts.untrained, known, hint="See them all with: brainbench models")
+    if parts.untrained not in known:
+        # A tag stays in the suggestion: the untrained model is another one.
+        choices = known if parts.tag is None else [*shipped(), *(f"{item}.{parts.tag}" for item in known)]
+        raise unknown_name("model", name, choices, hint="See them all with: brainbench models")
     if parts.tag is not None and parts.tag not in OBJECTIVES:
         raise unknown_name(f"weights tag of {parts.untrained!r}", parts.tag, OBJECTIVES)
     if parts.tag is None and pretrained is not None:
@@ -248,8 +254,13 @@ def describe_model(name: str) -> ModelDescription:
 
 
 def _known() -> dict[str, ModelRecord]:
-    """Return the registry, with what other packages add entered on first use."""
+    """Return the registry, with what other packages and the user add entered on first use."""
     if ENTRY_POINTS not in _loaded:
         _loaded.add(ENTRY_POINTS)
         load_entry_points(ENTRY_POINTS, lambda name, made: None)
+        for own in read_user_models().values():
+            if own.name in _records:
+                _LOG.warning("The model %r of a package hides the one that you added (%s).", own.name, own.target)
+                continue
+            _records[own.name] = ModelRecord(own.name, FAMILY, f"added from {own.target}", "", "unstated", own.build)
     return _records

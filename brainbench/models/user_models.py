@@ -23,19 +23,24 @@ def load_user_model(target: str, *, seed: int = 0) -> nn.Module:
             :class:`torch.nn.Module`.
         DataError: the file or module cannot be imported, or building the model fails.
     """
+    with seeded(seed):
+        return build_user_model(target).eval()
+
+
+def build_user_model(target: str, **options: Any) -> nn.Module:
+    """Build a model from its code with the random state as it is; see :func:`load_user_model`."""
     from torch import nn
 
-    with seeded(seed):
-        made = load_object(target, "model")
-        if callable(made) and not isinstance(made, nn.Module):
-            try:
-                made = made()
-            except Exception as error:
-                raise DataError(
-                    f"Building the model {target!r} failed with {type(error).__name__}: {error} "
-                    "(it is called without arguments)."
-                ) from error
-    return check_module(made, target).eval()
+    made = load_object(target, "model")
+    if callable(made) and not isinstance(made, nn.Module):
+        try:
+            made = made(**options)
+        except Exception as error:
+            given = f"with {', '.join(options)}" if options else "without arguments"
+            raise DataError(
+                f"Building the model {target!r} failed with {type(error).__name__}: {error} (it is called {given})."
+            ) from error
+    return check_module(made, target)
 
 
 def check_module(made: Any, target: str) -> nn.Module:

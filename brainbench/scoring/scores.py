@@ -93,6 +93,7 @@ def score_record(
     options = replace(options, metric=metric)
     resolved = resolve_model(model, seed=options.model_seed)
     brain = open_neural_responses(options.recordings, progress=progress, **options.selection)
+    brain = replace(brain, title=options.title)
     # Recordings name the stimuli that the animals felt; the caller's choice goes first.
     options = replace(options, stimuli=brain.stimuli if options.stimuli is None else options.stimuli)
     network = resolved.respond(options, progress=progress)

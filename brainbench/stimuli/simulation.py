@@ -19,6 +19,7 @@ from brainbench.core.contracts import check_stimulus_set
 from brainbench.core.errors import BrainbenchError, DataError, UsageError
 from brainbench.core.files import cache_dir, content_hash, to_json
 from brainbench.core.progress import Progress
+from brainbench.core.reading.sealed import seal_file, trust_sealed
 from brainbench.stimuli.engines import DEFAULT_ENGINE, PHYSICS_VERSION, get_engine
 from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.engines.job_schedule import plan
@@ -67,12 +68,13 @@ def simulate(
         UsageError: the scenes do not fit together, or a name is unknown.
     """
     chosen = _checked(scenes)
-    fidelity = Fidelity.of(fidelity)
     engine = get_engine(backend) if isinstance(backend, str) else backend
+    fidelity = _resolved(fidelity, chosen, engine)
     path = cache_path(chosen, fidelity, engine) if cache and isinstance(backend, str) else None
     if path is not None and path.exists():
         started = time.perf_counter()
         try:
+            trust_sealed(path)
             dataset = read_stimulus_set(path)
             dataset.encoding[SECONDS] = {"read": time.perf_counter() - started}
             return dataset
@@ -83,6 +85,7 @@ def simulate(
     if path is not None:
         try:
             write_stimulus_set(dataset, path)
+            seal_file(path)
         except OSError as error:
             _LOG.warning("the stimuli could not be kept in the cache (%s)", error)
     return dataset
@@ -101,10 +104,15 @@ def prepare(
     the same arguments and waits for the rest.
     """
     chosen = list(scenes)
-    fidelity = Fidelity.of(fidelity)
     engine = get_engine(backend)
+    fidelity = _resolved(fidelity, chosen, engine)
     if not cache_path(chosen, fidelity, engine).exists():
         _begin(engine, chosen, fidelity, progress)
+
+
+def _resolved(fidelity: Fidelity | str | None, scenes: Iterable[Scene], engine: WhiskerEngine) -> Fidelity:
+    """Return a fidelity that says whether whiskers twist."""
+    return Fidelity.of(fidelity).resolved(engine.twists and any(scene.twist for scene in scenes))
 
 
 def _begin(

@@ -26,8 +26,8 @@ from numpy.typing import ArrayLike, NDArray
 from brainbench.core.contracts import CHANNELS, check_stimulus_set
 from brainbench.core.errors import DataError, UsageError, unknown_name
 from brainbench.core.files import write_text
+from brainbench.core.reading.tables import read_numbers
 from brainbench.core.reading.texts import read_text
-from brainbench.stimuli.motion.recorded import read_numbers
 from brainbench.stimuli.whiskers.array import MountedWhisker, WhiskerArray, published_whisker
 from brainbench.stimuli.whiskers.selection import ROWS
 

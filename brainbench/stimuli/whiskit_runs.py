@@ -21,8 +21,8 @@ from numpy.typing import NDArray
 
 from brainbench.core.contracts import CHANNELS, GRID_SHAPE
 from brainbench.core.errors import DataError, UsageError, listing, unknown_name
+from brainbench.core.reading.tables import read_numbers
 from brainbench.stimuli.external import FRAME_STATUSES, assemble_stimulus_set
-from brainbench.stimuli.motion.recorded import read_numbers
 from brainbench.stimuli.scenes.frames import Frames
 from brainbench.stimuli.whiskers.selection import ROWS
 from brainbench.stimuli.whiskit import read_names

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -11,6 +10,7 @@ from typing import Any
 import msgspec
 
 from brainbench.core.errors import DataError, check_name, listing
+from brainbench.core.reading.texts import parse_json, read_text
 
 TRAININGS = "trainings.jsonl"
 OBJECTIVES = ("supervised", "simclr", "simsiam", "ae", "untrained", "baseline")
@@ -59,13 +59,13 @@ def read_trainings(path: Path) -> list[Training]:
         DataError: a line is not JSON, lacks a field, holds an impossible value, or stands there twice.
     """
     found: dict[str, Training] = {}
-    for number, line in enumerate(path.read_text(encoding="utf-8", errors="replace").splitlines(), start=1):
+    for number, line in enumerate(read_text(path, "list of trainings").splitlines(), start=1):
         if not line.strip():
             continue
         place = f"Line {number} of {path.name!r}"
         try:
-            training = msgspec.convert(json.loads(line), Training)
-        except ValueError as error:  # msgspec's is one too
+            training = msgspec.convert(parse_json(line, place), Training)
+        except msgspec.ValidationError as error:
             raise DataError(f"{place} is not a training: {error}; write the line again or delete it.") from error
         check_name(f"objective in line {number} of {path.name!r}", training.objective, OBJECTIVES)
         faults = [

@@ -15,8 +15,8 @@ from pathlib import Path
 import msgspec
 
 from brainbench.core.errors import DataError, UsageError
-from brainbench.core.files import atomic_path, write_json
-from leaderboards.writing import final_name, in_one_sentence, locked, sweep
+from brainbench.core.files import atomic_path, lock_folder, read_json, write_json
+from leaderboards.writing import final_name, in_one_sentence, sweep
 
 MANIFEST = "build-manifest.json"
 _Hashes = dict[str, list[str]]
@@ -37,7 +37,7 @@ def rebuilt(root: Path) -> Iterator[Callable[[str, str | bytes], Path]]:
     check_site(root)
     with in_one_sentence(root):
         root.mkdir(parents=True, exist_ok=True)
-        with locked(root) as alone:
+        with lock_folder(root) as alone:
             known, present = check_site(root)
             if alone:
                 for folder in {root, *(path.parent for path in root.rglob(".*-*"))}:
@@ -96,9 +96,11 @@ def _files(root: Path) -> Iterator[str]:
 def _read(root: Path) -> _Hashes | None:
     """Return what the manifest lists; None without one, so that nothing counts as ours."""
     path = root / MANIFEST
+    if not os.path.lexists(path):
+        return None
     try:
-        return msgspec.json.decode(path.read_bytes(), type=_Hashes) if path.is_file() else None
-    except (OSError, msgspec.DecodeError) as error:
+        return msgspec.convert(read_json(path, "manifest of a build"), _Hashes)
+    except msgspec.ValidationError as error:
         raise DataError(f"{str(path)!r} is no manifest of a build ({error}); give a new folder.") from error
 
 

@@ -9,11 +9,14 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
 import numpy as np
 
 from brainbench.core.devices import mujoco_module
-from brainbench.core.errors import DataError, DataFileNotFoundError, UsageError, unknown_name
+from brainbench.core.errors import DataError, UsageError, shown, unknown_name
+from brainbench.core.reading.regular import readable
+from brainbench.core.reading.texts import read_text
 from robotics_bridge.hands.layouts import Layout, check_names, pad_probes, palm_side, read_probes, select
 from robotics_bridge.hands.spec import HandSpec, build
 
@@ -23,6 +26,8 @@ _AUTO_GRIDS = {
     "high": {"tips": (6, 8, 0.002), "fingers": (6, 7, 0.0016), "palm": (20, 11, 0.0016)},
 }
 """Rows, columns and radius (m) on a link of a hand without a layout of its own."""
+_NAMES = {"name", "class", "childclass", "joint", "body", "link", "geom", "site", "mesh", "material", "file"}
+"""Attributes of URDF and MJCF that hold words."""
 _CROSSED = 0.012
 """Joints nearer to each other (m) act on a link together."""
 
@@ -145,14 +150,11 @@ def read_mjspec(path: Path) -> Any:
     """
     mujoco = mujoco_module()
 
-    if not path.is_file():
-        raise DataFileNotFoundError(f"There is no hand file {str(path)!r}.")
-    try:
-        spec = mujoco.MjSpec.from_file(str(path))
-    except ValueError as error:
-        raise DataError(f"MuJoCo cannot read {str(path)!r}: {error}") from error
+    _check_xml(path)
     folder = path.parent
-    files = [mesh.file for mesh in spec.meshes if mesh.file]
+    with readable(path, "URDF or MJCF file"):
+        spec = mujoco.MjSpec.from_file(str(path))
+        files = [mesh.file for mesh in spec.meshes if mesh.file]
     if any(not (folder / spec.meshdir / name).exists() and (folder / name).exists() for name in files):
         spec.meshdir = ""
     if path.suffix.lower() == ".urdf":
@@ -167,6 +169,23 @@ def read_mjspec(path: Path) -> Any:
     return spec
 
 
+def _check_xml(path: Path) -> None:
+    """Refuse numbers that are not finite, which MuJoCo takes, and included files that are no files."""
+    kind = "hand file (URDF or MJCF)"
+    text = read_text(path, kind)
+    with readable(path, kind):
+        for element in ElementTree.fromstring(text).iter():
+            if element.tag == "include":
+                _check_xml(path.parent / element.get("file", ""))
+            for key, value in element.items():
+                for word in value.split() if key not in _NAMES else ():
+                    if word.lstrip("+-").lower() in ("nan", "inf", "infinity"):
+                        raise DataError(
+                            f"{key!r} of <{shown(element.tag, quoted=False)}> in {shown(str(path))} is {shown(value)}; "
+                            "finite numbers are needed."
+                        )
+
+
 def from_file(path: Path) -> Hand:
     """Return the hand of a file; palm and fingers follow from its tree.
 
@@ -175,12 +194,8 @@ def from_file(path: Path) -> Hand:
     Raises:
         DataError: the file holds no hand.
     """
-    try:
+    with readable(path, "URDF or MJCF file"):
         model = read_mjspec(path).compile()
-    except ValueError as error:
-        if isinstance(error, DataError):
-            raise
-        raise DataError(f"MuJoCo cannot compile {str(path)!r}: {error}") from error
     children: dict[int, list[int]] = {body: [] for body in range(model.nbody)}
     for body in range(1, model.nbody):
         children[int(model.body_parentid[body])].append(body)

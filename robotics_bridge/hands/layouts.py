@@ -11,8 +11,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from brainbench.core.errors import DataError, UsageError, unknown_name
+from brainbench.core.errors import DataError, UsageError, shown, unknown_name
 from brainbench.core.files import read_json, write_json
+from brainbench.core.reading.regular import reason
 from robotics_bridge.hands.spec import BoxGeometry, CapsuleGeometry, Grid, Link, Pad
 from robotics_bridge.sensors.probes.placement import Probes
 
@@ -119,25 +120,27 @@ def read_probes(path: str | os.PathLike[str]) -> Layout:
     Raises:
         DataError: the file is missing or has another form.
     """
-    document = read_json(path)
+    document = read_json(path, "probe file")
     name = Path(path).name
     if not isinstance(document, list):
         raise DataError(f"{name} is no probe file: a list of links is expected, each with 'link_name' and 'probes'.")
     layout: Layout = {}
     for entry in document:
         try:
-            rows = entry["probes"]
+            link, rows = entry["link_name"], entry["probes"]
             cells = [cell for row in rows for cell in row]
             shape = (len(rows), len(rows[0]))
-            if any(len(row) != shape[1] for row in rows):
-                raise DataError(f"{name}: the rows of link {entry['link_name']!r} differ in length.")
+            if not isinstance(link, str) or any(len(row) != shape[1] for row in rows):
+                raise DataError(f"{name}: link {shown(link)} needs a name and rows of equal length.")
             position, normal, radius = ([cell[key] for cell in cells] for key in ("pos", "normal", "radius"))
-            probes = Probes(np.array(position), np.array(normal), np.array(radius), shape)
-        except (KeyError, TypeError, IndexError, UsageError) as error:
-            raise DataError(f"{name} is no probe file (link {len(layout) + 1}: {error}).") from error
-        if entry["link_name"] in layout:
-            raise DataError(f"{name}: link {entry['link_name']!r} appears twice.")
-        layout[entry["link_name"]] = probes
+            probes = Probes(*(np.array(values, dtype=float) for values in (position, normal, radius)), shape)
+        except DataError:
+            raise
+        except (LookupError, TypeError, ValueError) as error:
+            raise DataError(f"{name} is no probe file (link {len(layout) + 1}: {reason(error)}).") from error
+        if link in layout:
+            raise DataError(f"{name}: link {shown(link)} appears twice.")
+        layout[link] = probes
     return layout
 
 

@@ -11,8 +11,8 @@ import numpy as np
 import torch
 
 from brainbench.core.errors import BrainbenchError, DataError
+from brainbench.core.reading.tensors import check_finite
 from brainbench.models.export import onnx_session, require_onnx
-from robotics_bridge.policies.schema import require_finite
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -68,7 +68,7 @@ class _OnnxRunner:
         graph = onnx.load(str(path), load_external_data=False).graph
         if any(item.external_data for item in graph.initializer):
             raise DataError(f"{str(path)!r} keeps weights in other files; export the policy again.")
-        require_finite(Path(path), {item.name: onnx.numpy_helper.to_array(item) for item in graph.initializer})
+        check_finite({item.name: onnx.numpy_helper.to_array(item) for item in graph.initializer}, str(path))
         self.session = onnx_session(path, threads)
         inputs = {item.name: item.shape for item in self.session.get_inputs()}
         missing = sorted({*shapes, "h_in"} - set(inputs))
@@ -95,7 +95,7 @@ class _JitRunner:
             warnings.simplefilter("ignore")
             self.module = torch.jit.load(str(path))
         self.names = tuple(shapes)
-        require_finite(Path(path), self.module.state_dict())
+        check_finite(self.module.state_dict(), str(path))
 
     def __call__(self, obs: Mapping[str, NDArray[np.float32]], forget: bool = False) -> NDArray[np.float32]:
         if forget:

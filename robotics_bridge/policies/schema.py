@@ -7,12 +7,9 @@ from dataclasses import MISSING, dataclass, fields
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from brainbench.core.errors import DataError, check_name
-from brainbench.core.files import read_json
+from brainbench.core.reading.texts import read_mapping
 
-_LARGEST_FILE = 4_000_000
 _SHOWN = 80
 _ABSENT = object()
 
@@ -29,19 +26,12 @@ class Values:
 
     @classmethod
     def read(cls, path: Path) -> Values:
-        """Read a file of at most 4 MB.
+        """Read a JSON file.
 
         Raises:
             DataError: it cannot be read, or holds no names and values.
         """
-        try:
-            small = path.is_file() and path.stat().st_size <= _LARGEST_FILE
-            found = read_json(path) if small else None
-        except (ValueError, RecursionError, OSError) as error:
-            raise DataError(f"{str(path)!r} cannot be read as JSON ({str(error)[:_SHOWN]}).") from error
-        if not isinstance(found, dict):
-            raise DataError(f"{str(path)!r} is no JSON file of names and values with at most {_LARGEST_FILE:,} bytes.")
-        return cls(path.name, found)
+        return cls(path.name, read_mapping(path, "JSON file of names and values"))
 
     def error(self, name: str, allowed: str, received: Any) -> DataError:
         """Return the error for a value, of which 80 characters are shown."""
@@ -138,14 +128,6 @@ class Values:
             good, empty = _KINDS.get(plain, _KINDS["str"]), bool(optional)
             found[name] = self.get(name, lambda value, g=good, e=empty: g(value) or (e and value is None), annotation)
         return found
-
-
-def require_finite(path: Path, weights: Mapping[str, Any]) -> None:
-    """Raise :class:`DataError` if arrays or tensors of weights hold values that are not finite."""
-    for name, value in weights.items():
-        array = np.asarray(value.float() if hasattr(value, "float") else value)
-        if array.dtype.kind == "f" and not np.isfinite(array).all():
-            raise DataError(f"The weights {str(name)[:_SHOWN]!r} of {str(path)!r} are not finite.")
 
 
 def _within(value: Any, low: float, high: float) -> bool:

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping
 from dataclasses import fields, is_dataclass, replace
 from typing import Any
 
-from brainbench.core.errors import UsageError, unknown_name
+from brainbench.core.errors import UsageError, shown, unknown_name
 from robotics_bridge.tasks.task import Ending, Reward, Task
 
 
@@ -24,7 +25,7 @@ def apply_overrides(task: Task, words: Iterable[str]) -> Task:
     for word in words:
         name, sign, value = word.partition("=")
         if not (name and sign and value):
-            raise UsageError(f"A change of a task is written name=value, e.g. is_dropped=-300; received {word!r}.")
+            raise UsageError(f"A change of a task is written name=value, e.g. is_dropped=-300; received {shown(word)}.")
         task = _one(task, name.split("."), value)
     return task
 
@@ -60,7 +61,7 @@ def set_field(subject: Any, path: list[str], value: str) -> Any:
     present = getattr(subject, first)
     if rest:
         if not is_dataclass(present):
-            raise UsageError(f"{first!r} has no parts; received {'.'.join(path)!r}.")
+            raise UsageError(f"{first!r} has no parts; received {shown('.'.join(path))}.")
         return replace(subject, **{first: set_field(present, rest, value)})
     if value == "none" and any(field.name == first and field.default is None for field in fields(subject)):
         return replace(subject, **{first: None})
@@ -77,19 +78,26 @@ def _read(name: str, text: str, present: Any) -> Any:
         if isinstance(present, str):
             return text
         if present is None:
-            return float(text)
+            return _number(text)
         if isinstance(present, bool):
             return {"true": True, "false": False}[text.lower()]
         if isinstance(present, int):
-            number = float(text)
+            number = _number(text)
             if number != int(number):
                 raise ValueError
             return int(number)
         if isinstance(present, float):
-            return float(text)
+            return _number(text)
         if isinstance(present, tuple) and all(isinstance(item, (int, float)) for item in present):
-            kind = int if present and all(isinstance(item, int) for item in present) else float
+            kind = int if present and all(isinstance(item, int) for item in present) else _number
             return tuple(kind(part) for part in text.split(","))
     except (KeyError, ValueError):
-        raise UsageError(f"{name!r} takes a value like {present!r}; received {text!r}.") from None
+        raise UsageError(f"{name!r} takes a value like {shown(present)}; received {shown(text)}.") from None
     raise UsageError(f"{name!r} is more than a number; change it with dataclasses.replace in a task file.")
+
+
+def _number(text: str) -> float:
+    number = float(text)
+    if not math.isfinite(number):
+        raise ValueError
+    return number

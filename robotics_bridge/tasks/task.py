@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from brainbench.core.errors import UsageError, unknown_name
+from brainbench.core.reading.ranges import check_number
 from robotics_bridge.tasks.goals import Goal
 from robotics_bridge.tasks.objects import PRIMITIVES, ObjectShape
 from robotics_bridge.tasks.settings import AuxiliaryDecoder, StudentSettings, TeacherSettings
@@ -220,11 +221,26 @@ class Task:
     student: StudentSettings = field(default_factory=StudentSettings)
 
     def __post_init__(self) -> None:
-        if not (self.episode > 0 and math.isfinite(self.episode)):
-            raise UsageError(f"An episode of task {self.name!r} has a positive length (s); received {self.episode!r}.")
-        if self.action_limit is not None and not self.action_limit > 0:
-            raise UsageError(f"The action_limit of task {self.name!r} is positive; received {self.action_limit!r}.")
-        if not self.objects or self.copies < 1:
+        of = f"of task {self.name!r}"
+        check_number(f"episode (s) {of}", self.episode, above=0)
+        check_number(f"density (kg/m³) {of}", self.density, above=0)
+        check_number(f"copies {of}", self.copies, least=1, whole=True)
+        check_number(f"turn_window {of}", self.turn_window, least=1, whole=True)
+        for name in ("friction", "action_ratio"):
+            check_number(f"{name} {of}", getattr(self, name), least=0)
+        for name in ("position", "velocity"):
+            check_number(f"noise.{name} {of}", getattr(self.noise, name), least=0)
+        for name in ("timestep", "tolerance"):
+            check_number(f"solver.{name} {of}", getattr(self.solver, name), above=0)
+        for name in ("decimation", "iterations", "line_search"):
+            check_number(f"solver.{name} {of}", getattr(self.solver, name), least=1, whole=True)
+        check_number(f"object_changes.friction {of}", self.object_changes.friction[0], least=0)
+        check_number(f"object_changes.size {of}", self.object_changes.size[0], above=0)
+        for name, reward in self.rewards.items():
+            check_number(f"weight of {name!r} {of}", reward.weight)
+        if self.action_limit is not None:
+            check_number(f"action_limit {of}", self.action_limit, above=0)
+        if not self.objects:
             raise UsageError(f"Task {self.name!r} needs at least one object.")
         for name, (low, high) in self._ranges().items():
             if not (math.isfinite(low) and math.isfinite(high) and low <= high):
@@ -233,8 +249,6 @@ class Task:
             for name in names:
                 if name not in GROUPS:
                     raise unknown_name("observation group", name, GROUPS)
-        if self.solver.decimation < 1 or not self.solver.timestep > 0:
-            raise UsageError(f"Task {self.name!r} needs a positive time step and decimation.")
 
     @property
     def step_dt(self) -> float:

@@ -2,6 +2,7 @@ import json
 
 import torch
 
+from brainbench.models import registry
 from brainbench.models.registry import load_model
 from tests.factories.published_files import lightning_state
 
@@ -50,3 +51,40 @@ def test_published_weights_are_imported_by_name(run, tmp_path):
     assert made["parameters"] == sum(p.numel() for p in load_model(made["name"]).parameters())
     told = run(*given, "--architecture", "zhuang-gru-ln-small").out
     assert f"brainbench score local-dir:{tmp_path}" in " ".join(told.split())
+
+
+def test_the_group_alone_lists_what_is_trained_and_names_stay_whole(run, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "40")
+    listed = run("models")
+    assert listed.status == 0
+    rows = {line.split()[0]: line.split()[1] for line in listed.out.splitlines()[1:] if "  " in line}
+    assert rows["zhuang-intersection-ln-small.supervised"] == "trained"
+    assert rows["zhuang-intersection-ln-small+mamba"] == "untrained"
+    assert rows["zhuang-intersection-ln+gpt.simsiam-warmup"] == "needs"
+
+
+def test_a_suggestion_keeps_the_tag(run):
+    assert "'zhuang-intersection-ln-small.simclr'?" in run("models", "show", "zhuang-intersecton-ln-small.simclr").err
+
+
+def test_a_card_says_what_the_weights_are(run):
+    def shown(name):
+        return " ".join(run("models", "show", name).out.split())
+
+    assert "weights trained: simclr" in shown("zhuang-small.simclr")
+    assert "weights untrained" in shown("zhuang-small")
+    assert "brainbench train zhuang-gru --objective simclr" in shown("zhuang-gru.simclr")
+
+
+def test_a_model_of_ones_own_gets_a_name_and_loses_it(run, files, tmp_path, monkeypatch):
+    monkeypatch.setenv("BRAINBENCH_CONFIG", str(tmp_path / "settings"))
+    monkeypatch.setattr(registry, "_loaded", set())
+    monkeypatch.setattr(registry, "_records", dict(registry._records))
+    assert run("models", "add", files["model"], "--name", "mine").status == 0
+    monkeypatch.setattr(registry, "_loaded", set())  # as the next command finds it
+    assert "your code" in run("models", "list", "mine").out
+    asked = ("--conditions", "trials:texture", "--stimuli", files["arrays"], "--out", files["out"])
+    assert run("score", "mine", "--recordings", files["recordings"], *asked).status == 0
+    assert run("models", "add", files["model"], "--name", "mine").status == 2
+    assert run("models", "remove", "mine").status == 0
+    assert "'mine'" in run("models", "remove", "mine").err

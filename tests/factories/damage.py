@@ -1,4 +1,4 @@
-"""Seeded damage to files: bytes, the texts of JSON, TOML and CSV, HDF5 trees, safetensors, and what is no file."""
+"""Seeded damage to files: bytes, texts, HDF5 trees, archives of arrays and weights, and what is no file."""
 
 from __future__ import annotations
 
@@ -7,10 +7,13 @@ import os
 import random
 import re
 import shutil
+import zipfile
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
+import torch
 
 TOKENS = (
     "NaN", "nan", "Infinity", "inf", "-inf", "1e400", "-1", "0", "1e300", "1e-300", "-0.5", "2.5", "9" * 5000,
@@ -18,6 +21,8 @@ TOKENS = (
 )  # fmt: skip
 """What takes the place of a value in a text."""
 _VALUE = re.compile(rb'"[^"\n]*"|-?\d+(?:\.\d+)?(?:[eE][-+]?\d+)?|true|false|null')
+_NUMBER = re.compile(rb"-?\d+(?:\.\d+)?(?:[eE][-+]?\d+)?")
+_XML = (".xml", ".urdf")
 _NUMBERS = (np.nan, np.inf, -np.inf, -1.0, 1e300, 0.0, 3.5)
 
 
@@ -33,8 +38,12 @@ def damage(path: Path, seed: int) -> str:
         kinds += [_hdf5] * 4
     elif path.suffix == ".safetensors":
         kinds += [_tensors] * 3
-    elif path.suffix in (".json", ".toml", ".csv", ".txt", ".obj", ".off"):
+    elif path.suffix in (".json", ".toml", ".csv", ".txt", ".obj", ".off", ".xml", ".urdf", ".yaml", ".key"):
         kinds += [_text] * 4
+    elif path.suffix == ".npz":
+        kinds += [_npz] * 4
+    elif path.suffix == ".ckpt":
+        kinds += [_checkpoint] * 4
     return chance.choice(kinds)(path, chance)
 
 
@@ -99,22 +108,25 @@ def _bytes(path: Path, chance: random.Random) -> str:
 def _text(path: Path, chance: random.Random) -> str:
     data = path.read_bytes()
     if chance.random() < 0.1:
-        deep = {".toml": b"x = " + b"[" * 50_000, ".json": b'{"a":' * 50_000}.get(path.suffix, b"[" * 50_000)
-        path.write_bytes(deep)
+        deep = {".toml": b"x = " + b"[" * 50_000, ".json": b'{"a":' * 50_000, ".yaml": b"a: " + b"[" * 50_000}
+        deep |= dict.fromkeys(_XML, b"<a>" * 50_000)
+        path.write_bytes(deep.get(path.suffix, b"[" * 50_000))
         return "deep nesting"
-    values = list(_VALUE.finditer(data))
+    # In XML every value is quoted: the numbers within are what shall change.
+    pattern = _NUMBER if path.suffix in _XML else _VALUE
+    values = list(pattern.finditer(data))
     if not values:
         return _bytes(path, chance)
-    for _ in range(chance.choice((1, 1, 2))):
+    for _ in range(chance.choice((1, 1, 2)) if len(values) > 1 else 1):
         found, token = chance.choice(values), chance.choice(TOKENS)
         after = data[found.end() : found.end() + 1]
         # A key of JSON stays a key: its value is what shall change.
         if after == b":" and token[0] != '"':
             token = json.dumps(token[:80])
-        if path.suffix in (".csv", ".obj", ".off", ".txt"):
+        if path.suffix in (".csv", ".obj", ".off", ".txt", ".yaml", *_XML):
             token = token.strip('"')
         data = data[: found.start()] + token.encode() + data[found.end() :]
-        values = list(_VALUE.finditer(data))
+        values = list(pattern.finditer(data))
     path.write_bytes(data)
     return f"{token[:12]} for {found.group()[:12]!r}"
 
@@ -202,6 +214,80 @@ def _tensors(path: Path, chance: random.Random) -> str:
     text = b"[" * 50_000 if kind == "deep" else json.dumps(header).encode()
     size = 2**40 if kind == "length" else len(text)
     path.write_bytes(size.to_bytes(8, "little") + text + body)
+    return f"{kind} {name}"
+
+
+def _npz(path: Path, chance: random.Random) -> str:
+    with np.load(path) as stored:
+        arrays = {name: stored[name] for name in stored.files}
+    name = chance.choice(list(arrays))
+    values = arrays[name]
+    kind = chance.choice(
+        ("number", "number", "number", "drop", "rename", "shape", "type", "objects", "header", "foreign")
+    )
+    if kind == "number" and values.dtype.kind == "f" and values.size:
+        number = chance.choice(_NUMBERS)
+        values.reshape(-1)[chance.randrange(values.size)] = number
+        kind = f"{number}"
+    elif kind in ("drop", "rename"):
+        del arrays[name]
+        arrays |= {"other": values} if kind == "rename" else {}
+    elif kind == "shape":
+        arrays[name] = chance.choice([values[None], values.reshape(-1)[:-1], np.zeros((0, 6, 2)), np.zeros(())])
+    elif kind == "objects":
+        arrays[name] = np.array([{}, None], dtype=object)
+    else:
+        others = ([b"x"], [True] * 3, [1j], np.nan, "NaN", "9" * 5000, -1, 1e300, [np.datetime64("NaT")])
+        arrays[name] = np.array(chance.choice(others))
+    np.savez(path, **arrays)
+    if kind in ("header", "foreign"):
+        with zipfile.ZipFile(path, "a") as archive, archive.open("extra.npy", "w") as stream:
+            shape = chance.choice(((2**40,), (2**62, 4), (-1,), ("a",), (3,)))
+            header = {"descr": "<f8", "fortran_order": False, "shape": shape}
+            stream.write(b"<a/>") if kind == "foreign" else np.lib.format.write_array_header_1_0(stream, header)
+    return f"{kind} {name}"
+
+
+class Unknown:
+    """An object that only pickle could bring back."""
+
+
+def _checkpoint(path: Path, chance: random.Random) -> str:
+    content = torch.load(path, weights_only=True)
+    state = content["state_dict"]
+    name = chance.choice([key for key, value in state.items() if value.ndim])
+    kind = chance.choice(
+        ("nan", "inf", "drop", "rename", "shape", "huge", "type", "object", "epoch", "state", "deep", "sparse", "meta")
+    )
+    if kind in ("nan", "inf"):
+        state[name] = state[name].clone()
+        state[name].reshape(-1)[0] = float(kind)
+    elif kind in ("drop", "rename"):
+        state["other"] = state.pop(name)
+        del state["other" if kind == "drop" else next(iter(state))]
+    elif kind == "shape":
+        state[name] = chance.choice([state[name][None], state[name][:0], torch.zeros(()), torch.zeros(3, 70)])
+    elif kind == "huge":
+        # A single stored number stands for as many as one likes.
+        state[name] = torch.zeros(1).expand(2**40)
+    elif kind == "type":
+        state[name] = chance.choice(
+            [state[name].to(torch.complex64), state[name].bool(), state[name].to(torch.float16) * 1e6, "x", None, 3]
+        )
+    elif kind == "object":
+        content["hyper_parameters"] = Unknown()
+    elif kind == "epoch":
+        content["epoch"] = chance.choice([-1, float("nan"), "x", 2**80, None, [1]])
+    elif kind == "state":
+        content["state_dict"] = chance.choice([3, {}, {"a": {}}, {3: torch.zeros(1)}, [torch.zeros(2)], {"": name}])
+    elif kind == "deep":
+        nested: Any = name
+        for _ in range(400):
+            nested = [nested]
+        content["state_dict"] = {**state, name: nested}
+    else:
+        state[name] = state[name].to_sparse() if kind == "sparse" else state[name].to("meta")
+    torch.save(content, path)
     return f"{kind} {name}"
 
 

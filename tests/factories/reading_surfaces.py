@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import json
 import math
@@ -15,62 +16,46 @@ import torch
 from safetensors.torch import save_file
 
 from brainbench.cli.leaderboard.scoring import parse_seeds, read_batch
-from brainbench.core.files import read_json, read_mapping, write_json
+from brainbench.cli.options import numbers as option_numbers
+from brainbench.core.errors import DataError
+from brainbench.core.files import read_mapping
 from brainbench.core.labels import read_match
-from brainbench.core.records import ResultRecord
+from brainbench.core.records import ResultRecord, record_identity
 from brainbench.datasets import open_recordings, write_recordings
 from brainbench.datasets.trials.selection import Selection
+from brainbench.datasets.trials.windows import Window
 from brainbench.datasets.whisking.dataset import WhiskingDataset
 from brainbench.geometry.mesh import load_mesh, save_mesh
 from brainbench.models.features import read_features, write_features
 from brainbench.models.graph.tnn_import import read_graph
 from brainbench.models.training.checkpoints import load_weights, read_config
 from brainbench.models.training.config import TrainingConfig
-from brainbench.stimuli import load_stimuli
+from brainbench.scoring.recovery.design import parse_trials
+from brainbench.stimuli import WhiskerArray, load_stimuli
 from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.motion.recorded import load_initial_angles, load_trajectory
+from brainbench.stimuli.objects.collections import resolve_objects
 from brainbench.stimuli.objects.primitives import sphere
 from brainbench.stimuli.scenes.scene_files import load_scene
 from brainbench.stimuli.stimulus_set import hash_stimulus_set, write_stimulus_set
 from brainbench.stimuli.sweeps.generation import generate
 from brainbench.stimuli.whiskit_runs import read_runs
+from leaderboards import build_leaderboard, read_records
+from leaderboards.held_out import Commitment
+from leaderboards.reproduction.trainings import read_trainings
+from leaderboards.site.folder import MANIFEST, check_site
+from tests.factories.campaigns import draw_trainings
+from tests.factories.published_surfaces import PUBLISHED
 from tests.factories.published_sweeps import write_run
-from tests.factories.reading_trials import Surface, not_finite, numbers
+from tests.factories.reading_trials import Surface, bad_counts, not_finite, numbers, typed, written, written_json
 from tests.factories.recording_files import write_nwb
 from tests.factories.recordings import make_simple_session, make_stimuli
 from tests.factories.records import make_record
+from tests.factories.robot_surfaces import ROBOTS
+from tests.factories.scene_files import POLE
 from tests.factories.sweep_batches import small_plan
 
-SCENE = """
-description = "a pole"
-[array]
-species = "mouse"
-whiskers = "C1,C2"
-[array.replace.C2]
-young_modulus = 3.3e9
-[head]
-position_mm = [1, 2, 3]
-rotation_deg = [0, 90, 0]
-[whisking]
-frequency_hz = 8
-protraction_deg = 30
-onset_ms = 50
-[frames]
-first_ms = 1
-interval_ms = 9
-count = 10
-average = 2
-lowpass_hz = 40
-[[scene]]
-label = "near"
-[[scene.object]]
-shape = "cylinder"
-radius_mm = 0.5
-height_mm = 20
-position_mm = [14, 5, 0]
-friction = 0.3
-velocity_mm_s = [0, -30, 0]
-"""
+SCENE = POLE.replace("interval_ms = 1", "interval_ms = 1\naverage = 2\nlowpass_hz = 40")
 BATCH = """
 [options]
 recordings = "demo"
@@ -83,6 +68,7 @@ units_reliability = 0.5
 models = ["zhuang-small", "resnet18-small"]
 seeds = [0, 1]
 """
+MODEL = {"brainbench_model": 1, "architecture": "zhuang", "options": {"seed": 1}, "version": 1}
 CONFIG = """
 epochs = 4
 batch_size = 8
@@ -113,28 +99,6 @@ GRAPH = {
 }  # fmt: skip
 
 
-def _text(name: str, text: str) -> Callable[[Path], Path]:
-    def make(folder: Path) -> Path:
-        path = folder / name
-        path.write_text(text, encoding="utf-8")
-        return path
-
-    return make
-
-
-def _json(name: str, value: Any) -> Callable[[Path], Path]:
-    return lambda folder: write_json(folder / name, value)
-
-
-def _word(read: Callable[[str], Any]) -> Callable[[Path], Any]:
-    """Read an option that a user types: any text, from a file whose damage may be no text at all."""
-
-    def of(path: Path) -> Any:
-        return read(path.read_bytes().decode(errors="replace")[:100_000] if path.is_file() else "")
-
-    return of
-
-
 def _nwb(folder: Path) -> Path:
     return write_nwb(folder / "sub-m1_ses-s1.nwb")
 
@@ -146,18 +110,6 @@ def _spikes(folder: Path) -> Path:
 def _counts(folder: Path) -> Path:
     return write_recordings(
         folder / "counts.h5", open_recordings(_spikes(folder), conditions="trials:stimulus", bin=0.25)
-    )
-
-
-def _bad_counts(dataset: Any) -> bool:
-    """Counts are 0 or more, or missing; a bin has a length of 0 or more; times are finite."""
-    counts, duration = dataset["counts"].values, dataset["duration"].values
-    real = counts[~np.isnan(counts)]
-    return bool(
-        np.isinf(real).any()
-        or (real < 0).any()
-        or not (np.isfinite(duration) & (duration >= 0)).all()
-        or not np.isfinite(dataset["time"].values).all()
     )
 
 
@@ -279,6 +231,17 @@ def _bad_scene(recipe: Any) -> bool:
     return not_finite(scenes) or any((item.friction or 0) < 0 for scene in scenes for item in scene.objects)
 
 
+def _read_record(path: Path) -> ResultRecord:
+    """Read a record under the name that its content gives it: whoever damages one can rename it too."""
+    with contextlib.suppress(ValueError, LookupError, TypeError, AttributeError, RecursionError, OSError):
+        fitting = f"x--{record_identity(json.loads(path.read_text()))}.json" if path.is_file() else path.name
+        path = path.rename(path.with_name(fitting))
+    (stored,) = read_records(path)
+    if stored.record is None:
+        raise DataError(stored.problem)
+    return stored.record
+
+
 def _bad_record(record: Any) -> bool:
     scores = [record.score, *record.baselines.values()]
     return any(math.isinf(n) for n in numbers(record)) or any(
@@ -297,15 +260,41 @@ def _bad_batch(jobs: Any) -> bool:
     )
 
 
+def _site(folder: Path) -> Path:
+    return build_leaderboard([make_record()], folder / "site").with_name(MANIFEST)
+
+
+def _commitment(folder: Path) -> Path:
+    return Commitment("animals", 3, 8, "9f3c2a7be1d04455", "0f" * 32).write(folder / "held-out.json")
+
+
+def _bad_trainings(trainings: Any) -> bool:
+    shares = [one for item in trainings for one in (item.evaluation, item.twin_evaluation) if one]
+    return not_finite(trainings) or any(not 0 <= one.top1 <= one.top5 <= 1 or one.count < 1 for one in shares)
+
+
+def _whiskers(text: str) -> Any:
+    return WhiskerArray.mouse(whiskers=text)
+
+
+def _objects(text: str) -> Any:
+    return resolve_objects([text])
+
+
 SURFACES = (
-    Surface("recordings, NWB", _nwb, lambda path: open_recordings(path, conditions="trials:texture"), _bad_counts),
-    Surface("recordings, HDF5", _spikes, lambda path: open_recordings(path, conditions="trials:stimulus"), _bad_counts),
-    Surface("recordings, counts", _counts, open_recordings, _bad_counts),
+    Surface("recordings, NWB", _nwb, lambda path: open_recordings(path, conditions="trials:texture"), bad_counts),
+    Surface("recordings, HDF5", _spikes, lambda path: open_recordings(path, conditions="trials:stimulus"), bad_counts),
+    Surface("recordings, counts", _counts, open_recordings, bad_counts),
     Surface("stimulus set", _stimulus_set, lambda path: load_stimuli(path).input, not_finite),
     Surface("stimulus arrays", _arrays, lambda path: load_stimuli(path).input, not_finite),
     # NaN in activations is a missing value, and the score of such a layer has a status.
     Surface("activations", _activations, read_features, lambda found: False),
-    Surface("scene", _text("scene.toml", SCENE), load_scene, _bad_scene),
+    Surface(
+        "scene",
+        written("scene.toml", SCENE),
+        load_scene,
+        _bad_scene,
+    ),
     *(
         Surface(f"mesh, {suffix[1:].upper()}", _mesh(suffix), lambda path: load_mesh(path, unit="mm"), not_finite)
         for suffix in (".obj", ".stl", ".ply", ".off", ".glb")
@@ -314,42 +303,64 @@ SURFACES = (
     Surface("WHISKiT table", _run("dynamics/Fx.csv"), _read_run, _bad_run),
     Surface("trajectory", _trajectory, load_trajectory, not_finite),
     Surface("starting angles", _angles, load_initial_angles, not_finite),
-    Surface("network, JSON", _json("graph.json", GRAPH), read_graph, _bad_graph),
+    Surface("network, JSON", written_json("graph.json", GRAPH), read_graph, _bad_graph),
     Surface("weights", _weights, _load, not_finite),
     Surface(
         "model configuration",
-        _json("config.json", {"brainbench_model": 1, "architecture": "zhuang", "options": {"seed": 1}, "version": 1}),
+        written_json(
+            "config.json", {"brainbench_model": 1, "architecture": "zhuang", "options": {"seed": 1}, "version": 1}
+        ),
         lambda path: read_config(path.parent),
         not_finite,
     ),
     Surface(
         "training options",
-        _text("train.toml", CONFIG),
+        written("train.toml", CONFIG),
         lambda path: TrainingConfig.published("zhuang-small", **read_mapping(path)),
         _bad_config,
     ),
-    Surface("batch file", _text("batch.toml", BATCH), read_batch, _bad_batch),
-    Surface("match, JSON", _json("match.json", {"a": "b", "c": None}), read_match, not_finite),
-    Surface("match, CSV", _text("match.csv", "a,b\nc,\n"), read_match, not_finite),
+    Surface("batch file", written("batch.toml", BATCH), read_batch, _bad_batch),
+    Surface("match, JSON", written_json("match.json", {"a": "b", "c": None}), read_match, not_finite),
+    Surface("match, CSV", written("match.csv", "a,b\nc,\n"), read_match, not_finite),
     Surface("manifest", _sweeps("manifest.json"), _read_sweeps, not_finite),
     Surface("shard", _sweeps("train-00000.h5"), _read_sweeps, not_finite),
     Surface(
         "result record",
-        _json("record.json", json.loads(make_record().to_json())),
-        lambda path: ResultRecord.from_json(read_json(path)),
+        written_json("record.json", json.loads(make_record().to_json())),
+        _read_record,
         _bad_record,
+    ),
+    Surface("site manifest", _site, lambda path: check_site(path.parent), lambda found: not found[1]),
+    Surface("commitment", _commitment, Commitment.read, lambda found: min(found.held, found.kept) < 1),
+    Surface(
+        "trainings",
+        written("trainings.json", "".join(json.dumps(line) + "\n" for line in draw_trainings(1.0)[:4])),
+        read_trainings,
+        _bad_trainings,
     ),
     Surface(
         "fidelity text",
-        _text("fidelity.txt", "fast,links=12,links_per_mm=0.3,time_step=1e-4,solver=quasistatic"),
-        _word(Fidelity.parse),
+        written("fidelity.txt", "fast,links=12,links_per_mm=0.3,time_step=1e-4,solver=quasistatic"),
+        typed(Fidelity.parse),
         not_finite,
     ),
     Surface(
         "selection text",
-        _text("selection.txt", "outcome=correct|error; units.layer=4; depth=1.5..20; min_spikes=50"),
-        _word(Selection.parse),
+        written("selection.txt", "outcome=correct|error; units.layer=4; depth=1.5..20; min_spikes=50"),
+        typed(Selection.parse),
         lambda value: value.min_spikes < 0,
     ),
-    Surface("seeds text", _text("seeds.txt", "0-4,7,9"), _word(parse_seeds), lambda seeds: min(seeds) < 0),
+    Surface("seeds text", written("seeds.txt", "0-4,7,9"), typed(parse_seeds), lambda seeds: min(seeds) < 0),
+    Surface("window text", written("window.txt", "first-contact-0.1..choice+0.25"), typed(Window.parse), not_finite),
+    Surface("trials text", written("trials.txt", "16-20"), typed(parse_trials), lambda found: min(numbers(found)) < 1),
+    Surface("whiskers text", written("whiskers.txt", "C1-C3,D*,*2"), typed(_whiskers), lambda array: not len(array)),
+    Surface("objects text", written("objects.txt", "torus:20"), typed(_objects), lambda found: not found),
+    Surface(
+        "numbers text",
+        written("numbers.txt", "0.5,1e-3,20"),
+        typed(lambda text: option_numbers(text, "--steps", float)),
+        not_finite,
+    ),
+    *PUBLISHED,
+    *ROBOTS,
 )

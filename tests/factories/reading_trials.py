@@ -19,10 +19,11 @@ import numpy as np
 import xarray as xr
 
 from brainbench.core.errors import BrainbenchError
+from brainbench.core.files import write_json
 from tests.factories.damage import damage, remove
 
 SECONDS = 10.0
-"""Time after which a reader hangs."""
+"""Seconds of work after which a reader hangs; by the clock, what waits has three times as many on a busy machine."""
 MEMORY = 2 << 30
 """Address space [bytes] that a reader may take beyond what the process has."""
 LONGEST = 1000
@@ -92,15 +93,18 @@ def _bounds() -> Iterator[None]:
         raise HangError
 
     used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
-    before, handler = resource.getrlimit(resource.RLIMIT_AS), signal.signal(signal.SIGALRM, stop)
-    resource.setrlimit(resource.RLIMIT_AS, (used + MEMORY + (1 << 28), before[1]))
-    signal.setitimer(signal.ITIMER_REAL, SECONDS)
+    timers = ((signal.SIGPROF, signal.ITIMER_PROF, SECONDS), (signal.SIGALRM, signal.ITIMER_REAL, 3 * SECONDS))
+    limit, handlers = resource.getrlimit(resource.RLIMIT_AS), [signal.signal(kind, stop) for kind, _, _ in timers]
+    resource.setrlimit(resource.RLIMIT_AS, (used + MEMORY + (1 << 28), limit[1]))
+    for _, timer, seconds in timers:
+        signal.setitimer(timer, seconds)
     try:
         yield
     finally:
-        signal.setitimer(signal.ITIMER_REAL, 0)
-        signal.signal(signal.SIGALRM, handler)
-        resource.setrlimit(resource.RLIMIT_AS, before)
+        for (kind, timer, _), handler in zip(timers, handlers, strict=True):
+            signal.setitimer(timer, 0)
+            signal.signal(kind, handler)
+        resource.setrlimit(resource.RLIMIT_AS, limit)
 
 
 def numbers(value: Any, *, depth: int = 12) -> Iterator[float]:
@@ -131,3 +135,40 @@ def numbers(value: Any, *, depth: int = 12) -> Iterator[float]:
 def not_finite(value: Any) -> bool:
     """Return whether nested data holds a number that is not finite."""
     return any(not math.isfinite(number) for number in numbers(value))
+
+
+def bad_counts(dataset: Any) -> bool:
+    """Return whether counts are negative or infinite (missing ones are NaN), or bins and times impossible."""
+    counts, duration = dataset["counts"].values, dataset["duration"].values
+    real = counts[~np.isnan(counts)]
+    return bool(
+        np.isinf(real).any()
+        or (real < 0).any()
+        or not (np.isfinite(duration) & (duration >= 0)).all()
+        or not np.isfinite(dataset["time"].values).all()
+    )
+
+
+def written(name: str, text: str) -> Callable[[Path], Path]:
+    """Return what writes a text into a folder."""
+
+    def make(folder: Path) -> Path:
+        path = folder / name
+        path.write_text(text, encoding="utf-8")
+        return path
+
+    return make
+
+
+def written_json(name: str, value: Any) -> Callable[[Path], Path]:
+    """Return what writes a value as JSON into a folder."""
+    return lambda folder: write_json(folder / name, value)
+
+
+def typed(read: Callable[[str], Any]) -> Callable[[Path], Any]:
+    """Return the reader of an option that a user types: any text, from a file whose damage may be no text at all."""
+
+    def of(path: Path) -> Any:
+        return read(path.read_bytes().decode(errors="replace")[:100_000] if path.is_file() else "")
+
+    return of

@@ -17,11 +17,11 @@ GRID = dataclasses.replace(
     height=(-0.002, 0.0),
     rotation=(0.0, math.pi / 4),
     distance=(0.005,),
-    start=-0.002,
+    start=-0.001,
     frames=Frames(count=10, interval=0.01),
     published="",
 )
-"""Four sweeps of .1 s per object, which C2 and C3 feel; from ``start`` = −6 mm some are hit at once."""
+"""Four sweeps of .1 s per object, which C2 and C3 feel; from ``start`` = −2 mm C3 would begin inside the brick."""
 
 
 def small_scenes(objects=("brick:2", "cone:2"), whiskers="C3", grid=GRID):

@@ -82,8 +82,8 @@ def test_names_that_share_a_slug_do_not_share_a_file(make_record, tmp_path):
         (lambda text: text.replace("0.523", "0.923"), "was edited or renamed"),
         (lambda text: text.replace("mouse-a", "mouse-z"), "was edited or renamed"),
         (lambda text: text[:-40], "is not valid JSON"),
-        (lambda text: text.replace("0.0127", "NaN"), "NaN is not JSON"),
-        (lambda text: text.replace("0.0127", "1e999"), "1e999 is larger"),
+        (lambda text: text.replace("0.0127", "NaN"), "is nan"),
+        (lambda text: text.replace("0.0127", "1e999"), "is inf"),
         (
             lambda text: text.replace('"schema": 2', '"schema": 7'),
             "schema version 7; this brainbench reads versions 1 to 2; update",
@@ -115,7 +115,7 @@ def test_a_renamed_file_is_refused(make_record, tmp_path):
 def test_a_binary_file_is_refused_in_words(tmp_path):
     path = tmp_path / "x.json"
     path.write_bytes(b"\x89HDF\xff\xfe")
-    with pytest.raises(DataError, match="cannot be read as UTF-8 text"):
+    with pytest.raises(DataError, match="utf-8"):
         read_record(path)
 
 

@@ -13,11 +13,11 @@ from brainbench.cli.leaderboard.scoring import ScoringJob, full_settings, jobs_o
 from brainbench.cli.options import SCORE, SCORE_FLAGS, SchedulerOption, with_options
 from brainbench.cli.output import JsonOption, emit, progress_bar
 from brainbench.core.errors import DataFileNotFoundError, UsageError
-from brainbench.core.files import to_json
+from brainbench.core.files import lock_folder, to_json
 from brainbench.core.records import ResultRecord
 from leaderboards.audit import computation, conflicting, remarks
 from leaderboards.store import StoredRecord, read_records, write_record
-from leaderboards.writing import in_one_sentence, locked, sweep
+from leaderboards.writing import in_one_sentence, sweep
 
 OFFERED = (
     "recordings", "conditions", "select", "window", "stimuli", "fidelity", "whiskers", "metric", "estimator", "time"
@@ -132,7 +132,7 @@ def _present(to: Path) -> list[tuple[Path, ResultRecord]]:
     """Return the records of a folder; what killed writers left there is removed."""
     if not to.is_dir():
         return []
-    with in_one_sentence(to), locked(to) as alone:
+    with in_one_sentence(to), lock_folder(to) as alone:
         if alone:
             sweep(to, lambda name: name.endswith(".json"))
     if not any(to.rglob("*.json")):

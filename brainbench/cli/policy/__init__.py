@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import typer
 
+from brainbench.cli.output import list_without_command
 from brainbench.cli.policy import deploy, play, report, train
 
-app = typer.Typer(no_args_is_help=True, help="Dexterous tasks of robot hands: play, train, evaluate, deploy.")
+app = typer.Typer(help="Dexterous tasks of robot hands: play, train, evaluate, deploy.")
 app.command("tasks")(play.list_tasks)
+list_without_command(app, play.list_tasks)
 for _command in (
     play.play,
     train.train,

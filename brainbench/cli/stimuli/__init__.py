@@ -7,10 +7,12 @@ from __future__ import annotations
 
 import typer
 
+from brainbench.cli.output import list_without_command
 from brainbench.cli.stimuli import convert, draw, hand, objects, scenes, simulate, sweep
 
-app = typer.Typer(no_args_is_help=True, help="Simulate whiskers on objects; look at scenes and forces.")
+app = typer.Typer(help="Simulate whiskers on objects; look at scenes and forces.")
 app.command("list")(scenes.list_)
+list_without_command(app, scenes.list_)
 for _command in (
     scenes.show,
     simulate.simulate,

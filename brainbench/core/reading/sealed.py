@@ -11,8 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brainbench.core.errors import DataError
-from brainbench.core.files import atomic_path, hash_arrays
+from brainbench.core.files import atomic_path, file_hash, hash_arrays, write_text
 from brainbench.core.reading.archives import read_npz
+from brainbench.core.reading.hdf5 import trust_hdf5
 
 _HASH = "sha256"
 _LOG = logging.getLogger(__name__)
@@ -46,3 +47,15 @@ def write_sealed(path: Path, what: str, arrays: Mapping[str, Any], *, compress: 
             (np.savez_compressed if compress else np.savez)(temporary, **sealed)
     except OSError as error:
         _LOG.warning("The %s could not be kept in the cache (%s)", what, error)
+
+
+def seal_file(path: Path) -> None:
+    """Write the hash of an HDF5 file of the cache beside it."""
+    write_text(path.with_suffix(".sha256"), file_hash(path, length=64))
+
+
+def trust_sealed(path: Path) -> None:
+    """Open an HDF5 file of the cache without looking through it first, if its bytes fit the hash beside it."""
+    seal = path.with_suffix(".sha256")
+    if seal.is_file() and seal.read_bytes()[:64] == file_hash(path, length=64).encode():
+        trust_hdf5(path)

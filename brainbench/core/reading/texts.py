@@ -1,4 +1,4 @@
-"""JSON, TOML and tables of numbers, of bounded size, depth and digits; no value is NaN or infinite."""
+"""JSON, TOML and YAML of bounded size, depth and digits; no value is NaN or infinite."""
 
 from __future__ import annotations
 
@@ -7,14 +7,10 @@ import math
 import os
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from brainbench.core.errors import DataError, shown
-from brainbench.core.reading.regular import MOST_TABLE, MOST_TEXT, check_file, readable, reason
-
-if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
+from brainbench.core.errors import DataError, missing_dependency, shown
+from brainbench.core.reading.regular import MOST_TEXT, check_file, readable, reason
 
 MOST_LEVELS = 64
 """Levels of nesting."""
@@ -74,43 +70,47 @@ def read_toml(path: str | os.PathLike[str], kind: str = "file") -> dict[str, Any
     return parse_toml(read_text(path, kind), os.fspath(path))
 
 
+def read_yaml(path: str | os.PathLike[str], kind: str = "file") -> Any:
+    """Read YAML.
+
+    Raises:
+        DataFileNotFoundError: there is no such file.
+        DataError: it cannot be parsed, repeats values by alias, or see :func:`parse_json`.
+        MissingDependencyError: no reader of YAML is installed.
+    """
+    try:
+        import yaml
+    except ImportError as error:
+        raise missing_dependency("pyyaml", extra="hub", purpose="Reading YAML settings") from error
+    text, name = read_text(path, kind), os.fspath(path)
+    with readable(path, "YAML"):
+        try:
+            # Deep texts take the time of their depth squared; a few aliases of aliases stand for any number of values.
+            level = 0
+            for event in yaml.parse(text, yaml.SafeLoader):
+                level += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
+                if level > MOST_LEVELS:
+                    raise DataError(f"{shown(name)} is nested too deeply: more than {MOST_LEVELS} levels.")
+                if isinstance(event, yaml.AliasEvent):
+                    raise DataError(f"{shown(name)} repeats values by alias (*name); write them out instead.")
+            return check_values(yaml.safe_load(text), name)
+        except yaml.YAMLError as error:
+            raise DataError(f"{shown(name)} is not valid YAML ({reason(error)}).") from error
+
+
 def read_mapping(path: str | os.PathLike[str], kind: str = "file") -> dict[str, Any]:
-    """Read names and values from a TOML or JSON file, which its ending tells apart.
+    """Read names and values from a TOML, JSON or YAML file, which its ending tells apart.
 
     Raises:
         DataFileNotFoundError: there is no such file.
         DataError: it cannot be parsed or holds no mapping.
     """
-    values = read_json(path, kind) if Path(path).suffix.lower() == ".json" else read_toml(path, kind)
+    suffix = Path(path).suffix.lower()
+    read = read_json if suffix == ".json" else read_yaml if suffix in (".yaml", ".yml") else read_toml
+    values = read(path, kind)
     if not isinstance(values, dict):
-        raise DataError(f"{os.fspath(path)!r} holds a {type(values).__name__}, not names and values.")
+        raise DataError(f"{shown(os.fspath(path))} holds a {type(values).__name__}, not names and values.")
     return values
-
-
-def read_numbers(path: str | os.PathLike[str], kind: str = "table of comma-separated numbers") -> NDArray[np.float64]:
-    """Return the numbers [line, column] of a comma-separated file; lines may end with a comma.
-
-    NaN and infinity are numbers here: some tables have gaps, and their readers say what these mean.
-
-    Raises:
-        DataError: there is no such file, something is no number, or lines differ in length.
-    """
-    import numpy as np
-
-    lines = [line.rstrip(",\r ") for line in read_text(path, kind, most=MOST_TABLE).split("\n") if line.strip()]
-    rows = []
-    for number, line in enumerate(lines, 1):
-        try:
-            rows.append(np.array(line.split(","), dtype=float))
-        except ValueError as error:
-            raise DataError(f"{os.fspath(path)!r} is not a {kind}: row {number} is {shown(line)}.") from error
-        if len(rows[-1]) != len(rows[0]):
-            raise DataError(
-                f"{os.fspath(path)!r} is not a {kind}: row {number} has {len(rows[-1])} columns, row 1 {len(rows[0])}."
-            )
-    if not rows:
-        raise DataError(f"{os.fspath(path)!r} holds no table of numbers.")
-    return np.stack(rows)
 
 
 def check_values(value: Any, name: str) -> Any:
@@ -130,12 +130,26 @@ def _check(value: Any, name: str, place: tuple[str | int, ...]) -> None:
     elif type(value) is int:
         if abs(value) > LARGEST_WHOLE:
             raise DataError(f"{_place(name, place)} is a number of about 2^{value.bit_length()}; the largest is 2^63.")
+    elif type(value) is str:
+        _encode(value, name, place)
     elif isinstance(value, (Mapping, list)):
         if len(place) >= MOST_LEVELS:
             raise DataError(f"{shown(name)} is nested too deeply: more than {MOST_LEVELS} levels.")
+        if isinstance(value, Mapping):
+            for key in value:
+                _encode(str(key), name, place)
         for key, item in value.items() if isinstance(value, Mapping) else enumerate(value):
-            if type(item) is not str:
+            # Most of a large file are numbers in order.
+            if type(item) is not float or not math.isfinite(item):
                 _check(item, name, (*place, key))
+
+
+def _encode(text: str, name: str, place: tuple[str | int, ...]) -> None:
+    if not text.isascii():
+        try:
+            text.encode()
+        except UnicodeEncodeError as error:
+            raise DataError(f"{_place(name, place)} holds half of a surrogate pair, which is no text.") from error
 
 
 def _place(name: str, place: tuple[str | int, ...]) -> str:

@@ -9,12 +9,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brainbench.core.errors import DataError, listing
-from brainbench.datasets.npz import read_npz
+from brainbench.core.reading.archives import read_npz
 
 STRAY = "allow_pickle"
 """Entry without meaning: numpy before 2.2 stored this keyword of ``savez`` as an array."""
 SLOTS = tuple(f"slot-{number}" for number in range(1, 7))
 """Places along axis 1, in the order of the file."""
+MOST_RATE = 1e6
+"""Spikes per second beyond those of any neuron, even in the shortest window."""
 RATES = f"rates [trials, {len(SLOTS)}, units]"
 
 
@@ -24,7 +26,7 @@ def read_arrays(path: Path) -> tuple[dict[str, NDArray[np.float64]], bool]:
     Raises:
         DataError: the file is no ``.npz`` of plain arrays, holds something else, or rates that cannot be.
     """
-    arrays = read_npz(path, RATES)
+    arrays = read_npz(path, "file of published recordings (.npz)")
     if {"data", "label"} <= arrays.keys():
         raise DataError(
             f"{path} is a whisker sweep (arrays {listing(sorted(arrays))}), not recordings of neurons; a "
@@ -54,8 +56,8 @@ def _fault(array: NDArray[Any]) -> str:
     gone: NDArray[np.bool_] = np.asarray(missing.all(axis=1))
     if missing.all():
         return "holds no rate: every value is NaN; leave this animal out"
-    if np.isinf(array).any() or (array < 0).any():
-        return "holds infinite or negative rates; rates are finite and at least 0 spikes/s"
+    if (array > MOST_RATE).any() or (array < 0).any():
+        return f"holds infinite, negative or impossible rates; rates are 0 to {MOST_RATE:,.0f} spikes/s"
     if np.any(gone[:-1] & ~gone[1:]) or np.any(gone[0]):
         return "has trials of NaN inside a session; they may only pad a unit's trials at the end"
     if len(several := np.argwhere((array > 0).sum(axis=1) > 1)):

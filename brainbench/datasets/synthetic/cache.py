@@ -11,6 +11,7 @@ from typing import Any
 
 from brainbench.core.errors import DataError
 from brainbench.core.files import cache_dir, check_folder, content_hash, file_hash, read_json
+from brainbench.core.reading.hdf5 import trust_hdf5
 from brainbench.datasets.synthetic.truth import TRUTH
 
 _ABANDONED = 24 * 3600.0
@@ -46,7 +47,10 @@ def ensure_recordings(name: str, *key: object, make: Callable[[Path], object]) -
 
 
 def _is_whole(path: Path, stated: Mapping[str, Any]) -> bool:
-    return path.stat().st_size == stated["bytes"] and file_hash(path) == stated["hash"]
+    whole = path.stat().st_size == stated["bytes"] and file_hash(path) == stated["hash"]
+    if whole:
+        trust_hdf5(path)
+    return whole
 
 
 def _complete(folder: Path) -> bool:

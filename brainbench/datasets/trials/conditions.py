@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from brainbench.core.errors import DataError, UsageError
+from brainbench.core.errors import DataError, UsageError, shown
 from brainbench.datasets.sessions import SessionTable, as_labels, natural_key
 
 
@@ -33,7 +33,7 @@ class Conditions:
         columns = tuple(item.strip() for item in rest.split(","))
         if not colon or not table.strip() or not all(columns):
             raise UsageError(
-                f"The conditions {source!r} cannot be read; write TABLE:COLUMN or TABLE:COLUMN,COLUMN, such as "
+                f"The conditions {shown(source)} cannot be read; write TABLE:COLUMN or TABLE:COLUMN,COLUMN, such as "
                 f"'trials:stimulus'. `brainbench recordings inspect FILE` proposes some."
             )
         return cls(table.strip(), columns)

@@ -8,7 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from brainbench.core.errors import DataError, UsageError
+from brainbench.core.errors import DataError, UsageError, shown
+from brainbench.core.reading.ranges import check_number
 from brainbench.datasets.sessions import Session, SessionTable
 
 FIRST_CONTACT = "first-contact"
@@ -48,8 +49,10 @@ class Window:
     def __post_init__(self) -> None:
         if self.stop is None and self.length is None:
             raise UsageError(f"The window from {self.anchor!r} has no end; give stop (an anchor) or length (s).")
-        if self.length is not None and not self.length > 0:
-            raise UsageError(f"A window's length is positive; received {self.length} s.")
+        for name in ("offset", "stop_offset", "shortest_contact"):
+            check_number(f"A window's {name} (s)", getattr(self, name))
+        if self.length is not None:
+            check_number("A window's length (s)", self.length, above=0)
         if self.stop == FIRST_CONTACT:
             raise UsageError("A window cannot end at the first contact, which is sought before its end.")
 
@@ -69,7 +72,7 @@ class Window:
         begin, end = _EDGE.match(first), _EDGE.match(last)
         if not dots or begin is None or end is None or not begin["name"] or not last:
             raise UsageError(
-                f"The window {source!r} cannot be read; write FROM..TO or FROM..+SECONDS, such as "
+                f"The window {shown(source)} cannot be read; write FROM..TO or FROM..+SECONDS, such as "
                 f"'first-contact..choice' or 'start+0.2..+0.5'."
             )
         window = {"anchor": begin["name"], "offset": float(begin["offset"] or 0)}

@@ -19,7 +19,8 @@ import numpy as np
 
 from brainbench.core.contracts import CHANNELS, GRID_SHAPE
 from brainbench.core.errors import DataError
-from brainbench.datasets.npz import read_npz
+from brainbench.core.reading.archives import read_npz
+from brainbench.core.reading.texts import check_values
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -87,7 +88,7 @@ def read_sweep(path: str | os.PathLike[str]) -> SweepFile:
     Raises:
         DataError: the file is missing, damaged or another one; the message says what it holds.
     """
-    name, held = os.fspath(path), read_npz(path, "a whisker sweep")
+    name, held = os.fspath(path), read_npz(path, "published sweep (.npz)")
     rate = next((rate for rate, needed in RATES.items() if {"data", "shape", *needed} <= held.keys()), None)
     if rate is None:
         raise DataError(
@@ -98,6 +99,7 @@ def read_sweep(path: str | os.PathLike[str]) -> SweepFile:
         told = {key: float(str(held[key])) for key in RATES[rate]}
     except ValueError as error:
         raise DataError(f"{name!r} has a condition that is no number ({error}).") from error
+    check_values(told, name)
     label = _label(str(held.get("label", "")))
     return SweepFile(_whiskers(held["data"], name), label, str(held["shape"]), rate, _conditions(told))
 

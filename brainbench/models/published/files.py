@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import os
-import pickle
-import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,8 +10,10 @@ from typing import Any
 
 import torch
 
-from brainbench.core.errors import DataError, DataFileNotFoundError, listing, missing_dependency
-from brainbench.core.files import file_hash, read_mapping
+from brainbench.core.errors import DataError, listing, shown
+from brainbench.core.files import file_hash
+from brainbench.core.reading.tensors import check_stored, read_checkpoint, read_tensors
+from brainbench.core.reading.texts import read_mapping
 from brainbench.models.graph.tnn_import import read_graph
 
 # Values of their settings; what they mean here.
@@ -49,19 +49,16 @@ def read_weights(path: str | os.PathLike[str]) -> ForeignWeights:
         DataFileNotFoundError: there is no such file.
         DataError: it is no such file, is cut short, needs pickle, or a weight is not finite.
     """
-    path = Path(path)
-    if not path.is_file():
-        raise DataFileNotFoundError(f"There is no file of weights {os.fspath(path)!r}.")
-    content = _read(path)
+    path, kind = Path(path), "file of weights"
+    content = read_tensors(path, kind) if path.suffix == ".safetensors" else read_checkpoint(path, kind)
     state = content.get("state_dict", content)
-    if not isinstance(state, Mapping) or not state or not all(isinstance(v, torch.Tensor) for v in state.values()):
+    named = isinstance(state, Mapping) and all(isinstance(name, str) for name in state)
+    if not named or not state or not all(isinstance(value, torch.Tensor) for value in state.values()):
         raise DataError(
-            f"{os.fspath(path)!r} holds no weights: expected tensors by name, or such a mapping as 'state_dict'; found "
-            f"{listing(content) if content else 'nothing'}."
+            f"{shown(os.fspath(path))} holds no weights: expected tensors by name, or such a mapping as 'state_dict'; "
+            f"found {listing(map(str, content)) if content else 'nothing'}."
         )
-    bad = [name for name, value in state.items() if value.is_floating_point() and not value.isfinite().all()]
-    if bad:
-        raise DataError(f"{os.fspath(path)!r} has weights that are not finite: {listing(bad)}; the training diverged.")
+    check_stored(state, os.fspath(path))
     counts = {ours: content.get(theirs) for ours, theirs in (("epoch", "epoch"), ("step", "global_step"))}
     counts = {name: value if isinstance(value, int) else None for name, value in counts.items()}
     return ForeignWeights(_prefixed(state), path, file_hash(path, length=64), **counts)
@@ -75,8 +72,7 @@ def read_settings(path: str | os.PathLike[str]) -> Settings:
         DataError: it cannot be read, or says nothing that is known here.
         MissingDependencyError: it is YAML and no reader is installed.
     """
-    path = Path(path)
-    values = _read_yaml(path) if path.suffix.lower() in (".yaml", ".yml") else read_mapping(path)
+    values = read_mapping(path, "file of settings")
     if "nodes" in values:
         memory = next((node.memory for node in read_graph(values).nodes if node.memory is not None), None)
         return Settings(memory and memory.kind + ("-ln" if memory.layer_norm else ""))
@@ -86,46 +82,10 @@ def read_settings(path: str | os.PathLike[str]) -> Settings:
         cell = (words[0] if words[0] in _CELLS else "time-decay") + ("-ln" if "ln" in words else "")
     if cell is None and objective is None:
         raise DataError(
-            f"{os.fspath(path)!r} says nothing of a network: expected 'model.encoder.model_config_file', 'train.ssl' "
-            f"or a graph's 'nodes'; found {listing(values) if values else 'nothing'}."
+            f"{shown(os.fspath(path))} says nothing of a network: expected 'model.encoder.model_config_file', "
+            f"'train.ssl' or a graph's 'nodes'; found {listing(map(str, values)) if values else 'nothing'}."
         )
     return Settings(cell, objective)
-
-
-def _read(path: Path) -> Mapping[str, Any]:
-    from safetensors import SafetensorError
-    from safetensors.torch import load_file
-
-    name = os.fspath(path)
-    try:
-        if path.suffix == ".safetensors":
-            return load_file(path)
-        content = torch.load(path, map_location="cpu", weights_only=True)
-    except (pickle.UnpicklingError, SafetensorError, RuntimeError, EOFError, ValueError, OSError, KeyError) as error:
-        # PyTorch writes zip archives; only in a sound one is an object in the way, and not a torn file.
-        if isinstance(error, pickle.UnpicklingError) and zipfile.is_zipfile(path):
-            raise DataError(
-                f"{name!r} holds objects that only pickle could load, which may run code; save its 'state_dict' alone "
-                "with torch.save, or as safetensors."
-            ) from error
-        raise DataError(
-            f"{name!r} is not a readable file of weights, or it is cut short ({type(error).__name__}); get it again."
-        ) from error
-    return content if isinstance(content, Mapping) else {}
-
-
-def _read_yaml(path: Path) -> Mapping[str, Any]:
-    if not path.is_file():
-        raise DataFileNotFoundError(f"There is no file {os.fspath(path)!r}.")
-    try:
-        import yaml
-    except ImportError as error:
-        raise missing_dependency("pyyaml", extra="hub", purpose="Reading YAML settings") from error
-    try:
-        values = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise DataError(f"{os.fspath(path)!r} is not valid YAML ({str(error).splitlines()[0]}).") from error
-    return values if isinstance(values, Mapping) else {}
 
 
 def _inner(values: Any, *names: str) -> Any:

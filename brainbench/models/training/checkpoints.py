@@ -118,7 +118,7 @@ def load_weights(model: nn.Module, path: str | os.PathLike[str], *, what: str) -
         DataFileNotFoundError: there is no such file.
         DataError: it cannot be read, or does not fit the model.
     """
-    from brainbench.core.reading.archives import read_tensors
+    from brainbench.core.reading.tensors import read_tensors
     from brainbench.models.ops.parameters import load_named
 
     state = read_tensors(path, f"file of weights for {what!r} (safetensors)")

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass, field
 
-from brainbench.core.errors import UsageError
+from brainbench.core.errors import UsageError, shown
 from brainbench.datasets.synthetic.design import PopulationDesign
 
 FEWEST_STIMULI = 4
@@ -52,8 +53,8 @@ def parse_trials(text: str) -> int | tuple[int, int]:
     Raises:
         UsageError: it is something else.
     """
-    first, dash, last = text.partition("-")
-    try:
-        return (int(first), int(last)) if dash else int(first)
-    except ValueError as error:
-        raise UsageError(f"Trials are a number or a range such as 16-20; received {text!r}.") from error
+    found = re.fullmatch(r"\s*(\d{1,9})\s*(?:-\s*(\d{1,9})\s*)?", text)
+    first, last = (int(part or 0) for part in found.groups()) if found else (0, 0)
+    if first < 1 or (found and found[2] and last < first):
+        raise UsageError(f"Trials are a number above 0 or a range such as 16-20; received {shown(text)}.")
+    return (first, last) if last else first

@@ -150,6 +150,8 @@ class WhiskerEngine(ABC):
     """Kinds of devices it runs on."""
     solvers: ClassVar[tuple[str, ...]] = ("dynamic",)
     """Values of :attr:`Fidelity.solver` it knows."""
+    twists: ClassVar[bool] = False
+    """True when whiskers can twist about their axis; in other engines they only bend."""
     surfaces: ClassVar[bool] = False
     """True when it collides the exact surface of obstacles that have one; others collide convex parts."""
     retries: ClassVar[bool] = False

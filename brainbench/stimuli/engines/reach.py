@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brainbench.core.rotations import to_matrices
+from brainbench.geometry import Mesh, winding_number
 from brainbench.stimuli.objects.obstacle import Obstacle
 from brainbench.stimuli.whiskers.chain import Chain
 from brainbench.stimuli.whiskers.whisker import Whisker
@@ -54,7 +55,8 @@ def reachable(
 
     Conservative: an inextensible whisker never leaves the ball of its arc length around its base, so a
     part whose bounding box stays outside that ball at every time cannot be touched, however it bends.
-    What base and obstacle travel against one another between two times is added to the ball.
+    What base and obstacle travel against one another between two times is added to the ball. A surface around the base
+    is kept however far it is: a whisker that starts deep inside it must be flagged.
 
     With ``surfaces`` the surface of every obstacle that has one is taken, as by engines that collide meshes; otherwise
     its parts, and the surface only where there are none.
@@ -68,12 +70,20 @@ def reachable(
         obstacle = touched(obstacle, surfaces=surfaces)
         boxes = [part.bounds() for part in obstacle.parts] if obstacle.surface is None else obstacle.surface.boxes
         distances = [max(0.0, float(_box_distance(box, points).min()) - between) for box in boxes]
-        if min(distances) > limit:
+        if min(distances) > limit and not _encloses(obstacle, points[0]):
             continue
         near = tuple(part for part, distance in zip(obstacle.parts, distances, strict=False) if distance <= limit)
         kept.append(replace(obstacle, parts=near))
         nearest = min(nearest, *distances)
     return Reach(tuple(kept), nearest)
+
+
+def _encloses(obstacle: Obstacle, point: NDArray[np.float64]) -> bool:
+    """Return whether a point [3] in the frame of the obstacle lies inside its surface."""
+    surface = obstacle.surface
+    if surface is None or ((point < obstacle.bounds[0]) | (point > obstacle.bounds[1])).any():
+        return False
+    return bool(winding_number(Mesh(surface.vertices, surface.faces), point)[0] > 0.5)
 
 
 def touched(obstacle: Obstacle, *, surfaces: bool) -> Obstacle:

@@ -16,9 +16,10 @@ from numpy.typing import NDArray
 from brainbench.core.devices import usable_processors
 from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.engines.job_pool import run_groups
+from brainbench.stimuli.engines.overlap import overlap_fault
 from brainbench.stimuli.engines.protocol import Job, Progress, Trace, WhiskerEngine, base_rotation
 from brainbench.stimuli.engines.reach import Reach, reachable
-from brainbench.stimuli.engines.trust import check_jobs, passed_unseen
+from brainbench.stimuli.engines.trust import GOT_INSIDE, LARGEST_OVERLAP, check_jobs, fault, passed_unseen
 from brainbench.stimuli.whiskers.chain import Chain
 
 
@@ -121,10 +122,15 @@ class SteppedJob:
         """Return the trace of a whisker that feels nothing."""
         return silent_trace(self.job, self.fidelity, self.record_shape, time.thread_time() - self.started)
 
+    @cached_property
+    def overlap(self) -> tuple[int, str, float]:
+        """First step at which the whisker starts in an object or one reaches its base, why, and overlap at first."""
+        return overlap_fault(self.reach.obstacles, self.chain, *self.pose, self.times)
+
     def end(self, failed: int, reason: str) -> tuple[int, str]:
         """Return the first step that cannot be trusted and why, given what the integration found."""
-        missed, why = passed_unseen(self.job, self.reach, *self.pose, self.times)
-        return (missed, why) if missed < failed else (failed, reason)
+        missed = passed_unseen(self.job, self.reach, *self.pose, self.times)
+        return min(self.overlap[:2], missed, (failed, reason), key=lambda found: found[0])
 
     def frames(self, failed: int) -> FrameSteps:
         """Return the steps around each frame when those from ``failed`` on cannot be trusted."""
@@ -146,7 +152,10 @@ class SteppedJob:
         steps: int,
     ) -> Trace:
         """Return the trace of values at the frames, NaN where they cannot be trusted; ``shape`` in m."""
-        good = frames.good
+        good, penetration = frames.good, max(penetration, self.overlap[2])
+        if not reason and penetration > 2 * LARGEST_OVERLAP:
+            # The contacts of these engines are soft, and when it was deepest they do not tell.
+            good, reason = good & False, fault(GOT_INSIDE, self.job.start, penetration)
         return Trace(
             wrench=np.where(good[:, None], wrench, np.nan),
             contact=contact & good,

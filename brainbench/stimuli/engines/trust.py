@@ -29,8 +29,33 @@ the converged solution (docs/stimuli.md)."""
 LARGEST_CROWDED_SHARE = 0.02
 """Share of the steps with more contacts than are solved together from which a result counts as unstable."""
 
-OK, BENT, LOST = 0, 1, 2
-"""Ends of an integration: in order, with a joint bent beyond :data:`LARGEST_BEND`, with a value that is no number."""
+LARGEST_OVERLAP = 5e-4
+"""Overlap (m) with an object from which a whisker counts as inside it. Twice the way of one step beside an object: tips
+that flick over edges in long steps overlap by some tenths of a millimetre for a step."""
+LARGEST_START_OVERLAP = 2e-5
+"""The same at the start, where nothing has moved yet: what one step undoes, far more than rounding."""
+LARGEST_STRAIN = 0.01
+"""Stretch of the base from which a base force cannot be right. A chain cannot stretch, which beyond this is a worse
+error than any preset has, and keratin yields at some 2 %. Whiskers that brush past objects reach .0003."""
+SUSPICIOUS_SHARE = 0.4
+"""Share of the largest overlap, residual and base force from which a reliable whisker is suspicious."""
+LARGEST_CHANGE = 0.2
+"""Share by which the base force (root mean square over the readings) may change when the step is halved."""
+
+OK, BENT, LOST, STARTED_INSIDE, GOT_INSIDE, AT_BASE = range(6)
+"""Ends of an integration: in order; with a joint bent beyond :data:`LARGEST_BEND`; with a value that is no number; in
+an object from the start, or later; with an object over the base point, where contact has no lever and is not felt."""
+
+
+_FINER = "at {0:.6g} s; choose more links or a smaller time step"
+_FAULTS = {
+    BENT: f"a joint bent by more than {LARGEST_BEND:g} rad, more than a chain of links can represent, {_FINER}",
+    LOST: f"the state stopped being finite, {_FINER}",
+    STARTED_INSIDE: "the whisker starts {1:.3g} mm deep in an object; move one of them",
+    GOT_INSIDE: "the whisker was {1:.3g} mm deep in an object at {0:.6g} s; choose a smaller time step",
+    AT_BASE: "an object reached the whisker's base point, where nothing is felt, at {0:.6g} s; move one of them",
+}
+"""Fault in words, given its time (s) and the deepest overlap (mm)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,7 +63,7 @@ class RunFacts:
     """Facts of simulated whiskers on which :func:`judge` rests: arrays of one shape, times in s."""
 
     status: NDArray[np.int32]
-    """:data:`OK`, :data:`BENT` or :data:`LOST`."""
+    """:data:`OK`, :data:`BENT`, :data:`LOST`, :data:`STARTED_INSIDE`, :data:`GOT_INSIDE` or :data:`AT_BASE`."""
     failed: NDArray[np.floating]
     """Time at which that happened."""
     strength: NDArray[np.floating]
@@ -57,6 +82,10 @@ class RunFacts:
     """Steps for some of whose contacts there was no room."""
     steps: NDArray[np.int32]
     """Steps computed."""
+    depth: NDArray[np.floating]
+    """Deepest overlap with an object (m)."""
+    peak: NDArray[np.floating]
+    """Largest base force (N)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,6 +98,8 @@ class Verdict:
     """True where finer steps may give a result that can be trusted."""
     reasons: NDArray[np.object_]
     """Fault of each whisker in words; empty for a reliable one."""
+    suspicious: NDArray[np.bool_]
+    """True where a reliable whisker is simulated again with half the step, to see whether its force stays."""
 
     @property
     def unstable(self) -> NDArray[np.bool_]:
@@ -82,30 +113,26 @@ def residual(miss: NDArray[np.floating], load: NDArray[np.floating]) -> NDArray[
     ``miss`` and ``load`` are sums over the steps: of the squared change in the last iteration, and of the squared
     forces.
     """
-    return np.sqrt(miss / np.maximum(load, 1e-30))
+    return np.sqrt(miss.astype(float) / np.maximum(load, 1e-30))
 
 
 def judge(facts: RunFacts) -> Verdict:
     """Return which whiskers can be trusted; of several things wrong, what happens first is told.
 
-    Shorter steps mend chains that fold and contacts that are not solved; not a force that only stretching the whisker
-    could relieve, nor an object that is too fast for the search for contacts.
+    Shorter steps mend chains that fold, that get inside an object, and contacts that are not solved; not a force that
+    only stretching the whisker could relieve, an object that is too fast for the search for contacts, nor one that the
+    whisker starts in or that passes through its base.
     """
     until = np.where(facts.status == OK, np.inf, facts.failed)
-    retryable = facts.status != OK
+    retryable = np.isin(facts.status, (BENT, LOST, GOT_INSIDE))
     reasons = np.full(facts.status.shape, "", dtype=object)
 
     def blame(which: NDArray[np.bool_], words: Callable[[tuple[int, ...]], str]) -> None:
         for index in zip(*np.nonzero(which), strict=True):
             reasons[index] = words(index)
 
-    ends = {
-        BENT: f"a joint bent by more than {LARGEST_BEND:g} rad, more than a chain of links can represent",
-        LOST: "the state stopped being finite",
-    }
-    for status, words in ends.items():
-        text = f"{words}, at {{:.6g}} s; choose more links or a smaller time step"
-        blame(facts.status == status, lambda i, text=text: text.format(facts.failed[i]))
+    for status in _FAULTS:
+        blame(facts.status == status, lambda i, status=status: fault(status, facts.failed[i], facts.depth[i]))
     # Faults with a time: the earliest counts, and what comes before it may be used.
     strong = facts.strong_at < until
     until = np.where(strong, facts.strong_at, until)
@@ -123,9 +150,43 @@ def judge(facts: RunFacts) -> Verdict:
     missed = "contact forces missed by {:.0%} (root mean square); choose a smaller time step"
     many = "more contacts than can be solved together in {} of {} steps"
     blame(fast, lambda i: moved.format(facts.travel[i] * MILLI, facts.fast_at[i]))
-    blame(unsolved, lambda i: missed.format(facts.residual[i]))
+    blame(unsolved, lambda i: missed.format(min(facts.residual[i], 10.0)))
     blame(crowded, lambda i: many.format(facts.crowded[i], facts.steps[i]))
-    return Verdict(np.where(unsolved | crowded, -np.inf, until), (retryable & ~fast) | unsolved | crowded, reasons)
+    bad = unsolved | crowded
+    until = np.where(bad, -np.inf, until)
+    suspicious = (until == np.inf) & (
+        (facts.peak > SUSPICIOUS_SHARE * facts.strongest)
+        | (facts.depth > SUSPICIOUS_SHARE * LARGEST_OVERLAP)
+        | (facts.residual > SUSPICIOUS_SHARE * LARGEST_RESIDUAL)
+    )
+    return Verdict(until, (retryable & ~fast) | bad, reasons, suspicious)
+
+
+def fault(status: int, time: float, depth: float) -> str:
+    """Return in words why an integration ended (one of the constants above but ``OK``), with its overlap (m)."""
+    return _FAULTS[status].format(time, depth * MILLI)
+
+
+def halved(verdict: Verdict, change: NDArray[np.floating], which: NDArray[np.bool_]) -> Verdict:
+    """Return the verdict of whiskers of which some (``which``) were simulated again with half the step.
+
+    ``change`` is that of the base force (:func:`force_change`); NaN where the finer run is not reliable.
+    """
+    # NaN fails the comparison and counts as changed.
+    changed, reasons = which & ~(change <= LARGEST_CHANGE), verdict.reasons.copy()
+    for index in zip(*np.nonzero(changed), strict=True):
+        by = f"by {change[index]:.0%}" if np.isfinite(change[index]) else "beyond what can be trusted"
+        reasons[index] = (
+            f"the base force changes {by} (root mean square) with half the step; choose a smaller time step"
+        )
+    until = np.where(changed, -np.inf, verdict.until)
+    return Verdict(until, verdict.retryable | changed, reasons, verdict.suspicious & ~which)
+
+
+def force_change(force: NDArray[np.floating], half: NDArray[np.floating]) -> NDArray[np.floating]:
+    """Return the difference [row, column] of two forces [row, reading, column, 3] over the larger (rms)."""
+    square = [np.einsum("rtcd,rtcd->rc", x, x) for x in (half - force, force, half)]
+    return np.sqrt(square[0] / np.maximum(np.maximum(square[1], square[2]), 1e-30))
 
 
 class Judged(Protocol):
@@ -140,6 +201,10 @@ class Judged(Protocol):
         """Return the results with these whiskers as another simulation of them gave them."""
         ...
 
+    def compared(self, which: NDArray[np.bool_], half: Self) -> Self:
+        """Return the results with these whiskers judged by a simulation of them with half the step (:func:`halved`)."""
+        ...
+
 
 Result = TypeVar("Result", bound=Judged)
 
@@ -147,30 +212,36 @@ Result = TypeVar("Result", bound=Judged)
 def run_with_retries(simulate: Callable[[NDArray[np.bool_] | None, int], Result], retry: int) -> Result:
     """Simulate whiskers, and those that finer steps may mend again: with steps over ``retry``, then over twice that.
 
-    ``simulate`` is called with which whiskers (all when None) and the divisor. A ``retry`` of 1 leaves all as they are.
+    After each of these, suspicious whiskers are compared with half the step (:func:`halved`). ``simulate`` is called
+    with which whiskers (all when None) and the divisor. A ``retry`` of 1 leaves all as they are.
     """
     result = simulate(None, 1)
-    for finer in (retry, 2 * retry) if retry > 1 else ():
-        left = result.verdict.retryable.copy()
-        if not left.any():
-            break
-        result = result.replaced(left, simulate(left, finer))
+    left = np.ones_like(result.verdict.retryable)
+    for finer in (1, retry, 2 * retry) if retry > 1 else ():
+        if finer > 1:
+            left = result.verdict.retryable.copy()
+            if not left.any():
+                break
+            result = result.replaced(left, simulate(left, finer))
+        suspicious = result.verdict.suspicious & left
+        if suspicious.any():
+            result = result.compared(suspicious, simulate(suspicious, 2 * finer))
     return result
 
 
 def strongest_force(whisker: Whisker) -> float:
-    """Return the force (N) that would stretch a whisker's base to twice its length: far beyond what keratin bears.
+    """Return the force (N) that would stretch a whisker's base by :data:`LARGEST_STRAIN`, E A times that.
 
     A chain cannot stretch, so a contact that can only be relieved along it has any force; it counts as unstable.
     """
-    return whisker.young_modulus * np.pi * whisker.base_radius**2
+    return LARGEST_STRAIN * whisker.young_modulus * np.pi * whisker.base_radius**2
 
 
 def too_strong(force: float, strongest: float) -> str:
     """Return in words that a base force (N) cannot be right, beyond the ``strongest`` (N) that the whisker bears."""
     return (
-        f"the base force reached {force:.3g} N, and {strongest:.3g} N stretch the whisker to twice its "
-        "length: an overlap could not be resolved; choose a smaller time step or slower motion"
+        f"the base force reached {force:.3g} N, and {strongest:.3g} N stretch the whisker by {LARGEST_STRAIN:.0%}: an "
+        "overlap could not be resolved; choose a smaller time step or slower motion"
     )
 
 
@@ -239,6 +310,10 @@ def check_jobs(engine: WhiskerEngine, jobs: Sequence[Job], fidelity: Fidelity, w
         raise UsageError(
             f"The backend {engine.name!r} has no solver {fidelity.solver!r}, only {listing(engine.solvers)}; use the "
             "backend 'rod' for it."
+        )
+    if fidelity.twist and not engine.twists:
+        raise UsageError(
+            f"Whiskers of the backend {engine.name!r} bend but do not twist; leave twist out, or use the backend 'rod'."
         )
     if not engine.surfaces:
         require_parts(jobs, engine.name)

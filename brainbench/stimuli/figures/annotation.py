@@ -106,10 +106,13 @@ class Annotation:
     def _row_key(self) -> None:
         rows = sorted({mount.row for mount in self.picture.recording.scene.mounts})
         top = self._edge + 84 * self._unit
-        for place, row in enumerate(rows):
+        key = [(f"row {ROWS[row]}", canvas.ROW_COLORS[row]) for row in rows]
+        if self.picture.recording.unstable:
+            key.append(("unstable, drawn unbent", canvas.UNSTABLE_COLOR))
+        for place, (words, color) in enumerate(key):
             y = top + 26 * self._unit * place
-            self._line([self._edge, self._edge + 30 * self._unit], [y, y], canvas.ROW_COLORS[row], 4)
-            self._text(self._edge + 40 * self._unit, y, f"row {ROWS[row]}", size=15, va="center_baseline")
+            self._line([self._edge, self._edge + 30 * self._unit], [y, y], color, 4)
+            self._text(self._edge + 40 * self._unit, y, words, size=15, va="center_baseline")
 
     def _moment_bar(self) -> None:
         left, top, long, wide = self._edge, self._edge + 84 * self._unit, 220 * self._unit, 16 * self._unit

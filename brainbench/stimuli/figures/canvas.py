@@ -14,6 +14,8 @@ if TYPE_CHECKING:
 
 ROW_COLORS = ("#3466ac", "#1b9aa0", "#d1495b", "#7b4fa3", "#e08e1b")
 """Colours of the whisker rows A to E."""
+UNSTABLE_COLOR = "#111111"
+"""Colour of whiskers whose simulation cannot be trusted."""
 MOMENT_MAP = "plasma"
 """Colour map of bending moments, by its name in matplotlib."""
 INK, PALE = "#22262b", "#6c757d"

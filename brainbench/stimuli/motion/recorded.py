@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brainbench.core.errors import DataError, UsageError, listing, unknown_name
-from brainbench.core.reading.texts import read_numbers
+from brainbench.core.reading.tables import read_numbers
 from brainbench.stimuli.engines.protocol import base_rotation
 from brainbench.stimuli.motion.hinge_angles import follow_angles
 from brainbench.stimuli.motion.trajectories import ROTATIONS, Rotations, Vector

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from brainbench.core.errors import DataFileNotFoundError, UsageError, unknown_name
+from brainbench.core.errors import DataFileNotFoundError, UsageError, shown, unknown_name
 from brainbench.core.files import file_hash
 from brainbench.geometry import Mesh
 from brainbench.stimuli.objects.mesh_solids import mesh_solid, shape_solid
@@ -33,6 +33,10 @@ DIAGONAL = 0.04
 """Size [m] at which objects are built; each sweep scales them to its own."""
 
 
+MOST_CHARACTERS = 4096
+"""Of the name of an object: as many as a path may have."""
+MOST_MEMBERS = 1_000_000
+"""Of a family, in one data set."""
 SURFACE = "surface"
 """Stands for ``surfaces`` where shape families are built; other kinds of objects have their default then."""
 
@@ -86,12 +90,16 @@ def _resolve(text: str, unit: str | None, collision: str | None) -> Iterator[Nam
     if text.startswith("shapenet:"):
         yield from _shapenet(text.removeprefix("shapenet:"), of_meshes)
         return
-    if Path(text).is_file() or glob.has_magic(text):
+    if len(text) > MOST_CHARACTERS:
+        raise UsageError(f"An object is named in at most {MOST_CHARACTERS:,} characters; received {shown(text)}.")
+    if _is_file(text) or glob.has_magic(text):
         yield from _files(text, unit, of_meshes)
         return
     name, _, number = text.partition(":")
-    if number and not (number.isdigit() and int(number) > 0):
-        raise UsageError(f"The number of members in {text!r} is a whole number above zero, as in {name}:20.")
+    if number and not (number.isdecimal() and 0 < int(number) <= MOST_MEMBERS):
+        raise UsageError(
+            f"The number of members in {shown(text)} is a whole number from 1 to {MOST_MEMBERS:,}, as in torus:20."
+        )
     count = int(number or 1)
     if name in COLLECTIONS:
         for family in COLLECTIONS[name]:
@@ -107,6 +115,13 @@ def _resolve(text: str, unit: str | None, collision: str | None) -> Iterator[Nam
         )
     for chosen in range(count) if seed is None else (seed,):
         yield _member(family, chosen, 4_000, collision)
+
+
+def _is_file(text: str) -> bool:
+    try:
+        return Path(text).is_file()
+    except (OSError, ValueError):  # longer than a name may be, or no name at all
+        return False
 
 
 def _member(family: str, seed: int, detail: int, collision: str | None) -> NamedObject:

@@ -72,6 +72,9 @@ class Scene:
     """More animals among the same objects. Whiskers touch objects only, neither one another nor a face."""
     animal: str = "a"
     """Name of the first animal, whose array, whisking and head stand above; used when there are others."""
+    twist: bool = True
+    """Whether whiskers twist when :attr:`Fidelity.twist` leaves it open. False in recipes with shipped recordings or
+    networks, which were made before whiskers could twist."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "objects", tuple(self.objects))

@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
-import contextlib
 import logging
 import multiprocessing
 import os
 import re
 import shutil
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from datetime import timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from brainbench.core.errors import DataError, UsageError
-from brainbench.core.files import read_json, to_plain, write_json
+from brainbench.core.files import lock_folder, read_json, to_plain, write_json
 from brainbench.core.progress import Progress
 from brainbench.stimuli.engines import get_engine
 from brainbench.stimuli.sweeps import running
@@ -92,7 +91,7 @@ def write_data_set(
     """
     folder = Path(out).absolute()
     folder.mkdir(parents=True, exist_ok=True)
-    with _locked(folder):
+    with lock_folder(folder, wait=False):
         _check_config(plan, folder)
         _clean(folder)
         missing = [task for task in plan.shards if not is_complete(folder / task.name, task)]
@@ -125,27 +124,6 @@ def _reporter(total: int, what: str, progress: Progress | None) -> Callable[[int
             _LOG.info("%d of %d sweeps, %.3g sweeps/s, about %s left", done, total, rate, rest)
 
     return report
-
-
-@contextlib.contextmanager
-def _locked(folder: Path) -> Iterator[None]:
-    """Hold a lock on the folder, which the system releases when this process ends in whatever way."""
-    try:
-        import fcntl
-    except ImportError:  # no such locks on this system
-        yield
-        return
-    handle = os.open(folder, os.O_RDONLY)
-    try:
-        try:
-            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as error:
-            raise UsageError(f"Another process is writing {str(folder)!r}; wait for it, or end it.") from error
-        except OSError as error:
-            _LOG.warning("%s cannot be locked (%s); start no second run there", folder, error)
-        yield
-    finally:
-        os.close(handle)
 
 
 def _check_config(plan: GenerationPlan | SweepTable, folder: Path) -> None:

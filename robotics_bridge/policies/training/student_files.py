@@ -8,14 +8,15 @@ from typing import Any
 
 import torch
 from safetensors import SafetensorError, safe_open
-from safetensors.torch import load_file, save_file
+from safetensors.torch import save_file
 from tensordict import TensorDict
 
 from brainbench.core.errors import BrainbenchError, DataError
 from brainbench.core.files import atomic_path
+from brainbench.core.reading.tensors import read_tensors
 from robotics_bridge.policies.contract import JOINTS, MOST_NUMBERS
 from robotics_bridge.policies.encoders.arms import EncoderConfig
-from robotics_bridge.policies.schema import Values, require_finite
+from robotics_bridge.policies.schema import Values
 from robotics_bridge.policies.shipped import policy_path
 from robotics_bridge.policies.student import TACTILE, TactilePolicy
 from robotics_bridge.policies.training.distill_config import EARLIER_TWIST, DistillConfig
@@ -79,14 +80,13 @@ def load_student(folder: str | Path, *, device: str = "cpu") -> tuple[TactilePol
         _require_sizes(folder / MODEL, config, shapes)
         with torch.random.fork_rng(devices=[]):
             student = build_student(config, shapes, list(shapes), actions)
-        weights = load_file(folder / MODEL)
+        weights = read_tensors(folder / MODEL, "file of weights (safetensors)")
         student.load_state_dict(weights)
     except BrainbenchError:
         raise
     except (SafetensorError, RuntimeError, ValueError, TypeError, LookupError, OSError) as error:
         first = " ".join(str(error).split())[:120]
         raise DataError(f"The weights in {str(folder)!r} are damaged or of another student ({first}).") from error
-    require_finite(folder / MODEL, weights)
     return student.to(device).eval(), dict(described.values)
 
 

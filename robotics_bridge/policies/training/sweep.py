@@ -7,7 +7,6 @@ noise; ``encoders``, the arms of tactile encoders there; or one type's name, all
 
 from __future__ import annotations
 
-import tomllib
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -15,7 +14,9 @@ from itertools import product
 from pathlib import Path
 from typing import Any
 
-from brainbench.core.errors import DataError, DataFileNotFoundError, UsageError, unknown_name
+from brainbench.core.errors import UsageError, shown, unknown_name
+from brainbench.core.reading.regular import readable
+from brainbench.core.reading.texts import read_toml
 from robotics_bridge.hands.layouts import check_names
 from robotics_bridge.hands.observations import observation_type
 from robotics_bridge.policies.training.distill_config import DistillConfig
@@ -133,13 +134,12 @@ def read_sweep(path: str | Path = PUBLISHED) -> StudentSweep:
         DataError: the file is no TOML.
         UsageError: a key or name in it is unknown, or an entry is incomplete.
     """
-    path = Path(path)
-    if not path.is_file():
-        raise DataFileNotFoundError(f"There is no sweep {str(path)!r}; the published one is {PUBLISHED.name}.")
-    try:
-        document = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise DataError(f"{str(path)!r} is not a TOML file ({error}).") from error
+    document = read_toml(path, f"sweep (the published one is {PUBLISHED.name})")
+    with readable(path, "sweep of students"):
+        return _sweep(Path(path), document)
+
+
+def _sweep(path: Path, document: Mapping[str, Any]) -> StudentSweep:
     _known(document, _KEYS, "key of a sweep")
     entries = tuple(_entry(item, document.get("settings", {})) for item in document.get("entries", ()))
     if not entries:
@@ -169,7 +169,9 @@ def read_sweep(path: str | Path = PUBLISHED) -> StudentSweep:
             check_names(resolution, placement)
     for arm in sweep.arms:
         if "encoder" not in arm:
-            raise UsageError(f"An arm of the sweep {path.name!r} names no 'encoder': {dict(arm)!r}.")
+            raise UsageError(f"An arm of the sweep {path.name!r} names no 'encoder': {shown(dict(arm))}.")
+    # Every student is made once, so that no value is found wrong in the middle of a sweep.
+    sweep.students()
     return sweep
 
 
@@ -177,7 +179,7 @@ def _entry(item: Mapping[str, Any], settings: Mapping[str, Any]) -> SweepEntry:
     _known(item, _ENTRY, "key of a sweep's entry")
     for key in ("task", "hand", "placements"):
         if not item.get(key):
-            raise UsageError(f"An entry of a sweep needs {key!r}; received {dict(item)!r}.")
+            raise UsageError(f"An entry of a sweep needs {key!r}; received {shown(dict(item))}.")
     own = {**settings, **item.get("settings", {})}
     if "iterations" in item:
         own["iterations"] = item["iterations"]

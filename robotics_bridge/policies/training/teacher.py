@@ -21,9 +21,10 @@ import torch
 
 from brainbench.core.errors import BrainbenchError, DataError, DataFileNotFoundError, UsageError, missing_dependency
 from brainbench.core.files import file_hash, provenance, read_json, write_json
+from brainbench.core.reading.tensors import check_finite
 from robotics_bridge.envs.rsl_rl import RslRlEnv
 from robotics_bridge.policies.evaluate import Policy
-from robotics_bridge.policies.schema import Values, require_finite
+from robotics_bridge.policies.schema import Values
 from robotics_bridge.policies.shipped import policy_path
 from robotics_bridge.policies.training import state_tree
 from robotics_bridge.tasks.settings import TeacherSettings
@@ -374,7 +375,7 @@ def load_teacher(run: str | Path, env: Env) -> Policy:
     settings = replace(env.task.teacher, **{name: found[name] for name in _ACTOR if name in found})
     weights = state_tree.load(file).get("actor")
     weights = weights if isinstance(weights, dict) else {}
-    require_finite(file, weights)
+    check_finite(weights, str(file))
     biases = [weights.get(f"mlp.{2 * layer}.bias") for layer in range(len(settings.hidden))]
     if [list(getattr(bias, "shape", ())) for bias in biases] != [[width] for width in settings.hidden]:
         raise DataError(f"The weights in {str(file)!r} are of another policy than config.json describes.")

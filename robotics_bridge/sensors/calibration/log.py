@@ -5,7 +5,6 @@ Letters: T reading, N probe. An episode is (x [T], y [T, N]): the true signal an
 
 from __future__ import annotations
 
-import csv
 import os
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,7 +12,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from brainbench.core.errors import DataError, DataFileNotFoundError, UsageError
+from brainbench.core.errors import DataError, UsageError, listing
+from brainbench.core.reading.tables import read_columns
 
 Episode = tuple["NDArray[np.float64]", "NDArray[np.float64]"]
 
@@ -59,30 +59,27 @@ def read_log(path: str | os.PathLike[str]) -> Log:
         DataError: it has no time or probe, fewer than 20 rows, uneven steps, or holds what is no number.
     """
     name = Path(path).name
-    if not Path(path).is_file():
-        raise DataFileNotFoundError(f"There is no log {str(path)!r}.")
-    with Path(path).open(newline="", encoding="utf-8-sig") as stream:
-        rows = list(csv.reader(stream))
-    header = [cell.strip() for cell in rows[0]] if rows else []
+    header, table = read_columns(path, "log")
     probes = [cell for cell in header if cell.lower() not in ("time", "reference", "episode")]
     if "time" not in [cell.lower() for cell in header] or not probes:
-        raise DataError(f"{name} needs a header with 'time' (s) and at least one column of readings; found {header}.")
-    if len(rows) < 20:
-        raise DataError(f"{name} holds {len(rows) - 1} readings; a calibration needs at least 20 (better thousands).")
-    try:
-        table = np.array([[float(cell) for cell in row] for row in rows[1:] if row], dtype=float)
-    except ValueError as error:
-        raise DataError(f"{name} holds a cell that is no number ({error}).") from error
-    if table.ndim != 2 or table.shape[1] != len(header) or not np.isfinite(table).all():
-        raise DataError(f"{name}: every row needs {len(header)} finite numbers.")
+        raise DataError(
+            f"{name} needs a header with 'time' (s) and at least one column of readings; found {listing(header)}."
+        )
+    if len(table) < 20:
+        raise DataError(f"{name} holds {len(table)} readings; a calibration needs at least 20 (better thousands).")
     columns = {cell.lower(): table[:, index] for index, cell in enumerate(header)}
     readings = np.stack([table[:, header.index(probe)] for probe in probes], axis=1)
-    episode = columns["episode"].astype(int) if "episode" in columns else None
+    episode = None
+    if "episode" in columns:
+        episode = columns["episode"].astype(np.int64)
+        if (np.abs(columns["episode"]) > 1e9).any() or (episode != columns["episode"]).any():
+            raise DataError(f"{name}: episodes are whole numbers of at most a billion.")
     log = Log(columns["time"], readings, columns.get("reference"), episode, tuple(probes))
     gaps = np.diff(log.time)[np.diff(episode) == 0] if episode is not None else np.diff(log.time)
-    if gaps.min() <= 0 or gaps.max() > 1.5 * gaps.min():
+    if not len(gaps) or gaps.min() <= 0 or gaps.max() > 1.5 * gaps.min():
         raise DataError(
-            f"{name}: times must rise in equal steps within an episode; found {gaps.min():g}…{gaps.max():g} s."
+            f"{name}: times must rise in equal steps within an episode; found "
+            f"{f'{gaps.min():g}…{gaps.max():g} s' if len(gaps) else 'no two rows of one episode'}."
         )
     return log
 

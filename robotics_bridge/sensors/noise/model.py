@@ -15,8 +15,9 @@ from dataclasses import dataclass, fields
 from typing import Any
 
 from brainbench.core.devices import warp
-from brainbench.core.errors import DataError, UsageError, unknown_name
+from brainbench.core.errors import DataError, UsageError, listing, unknown_name
 from brainbench.core.files import read_json, to_plain, write_json
+from brainbench.core.reading.regular import readable
 
 BASE_KNOBS = frozenset({"read_delay", "jitter", "white", "bias", "walk", "quantum"})
 """Knobs of every sensor (table 4.2)."""
@@ -140,15 +141,16 @@ class Noise:
         Raises:
             DataError: the file is missing or is no preset.
         """
-        document = read_json(path)
+        document = read_json(path, "noise preset")
         knobs = document.get("noise") if isinstance(document, dict) else None
         if not isinstance(knobs, dict) or document.get("format") != _FORMAT:
             raise DataError(f"{str(path)!r} is no noise preset (format {_FORMAT!r}).")
         names = {field.name for field in fields(cls)}
         if unknown := [name for name in knobs if name not in names]:
-            raise DataError(f"{str(path)!r} holds unknown noise knobs: {', '.join(map(repr, unknown))}.")
+            raise DataError(f"{str(path)!r} holds unknown noise knobs: {listing(unknown)}.")
         values: dict[str, Any] = {name: tuple(item) if isinstance(item, list) else item for name, item in knobs.items()}
-        return cls(**values)
+        with readable(path, "noise preset"):
+            return cls(**values)
 
     @classmethod
     def preset(cls, name: str) -> Noise:

@@ -7,21 +7,13 @@ import pytest
 from tests.factories.reading_surfaces import SURFACES
 from tests.factories.reading_trials import attempt
 
-NOT_YET = ("WHISKiT names",)
-"""Surfaces whose reader does not use the reading layer yet."""
-
 
 def _failures(surface, good, seeds):
     outcomes = {seed: attempt(surface, good, seed) for seed in seeds}
     return {seed: outcome for seed, outcome in outcomes.items() if outcome.kind not in ("refused", "accepted")}
 
 
-def _case(surface):
-    marks = [pytest.mark.xfail(reason="its reader is being rewritten", run=False)] if surface.name in NOT_YET else []
-    return pytest.param(surface, marks=marks, id=surface.name.replace(", ", "-").replace(" ", "-"))
-
-
-CASES = [_case(surface) for surface in SURFACES]
+CASES = [pytest.param(surface, id=surface.name.replace(", ", "-").replace(" ", "-")) for surface in SURFACES]
 
 
 @pytest.fixture(scope="module")
@@ -47,7 +39,7 @@ def test_much_damage_is_refused_in_one_sentence(surface, goods):
     assert _failures(surface, goods(surface), range(500)) == {}
 
 
-@pytest.mark.parametrize("surface", [case for case in CASES if case.values[0].name not in NOT_YET])
+@pytest.mark.parametrize("surface", CASES)
 def test_what_is_whole_is_read(surface, goods, tmp_path):
     good = goods(surface)
     copy = shutil.copytree(good.parent, tmp_path / "copy") / good.name

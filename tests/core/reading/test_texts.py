@@ -1,10 +1,9 @@
 import json
 
-import numpy as np
 import pytest
 
 from brainbench.core.errors import DataError
-from brainbench.core.reading.texts import parse_json, parse_toml, read_numbers
+from brainbench.core.reading.texts import parse_json, parse_toml, read_mapping
 
 
 @pytest.mark.parametrize(
@@ -16,6 +15,8 @@ from brainbench.core.reading.texts import parse_json, parse_toml, read_numbers
         (f'{{"a": {"9" * 5000}}}', "file"),
         ("[" * 70 + "]" * 70, "64 levels"),
         ("[" * 100_000, "deep"),
+        ('{"a": ["\\ud800"]}', r"a\[0\]"),
+        ('{"\\udfff": 1}', "file"),
     ],
 )
 def test_json_is_bounded_in_digits_depth_and_range(text, told):
@@ -34,11 +35,18 @@ def test_plain_values_pass_unchanged():
     assert parse_json(json.dumps(value), "file") == value
 
 
-def test_a_table_of_numbers_names_the_row_that_is_none(tmp_path):
-    path = tmp_path / "a.csv"
-    path.write_text("1,2,\n\nnan,4\r\n")
-    np.testing.assert_array_equal(read_numbers(path), [[1, 2], [np.nan, 4]])
-    for text, told in (("1,2\n3,x\n", "row 2"), ("1,2\n3\n", "row 2"), ("\n", "no table")):
-        path.write_text(text)
+def test_the_ending_tells_the_language_and_aliases_are_refused(tmp_path):
+    pytest.importorskip("yaml")
+    for name, text in (("a.json", '{"a": {"b": 1}}'), ("a.toml", "a.b = 1"), ("a.yaml", "a:\n  b: 1\n")):
+        (tmp_path / name).write_text(text)
+        assert read_mapping(tmp_path / name) == {"a": {"b": 1}}
+    laughs = "a: &a [x, x]\n" + "".join(f"b{i}: &b{i} [*a, *a]\n" for i in range(3))
+    for text, told in (
+        (laughs, "alias"),
+        ("a: .nan", "nan"),
+        ("a: " + "[" * 50_000, "deep"),
+        ("a: [", "YAML"),
+    ):
+        (tmp_path / "a.yaml").write_text(text)
         with pytest.raises(DataError, match=told):
-            read_numbers(path)
+            read_mapping(tmp_path / "a.yaml")

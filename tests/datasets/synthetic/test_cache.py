@@ -5,6 +5,7 @@ import pytest
 
 from brainbench.core.errors import DataError
 from brainbench.core.files import file_hash
+from brainbench.core.reading import hdf5
 from brainbench.datasets import open_recordings
 from brainbench.datasets.synthetic import PopulationDesign, ResponseGeometry, write_files
 from brainbench.datasets.synthetic.cache import ensure_recordings
@@ -89,3 +90,10 @@ def test_no_folder_is_left_after_a_failure(cache):
     with pytest.raises(DataError):
         ensure_recordings("small", 1, make=fail)
     assert list(cache.iterdir()) == []
+
+
+def test_files_whose_hash_was_just_checked_are_opened_at_once(monkeypatch):
+    ensure()
+    made = ensure()
+    monkeypatch.setattr(hdf5._Worker, "ask", lambda *_: pytest.fail("was looked through by another process"))
+    assert open_recordings(made).sizes["trial"] > 0

@@ -56,7 +56,7 @@ def test_what_holds_no_finite_weights_is_refused(tmp_path):
     with pytest.raises(DataError, match="holds no weights"):
         read_weights(tmp_path / "x.ckpt")
     torch.save({"state_dict": {"a": torch.tensor([1.0, float("nan")])}}, tmp_path / "x.ckpt")
-    with pytest.raises(DataError, match="not finite: 'a'"):
+    with pytest.raises(DataError, match=r"'a'.*not finite"):
         read_weights(tmp_path / "x.ckpt")
     with pytest.raises(DataFileNotFoundError, match=r"gone\.ckpt"):
         read_weights(tmp_path / "gone.ckpt")

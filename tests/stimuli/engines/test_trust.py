@@ -10,11 +10,14 @@ from brainbench.core.errors import UsageError
 from brainbench.stimuli.engines.protocol import Job, StillFollicle
 from brainbench.stimuli.engines.reach import reachable
 from brainbench.stimuli.engines.trust import (
+    AT_BASE,
     BENT,
+    GOT_INSIDE,
     LOST,
-    OK,
-    RunFacts,
+    STARTED_INSIDE,
     Verdict,
+    force_change,
+    halved,
     judge,
     passed_unseen,
     require_parts,
@@ -25,6 +28,7 @@ from brainbench.stimuli.engines.trust import (
 )
 from brainbench.stimuli.objects.obstacle import Capsule, Obstacle, Sphere, TriangleMesh
 from brainbench.stimuli.whiskers.whisker import Whisker
+from tests.factories.trust import facts
 
 WHISKER = Whisker(0.02, 50e-6, 5e-6, young_modulus=4e9, density=1260.0, damping_ratio=0.3)
 TIMES = np.linspace(0.0, 0.01, 11)
@@ -71,9 +75,9 @@ def test_an_object_that_flies_farther_than_it_is_thick_may_pass_unseen(obstacle,
     assert passed_unseen(job, reach, *StillFollicle().pose(fine), fine) == (200, "")
 
 
-def test_the_force_that_no_whisker_bears_is_its_stiffness_against_stretching():
-    # E A = 4e9 Pa × π (50 µm)²; keratin breaks at some hundredth of it.
-    assert strongest_force(WHISKER) == pytest.approx(31.4159, rel=1e-4)
+def test_the_force_that_no_whisker_bears_stretches_its_base_by_a_hundredth():
+    # .01 E A = .01 × 4e9 Pa × π (50 µm)²; keratin yields at some .02.
+    assert strongest_force(WHISKER) == pytest.approx(0.314159, rel=1e-4)
 
 
 def test_a_surface_without_parts_is_refused_in_words():
@@ -84,15 +88,6 @@ def test_a_surface_without_parts_is_refused_in_words():
         require_parts([Job(WHISKER, StillFollicle(), (parts, bare), TIMES[1:])], "mujoco")
 
 
-def _facts(**changed):
-    """Facts of one whisker in good order but for what is changed."""
-    values = {
-        "status": OK, "failed": 0.0, "strength": 0.0, "strong_at": np.inf, "strongest": 30.0, "travel": 0.0,
-        "fast_at": np.inf, "residual": 0.01, "crowded": 0, "steps": 100,
-    }  # fmt: skip
-    return RunFacts(**{name: np.array([value]) for name, value in (values | changed).items()})
-
-
 @pytest.mark.parametrize(
     ("changed", "until", "retryable", "words"),
     [
@@ -100,6 +95,9 @@ def _facts(**changed):
         ({"crowded": 2}, np.inf, False, ""),
         ({"status": BENT, "failed": 0.3}, 0.3, True, "a joint bent by more than 1.5 rad"),
         ({"status": LOST, "failed": 0.3}, 0.3, True, "stopped being finite"),
+        ({"status": STARTED_INSIDE, "failed": 0.0, "depth": 4e-3}, 0.0, False, "starts 4 mm deep"),
+        ({"status": GOT_INSIDE, "failed": 0.3, "depth": 7e-4}, 0.3, True, "0.7 mm deep in an object at 0.3 s"),
+        ({"status": AT_BASE, "failed": 0.3}, 0.3, False, "base point, where nothing is felt, at 0.3 s"),
         ({"strength": 31.0, "strong_at": 0.2}, 0.2, False, "reached 31 N, and 30 N stretch"),
         ({"strength": 31.0, "strong_at": 0.2, "status": BENT, "failed": 0.3}, 0.2, True, "stretch the whisker"),
         ({"strength": 31.0, "strong_at": 0.4, "status": BENT, "failed": 0.3}, 0.3, True, "a joint bent"),
@@ -114,7 +112,7 @@ def _facts(**changed):
 def test_what_goes_wrong_first_is_told_and_finer_steps_are_tried_where_they_may_mend_it(
     changed, until, retryable, words
 ):
-    verdict = judge(_facts(**changed))
+    verdict = judge(facts(**changed))
     assert verdict.until.tolist() == [until]
     assert verdict.retryable.tolist() == [retryable]
     assert verdict.unstable.tolist() == [until < np.inf]
@@ -126,6 +124,36 @@ def test_the_residual_is_what_changed_last_over_the_forces():
     np.testing.assert_allclose(residual(np.array([0.04, 0.0]), np.array([4.0, 0.0])), [0.1, 0.0])
 
 
+@pytest.mark.parametrize(
+    ("changed", "suspicious"),
+    [
+        ({}, False),
+        ({"peak": 13.0}, True),
+        ({"depth": 2.1e-4}, True),
+        ({"residual": 0.021}, True),
+        ({"residual": 0.06}, False),
+        ({"status": BENT, "failed": 0.3, "depth": 3e-4}, False),
+    ],
+)
+def test_whiskers_near_a_limit_are_suspicious_and_those_beyond_it_are_not(changed, suspicious):
+    assert judge(facts(**changed)).suspicious.tolist() == [suspicious]
+
+
+def test_a_force_that_changes_by_a_fifth_with_half_the_step_is_flagged_and_tried_again():
+    verdict, which = judge(facts(depth=3e-4)), np.array([True])
+    kept = halved(verdict, np.array([0.19]), which)
+    assert (kept.unstable.tolist(), kept.suspicious.tolist(), kept.reasons[0]) == ([False], [False], "")
+    for change, words in ((0.23, "by 23%"), (np.nan, "beyond what can be trusted")):
+        found = halved(verdict, np.array([change]), which)
+        assert (found.until.tolist(), found.retryable.tolist()) == ([-np.inf], [True])
+        assert words in found.reasons[0]
+    assert not halved(verdict, np.array([np.nan]), ~which).unstable.any()
+    force = np.zeros((1, 4, 2, 3))
+    force[..., 0] = 1.0
+    np.testing.assert_allclose(force_change(force, force * [[1.25], [0.8]]), [[0.2, 0.2]])
+    assert force_change(force, -force).tolist() == [[2.0, 2.0]]
+
+
 class _Runs:
     """Whiskers of which each is in order from some fineness of its steps on."""
 
@@ -135,7 +163,8 @@ class _Runs:
     @property
     def verdict(self):
         bad = self.finer < self.needs
-        return Verdict(np.where(bad, 0.0, np.inf), bad & (self.needs < 1000), np.where(bad, "bad", ""))
+        none = np.zeros_like(bad)
+        return Verdict(np.where(bad, 0.0, np.inf), bad & (self.needs < 1000), np.where(bad, "bad", ""), none)
 
     def replaced(self, which, finer):
         self.finer[which] = finer.finer

@@ -87,7 +87,7 @@ def test_a_shapenet_tree_names_its_models_and_their_classes(tmp_path):
     [
         (["torsu"], "Unknown object 'torsu'; did you mean 'torus'"),
         (["procedural-42:3"], "did you mean 'procedural-24'"),
-        (["torus:none"], "whole number above zero"),
+        (["torus:none"], "1,000,000"),
         (["torus-2:3"], "write torus-2 or torus:3"),
         (["torus", "torus-0"], "same name, 'torus-0'"),
         ([], "There is no object"),

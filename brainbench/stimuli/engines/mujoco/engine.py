@@ -35,6 +35,7 @@ class MujocoWhiskerEngine(SteppedEngine):
     """Runs whisker jobs in MuJoCo."""
 
     name = "mujoco"
+    twists = True
     package = "mujoco-core"
 
     @contextlib.contextmanager

@@ -16,6 +16,7 @@ from brainbench.core.devices import pick_device, usable_processors
 from brainbench.core.progress import Progress as NamedProgress
 from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.engines.job_pool import run_groups
+from brainbench.stimuli.engines.planarity import stays_in_plane
 from brainbench.stimuli.engines.protocol import Job, Progress, Trace, WhiskerEngine
 from brainbench.stimuli.engines.reach import Reach, reachable
 from brainbench.stimuli.engines.rod.compilation import load_kernels
@@ -51,6 +52,7 @@ class RodEngine(WhiskerEngine):
     package = "warp-lang"
     devices = ("cpu", "cuda")
     solvers = ("dynamic", "quasistatic")
+    twists = True
     surfaces = True
     retries = True
     batches = True
@@ -66,7 +68,10 @@ class RodEngine(WhiskerEngine):
             what = f"compiling the whisker solver for {capacity} links (once; it is kept)"
             tell = progress or (lambda done, total, what: None)
             real = real_type(fidelity)
-            load_kernels(device, real, capacity, compiling=lambda begins: tell(0 if begins else 1, 1, what))
+            hinges = 2 + (fidelity.twist is not False)
+            load_kernels(
+                device, real, capacity, hinges=hinges, compiling=lambda begins: tell(0 if begins else 1, 1, what)
+            )
 
         with ThreadPoolExecutor(max_workers=max(1, len(sizes))) as pool:
             list(pool.map(load, sizes))
@@ -119,6 +124,8 @@ class _Task:
     """[n] s at which base and obstacles were looked at."""
     pose: tuple[NDArray[np.float64], NDArray[np.float64]]
     """Base point [n, 3] (m) and angles [n, 3] (rad) at these times."""
+    twists: bool
+    """Whether it may leave its plane, and may twist at this fidelity."""
 
 
 def _simulate(
@@ -138,9 +145,18 @@ def _simulate(
         if is_silent(job, reach, position, euler):
             traces[index] = silent_trace(job, fidelity, record_shape, time.thread_time() - started)
         else:
-            tasks[index] = _Task(job, reach, seen, (position, euler))
-    if not tasks:
-        return traces
+            twists = fidelity.twist is not False and not stays_in_plane(job, reach, position, euler, seen)
+            tasks[index] = _Task(job, reach, seen, (position, euler), twists)
+    for twists in (False, True):
+        some = {index: task for index, task in tasks.items() if task.twists == twists}
+        traces |= _simulate_alike(some, retry, fidelity, device, record_shape) if some else {}
+    return traces
+
+
+def _simulate_alike(
+    tasks: dict[int, _Task], retry: int, fidelity: Fidelity, device: Any, record_shape: bool
+) -> dict[int, Trace]:
+    """Run tasks of which all or none twist in one launch."""
     given, seconds = list(tasks.values()), np.zeros(len(tasks))
 
     def launch(which: NDArray[np.bool_] | None, finer: int) -> LaunchResult:
@@ -151,7 +167,7 @@ def _simulate(
 
     result = run_with_retries(launch, retry)
     found = (_trace(result, row, task.job, fidelity, seconds[row]) for row, task in enumerate(given))
-    return traces | dict(zip(tasks, found, strict=True))
+    return dict(zip(tasks, found, strict=True))
 
 
 def _launch(
@@ -181,7 +197,7 @@ def _launch(
     packed = PackedJobs(whisker, scene, base, row, np.zeros_like(row), [task.job.loads for task in tasks])
     # Compiling is done once; it is no cost of a whisker.
     paused = time.thread_time()
-    solver = WhiskerSolver(list(chains.values()), fidelity, device, shapes.needs)
+    solver = WhiskerSolver(list(chains.values()), fidelity, device, shapes.needs, twists=tasks[0].twists)
     started += time.thread_time() - paused
     shortest = solver.shortest[whisker].tolist()
     fast = np.array([_too_fast(task, step) for task, step in zip(tasks, shortest, strict=True)])

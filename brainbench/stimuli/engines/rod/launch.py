@@ -17,7 +17,7 @@ from brainbench.stimuli.engines.rod.limits import FINEST, LIGHT
 from brainbench.stimuli.engines.rod.packing import PackedJobs, PackedMotions, capacity_for, pack_chains
 from brainbench.stimuli.engines.rod.scheduling import Slices, allocate, make_problems
 from brainbench.stimuli.engines.rod.shapes import PackedShapes
-from brainbench.stimuli.engines.trust import RunFacts, Verdict, judge, residual, strongest_force
+from brainbench.stimuli.engines.trust import RunFacts, Verdict, force_change, halved, judge, residual, strongest_force
 from brainbench.stimuli.engines.units import MILLI
 from brainbench.stimuli.whiskers.chain import Chain
 
@@ -71,11 +71,21 @@ class LaunchResult:
         for mine, theirs in ((self.counts, finer.counts), (vars(self.verdict), vars(finer.verdict))):
             for name in mine:
                 take(mine[name], theirs[name])
-        take(self.depth, finer.depth)
-        take(self.residual, finer.residual)
+        for name in ("depth", "residual"):
+            take(getattr(self, name), getattr(finer, name))
         if self.points is not None and self.contact_wrench is not None:
             self.points[rows], self.contact_wrench[rows] = finer.points, finer.contact_wrench
         self.retried |= which
+        return self
+
+    def compared(self, which: NDArray[np.bool_], half: LaunchResult) -> LaunchResult:
+        """Return these results, some jobs [row, column] judged by another launch, of their rows alone."""
+        rows = np.flatnonzero(which.any(axis=1))
+        change = np.full(which.shape, np.nan)
+        found = force_change(self.wrench[rows, ..., :3], half.wrench[..., :3])
+        change[rows] = np.where(half.verdict.unstable, np.nan, found)
+        self.verdict = halved(self.verdict, change, which)
+        self.counts["steps"][rows] += np.where(which[rows], half.steps, 0)
         return self
 
 
@@ -89,6 +99,7 @@ class WhiskerSolver:
         device: Any,
         needs: int,
         *,
+        twists: bool = True,
         block: int | None = None,
         sliced: bool = False,
         **options: Any,
@@ -98,6 +109,7 @@ class WhiskerSolver:
         Args:
             chains, fidelity: whiskers, with their time step, precision and solver.
             device, needs, options: as for :func:`brainbench.stimuli.engines.rod.compilation.load_kernels`.
+            twists: False when nothing twists the whiskers: their joints then have two hinges instead of three.
             block: threads of a block on a GPU; Warp's choice when None.
             sliced: True when whiskers pause for distances and contact forces (:class:`.scheduling.Slices`).
         """
@@ -105,10 +117,11 @@ class WhiskerSolver:
         self.real = real_type(fidelity)
         self.capacity = capacity_for(max(chain.links for chain in chains))
         self.quasistatic = fidelity.solver == "quasistatic"
+        hinges = 2 + twists
         if options:
             options["sliced"] = sliced
-        self.kernels = load_kernels(device, self.real, self.capacity, needs, **options)
-        packed = pack_chains(self.capacity, self.chains, self.quasistatic)
+        self.kernels = load_kernels(device, self.real, self.capacity, needs, hinges=hinges, **options)
+        packed = pack_chains(self.capacity, self.chains, self.quasistatic, hinges)
         self.chain_arrays = to_struct(self.kernels.structs.ChainArrays, packed, device)
         self.block = {} if block is None else {"block_dim": block}
         self.steps = np.array([fidelity.step_of(chain) * MILLI for chain in self.chains])
@@ -197,18 +210,22 @@ class WhiskerSolver:
         counts = {name: table(getattr(out, name).numpy()) for name in _COUNTS}
         numbers = {name: getattr(out, name).numpy() for name in _NUMBERS}
         wrench, missed = out.wrench.numpy(), table(residual(numbers["miss"], numbers["load"]))
+        depth = table(numbers["depth"].astype(float)) / MILLI
+        force = np.sqrt(np.einsum("...d,...d", wrench[..., :3], wrench[..., :3]))
         facts = RunFacts(
             counts["status"],
             table(numbers["failed"].astype(float)) / MILLI,
-            *_strong(wrench, table(self.strongest[jobs.whisker]), readings),
+            *_strong(force, table(self.strongest[jobs.whisker]), readings),
             travel=np.zeros(size) if travel is None else travel,
             fast_at=np.full(size, np.inf) if fast_at is None else fast_at,
             residual=missed,
             crowded=counts["crowded"],
             steps=counts["steps"],
+            depth=depth,
+            peak=force.max(axis=1),
         )
-        contact, depth = out.contact.numpy(), table(numbers["depth"].astype(float)) / MILLI
-        result = LaunchResult(wrench, contact, counts, depth, missed, judge(facts), np.zeros(size, dtype=bool))
+        contact, again = out.contact.numpy(), np.zeros(size, dtype=bool)
+        result = LaunchResult(wrench, contact, counts, depth, missed, judge(facts), again)
         result.seconds = dict(zip(("upload", "kernel"), np.diff(clock).tolist(), strict=True))
         if record_shape:
             result.points = np.moveaxis(out.points.numpy().astype(float) / MILLI, 2, 0)
@@ -223,11 +240,9 @@ def real_type(fidelity: Fidelity) -> type:
 
 
 def _strong(
-    wrench: NDArray[np.floating], strongest: NDArray[np.float64], readings: NDArray[np.float64]
+    strength: NDArray[np.floating], strongest: NDArray[np.float64], readings: NDArray[np.float64]
 ) -> tuple[NDArray[np.floating], NDArray[np.float64], NDArray[np.float64]]:
     """Return ``strength``, ``strong_at`` and ``strongest`` of :class:`RunFacts`, [row, column]."""
-    force = wrench[..., :3]
-    strength = np.sqrt(np.einsum("...d,...d", force, force))
     # Written as "not at most" so that NaN counts as too strong.
     wild = ~(strength <= strongest[:, None])
     first = wild.argmax(axis=1)

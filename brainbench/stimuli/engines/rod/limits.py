@@ -1,6 +1,15 @@
 """Limits of the ``rod`` solver: what it looks at, how long it tries, and when it gives up. mm, ms, rad."""
 
-from brainbench.stimuli.engines.trust import BENT, LARGEST_BEND, LOST  # noqa: F401 — kernels take every limit from here
+from brainbench.stimuli.engines.trust import (  # noqa: F401 — kernels take every limit from here
+    AT_BASE,
+    BENT,
+    GOT_INSIDE,
+    LARGEST_BEND,
+    LARGEST_OVERLAP,
+    LARGEST_START_OVERLAP,
+    LOST,
+    STARTED_INSIDE,
+)
 
 CONTACTS = 8, 14
 """Contacts of one whisker that are solved together, of up to 12 links and of more; the tightest are kept when there are
@@ -11,6 +20,8 @@ CONTACT_ROUNDS = 4
 """Times that contacts are added to a step because the others press the whisker onto them."""
 CLOSED = 1e-3
 """Overlap (mm) at the end of a step from which a place counts as pressed upon."""
+LARGEST_FORCE = 1e6
+"""Force (mN) of a contact from which it counts as one that no force can resolve."""
 SWEEPS = 8
 """Most Gauss-Seidel sweeps over the contacts of one step."""
 FOLD = 1.2
@@ -25,6 +36,10 @@ REST = 1e-6
 """Bend (rad) and rate (rad/ms) of every joint below which a whisker without contact is at rest."""
 FAR = 3.0
 """Farthest distance (mm) that a query finds; a link further away is asked for again when it may have come nearer."""
+ANYWHERE = 1e6
+"""The same (mm) for a link that may have got inside unseen: the nearest triangle tells inside from outside."""
+PARTS = 8
+"""Parts of a link at whose ends its overlap with a surface is measured."""
 TRAVEL = 0.25
 """Longest way (mm) of any point of a whisker in one step while something is near; steps are shortened to keep it."""
 FINEST = 16

@@ -149,22 +149,22 @@ def _continuous(quaternion: NDArray[np.float64]) -> NDArray[np.float64]:
     return quaternion * np.concatenate([[1.0], flips])[:, None]
 
 
-def pack_chains(capacity: int, chains: Sequence[Chain], quasistatic: bool) -> dict[str, NDArray]:
+def pack_chains(capacity: int, chains: Sequence[Chain], quasistatic: bool, hinges: int) -> dict[str, NDArray]:
     """Return what the kernel's ``ChainArrays`` hold: whiskers as chains, [link, whisker] of ``capacity`` links."""
     count = len(chains)
     mass = LIGHT if quasistatic else 1.0
-    build, inertia, taper = (np.zeros((capacity, count, 4)) for _ in range(3))
+    build, inertia, taper = (np.zeros((capacity, count, width)) for width in (4, 2 + hinges, 4))
     for w, chain in enumerate(chains):
         n = chain.links
         # kg to mg, kg·m² to mg·mm², N·m to µN·m.
-        lengths = chain.lengths * MILLI
+        # A joint that twists does so between two halves of its rest bend.
+        bends = chain.rest_angles / np.where((chain.torsion > 0) & (hinges == 3), 2, 1)
         build[:n, w] = np.stack(
-            [lengths, np.cos(chain.rest_angles), np.sin(chain.rest_angles), chain.masses * (mass * MICRO)],
-            axis=1,
+            [chain.lengths * MILLI, np.cos(bends), np.sin(bends), chain.masses * (mass * MICRO)], axis=1
         )
+        springs = (chain.stiffness * MICRO, chain.torsion * MICRO)[: hinges - 1]
         inertia[:n, w] = np.stack(
-            [chain.centres * MILLI, *(chain.inertias.T * (mass * MICRO * MILLI**2)), chain.stiffness * MICRO],
-            axis=1,
+            [chain.centres * MILLI, *(chain.inertias.T * (mass * MICRO * MILLI**2)), *springs], axis=1
         )
         radii = chain.whisker.radius(chain.nodes) * MILLI
         taper[:n, w] = np.stack([radii[:-1], radii[1:], chain.nodes[:-1] * MILLI, np.diff(chain.nodes) * MILLI], axis=1)

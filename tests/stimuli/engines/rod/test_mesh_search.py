@@ -167,7 +167,7 @@ def test_a_link_outside_is_never_told_that_it_overlaps_wherever_the_search_begin
         body = BodyMotion()
         body.turn = wp.vec4d(wp.float64(1.0), wp.float64(0.0), wp.float64(0.0), wp.float64(0.0))
         thin = LinkTaper(wp.float64(1e-3), wp.float64(1e-3), wp.float64(0.0), wp.float64(1.0))
-        found = link_shape_distance(shapes, 0, body, a[k], b[k], thin, margin, leaf[k], 0, 1)
+        found = link_shape_distance(shapes, 0, body, a[k], b[k], thin, margin, wp.float64(1.0), leaf[k], 0, 1)
         out[k, 0] = wp.where(found.between == 1, found.gap, wp.float64(1e30))
         out[k, 1] = wp.where(found.end == 1, found.end_gap, wp.float64(1e30))
 

@@ -51,7 +51,7 @@ def test_a_tapered_link_meets_a_turned_primitive_where_its_gap_is_least(kind, sc
         normals: wp.array2d(dtype=vec3),
     ):
         k = wp.tid()
-        found = link_shape_distance(shapes, 0, body, a[k], b[k], taper, real(1.0), 0, 0, 1)
+        found = link_shape_distance(shapes, 0, body, a[k], b[k], taper, real(1.0), real(1.0), 0, 0, 1)
         numbers[k, 0] = found.share
         numbers[k, 1] = found.gap
         numbers[k, 2] = found.end_gap

@@ -7,22 +7,29 @@ before it closes (g + h vₙ ≥ 0, gap g, approach vₙ), so nothing passes thr
 
 import warp as wp
 
-from brainbench.stimuli.engines.rod.limits import WIDEST
+from brainbench.stimuli.engines.rod.limits import (
+    AT_BASE,
+    GOT_INSIDE,
+    LARGEST_OVERLAP,
+    LARGEST_START_OVERLAP,
+    STARTED_INSIDE,
+    WIDEST,
+)
+from brainbench.stimuli.engines.units import MILLI
 
 from .algebra import first_axis, rotate, vec3
+from .articulated_body import ChainState, ProximityState, hinge_direction
 from .motion import BodyMotion, pose_at
 from .narrow_phase import link_shape_distance
-from .parameters import real, sliced
+from .parameters import hinges, real, sliced
 from .state import (
     WAIT_DISTANCES,
     WAIT_SLICE,
     ChainArrays,
-    ChainState,
     ContactCandidates,
     LinkDistance,
     MotionArrays,
     PausedWhiskers,
-    ProximityState,
     ShapeArrays,
     StepOptions,
     WhiskerJob,
@@ -117,6 +124,8 @@ def query_distances(
             paused.query[place].link = i
             paused.query[place].start = row(chain.node, i) + origin
             paused.query[place].stop = row(chain.node, i + 1) + origin
+            nearer = reach.time * (row(proximity.end_speed, i) + reach.unknown_speed)
+            paused.query[place].bound = row(proximity.clearance, i) - nearer
             place = place + 1
     paused.query_time[job.index] = now
     paused.query_margin[job.index] = reach.margin
@@ -151,6 +160,26 @@ def candidate_slot(
 
 
 @wp.func(inline=True)
+def judge_overlap(state: wp.ref[WhiskerState], deepest: real, crossing: int, base_gap: real, now: real):
+    """End a whisker that lies too deep in an object, or whose base point an object reaches.
+
+    ``crossing`` is 1 where some of its axis lies inside, which at the start no thickness excuses. ``base_gap`` is the
+    gap at the base point at the end of the step: a contact there has no lever and bends nothing.
+    """
+    state.depth = wp.max(state.depth, deepest)
+    status = int(0)
+    if base_gap < real(0.0):
+        status = wp.static(AT_BASE)
+    if deepest > real(wp.static(LARGEST_OVERLAP * MILLI)):
+        status = wp.static(GOT_INSIDE)
+    if state.steps == 0 and (crossing == 1 or deepest > real(wp.static(LARGEST_START_OVERLAP * MILLI))):
+        status = wp.static(STARTED_INSIDE)
+    if status != 0 and state.status == 0:
+        state.status = status
+        state.failed_at = now
+
+
+@wp.func(inline=True)
 def find_candidates(
     chains: ChainArrays,
     motions: MotionArrays,
@@ -172,6 +201,9 @@ def find_candidates(
     sides = int(2) + wp.min(0, job.index)
     origin = pose.place
     count = int(0)
+    deepest = zero
+    crossing = int(0)
+    base_gap = zero
     query = state.first_query
     angular = pose.spin
     linear = pose.velocity
@@ -181,7 +213,10 @@ def find_candidates(
         link = row(chain.node, i + 1) - joint
         e2 = row(chain.axis2, i)
         # Twist of the link: what its joint adds to that of the link before.
-        spun = first_axis(e2, link, row(chain.angle, i)[1]) * rate[0] + e2 * rate[1]
+        spun = first_axis(e2, hinge_direction(chain, i), row(chain.angle, i)[1]) * rate[0] + e2 * rate[1]
+        if wp.static(hinges == 3):
+            if i % 2 == 1:
+                spun = spun + row(chain.axis3, i) * rate[2]
         angular = angular + spun
         linear = linear + wp.cross(joint, spun)
         taper = chains.taper[i, job.whisker]
@@ -198,9 +233,17 @@ def find_candidates(
                 else:
                     a = joint + origin
                     b = row(chain.node, i + 1) + origin
-                    found = link_shape_distance(shapes, s, body, a, b, taper, margin, row(proximity.leaf, i), 0, 1)
+                    bound = row(proximity.clearance, i)
+                    leaf = row(proximity.leaf, i)
+                    found = link_shape_distance(shapes, s, body, a, b, taper, margin, bound, leaf, 0, 1)
                 proximity.leaf[i] = found.leaf
                 closest = wp.min(closest, found.clearance)
+                deepest = wp.max(deepest, found.depth)
+                crossing = wp.max(crossing, found.crossing)
+                if i == 0 and found.start == 1 and found.start_gap < margin:
+                    way = rotate(body.turn, rotate(turn_s, found.start_normal))
+                    approach = wp.dot(way, pose.velocity - body.velocity - wp.cross(body.spin, origin - body.place))
+                    base_gap = wp.min(base_gap, found.start_gap + h * wp.min(approach, zero))
                 for which in range(sides):
                     offered = found.between
                     share = found.share
@@ -212,7 +255,7 @@ def find_candidates(
                         gap = found.end_gap
                         way = found.end_normal
                     if offered == 1 and gap < margin:
-                        state.depth = wp.max(state.depth, -gap)
+                        deepest = wp.max(deepest, -gap)
                         normal = rotate(body.turn, rotate(turn_s, way))
                         radius = taper.start_radius + (taper.end_radius - taper.start_radius) * share
                         # The force acts on the skin of the whisker: its radius is the lever of friction.
@@ -239,4 +282,5 @@ def find_candidates(
                             candidates.object_velocity[slot] = object_velocity
                             candidates.normal[slot] = normal
             proximity.clearance[i] = closest
+    judge_overlap(state, deepest, crossing, base_gap, now)
     return count

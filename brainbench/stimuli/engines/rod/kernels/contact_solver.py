@@ -13,7 +13,7 @@ the source is the same. Forces in mN, compliance in mm/ms per mN.
 
 import warp as wp
 
-from brainbench.stimuli.engines.rod.limits import CONTACT_BOUNDS, CONTACT_ROUNDS, SWEEPS, WARP
+from brainbench.stimuli.engines.rod.limits import CONTACT_BOUNDS, CONTACT_ROUNDS, LARGEST_FORCE, SWEEPS, WARP
 
 from .algebra import vec3, vec6
 from .delassus import (
@@ -32,7 +32,7 @@ from .delassus import (
     stride,
 )
 from .parameters import group_size, max_contacts, module_options, queue, real
-from .state import ContactProblems, PausedWhiskers, PerLink2
+from .state import ContactProblems, PausedWhiskers, PerLinkJoint
 from .thread_groups import broadcast, group_max, group_or, group_sum, warp_max
 
 
@@ -102,7 +102,7 @@ def solve_single_contact(own6: vec6, bn: real, b1: real, b2: real, p0: real, q0:
                         break
                 fn = wp.max(zero, -(bn + n1 * f1 + n2 * f2) / nn)
     # Two contacts at one point may leave nothing to divide by.
-    if not (fn + wp.abs(f1) + wp.abs(f2) < real(1e6)):
+    if not (fn + wp.abs(f1) + wp.abs(f2) < real(wp.static(LARGEST_FORCE))):
         fn = zero
         f1 = zero
         f2 = zero
@@ -152,6 +152,9 @@ def gauss_seidel_sweep(
             b1 = row(own.rate, 3 * k + 1) - block[1] * n0 - block[3] * p0 - block[4] * q0
             b2 = row(own.rate, 3 * k + 2) - block[2] * n0 - block[4] * p0 - block[5] * q0
             found = solve_single_contact(block, bn, b1, b2, p0, q0, row(own.friction, k), tries)
+            # No force below LARGEST_FORCE keeps it closed: without this, zero forces would count as solved.
+            if bn < zero and found[0] == zero:
+                force_change += real(wp.static(LARGEST_FORCE))
             own.force[3 * k] = found[0]
             own.force[3 * k + 1] = found[1]
             own.force[3 * k + 2] = found[2]
@@ -317,7 +320,7 @@ def share_normal_forces(
     # Take the forces only if all are sound, and keep friction within its cone.
     diverged = zero
     for k in range(each):
-        if part + k < contacts and not (wp.abs(load[k]) < real(1e6)):
+        if part + k < contacts and not (wp.abs(load[k]) < real(wp.static(LARGEST_FORCE))):
             diverged = real(1.0)
     diverged = group_max(diverged)
     changed = int(0)
@@ -393,7 +396,7 @@ def solve_contacts(problems: ContactProblems, index: int, part: int, live: int):
     matrix = DelassusRows()
     normals = NormalMatrix()
     work = NormalMatrix()
-    joint_change = PerLink2()
+    joint_change = PerLinkJoint()
     rounds_most = int(wp.static(CONTACT_ROUNDS)) + solver.unknown_zero
     more = live
     for round_ in range(rounds_most):

@@ -6,15 +6,16 @@ Aanæs 2005). On a processor one thread takes one link; on a GPU a group of thre
 
 import warp as wp
 
-from brainbench.stimuli.engines.rod.limits import DISTANCE_BOUNDS, FAR, MESH, MESHES, WARP
+from brainbench.stimuli.engines.rod.limits import ANYWHERE, DISTANCE_BOUNDS, FAR, MESH, MESHES, PARTS, WARP
 from brainbench.stimuli.engines.rod.mesh_bvh import WIDE
 
-from .algebra import unrotate, vec3, vec4
+from .algebra import unrotate, vec2, vec3, vec4
 from .distances import primitive, segment_primitive
 from .mesh_bvh import NearestTriangles, nearest_triangles
 from .motion import BodyMotion, pose_at
 from .parameters import against, group_size, module_options, real
 from .state import ChainArrays, JobArrays, LinkDistance, LinkTaper, MotionArrays, PausedWhiskers, ShapeArrays
+from .thread_groups import warp_max
 
 
 @wp.func
@@ -93,10 +94,17 @@ def mesh_distance(
         w = got.start_w
     if face >= 0:
         found.leaf = face // wp.static(WIDE) + 1
+        away = a + (b - a) * share - surface_point(shapes, first + face, v, w)
+        radius = ra + (rb - ra) * share
+        out = signed_direction(away, found.clearance, pseudo_normal(shapes, first + face, v, w), radius)
+        # The whole axis is on the side of its nearest point, or it crosses the surface there.
+        if out[3] < real(1e-3) * radius:
+            found.crossing = 1
+        if share == real(0.0):
+            found.start = 1
+            found.start_gap = out[3] - radius
+            found.start_normal = vec3(out[0], out[1], out[2])
         if found.clearance > within:
-            away = a + (b - a) * share - surface_point(shapes, first + face, v, w)
-            radius = ra + (rb - ra) * share
-            out = signed_direction(away, found.clearance, pseudo_normal(shapes, first + face, v, w), radius)
             # No contact within reach, but the axis lies inside: without this a deep overlap would count as free.
             if out[3] < real(0.0):
                 found.between = 1
@@ -130,6 +138,28 @@ def mesh_distance(
 
 
 @wp.func
+def mesh_overlap(
+    shapes: ShapeArrays, s: int, a: vec3, b: vec3, ra: real, rb: real, leaf: int, part: int, live: int
+) -> vec2:
+    """Return the deepest overlap of a link with a surface, and that of its start; measured at places along it."""
+    overlap = vec2(real(-1e20), real(0.0))
+    for k in range(wp.static(PARTS + 1)):
+        share = real(k) / real(wp.static(PARTS))
+        x = a + (b - a) * share
+        got = nearest_triangles(shapes, s, x, x, real(wp.static(ANYWHERE)), real(0.0), leaf, part, live)
+        if got.end_face >= 0:
+            face = shapes.face[s] + got.end_face
+            away = x - surface_point(shapes, face, got.end_v, got.end_w)
+            radius = ra + (rb - ra) * share
+            out = pseudo_normal(shapes, face, got.end_v, got.end_w)
+            depth = radius - signed_direction(away, wp.sqrt(got.end), out, radius)[3]
+            overlap[0] = wp.max(overlap[0], depth)
+            if k == 0:
+                overlap[1] = depth
+    return overlap
+
+
+@wp.func
 def link_shape_distance(
     shapes: ShapeArrays,
     s: int,
@@ -138,6 +168,7 @@ def link_shape_distance(
     b_world: vec3,
     taper: LinkTaper,
     margin: real,
+    bound: real,
     leaf: int,
     part: int,
     live: int,
@@ -145,6 +176,7 @@ def link_shape_distance(
     """Return how near a link comes to a shape, in lengths of the scene but directions of the shape.
 
     Contacts are told up to a gap of ``margin``; a negative one asks only for a bound of the distance, up to so far.
+    ``bound`` is what is known of the distance already: from 0 on down the link may be inside, however deep.
     """
     # Into the frame and the unit of the shape.
     turn_s = shapes.turn[s]
@@ -168,8 +200,22 @@ def link_shape_distance(
         if margin < real(0.0):
             within = real(0.0)
             radius = -margin / scale
-        got = nearest_triangles(shapes, s, a, b, radius, within, leaf - 1, part, searching)
+        farthest = radius
+        # Without a bound, nothing found within a radius means outside or deep inside: the nearest of all tells.
+        if bound <= real(0.0):
+            farthest = real(wp.static(ANYWHERE)) / scale
+        got = nearest_triangles(shapes, s, a, b, farthest, within, leaf - 1, part, searching)
         found = mesh_distance(shapes, s, a, b, ra, rb, within, got)
+        found.clearance = wp.min(found.clearance, radius)
+        deep = int(0)
+        if searching == 1 and found.crossing == 1 and margin >= real(0.0):
+            deep = 1
+        if warp_max(deep) == 1:
+            overlap = mesh_overlap(shapes, s, a, b, ra, rb, found.leaf - 1, part, deep)
+            if deep == 1:
+                found.depth = overlap[0]
+                found.start = 1
+                found.start_gap = -overlap[1]
     # Primitives: what lies between the ends, and the far end on its own.
     if meshed == 0:
         nearest = segment_primitive(shapes.kind[s], shapes.size[s] / scale, a, b, ra, rb)
@@ -185,10 +231,20 @@ def link_shape_distance(
         found.end = 1
         found.end_gap = tip[3] - rb
         found.end_normal = vec3(tip[0], tip[1], tip[2])
+        near = primitive(shapes.kind[s], shapes.size[s] / scale, a)
+        found.start = 1
+        found.start_gap = near[3] - ra
+        found.start_normal = vec3(near[0], near[1], near[2])
+        found.depth = wp.max(-nearest[1], real(0.0))
+        # Even where the whisker is thickest, its axis is inside.
+        if found.depth > wp.max(ra, rb):
+            found.crossing = 1
         found.leaf = leaf
     found.clearance = found.clearance * scale
     found.gap = found.gap * scale
     found.end_gap = found.end_gap * scale
+    found.start_gap = found.start_gap * scale
+    found.depth = found.depth * scale
     return found
 
 
@@ -226,6 +282,7 @@ def measure_distances(
         stop = paused.query[which].stop
         leaf = paused.link[i, index].leaf
         taper = chains.taper[i, jobs.whisker[index]]
-        found = link_shape_distance(shapes, s, body, start, stop, taper, margin, leaf, part, live)
+        bound = paused.query[which].bound
+        found = link_shape_distance(shapes, s, body, start, stop, taper, margin, bound, leaf, part, live)
         if live == 1 and part == 0:
             paused.answer[which] = found

@@ -13,15 +13,16 @@ import warp as wp
 
 from brainbench.stimuli.engines.rod.limits import SPARE, contacts_for
 
-from .algebra import mat33, reader, vec2, vec3, vec4
-from .parameters import capacity, real
+from .algebra import JointInverse, JointVector, mat33, reader, vec3, vec4
+from .parameters import capacity, hinges, real
 
 WAIT_DISTANCES, WAIT_SLICE, WAIT_FORCES, WAIT_REST = 1, 2, 3, 4
 """Reasons to pause: distances of near links, its next slice, contact forces, distances at rest."""
 
 most_candidates = contacts_for(capacity) + SPARE
 PerLink1: Any = wp.types.vector(capacity, real)
-PerLink2: Any = wp.types.matrix((capacity, 2), real)
+PerLinkJoint: Any = wp.types.matrix((capacity, hinges), real)
+PerLinkInverse: Any = wp.types.matrix((capacity, hinges + 1), real)
 PerLink3: Any = wp.types.matrix((capacity, 3), real)
 PerLinkInt: Any = wp.types.vector(capacity, wp.int32)
 PerNode3: Any = wp.types.matrix((capacity + 1, 3), real)
@@ -31,8 +32,8 @@ PerCandidateInt: Any = wp.types.vector(most_candidates, wp.int32)
 
 
 row = reader(
-    (PerLink1, real), (PerLink2, vec2), (PerLink3, vec3), (PerLinkInt, wp.int32), (PerNode3, vec3),
-    (PerCandidate1, real), (PerCandidate3, vec3), (PerCandidateInt, wp.int32),
+    (PerLink1, real), (PerLinkJoint, JointVector), (PerLinkInverse, JointInverse), (PerLink3, vec3),
+    (PerLinkInt, wp.int32), (PerNode3, vec3), (PerCandidate1, real), (PerCandidate3, vec3), (PerCandidateInt, wp.int32),
 )  # fmt: skip
 
 
@@ -42,7 +43,7 @@ class LinkBuild:
 
     length: real
     bend_cosine: real
-    """Cosine and sine of the angle at rest to the link before."""
+    """Cosine and sine of the angle at rest to the link before; of half that angle at a joint that twists."""
     bend_sine: real
     mass: real
 
@@ -56,6 +57,9 @@ class LinkInertia:
     axial: real
     transverse: real
     stiffness: real
+    if hinges == 3:
+        torsion: real
+        """Of joints 1, 3, 5 …"""
 
 
 @wp.struct
@@ -70,7 +74,7 @@ class LinkTaper:
 
 @wp.struct
 class ChainArrays:
-    """Whiskers as chains of rigid links with universal joints."""
+    """Whiskers as chains of rigid links with elastic joints."""
 
     links: wp.array(dtype=wp.int32)
     """[whisker]"""
@@ -292,40 +296,6 @@ class WhiskerState:
 
 
 @wp.struct
-class ChainState:
-    """State of the joints, and what one step keeps of each link between its passes."""
-
-    angle: PerLink2
-    rate: PerLink2
-    axis2: PerLink3
-    """Second axis of the joint."""
-    node: PerNode3
-    """Joints and tip, from the base point."""
-    gain1_w: PerLink3
-    """U D⁻¹ of each axis (``articulated_body``), rotation and translation."""
-    gain1_v: PerLink3
-    gain2_w: PerLink3
-    gain2_v: PerLink3
-    acceleration: PerLink2
-    """D⁻¹u of the joint, then its accelerations."""
-
-
-@wp.struct
-class ProximityState:
-    """State of each link that only contact needs; without objects a kernel leaves it out."""
-
-    inverse_inertia: PerLink3
-    """Inverse inertia D⁻¹ of the joint (11, 12, 22)."""
-    clearance: PerLink1
-    """Lower bound of the distance from all objects; at rest, the time until which nothing can come near."""
-    leaf: PerLinkInt
-    """Leaf of the search tree where the last search ended (+ 1)."""
-    safe_until: PerLink1
-    end_speed: PerLink1
-    """Speed of the faster end."""
-
-
-@wp.struct
 class ContactCandidates:
     """Places where contact is possible within one step."""
 
@@ -356,6 +326,14 @@ class LinkDistance:
     """1: the far end is near."""
     end_gap: real
     end_normal: vec3
+    start: wp.int32
+    """1: the near end is known to be near."""
+    start_gap: real
+    start_normal: vec3
+    crossing: wp.int32
+    """1: some of the axis lies inside."""
+    depth: real
+    """Deepest overlap; 0 without."""
     clearance: real
     """Lower bound of the distance of the link's axis from the surface."""
     leaf: wp.int32
@@ -390,7 +368,12 @@ class JointRecord:
     gain1_v: vec3
     gain2_w: vec3
     gain2_v: vec3
-    inverse_inertia: vec3
+    if hinges == 3:
+        axis3: vec3
+        moment3: vec3
+        gain3_w: vec3
+        gain3_v: vec3
+    inverse_inertia: JointInverse
 
 
 @wp.struct
@@ -455,9 +438,9 @@ class ContactProblems:
     """[job · candidate] gap at the end of the step."""
     held: wp.array2d(dtype=HeldContact)
     """[job, contact] of the last step; then of this one."""
-    free_acceleration: wp.array2d(dtype=vec2)
+    free_acceleration: wp.array2d(dtype=JointVector)
     """[job, link] acceleration of the joint without contact forces."""
-    added_acceleration: wp.array2d(dtype=vec2)
+    added_acceleration: wp.array2d(dtype=JointVector)
     """[job, link] acceleration that they add."""
     solution: wp.array(dtype=ContactSolution)
     """[job]"""
@@ -467,8 +450,8 @@ class ContactProblems:
 class PausedLink:
     """Joint, clearance and leaf of a link, see :class:`ChainState` and :class:`ProximityState`."""
 
-    angle: vec2
-    rate: vec2
+    angle: JointVector
+    rate: JointVector
     clearance: real
     leaf: wp.int32
 
@@ -481,6 +464,8 @@ class DistanceQuery:
     link: wp.int32
     start: vec3
     stop: vec3
+    bound: real
+    """Lower bound of its distance, as far as that is known; 0 or less: it may be inside."""
 
 
 @wp.struct

@@ -11,7 +11,14 @@ import warp as wp
 from brainbench.stimuli.engines.rod.limits import FINEST, NOTHING, REST, TRAVEL
 
 from .algebra import SpatialAcceleration, Twist, Wrench, vec3
-from .articulated_body import articulated_inertia, forward_kinematics, integrate_joint, joint_accelerations
+from .articulated_body import (
+    ChainState,
+    ProximityState,
+    articulated_inertia,
+    forward_kinematics,
+    integrate_joint,
+    joint_accelerations,
+)
 from .broad_phase import count_near_links, find_candidates, lower_clearance, query_distances, search_range
 from .contact_problem import any_gap_closes, queue_problem, read_solution, write_problem
 from .contact_solver import solve_contacts
@@ -24,13 +31,11 @@ from .state import (
     WAIT_FORCES,
     WAIT_SLICE,
     ChainArrays,
-    ChainState,
     ContactCandidates,
     ContactProblems,
     JobArrays,
     MotionArrays,
     PausedWhiskers,
-    ProximityState,
     ResultArrays,
     ShapeArrays,
     StepOptions,

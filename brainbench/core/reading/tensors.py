@@ -1,0 +1,89 @@
+"""Weights: safetensors, and the files of PyTorch without the code that they may hold. All of them are finite."""
+
+from __future__ import annotations
+
+import os
+import pickle
+import zipfile
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+from brainbench.core.errors import DataError, shown
+from brainbench.core.reading.archives import check_archive
+from brainbench.core.reading.regular import check_file, readable
+
+if TYPE_CHECKING:
+    import torch
+
+CUT = "It may be cut short: get it again."
+
+
+def read_tensors(path: str | os.PathLike[str], kind: str = "safetensors file") -> dict[str, torch.Tensor]:
+    """Read all tensors of a safetensors file; a weight that is not finite is refused.
+
+    Raises:
+        DataFileNotFoundError: there is no such file.
+        DataError: it is damaged, of another format, or holds NaN or infinity.
+    """
+    from safetensors.torch import load_file
+
+    found = check_file(path, kind)
+    with readable(path, kind, CUT):
+        tensors: dict[str, torch.Tensor] = load_file(found)
+    check_finite(tensors, os.fspath(path))
+    return tensors
+
+
+def read_checkpoint(path: str | os.PathLike[str], kind: str = "PyTorch file") -> Mapping[str, Any]:
+    """Read the mapping that ``torch.save`` wrote; nothing in it is executed, and every weight is stored and finite.
+
+    Raises:
+        DataFileNotFoundError: there is no such file.
+        DataError: it is damaged, holds objects, or a tensor in it is not plain or not finite.
+    """
+    import torch
+
+    found, name = check_file(path, kind), shown(os.fspath(path))
+    with readable(path, kind, CUT):
+        sound = zipfile.is_zipfile(found)
+        if sound:
+            with zipfile.ZipFile(found) as archive:
+                check_archive(archive, path, kind)
+        try:
+            content = torch.load(found, map_location="cpu", weights_only=True)
+        except pickle.UnpicklingError as error:
+            # PyTorch writes zip archives; only in a sound one is an object in the way, and not a torn file.
+            if not sound:
+                raise
+            raise DataError(
+                f"{name} holds objects that only pickle could load, which may run code; save its 'state_dict' alone "
+                "with torch.save, or as safetensors."
+            ) from error
+    return content if isinstance(content, Mapping) else {}
+
+
+def check_stored(tensors: Mapping[str, torch.Tensor], name: str) -> None:
+    """Refuse tensors that stand for more numbers than are stored, or that are not finite.
+
+    Raises:
+        DataError: the first of them by name.
+    """
+    import torch
+
+    for key, value in tensors.items():
+        # A view may repeat one stored number without end; only its use would take the memory.
+        plain = value.layout == torch.strided and value.device.type == "cpu" and not value.is_complex()
+        if not plain or value.numel() * value.element_size() > value.untyped_storage().nbytes():
+            raise DataError(f"{shown(key)} in {shown(name)} is no plain tensor with all of its numbers.")
+    check_finite(tensors, name)
+
+
+def check_finite(arrays: Mapping[str, Any], name: str) -> None:
+    """Refuse floating-point arrays or tensors with NaN or infinity; the :class:`DataError` names the first."""
+    import numpy as np
+
+    for key, values in arrays.items():
+        array = values.detach().float().cpu().numpy() if hasattr(values, "detach") else np.asarray(values)
+        if array.dtype.kind in "fc" and not np.isfinite(array).all():
+            bad = int((~np.isfinite(array)).sum())
+            raise DataError(f"{shown(key)} in {shown(name)} has {bad:,} of {array.size:,} values that are not finite.")

@@ -1,0 +1,46 @@
+import pytest
+import torch
+from safetensors.torch import save_file
+
+from brainbench.core.errors import DataError, DataFileNotFoundError
+from brainbench.core.reading.tensors import check_stored, read_checkpoint, read_tensors
+from tests.factories.damage import Unknown
+
+
+def test_weights_that_are_not_finite_are_named(tmp_path):
+    save_file({"good": torch.ones(2), "bad": torch.tensor([1.0, torch.nan])}, tmp_path / "a.safetensors")
+    with pytest.raises(DataError, match=r"'bad'.*1 of 2"):
+        read_tensors(tmp_path / "a.safetensors")
+
+
+def test_a_checkpoint_comes_back_without_the_objects_of_others(tmp_path):
+    path = tmp_path / "a.ckpt"
+    torch.save({"state_dict": {"a": torch.arange(3)}, "epoch": 2}, path)
+    found = read_checkpoint(path)
+    assert found["epoch"] == 2
+    assert found["state_dict"]["a"].tolist() == [0, 1, 2]
+    torch.save({"state_dict": {}, "more": Unknown()}, path)
+    with pytest.raises(DataError, match="pickle"):
+        read_checkpoint(path)
+    path.write_bytes(path.read_bytes()[:-40])
+    with pytest.raises(DataError, match=r"a\.ckpt"):
+        read_checkpoint(path)
+    with pytest.raises(DataFileNotFoundError):
+        read_checkpoint(tmp_path / "none.ckpt")
+
+
+@pytest.mark.parametrize(
+    "tensor",
+    [
+        torch.zeros(1).expand(2**40),
+        torch.zeros(3).to_sparse(),
+        torch.zeros(3, device="meta"),
+        torch.zeros(3, dtype=torch.complex64),
+        torch.tensor([torch.inf]),
+    ],
+    ids=["repeated", "sparse", "meta", "complex", "infinite"],
+)
+def test_only_plain_tensors_with_all_their_numbers_pass(tensor):
+    check_stored({"good": torch.ones(2, 3)}, "file")
+    with pytest.raises(DataError, match=r"'bad'.*file"):
+        check_stored({"good": torch.ones(2), "bad": tensor}, "file")

@@ -1,0 +1,98 @@
+"""Readers of the published study's files: recordings and sweeps (.npz), checkpoints (.ckpt) and settings."""
+
+from __future__ import annotations
+
+import functools
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from brainbench.datasets import open_recordings
+from brainbench.datasets.whisking.sweep_files import SweepFile, read_sweep
+from brainbench.datasets.whisking.sweep_tree import open_sweep_tree
+from brainbench.metrics.explain import explain_file
+from brainbench.models.published.files import read_settings, read_weights
+from brainbench.models.published.importing import build_published
+from brainbench.models.published.recognition import recognise
+from brainbench.models.registry import load_model
+from tests.factories.published_files import lightning_state
+from tests.factories.published_recordings import make_zero_filled, write_published
+from tests.factories.published_sweeps import write_sweep
+from tests.factories.reading_trials import Surface, bad_counts, not_finite, numbers
+
+SETTINGS = """
+model:
+  encoder:
+    model_config_file: configs/rnn_fdb_converted_modern_ugrnn_ln.json
+train:
+  ssl: SimCLRLoss
+  epochs: 100
+  learning_rate: 0.01
+"""
+
+
+def _recordings(folder: Path) -> Path:
+    return write_published(folder / "rodgers6_data.npz", m1=make_zero_filled([14, 12], units=3)[0])
+
+
+def _tree(folder: Path) -> Path:
+    for name in ("train", "test"):
+        write_sweep(folder / name / "00000000.npz")
+    (folder / "categories.json").write_text('{"03211117/screen": 0, "04530566/boat": 2}')
+    return folder / "categories.json"
+
+
+def _halves(folder: Path) -> Path:
+    draw = np.random.default_rng(0)
+    np.savez(folder / "splits.npz", r_xy=draw.uniform(0, 1, 20), r_yy=draw.uniform(0, 1, 20))
+    return folder / "splits.npz"
+
+
+@functools.cache
+def _state() -> dict[str, torch.Tensor]:
+    with torch.random.fork_rng():
+        return lightning_state(load_model("zhuang-gru-small", classes=3))
+
+
+def _checkpoint(folder: Path) -> Path:
+    torch.save({"state_dict": dict(_state()), "epoch": 6, "global_step": 50}, folder / "best.ckpt")
+    return folder / "best.ckpt"
+
+
+def _import(path: Path) -> Any:
+    weights = read_weights(path)
+    return weights, build_published(weights.state, recognise(weights.state, architecture="zhuang-gru-small"))[
+        0
+    ].state_dict()
+
+
+def _bad_sweep(sweep: SweepFile) -> bool:
+    """Forces are finite or missing, and stay within what is trusted; conditions and label are numbers."""
+    label = 0 if sweep.label is None else sweep.label
+    return not_finite(sweep.conditions) or np.isinf(sweep.wrench()).any() or not 0 <= label < 2**31
+
+
+def _settings(folder: Path) -> Path:
+    (folder / "config.yaml").write_text(SETTINGS)
+    return folder / "config.yaml"
+
+
+def _bad_steps(steps: Any) -> bool:
+    return any(np.isinf(number) for number in numbers(steps))
+
+
+PUBLISHED = (
+    Surface("published recordings, npz", _recordings, open_recordings, bad_counts),
+    Surface("published sweep, npz", lambda folder: write_sweep(folder / "0.npz"), read_sweep, _bad_sweep),
+    Surface(
+        "published sweeps, categories",
+        _tree,
+        lambda path: open_sweep_tree(path.parent).classes,
+        lambda names: len(names) > 1000,
+    ),
+    Surface("split halves, npz", _halves, explain_file, _bad_steps),
+    Surface("published weights, ckpt", _checkpoint, _import, not_finite),
+    Surface("published settings, YAML", _settings, read_settings, not_finite),
+)

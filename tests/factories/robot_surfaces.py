@@ -1,0 +1,191 @@
+"""Readers of files and texts about hands and policies."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from robotics_bridge import hands, tasks
+from robotics_bridge.deploy.frames import KEY, read_key
+from robotics_bridge.deploy.simulated_hand import Faults
+from robotics_bridge.hands.layouts import read_probes, write_probes
+from robotics_bridge.policies.contract import PolicyContract
+from robotics_bridge.policies.training.student_files import load_student
+from robotics_bridge.policies.training.sweep import StudentSweep, read_sweep
+from robotics_bridge.sensors.calibration.calibrate import calibrate
+from robotics_bridge.sensors.calibration.log import read_log
+from robotics_bridge.sensors.noise.model import Noise
+from robotics_bridge.tasks.overrides import apply_overrides
+from tests.factories.policies import contract_of, student_folder
+from tests.factories.reading_trials import Surface, not_finite, numbers, typed, written, written_json
+
+CHANGES = (
+    "is_dropped=-300 rotation_progress.clip=2 episode=15 entropy=0 learning_rate_range=1e-4,1e-3 friction=0.8 "
+    "object_changes.friction=0.8,1 density=300 noise.position=0.01 hidden=64,32 copies=1 solver.timestep=0.004"
+)
+MJCF = """
+<mujoco model="claw">
+  <compiler angle="radian"/>
+  <worldbody>
+    <body name="palm" pos="0 0 0.1">
+      <geom type="box" size="0.02 0.03 0.01" mass="0.3"/>
+      <body name="near" pos="0 0.03 0">
+        <joint name="a" axis="1 0 0" range="0 1.5" damping="0.1"/>
+        <geom type="capsule" fromto="0 0 0 0 0.04 0" size="0.008" mass="0.05"/>
+        <body name="tip" pos="0 0.04 0">
+          <joint name="b" axis="1 0 0" range="0 1.2" armature="0.001"/>
+          <geom type="capsule" fromto="0 0 0 0 0.03 0" size="0.007" mass="0.03" friction="0.8 0.01 0.001"/>
+        </body>
+      </body>
+    </body>
+  </worldbody>
+  <actuator><position joint="a" kp="5" ctrlrange="0 1.5" forcerange="-1 1"/></actuator>
+</mujoco>
+"""
+URDF = """
+<robot name="claw">
+  <link name="palm">
+    <inertial><mass value="0.3"/><inertia ixx="1e-4" ixy="0" ixz="0" iyy="1e-4" iyz="0" izz="1e-4"/></inertial>
+    <collision><geometry><box size="0.04 0.06 0.02"/></geometry></collision>
+  </link>
+  <link name="tip">
+    <inertial><mass value="0.05"/><inertia ixx="1e-5" ixy="0" ixz="0" iyy="1e-5" iyz="0" izz="1e-5"/></inertial>
+    <collision><origin xyz="0 0.02 0" rpy="1.57 0 0"/><geometry><cylinder radius="0.008" length="0.04"/></geometry>
+    </collision>
+  </link>
+  <joint name="a" type="revolute">
+    <parent link="palm"/><child link="tip"/><origin xyz="0 0.03 0" rpy="0 0 0"/><axis xyz="1 0 0"/>
+    <limit lower="0" upper="1.5" effort="1" velocity="5"/><dynamics damping="0.1"/>
+  </joint>
+</robot>
+"""
+STUDENTS = """
+types = ["agg_force", "bool"]
+resolutions = ["low", "med"]
+noisy = [false, true]
+seeds = [0, 1]
+teacher = "teachers/{task}-{hand}"
+pinned = { resolution = "med", noisy = true }
+settings = { iterations = 300, num_envs = 16 }
+[encoders]
+types = ["agg_force"]
+arms = [{ encoder = "mlp" }]
+[[entries]]
+task = "in_palm_rotate"
+hand = "xhand1"
+placements = ["tips", "hand"]
+"""
+_MODEL = (
+    "body_pos", "body_quat", "body_mass", "body_inertia", "geom_size", "geom_pos", "geom_friction", "jnt_range",
+    "jnt_axis", "dof_damping", "dof_armature", "actuator_gainprm", "actuator_ctrlrange",
+)  # fmt: skip
+
+
+def _probes(folder: Path) -> Path:
+    write_probes(folder / "probes.json", hands.load("xhand1").layout("low", "tips"))
+    return folder / "probes.json"
+
+
+def _bad_layout(layout: Any) -> bool:
+    return not_finite(layout) or any((probes.radius < 0).any() for probes in layout.values())
+
+
+def _log(folder: Path) -> Path:
+    draw, times = np.random.default_rng(0), 0.01 * np.arange(60)
+    table = np.column_stack([times, np.sin(5 * times), np.sin(5 * times)[:, None] + 0.01 * draw.normal(size=(60, 3))])
+    lines = [",".join(f"{value:.5f}" for value in row) for row in table]
+    (folder / "log.csv").write_text("\n".join(["time,reference,p1,p2,p3", *lines]) + "\n")
+    return folder / "log.csv"
+
+
+def _bad_calibration(found: Any) -> bool:
+    log, calibration = found
+    return not_finite(log) or not_finite(calibration.noise)
+
+
+def _read_log(path: Path) -> Any:
+    log = read_log(path)
+    return log, calibrate(log)
+
+
+def _noise(folder: Path) -> Path:
+    Noise.preset("published-elastomer").save(folder / "noise.json", sensor="x")
+    return folder / "noise.json"
+
+
+def _bad_noise(noise: Noise) -> bool:
+    return not_finite(noise) or not 0 <= noise.dead_probability <= 1 or min(noise.white, noise.walk, noise.quantum) < 0
+
+
+def _read_hand(path: Path) -> Any:
+    hand = hands.load(path)
+    return {name: getattr(hand.model, name) for name in _MODEL} | {"probes": hand.layout("low")}
+
+
+def _bad_hand(values: Any) -> bool:
+    return not_finite(values) or (values["body_mass"] < 0).any() or (values["geom_friction"] < 0).any()
+
+
+def _change(text: str) -> Any:
+    return apply_overrides(tasks.load("in_palm_rotate"), text.split())
+
+
+def _bad_task(task: Any) -> bool:
+    counts = (task.teacher.num_envs, task.teacher.epochs, task.teacher.minibatches, *task.teacher.hidden, task.copies)
+    return (
+        not_finite(task)
+        or min(counts) < 1
+        or min(task.friction, task.noise.position, task.teacher.entropy, *task.object_changes.friction) < 0
+        or min(task.density, task.episode, task.solver.timestep) <= 0
+    )
+
+
+def _student(name: str) -> Any:
+    return lambda folder: student_folder(folder) / name
+
+
+def _load_student(path: Path) -> Any:
+    student, described = load_student(path.parent)
+    return dict(student.state_dict()), described
+
+
+def _bad_sweep(sweep: StudentSweep) -> bool:
+    students = sweep.students()
+    return not_finite([vars(one) for one in students]) or any(
+        one.seed < 0 or one.iterations < 1 or one.num_envs < 1 for one in students
+    )
+
+
+def _key(folder: Path) -> Path:
+    path = folder / "hand.key"
+    path.write_text("0f" * KEY)
+    path.chmod(0o600)
+    return path
+
+
+def _bad_contract(contract: PolicyContract) -> bool:
+    return any(not math.isfinite(n) for n in numbers(contract)) or contract.rate <= 0
+
+
+ROBOTS = (
+    Surface("change text", written("change.txt", CHANGES), typed(_change), _bad_task),
+    Surface(
+        "fault text",
+        written("fault.txt", "drop=0.2 jitter=0.03 silent-after=2 seed=3"),
+        typed(lambda text: Faults.parse(text.split())),
+        not_finite,
+    ),
+    Surface("hand, URDF", written("hand.urdf", URDF), _read_hand, _bad_hand),
+    Surface("hand, MJCF", written("hand.xml", MJCF), _read_hand, _bad_hand),
+    Surface("probe layout", _probes, read_probes, _bad_layout),
+    Surface("calibration log", _log, _read_log, _bad_calibration),
+    Surface("noise preset", _noise, Noise.load, _bad_noise),
+    Surface("contract", written_json("policy.onnx.json", contract_of()), PolicyContract.read, _bad_contract),
+    Surface("student, configuration", _student("config.json"), _load_student, not_finite),
+    Surface("student, weights", _student("model.safetensors"), _load_student, not_finite),
+    Surface("sweep of students", written("students.toml", STUDENTS), read_sweep, _bad_sweep),
+    Surface("key of a hand", _key, read_key, lambda key: len(key) != KEY),
+)
