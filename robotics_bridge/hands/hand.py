@@ -11,8 +11,6 @@ from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
 
-import numpy as np
-
 from brainbench.core.devices import mujoco_module
 from brainbench.core.errors import DataError, UsageError, shown, unknown_name
 from brainbench.core.reading.regular import readable
@@ -87,8 +85,8 @@ class Hand:
         """Return the probes of each link.
 
         Our hands have exactly the counts of the thesis (table 4.11). On any other hand, grids are cast onto the
-        palmar side of the links, which is where they move when their joints flex or jaws close; see :meth:`with_probes` for a
-        layout of your own.
+        palmar side of the links, which is where they move when their joints flex or jaws close; see
+        :meth:`with_probes` for a layout of your own.
 
         Raises:
             UsageError: resolution or placement are unknown, or no link of the placement gets a probe (it says why).

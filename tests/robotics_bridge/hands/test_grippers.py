@@ -1,4 +1,4 @@
-"""Grippers: jaws that slide, mimic, are fixed or swing; every facing surface gets taxels, and a file without says why."""
+"""Grippers: jaws that slide, mimic, are fixed or swing; facing surfaces get taxels, and a file without says why."""
 
 from __future__ import annotations
 
@@ -27,15 +27,19 @@ PANDA_LIKE = """<mujoco model="gripper"><compiler angle="radian" autolimits="tru
 URDF = """<robot name="jaws">{links}
 <joint name="l" type="prismatic"><parent link="base"/><child link="left"/><origin xyz="0 .02 .06"/><axis xyz="0 1 0"/>
 <limit lower="0" upper=".03" effort="10" velocity="1"/></joint>
-<joint name="r" type="prismatic"><parent link="base"/><child link="right"/><origin xyz="0 -.02 .06"/><axis xyz="0 -1 0"/>
-<limit lower="0" upper=".03" effort="10" velocity="1"/><mimic joint="l" multiplier="1"/></joint></robot>"""
-LINK = """<link name="{}"><inertial><mass value=".1"/><inertia ixx="1e-4" iyy="1e-4" izz="1e-4" ixy="0" ixz="0" iyz="0"/>
+<joint name="r" type="prismatic"><parent link="base"/><child link="right"/><origin xyz="0 -.02 .06"/>
+<axis xyz="0 -1 0"/><limit lower="0" upper=".03" effort="10" velocity="1"/><mimic joint="l" multiplier="1"/></joint>
+</robot>"""
+LINK = """<link name="{}"><inertial><mass value=".1"/>
+<inertia ixx="1e-4" iyy="1e-4" izz="1e-4" ixy="0" ixz="0" iyz="0"/>
 </inertial><collision><geometry><box size="{}"/></geometry></collision></link>"""
 FOUR_BAR = """<mujoco><compiler angle="radian" autolimits="true"/><worldbody><body name="base">
 <geom type="box" size=".03 .03 .02"/>
-<body name="right" pos="0 .03 .03"><joint axis="1 0 0" range="-.6 .6"/><geom type="capsule" fromto="0 0 0 0 0 .04" size=".006"/>
+<body name="right" pos="0 .03 .03"><joint axis="1 0 0" range="-.6 .6"/>
+  <geom type="capsule" fromto="0 0 0 0 0 .04" size=".006"/>
   <body name="right_pad" pos="0 -.004 .04"><geom type="box" size=".01 .003 .01"/></body></body>
-<body name="left" pos="0 -.03 .03"><joint axis="1 0 0" range="-.6 .6"/><geom type="capsule" fromto="0 0 0 0 0 .04" size=".006"/>
+<body name="left" pos="0 -.03 .03"><joint axis="1 0 0" range="-.6 .6"/>
+  <geom type="capsule" fromto="0 0 0 0 0 .04" size=".006"/>
   <body name="left_pad" pos="0 .004 .04"><geom type="box" size=".01 .003 .01"/></body></body>
 </body></worldbody></mujoco>"""
 ONE_JAW = """<mujoco><compiler angle="radian" autolimits="true"/><worldbody>
