@@ -402,15 +402,19 @@ def sense_temperature(heat: HeatArrays, io: ReadoutArrays, fresh: wp.array2d(dty
     env, n = wp.tid()
     grid = heat.sensors[heat.part[n]]
     t = fresh[env, n]
+    earlier = heat.temperature[env, n]
     heat.temperature[env, n] = t
     lagged = t
-    # The lag of 4.40 with its exact factor 1 − exp(−Δt/τ): forward Euler diverges beyond Δt = 2 τ.
+    # The lag of 4.40, exact for a temperature that changes evenly within the step; forward Euler diverges beyond
+    # Δt = 2 τ, and a temperature held at its last value is read too early by Δt/2.
     if grid.tau > float(0.0):
         before = heat.element[env, n]
         if io.age[env] == 0:
             before = wp.float64(grid.base)
+            earlier = before
         part_of = wp.float64(io.dt) / wp.float64(grid.tau)
-        lagged = before + (t - before) * part_of * mean_decay(part_of)
+        held = mean_decay(part_of)
+        lagged = t + (before - earlier) * (wp.float64(1.0) - part_of * held) - (t - earlier) * held
         heat.element[env, n] = lagged
     seen = grid.base + wp.clamp(float(lagged - wp.float64(grid.base)), -grid.cold, grid.warm)
     true = float(t)

@@ -277,6 +277,12 @@ def test_the_element_lags_exactly_and_reads_less_upward_than_downward():
             suite.update(state, step)
             assert float(suite.read("grid")) == pytest.approx(30 - 10 * math.exp(-count * step / 0.4), abs=1e-4)
         assert float(suite.read_ground_truth("grid")) == pytest.approx(30, abs=1e-4)
+    # A source warms evenly at 3 K/s; the element follows by τ, whatever the step.
+    for step in (1e-3, 0.1, 0.6):
+        suite, state = _make(cells=(1, 1, 1), tau=0.4, base_temperature=22.0, source=3e6)
+        for _ in range(round(1.2 / step)):
+            suite.update(state, step)
+        assert float(suite.read("grid")) == pytest.approx(22 + 3 * (1.2 - 0.4 * (1 - math.exp(-3))), abs=1e-3)
     suite, state = _make(cells=(1, 1, 2), warm_range=5.0, cold_range=15.0, base_temperature=30.0)
     suite.update(state, 1e-3)
     _field(suite, np.array([80.0, -40.0]))
