@@ -133,6 +133,7 @@ def list_contacts(
                 for n in range(span[0], span[1]):
                     if wp.length(probes.position[n] - point) <= plan.reach[n] + overlap:
                         felt = felt | bit
+                        break
     load = state.contact_force[c]
     if felt != tracked and load > 0.0:
         wp.atomic_or(state.status, env, 4)

@@ -299,7 +299,10 @@ def conduct_contacts(measure: int, state: StateArrays, heat: HeatArrays, io: Rea
     inverse = wp.transform_inverse(frame)
     radius = wp.sqrt(area / wp.pi)
     piece = area / float(wp.static(PIECES * PIECES))
-    for number in range(wp.static(PIECES * PIECES)):
+    # Neighbouring pieces in one cell are entered together.
+    last = int(-1)
+    run = float(0.0)
+    for number in range(wp.static(PIECES * PIECES + 1)):
         i = number // wp.static(PIECES)
         outward = wp.sqrt((float(i) + float(0.5)) / float(wp.static(PIECES)))
         along = (float(number % wp.static(PIECES)) + float(0.5)) / float(wp.static(PIECES))
@@ -314,12 +317,16 @@ def conduct_contacts(measure: int, state: StateArrays, heat: HeatArrays, io: Rea
             cell = int(wp.floor((local[axis] - grid.low[axis]) / grid.cell[axis]))
             index = index * grid.shape[axis] + wp.clamp(cell, 0, grid.shape[axis] - 1)
         index = grid.first + index
-        if measure == 1:
-            wp.atomic_add(heat.covered, env, index, piece)
-        else:
-            g = piece * conductance_of(state, heat, io, env, s, c, index, other, whole)
-            wp.atomic_add(heat.conductance, env, index, g)
-            wp.atomic_add(heat.inflow, env, index, g * heat.link_temperature[env, other])
+        if last >= 0 and (index != last or number == wp.static(PIECES * PIECES)):
+            if measure == 1:
+                wp.atomic_add(heat.covered, env, last, run)
+            else:
+                g = run * conductance_of(state, heat, io, env, s, c, last, other, whole)
+                wp.atomic_add(heat.conductance, env, last, g)
+                wp.atomic_add(heat.inflow, env, last, g * heat.link_temperature[env, other])
+            run = float(0.0)
+        last = index
+        run = run + piece
 
 
 @wp.func
