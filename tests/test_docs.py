@@ -103,7 +103,7 @@ def _commands(page: str) -> list[str]:
 
 
 PRELUDES = {
-    "docs/models.md": "import torch\nstimuli = torch.zeros(2, 22, 30, 5, 7)",
+    "docs/export.md": "import torch\nstimuli = torch.zeros(2, 22, 30, 5, 7)",
     "docs/stimuli.md": "from brainbench.stimuli import WhiskerArray, whiskit\n"
     "whiskit.save_parameters(WhiskerArray.rat(), 'whisker_param_average_rat/')",
 }

@@ -69,19 +69,21 @@ def main() -> None:
     parser.add_argument("--cases", type=int, default=500)
     parser.add_argument("--only", help="name of one reader: print its outcomes")
     parser.add_argument("--first", type=int, default=0, help="seed of the first case")
-    parser.add_argument("--out", type=Path, help="JSON file for the counts")
+    parser.add_argument("--out", type=Path, help="JSON file for the counts; what it holds already is kept")
     parser.add_argument("--before", type=Path, help="such a file of an earlier state")
     parser.add_argument("--write", action="store_true", help="write the section of RESULTS.md")
     chosen = parser.parse_args()
     if chosen.only:
         attempts(chosen.only, chosen.first, chosen.cases)
         return
+    kept: dict[str, dict[str, int]] = json.loads(chosen.out.read_text()) if chosen.out and chosen.out.exists() else {}
     counts: dict[str, dict[str, int]] = {}
     for surface in SURFACES:
-        counts[surface.name] = dict(count(surface.name, chosen.cases))
+        found = kept.get(surface.name, {})
+        counts[surface.name] = found if sum(found.values()) == chosen.cases else dict(count(surface.name, chosen.cases))
         print(surface.name, counts[surface.name], flush=True)
-    if chosen.out:
-        write_json(chosen.out, counts)
+        if chosen.out:
+            write_json(chosen.out, {**kept, **counts})
     before = json.loads(chosen.before.read_text()) if chosen.before else {}
     rows = []
     for name in (*counts, "all"):

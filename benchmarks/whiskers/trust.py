@@ -43,8 +43,7 @@ def run(recipe: str, placing: str, fidelity: str, objects: int, each: int) -> li
     first = {name: launcher.launch([(name, sweeps)]) for name, sweeps in picked.items()}
     once = time.process_time() - started
     found: Counter[str] = Counter()
-    suspicious, strain, depth, lost = 0, 0.0, [], 0
-    compared = 0.0
+    strain, compared, depth = 0.0, 0.0, []
     for name, result in first.items():
         verdict, touching = result.verdict, result.counts["touching"] > 0
         good = touching & ~verdict.unstable
@@ -95,11 +94,11 @@ def main() -> None:
         "time with retries and comparisons over one run",
     ]  # fmt: skip
     text = (
-        f"{args.each} sweeps of {args.objects} procedural objects past 30 mouse whiskers each. *Start inside*: flagged at the "
-        "first step, whatever their depth. Overlap and force are those of whiskers in good order at the first try. *Of those "
-        "that change*: whiskers whose base force changes by more than 20 % (root mean square over the readings) at half "
-        "the step, when every touching whisker is simulated so, and how many of them are suspicious, so that the rule "
-        "compares them.\n\n" + table(head, rows)
+        f"{args.each} sweeps of {args.objects} procedural objects past 30 mouse whiskers each. *Start inside*: flagged"
+        " at the first step, whatever their depth. Overlap and force are those of whiskers in good order at first."
+        " *Of those that change*: whiskers whose base force changes by more than 20 % (root mean square over the"
+        " readings) at half the step, when every touching whisker is simulated so, and how many of them are suspicious,"
+        " so that the rule compares them.\n\n" + table(head, rows)
     )
     print(text)
     if args.write:

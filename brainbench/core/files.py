@@ -6,10 +6,8 @@ import contextlib
 import errno
 import hashlib
 import json
-import logging
 import math
 import os
-import secrets
 from collections.abc import Iterator, Mapping
 from dataclasses import Field, fields, is_dataclass
 from pathlib import Path
@@ -17,13 +15,7 @@ from typing import Any
 
 from brainbench.core.errors import FileWriteError, UsageError, shown
 from brainbench.core.reading.texts import read_json, read_mapping  # noqa: F401 - also imported from here
-
-try:
-    import fcntl
-except ImportError:  # Windows
-    fcntl = None
-
-_LOG = logging.getLogger(__name__)
+from brainbench.core.writing.temporaries import temporary_path
 
 CACHE_VARIABLE = "BRAINBENCH_CACHE"
 """Environment variable that overrides the platform's cache folder."""
@@ -79,9 +71,10 @@ def atomic_path(target: str | os.PathLike[str]) -> Iterator[Path]:
         FileWriteError: the folder cannot be made or written, or the disk is full.
     """
     target = Path(target)
-    temporary = target.with_name(f".{target.stem[:200]}-{secrets.token_hex(8)}{target.suffix}")
+    temporary = target
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
+        temporary = temporary_path(target)
         # Made by hand: tempfile's files are private, and to read the umask is not safe among threads.
         os.close(os.open(temporary, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
         yield temporary
@@ -93,39 +86,9 @@ def atomic_path(target: str | os.PathLike[str]) -> Iterator[Path]:
             raise
         raise FileWriteError(f"{shown(str(target))} cannot be written ({os.strerror(error.errno)}).") from error
     finally:
-        with contextlib.suppress(OSError):
-            temporary.unlink(missing_ok=True)
-
-
-@contextlib.contextmanager
-def lock_folder(folder: Path, *, wait: bool = True) -> Iterator[bool]:
-    """Hold a lock on a folder, which the system releases when this process ends in whatever way.
-
-    Args:
-        folder: must exist.
-        wait: for another process that holds it, rather than refuse.
-
-    Yields:
-        False where there are no such locks (Windows; some network file systems, which are warned of).
-
-    Raises:
-        UsageError: another process holds it, and ``wait`` is false.
-    """
-    if fcntl is None:
-        yield False
-        return
-    handle, held = os.open(folder, os.O_RDONLY), False
-    try:
-        try:
-            fcntl.flock(handle, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
-            held = True
-        except BlockingIOError as error:
-            raise UsageError(f"Another process is writing {shown(str(folder))}; wait for it, or end it.") from error
-        except OSError as error:
-            _LOG.warning("%s cannot be locked (%s); start no second run there", folder, error)
-        yield held
-    finally:
-        os.close(handle)
+        if temporary != target:
+            with contextlib.suppress(OSError):
+                temporary.unlink(missing_ok=True)
 
 
 def _is_unused(value: Any, field: Field[Any]) -> bool:

@@ -13,7 +13,7 @@ from xml.etree import ElementTree
 
 from brainbench.core.devices import mujoco_module
 from brainbench.core.errors import DataError, UsageError, shown, unknown_name
-from brainbench.core.reading.regular import readable
+from brainbench.core.reading.regular import check_file, readable
 from brainbench.core.reading.texts import read_text
 from robotics_bridge.hands.facing import palmar_directions
 from robotics_bridge.hands.layouts import Layout, check_names, pad_probes, read_probes, select
@@ -165,6 +165,10 @@ def read_mjspec(path: Path) -> Any:
         files = [mesh.file for mesh in spec.meshes if mesh.file]
     if any(not (folder / spec.meshdir / name).exists() and (folder / name).exists() for name in files):
         spec.meshdir = ""
+    for name in files:
+        # To open a pipe or a device would wait for ever; what is not there is told in compiling.
+        if os.path.lexists(place := folder / spec.meshdir / name):
+            check_file(place, "mesh file")
     if path.suffix.lower() == ".urdf":
         spec.compiler.discardvisual = True
         # Fixed links join their parents, as their solids should; a sensor keeps the palm from joining the world.

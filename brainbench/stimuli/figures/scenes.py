@@ -15,13 +15,14 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from brainbench.core.errors import UsageError, listing, unknown_name
+from brainbench.core.figures.style import check_format
 from brainbench.core.progress import Progress
 from brainbench.stimuli.engines import DEFAULT_ENGINE
 from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.engines.protocol import WhiskerEngine
 from brainbench.stimuli.figures.annotation import Annotation
 from brainbench.stimuli.figures.camera import Camera, Lens
-from brainbench.stimuli.figures.canvas import MOMENT_MAP, ROW_COLORS, UNSTABLE_COLOR, check_format, round_up
+from brainbench.stimuli.figures.canvas import MOMENT_MAP, ROW_COLORS, UNSTABLE_COLOR, round_up
 from brainbench.stimuli.figures.films import require_writer, write_film
 from brainbench.stimuli.figures.raster import RasterLayer, Triangles, draw
 from brainbench.stimuli.figures.shading import floor, lamp, paint, shade

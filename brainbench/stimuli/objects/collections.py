@@ -15,6 +15,7 @@ import numpy as np
 
 from brainbench.core.errors import DataFileNotFoundError, UsageError, shown, unknown_name
 from brainbench.core.files import file_hash
+from brainbench.core.reading.regular import readable
 from brainbench.geometry import Mesh
 from brainbench.stimuli.objects.mesh_solids import mesh_solid, shape_solid
 from brainbench.stimuli.objects.procedural import DETAIL, describe_family, list_families, make
@@ -148,12 +149,14 @@ def _detail(family: str, seed: int) -> int:
 def _files(pattern: str, unit: str | None, collision: str) -> Iterator[NamedObject]:
     given = Path(pattern)
     # In alphabetical order; ``**`` stands for any number of folders.
-    found = [given] if given.is_file() else sorted(Path(given.anchor or ".").glob(str(given.relative_to(given.anchor))))
-    paths = [path for path in found if path.is_file()]
+    with readable(pattern, "pattern of mesh files"):
+        below = str(given.relative_to(given.anchor))
+        found = [given] if _is_file(pattern) else sorted(Path(given.anchor or ".").glob(below))
+        paths = [path for path in found if path.is_file()]
     if not paths:
-        raise DataFileNotFoundError(f"No mesh file matches {pattern!r}.")
+        raise DataFileNotFoundError(f"No mesh file matches {shown(pattern)}.")
     if unit is None:
-        raise UsageError(f"The length unit of {pattern!r} is not in the file; say it with --unit (m, cm, mm, …).")
+        raise UsageError(f"The length unit of {shown(pattern)} is not in the file; say it with --unit (m, cm, mm, …).")
     several = len({path.parent for path in paths}) > 1
     for path in paths:
         label = path.parent.name if several else path.stem

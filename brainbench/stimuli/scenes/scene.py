@@ -149,8 +149,14 @@ class Scene:
         # Row vectors times the matrix are world vectors in the axes of the array; rotations become Rᵀ T R.
         travel = None if isinstance(motion, Still) else lambda times: motion.displacement(times) @ axes
         turn = (lambda times: axes.T @ motion.turn(times) @ axes) if isinstance(motion, Path) else None
+        finest = min(self.whisking.finest, motion.finest)
         return [
-            Job(mount.whisker, ArrayFollicle(mount, self.whisking, travel, turn), obstacles, self.frames.readings)
+            Job(
+                mount.whisker,
+                ArrayFollicle(mount, self.whisking, travel, turn, finest),
+                obstacles,
+                self.frames.readings,
+            )
             for mount in self.array
         ]
 

@@ -9,7 +9,6 @@ from typing import Any
 import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
-from tensordict import TensorDict
 
 from brainbench.core.errors import BrainbenchError, DataError
 from brainbench.core.files import atomic_path
@@ -38,7 +37,7 @@ def build_student(
     Raises:
         UsageError: the shapes do not fit the tactile encoder.
     """
-    example = TensorDict({name: torch.zeros(1, *shapes[name]) for name in groups}, batch_size=[1])
+    example: Any = {name: torch.zeros(1, *shapes[name]) for name in groups}
     tactile = config.tactile
     return TactilePolicy(
         example, {"student": groups}, "student", actions, hidden_dims=config.hidden, embedder=config.embedder,

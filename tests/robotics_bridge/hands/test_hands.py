@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 
 import mujoco
@@ -226,6 +227,16 @@ def test_unknown_names_and_unusable_files_are_explained(tmp_path):
     (tmp_path / "still.xml").write_text('<mujoco><worldbody><geom size="1"/></worldbody></mujoco>')
     with pytest.raises(DataError, match=r"still\.xml' .*joints"):
         hands.load(tmp_path / "still.xml")
+    (tmp_path / "odd.xml").write_text('<mujoco><worldbody><body pos="0 NaN 0"/></worldbody></mujoco>')
+    with pytest.raises(DataError, match=r"'pos' of <body> .*odd\.xml"):
+        hands.load(tmp_path / "odd.xml")
+    os.mkfifo(tmp_path / "pipe.stl")
+    (tmp_path / "mesh.xml").write_text('<mujoco><asset><mesh file="pipe.stl"/></asset></mujoco>')
+    with pytest.raises(DataError, match=r"pipe\.stl"):
+        hands.load(tmp_path / "mesh.xml")
+    (tmp_path / "loop.xml").write_text('<mujoco><include file="loop.xml"/></mujoco>')
+    with pytest.raises(DataError, match=r"loop\.xml"):
+        hands.load(tmp_path / "loop.xml")
     with pytest.raises(UsageError, match="resolution 'hi'"):
         hands.load("xhand1").layout("hi")
     with pytest.raises(UsageError, match=r"'tip'; .* 'tips'"):

@@ -105,7 +105,8 @@ def test_whiskers_of_unknown_shape_are_drawn_black_and_unbent_and_said_aloud(cap
     # Both still rest at t = 0, so the one whose shape is not known lies where it lay.
     whole = record(SCENE, [0.0], fidelity=FAST, cache=False)
     np.testing.assert_allclose(recording.unbent(0, 0), whole.joints[0][0], atol=1e-7)
-    known, unknown = (Picture(some, ABOVE, SMALL)._whiskers(0, Picture(some, ABOVE, SMALL).lens) for some in (whole, recording))
+    pictures = [Picture(some, ABOVE, SMALL) for some in (whole, recording)]
+    known, unknown = (picture._whiskers(0, picture.lens) for picture in pictures)
     assert len(known.corners) == len(unknown.corners)
     assert unknown.colors.reshape(-1, 3).min(axis=1).min() < known.colors.reshape(-1, 3).max(axis=1).min()
 

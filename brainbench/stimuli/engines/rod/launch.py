@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from brainbench.core.devices import to_struct, warp
 from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.engines.rod.compilation import load_kernels
-from brainbench.stimuli.engines.rod.limits import FINEST, LIGHT
+from brainbench.stimuli.engines.rod.limits import FINEST, LIGHT, LONGEST_SPAN
 from brainbench.stimuli.engines.rod.packing import PackedJobs, PackedMotions, capacity_for, pack_chains
 from brainbench.stimuli.engines.rod.scheduling import Slices, allocate, make_problems
 from brainbench.stimuli.engines.rod.shapes import PackedShapes
@@ -46,7 +46,7 @@ class LaunchResult:
     retried: NDArray[np.bool_]
     """[row, column] True where a whisker was simulated again."""
     points: NDArray[np.floating] | None = None
-    """[row, reading, node, 3] joints and tip (m), when shapes were asked for."""
+    """[row, reading, node, 3] joints and tip (m) from the base point, when shapes were asked for."""
     contact_wrench: NDArray[np.floating] | None = None
     """[row, reading, 6] force and moment of all contacts (N, N·m), when shapes were asked for."""
     seconds: dict[str, float] = field(default_factory=dict)
@@ -175,7 +175,6 @@ class WhiskerSolver:
         )
         out.contact = wp.full((size[0], frames, size[1]), -1.0, dtype=real, device=device)
         options = structs.StepOptions()
-        options.start = start * MILLI
         options.quasistatic = int(self.quasistatic)
         weight = LIGHT if self.quasistatic else 1.0
         # Quasistatic whiskers have masses that are scaled by LIGHT; gravity is scaled back, so that their weight stays.
@@ -186,9 +185,9 @@ class WhiskerSolver:
             self.chain_arrays,
             to_struct(structs.MotionArrays, motions.arrays(), device),
             to_struct(structs.ShapeArrays, shapes.arrays(), device),
-            to_struct(structs.JobArrays, jobs.arrays(self.chains, self.steps[jobs.whisker] / finer), device),
+            to_struct(structs.JobArrays, jobs.arrays(self.chains, self.steps[jobs.whisker], start, finer), device),
             options,
-            wp.array(readings * MILLI, dtype=real, device=device),
+            to_struct(structs.ReadingArrays, _readings(readings - start), device),
             out,
             make_problems(self.kernels, self.capacity, count, device),
         ]
@@ -214,7 +213,8 @@ class WhiskerSolver:
         force = np.sqrt(np.einsum("...d,...d", wrench[..., :3], wrench[..., :3]))
         facts = RunFacts(
             counts["status"],
-            table(numbers["failed"].astype(float)) / MILLI,
+            # Single precision rounds a late time; the reading at it must not pass for one before it.
+            start + table(numbers["failed"].astype(float)) * (1 - 2e-7) / MILLI,
             *_strong(force, table(self.strongest[jobs.whisker]), readings),
             travel=np.zeros(size) if travel is None else travel,
             fast_at=np.full(size, np.inf) if fast_at is None else fast_at,
@@ -237,6 +237,23 @@ class WhiskerSolver:
 def real_type(fidelity: Fidelity) -> type:
     """Return Warp's type of the numbers that a simulation calculates with."""
     return warp().float32 if fidelity.precision == "single" else warp().float64
+
+
+def _readings(times: NDArray[np.float64]) -> dict[str, NDArray]:
+    """Return what the kernel's ``ReadingArrays`` hold, for times (s) since the start."""
+    times = times * MILLI
+    before = np.concatenate([[0.0], times[:-1]])
+    # Within a span single precision keeps time; longer ones are divided, in equal parts.
+    parts = np.maximum(np.ceil((times - before) / LONGEST_SPAN - 1e-9), 1).astype(int)
+    which = np.repeat(np.arange(len(times)), parts)
+    last = np.cumsum(parts) - 1
+    share = (np.arange(len(which)) - last[which]) / parts[which] + 1
+    all_times = before[which] + (times - before)[which] * share
+    all_times[last] = times
+    tick = np.floor(all_times)
+    row = np.full(len(which), -1, dtype=np.int32)
+    row[last] = np.arange(len(times))
+    return {"time": np.stack([tick, all_times - tick], axis=1), "row": row}
 
 
 def _strong(

@@ -91,7 +91,7 @@ class SweepLauncher:
         """
         started = time.perf_counter()
         motions, shapes = PackedMotions(), PackedShapes()
-        bases = np.array([motions.add(knot, 0.0, 1.0) for knot in self._bases], dtype=np.int32)
+        bases = motions.add_straight(np.concatenate(self._bases))
         prepared = self._prepare([name for name, _ in objects])
         for name, sweeps in objects:
             if len(sweeps):

@@ -384,17 +384,16 @@ def apply_forces(
             a2 = extra[1] - wp.dot(joint.gain2_w, aw) - wp.dot(joint.gain2_v, av)
             aw = aw + joint.axis1 * a1 + joint.axis2 * a2
             av = av + joint.moment1 * a1 + joint.moment2 * a2
-            change = JointVector()
-            change[0] = a1
-            change[1] = a2
             if wp.static(hinges == 3):
+                a3 = real(0.0)
                 if i % 2 == 1:
                     a3 = extra[2] - wp.dot(joint.gain3_w, aw) - wp.dot(joint.gain3_v, av)
                     aw = aw + joint.axis3 * a3
                     av = av + joint.moment3 * a3
-                    change[2] = a3
-            if solver.thread == 0:
-                problems.added_acceleration[solver.job, i] = change
+                if solver.thread == 0:
+                    problems.added_acceleration[solver.job, i] = JointVector(a1, a2, a3)
+            elif solver.thread == 0:
+                problems.added_acceleration[solver.job, i] = JointVector(a1, a2)
             if solver.contacts < solver.candidates:
                 for j in range(solver.candidates):
                     if problems.candidate_link[first_candidate + j] == i and (solver.selected >> j) % 2 == 0:

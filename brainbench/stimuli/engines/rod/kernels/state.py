@@ -11,7 +11,7 @@ from typing import Any
 
 import warp as wp
 
-from brainbench.stimuli.engines.rod.limits import SPARE, contacts_for
+from brainbench.stimuli.engines.rod.limits import LISTED, SPARE, contacts_for
 
 from .algebra import JointInverse, JointVector, mat33, reader, vec3, vec4
 from .parameters import capacity, hinges, real
@@ -29,11 +29,13 @@ PerNode3: Any = wp.types.matrix((capacity + 1, 3), real)
 PerCandidate1: Any = wp.types.vector(most_candidates, real)
 PerCandidate3: Any = wp.types.matrix((most_candidates, 3), real)
 PerCandidateInt: Any = wp.types.vector(most_candidates, wp.int32)
-
+PerListed1: Any = wp.types.vector(LISTED, real)
+PerListedInt: Any = wp.types.vector(LISTED, wp.int32)
 
 row = reader(
     (PerLink1, real), (PerLinkJoint, JointVector), (PerLinkInverse, JointInverse), (PerLink3, vec3),
     (PerLinkInt, wp.int32), (PerNode3, vec3), (PerCandidate1, real), (PerCandidate3, vec3), (PerCandidateInt, wp.int32),
+    (PerListed1, real), (PerListedInt, wp.int32),
 )  # fmt: skip
 
 
@@ -93,19 +95,29 @@ class ChainArrays:
 
 
 @wp.struct
+class Instant:
+    """A time since the start of the launch."""
+
+    tick: wp.int32
+    """Whole milliseconds."""
+    part: real
+    """The rest; it may be negative or more than one."""
+
+
+@wp.struct
 class MotionArrays:
     """Motions of bases and objects, see ``motion``: knots of all tracks one behind the other."""
 
     first: wp.array(dtype=wp.int32)
-    """[track] index of the first knot."""
+    """[track] first of its cells; of a track with one knot that knot."""
     count: wp.array(dtype=wp.int32)
-    """[track] number of knots."""
-    start: wp.array(dtype=real)
-    """[track] time of the first knot."""
-    spacing: wp.array(dtype=real)
-    """[track] time between knots."""
+    """[track] number of cells + 1; 1 of a track with one knot."""
+    cell: wp.array(dtype=wp.int32)
+    """[cell] first knot; behind the cells of each track its last knot."""
+    coarse: wp.array(dtype=vec3)
+    """[knot] part of the position on a coarse grid."""
     place: wp.array(dtype=vec3)
-    """[knot] position."""
+    """[knot] the rest of it."""
     velocity: wp.array(dtype=vec3)
     """[knot]"""
     turn: wp.array(dtype=vec4)
@@ -133,7 +145,7 @@ class ShapeArrays:
     scale: wp.array(dtype=real)
     """[shape] length of one unit of the shape (mm)."""
     radius: wp.array(dtype=real)
-    """[shape] farthest point of the shape from the body's origin (mm)."""
+    """[shape] farthest point of the shape from its origin (mm)."""
     speed: wp.array(dtype=real)
     """[shape] fastest that any of its points ever moves."""
     friction: wp.array(dtype=real)
@@ -168,6 +180,10 @@ class JobArrays:
     """[job] motion of the base."""
     step: wp.array(dtype=real)
     """[job] longest time step."""
+    limit_first: wp.array(dtype=wp.int32)
+    """[job + 1] first limit of each job."""
+    limit: wp.array(dtype=real)
+    """[limit] longest step from each cell of the motions on; a job without is limited by ``step`` alone."""
     row: wp.array(dtype=wp.int32)
     """[job] first index of its results."""
     column: wp.array(dtype=wp.int32)
@@ -188,7 +204,6 @@ class JobArrays:
 class StepOptions:
     """Options that all jobs of a launch share."""
 
-    start: real
     gravity: vec3
     axes: mat33
     """Rotation of the results."""
@@ -196,6 +211,16 @@ class StepOptions:
     """1: rates are forgotten after each step, and a reading takes the wrench of the step that ends at it."""
     shape: wp.int32
     """1: shapes and contact wrenches are recorded."""
+
+
+@wp.struct
+class ReadingArrays:
+    """Times at which whiskers are read, ascending, and some between them so that none are far apart."""
+
+    time: wp.array(dtype=Instant)
+    """[reading]"""
+    row: wp.array(dtype=wp.int32)
+    """[reading] where the results go; negative for none."""
 
 
 @wp.struct
@@ -240,6 +265,8 @@ class WhiskerJob:
     links: wp.int32
     beta: real
     longest_step: real
+    first_limit: wp.int32
+    limits: wp.int32
     first_shape: wp.int32
     end_shape: wp.int32
     object_speed: real
@@ -257,15 +284,21 @@ class WhiskerState:
     reading: wp.int32
     """Reading that the whisker is on its way to."""
     pending_reading: wp.int32
-    """Reading that the next step writes: it takes the wrench of the step that begins at its time."""
-    reading_time: real
+    """Result that the next step writes: it takes the wrench of the step that begins at its time."""
+    reading_time: Instant
     """Time of the last reading."""
     time_left: real
     """Time left to the next reading, when the whisker paused."""
     contacts: wp.int32
     """Contacts of the last step."""
-    is_near: wp.int32
-    """1: some link may be near an object."""
+    split_time: real
+    """Time for which steps stay split, because an object was about to be touched."""
+    near_speed: real
+    """Speed of the fastest such object."""
+    closes: wp.int32
+    """1: a candidate of this step may close within it."""
+    closing_speed: real
+    """Speed of the fastest object among these."""
     top_speed: real
     """Speed of the fastest point."""
     velocity_jump: real
@@ -279,8 +312,9 @@ class WhiskerState:
     """One of the ``WAIT_`` constants; 0 before the whisker first pauses and once it has what it waited for."""
     first_query: wp.int32
     """First of its distance queries."""
-    step_is_near: wp.int32
-    """``is_near`` and ``top_speed`` in the step whose contact forces are awaited."""
+    step_split_time: real
+    """``split_time``, ``near_speed`` and ``top_speed`` of the step whose contact forces are awaited."""
+    step_near_speed: real
     step_top_speed: real
     largest_change: real
     """Largest bend or rate in a step."""
@@ -293,6 +327,22 @@ class WhiskerState:
     unsolved: wp.int32
     miss: real
     load: real
+
+
+@wp.struct
+class NearShapes:
+    """The shapes nearest to a whisker, where a scene has more than are looked at in each step."""
+
+    shape: PerListedInt
+    """In the order of the scene."""
+    distance: PerListed1
+    """Bound of the distance from the whisker's axis when they were listed."""
+    count: wp.int32
+    """0: there is no list; all shapes are looked at."""
+    room: real
+    """Least distance of all others from the whisker's axis then."""
+    moved: real
+    """How much nearer any of them may have come since."""
 
 
 @wp.struct
@@ -469,6 +519,15 @@ class DistanceQuery:
 
 
 @wp.struct
+class QueryFrame:
+    """When distances are asked for, and the point from which the ends of the links count: the base."""
+
+    time: Instant
+    coarse: vec3
+    place: vec3
+
+
+@wp.struct
 class PausedWhiskers:
     """Whiskers between two slices, the queues they stand in, and the distances they wait for."""
 
@@ -494,8 +553,8 @@ class PausedWhiskers:
     """[job]"""
     link: wp.array2d(dtype=PausedLink)
     """[link, job]"""
-    query_time: wp.array(dtype=real)
-    """[job] time for which distances are asked."""
+    query_frame: wp.array(dtype=QueryFrame)
+    """[job]"""
     query_margin: wp.array(dtype=real)
     """[job] gap up to which a contact takes part; at rest negative: how far to search."""
     query: wp.array(dtype=DistanceQuery)
