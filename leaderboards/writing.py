@@ -8,7 +8,8 @@ from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 
 from brainbench.core.errors import BrainbenchError, DataError
-from brainbench.core.files import atomic_path, lock_folder
+from brainbench.core.files import atomic_path
+from brainbench.core.writing.locks import lock_folder
 
 _TEMPORARY = re.compile(r"\.(?P<stem>.+)-[0-9a-f]{16}(?P<suffix>\.[^.]*)?")
 """Names that :func:`brainbench.core.files.atomic_path` gives before a file is whole."""

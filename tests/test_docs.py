@@ -51,24 +51,28 @@ def test_the_data_set_of_the_datasets_page_can_be_made_and_read(tmp_path: Path, 
 PAGES = sorted(str(path.relative_to(ROOT)) for path in (ROOT / "docs").glob("*.md"))
 
 
-@pytest.mark.parametrize("page", ["README.md", "CONTRIBUTING.md", *PAGES])
-def test_links_between_pages_lead_somewhere(page: str):
-    text = (ROOT / page).read_text(encoding="utf-8")
-    for target in re.findall(r"\]\(([^)#:]+)(?:#[^)]*)?\)", text):
-        # Pages that the site makes of other files.
-        if Path(target).name in ("results.md", "from-simulation-to-leaderboard.md"):
-            continue
-        assert ((ROOT / page).parent / target).exists(), f"{page} links to {target}, which does not exist"
+FRONT = ("README.md", "CONTRIBUTING.md", "RELEASING.md")
 
 
-def test_the_readme_names_only_commands_that_exist(run_help):
-    text = (ROOT / "README.md").read_text(encoding="utf-8")
-    named = set(re.findall(r"(?:`|&& |^)brainbench ([a-z]+)(?: ([a-z]+))?", text, flags=re.MULTILINE))
-    assert ("score", "zhuang") in named
-    for command, sub in named:
-        assert command in run_help(), f"README names brainbench {command}"
-        if sub and command in ("models", "recordings", "stimuli", "leaderboard"):
-            assert sub in run_help(command), f"README names brainbench {command} {sub}"
+def _slugs(page: Path) -> set[str]:
+    """Return the anchors of a page that both the repository host and the site give to its headings."""
+    text = re.sub(r"```.*?```", "", page.read_text(encoding="utf-8"), flags=re.DOTALL)
+    slugs = set()
+    for title in re.findall(r"^#+ (.+)$", text, flags=re.MULTILINE):
+        plain = re.sub(r"\[([^]]*)\]\([^)]*\)", r"\1", title).replace("`", "").strip().lower()
+        host = re.sub(r"[^\w\- ]", "", plain).replace(" ", "-")
+        slugs |= {host} & {re.sub(r"[-\s]+", "-", host)}
+    return slugs
+
+
+@pytest.mark.parametrize("page", [*FRONT, *PAGES])
+def test_links_lead_to_files_and_headings_of_the_repository(page: str):
+    text = re.sub(r"```.*?```", "", (ROOT / page).read_text(encoding="utf-8"), flags=re.DOTALL)
+    for target, anchor in re.findall(r"\]\(([^)#:]*)(?:#([^)]*))?\)", text):
+        path = ((ROOT / page).parent / target) if target else ROOT / page
+        assert path.exists(), f"{page} links to {target}, which does not exist"
+        if anchor and path.suffix == ".md":
+            assert anchor in _slugs(path), f"{page} links to {target}#{anchor}; its headings are {sorted(_slugs(path))}"
 
 
 @pytest.mark.parametrize("page", ["README.md", *PAGES])
@@ -88,25 +92,18 @@ def test_commands_and_options_of_a_page_exist(page: str):
 
 
 def _commands(page: str) -> list[str]:
-    found = []
-    for block in _blocks(page, "bash"):
+    text = re.sub(r"```.*?```", "", (ROOT / page).read_text(encoding="utf-8"), flags=re.DOTALL)
+    found = re.findall(r"`(brainbench [^`\[…|]+)`", text)
+    indented = "\n".join(re.findall(r"^    (.+)$", text, flags=re.MULTILINE))
+    for block in (*_blocks(page, "bash"), indented):
         for line in block.replace("\\\n", " ").splitlines():
             parts = re.split(r"&&|\|\|?", line.partition("#")[0])
             found += [part.strip() for part in parts if part.strip().startswith("brainbench ")]
     return found
 
 
-@pytest.fixture
-def run_help():
-    from typer.testing import CliRunner
-
-    from brainbench.cli import app
-
-    return lambda *words: CliRunner().invoke(app, [*words, "--help"]).output
-
-
 PRELUDES = {
-    "docs/models.md": "import torch\nstimuli = torch.zeros(2, 22, 30, 5, 7)",
+    "docs/export.md": "import torch\nstimuli = torch.zeros(2, 22, 30, 5, 7)",
     "docs/stimuli.md": "from brainbench.stimuli import WhiskerArray, whiskit\n"
     "whiskit.save_parameters(WhiskerArray.rat(), 'whisker_param_average_rat/')",
 }
@@ -166,7 +163,8 @@ def test_the_site_builds_without_a_warning_and_asks_nothing_of_the_network(tmp_p
 
 
 @pytest.mark.slow
-def test_the_notebook_runs_and_gives_what_is_shown(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+@pytest.mark.parametrize("name", sorted(path.stem for path in (ROOT / "docs/notebooks/sources").glob("*.md")))
+def test_a_notebook_runs_and_gives_what_is_shown(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     pytest.importorskip("nbclient")
     pytest.importorskip("ipykernel")
     nbformat = pytest.importorskip("nbformat")
@@ -175,11 +173,11 @@ def test_the_notebook_runs_and_gives_what_is_shown(tmp_path: Path, monkeypatch: 
     assert spec.loader is not None
     build = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(build)
-    shown = nbformat.read(build.NOTEBOOK, as_version=4)
+    shown = nbformat.read(build.FOLDER / f"{name}.ipynb", as_version=4)
     sources = [(cell.cell_type, cell.source) for cell in shown.cells]
-    assert sources == list(build.CELLS), "run docs/notebooks/build.py anew"
+    assert sources == build.cells(name), f"run docs/notebooks/build.py {name} anew"
     monkeypatch.setenv("PYTHONPATH", str(ROOT))
-    made = build.make(tmp_path)
+    made = build.make(name, tmp_path)
     for old, new in zip(shown.cells, made.cells, strict=True):
         if new.cell_type == "code":
             kinds = [

@@ -1,10 +1,10 @@
-"""Table and learning curves of teachers that ``policy.py --part teacher`` trained, from new weights or another's.
+"""Table and picture of teachers that ``policy.py --part teacher`` trained, from new weights or another's.
 
     brainbench policy evaluate in_palm_rotate RUN --config careful --episodes 128 --envs 64 -o processor/careful.json
     python -m benchmarks.policies.teachers --runs NAME=FOLDER … --after NAME=NAME … \
         --processor NAME=FILE … [--notes FILE] [--write]
 
-A folder is what ``--out`` named. ``--after`` names the run whose networks another began with; its curve follows.
+A folder is what ``--out`` named. ``--after`` names the run whose networks another began with.
 
     python -m benchmarks.policies.teachers --first TASK=FOLDER … [--notes FILE] [--write]
 
@@ -21,8 +21,18 @@ from typing import Any
 import numpy as np
 
 from benchmarks.report import table, write_section
+from brainbench.core.figures.style import COLORS, PALE, panels, save_figure
 
-PICTURE = Path(__file__).resolve().parents[2] / "docs" / "images" / "policy-learning.png"
+PICTURE = Path(__file__).resolve().parents[2] / "docs" / "images" / "policy-teachers.png"
+NAMES = {
+    "zero": "no movement",
+    "random": "random movement",
+    "from the thrower": "continued from a teacher that threw the block",
+    "default": "new weights, reward for coming nearer",
+    "dear drop": "the one above, higher penalty for drops",
+    "careful": "the same, also higher reward for goals (shipped)",
+}
+"""Agent of the table → what the picture calls it."""
 _SMOOTH = 8
 """Iterations over whose episodes a curve's point is the mean."""
 STEP = 0.025
@@ -102,44 +112,21 @@ def first(runs: dict[str, Path]) -> str:
     return f"{table(columns, found)}\n\n{table(moments, way)}"
 
 
-def draw(runs: dict[str, Path], after: dict[str, str], path: Path) -> None:
-    """Draw success and goals of the episodes that ended, and the goal's width, over control steps."""
-    import matplotlib as mpl
-
-    mpl.use("Agg")
-    from matplotlib import pyplot as plt
-
-    figure, axes = plt.subplots(1, 2, figsize=(9, 3.2), constrained_layout=True)
-    width = axes[0].twinx()
-    ends: dict[str, float] = {}
-    for index, (name, folder) in enumerate(runs.items()):
-        (log,) = folder.glob("teacher-*/log.jsonl")
-        rows = [row for row in lines(log) if row.get("episode/episodes")]
-        first = ends.get(after.get(name, ""), 0.0)
-        steps = first + np.array([row["steps"] for row in rows]) / 1e6
-        ends[name] = steps[-1]
-        weights = np.array([row["episode/episodes"] for row in rows])
-        for axis, key in ((axes[0], "episode/success"), (axes[1], "episode/metric")):
-            values = weights * np.array([row[key] for row in rows])
-            total = np.convolve(weights, np.ones(_SMOOTH), "valid")
-            axis.plot(
-                steps[_SMOOTH - 1 :],
-                np.convolve(values, np.ones(_SMOOTH), "valid") / total,
-                color=f"C{index}",
-                label=name,
-            )
-        if "threshold" in rows[0]:
-            width.plot(steps, [row["threshold"] for row in rows], color=f"C{index}", lw=0.8, ls=":")
-    axes[0].set(ylabel="success in training", ylim=(0, 0.8))
-    axes[1].set(ylabel="goals an episode", ylim=(0, None))
-    width.set(ylabel="dotted: width of the goal (rad)", ylim=(0, 0.5))
-    axes[1].legend(frameon=False)
-    for axis in axes:
-        axis.set_xlabel("control steps (millions)")
-        axis.spines["top"].set_visible(False)
-    width.spines["top"].set_visible(False)
-    figure.savefig(path, dpi=110)
-    plt.close(figure)
+def draw(section: str) -> None:
+    """Draw success and goals of each agent of the section's table, with 95 % intervals."""
+    rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in section.splitlines() if line[:1] == "|"]
+    agents = [row for row in rows[2:] if row[0] in NAMES][::-1]
+    figure, ((left, right),) = panels(1, 2, (9.5, 3.4), sharey=True)
+    for height, row in enumerate(agents):
+        color = COLORS[0] if row[2] != "–" else PALE
+        value, low, high = (float(word.strip("[],")) for word in row[4].split())
+        left.errorbar(value, height, xerr=[[value - low], [high - value]], fmt="o", color=color, capsize=3)
+        value, half = (float(word) for word in row[5].split(" ± "))
+        right.errorbar(value, height, xerr=half, fmt="o", color=color, capsize=3)
+    left.set_yticks(range(len(agents)), [NAMES[row[0]] for row in agents])
+    left.set(xlabel="episodes with at least a quarter turn (share)", xlim=(-0.02, 0.8))
+    right.set(xlabel="quarter turns an episode (mean)", xlim=(-0.06, 2.5))
+    save_figure(figure, PICTURE, dpi=120)
 
 
 def main() -> None:
@@ -169,7 +156,7 @@ def main() -> None:
         )
         write_section("First teachers of other tasks", command, text, where=options.device, subject="policies")
     elif options.write:
-        draw(runs, after, PICTURE)
+        draw(text)
         command = "python -m benchmarks.policies.tasks --part teacher --device cuda --tasks in_palm_rotate …"
         write_section("Teachers of in_palm_rotate", command, text, where=options.device, subject="policies")
 

@@ -24,6 +24,7 @@ from scipy import stats
 from benchmarks.report import table, write_section
 from benchmarks.scores import simulated_boards
 from benchmarks.scores.simulated_boards import BIN, BOARDS, RULES, Study
+from brainbench.core.figures.style import COLORS, INK, PALE, panels, save_figure
 from brainbench.core.files import write_text
 from brainbench.core.jobs import run_jobs
 from brainbench.core.trials import Trials
@@ -39,7 +40,6 @@ from brainbench.metrics.reliability.subject_rdm import SubjectRDM, subject_rdm
 DOCS = Path(__file__).parents[2] / "docs"
 IMAGES = DOCS / "images"
 PAIRS = permuted_pairs(np.concatenate(list(label_orders(6, 0))))
-INK, ACCENT, WARN = "#333333", "#1f6f8b", "#c0504d"
 
 
 @dataclass
@@ -327,7 +327,7 @@ def make_pool(
 
 def recovery(run: Run) -> Result:
     simulations = run.simulations
-    rows, points = [], []
+    rows = []
     for noise in (1.0, 3.0, 5.0, 7.0, 9.0, 12.0, 15.0, 20.0):
         pool = make_pool(simulations, noise, units=200, repeats=20, individual=0.0, mix=0.235, seed=7)
         reliability = np.array([subject.reliability for subject in pool.subjects])
@@ -336,16 +336,6 @@ def recovery(run: Run) -> Result:
             value = raw / np.sqrt(np.where(reliability > 0, reliability, np.nan))
         trusted = reliability >= 0.5
         kept = value[trusted]
-        points.append(
-            (
-                reliability.mean(),
-                pool.truth.mean(),
-                raw.mean(),
-                np.nanmean(value),
-                kept.mean() if trusted.any() else np.nan,
-                trusted.mean(),
-            )
-        )
         rows.append(
             [
                 f"{reliability.mean():.3f}",
@@ -357,35 +347,33 @@ def recovery(run: Run) -> Result:
             ]
         )
 
-    def draw() -> None:
-        figure, axes = _figure(1, 1)
-        x = [point[0] for point in points]
-        for index, name, colour, style in (
-            (1, "truth", "#999999", ":"),
-            (2, "raw r", INK, "-"),
-            (3, "corrected, everyone", WARN, "--"),
-            (4, "corrected, reliable animals (default)", ACCENT, "-"),
-        ):
-            axes[0].plot(
-                x,
-                [point[index] for point in points],
-                style,
-                color=colour,
-                label=name,
-                marker="." if style != ":" else None,
-            )
-        axes[0].axvline(0.5, ls=":", color="#999999")
-        axes[0].set(xlabel="mean reliability of an animal's RDM", ylabel="comparison with the model", ylim=(0, 1.4))
-        axes[0].legend(frameon=False, loc="lower left", fontsize=7)
-        _save(figure, "calibration_recovery.png")
-
     return Result(
         "A true comparison near .954, corrected for noise",
         ["mean reliability", "truth", "raw r", "corrected, everyone", "corrected, reliable ones", "flagged"],
         rows,
-        "",
-        draw,
+        partial(draw_recovery, rows),
     )
+
+
+def draw_recovery(rows: list[list[str]]) -> None:
+    """Draw the rows of the table ``recovery``; bars are 95 % intervals of the simulation."""
+    numbers = [[tuple(float(part) for part in cell.rstrip("%").split(" ± ")) for cell in row[:5]] for row in rows]
+    x = [row[0][0] for row in numbers]
+    figure, axes = _figure(1, 1, (6.0, 4.0))
+    axes[0].axvspan(0, 0.5, color="0.94", lw=0)
+    axes[0].text(0.49, 1.36, "reliability below 0.5:\nanimal left out", ha="right", va="top", fontsize=8.5, color=PALE)
+    for index, name, colour, style in (
+        (1, "true comparison, without noise", PALE, ":"),
+        (2, "not corrected (raw r)", INK, "o-"),
+        (3, "corrected, all animals", COLORS[1], "o--"),
+        (4, "corrected, reliable animals (default)", COLORS[0], "o-"),
+    ):
+        y, half = [row[index][0] for row in numbers], [1.96 * sum(row[index][1:]) for row in numbers]
+        axes[0].errorbar(x, y, half, fmt=style, color=colour, label=name, ms=4, capsize=3)
+    axes[0].set(xlabel="mean split-half reliability of an animal's RDM", ylabel="correlation with the model's RDM")
+    axes[0].set(xlim=(0.25, 1.02), ylim=(0, 1.4))
+    axes[0].legend(frameon=False, loc="lower right", fontsize=8.5)
+    _save(figure, "calibration_recovery.png")
 
 
 def ceiling(run: Run) -> Result:
@@ -458,20 +446,13 @@ JOBS: dict[str, Callable[[Run], Result]] = {
 }
 
 
-def _figure(rows: int, columns: int) -> tuple[object, list]:
-    import matplotlib
-
-    matplotlib.use("Agg")
-    from matplotlib import pyplot as plt
-
-    plt.rcParams.update({"font.size": 9, "axes.spines.top": False, "axes.spines.right": False})
-    figure, axes = plt.subplots(rows, columns, figsize=(4.2 * columns, 3.2 * rows), squeeze=False, layout="constrained")
+def _figure(rows: int, columns: int, inches: tuple[float, float] | None = None) -> tuple[Any, list[Any]]:
+    figure, axes = panels(rows, columns, inches or (4.2 * columns, 3.2 * rows))
     return figure, list(axes.ravel())
 
 
-def _save(figure: object, name: str) -> None:
-    IMAGES.mkdir(parents=True, exist_ok=True)
-    figure.savefig(IMAGES / name, dpi=150)
+def _save(figure: Any, name: str) -> None:
+    save_figure(figure, IMAGES / name, dpi=150)
 
 
 def write_docs(name: str, body: str) -> None:

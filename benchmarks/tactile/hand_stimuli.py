@@ -14,12 +14,14 @@ import torch
 from benchmarks.report import table, write_section
 from brainbench import load_model
 from brainbench.cli.stimuli.hand import objects_of
+from brainbench.core.figures.style import panels, save_figure
 from brainbench.metrics import compare, rdm
 from brainbench.stimuli import load_stimuli
 from brainbench.stimuli.stimulus_set import hash_stimulus_set
 from robotics_bridge.exploration.procedures import PROCEDURES
 from robotics_bridge.exploration.record import record_exploration
 
+NAMES = {"input": "forces and moments", "encoder": "encoder of the network"}
 PICTURE = Path(__file__).resolve().parents[2] / "docs" / "images" / "policy-rdms.png"
 
 
@@ -39,30 +41,24 @@ def views(name: str, stimuli: np.ndarray) -> dict[str, np.ndarray]:
 
 
 def draw(rdms: dict[tuple[str, str], np.ndarray], labels: list[str], columns: list[str], rows: list[str]) -> None:
-    import matplotlib as mpl
-
-    mpl.use("Agg")
-    from matplotlib import pyplot as plt
-
-    figure, axes = plt.subplots(
-        len(rows), len(columns), figsize=(2.3 * len(columns) + 1.2, 2.3 * len(rows) + 0.6), layout="constrained"
-    )
+    size = (1.9 * len(columns) + 2.2, 2.0 * len(rows) + 1.6)
+    figure, axes = panels(len(rows), len(columns), size, sharex=True, sharey=True)
+    shown = None
     upper = np.triu_indices(6, 1)
     for row, axis_row in zip(rows, axes, strict=True):
         for column, axis in zip(columns, axis_row, strict=True):
             square = np.zeros((6, 6))
             square[upper] = rdms[column, row]
             square += square.T
-            axis.imshow(square / square.max(), cmap="magma", vmin=0, vmax=1)
-            axis.set_xticks([])
-            axis.set_yticks(
-                range(6) if column == columns[0] else [], labels if column == columns[0] else [], fontsize=7
-            )
+            shown = axis.imshow(square / square.max(), cmap="magma", vmin=0, vmax=1)
+            axis.set_xticks(range(6), labels, rotation=90)
+            axis.set_yticks(range(6), labels)
             if row == rows[0]:
-                axis.set_title(column, fontsize=8)
+                axis.set_title(column.replace(", ", ",\n"))
             if column == columns[0]:
-                axis.set_ylabel(row, fontsize=8)
-    figure.savefig(PICTURE, dpi=120)
+                axis.set_ylabel(NAMES[row])
+    figure.colorbar(shown, ax=axes, label="dissimilarity (1 − Pearson, share of the panel's largest)", shrink=0.8)
+    save_figure(figure, PICTURE, dpi=120)
 
 
 def main() -> None:

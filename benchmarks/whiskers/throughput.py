@@ -62,7 +62,7 @@ def free(
     chains = [build_chain(mount.whisker, links) for mount in WhiskerArray.mouse()]
     solver = WhiskerSolver(chains, fidelity, pick_device(device_name), NOTHING, block=block, bounds=bounds)
     motions, shapes = PackedMotions(), PackedShapes()
-    motions.add(still_knots(np.zeros(3), np.array([1.0, 0, 0, 0])), 0.0, 1.0)
+    motions.add_straight(still_knots(np.zeros(3), np.array([1.0, 0, 0, 0])))
     shapes.first.append(0)
     which, zeros = np.sort(np.arange(lanes, dtype=np.int32) % len(chains)), np.zeros(lanes, dtype=np.int32)
     jobs = PackedJobs(which, zeros, zeros, np.arange(lanes, dtype=np.int32), zeros)

@@ -1,7 +1,8 @@
-"""Measure every preset against the elastica, the slip-off depth and the Euler-Bernoulli frequencies.
+"""Measure every preset against the elastica, the slip-off depth, the Euler-Bernoulli frequencies, and a shaken beam.
 
-Run from the repository root: ``python -m benchmarks.whiskers.validation``; it rewrites its section of RESULTS.md, one
-per ``--backend``. The gates (base moment/force of pegs, slip-off, frequencies, damping ratio) are :data:`GATES`.
+Run from the repository root: ``python -m benchmarks.whiskers.validation``; it rewrites its sections of RESULTS.md, one
+per ``--backend`` and ``--part``. Gates (base moment and force of pegs, slip-off, frequencies, damping, peak moment of a
+base that is shaken or pushed) are :data:`GATES`.
 """
 
 from __future__ import annotations
@@ -15,20 +16,27 @@ from functools import partial
 import numpy as np
 
 from benchmarks.report import table, write_section
+from benchmarks.whiskers import out_of_plane
 from brainbench.core.errors import BrainbenchError
 from brainbench.stimuli.engines import list_engines
 from brainbench.stimuli.engines.fidelity import Fidelity, list_presets
+from brainbench.stimuli.motion.trajectories import smooth_step
 from brainbench.stimuli.validation import bench_tests, references
+from brainbench.stimuli.validation.shaken_base import shaken_base
 from brainbench.stimuli.whiskers.array import WhiskerArray
 from brainbench.stimuli.whiskers.whisker import Whisker
 
+PARTS = ("plane", "out-of-plane", "fast-bases")
 ARCS = (0.3, 0.5, 0.7, 0.8)
 OFFSETS = (0.02, 0.1, 0.2, 0.3)
 SLIPS = (0.3, 0.5, 0.8)
+SHAKES = (400.0, 700.0, 1000.0, 2000.0)
+PULSES = (1e-4, 6e-4)
+"""Frequencies (Hz) and widths (s) of sideways motions of the base by 10 µm."""
 GATES = {
-    "accurate": {"moment": 0.01, "force": 0.02, "slip": 0.03, "frequency": 0.01, "damping": 0.05},
-    "balanced": dict.fromkeys(("moment", "force", "slip", "frequency", "damping"), 0.05),
-    "fast": dict.fromkeys(("moment", "force", "slip", "frequency", "damping"), 0.15),
+    "accurate": {"moment": 0.01, "force": 0.02, "slip": 0.03, "frequency": 0.01, "damping": 0.05, "shake": 0.02},
+    "balanced": {**dict.fromkeys(("moment", "force", "slip", "frequency", "damping"), 0.05), "shake": 0.1},
+    "fast": {**dict.fromkeys(("moment", "force", "slip", "frequency", "damping"), 0.15), "shake": 0.2},
 }
 """Largest relative errors allowed where the contact slope is at most 60° and the depth at most .9 of slip-off."""
 
@@ -78,6 +86,43 @@ def measure(name: str, backend: str) -> dict[str, dict[str, object]]:
         out["ring"] = bench_tests.ringdown(whisker, backend=backend, fidelity=preset)
         out["own"] = bench_tests.ringdown(whisker, own_step=True, backend=backend, fidelity=preset).frequency_errors
     return result
+
+
+def report_fast_bases(backend: str) -> tuple[str, list[str]]:
+    """Return the table of shaken and pushed bases, and the broken gates."""
+    rows, broken = [], []
+    for preset in list_presets():
+        for name, whisker in subjects().items():
+            errors = [shaken(whisker, hertz, backend, preset) for hertz in SHAKES]
+            errors += [pushed(whisker, width, backend, preset) for width in PULSES]
+            rows.append([preset, name, *(f"{100 * error:+.2f}" for error in errors)])
+            if np.abs(errors).max() > GATES[preset]["shake"]:
+                broken.append(f"{preset} {name}: {rows[-1][2:]}")
+            print(rows[-1], flush=True)
+    named = [*(f"{hertz:g} Hz" for hertz in SHAKES), *(f"{1e3 * width:g} ms pulse" for width in PULSES)]
+    text = "Base shaken for 30 ms or pushed once, by 10 µm: error of the peak base moment in % of the beam's.\n\n"
+    text += table(["preset", "whisker", *named], rows)
+    return text + "\n\nBroken gates: " + ("none." if not broken else "; ".join(broken)), broken
+
+
+def shaken(whisker: Whisker, hertz: float, backend: str, preset: str) -> float:
+    """Return the error of the peak moment of a base that is shaken for 30 ms."""
+
+    def motion(times: np.ndarray) -> np.ndarray:
+        return 1e-5 * smooth_step(times, 4 / hertz) * np.sin(2 * np.pi * hertz * times)
+
+    times = np.arange(1, int(1.2 * hertz) + 1) / (40 * hertz)
+    return shaken_base(whisker, motion, times, backend=backend, fidelity=preset).peak_error
+
+
+def pushed(whisker: Whisker, width: float, backend: str, preset: str) -> float:
+    """Return the error of the peak moment of a base that is pushed once."""
+
+    def motion(times: np.ndarray) -> np.ndarray:
+        u = np.clip((times - 2e-3) / width, 0, 1)
+        return 1e-5 * np.sin(np.pi * u) ** 4
+
+    return shaken_base(whisker, motion, np.arange(1, 1001) * 1e-5, backend=backend, fidelity=preset).peak_error
 
 
 def step(whisker: Whisker, preset: str) -> float:
@@ -149,15 +194,23 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--backend", default="mujoco", choices=list_engines())
+    parser.add_argument("--part", choices=(*PARTS, "all"), default="all")
     arguments = parser.parse_args()
-    backend = arguments.backend
+    backend, failed = arguments.backend, False
     with ProcessPoolExecutor(arguments.workers) as pool:
-        results = dict(zip(subjects(), pool.map(partial(measure, backend=backend), subjects()), strict=True))
-    text, broken = report(results)
-    title = f"Whisker presets against mechanics ({backend})"
-    write_section(title, f"python -m benchmarks.whiskers.validation --backend {backend}", text, subject="whiskers")
-    print(text)
-    raise SystemExit(bool(broken))
+        for part in PARTS if arguments.part == "all" else (arguments.part,):
+            if part == "plane":
+                results = dict(zip(subjects(), pool.map(partial(measure, backend=backend), subjects()), strict=True))
+                title, (text, broken) = f"Whisker presets against mechanics ({backend})", report(results)
+            elif part == "out-of-plane":
+                title, (text, broken) = f"Whiskers out of their plane ({backend})", out_of_plane.report(pool, backend)
+            else:
+                title, (text, broken) = f"Bases moved fast against a beam ({backend})", report_fast_bases(backend)
+            command = f"python -m benchmarks.whiskers.validation --backend {backend} --part {part}"
+            write_section(title, command, text, subject="whiskers")
+            print(text)
+            failed |= bool(broken)
+    raise SystemExit(failed)
 
 
 if __name__ == "__main__":

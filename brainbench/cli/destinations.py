@@ -33,6 +33,12 @@ def report_file(path: Path | None) -> Path | None:
     if path is None:
         return None
     kind = path.suffix.removeprefix(".").lower()
+    if not kind:
+        allowed = ", ".join(f".{name}" for name in FORMATS)
+        raise UsageError(
+            f"--report names {shown(str(path))}, which has no ending; give a file that ends in one of {allowed}, or "
+            "leave --report out for no report."
+        )
     if kind not in FORMATS:
         raise unknown_name("report format", kind, FORMATS, hint="The ending of --report chooses it.")
     if kind == "pdf" and find_spec("weasyprint") is None:

@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 import contextlib
+import math
 import sys
+import time as clock
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from brainbench.core.files import to_json
 from brainbench.core.progress import Progress
+
+if TYPE_CHECKING:
+    from brainbench.core.records import Interval
 
 JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON document on stdout, nothing else.")]
 
@@ -27,6 +32,27 @@ def list_without_command(app: typer.Typer, command: Callable[[], None]) -> None:
 def emit(data: Any, text: str, *, as_json: bool) -> None:
     """Print ``data`` as JSON, or ``text`` for people, on stdout."""
     print(to_json(data) if as_json else text)
+
+
+def spanned(value: float, interval: Interval | None, *, most: float = math.inf) -> str:
+    """Return ``value [low, high]`` with as many digits as the interval carries: two of its half-width.
+
+    Args:
+        value: NaN is shown as a dash.
+        interval: Its interval; three significant digits are shown without one.
+        most: Largest value that can exist, where the interval is cut.
+
+    >>> from brainbench.core.records import Interval
+    >>> spanned(0.14021, Interval(0.0409, 0.2391)), spanned(0.97, Interval(0.9412, 1.1), most=1.0)
+    ('0.14 [0.04, 0.24]', '0.97 [0.94, 1.00]')
+    """
+    if not math.isfinite(value):
+        return "–"
+    if interval is None or not math.isfinite(interval.high - interval.low):
+        return f"{value:.3g}"
+    half = (interval.high - interval.low) / 2
+    digits = min(max(1 - math.floor(math.log10(half)), 0), 9) if half > 0 else 3
+    return f"{value:.{digits}f} [{interval.low:.{digits}f}, {min(interval.high, most):.{digits}f}]"
 
 
 def table_of(title: str, items: Iterable[Any], columns: Mapping[str, str | Callable[[Any], object]]) -> str:
@@ -58,7 +84,14 @@ def table(title: str, columns: list[str], rows: list[list[str]], *, right: tuple
     from rich.console import Console
     from rich.table import Table
 
-    grid = Table(title=title or None, title_justify="left", box=None, pad_edge=False, header_style="bold")
+    grid = Table(
+        title=title or None,
+        show_header=any(columns),
+        title_justify="left",
+        box=None,
+        pad_edge=False,
+        header_style="bold",
+    )
     for index, column in enumerate(columns):
         grid.add_column(column, justify="right" if index in right else "left", overflow="fold", no_wrap=not index)
     for row in rows:
@@ -76,11 +109,15 @@ def table(title: str, columns: list[str], rows: list[list[str]], *, right: tuple
     return "\n".join(line.rstrip() for line in buffer.getvalue().splitlines())
 
 
+FIRST_LINE, NEXT_LINE = 2.0, 10.0
+"""Seconds until progress is told in a line where no bar can be drawn, and between such lines."""
+
+
 @contextlib.contextmanager
 def progress_bar() -> Iterator[Progress]:
-    """Yield a progress callback that draws a bar on stderr when that is a terminal."""
+    """Yield a progress callback that draws a bar on stderr when that is a terminal, and else writes a line at times."""
     if not sys.stderr.isatty():
-        yield lambda done, total, what: None
+        yield _progress_lines()
         return
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
@@ -103,3 +140,17 @@ def progress_bar() -> Iterator[Progress]:
             bar.update(tasks[what], completed=done, total=total)
 
         yield update
+
+
+def _progress_lines() -> Progress:
+    start = clock.monotonic()
+    due = start + FIRST_LINE
+
+    def update(done: int, total: int, what: str) -> None:
+        nonlocal due
+        if (now := clock.monotonic()) < due:
+            return
+        due = now + NEXT_LINE
+        print(f"brainbench: {what}, {done:,} of {total:,} ({now - start:.0f} s)", file=sys.stderr, flush=True)
+
+    return update

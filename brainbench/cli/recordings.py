@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -10,6 +11,7 @@ import typer
 from brainbench.cli.destinations import out_folder
 from brainbench.cli.options import SCORE, option, with_options
 from brainbench.cli.output import JsonOption, emit, progress_bar, table, table_of
+from brainbench.cli.score_text import left_out
 
 if TYPE_CHECKING:
     import numpy as np
@@ -25,18 +27,21 @@ app = typer.Typer(no_args_is_help=True, help="Inspect, check, copy and fetch neu
 
 @app.command("inspect")
 def inspect(
-    path: Annotated[Path, typer.Argument(help="'demo', an NWB file, a file in our HDF5 layout or a published .npz.")],
+    path: Annotated[str, typer.Argument(help="'demo', an NWB, HDF5 or published .npz file, a folder, or a glob.")],
+    strict: Annotated[bool, option(SCORE, "strict", "--strict")] = False,
     as_json: JsonOption = False,
 ) -> None:
     """Show what a file holds and which --conditions could label its trials."""
     from brainbench.datasets import inspect as inspect_file
 
-    inspection = inspect_file(_found(str(path)))
+    found = _found(path)
+    with progress_bar() as progress:
+        inspection = inspect_file(found, strict=strict, progress=progress)
     emit(inspection, str(inspection), as_json=as_json)
 
 
 @app.command("rdm")
-@with_options(SCORE, ("conditions", "select", "window"), build=False)
+@with_options(SCORE, ("conditions", "select", "window", "strict"), build=False)
 def rdm(
     source: Annotated[str, typer.Argument(help="'demo', an NWB, HDF5 or published .npz file, a folder, or a glob.")],
     options: Any = None,
@@ -70,10 +75,11 @@ def rdm(
             "animal": "{0.subject}",
             ">units": "{0.units}",
             ">trials": "{0.trials}",
-            ">reliability": "{0.reliability:.3f}",
+            ">reliability": lambda item: "–" if math.isnan(item.reliability) else f"{item.reliability:.3f}",
             "": _verdict,
         },
     )
+    text += "".join(f"\n{line}" for line in left_out(brain.origin))
     if len(labels) <= _LARGEST_SHOWN:
         for item in animals:
             text += "\n\n" + _matrix(f"RDM of {item.subject}", labels, item.rdm)
@@ -98,7 +104,9 @@ def check(
     """
     from brainbench.datasets import check as check_files
 
-    checkup = check_files(_found(source), conditions=conditions)
+    found = _found(source)
+    with progress_bar() as progress:
+        checkup = check_files(found, conditions=conditions, progress=progress)
     told = ("verdict", "source", "sessions", "findings")
     emit({name: getattr(checkup, name) for name in told}, str(checkup), as_json=as_json)
     if checkup.count("error") or (strict and checkup.count("warning")):

@@ -6,24 +6,16 @@ import contextlib
 import errno
 import hashlib
 import json
-import logging
 import math
 import os
-import secrets
 from collections.abc import Iterator, Mapping
-from dataclasses import fields, is_dataclass
+from dataclasses import Field, fields, is_dataclass
 from pathlib import Path
 from typing import Any
 
 from brainbench.core.errors import FileWriteError, UsageError, shown
 from brainbench.core.reading.texts import read_json, read_mapping  # noqa: F401 - also imported from here
-
-try:
-    import fcntl
-except ImportError:  # Windows
-    fcntl = None
-
-_LOG = logging.getLogger(__name__)
+from brainbench.core.writing.temporaries import temporary_path
 
 CACHE_VARIABLE = "BRAINBENCH_CACHE"
 """Environment variable that overrides the platform's cache folder."""
@@ -79,9 +71,10 @@ def atomic_path(target: str | os.PathLike[str]) -> Iterator[Path]:
         FileWriteError: the folder cannot be made or written, or the disk is full.
     """
     target = Path(target)
-    temporary = target.with_name(f".{target.stem[:200]}-{secrets.token_hex(8)}{target.suffix}")
+    temporary = target
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
+        temporary = temporary_path(target)
         # Made by hand: tempfile's files are private, and to read the umask is not safe among threads.
         os.close(os.open(temporary, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
         yield temporary
@@ -93,50 +86,21 @@ def atomic_path(target: str | os.PathLike[str]) -> Iterator[Path]:
             raise
         raise FileWriteError(f"{shown(str(target))} cannot be written ({os.strerror(error.errno)}).") from error
     finally:
-        with contextlib.suppress(OSError):
-            temporary.unlink(missing_ok=True)
+        if temporary != target:
+            with contextlib.suppress(OSError):
+                temporary.unlink(missing_ok=True)
 
 
-@contextlib.contextmanager
-def lock_folder(folder: Path, *, wait: bool = True) -> Iterator[bool]:
-    """Hold a lock on a folder, which the system releases when this process ends in whatever way.
-
-    Args:
-        folder: must exist.
-        wait: for another process that holds it, rather than refuse.
-
-    Yields:
-        False where there are no such locks (Windows; some network file systems, which are warned of).
-
-    Raises:
-        UsageError: another process holds it, and ``wait`` is false.
-    """
-    if fcntl is None:
-        yield False
-        return
-    handle, held = os.open(folder, os.O_RDONLY), False
-    try:
-        try:
-            fcntl.flock(handle, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
-            held = True
-        except BlockingIOError as error:
-            raise UsageError(f"Another process is writing {shown(str(folder))}; wait for it, or end it.") from error
-        except OSError as error:
-            _LOG.warning("%s cannot be locked (%s); start no second run there", folder, error)
-        yield held
-    finally:
-        os.close(handle)
-
-
-def _is_default(value: Any, default: Any) -> bool:
-    return value is default or value == default  # NaN equals nothing
+def _is_unused(value: Any, field: Field[Any]) -> bool:
+    unused = field.metadata.get("before", field.default)
+    return value is unused or value == unused  # NaN equals nothing
 
 
 def to_plain(value: Any) -> Any:
     """Turn dataclasses, mappings, arrays and paths into JSON types; a float without value is null.
 
     A field that came later than files and hashes which exist (its metadata say ``later=True``) appears only where it
-    is used, so that those stay what they are.
+    is used, so that those stay what they are: where it differs from its default, or from ``before`` in the metadata.
     """
     # Most of a record are the numbers of its RDMs: they come first.
     if type(value) is float:
@@ -149,7 +113,7 @@ def to_plain(value: Any) -> Any:
         return {
             field.name: to_plain(getattr(value, field.name))
             for field in fields(value)
-            if not (field.metadata.get("later") and _is_default(getattr(value, field.name), field.default))
+            if not (field.metadata.get("later") and _is_unused(getattr(value, field.name), field))
         }
     if isinstance(value, (list, tuple)):
         return [to_plain(item) for item in value]

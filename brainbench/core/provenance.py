@@ -49,7 +49,9 @@ class Provenance(Mapping[str, Any]):
 
     @property
     def recordings_name(self) -> str:
-        """Short name of the recordings: the last part of each path, or ``unnamed recordings``."""
+        """Title that the user gave the recordings, else the last part of each path, or ``unnamed recordings``."""
+        if title := _text(self.recordings.get("title")):
+            return title
         source = self.recordings.get("source")
         sources = source if isinstance(source, (list, tuple)) else [source] if source else []
         names = [str(item).replace("\\", "/").rstrip("/").rpartition("/")[2] for item in sources]

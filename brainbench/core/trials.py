@@ -26,6 +26,9 @@ class Trials:
     def take(self, rows: Any) -> Trials:
         """Return the trials that an index or mask [R] names, in its order."""
         index = np.arange(len(self.labels))[rows]
+        if np.array_equal(index, np.arange(len(self.labels))):
+            # Long recordings in narrow bins are not copied for nothing.
+            return self
         return Trials(
             np.asarray(self.responses)[index],
             np.asarray(self.labels)[index],

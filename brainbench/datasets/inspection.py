@@ -15,10 +15,11 @@ from numpy.typing import NDArray
 
 from brainbench.core.errors import DataError
 from brainbench.core.files import to_json
+from brainbench.core.progress import Progress, track
 from brainbench.datasets import hdf5
 from brainbench.datasets.layouts.published_npz import LAYOUT, is_published, open_published
 from brainbench.datasets.layouts.registry import RecordingLayout
-from brainbench.datasets.reading import each_session, find_files, open_file
+from brainbench.datasets.reading import each_session, find_files, open_file, suitable_files
 from brainbench.datasets.sessions import SPIKES, Session, SessionTable, as_labels, natural_key
 from brainbench.datasets.trials.conditions import natural_vocabulary
 from brainbench.datasets.trials.counting import has_units, no_units, read_spikes, recorded_span
@@ -26,6 +27,10 @@ from brainbench.datasets.trials.counting import has_units, no_units, read_spikes
 if TYPE_CHECKING:
     import xarray as xr
 
+FEWEST_LABELS = 3
+"""Fewest conditions whose RDM can be compared."""
+ENOUGH_TRIALS = 4
+"""Fewest trials of each label for the default metric, whose cross-validated distances need two in each half."""
 EXAMPLES = 6
 """Number of values shown of a column."""
 _MOST_VALUES = 60
@@ -123,7 +128,9 @@ class Inspection:
     """Layout that will be used, because the layout is known."""
     sessions: tuple[SessionSummary, ...]
     proposals: tuple[Proposal, ...]
-    """Best first."""
+    """Conditions that can be scored, the likeliest first."""
+    skipped: tuple[str, ...] = ()
+    """Reason for each file that holds no recordings and is not described."""
 
     def to_json(self) -> str:
         """Serialise deterministically."""
@@ -138,18 +145,26 @@ class Inspection:
             yield f"layout: {self.layout} (detected from its columns)"
         for session in self.sessions:
             yield from _session_lines(session)
+        yield from (f"! skipped: {reason}" for reason in self.skipped)
         if self.proposals:
-            yield "conditions to try:"
-            for item in self.proposals:
+            yield "conditions that can be scored, the likeliest marked with →:"
+            for place, item in enumerate(self.proposals):
                 shown = ", ".join(item.labels[:EXAMPLES]) + (" …" if len(item.labels) > EXAMPLES else "")
-                yield f"  --conditions {item.conditions}   {len(item.labels)} labels, ≥ {item.fewest} trials: {shown}"
+                few = f" (fewer than {ENOUGH_TRIALS}: --metric rsa-correlation)" if item.fewest < ENOUGH_TRIALS else ""
+                counted = f"{len(item.labels)} labels, ≥ {item.fewest} trials{few}: {shown}"
+                yield f"{' ' if place else '→'} --conditions {item.conditions}   {counted}"
 
 
-def inspect(path: str | os.PathLike[str]) -> Inspection:
+def inspect(path: str | os.PathLike[str], *, strict: bool = False, progress: Progress | None = None) -> Inspection:
     """Describe the recordings of a file, a folder or a glob. Reads tables and spike times, no raw data.
 
     Problems inside a table or in the units are reported, not raised, so that a damaged or unsuitable
     file can still be looked into.
+
+    Args:
+        path: What is described.
+        strict: Refuse files among several that hold no recordings; they are skipped and named by default.
+        progress: Called with (files read, files, what).
 
     Raises:
         DataFileNotFoundError: there is no such file.
@@ -159,7 +174,8 @@ def inspect(path: str | os.PathLike[str]) -> Inspection:
     proposals: list[Proposal] = []
     formats: dict[str, None] = {}
     layouts: set[str | None] = set()
-    for file_path in find_files(path):
+    paths, skipped = suitable_files(find_files(path), strict=strict)
+    for file_path in track(paths, "reading recordings", progress):
         if is_published(file_path):
             return _counted(open_published(file_path), file_path, f"published .npz, layout {LAYOUT.name}")
         with open_file(file_path) as file:
@@ -172,7 +188,8 @@ def inspect(path: str | os.PathLike[str]) -> Inspection:
                 summaries.append(_summary(session, bool(own)))
                 proposals += own
     layout = layouts.pop() if len(layouts) == 1 else None
-    return Inspection(os.fspath(path), ", ".join(formats), layout, tuple(summaries), _merged(proposals))
+    told = ", ".join(formats)
+    return Inspection(os.fspath(path), told, layout, tuple(summaries), _merged(proposals), tuple(skipped))
 
 
 def _merged(proposals: list[Proposal]) -> tuple[Proposal, ...]:
@@ -196,7 +213,7 @@ def _summary(session: Session, usable: bool) -> SessionSummary:
     if not session.tables:
         missing.append("no interval tables: nothing says when which stimulus was presented")
     elif not usable:
-        missing.append("no column of the interval tables has 2 to 60 values with at least two trials each")
+        missing.append("no column of the interval tables has 3 to 60 values with at least two trials each")
     series = session.series.values()
     return SessionSummary(
         subject=session.subject,
@@ -293,18 +310,22 @@ def _session_lines(session: SessionSummary) -> Iterator[str]:
 
 
 def propose(session: Session, layout: RecordingLayout | None = None) -> list[Proposal]:
-    """Rank the columns that could label trials: 2–60 values (more if named like a stimulus), twice each or more.
+    """Rank the columns that could label trials: 3–60 values (more if named like a stimulus), twice each or more.
 
     The conditions of the session's layout come first. Stimulus-like names come before others and before
     behavioural ones; then text before integers before the rest, the table ``trials`` before others, and
-    balanced columns before unbalanced.
+    balanced columns before unbalanced. Columns with too few trials of a label for the default metric come last.
     """
     ranked: list[tuple[tuple[float, ...], Proposal]] = []
     for name, table in session.tables.items():
         for column in summarise_columns(table):
             # A column named like a stimulus may have thousands of values; others would be mere numbers.
             most = np.inf if _STIMULUS.search(column.name) else _MOST_VALUES
-            if 2 <= column.distinct <= most and column.fewest >= 2 and not column.name.endswith(("_time", "_times")):
+            if (
+                FEWEST_LABELS <= column.distinct <= most
+                and column.fewest >= 2
+                and not column.name.endswith(("_time", "_times"))
+            ):
                 labels = as_labels(table.column(column.name)).tolist()
                 ranked.append((_rank(name, column, len(table)), _proposal(f"{name}:{column.name}", labels)))
     if layout is not None:
@@ -328,7 +349,7 @@ def _rank(table: str, column: ColumnSummary, rows: int) -> tuple[float, ...]:
     topic = 0 if _STIMULUS.search(column.name) else 2 if _BEHAVIOUR.search(column.name) else 1
     kind = {"text": 0, "integer": 1}.get(column.kind, 2)
     imbalance = 1 - column.fewest * column.distinct / max(rows, 1)
-    return (topic, kind, table != "trials", imbalance)
+    return (column.fewest < ENOUGH_TRIALS, topic, kind, table != "trials", imbalance)
 
 
 def summarise_columns(table: SessionTable) -> Iterator[ColumnSummary]:

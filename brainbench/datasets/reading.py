@@ -101,6 +101,31 @@ def open_file(path: Path) -> Iterator[h5py.File]:
         yield file
 
 
+def suitable_files(paths: Sequence[Path], *, strict: bool = False) -> tuple[list[Path], list[str]]:
+    """Return the files that hold sessions of spike times, and for each other file a sentence that says why not.
+
+    One file alone was meant, so it is kept whatever it holds: reading it says what is wrong.
+
+    Raises:
+        DataError: there are several files of which none is suitable, or with ``strict`` not all.
+    """
+    if len(paths) < 2:
+        return list(paths), []
+    kept, skipped = [], []
+    for path in paths:
+        try:
+            with open_file(path) as file:
+                _check_kind(file, path)
+            kept.append(path)
+        except DataError as error:
+            if strict:
+                raise
+            skipped.append(str(error))
+    if not kept:
+        raise DataError(f"None of {len(paths)} files holds recordings; the first: {skipped[0]}")
+    return kept, skipped
+
+
 def each_session(
     file: h5py.File, path: Path, layout: RecordingLayout | None = None
 ) -> Iterator[tuple[Session, RecordingLayout | None]]:
@@ -118,12 +143,16 @@ def each_session(
 
 
 def _sessions(file: h5py.File, path: Path) -> list[Session]:
+    _check_kind(file, path)
+    return hdf5.read_sessions(file, path) if hdf5.is_ours(file) else [nwb.read_nwb(file, path)]
+
+
+def _check_kind(file: h5py.File, path: Path) -> None:
+    """Raise DataError unless an open file holds sessions of spike times, by its kind."""
     if hdf5.holds_counts(file, path):
         raise DataError(f"{path} holds counted responses, not sessions of spike times; open it alone.")
-    if hdf5.is_ours(file):
-        return hdf5.read_sessions(file, path)
-    if nwb.is_nwb(file):
-        return [nwb.read_nwb(file, path)]
+    if hdf5.is_ours(file) or nwb.is_nwb(file):
+        return
     inside = ", ".join(list(file)[:8]) or "nothing"
     raise DataError(
         f"{path} is HDF5 but neither NWB nor the {hdf5.FORMAT} layout: it holds {inside}. "

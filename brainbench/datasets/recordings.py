@@ -13,11 +13,19 @@ from typing import TYPE_CHECKING, Any, NoReturn
 
 from brainbench.core.contracts import check_recordings
 from brainbench.core.errors import DataError, UsageError, listing, unknown_name
+from brainbench.core.progress import Progress, track
 from brainbench.datasets import hdf5
 from brainbench.datasets.inspection import propose
 from brainbench.datasets.layouts.published_npz import is_published, open_published
 from brainbench.datasets.layouts.registry import RecordingLayout, list_layouts
-from brainbench.datasets.reading import Source, each_session, find_recordings, open_file, resolve_selection
+from brainbench.datasets.reading import (
+    Source,
+    each_session,
+    find_recordings,
+    open_file,
+    resolve_selection,
+    suitable_files,
+)
 from brainbench.datasets.sessions import Session
 from brainbench.datasets.trials.conditions import Conditions
 from brainbench.datasets.trials.counting import ReadingOptions, SessionCounts, count_session, has_units, no_units
@@ -36,6 +44,8 @@ def open_recordings(
     select: Selection | str | None = None,
     window: Window | str | None = None,
     bin: float | None = None,
+    strict: bool = False,
+    progress: Progress | None = None,
 ) -> xr.Dataset:
     """Read recordings into counted trials.
 
@@ -49,6 +59,9 @@ def open_recordings(
         window: a :class:`Window` or text such as "first-contact..choice" or "start+0.2..+0.5". By
             default the layout's, else start..stop.
         bin: bin width, s; None counts each window as one bin.
+        strict: refuse files among several that hold no recordings (another kind of file, a damaged one, no units),
+            which are skipped and named by default.
+        progress: called with (files read, files, what).
 
     A layout is used when it is named, or when every file has its layout and ``conditions`` are left out
     or use its table; an argument replaces the layout's part. Labels follow the layout's fixed
@@ -60,8 +73,8 @@ def open_recordings(
         ``unit_subject, unit_session, unit_id, depth, layer, inhibitory`` per unit, ``time`` (begin of
         the bin, s from the window's begin), and attributes: vocabulary, conditions, layout, window,
         bin, selection, removed (rule → trials or units that it removed, each counted once, in the
-        order of the rules), missing (subject → labels without a trial), sessions, notes, source,
-        synthetic, content_hash.
+        order of the rules), missing (subject → labels without a trial), sessions, notes,
+        skipped (why a file is left out), source, synthetic, content_hash.
 
     Raises:
         DataFileNotFoundError: the source names nothing.
@@ -81,8 +94,10 @@ def open_recordings(
         bin=bin,
         layout=layout,
         named=layout is not None,
+        strict=strict,
     )
-    for path in paths:
+    suitable, reader.skipped = suitable_files(paths, strict=strict)
+    for path in track(suitable, "reading recordings", progress):
         reader.read(path)
     return reader.dataset(", ".join(map(str, paths)) if len(paths) < 4 else f"{len(paths)} files, {paths[0]} …")
 
@@ -98,12 +113,15 @@ class _Reader:
     layout: RecordingLayout | None
     """The layout that the source named; else the one by which the first session was recognised."""
     named: bool
+    strict: bool = False
     options: ReadingOptions | None = None
     """Made for the first session and kept for all others."""
     counted: list[SessionCounts] = field(default_factory=list)
     seen: dict[tuple[str, ...], str] = field(default_factory=dict)
     """Names of the sessions that were read, each with its source."""
     notes: list[str] = field(default_factory=list)
+    skipped: list[str] = field(default_factory=list)
+    """Why each file that holds no recordings is left out."""
     without_units: list[str] = field(default_factory=list)
     other_subjects: set[str] = field(default_factory=set)
 
@@ -112,6 +130,8 @@ class _Reader:
         with open_file(path) as file:
             for session, found in each_session(file, path, self.layout if self.named else None):
                 if not has_units(session):
+                    if self.strict:
+                        raise DataError(no_units(session))
                     self.without_units.append(no_units(session))
                     continue
                 self._refuse_twins(session)
@@ -166,8 +186,10 @@ class _Reader:
             raise unknown_name("subject", self.options.selection.subjects[0], sorted(self.other_subjects))
         name = self.layout.name if self.layout else ""
         name += "" if self.named or not name else " (detected from its columns)"
-        notes = self.notes + self.without_units
-        return check_recordings(join_sessions(self.counted, self.options, source=source, layout=name, notes=notes))
+        skipped = self.skipped + self.without_units
+        made = join_sessions(self.counted, self.options, source=source, layout=name, notes=self.notes + skipped)
+        made.attrs["skipped"] = skipped
+        return check_recordings(made)
 
 
 def _no_conditions(session: Session) -> NoReturn:
@@ -175,7 +197,7 @@ def _no_conditions(session: Session) -> NoReturn:
     proposals = [item.conditions for item in propose(session)][:4]
     if not proposals:
         raise DataError(
-            f"{session.source} has no interval table with a column that could label trials (2 to 60 values, "
+            f"{session.source} has no interval table with a column that could label trials (3 to 60 values, "
             f"each at least twice; tables: {listing(session.tables)}); there is nothing to compare."
         )
     raise UsageError(

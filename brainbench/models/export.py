@@ -117,7 +117,9 @@ def _write(step: Any, path: Path, format: str) -> None:
         # The exporters warn of their own parts' deprecations, which nobody here can act on.
         warnings.simplefilter("ignore")
         if format == "torch":
-            torch.export.save(torch.export.export(step, example, **shapes), path)
+            # Given a name, PyTorch writes it into the file, and this one is temporary.
+            with path.open("wb") as file:
+                torch.export.save(torch.export.export(step, example, **shapes), file)
             return
         names: dict[str, Any] = {"input_names": list(INPUTS), "output_names": list(OUTPUTS)}
         program = torch.onnx.export(step, example, dynamo=True, opset_version=OPSET, verbose=False, **names, **shapes)

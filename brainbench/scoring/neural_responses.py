@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import glob
 import os
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -30,6 +31,8 @@ class NeuralResponses:
     dataset: xr.Dataset
     source: str
     """Short name of where they come from, without private folders."""
+    title: str | None = None
+    """Title that the user gave."""
 
     @property
     def vocabulary(self) -> tuple[str, ...]:
@@ -52,6 +55,8 @@ class NeuralResponses:
         names = ("content_hash", "window", "selection", "removed", "synthetic")
         # Boards of the demo say whether the network that made it was found.
         truth = {"truth": HIDDEN_NETWORK} if self.source == "demo" and self.synthetic else {}
+        truth |= {"title": self.title} if self.title else {}
+        truth |= {"skipped": skipped} if (skipped := self.dataset.attrs.get("skipped")) else {}
         return {"source": self.source, **{name: self.dataset.attrs[name] for name in names}, **truth}
 
     @property
@@ -128,10 +133,19 @@ def open_neural_responses(recordings: Any, *, progress: Progress | None, **selec
 
         return NeuralResponses(check_recordings(recordings), "data set")
     if isinstance(recordings, str) and recordings in DEMOS:
-        return NeuralResponses(open_recordings(demo_recordings(recordings, progress=progress), **selection), recordings)
+        folder = demo_recordings(recordings, progress=progress)
+        return NeuralResponses(open_recordings(folder, **selection, progress=progress), recordings)
     several = not isinstance(recordings, (str, os.PathLike))
-    name = ", ".join(Path(item).name for item in recordings) if several else Path(recordings).name
-    return NeuralResponses(open_recordings(recordings, **selection), name)
+    name = ", ".join(map(_short, recordings if several else [recordings]))
+    return NeuralResponses(open_recordings(recordings, **selection, progress=progress), name)
+
+
+def _short(source: str | os.PathLike[str]) -> str:
+    """Return the name of a file or a folder; of a pattern, that of the folder it searches."""
+    path = Path(source)
+    while glob.has_magic(path.name):
+        path = path.parent
+    return path.name or path.resolve().name
 
 
 def without_time(values: NDArray[np.floating], time: str) -> NDArray[np.floating]:

@@ -32,7 +32,7 @@ _NO_NUMBERS = (
     "recordings", "stimuli", "match", "select", "window", "whiskers", "fidelity", "metric", "layer", "estimator",
 )  # fmt: skip
 """Fields that take much in Python, and a number nowhere; a batch file can hold one."""
-_ELSEWHERE = ("recordings", "match", "explain")
+_ELSEWHERE = ("recordings", "match", "explain", "title", "strict")
 """Fields whose effect stands in other entries of the provenance: ``recordings``, ``pairs`` and ``statistics``."""
 
 
@@ -47,6 +47,8 @@ class ScoreOptions:
     recordings: str | os.PathLike[str] | Sequence[str | os.PathLike[str]] | xr.Dataset = "demo"
     """'demo' or 'demo-rodgers' (synthetic), an NWB, HDF5 or published .npz file, a folder, or a glob; in Python also a
     data set."""
+    title: str | None = None
+    """Title of the recordings in results; by default the name of their file or folder."""
     stimuli: str | os.PathLike[str] | Stimuli | xr.Dataset | None = None
     """A recipe, a scene file, a stimulus-set file, or an HDF5 array; by default what the recordings name."""
     conditions: str | None = None
@@ -57,6 +59,8 @@ class ScoreOptions:
     """Trials and units to use, e.g. 'outcome=correct; units.layer=4', or a name."""
     window: str | Window | None = None
     """Part of a trial to read, e.g. 'first-contact..choice' or 'start+0.2..+0.5'."""
+    strict: bool = False
+    """Refuse a folder with files that hold no recordings, instead of skipping them and saying so."""
     whiskers: str = "all"
     """Whiskers to simulate: all, C0-C3, C2,D1, …"""
     fidelity: str | Fidelity | None = "balanced"
@@ -93,7 +97,7 @@ class ScoreOptions:
 
     def __post_init__(self) -> None:
         """Refuse what no score can be made with, before anything is loaded."""
-        for name in ("over_time", "explain", "normalize"):
+        for name in ("over_time", "explain", "normalize", "strict"):
             if not isinstance(getattr(self, name), bool):
                 raise UsageError(f"{name} must be true or false; received {shown(getattr(self, name))}.")
         for name in _NO_NUMBERS:
@@ -146,7 +150,8 @@ class ScoreOptions:
     def selection(self) -> dict[str, Any]:
         """Arguments of :func:`brainbench.datasets.open_recordings`."""
         width = TIME_BIN if self.over_time and self.bin is None else self.bin
-        return {"conditions": self.conditions, "select": self.select, "window": self.window, "bin": width}
+        stated = {name: getattr(self, name) for name in ("conditions", "select", "window", "strict")}
+        return {**stated, "bin": width}
 
     @property
     def settings(self) -> dict[str, Any]:

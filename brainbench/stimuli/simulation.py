@@ -68,8 +68,8 @@ def simulate(
         UsageError: the scenes do not fit together, or a name is unknown.
     """
     chosen = _checked(scenes)
-    fidelity = Fidelity.of(fidelity)
     engine = get_engine(backend) if isinstance(backend, str) else backend
+    fidelity = _resolved(fidelity, chosen, engine)
     path = cache_path(chosen, fidelity, engine) if cache and isinstance(backend, str) else None
     if path is not None and path.exists():
         started = time.perf_counter()
@@ -104,10 +104,15 @@ def prepare(
     the same arguments and waits for the rest.
     """
     chosen = list(scenes)
-    fidelity = Fidelity.of(fidelity)
     engine = get_engine(backend)
+    fidelity = _resolved(fidelity, chosen, engine)
     if not cache_path(chosen, fidelity, engine).exists():
         _begin(engine, chosen, fidelity, progress)
+
+
+def _resolved(fidelity: Fidelity | str | None, scenes: Iterable[Scene], engine: WhiskerEngine) -> Fidelity:
+    """Return a fidelity that says whether whiskers twist."""
+    return Fidelity.of(fidelity).resolved(engine.twists and any(scene.twist for scene in scenes))
 
 
 def _begin(

@@ -40,6 +40,17 @@ class Recording:
         pairs = zip(self.scene.names, self.joints, strict=True)
         return tuple(name for name, points in pairs if not np.isfinite(points).all())
 
+    def unbent(self, whisker: int, instant: int) -> NDArray[np.float64]:
+        """Return joints and tip [N + 1, 3] (m, world) of a whisker that nothing bends, at one instant."""
+        from brainbench.stimuli.engines.protocol import base_rotation
+        from brainbench.stimuli.whiskers.chain import build_chain
+
+        job, axes = self.scene.jobs()[whisker], self.scene.axes[whisker]
+        origin = [part.head.position for part in self.scene.split() for _ in part.array][whisker]
+        place, euler = job.follicle.pose(self.times[instant : instant + 1])
+        rest = np.pad(build_chain(job.whisker, self.joints[whisker].shape[1] - 1).points, ((0, 0), (0, 1)))
+        return (rest @ base_rotation(euler)[0].T + place[0]) @ axes.T + np.asarray(origin)
+
 
 def record(
     scene: Scene,
@@ -64,8 +75,8 @@ def record(
     from brainbench.stimuli.simulation import cache_path
 
     times = np.atleast_1d(np.asarray(times, dtype=float))
-    fidelity = Fidelity.of(fidelity)
     engine = get_engine(backend) if isinstance(backend, str) else backend
+    fidelity = Fidelity.of(fidelity).resolved(engine.twists and scene.twist)
     jobs = [replace(job, times=times) for job in scene.jobs()]
     path = None
     if cache and isinstance(backend, str):

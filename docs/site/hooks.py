@@ -19,7 +19,9 @@ OUTSIDE = {
     "releasing.md": "RELEASING.md",
 }
 """Page → the file of the repository that it shows."""
-NOTEBOOKS = {"notebooks/from-simulation-to-leaderboard.md": "docs/notebooks/from-simulation-to-leaderboard.ipynb"}
+NOTEBOOKS = {
+    f"notebooks/{path.stem}.md": path.relative_to(ROOT).as_posix() for path in (ROOT / "docs/notebooks").glob("*.ipynb")
+}
 _LINK = re.compile(r"(?<=\]\()(?!https?:|#|mailto:)([^)\s#]+)(#[^)\s]*)?(?=\))")
 
 
@@ -52,7 +54,7 @@ def relinked(markdown: str, here: Path, there: Path) -> str:
 
     A link to a file that is no page becomes the file's name as code.
     """
-    shown = {source: page for page, source in OUTSIDE.items()} | {"README.md": "index.md"}
+    shown = {source: page for page, source in (OUTSIDE | NOTEBOOKS).items()} | {"README.md": "index.md"}
 
     def lead(match: re.Match[str]) -> str:
         target = _normal(here / match[1])

@@ -15,7 +15,8 @@ from pathlib import Path
 import msgspec
 
 from brainbench.core.errors import DataError, UsageError
-from brainbench.core.files import atomic_path, lock_folder, read_json, write_json
+from brainbench.core.files import atomic_path, read_json, write_json
+from brainbench.core.writing.locks import lock_folder
 from leaderboards.writing import final_name, in_one_sentence, sweep
 
 MANIFEST = "build-manifest.json"

@@ -92,6 +92,7 @@ class SimulatedHand:
         observe: Observation type that its skin gives; reports need ``agg_force`` on the tips.
         placement: Of its taxels.
         resolution: Of its taxels.
+        twist: Torsional friction of force taxels (N·m·s); None is that of their patch.
     """
 
     def __init__(
@@ -102,11 +103,12 @@ class SimulatedHand:
         observe: str = "agg_force",
         placement: str = "tips",
         resolution: str = "med",
+        twist: float | None = None,
     ) -> None:
         self.hand, self.rate = hands.load(hand), rate
         self.engine = MujocoEngine(holding(self.hand, timestep=1 / rate), 1, threads=1)
         self.observe, self.layout = observe, self.hand.layout(resolution, placement)
-        sensors = sensors_for(observe, self.layout, track=(OBJECT,))
+        sensors = sensors_for(observe, self.layout, track=(OBJECT,), twist=twist)
         self.suite = SensorSuite(self.engine.scene, sensors, num_envs=1)
         self.suite.update(self.engine.state, 1 / rate)
         self.calibration = PressureCalibration()
@@ -169,6 +171,7 @@ class ShadowTouch:
         joints: Names of the joints in the order of the reports.
         rate: Control steps per second.
         sub_steps: S.
+        twist: Torsional friction of its force taxels (N·m·s); None is that of their patch.
     """
 
     def __init__(
@@ -181,9 +184,12 @@ class ShadowTouch:
         joints: tuple[str, ...],
         rate: float = 40.0,
         sub_steps: int = 5,
+        twist: float | None = None,
     ) -> None:
         self.sub_steps = sub_steps
-        self.hand = SimulatedHand(hand, rate * sub_steps, observe=observe, placement=placement, resolution=resolution)
+        self.hand = SimulatedHand(
+            hand, rate * sub_steps, observe=observe, placement=placement, resolution=resolution, twist=twist
+        )
         self._order = [joints.index(name) for name in self.hand.joints]
 
     def __call__(self, reading: HandReading) -> NDArray[np.float32]:

@@ -116,7 +116,9 @@ class EnvState:
         if options.observe != "none":
             from robotics_bridge.envs.tactile import TactileObservation
 
-            self.touch = TactileObservation(self.model, hand, self.simulation, options, substeps=self.substeps)
+            self.touch = TactileObservation(
+                self.model, hand, self.simulation, options, substeps=self.substeps, twist=task.taxel_twist
+            )
         self._index()
         self.episode = EpisodeState.start(
             self.num_envs, self.device, actions=len(self.model.moved), terms=len(task.rewards), rest=self.rest

@@ -34,19 +34,27 @@ class TactileObservation:
         simulation: what moves the hand.
         options: of the environments, with an observation type other than ``none``.
         substeps: S.
+        twist: torsional friction of the task's force taxels (N·m·s), where the options' knobs name none.
 
     Raises:
         UsageError: a name is unknown.
     """
 
     def __init__(
-        self, model: TaskModel, hand: Hand, simulation: Simulation, options: EnvOptions, *, substeps: int
+        self,
+        model: TaskModel,
+        hand: Hand,
+        simulation: Simulation,
+        options: EnvOptions,
+        *,
+        substeps: int,
+        twist: float | None = None,
     ) -> None:
         observe, num_envs, device = options.observe, options.num_envs, simulation.warp_device
         kind = observation_type(observe)
         taxels = hand.layout(options.resolution, options.placement)
         taxels = {link: probes for link, probes in taxels.items() if probes.active.any()}
-        sensors = sensors_for(observe, taxels, noisy=options.noisy, track=model.objects, **options.knobs)
+        sensors = sensors_for(observe, taxels, noisy=options.noisy, track=model.objects, **{"twist": twist, **options.knobs})
         self.suite = SensorSuite(simulation.engine.scene, sensors, num_envs=num_envs, device=device, seed=options.seed)
         self._name, self.links = observe, tuple(taxels)
         """Links with taxels, in the order of their columns."""

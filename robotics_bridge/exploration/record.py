@@ -38,8 +38,8 @@ from robotics_bridge.sensors import SensorSuite
 _STEPS = 2
 """Physics steps per frame."""
 TWIST = 1.6e-5
-"""Torsional friction of a taxel (N·m·s): k_t R²/2 of a disc of the published k_t = 2 N·s/m and radius 4 mm. The
-published 2 N·m·s is that of a disc of 1.4 m; it would drown every other moment when an object turns."""
+"""Torsional friction of a taxel (N·m·s): that of a patch of 4 mm with the published k_t, stated since data depend on
+it."""
 _DENSE = 2e5
 """Density of explored objects (kg/m³): contacts must not move what is held."""
 

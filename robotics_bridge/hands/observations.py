@@ -77,7 +77,8 @@ def sensors_for(
         layout: Link → probes.
         noisy: With the published imperfections of the type (table 4.12), the release threshold included.
         track: Links that are looked at; empty means everything that may touch.
-        **knobs: Further settings of the sensor class, e.g. ``convention="thesis"`` or ``points=500``.
+        **knobs: Further settings of the sensor class, e.g. ``convention="thesis"`` or ``points=500``;
+            ``twist`` is left out where there is no force law.
 
     Raises:
         UsageError: there is no such type, or a knob has a wrong value.
@@ -86,6 +87,9 @@ def sensors_for(
     if kind.sensor is None:
         return {}
     settings: dict[str, Any] = {"track": track, **knobs}
+    if kind.sensor != "KinematicTaxel":
+        # Only a force law has it; tasks and stored students state theirs for any type.
+        settings.pop("twist", None)
     if noisy:
         settings["noise"] = sensors.Noise.preset(f"published-{name}")
         if kind.sensor == "ContactProbe":

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import os
+import warnings
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
@@ -190,6 +191,7 @@ class _Gatherer:
         self._views = [(d.xpos, d.xquat, d.cvel, d.subtree_com) for d in data]
         self._contacts: list[tuple[NDArray[Any], ...]] = [()] * count
         self._model = model
+        self._warned = False
 
     def gather(self, env: int) -> None:
         data = self._data[env]
@@ -212,17 +214,30 @@ class _Gatherer:
                 c.efc_address.copy(),
                 c.dim.copy(),
                 data.efc_force.copy(),
+                c.frame[:, 3:].reshape(-1, 2, 3).copy(),
+                c.friction[:, :2].copy(),
             )
 
-    def _forces(self, found: Sequence[tuple[NDArray[Any], ...]]) -> NDArray[np.float64]:
-        """Return the normal force of every contact: with a pyramidal cone the sum of its edges."""
-        address, dim = (np.concatenate([parts[index] for parts in found]) for index in (4, 5))
+    def _forces(self, found: Sequence[tuple[NDArray[Any], ...]]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return normal force [C] and friction [C, 3] of every contact, by its rows among the constraint forces."""
+        address, dim, tangent, cone = (np.concatenate([parts[i] for parts in found]) for i in (4, 5, 7, 8))
         before = np.cumsum([0, *(len(parts[6]) for parts in found)])
-        # Sum over each contact's rows as a difference of running sums, without a loop over contacts.
-        total = np.concatenate([[0.0], *(parts[6] for parts in found)]).cumsum()
-        rows = np.where((dim > 1) & (self._model.opt.cone == 0), 2 * (dim - 1), 1)
+        rows = np.concatenate([*(parts[6] for parts in found), np.zeros(1)])
         first = np.maximum(address, 0) + np.repeat(before[:-1], [len(parts[4]) for parts in found])
-        return np.where(address >= 0, total[np.minimum(first + rows, len(total) - 1)] - total[first], 0.0)
+
+        def row(offset: int, valid: NDArray[np.bool_]) -> NDArray[np.float64]:
+            return rows[np.where(valid & (address >= 0), first + offset, len(rows) - 1)]
+
+        if self._model.opt.cone:
+            # An elliptic cone has a row for the normal force and one for each tangent.
+            normal, slip = row(0, dim > 0), np.stack([row(1, dim > 1), row(2, dim > 1)], axis=1)
+        else:
+            # A pyramid has two edges for each tangent (and for each torque): their sum is the normal force, their
+            # difference by the coefficient the friction.
+            edges = np.stack([row(edge, edge < np.maximum(2 * (dim - 1), 1)) for edge in range(10)], axis=1)
+            normal = edges.sum(axis=1)
+            slip = np.where(dim[:, None] > 1, cone * (edges[:, [0, 2]] - edges[:, [1, 3]]), 0.0)
+        return normal, (slip[:, :, None] * tangent).sum(axis=1)
 
     def finish(self) -> None:
         omega = self._twist[..., :3]
@@ -238,13 +253,22 @@ class _Gatherer:
         if found:
             env = np.repeat(owners, [len(parts[1]) for parts in found])
             columns = [np.concatenate([parts[index] for parts in found])[:room] for index in range(4)]
-            columns.append(self._forces(found)[:room])
+            columns += [force[:room] for force in self._forces(found)]
             keep = len(columns[0])
             state.contact_env.numpy()[:keep] = env[:keep]
-            names = ("geom", "distance", "position", "normal", "force")
+            names = ("geom", "distance", "position", "normal", "force", "friction")
             for name, column in zip(names, columns, strict=True):
                 getattr(state, f"contact_{name}").numpy()[:keep] = column
         state.contact_count.fill_(total)
+        if total > room and not self._warned:
+            self._warned = True
+            most = max(len(parts[1]) for parts in found)
+            warnings.warn(
+                f"The engine found {total} contacts and has room for {room}; the last ones are lost. Make it with "
+                f"contacts={max(most, -(-total // len(self._data)))}.",
+                RuntimeWarning,
+                stacklevel=2,
+            )
 
 
 def _with_fields(model: Any, values: Mapping[str, NDArray]) -> Any:

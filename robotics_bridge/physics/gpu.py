@@ -188,8 +188,8 @@ class MujocoWarpEngine:
         self._fill_links()
         pyramidal = int(self.model.opt.cone == 0)
         c = d.contact
-        inputs = [d.nacon, c.worldid, c.frame, c.dim, c.efc_address, d.efc.force, pyramidal]
-        inputs += [state.contact_normal, state.contact_force]
+        inputs = [d.nacon, c.worldid, c.frame, c.dim, c.efc_address, d.efc.force, c.friction, pyramidal]
+        inputs += [state.contact_normal, state.contact_force, state.contact_friction]
         wp.launch(fill_contacts, dim=c.worldid.shape[0], inputs=inputs, device=self._device)
 
 

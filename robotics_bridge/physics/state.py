@@ -15,13 +15,17 @@ import torch
 from numpy.typing import ArrayLike
 
 from brainbench.core.devices import pick_device, warp
-from brainbench.core.errors import UsageError
+from brainbench.core.errors import UsageError, unknown_name
 from robotics_bridge.physics.kernels.state import StateArrays
 
 DIVERGED = 1
 """Bit of :attr:`HandState.status`: a pose or velocity of the environment is not a finite number."""
 CROWDED = 2
 """Bit of :attr:`HandState.status`: contacts were lost because there was no room for them."""
+UNFELT = 4
+"""Bit of :attr:`HandState.status`: a contact pushed a link that has taxels with ``total="engine"`` where none felt it."""
+_CONTACT = {"distance": 0.0, "force": float("nan"), "position": 0.0, "normal": 0.0, "friction": 0.0}
+"""What may be told of a contact, and what it is where nobody tells."""
 MOST_ENVS = 1_000_000
 """Most environments at once; more is a slip of the keys that would fill the memory."""
 
@@ -46,12 +50,15 @@ class HandState:
     """Warp array [C] of vec3, from the first geometry to the second."""
     contact_force: Any
     """Warp array [C] float32: normal force (N); NaN where the engine does not tell."""
+    contact_friction: Any
+    """Warp array [C] of vec3: tangential force on the second geometry (N), world axes; 0 where the engine does not
+    tell."""
     contact_count: Any
     """Warp array [1] int32: contacts found, which may exceed the room C."""
     time: Any
     """Warp array [B] float32 (s)."""
     status: Any
-    """Warp array [B] int32 of :data:`DIVERGED` and :data:`CROWDED`, as of the last update of a suite."""
+    """Warp array [B] int32 of :data:`DIVERGED`, :data:`CROWDED` and :data:`UNFELT`, as of the last update of a suite."""
 
     @classmethod
     def empty(cls, num_envs: int, num_links: int, contacts: int = 0, device: Any = "cpu") -> HandState:
@@ -89,6 +96,7 @@ class HandState:
             contact_position=zeros(wp.vec3f),
             contact_normal=zeros(wp.vec3f),
             contact_force=wp.full(room, float("nan"), dtype=wp.float32, device=device),
+            contact_friction=zeros(wp.vec3f),
             contact_count=wp.zeros(1, dtype=wp.int32, device=device),
             time=wp.zeros(num_envs, dtype=wp.float32, device=device),
             status=wp.zeros(num_envs, dtype=wp.int32, device=device),
@@ -133,12 +141,24 @@ class HandState:
         return warp().to_torch(self.time)
 
     def set_pose(self, pose: ArrayLike | torch.Tensor) -> None:
-        """Write world poses [B, L, 7] (or one [L, 7] for all) as (x, y, z, qw, qx, qy, qz)."""
-        self._write(self.pose_torch, pose, "poses", order=(0, 1, 2, 4, 5, 6, 3))
+        """Write world poses [B, L, 7] (or one [L, 7] for all) as (x, y, z, qw, qx, qy, qz), quaternions normalised.
+
+        Raises:
+            UsageError: the shape is another, or a quaternion is zero (on a GPU, where looking would wait for the
+                device, it becomes NaN: its environment is diverged).
+        """
+        self._check_shape(self.pose_torch, pose, "poses")
+        values = _tensor(pose)
+        length = values[..., 3:].norm(dim=-1, keepdim=True)
+        if not values.is_cuda and bool((length == 0).any()):
+            where = tuple((length[..., 0] == 0).nonzero()[0].tolist())
+            raise UsageError(f"The quaternion of the pose {where} is zero, which is no orientation; use (1, 0, 0, 0).")
+        self.pose_torch.copy_(torch.cat([values[..., :3], values[..., [4, 5, 6, 3]] / length], dim=-1))
 
     def set_velocity(self, velocity: ArrayLike | torch.Tensor) -> None:
         """Write velocities [B, L, 6] (or one [L, 6] for all) as (linear of the origin, angular)."""
-        self._write(self.velocity_torch, velocity, "velocities")
+        self._check_shape(self.velocity_torch, velocity, "velocities")
+        self.velocity_torch.copy_(_tensor(velocity))
 
     def set_contacts(self, env: ArrayLike, geometries: ArrayLike, **optional: ArrayLike) -> None:
         """Replace all contacts.
@@ -146,10 +166,11 @@ class HandState:
         Args:
             env: environment [n] of each contact.
             geometries: pairs [n, 2] of geometry numbers.
-            **optional: ``distance``, ``force`` [n], ``position``, ``normal`` [n, 3].
+            **optional: ``distance``, ``force`` [n], ``position``, ``normal``, ``friction`` [n, 3]. What is not given
+                is set to 0, and forces to NaN: nothing is left of earlier contacts.
 
         Raises:
-            UsageError: there are more contacts than room, or an unknown quantity is given.
+            UsageError: there are more contacts than room, or an environment or a quantity is unknown.
         """
         wp = warp()
         environments = np.asarray(env, dtype=np.int32).reshape(-1)
@@ -161,26 +182,28 @@ class HandState:
             )
         if len(pairs) != count:
             raise UsageError(f"Every contact needs one pair of geometries; received {count} and {len(pairs)}.")
-        given = {"env": environments, "geom": pairs, **optional}
-        for name, values in given.items():
-            target = getattr(self, f"contact_{name}", None)
-            if target is None or name == "count":
-                raise UsageError(f"A contact has no {name!r}; it has distance, force, position and normal.")
-            view = wp.to_torch(target)
-            rows = np.asarray(values, dtype=np.int32 if view.dtype.is_floating_point is False else np.float32)
-            _copy(view[:count], rows.reshape(tuple(view[:count].shape)))
+        if count and not (0 <= environments.min() and environments.max() < self.num_envs):
+            raise UsageError(
+                f"Environments of contacts are 0 to {self.num_envs - 1}; received {environments.min()} to "
+                f"{environments.max()}."
+            )
+        for name in optional:
+            if name not in _CONTACT:
+                raise unknown_name("quantity of a contact", name, tuple(_CONTACT))
+        for name, values in {"env": environments, "geom": pairs, **_CONTACT, **optional}.items():
+            view = wp.to_torch(getattr(self, f"contact_{name}"))[:count]
+            if isinstance(values, float):
+                view.fill_(values)
+            else:
+                rows = np.asarray(values, dtype=np.float32 if view.dtype.is_floating_point else np.int32)
+                view.copy_(_tensor(rows.reshape(tuple(view.shape))))
         self.contact_count.fill_(count)
 
-    def _write(self, view: torch.Tensor, values: Any, what: str, order: tuple[int, ...] | None = None) -> None:
-        shape = tuple(view.shape)
-        values = values if hasattr(values, "shape") else np.asarray(values)
-        given = tuple(values.shape)
+    def _check_shape(self, view: torch.Tensor, values: Any, what: str) -> None:
+        shape, given = tuple(view.shape), tuple(np.shape(values))
         if given not in (shape, shape[1:]):
             raise UsageError(f"The {what} of this state have the shape {shape}; received {given}.")
-        _copy(view, values if order is None else values[..., list(order)])
 
 
-def _copy(view: torch.Tensor, values: Any) -> None:
-    if not isinstance(values, torch.Tensor):
-        values = torch.from_numpy(np.array(values))
-    view.copy_(values)
+def _tensor(values: Any) -> torch.Tensor:
+    return values if isinstance(values, torch.Tensor) else torch.from_numpy(np.array(values, dtype=np.float32))

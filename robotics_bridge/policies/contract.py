@@ -16,12 +16,15 @@ from brainbench.core.errors import DataError, UsageError
 from brainbench.core.files import to_json
 from robotics_bridge.hands.observations import OBSERVATIONS
 from robotics_bridge.policies.schema import Values
+from robotics_bridge.sensors.taxels.sensors import PUBLISHED_TWIST
 
 FORMATS = ("onnx", "jit")
 RATE = (1.0, 1000.0)
 """Control steps per second [Hz]."""
 ANGLE = (-4 * math.pi, 4 * math.pi)
 """Positions of joints (rad)."""
+MOST_TWIST = 100.0
+"""N·m·s."""
 SCALE = (-10.0, 10.0)
 """Radians per unit of action; 0 is not allowed."""
 JOINTS = 255
@@ -59,7 +62,8 @@ class PolicyContract:
     sha256: str = ""
     """Hash of the file of the network; empty in contracts of earlier versions."""
     more: Mapping[str, Any] = field(default_factory=dict)
-    """``task``, ``placement``, ``resolution`` and ``sub_steps``, where they stand in the contract."""
+    """``task``, ``placement``, ``resolution`` and ``sub_steps``, where they stand in the contract, and ``twist``, the
+    torsional friction of force taxels (N·m·s; None is that of their patch)."""
 
     @classmethod
     def read(cls, path: Path) -> PolicyContract:
@@ -105,6 +109,10 @@ class PolicyContract:
         }
         if "sub_steps" in given.values:
             more["sub_steps"] = given.whole("sub_steps", 1, 1000)
+        # Contracts of earlier versions say nothing of it: they have the published law.
+        more["twist"] = PUBLISHED_TWIST
+        if "twist" in given.values:
+            more["twist"] = None if given.values["twist"] is None else given.number("twist", 0.0, MOST_TWIST)
         return cls(
             found.text("format", FORMATS), inputs, given.number("rate", *RATE), given.text("hand"), joints, moved,
             action_map, frozen, links, observe, found.text("sha256") if "sha256" in found.values else "", more,

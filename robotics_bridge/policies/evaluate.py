@@ -14,11 +14,10 @@ from numpy.typing import ArrayLike
 from brainbench.core.errors import UsageError, unknown_name
 from brainbench.core.statistics import wilson_interval
 from robotics_bridge.envs.env import Env
+from robotics_bridge.policies.shipped import AGENTS
 
 QUANTITIES = ("metric", "returns", "lengths", "goals", "turn_rate", "seconds", "dropped")
 """Quantities of each episode beside its success."""
-AGENTS = ("zero", "random")
-"""Agents that every trained one is held against."""
 _Z = 1.959964
 """Normal quantile of a 95 % interval: episodes are many."""
 
@@ -93,7 +92,7 @@ class Policy:
     """A trained teacher or student as a function of observation groups that may remember; returns actions [B, A].
 
     Args:
-        actor: Model class of rsl_rl, put into evaluation mode.
+        actor: Module of groups of observations, with a method ``reset``; put into evaluation mode.
     """
 
     def __init__(self, actor: torch.nn.Module) -> None:
@@ -102,11 +101,6 @@ class Policy:
 
     def act(self, observations: Mapping[str, torch.Tensor]) -> torch.Tensor:
         """Return the mean actions [B, A]."""
-        from tensordict import TensorDict
-
-        if not isinstance(observations, TensorDict):
-            first = next(iter(observations.values()))
-            observations = TensorDict(dict(observations), batch_size=[first.shape[0]])  # type: ignore[arg-type]
         with torch.inference_mode():
             return self.actor(observations)
 

@@ -8,6 +8,8 @@ from pathlib import Path
 from brainbench.core.errors import unknown_name
 from brainbench.core.files import read_json
 
+AGENTS = ("zero", "random")
+"""Agents that every trained one is held against."""
 FOLDER = Path(__file__).parent / "trained"
 """A run's folder per policy, with a model card."""
 

@@ -16,8 +16,6 @@ from contextlib import nullcontext
 from typing import TYPE_CHECKING, Any
 
 import torch
-from rsl_rl.models import MLPModel
-from rsl_rl.utils import unpad_trajectories
 from torch import nn
 
 from brainbench.core.errors import UsageError, unknown_name
@@ -25,7 +23,13 @@ from robotics_bridge.policies.encoders.arms import EncoderConfig, TactileEncoder
 from robotics_bridge.policies.exported import JitPolicy, StepPolicy
 
 if TYPE_CHECKING:
+    from rsl_rl.models import MLPModel
     from tensordict import TensorDict
+else:
+    try:
+        from rsl_rl.models import MLPModel
+    except ImportError:  # who only plays a trained student needs no package for training
+        from robotics_bridge.policies.acting import ActingModel as MLPModel
 
 TACTILE = "tactile"
 """Name of the group of readings."""
@@ -282,6 +286,8 @@ class TactilePolicy(MLPModel):
             return latent
         if hidden_state is None:
             raise UsageError("Sequences need the hidden state in which they begin.")
+        from rsl_rl.utils import unpad_trajectories
+
         latents, _ = self.unroll({name: obs[name] for name in self.shapes}, hidden_state[0])
         return unpad_trajectories(latents, masks)  # type: ignore[return-value]
 

@@ -49,6 +49,9 @@ def _felt(device: str, sensor: Sensor, *, depth: float = 2e-3, steps: int = 1) -
     pose[:, 3] = 1
     pose[1, 2] = 0.02 - depth
     state.set_pose(pose)
+    if isinstance(sensor, ContactAudio):
+        # A blow is a rise of force, so there must be an update before it.
+        suite.update(state, 0.01)
     state.set_contacts(
         [0], [[0, 1]], distance=[-depth], position=[[0, 0, -depth / 2]], normal=[[0, 0, 1.0]], force=[1.0]
     )

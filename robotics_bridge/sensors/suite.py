@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple, cast
 
@@ -13,7 +14,7 @@ from brainbench.core.cuda_graphs import record_launches
 from brainbench.core.devices import pick_device, warp
 from brainbench.core.errors import UsageError, unknown_name
 from robotics_bridge.physics.scene import TouchScene
-from robotics_bridge.physics.state import DIVERGED, MOST_ENVS, HandState
+from robotics_bridge.physics.state import DIVERGED, MOST_ENVS, UNFELT, HandState
 from robotics_bridge.sensors.context import ReadoutSlice, SuiteContext, UpdateClock
 from robotics_bridge.sensors.fidelity import SensorFidelity
 from robotics_bridge.sensors.probes.runtime import DistanceRuntime
@@ -53,6 +54,9 @@ class SensorSuite:
         env_offset: number of environment 0 in the whole experiment, so that shards draw different noise.
         resolution: cells of distance fields along a mesh's longest edge; 64 by default.
         fidelity: query, resolution and surface points for all sensors, in place of their own.
+        listed: geometries in contact with one link that are looked at; all by default, 16 where lists of all would take
+            more than 256 MiB. A warning says once how many there were if some were lost (on a GPU when :attr:`crowded`
+            is read).
 
     Raises:
         UsageError: a sensor is no sensor, or names a link that the scene does not have.
@@ -76,10 +80,13 @@ class SensorSuite:
         env_offset: int = 0,
         resolution: int | None = None,
         fidelity: SensorFidelity | None = None,
+        listed: int | None = None,
     ) -> None:
         if fidelity is not None:
             sensors, resolution = fidelity.apply(sensors), resolution or fidelity.resolution
         resolution = resolution or 64
+        if listed is not None and listed < 1:
+            raise UsageError(f"listed is the positive number of geometries looked at on a link; received {listed}.")
         if not 1 <= num_envs <= MOST_ENVS:
             raise UsageError(f"A suite serves 1 to {MOST_ENVS:,} environments; received {num_envs}.")
         self.scene, self.sensors = scene, dict(sensors)
@@ -99,7 +106,7 @@ class SensorSuite:
             age = wp.full(num_envs, -1, dtype=wp.int32, device=self.device)
             self.clock = UpdateClock(age, wp.zeros(num_envs, dtype=wp.int32, device=self.device), env_offset)
             self.solids = Solids(scene, num_envs, self.device, required, resolution=resolution)
-            self.pairs = PairTable(self.solids, num_envs, self.device)
+            self.pairs = PairTable(self.solids, num_envs, self.device, listed)
             self.context = context = SuiteContext(
                 num_envs, self.device, seed, self.clock, scene, self.solids, self.pairs
             )
@@ -115,6 +122,7 @@ class SensorSuite:
             }
         self._recorded: _RecordedUpdate | None = None
         self._status: Any = None
+        self._warned = False
 
     def update(self, state: HandState, dt: float = 0.01) -> None:
         """Read the state with every sensor.
@@ -132,6 +140,7 @@ class SensorSuite:
             raise UsageError(f"dt is the positive time since the last update (s); received {dt!r}.")
         if not self.device.is_cuda:
             self._launch(state, dt)
+            self._warn_crowded()
         elif self.device.is_capturing:
             if self._histories or not all(runtime.recordable for runtime in self.runtimes):
                 raise UsageError("Sensors with a history or with meshes that move cannot be part of another recording.")
@@ -212,15 +221,34 @@ class SensorSuite:
 
     @property
     def diverged(self) -> torch.Tensor:
-        """Mask [B] of environments that held numbers that are not finite at the last update; their readings are NaN."""
+        """Mask [B] of environments that held numbers that are not finite since their reset; their readings are NaN."""
         if self._status is None:
             raise UsageError("Nothing was read yet; call update(state) first.")
         return (wp.to_torch(self._status) & DIVERGED) != 0
 
     @property
+    def unfelt(self) -> torch.Tensor:
+        """Mask [B] of environments in which, at the last update, a contact on a link with taxels of ``total="engine"``
+        lay near none of them that feels it: their sum lacks its force."""
+        if self._status is None:
+            raise UsageError("Nothing was read yet; call update(state) first.")
+        return (wp.to_torch(self._status) & UNFELT) != 0
+
+    @property
     def crowded(self) -> torch.Tensor:
         """Mask [B] of environments that ever had more geometries in contact with one sensor link than are looked at."""
+        self._warn_crowded()
         return wp.to_torch(self.pairs.crowded) != 0
+
+    def _warn_crowded(self) -> None:
+        if not self._warned and (most := int(wp.to_torch(self.pairs.crowded).max())):
+            self._warned = True
+            warnings.warn(
+                f"{most} geometries touched one sensor link at once, more than are listed; some were not felt. Make the "
+                f"suite with listed={most}.",
+                RuntimeWarning,
+                stacklevel=3,
+            )
 
     @property
     def state_bytes(self) -> dict[str, int]:

@@ -26,7 +26,7 @@ import trimesh
 from numpy.typing import NDArray
 from trimesh.triangles import closest_point
 
-from brainbench.core.errors import missing_dependency
+from brainbench.core.figures.style import panels, save_figure
 from brainbench.core.files import write_json
 from brainbench.core.progress import Progress
 from brainbench.geometry import Mesh, winding_number
@@ -209,28 +209,27 @@ def plot_tradeoff(rows: Sequence[dict[str, Any]], path: Path) -> None:
     Raises:
         MissingDependencyError: matplotlib is not installed.
     """
-    try:
-        from matplotlib.backends.backend_agg import FigureCanvasAgg
-        from matplotlib.figure import Figure
-    except ImportError as error:
-        raise missing_dependency("matplotlib", extra="report", purpose="Drawing pictures") from error
-    figure = Figure(figsize=(9.6, 3.4), dpi=110, facecolor="white", layout="constrained")
-    FigureCanvasAgg(figure)
-    titles = {"mesh": "4,608 triangles: field or tree", "points": "proximity: surface points", "taxels": "pad: taxels"}
-    for number, (part, title) in enumerate(titles.items()):
-        axes = figure.add_subplot(1, 3, number + 1)
+    figure, axes = panels(1, 3, (10.5, 3.6))
+    titles = {
+        "mesh": "distance to 4,608 triangles,\nby cells of the distance field",
+        "points": "proximity taxels,\nby number of surface points",
+        "taxels": "pad of taxels,\nby number of taxels",
+    }
+    for (part, title), one in zip(titles.items(), axes[0], strict=True):
         chosen = [row for row in rows if row["part"] == part]
-        axes.loglog([r["cost"] for r in chosen], [r["error"] for r in chosen], "o", color="#c1440e", markersize=5)
-        for row in chosen:
-            query = f"sdf {row['resolution']}" if row.get("resolution") else "raycast"
-            label = str(row.get("points") or row.get("taxels") or query)
-            left = row.get("resolution") in RESOLUTIONS[::2]
-            offset = {"xytext": (-6 if left else 6, -3), "textcoords": "offset points"}
-            axes.annotate(label, (row["cost"], row["error"]), ha="right" if left else "left", fontsize=8, **offset)
-        axes.set_title(title, fontsize=9)
-        axes.set_xlabel("µs per environment and update")
-        axes.margins(0.3)
-        axes.spines[["top", "right"]].set_visible(False)
-        if not number:
-            axes.set_ylabel("relative error")
-    figure.savefig(path)
+        one.loglog([r["cost"] for r in chosen], [r["error"] for r in chosen], "o", markersize=5)
+        for number, row in enumerate(chosen):
+            cells = f"{row['resolution']}³" if row.get("resolution") else "no field: each triangle"
+            label = f"{row.get('points') or row.get('taxels') or 0:,}" if part != "mesh" else cells
+            # On alternate sides, because neighbours are close: beside a column of points, else above and below.
+            side = 1 if number % 2 else -1
+            beside = part == "mesh"
+            left = side < 0 or number == len(chosen) - 1
+            place = {"xytext": (-7 if left else 7, 0) if beside else (0, -12 * side), "textcoords": "offset points"}
+            align = ("right" if left else "left") if beside else "center"
+            one.annotate(label, (row["cost"], row["error"]), ha=align, va="center", fontsize=8.5, **place)
+        one.set_title(title)
+        one.set_xlabel("time per environment and update (µs)")
+        one.set_ylabel("relative error of the force (RMS)")
+        one.margins(0.3)
+    save_figure(figure, path, dpi=150)

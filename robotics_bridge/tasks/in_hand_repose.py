@@ -6,6 +6,7 @@ released with it (neuroagents-lab/tactile-genesis).
 
 from __future__ import annotations
 
+from robotics_bridge.sensors.taxels.sensors import PUBLISHED_TWIST
 from robotics_bridge.tasks import terms
 from robotics_bridge.tasks.goals import TimedRotation
 from robotics_bridge.tasks.in_palm_rotate import PALM_UP
@@ -34,6 +35,7 @@ def published() -> Task:
         placement=Placement(height=0.5, x=(-0.02, 0.02), y=(-0.02, 0.02), yaw=(-3.14159, 3.14159)),
         hand_poses={"xhand1": ((0.07, 0.0, 0.475), PALM_UP), "sharpa": ((0.07, -0.015, 0.48), PALM_UP)},
         goal=TimedRotation(threshold=0.1, tilt=(-0.7853975, 0.7853975), deadline=(4.0, 6.0)),
+        taxel_twist=PUBLISHED_TWIST,
         rewards={
             "success_bonus": Reward(500.0, terms.goal_reached),
             "track_orientation_gaussian": Reward(2.0, terms.orientation_gaussian, {"sigma": 0.4}),

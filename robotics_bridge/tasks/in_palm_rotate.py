@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+from robotics_bridge.sensors.taxels.sensors import PUBLISHED_TWIST
 from robotics_bridge.tasks import terms
 from robotics_bridge.tasks.goals import SteppingRotation
 from robotics_bridge.tasks.objects import PRIMITIVES
@@ -46,6 +47,7 @@ def published() -> Task:
         hand_poses={"xhand1": ((0.07, 0.0, 0.475), PALM_UP), "sharpa": ((0.07, -0.015, 0.48), PALM_UP)},
         moves=("thumb", "mid"),
         goal=SteppingRotation(axis=(-1.0, 0.0, 0.0), step=1.570795, threshold=0.1, allowed_off_axis=0.5235983333),
+        taxel_twist=PUBLISHED_TWIST,
         rewards={
             "success_bonus": Reward(150.0, terms.goal_reached),
             "rotation_progress": Reward(2.0, terms.rotation_progress, {"clip": 6.0, "penalty_scale": 5.0}),
@@ -93,7 +95,8 @@ def default() -> Task:
     Actions are counted from a cupped hand instead of a flat one: from there random actions turn the block now and
     then. Rotation weighs more, but only slow turns count, and so does coming nearer to the goal in every direction;
     reaching it pays; the goal begins wide. The block's place is where it lies, 2 cm higher, so that lying still costs
-    nothing. Without the approach to the goal, teachers threw the block round and lost it. Actions are bounded.
+    nothing. Without the approach to the goal, teachers threw the block round and lost it. Actions are bounded. Taxels
+    have the torsional friction of their patch.
     """
     task = published()
     rewards = dict(task.rewards)
@@ -107,8 +110,9 @@ def default() -> Task:
         axis=(-1.0, 0.0, 0.0), step=1.570795, threshold=0.1, allowed_off_axis=0.5235983333, start_threshold=0.4
     )
     return replace(
-        task, joints={"xhand1": CUPPED}, rewards=rewards, teacher=settings, goal=goal, action_limit=ACTION_LIMIT
-    )
+        task, joints={"xhand1": CUPPED}, rewards=rewards, teacher=settings, goal=goal, action_limit=ACTION_LIMIT,
+        taxel_twist=None,
+    )  # fmt: skip
 
 
 @register("in_palm_rotate", "careful")

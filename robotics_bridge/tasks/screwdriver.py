@@ -10,6 +10,7 @@ from __future__ import annotations
 from typing import Any
 
 from brainbench.core.devices import mujoco_module
+from robotics_bridge.sensors.taxels.sensors import PUBLISHED_TWIST
 from robotics_bridge.tasks import terms
 from robotics_bridge.tasks.objects import SCREWDRIVERS
 from robotics_bridge.tasks.registry import register, register_bounded
@@ -66,6 +67,7 @@ def published() -> Task:
         starts="grasps",
         turn_axis=TURN,
         turn_window=60,
+        taxel_twist=PUBLISHED_TWIST,
         rewards={
             "rotation_reward": Reward(10.0, terms.spin, {"local_axis": TURN, "low": -0.2, "high": 0.2}),
             "surface_distance_reward": Reward(1.0, terms.near_surface, {"nearest_k": 2, "sigma": 0.01}),

@@ -183,6 +183,8 @@ class Task:
     starts: str | None = None
     """``grasps``: start from sampled grasps instead of the placement."""
     solver: Solver = Solver()
+    taxel_twist: float | None = None
+    """Torsional friction of the force taxels [N·m·s]; None is that of their patch, the published tasks have 2."""
     # --- control ---
     action_ratio: float = 0.5
     """Part of a joint's range by which an action of 1 moves its target away from rest."""

@@ -8,6 +8,7 @@ import pytest
     [
         (("--out", "file/inside"), "file"),
         (("--report", "x.txt2"), "txt2"),
+        (("--report", "none"), "'none'"),
         (("--report", "file/x.md"), "file"),
         (("--report", "."), "report"),
     ],

@@ -83,7 +83,8 @@ def test_a_model_of_ones_own_gets_a_name_and_loses_it(run, files, tmp_path, monk
     assert run("models", "add", files["model"], "--name", "mine").status == 0
     monkeypatch.setattr(registry, "_loaded", set())  # as the next command finds it
     assert "your code" in run("models", "list", "mine").out
-    assert run("score", "mine", "-r", files["recordings"], "-s", files["arrays"], "-o", files["out"]).status == 0
+    asked = ("--conditions", "trials:texture", "--stimuli", files["arrays"], "--out", files["out"])
+    assert run("score", "mine", "--recordings", files["recordings"], *asked).status == 0
     assert run("models", "add", files["model"], "--name", "mine").status == 2
     assert run("models", "remove", "mine").status == 0
     assert "'mine'" in run("models", "remove", "mine").err

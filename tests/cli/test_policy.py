@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -50,6 +52,38 @@ def test_a_played_task_leaves_a_strip_of_frames(tmp_path: Path) -> None:
     out = _run("play", "in_palm_rotate", "--seconds", "0.1", "--strip", str(strip), "--width", "96", "--json")
     assert json.loads(out)["seconds"] == pytest.approx(0.1)
     assert strip.read_bytes().startswith(b"\x89PNG")
+
+
+def test_what_a_shipped_policy_did_is_told_in_goals_turns_and_drops() -> None:
+    words = ("play", "in_palm_rotate", "--agent", "in_palm_rotate.careful", "--seconds", "2", "--seed", "2")
+    told = {line.split("  ")[0]: line.split("  ")[-1].strip() for line in _run(*words).splitlines()}
+    found = json.loads(_run(*words, "--json"))
+    assert int(told["goals reached"]) == found["goals"] >= 1
+    assert told["turned"].startswith(f"{found['turned']:.2f} rad")
+    assert told["dropped"].startswith("0")
+
+
+def test_playing_needs_no_package_for_training_and_checks_names_first() -> None:
+    code = (
+        "import sys\n"
+        "for name in ('rsl_rl', 'tensordict', 'tensorboard', 'gymnasium'): sys.modules[name] = None\n"
+        "from brainbench.cli import main\n"
+        "main()\n"
+    )
+
+    def play(agent: str, *more: str) -> subprocess.CompletedProcess[str]:
+        words = ["policy", "play", "in_palm_rotate", "--agent", agent, "--seconds", "0.1", *more]
+        return subprocess.run([sys.executable, "-c", code, *words], capture_output=True, text=True, check=False)
+
+    for agent in ("in_palm_rotate.careful", "in_palm_rotate.force-torque-hand"):
+        done = play(agent)
+        assert done.returncode == 0, done.stderr
+        assert "CUDA" not in done.stderr
+    light = code.replace("'gymnasium'", "'gymnasium', 'torch', 'warp', 'mujoco'")
+    for words in (["--agent", "in_palm_rotate.carful"], ["--video", "x.mpx"]):
+        given = [sys.executable, "-c", light, "policy", "play", "in_palm_rotate", *words]
+        done = subprocess.run(given, capture_output=True, text=True, check=False)
+        assert (done.returncode, done.stderr.count("\n")) == (2, 1), done.stderr
 
 
 def test_a_shipped_teacher_is_listed_and_plays() -> None:

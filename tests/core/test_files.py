@@ -2,8 +2,6 @@ import hashlib
 import json
 import math
 import multiprocessing
-import subprocess
-import sys
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -134,19 +132,3 @@ def test_names_and_values_are_read_from_toml_and_json(tmp_path):
     (tmp_path / "c.json").write_text("[1]")
     with pytest.raises(DataError, match=r"/c\.json' .*list"):
         files.read_mapping(tmp_path / "c.json")
-
-
-def test_a_locked_folder_is_refused_or_waited_for(tmp_path):
-    code = (
-        "import pathlib, sys; from brainbench.core.files import lock_folder\n"
-        "with lock_folder(pathlib.Path(sys.argv[1]), wait=sys.argv[2] == 'wait') as held: print(held)"
-    )
-    words = [sys.executable, "-c", code, str(tmp_path)]
-    with files.lock_folder(tmp_path) as held:
-        assert held
-        refused = subprocess.run([*words, "refuse"], capture_output=True, text=True, check=False)
-        assert (refused.returncode, tmp_path.name in refused.stderr) == (1, True)
-        waiting = subprocess.Popen([*words, "wait"], stdout=subprocess.PIPE, text=True)
-        with pytest.raises(subprocess.TimeoutExpired):
-            waiting.wait(2)
-    assert waiting.communicate(timeout=30)[0] == "True\n"

@@ -1,8 +1,10 @@
 import json
 
+import h5py
 import numpy as np
 import pytest
 
+from brainbench.core.errors import DataError
 from brainbench.datasets import inspect, open_recordings, write_recordings
 from tests.factories.recording_files import write_nwb
 from tests.factories.recordings import make_simple_session
@@ -10,15 +12,23 @@ from tests.factories.recordings import make_simple_session
 
 def test_proposals_put_stimulus_like_columns_first_and_times_nowhere(tmp_path):
     columns = {
-        "response": np.resize(np.array(["l", "r"]), 12),
-        "block": np.resize(np.array([1, 2]), 12),
+        "response": np.resize(np.array(["l", "m", "r"]), 12),
+        "block": np.resize(np.array([1, 2, 3]), 12),
+        "side": np.resize(np.array(["l", "r"]), 12),  # two labels have one distance: nothing to compare
+        "texture": np.resize(np.array(["x", "y", "z", "w"]), 12),  # three trials are too few for the default metric
         "cue_time": np.resize(np.array([0.5, 0.7]), 12),
         "unique": np.arange(12),
         "constant": np.ones(12),
     }
     path = write_recordings(tmp_path / "a.h5", make_simple_session(columns=columns))
     report = inspect(path)
-    assert [item.conditions for item in report.proposals] == ["trials:stimulus", "trials:block", "trials:response"]
+    assert [item.conditions for item in report.proposals] == [
+        "trials:stimulus",
+        "trials:block",
+        "trials:response",
+        "trials:texture",
+    ]
+    assert [line[0] for line in str(report).splitlines() if "--conditions" in line] == ["→", " ", " ", " "]
     assert report.proposals[0].labels == ("a", "b", "c")
     assert report.proposals[0].fewest == 4
     assert open_recordings(path, conditions=report.proposals[0].conditions).sizes["trial"] == 12
@@ -37,12 +47,10 @@ def test_an_inspection_is_text_and_json(tmp_path):
         assert expected in text
     data = json.loads(report.to_json())
     assert data["sessions"][0]["units"]["spikes"] == 120
-    assert data["proposals"][0]["conditions"] == "trials:texture"
+    assert data["proposals"] == []
 
 
 def test_signals_are_listed_and_a_broken_link_hides_nothing(tmp_path):
-    import h5py
-
     path = write_nwb(tmp_path / "a.nwb")
     with h5py.File(path, "a") as file:
         file["acquisition/behavior/touch/data"] = np.zeros((1000, 2))
@@ -54,15 +62,13 @@ def test_signals_are_listed_and_a_broken_link_hides_nothing(tmp_path):
 
 
 def test_problems_are_reported_not_raised(tmp_path):
-    import h5py
-
     path = write_recordings(tmp_path / "a.h5", make_simple_session())
     with h5py.File(path, "a") as file:
         file["sessions/mouse-1/units/spike_times"][3] = np.inf
         del file["sessions/mouse-1/tables/trials/stimulus"]
     missing = " ".join(inspect(path).sessions[0].missing)
     assert "1 spike times" in missing
-    assert "2 to 60 values" in missing
+    assert "3 to 60 values" in missing
 
 
 def test_a_folder_is_inspected_as_a_whole(tmp_path):
@@ -71,6 +77,24 @@ def test_a_folder_is_inspected_as_a_whole(tmp_path):
     report = inspect(tmp_path)
     assert [session.subject for session in report.sessions] == ["m1", "m2"]
     assert len(report.proposals) == 1
+
+
+def test_a_file_that_holds_no_recordings_is_skipped_and_named(tmp_path):
+    for name in ("m1", "m2"):
+        write_recordings(tmp_path / f"{name}.h5", make_simple_session(subject=name))
+    with h5py.File(tmp_path / "features.h5", "w") as file:
+        file["layer"] = np.zeros(3)
+    (tmp_path / "torn.h5").write_bytes(b"")
+    report = inspect(tmp_path)
+    assert [session.subject for session in report.sessions] == ["m1", "m2"]
+    opened = open_recordings(tmp_path, conditions="trials:stimulus")
+    for skipped in (report.skipped, opened.attrs["skipped"]):
+        assert [next(name for name in ("features", "torn") if name in text) for text in skipped] == ["features", "torn"]
+    for read in (inspect, lambda path, **how: open_recordings(path, conditions="trials:stimulus", **how)):
+        with pytest.raises(DataError, match="features"):
+            read(tmp_path, strict=True)
+        with pytest.raises(DataError, match="features"):
+            read(tmp_path / "features.h5")
 
 
 def test_counted_recordings_are_described_by_their_labels(tmp_path):

@@ -27,7 +27,10 @@ def _turn(axis, angle):
 
 @dataclass
 class DenseChain:
-    """Links with two hinges each (about y, then z) on a base that moves. mg, mm, ms, mN."""
+    """Links with two hinges each (about y, then z) on a base that moves. mg, mm, ms, mN.
+
+    With three ``hinges`` links 1, 3, 5 … also twist, between two halves of their rest bend.
+    """
 
     length: np.ndarray
     rest: np.ndarray
@@ -38,8 +41,9 @@ class DenseChain:
     """Axial and transverse [link, 2]."""
     stiffness: np.ndarray
     angle: np.ndarray
-    """[link, 2]"""
+    """[link, hinge]; zero where there is no hinge, as rates are."""
     rate: np.ndarray
+    torsion: np.ndarray
     beta: float = 0.1
     base_turn: np.ndarray = None
     """Unit quaternion (w, x, y, z)."""
@@ -47,10 +51,10 @@ class DenseChain:
     """Angular velocity and velocity [6]."""
 
     @classmethod
-    def random(cls, links=6, seed=0):
+    def random(cls, links=6, seed=0, hinges=2):
         rng = np.random.default_rng(seed)
         turn = rng.normal(size=4)
-        return cls(
+        made = cls(
             length=rng.uniform(0.5, 2, links),
             rest=rng.uniform(-0.2, 0.2, links),
             mass=rng.uniform(0.5, 2, links),
@@ -61,18 +65,40 @@ class DenseChain:
             rate=rng.normal(size=(links, 2)) * 0.2,
             base_turn=turn / np.linalg.norm(turn),
             base_twist=rng.normal(size=6) * 0.2,
+            torsion=np.zeros(links),
         )
+        if hinges == 3:
+            made.torsion[1::2] = rng.uniform(1, 20, links // 2)
+            angle, rate = rng.uniform(-0.5, 0.5, links), rng.normal(size=links) * 0.2
+            turns = made.torsion > 0
+            made.angle, made.rate = np.c_[made.angle, turns * angle], np.c_[made.rate, turns * rate]
+        return made
 
     @property
     def links(self):
         return len(self.length)
 
+    @property
+    def hinges(self):
+        return self.angle.shape[1]
+
+    @property
+    def free(self):
+        """Which angles are hinges [link, hinge]."""
+        return np.column_stack([np.ones((self.links, 2), dtype=bool), self.torsion > 0])[:, : self.hinges]
+
+    @property
+    def axes_count(self):
+        return np.count_nonzero(self.free)
+
     def arrays(self):
         """Return the fields of ``ChainArrays``, for one whisker."""
-        n, shape = self.links, (CAPACITY, 1, 4)
-        build, inertia, taper = np.zeros(shape), np.zeros(shape), np.zeros(shape)
-        build[:n, 0] = np.stack([self.length, np.cos(self.rest), np.sin(self.rest), self.mass], axis=1)
-        inertia[:n, 0] = np.column_stack([self.centre, self.inertia, self.stiffness])
+        n = self.links
+        build, inertia, taper = (np.zeros((CAPACITY, 1, width)) for width in (4, 2 + self.hinges, 4))
+        rest = np.where(self.torsion > 0, self.rest / 2, self.rest)
+        build[:n, 0] = np.stack([self.length, np.cos(rest), np.sin(rest), self.mass], axis=1)
+        springs = (self.stiffness, self.torsion)[: self.hinges - 1]
+        inertia[:n, 0] = np.column_stack([self.centre, self.inertia, *springs])
         radius = np.linspace(0.05, 0.01, n + 1)
         arc = np.concatenate([[0], np.cumsum(self.length)])
         taper[:n, 0] = np.stack([radius[:-1], radius[1:], arc[:-1], self.length], axis=1)
@@ -82,7 +108,7 @@ class DenseChain:
         }  # fmt: skip
 
     def pose(self, time=0.0):
-        """Base frame, joints [link + 1, 3], axes [link, 2, 3] and frames [link, 3, 3] a time later at steady rates."""
+        """Base frame, joints [link + 1, 3], axes (a list [hinge, 3] per link) and frames [link, 3, 3], a time later."""
         w, *v = self.base_turn
         k = np.cross(AXES, v)
         frame = np.eye(3) + 2 * w * k + 2 * k @ k
@@ -91,25 +117,31 @@ class DenseChain:
         frame = _turn(spin / speed, speed * time) @ frame if speed else frame
         nodes, axes, frames = [self.base_twist[3:] * time], [], []
         for i in range(self.links):
-            frame = frame @ _turn(AXES[2], self.rest[i])
+            half = self.rest[i] / 2 if self.torsion[i] > 0 else 0.0
+            frame = frame @ _turn(AXES[2], self.rest[i] - half)
             first = frame[:, 1]
             frame = frame @ _turn(AXES[1], self.angle[i, 0] + self.rate[i, 0] * time)
             second = frame[:, 2]
             frame = frame @ _turn(AXES[2], self.angle[i, 1] + self.rate[i, 1] * time)
             axes.append([first, second])
+            if half:
+                axes[-1].append(frame[:, 0])
+                frame = frame @ _turn(AXES[0], self.angle[i, 2] + self.rate[i, 2] * time) @ _turn(AXES[2], half)
             frames.append(frame)
             nodes.append(nodes[-1] + frame[:, 0] * self.length[i])
-        return np.array(nodes), np.array(axes), np.array(frames)
+        return np.array(nodes), axes, np.array(frames)
 
     def point_jacobian(self, point, link, pose=None):
-        """Jacobian [6, 6 + 2 links] of the rotation and translation of a link at a point, by base twist and rates."""
+        """Jacobian [6, 6 + hinges] of the rotation and translation of a link at a point, by base twist and rates."""
         nodes, axes, _ = pose or self.pose()
-        out = np.zeros((6, 6 + 2 * self.links))
+        out = np.zeros((6, 6 + self.axes_count))
         out[:3, :3] = out[3:, 3:6] = np.eye(3)
         out[3:, :3] = -np.cross(AXES, point - nodes[0])
+        column = 6
         for i in range(link + 1):
-            for k in range(2):
-                out[:, 6 + 2 * i + k] = *axes[i, k], *np.cross(axes[i, k], point - nodes[i])
+            for axis in axes[i]:
+                out[:, column] = *axis, *np.cross(axis, point - nodes[i])
+                column += 1
         return out
 
     def _bodies(self, time=0.0):
@@ -122,15 +154,15 @@ class DenseChain:
             yield self.point_jacobian(centre, i, pose), tensor
 
     def mass_matrix(self):
-        """Mass matrix [6 + 2 links]² of base and joints."""
+        """Mass matrix [6 + hinges]² of base and joints."""
         return sum(
             j[:3].T @ tensor @ j[:3] + m * j[3:].T @ j[3:]
             for (j, tensor), m in zip(self._bodies(), self.mass, strict=True)
         )
 
     def bias(self, step=1e-3):
-        """Forces [6 + 2 links] of base and joints at steady rates and a base point that moves straight."""
-        speed = np.concatenate([self.base_twist, self.rate.ravel()])
+        """Forces [6 + hinges] of base and joints at steady rates and a base point that moves straight."""
+        speed = np.concatenate([self.base_twist, self.rate[self.free]])
 
         def momenta(time):
             found = [(j @ speed, tensor) for j, tensor in self._bodies(time)]
@@ -145,5 +177,5 @@ class DenseChain:
     def implicit(self, h):
         """Mass matrix of the joints with springs and dampers at the end of a step, and their forces now."""
         lag = max(self.beta, h)
-        k = np.repeat(self.stiffness, 2)
-        return self.mass_matrix()[6:, 6:] + np.diag(h * lag * k), -k * (self.angle + lag * self.rate).ravel()
+        k = np.column_stack([self.stiffness, self.stiffness, self.torsion])[:, : self.hinges][self.free]
+        return self.mass_matrix()[6:, 6:] + np.diag(h * lag * k), -k * (self.angle + lag * self.rate)[self.free]

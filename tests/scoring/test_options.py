@@ -12,7 +12,13 @@ from brainbench.core.errors import UsageError
 from brainbench.scoring import ScoreOptions
 
 NAMES = [item.name for item in fields(ScoreOptions)]
-ELSEWHERE = {"recordings": "recordings", "match": "pairs", "explain": "statistics"}
+ELSEWHERE = {
+    "recordings": "recordings",
+    "match": "pairs",
+    "explain": "statistics",
+    "title": "recordings",
+    "strict": "recordings",
+}
 """Options whose effect stands in another entry of the provenance than its settings."""
 
 

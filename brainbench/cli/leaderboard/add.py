@@ -13,8 +13,9 @@ from brainbench.cli.leaderboard.scoring import ScoringJob, full_settings, jobs_o
 from brainbench.cli.options import SCORE, SCORE_FLAGS, SchedulerOption, with_options
 from brainbench.cli.output import JsonOption, emit, progress_bar
 from brainbench.core.errors import DataFileNotFoundError, UsageError
-from brainbench.core.files import lock_folder, to_json
+from brainbench.core.files import to_json
 from brainbench.core.records import ResultRecord
+from brainbench.core.writing.locks import lock_folder
 from leaderboards.audit import computation, conflicting, remarks
 from leaderboards.store import StoredRecord, read_records, write_record
 from leaderboards.writing import in_one_sentence, sweep

@@ -167,4 +167,5 @@ def _shadow(deployed: DeployedPolicy, joints: tuple[str, ...]) -> Any:
             f"The contract does not say {sorted(missing)[0]!r}, so no touch can be simulated beside the hand."
         )
     names = (facts[name] for name in ("observe", "placement", "resolution"))
-    return ShadowTouch(contract.hand, *names, joints=joints, rate=contract.rate, sub_steps=facts["sub_steps"])
+    settings = {"rate": contract.rate, "sub_steps": facts["sub_steps"], "twist": facts["twist"]}
+    return ShadowTouch(contract.hand, *names, joints=joints, **settings)

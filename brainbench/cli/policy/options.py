@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -39,22 +40,54 @@ def read_task_file(path: Path | None) -> None:
         load_module(str(path.absolute()))
 
 
+def check_names(task: str, agents: Iterable[str], task_file: Path | None = None) -> None:
+    """Raise UsageError for an unknown task or agent, before anything slow is imported.
+
+    Raises:
+        UsageError: there is no such task, or no such agent or folder.
+    """
+    from brainbench.core.errors import check_name, unknown_name
+    from robotics_bridge import tasks
+    from robotics_bridge.policies import shipped
+
+    if task_file is None:  # else the file may register the task
+        check_name("task", task, tasks.list_tasks())
+    known = (*shipped.AGENTS, *shipped.list_policies("teacher"), *shipped.list_policies("student"))
+    for name in agents:
+        if name not in known and not Path(name).exists():
+            raise unknown_name("agent", name, known, hint="Or give the folder of a training run.")
+
+
+def check_paths(video: Path | None, strip: Path | None) -> None:
+    """Check before anything is played that a film and a strip can be written.
+
+    Raises:
+        UsageError: a path has another ending than .mp4 or .gif (film) or .png (strip), or cannot be written.
+        MissingDependencyError: what writes this format is not installed.
+    """
+    from brainbench.core.files import check_folder
+    from brainbench.core.figures.style import check_format
+    from brainbench.stimuli.figures.films import require_writer
+
+    for path, endings, option in ((video, (".mp4", ".gif"), "--video"), (strip, (".png",), "--strip")):
+        if path is not None:
+            require_writer(check_format(path, endings))
+            check_folder(path.parent, option)
+
+
 def agent_of(name: str, env: Env, *, seed: int = 0) -> Any:
     """Return the agent ``zero`` or ``random``, a shipped policy, or the teacher or student of a run's folder."""
-    from brainbench.core.errors import unknown_name
-    from robotics_bridge.policies import evaluate, shipped
-    from robotics_bridge.policies.training import teacher
+    from robotics_bridge.policies import evaluate
 
     if name in evaluate.AGENTS:
         return evaluate.agent(name, env, seed=seed)
-    known = (*evaluate.AGENTS, *shipped.list_policies("teacher"), *shipped.list_policies("student"))
-    if name not in known and not Path(name).exists():
-        raise unknown_name("agent", name, known, hint="Or give the folder of a training run.")
     if _student(name):
         from robotics_bridge.policies.training.student_files import load_student
 
         student, _ = load_student(name, device=str(env.device))
         return evaluate.Policy(student)
+    from robotics_bridge.policies.training import teacher
+
     return teacher.load_teacher(name, env)
 
 
@@ -76,13 +109,18 @@ def touch_of(names: list[str]) -> dict[str, Any]:
     """
     from brainbench.core.errors import UsageError
     from robotics_bridge.policies.schema import Values
-    from robotics_bridge.policies.training.distill_config import DistillConfig
 
     found: dict[str, dict[str, Any]] = {}
     for name in names:
         if facts := _student(name):
+            # Loads the students' networks, which other agents do not need.
+            from robotics_bridge.policies.training.distill_config import EARLIER_TWIST, DistillConfig
+
             kept = Values("config.json", facts).part("distill").fields(DistillConfig)
             found[name] = {key: kept[key] for key in TOUCH if key in kept}
+            config = DistillConfig.of({"twist": EARLIER_TWIST, **kept})
+            if config.knobs and config.observe in ("force", "force_torque"):
+                found[name]["knobs"] = config.knobs
     if any(senses != next(iter(found.values())) for senses in found.values()):
         raise UsageError(f"The students {', '.join(found)} feel differently; evaluate them one at a time.")
     return next(iter(found.values()), {})

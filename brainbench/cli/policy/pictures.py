@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from brainbench.cli.tactile import figures
+from brainbench.core.figures.style import save_figure
 from brainbench.stimuli.figures.camera import Camera
-from brainbench.stimuli.figures.canvas import save_figure
-from brainbench.stimuli.figures.films import require_writer, write_film
+from brainbench.stimuli.figures.films import write_film
 from brainbench.stimuli.figures.raster import Triangles
 from brainbench.stimuli.figures.scenes import Style
 
@@ -86,7 +86,6 @@ def write_video(
     path: Path, frames: Iterable[NDArray[np.uint8]], count: int, size: tuple[int, int], rate: float
 ) -> None:
     """Write frames to an ``.mp4`` or ``.gif``."""
-    require_writer(path.suffix.lower())
     kept = list(frames) if path.suffix.lower() == ".gif" else frames
     sample: Sequence[Any] = kept[:: max(1, count // 4)] if isinstance(kept, list) else ()
     write_film(path, kept, count, Style(size=size, frames_per_second=rate), palette_from=sample)

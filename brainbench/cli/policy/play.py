@@ -21,6 +21,8 @@ from brainbench.cli.policy.options import (
     TaskArgument,
     TaskFileOption,
     agent_of,
+    check_names,
+    check_paths,
     make_env,
     touch_of,
 )
@@ -74,7 +76,6 @@ def play(
     as_json: JsonOption = False,
 ) -> None:
     """Run an agent in one environment of a task and show what happens, as numbers and as a film."""
-    from brainbench.cli.policy import pictures as drawing
     from brainbench.core.errors import UsageError
 
     if not (seconds > 0 and math.isfinite(seconds) and rate > 0 and width >= 64):
@@ -82,13 +83,18 @@ def play(
             f"A film has a positive length and rate, and 64 pixels or more across; received {seconds} s, "
             f"{rate} frames/s and {width} pixels."
         )
+    check_names(task, [agent], task_file)
+    pictures = [path for path in (video, strip) if path is not None]
+    if pictures:
+        check_paths(video, strip)
+        from brainbench.cli.policy import pictures as drawing
     options |= touch_of([agent])
     env = make_env(task, task_file=task_file, num_envs=1, hand=hand, config=config, threads=1, **options)
     act = agent_of(agent, env, seed=options["seed"])
     steps = max(round(seconds / env.step_dt), 1)
-    pictures = [path for path in (video, strip) if path is not None]
     rewards: list[float] = []
-    ended = 0
+    ended, dropped, goals, turned = 0, 0, 0, 0.0
+    limit = env.task.goal.limit if env.task.goal is not None else None
     with progress_bar() as progress:
         size = (width, round(width * 5 / 6))
         stage = drawing.Stage(env, size) if pictures else None
@@ -103,9 +109,14 @@ def play(
                 if step in marks:
                     stills.append(frame)
                     times.append(step * env.step_dt)
-            _, reward, terminated, truncated, _ = env.step(act(env.observations))
+            _, reward, terminated, truncated, info = env.step(act(env.observations))
             rewards.append(float(reward))
-            ended += int(terminated | truncated)
+            over = bool(terminated | truncated)
+            ended += over
+            full = limit is not None and float(info["goals"]) >= limit
+            dropped += bool(terminated) and not bool(info["diverged"]) and not full
+            if over or step == steps - 1:
+                goals, turned = goals + int(info["goals"]), turned + float(info["turned"])
             progress(step + 1, steps, "playing")
         if video is not None:
             drawing.write_video(video, film, len(film), size, 1 / (every * env.step_dt))
@@ -114,8 +125,15 @@ def play(
     told = {
         "task": env.task.name, "hand": env.hand.name, "agent": agent, "seconds": steps * env.step_dt,
         "reward": sum(rewards), "episodes_ended": ended, "metric": env.task.success.metric, "files": pictures,
+        "goals": goals, "turned": turned, "dropped": dropped,
     }  # fmt: skip
-    emit(told, facts(told, env.task.text), as_json=as_json)
+    shown: dict[str, object] = {
+        "task": told["task"], "hand": told["hand"], "agent": agent, "simulated": f"{told['seconds']:g} s",
+        "goals reached": goals, "turned": f"{turned:.2f} rad about the commanded axis", "dropped": f"{dropped} times",
+        "episodes ended": ended, "reward": f"{sum(rewards):.3g}",
+    }  # fmt: skip
+    shown |= {"files": ", ".join(map(str, pictures))} if pictures else {}
+    emit(told, f"{env.task.text}\n\n{facts(shown)}", as_json=as_json)
 
 
 def evaluate(
@@ -148,6 +166,7 @@ def evaluate(
 
     if seeds < 1:
         raise UsageError(f"An evaluation needs at least one seed; received {seeds}.")
+    check_names(task, agents or [], task_file)
     touch = touch_of(list(agents or []))
     env = make_env(task, task_file=task_file, num_envs=envs, hand=hand, config=config, device=device, **touch)
     names = ["zero", "random", *(name for name in agents or [] if name not in ("zero", "random"))]

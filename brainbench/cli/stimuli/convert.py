@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 import json
-import tempfile
+import shutil
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -12,6 +13,7 @@ import typer
 
 from brainbench.cli.output import JsonOption, emit, facts, progress_bar
 from brainbench.core.errors import DataError, DataFileNotFoundError, UsageError, listing
+from brainbench.core.writing.temporaries import temporary_path
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -169,8 +171,15 @@ def _run(source: Path, out: Path, **options: Any) -> dict[str, Any]:
     dataset = read_stimulus_set(source)
     out.parent.mkdir(parents=True, exist_ok=True)
     # A run is many files: they appear together, or not at all.
-    with tempfile.TemporaryDirectory(dir=out.parent, prefix=".run-") as temporary:
-        save_run(dataset, Path(temporary) / "run", **options).rename(out)
+    temporary = temporary_path(out.absolute())
+    try:
+        save_run(dataset, temporary, **options).rename(out)
+    except OSError as error:
+        if error.errno not in (errno.ENOTEMPTY, errno.EEXIST):
+            raise
+        raise UsageError(f"{str(out)!r} was made by another process meanwhile; choose another folder.") from error
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
     units = "mN and µN·m; action of the whisker on its base, world axes"
     return {"kind": "run", "frames": dataset.sizes["time"], "whiskers": dataset.sizes["whisker"], "units": units}
 

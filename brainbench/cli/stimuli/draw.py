@@ -48,9 +48,9 @@ def render(
     as_json: JsonOption = False,
 ) -> None:
     """Draw a scene: whiskers bent by its objects, as a picture or a film; no display is needed."""
+    from brainbench.core.figures.style import check_format
     from brainbench.stimuli.figures import scenes as drawing
     from brainbench.stimuli.figures.camera import Camera
-    from brainbench.stimuli.figures.canvas import check_format
 
     suffix = check_format(out, drawing.FORMATS)
     scene = scenes.choose_scene(scenes.open_recipe(source, whiskers), stimulus)
@@ -111,8 +111,8 @@ def plot(
     """Plot forces or moments of every whisker on the 5 × 7 layout, to one scale, contacts shaded."""
     import math
 
+    from brainbench.core.figures.style import check_format
     from brainbench.stimuli import load_stimuli
-    from brainbench.stimuli.figures.canvas import check_format
     from brainbench.stimuli.figures.traces import FORMATS, check_channel
     from brainbench.stimuli.figures.traces import plot as draw
 

@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import spectrogram
 
+from brainbench.core.figures.style import COLORS, new_figure, panels, save_figure
 from brainbench.core.rotations import to_matrices
 from brainbench.stimuli.figures.camera import Camera, Lens
-from brainbench.stimuli.figures.canvas import new_figure, save_figure
 from brainbench.stimuli.figures.raster import Triangles, draw
 from brainbench.stimuli.figures.shading import lamp, paint, shade
 from brainbench.stimuli.figures.surfaces import ball, corner_normals, tube
@@ -23,17 +23,6 @@ SIZE = (1100, 900)
 SKIN, OBJECT = (0.80, 0.82, 0.86), (0.95, 0.75, 0.45)
 SAMPLES = 2
 """Samples of a pixel along each axis."""
-
-
-def panels(count: int, inches: tuple[float, float], **options: Any) -> tuple[Any, Any]:
-    """Return a figure and its axes [count] side by side; further options are matplotlib's ``subplots``.
-
-    Raises:
-        MissingDependencyError: matplotlib is not installed.
-    """
-    figure = new_figure(round(100 * inches[0]), round(100 * inches[1]))
-    figure.set_layout_engine("constrained")
-    return figure, figure.subplots(1, count, squeeze=False, **options)[0]
 
 
 def link_rotation(pose: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -143,7 +132,7 @@ def _trimmed(image: NDArray[np.float64], margin: int = 24) -> NDArray[np.float64
 
 def draw_markers(path: Path, rest: NDArray[np.float64], fields: Mapping[str, NDArray[np.float64]]) -> None:
     """Draw marker displacements [N, 3] (m) from their places at rest [N, 3], one panel per motion."""
-    figure, axes = panels(len(fields), (11, 4.1))
+    figure, (axes,) = panels(1, len(fields), (11, 4.1))
     bulge = max(float(np.abs(field[:, 2]).max()) for field in fields.values()) or 1.0
     places = None
     for panel, (name, field) in zip(axes, fields.items(), strict=True):
@@ -157,7 +146,7 @@ def draw_markers(path: Path, rest: NDArray[np.float64], fields: Mapping[str, NDA
         )  # fmt: skip
         panel.set(title=f"{name}: up to {1e3 * largest:.2g} mm", xlabel="x (mm)", aspect="equal")
     axes[0].set_ylabel("y (mm)")
-    figure.colorbar(places, ax=axes, label="bulge (of the largest)", shrink=0.8)
+    figure.colorbar(places, ax=axes, label="displacement outwards (share of the largest)", shrink=0.8)
     save_figure(figure, path, dpi=110)
 
 
@@ -169,15 +158,14 @@ def draw_temperature(
     maps: Mapping[str, NDArray[np.float64]],
 ) -> None:
     """Draw the warmest cell over time, and for each material the warmest value along one axis (°C)."""
-    figure, axes = panels(1 + len(maps), (12, 3.4), width_ratios=[1.5] + [1] * len(maps))
+    figure, (axes,) = panels(1, 1 + len(maps), (12, 3.4), width_ratios=[1.5] + [1] * len(maps))
     from matplotlib.colors import PowerNorm
 
-    colors = dict(zip(lines, ("#c1440e", "#2b6cb0", "#4a7c3a"), strict=False))
+    colors = dict(zip(lines, COLORS, strict=False))
     for name, line in lines.items():
         axes[0].plot(times, line, color=colors.get(name), linewidth=1.8)
         place = {"xytext": (5, -3), "textcoords": "offset points", "color": colors.get(name), "fontsize": 9}
         axes[0].annotate(name, (times[-1], line[-1]), **place)
-    axes[0].spines[["top", "right"]].set_visible(False)
     axes[0].set(xlabel="time (s)", ylabel="warmest cell (°C)", title=f"tip {link.replace('right_hand_', '')}")
     axes[0].set_xlim(right=1.25 * times[-1])
     top = max(float(field.max()) for field in maps.values())
@@ -191,7 +179,7 @@ def draw_temperature(
         panel.set_title(f"{name} ball, 45 °C: +{seen.max() - bottom:.1f} K", fontsize=10)
         panel.set(xlabel="cell across", xticks=[], yticks=[])
     axes[1].set_ylabel("cell along the finger")
-    bar = figure.colorbar(shown, ax=axes[1:], label="°C", shrink=0.85)
+    bar = figure.colorbar(shown, ax=axes[1:], label="temperature (°C), scale not linear", shrink=0.85)
     bar.set_ticks([bottom, *(bottom + share * (top - bottom) for share in (0.02, 0.1, 0.3, 0.6)), top])
     bar.ax.yaxis.set_major_formatter("{x:.1f}")
     save_figure(figure, path, dpi=110)
@@ -199,7 +187,7 @@ def draw_temperature(
 
 def draw_sound(path: Path, signals: Mapping[str, NDArray[np.float64]], rate: float) -> None:
     """Draw spectrograms of signals [T] at a sample rate (Hz)."""
-    figure, axes = panels(len(signals), (12, 3.8), sharey=True)
+    figure, (axes,) = panels(1, len(signals), (12, 3.8), sharey=True)
     shown = None
     for panel, (name, signal) in zip(axes, signals.items(), strict=True):
         frequency, time, power = spectrogram(signal, rate, nperseg=1024, noverlap=896)
@@ -207,5 +195,5 @@ def draw_sound(path: Path, signals: Mapping[str, NDArray[np.float64]], rate: flo
         shown = panel.pcolormesh(time, frequency / 1e3, level, vmin=-80, vmax=0, cmap="magma", rasterized=True)
         panel.set(title=f"ball on {name}", xlabel="time (s)")
     axes[0].set_ylabel("frequency (kHz)")
-    figure.colorbar(shown, ax=axes, label="dB", shrink=0.9)
+    figure.colorbar(shown, ax=axes, label="level (dB below the loudest)", shrink=0.9)
     save_figure(figure, path, dpi=110)

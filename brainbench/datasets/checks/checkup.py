@@ -7,15 +7,17 @@ a *note* when it only has to be known.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import re
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 from brainbench.core.errors import DataError
 from brainbench.core.files import to_json
+from brainbench.core.progress import Progress, track
 from brainbench.datasets import hdf5
 from brainbench.datasets.checks.clock import check_clock
-from brainbench.datasets.checks.findings import SEVERITIES, Finding, repeats
+from brainbench.datasets.checks.findings import SEVERITIES, Finding, repeats, some
 from brainbench.datasets.checks.labels import check_labels
 from brainbench.datasets.checks.published import check_published
 from brainbench.datasets.checks.spikes import check_spikes
@@ -26,6 +28,8 @@ from brainbench.datasets.reading import Source, each_session, find_recordings, o
 from brainbench.datasets.sessions import Session
 from brainbench.datasets.trials.conditions import Conditions
 from brainbench.datasets.trials.counting import has_units, no_units, read_spikes
+
+_NUMBER = re.compile(r"\d+(?:,\d{3})*(?:\.\d+)?")
 
 
 @dataclass(frozen=True)
@@ -57,13 +61,32 @@ class Checkup:
     def _lines(self) -> Iterator[str]:
         found = ", ".join(f"{self.count(level)} {level}{'s' * (self.count(level) != 1)}" for level in SEVERITIES)
         yield f"{self.source}: {len(self.sessions)} session{'s' * (len(self.sessions) != 1)}, {found}"
-        for item in self.findings:
-            yield f"{item.severity.upper():8}{item.check:12}{item.where}: {item.message}"
-            if item.advice:
-                yield f"{'':20}→ {item.advice}"
+        for items in _alike(self.findings):
+            first, names = items[0], [item.where for item in items]
+            where = names[0] if len(names) == 1 else f"{len(names)} sessions ({some(names, 3)})"
+            yield f"{first.severity.upper():8}{first.check:12}{where}: {_ranges([item.message for item in items])}"
+            if first.advice:
+                yield f"{'':20}→ {first.advice}"
 
 
-def check(source: Source, *, conditions: str | Conditions | None = None) -> Checkup:
+def _alike(findings: Iterable[Finding]) -> Iterable[list[Finding]]:
+    """Return findings in groups: notes that differ in numbers alone stand together, others for themselves."""
+    groups: dict[object, list[Finding]] = {}
+    for place, item in enumerate(findings):
+        note = (item.check, _NUMBER.sub("#", item.message), item.advice)
+        groups.setdefault(note if item.severity == "note" else place, []).append(item)
+    return groups.values()
+
+
+def _ranges(messages: list[str]) -> str:
+    """Return messages that differ in numbers alone as one, with the range of each number."""
+    columns = zip(*(_NUMBER.findall(message) for message in messages), strict=True)
+    spans = [sorted(set(numbers), key=lambda text: float(text.replace(",", ""))) for numbers in columns]
+    texts = iter(numbers[0] if len(numbers) == 1 else f"{numbers[0]}–{numbers[-1]}" for numbers in spans)
+    return _NUMBER.sub(lambda _: next(texts), messages[0])
+
+
+def check(source: Source, *, conditions: str | Conditions | None = None, progress: Progress | None = None) -> Checkup:
     """Look for what would make scores of these recordings wrong.
 
     Files that cannot be read become findings, so that a folder is judged as a whole.
@@ -71,6 +94,7 @@ def check(source: Source, *, conditions: str | Conditions | None = None) -> Chec
     Args:
         source: as in :func:`~brainbench.datasets.open_recordings`.
         conditions: table and columns that label the trials, to check the labels; the layout's by default.
+        progress: called with (files checked, files, what).
 
     Raises:
         DataFileNotFoundError: the source names nothing.
@@ -80,7 +104,7 @@ def check(source: Source, *, conditions: str | Conditions | None = None) -> Chec
     wanted = Conditions.parse(conditions) if isinstance(conditions, str) else conditions
     findings: list[Finding] = []
     names: list[str] = []
-    for path in paths:
+    for path in track(paths, "checking recordings", progress):
         try:
             findings += _check_file(path, layout, wanted, names)
         except DataError as error:

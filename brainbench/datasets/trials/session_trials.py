@@ -90,18 +90,21 @@ def trials_by_subject(dataset: xr.Dataset) -> dict[str, tuple[Trials, ...]]:
     for subject, session in dict.fromkeys(zip(subjects.tolist(), sessions.tolist(), strict=True)):
         rows = np.flatnonzero((subjects == subject) & (sessions == session))
         columns = np.flatnonzero((unit_subjects == subject) & (unit_sessions == session))
-        own = counts[np.ix_(rows, np.arange(counts.shape[1]), columns)]
+        # One session of all units is no copy: in narrow bins its counts are many.
+        whole = len(rows) == len(counts) and len(columns) == counts.shape[2]
+        own = counts if whole else counts[np.ix_(rows, np.arange(counts.shape[1]), columns)]
         recorded = np.isfinite(own)
         # Units may be lost in mid-session: only what is missing everywhere is left out, other gaps stay NaN.
         keep, units = recorded.any(axis=(1, 2)), recorded.any(axis=(0, 1))
         if not keep.any():
             continue
         rows = rows[keep]
+        own = own if keep.all() and units.all() else own[np.ix_(keep, np.arange(own.shape[1]), units)]
         # Bins past a window's end have NaN counts and duration 0; NaN seconds avoid the division by zero.
         seconds = np.where(duration[rows] > 0, duration[rows], np.nan)
         found.setdefault(subject, []).append(
             Trials(
-                responses=own[keep][:, :, units] / seconds[:, :, None],
+                responses=own / seconds[:, :, None],
                 labels=labels[rows],
                 keys=_unique([f"{subject}/{session}/{ids[row]}" for row in rows]),
                 covariates={name: dataset[name].values[rows].astype(np.float64) for name in known},

@@ -22,6 +22,9 @@ from brainbench.metrics.reliability.trial_hashes import Hashes, draws
 _CHUNK_BYTES = 1 << 20
 """Sums of one chunk of splits stay in the processor's cache."""
 
+_PATTERN_BYTES = 1 << 26
+"""Mean patterns of one chunk of splits, where they are formed."""
+
 _COMMON = 1e-3
 """Products of trials lose digits when less than this share of a pattern's square is left after taking
 away its mean over units; then mean patterns are formed instead."""
@@ -59,7 +62,9 @@ class SplitRDMs:
             one, two = self._from_products(sums), self._from_products(rest)
             if one is not None and two is not None:
                 return one, two
-        return self._from_patterns(members), self._from_patterns([1.0 - member for member in members])
+        # Both at once, since what takes time does not grow with the number of halves.
+        found = self._from_patterns([np.concatenate([member, 1.0 - member]) for member in members])
+        return found[: len(found) // 2], found[len(found) // 2 :]
 
     def _summed(self, members: list[Floats]) -> list[_Sums]:
         return [_Sums(*each, self._count) for each in zip(self._sessions, members, strict=True)]
@@ -91,20 +96,32 @@ class SplitRDMs:
 
     def _from_patterns(self, members: list[Floats]) -> Floats:
         """Return RDMs from mean patterns: any method, missing entries, large common offsets."""
-        unbiased = self._method == "crossnobis"
-        found = [
-            mean_patterns(session, member, self._count, variances=unbiased)
-            for session, member in zip(self._sessions, members, strict=True)
-        ]
-        patterns, variances = (np.concatenate([item[part] for item in found], axis=-1) for part in (0, 1))
-        if unbiased:
-            return _unbiased_distances(patterns, variances)
+        each = list(zip(self._sessions, members, strict=True))
         if self._method == "correlation":
-            return correlation_distances(patterns, missing=True)
+            found = [mean_patterns(*item, self._count, variances=False)[0] for item in each]
+            return correlation_distances(np.concatenate(found, axis=-1), missing=True)
+        # The other distances are means over the units that both patterns have, so slices of units add up.
+        total = number = 0.0
+        for session, member in each:
+            for units in session.slices():
+                found = mean_patterns(session, member, self._count, variances=self._method == "crossnobis", units=units)
+                distances, both = self._of_slice(*found)
+                total, number = total + np.where(both > 0, distances * both, 0.0), number + both
+        return np.divide(total, number, out=np.full(np.shape(total), np.nan), where=number > 0)
+
+    def _of_slice(self, patterns: Floats, variances: Floats) -> tuple[Floats, Floats]:
+        """Return distances [N, P] over some units, and how many of them both patterns have."""
+        present = np.isfinite(patterns)
+        if self._method == "crossnobis":
+            present &= np.isfinite(variances)
+        weight = present.astype(np.float64)
+        both = upper(weight @ np.swapaxes(weight, -1, -2))
+        if self._method == "crossnobis":
+            return _unbiased_distances(patterns, variances), both
         if self._method == "poisson":
             rates = poisson_rates(patterns)
-            return product_distances(rates, np.log(rates), missing=True)
-        return product_distances(patterns, patterns, missing=True)
+            return product_distances(rates, np.log(rates), missing=True), both
+        return product_distances(patterns, patterns, missing=True), both
 
 
 class _Sums:
@@ -151,20 +168,23 @@ def _unbiased_distances(patterns: Floats, variances: Floats) -> Floats:
         return product_distances(seen, seen, missing=True) - upper((own + np.swapaxes(own, -1, -2)) / both)
 
 
-def mean_patterns(session: SortedTrials, members: Floats, count: int, *, variances: bool) -> tuple[Floats, Floats]:
-    """Return mean patterns [N, K, F] over the trials that are 1 in [N, R], and, if asked for, their variances.
+def mean_patterns(
+    session: SortedTrials, members: Floats, count: int, *, variances: bool, units: slice = slice(None)
+) -> tuple[Floats, Floats]:
+    """Return mean patterns [N, K, F] of units over the trials that are 1 in [N, R], and, if asked for, their variances.
 
     A unit without a trial of a stimulus is NaN there; a variance needs two.
     """
-    shape = (len(members), count, session.responses.shape[1])
+    responses = session.responses[:, units]
+    filled = responses if session.complete else np.nan_to_num(responses)
+    shape = (len(members), count, responses.shape[1])
     means, spread = np.empty(shape), np.empty(shape if variances else (0, *shape[1:]))
-    filled = session.responses if session.complete else np.nan_to_num(session.responses)
     with np.errstate(invalid="ignore", divide="ignore"):
         for stimulus in range(count):
             rows = session.group(stimulus)
             member = members[:, rows]
             # A unit unseen in these trials is missing here, not silent.
-            seen = np.ones((member.shape[1], 1)) if session.complete else np.isfinite(session.responses[rows]) * 1.0
+            seen = np.ones((member.shape[1], 1)) if session.complete else np.isfinite(responses[rows]) * 1.0
             number = member @ seen
             number[number == 0] = np.nan
             means[:, stimulus] = member @ filled[rows] / number
@@ -177,10 +197,14 @@ def mean_patterns(session: SortedTrials, members: Floats, count: int, *, varianc
     return means, spread
 
 
-def chunk_size(sessions: list[SortedTrials], count: int) -> int:
+def chunk_size(sessions: list[SortedTrials], count: int, method: str) -> int:
     """Return how many splits are computed at once."""
     width = sum(min(session.responses.shape) for session in sessions)
-    return max(1, _CHUNK_BYTES // (8 * count * max(width, count)))
+    step = _CHUNK_BYTES // (8 * count * max(width, count))
+    if method == "correlation":
+        # It forms the patterns of all units; other distances come in slices of units.
+        step = min(step, _PATTERN_BYTES // (8 * count * sum(session.responses.shape[1] for session in sessions)))
+    return max(1, step)
 
 
 def members(random: Hashes) -> Floats:
@@ -204,7 +228,7 @@ def split_members(session: SortedTrials, count: int, index: Ints, seed: int) -> 
 def half_rdms(sessions: list[SortedTrials], count: int, method: str, index: Ints, seed: int) -> tuple[Floats, Floats]:
     """Return the RDMs [S, P] of both halves of the splits ``index`` [S]."""
     every = SplitRDMs(sessions, count, method)
-    step = chunk_size(sessions, count)
+    step = chunk_size(sessions, count, method)
     parts = [
         every.halves([split_members(session, count, index[start : start + step], seed) for session in sessions])
         for start in range(0, len(index), step)

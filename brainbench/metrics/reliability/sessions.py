@@ -9,9 +9,10 @@ Without any session left the animal is undefined.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -22,16 +23,20 @@ from brainbench.metrics.reliability.trial_hashes import Hashes, content_hashes, 
 from brainbench.metrics.stimulus_labels import (
     check_finite,
     listed,
-    membership,
     response_matrix,
     stimulus_codes,
     stimulus_means,
 )
 
+_SLICE_ELEMENTS = 1 << 20
+
 
 @dataclass(frozen=True)
 class SortedTrials(Trials):
-    """Trials [R, U] of one session sorted by stimulus, each with the hash from which its random numbers come."""
+    """Trials [R, U] of one session sorted by stimulus, each with the hash from which its random numbers come.
+
+    Its responses are a copy of its own, which whitening and shifting change in place.
+    """
 
     hashes: Hashes = field(default_factory=lambda: np.empty(0, dtype=np.uint64), repr=False)
     """[R]"""
@@ -39,11 +44,25 @@ class SortedTrials(Trials):
     """Noise variance of means, in units of the noise that the trials were divided by."""
 
     @classmethod
-    def sort(cls, responses: Floats, labels: Ints, hashes: Hashes) -> SortedTrials:
-        """Sort trials by stimulus and hash, so that the order in which they came is forgotten."""
+    def sort(
+        cls, responses: Floats, labels: Ints, hashes: Hashes, *, rows: Ints | None = None, units: Any = slice(None)
+    ) -> SortedTrials:
+        """Sort trials by stimulus and hash, so that the order in which they came is forgotten.
+
+        Args:
+            responses: [R′, U′].
+            labels: [R] stimulus of the trials that are taken.
+            hashes: [R] theirs.
+            rows: [R] the trials that are taken; all by default.
+            units: index or mask of the units that are taken.
+        """
         # Sorted by content, sums are formed in one order, so results do not change with the order of trials.
         order = np.lexsort((hashes, labels))
-        return cls(responses[order], labels[order], hashes=hashes[order])
+        taken = np.empty((len(order), responses[:1, units].shape[1]))
+        # Row by row, so that nothing but the result is large.
+        for place, row in enumerate(order if rows is None else rows[order]):
+            taken[place] = responses[row, units]
+        return cls(taken, labels[order], hashes=hashes[order])
 
     @cached_property
     def complete(self) -> bool:
@@ -61,7 +80,16 @@ class SortedTrials(Trials):
         if self.responses.shape[1] <= len(self.labels):
             return self.responses
         # Rᵀ of responsesᵀ = Q R keeps the inner products of trials, and work then grows with trials, not with units.
-        return np.asarray(np.linalg.qr(self.responses.T, mode="r")).T
+        # Slices of units are taken up one after another (Golub & Van Loan 2013, section 5.1), so that QR copies little.
+        triangle = np.empty((0, len(self.labels)))
+        for units in self.slices():
+            triangle = np.linalg.qr(np.concatenate([triangle, self.responses[:, units].T]), mode="r")
+        return np.asarray(triangle).T
+
+    def slices(self) -> Iterator[slice]:
+        """Yield the units in slices of some MiB, in which temporary arrays are small."""
+        step = max(8 * len(self.labels), _SLICE_ELEMENTS // max(1, len(self.labels)))
+        yield from (slice(start, start + step) for start in range(0, self.responses.shape[1], step))
 
     def group(self, stimulus: int) -> slice:
         """Return the rows of a stimulus."""
@@ -85,14 +113,14 @@ def usable_sessions(
     total = np.zeros(count, dtype=np.int64)
     dropped = 0
     for block in blocks:
-        responses = response_matrix(block.responses, "trials").astype(np.float64)
+        responses = response_matrix(block.responses, "trials")
         codes, _ = stimulus_codes(block.labels, count)
         if len(codes) != len(responses):
             raise UsageError(f"There are {len(responses)} trials but {len(codes)} labels; give one label per trial.")
         check_finite(responses)
-        recorded = np.isfinite(responses).any(axis=1)
-        hashes = trial_hashes(block, responses, codes)[recorded]
-        responses, codes = responses[recorded], codes[recorded]
+        present = np.isfinite(responses)
+        recorded = present.any(axis=1)
+        hashes, codes, present = trial_hashes(block, responses, codes)[recorded], codes[recorded], present[recorded]
         # A trial without any recorded unit is no trial, whatever its label.
         trials = np.bincount(codes, minlength=count)
         total += trials
@@ -103,10 +131,12 @@ def usable_sessions(
             )
             continue
         # Both halves need recorded trials of every stimulus in each unit that is kept.
-        splittable = (membership(codes, count) @ np.isfinite(responses) >= least).all(axis=0)
+        groups = [codes == stimulus for stimulus in range(count)]
+        splittable = np.all([np.count_nonzero(present[group], axis=0) >= least for group in groups], axis=0)
         dropped += int((~splittable).sum())
         if splittable.any():
-            sessions.append(SortedTrials.sort(responses[:, splittable], codes, hashes))
+            columns = slice(None) if splittable.all() else splittable
+            sessions.append(SortedTrials.sort(responses, codes, hashes, rows=np.flatnonzero(recorded), units=columns))
         else:
             lacking.append(f"no unit recorded in {least} trials of every stimulus")
     notes = [f"{len(lacking)} of {len(blocks)} sessions left out: {'; '.join(sorted(set(lacking)))}"] if lacking else []
@@ -136,13 +166,19 @@ def trial_hashes(block: Trials, responses: Floats, codes: Ints) -> Hashes:
 
 
 def shifted_sessions(sessions: list[SortedTrials], count: int, *, by_unit: bool) -> list[SortedTrials]:
-    """Return the sessions less an offset that distances do not feel, but that half means would lose digits to.
+    """Subtract, in place, an offset that distances do not feel, but that half means would lose digits to.
 
     Correlation distance does not feel one number taken from all units, squared distance not even one per unit.
     """
-    means = [stimulus_means(session.responses, session.labels, count) for session in sessions]
+    means = []
+    for session in sessions:
+        parts = [stimulus_means(session.responses[:, units], session.labels, count) for units in session.slices()]
+        means.append(np.concatenate(parts, axis=1))
     if by_unit:
         shifts = [np.nanmean(mean, axis=0) for mean in means]
     else:
         shifts = [np.nanmean(np.concatenate([mean.ravel() for mean in means]))] * len(sessions)
-    return [replace(s, responses=s.responses - shift) for s, shift in zip(sessions, shifts, strict=True)]
+    for session, shift in zip(sessions, shifts, strict=True):
+        np.subtract(session.responses, shift, out=session.responses)
+    # What was derived from the trials before does not hold for them now.
+    return [replace(session) for session in sessions]

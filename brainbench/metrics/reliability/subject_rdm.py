@@ -191,13 +191,15 @@ def _mean_responses(sessions: list[SortedTrials], count: int) -> tuple[Floats, F
     """Return mean responses [K, U] over trials, units of all sessions joined, and the variance of those means."""
     means, noise = [], []
     for session in sessions:
-        mean = stimulus_means(session.responses, session.labels, count)
-        square = stimulus_means((session.responses - mean[session.labels]) ** 2, session.labels, count)
-        # Trials counted by unit, since a unit may be missing in some of them.
-        number = membership(session.labels, count) @ np.isfinite(session.responses)
-        means.append(mean)
-        # Mean square deviation × n/(n − 1) is the variance over trials; over n, that of their mean.
-        noise.append(square / (number - 1))
+        for units in session.slices():
+            responses = session.responses[:, units]
+            mean = stimulus_means(responses, session.labels, count)
+            square = stimulus_means((responses - mean[session.labels]) ** 2, session.labels, count)
+            # Trials counted by unit, since a unit may be missing in some of them.
+            number = membership(session.labels, count) @ np.isfinite(responses)
+            means.append(mean)
+            # Mean square deviation × n/(n − 1) is the variance over trials; over n, that of their mean.
+            noise.append(square / (number - 1))
     return np.concatenate(means, axis=1), np.concatenate(noise, axis=1)
 
 

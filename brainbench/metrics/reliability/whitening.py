@@ -10,9 +10,11 @@ a tenth of the residuals in turn.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from brainbench.core.errors import DataError, unknown_name
 from brainbench.metrics.rdms.noise import NOISE_METHODS, NoiseModel, estimate_noise
@@ -55,10 +57,7 @@ def whitened(session: SortedTrials, count: int, noise: str) -> tuple[SortedTrial
         return session, ""
     if noise not in NOISE_METHODS:
         raise unknown_name("noise covariance method", noise, ("none", *NOISE_METHODS))
-    # Noise is what trials differ by from their stimulus' mean; below the rounding of its values a unit has none.
-    residuals = session.responses - stimulus_means(session.responses, session.labels, count)[session.labels]
-    largest = np.nanmax(np.abs(session.responses), axis=0)
-    varies = np.nanmax(np.abs(residuals), axis=0) > 8 * np.finfo(np.float64).eps * largest
+    varies, power, number = (np.concatenate(part) for part in zip(*_noise(session, count), strict=True))
     usable = varies if noise == "diag" else varies & np.isfinite(session.responses).all(axis=0)
     told = (
         f"{int((~usable).sum())} units or bins left out: without noise or not in every trial"
@@ -67,12 +66,11 @@ def whitened(session: SortedTrials, count: int, noise: str) -> tuple[SortedTrial
     )
     if not usable.any():
         return None, "no unit has noise to divide by"
-    responses = session.responses[:, usable]
+    responses = session.responses if usable.all() else session.responses[:, usable]
     if noise == "diag":
-        rest = residuals[:, usable]
         # ν = trials − stimuli, per unit; for Gaussian noise E[σ²/σ̂²] = ν/(ν − 2).
-        freedom = np.isfinite(rest).sum(axis=0) - count
-        scaled = responses / np.sqrt(np.nansum(rest**2, axis=0) / freedom)
+        freedom = number[usable] - count
+        scaled = np.divide(responses, np.sqrt(power[usable] / freedom), out=responses)
         # Units with two degrees of freedom or fewer have no expected factor; four is the least anyone has.
         inflation = float(np.mean(freedom / np.maximum(freedom - 2, 1)))
         return replace(session, responses=scaled, inflation=inflation), told
@@ -83,6 +81,17 @@ def whitened(session: SortedTrials, count: int, noise: str) -> tuple[SortedTrial
     # With the precision P̂ = L Lᵀ, trials times L have noise of unit covariance.
     inflation = _inflation(responses, session.labels, noise, count)
     return replace(session, responses=responses @ np.linalg.cholesky(precision), inflation=inflation), told
+
+
+def _noise(session: SortedTrials, count: int) -> Iterator[tuple[NDArray[np.bool_], Floats, Ints]]:
+    """Yield for slices of units whether each varies between trials of a stimulus, Σ residual² and its trials."""
+    for units in session.slices():
+        # Noise is what trials differ by from their stimulus' mean; below the rounding of its values a unit has none.
+        responses = session.responses[:, units]
+        residuals = responses - stimulus_means(responses, session.labels, count)[session.labels]
+        largest = np.nanmax(np.abs(responses), axis=0)
+        varies = np.nanmax(np.abs(residuals), axis=0) > 8 * np.finfo(np.float64).eps * largest
+        yield varies, np.nansum(residuals**2, axis=0), np.isfinite(residuals).sum(axis=0)
 
 
 def _inflation(responses: Floats, codes: Ints, noise: str, count: int) -> float:

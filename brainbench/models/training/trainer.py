@@ -23,6 +23,7 @@ from torch import nn
 from brainbench.core.errors import DataError, UsageError
 from brainbench.core.files import read_json, write_json
 from brainbench.core.progress import Progress
+from brainbench.core.writing.locks import lock_folder
 from brainbench.models.activations import evaluating
 from brainbench.models.ops.seeding import seeded
 from brainbench.models.registry import load_model
@@ -110,7 +111,11 @@ def train(
         UsageError: the folder holds another run, or the configuration does not fit the data.
         DataError: the data set has no training sweeps, or a file of the run is damaged.
     """
-    with processes(device) as where, seeded(config.seed):
+    with (
+        processes(device) as where,
+        lock_folder(Path(out), wait=False) if where.first else nullcontext(),
+        seeded(config.seed),
+    ):
         run = _Run(config, data, Path(out), where, progress, Path(controls or out) / CONTROLS_FILE)
         try:
             return run.run(math.inf if stop_after is None else stop_after)

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
+from brainbench.core.figures.style import INK, PALE, check_format, new_figure, save_figure
 from brainbench.scoring.recovery.confusion import Recovery
-from brainbench.stimuli.figures.canvas import INK, PALE, check_format, new_figure, save_figure
 
 FORMATS = (".png", ".svg", ".pdf")
 
@@ -27,10 +27,11 @@ def plot_confusion(recovery: Recovery, path: str | os.PathLike[str]) -> Path:
     count = len(recovery.names)
     share = recovery.firsts / np.maximum(recovery.made[:, None], 1)
     size = 260 + 42 * count
-    figure = new_figure(size + 60, size)
+    figure = new_figure(size + 160, size)
     figure.set_layout_engine("constrained")
     axes = figure.subplots()
-    axes.imshow(share, cmap="BuGn", vmin=0, vmax=1)
+    shown = axes.imshow(share, cmap="BuGn", vmin=0, vmax=1)
+    figure.colorbar(shown, ax=axes, label="share of the boards in which it came first", shrink=0.6)
     for row, column in np.argwhere(share > 0).tolist():
         value = share[row, column]
         axes.text(
@@ -38,8 +39,8 @@ def plot_confusion(recovery: Recovery, path: str | os.PathLike[str]) -> Path:
         )
     axes.set_xticks(range(count), recovery.names, rotation=90, fontsize=8, color=INK)
     axes.set_yticks(range(count), recovery.names, fontsize=8, color=INK)
-    axes.set_xlabel("came first", color=PALE)
-    axes.set_ylabel("made the data", color=PALE)
+    axes.set_xlabel("network that came first", color=PALE)
+    axes.set_ylabel("network that made the data", color=PALE)
     interval = recovery.wins()
     population = recovery.design.population
     axes.set_title(

@@ -38,6 +38,9 @@ class Fidelity:
     solver: Literal["dynamic", "quasistatic"] = field(default="dynamic", metadata={"later": True})
     """``quasistatic`` leaves out inertia and damping: whiskers are in balance at every time step. For slow sweeps; of
     the backends ``rod`` alone knows it, and ``steps_per_period`` means nothing in it."""
+    twist: bool | None = field(default=None, metadata={"later": True, "before": False})
+    """Whether whiskers twist about their axis; a whisker that stays in one plane is computed without in any case. None:
+    as the scenes say (:attr:`brainbench.stimuli.scenes.scene.Scene.twist`), where the backend can."""
 
     def __post_init__(self) -> None:
         if not 2 <= self.links <= MOST_LINKS:
@@ -47,6 +50,8 @@ class Fidelity:
         if not 1e-7 <= self.time_step <= 5e-3:
             raise UsageError(f"time_step must lie between 1e-7 and 5e-3 s; received {self.time_step!r}.")
 
+        if self.twist not in (None, True, False):
+            raise UsageError(f"twist must be True, False or None; received {shown(self.twist)}.")
         if self.solver not in SOLVERS:
             raise unknown_name("solver", str(self.solver), SOLVERS)
         if self.precision not in PRECISIONS:
@@ -101,6 +106,10 @@ class Fidelity:
             raise UsageError(f"error must be positive (0.05 = 5 %); received {error!r}.")
         return cls(**cheapest(measured(backend), error).settings)
 
+    def resolved(self, twist: bool) -> Fidelity:
+        """Return this fidelity with ``twist`` where it leaves that open."""
+        return replace(self, twist=twist) if self.twist is None else self
+
     def chain(self, whisker: Whisker) -> Chain:
         """Return the chain of links that stands for a whisker; errors as for :meth:`link_count`."""
         from brainbench.stimuli.whiskers.chain import build_chain
@@ -135,6 +144,8 @@ def _value(name: str, text: str) -> Any:
         return None
     if name in ("precision", "solver"):
         return text
+    if name == "twist":
+        return {"true": True, "false": False}.get(text.lower(), text)
     try:
         return int(text) if name == "links" else float(text)
     except ValueError as error:

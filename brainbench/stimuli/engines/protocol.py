@@ -35,8 +35,9 @@ class Follicle(Protocol):
         """Return positions [n, 3] (m, world) and Euler angles [n, 3] (θ, φ, ζ; rad) at ``times`` [n] (s).
 
         The rotation Rz(θ − π/2) · Ry(−φ) · Rx(ζ + π/2) maps the whisker's base frame to the world. The
-        motion must be smooth (finite velocity jumps are felt by the whisker as impacts) and defined
-        from the job's start to its last frame.
+        motion must be continuous (jumps of velocity are felt by the whisker as impacts) and defined from the job's
+        start to 10 ms behind its last frame. It may have an attribute ``finest``
+        (:mod:`brainbench.stimuli.engines.motion_pieces`).
         """
         ...
 
@@ -45,6 +46,7 @@ class Follicle(Protocol):
 class StillFollicle:
     """A base that stands still."""
 
+    finest: ClassVar[float] = math.inf
     position: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Base point [m, world]."""
     euler: tuple[float, float, float] = (math.pi / 2, 0.0, -math.pi / 2)
@@ -150,6 +152,8 @@ class WhiskerEngine(ABC):
     """Kinds of devices it runs on."""
     solvers: ClassVar[tuple[str, ...]] = ("dynamic",)
     """Values of :attr:`Fidelity.solver` it knows."""
+    twists: ClassVar[bool] = False
+    """True when whiskers can twist about their axis; in other engines they only bend."""
     surfaces: ClassVar[bool] = False
     """True when it collides the exact surface of obstacles that have one; others collide convex parts."""
     retries: ClassVar[bool] = False

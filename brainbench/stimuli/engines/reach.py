@@ -23,6 +23,8 @@ class Reach:
     """The obstacles with only what is touched of them: their reachable parts, or their surface."""
     nearest: float
     """Least distance of anything touched from the base (m); points at a smaller arc length cannot touch."""
+    indices: tuple[int, ...] = ()
+    """Which of all obstacles these are."""
 
     def __bool__(self) -> bool:
         """Return True when anything is within reach."""
@@ -62,20 +64,46 @@ def reachable(
     its parts, and the surface only where there are none.
     """
     limit = whisker.arc_length + max(whisker.base_radius, whisker.tip_radius)
-    kept, nearest = [], math.inf
-    for obstacle in obstacles:
+    still = np.array([obstacle.motion is None for obstacle in obstacles], dtype=bool)
+    bounds = np.array([obstacle.bounds for obstacle, stands in zip(obstacles, still, strict=True) if stands])
+    apart = np.zeros(len(obstacles))
+    apart[still] = _box_distances(bounds.reshape(-1, 2, 3), base)
+    kept, indices, nearest = [], [], math.inf
+    for index in np.flatnonzero(apart <= limit).tolist():
+        obstacle, distances = touched(obstacles[index], surfaces=surfaces), apart[index : index + 1]
+        boxes = obstacle.bounds[None]
+        if obstacle.surface is not None:
+            boxes = obstacle.surface.boxes
+        elif len(obstacle.parts) > 1:
+            boxes = np.stack([part.bounds() for part in obstacle.parts])
+        # The bounds of what stands still have been looked at.
         points = _in_obstacle_frame(obstacle, base, times)
-        # Between two times a base is no further from one of its two places than half the way between them.
-        between = float(np.linalg.norm(np.diff(points, axis=0), axis=1).max(initial=0.0)) / 2
-        obstacle = touched(obstacle, surfaces=surfaces)
-        boxes = [part.bounds() for part in obstacle.parts] if obstacle.surface is None else obstacle.surface.boxes
-        distances = [max(0.0, float(_box_distance(box, points).min()) - between) for box in boxes]
-        if min(distances) > limit and not _encloses(obstacle, points[0]):
+        if len(boxes) > 1 or not still[index]:
+            distances = _box_distances(boxes, points)
+        if distances.min() > limit and not _encloses(obstacle, points[0]):
             continue
-        near = tuple(part for part, distance in zip(obstacle.parts, distances, strict=False) if distance <= limit)
-        kept.append(replace(obstacle, parts=near))
-        nearest = min(nearest, *distances)
-    return Reach(tuple(kept), nearest)
+        if obstacle.surface is None and distances.max() > limit:
+            near = (part for part, distance in zip(obstacle.parts, distances, strict=True) if distance <= limit)
+            obstacle = replace(obstacle, parts=tuple(near))
+        kept.append(obstacle)
+        indices.append(index)
+        nearest = min(nearest, float(distances.min()))
+    return Reach(tuple(kept), nearest, tuple(indices))
+
+
+def _box_distances(boxes: NDArray[np.float64], points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return how near each box [b, 2, 3] comes at least to a way along points [n, 3]; zero inside."""
+    if np.ptp(points, axis=0).max() == 0:
+        points = points[:1]
+    # Between two points the way is no further from one of them than half their distance.
+    between = float(np.linalg.norm(np.diff(points, axis=0), axis=1).max(initial=0.0)) / 2
+    found = np.empty(len(boxes))
+    some = max(1, 100_000 // len(points))
+    for first in range(0, len(boxes), some):
+        low, high = boxes[first : first + some, 0, None], boxes[first : first + some, 1, None]
+        outside = np.maximum(np.maximum(low - points, points - high), 0.0)
+        found[first : first + some] = np.sqrt(np.einsum("bnd,bnd->bn", outside, outside)).min(axis=1)
+    return np.maximum(found - between, 0.0)
 
 
 def _encloses(obstacle: Obstacle, point: NDArray[np.float64]) -> bool:
@@ -88,9 +116,9 @@ def _encloses(obstacle: Obstacle, point: NDArray[np.float64]) -> bool:
 
 def touched(obstacle: Obstacle, *, surfaces: bool) -> Obstacle:
     """Return the obstacle with only what an engine touches of it, its parts or its surface; see :func:`reachable`."""
-    if obstacle.surface is not None and (surfaces or not obstacle.parts):
-        return replace(obstacle, parts=())
-    return replace(obstacle, surface=None)
+    if obstacle.surface is None:
+        return obstacle
+    return replace(obstacle, parts=()) if surfaces or not obstacle.parts else replace(obstacle, surface=None)
 
 
 def distances(obstacle: Obstacle, bounds: NDArray, points: NDArray, times: NDArray) -> NDArray[np.float64]:
@@ -100,7 +128,7 @@ def distances(obstacle: Obstacle, bounds: NDArray, points: NDArray, times: NDArr
 
 def _in_obstacle_frame(obstacle: Obstacle, points: NDArray, times: NDArray) -> NDArray[np.float64]:
     if obstacle.motion is None:
-        return points[:1] if np.ptp(points, axis=0).max() == 0 else points
+        return points
     position, quaternion = obstacle.motion(times)
     # The transposed rotation: from world axes into those of the obstacle.
     return np.einsum("nji,nj->ni", to_matrices(quaternion), points - position)

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from brainbench.core.devices import usable_processors
 from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.engines.job_pool import run_groups
+from brainbench.stimuli.engines.motion_pieces import Cutting
 from brainbench.stimuli.engines.overlap import overlap_fault
 from brainbench.stimuli.engines.protocol import Job, Progress, Trace, WhiskerEngine, base_rotation
 from brainbench.stimuli.engines.reach import Reach, reachable
@@ -86,8 +87,13 @@ class SteppedJob:
 
     @cached_property
     def step(self) -> float:
-        """Time step [s]."""
-        return self.fidelity.step_of(self.chain)
+        """Time step [s]: that of the fidelity, or a shorter one that the fastest motion of the job asks for."""
+        step, job = self.fidelity.step_of(self.chain), self.job
+        cutting = Cutting(job.start, float(job.times[-1]), step, step)
+        pieces = [cutting.follicle(job.follicle, job.whisker.arc_length)]
+        moving = (obstacle for obstacle in job.obstacles if obstacle.motion is not None)
+        pieces += [cutting.obstacle(obstacle, np.zeros(3)) for obstacle in moving]
+        return min(float(some.longest_steps(step, self.fidelity.steps_per_period).min()) for some in pieces)
 
     @cached_property
     def where(self) -> NDArray[np.float64]:

@@ -311,6 +311,10 @@ def check_jobs(engine: WhiskerEngine, jobs: Sequence[Job], fidelity: Fidelity, w
             f"The backend {engine.name!r} has no solver {fidelity.solver!r}, only {listing(engine.solvers)}; use the "
             "backend 'rod' for it."
         )
+    if fidelity.twist and not engine.twists:
+        raise UsageError(
+            f"Whiskers of the backend {engine.name!r} bend but do not twist; leave twist out, or use the backend 'rod'."
+        )
     if not engine.surfaces:
         require_parts(jobs, engine.name)
     warn_overdamped(jobs, fidelity)

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from brainbench.core.figures.style import DOTS_PER_INCH, INK, PALE, new_figure, save_figure
 from brainbench.stimuli.figures import canvas
-from brainbench.stimuli.figures.canvas import DOTS_PER_INCH, INK, PALE
 from brainbench.stimuli.whiskers.selection import ROWS
 
 if TYPE_CHECKING:
@@ -24,7 +24,7 @@ class Annotation:
     def __init__(self, picture: Picture) -> None:
         self.picture = picture
         self.width, self.height = picture.style.size
-        self.figure = canvas.new_figure(self.width, self.height)
+        self.figure = new_figure(self.width, self.height)
         self.axes = self.figure.add_axes((0, 0, 1, 1))
         self.axes.set(xlim=(0, self.width), ylim=(self.height, 0))
         self.axes.axis("off")
@@ -57,7 +57,7 @@ class Annotation:
     def save(self, path: Path, index: int = 0) -> Path:
         """Write the annotated picture at one instant."""
         self._show(index)
-        return canvas.save_figure(self.figure, path, dpi=DOTS_PER_INCH)
+        return save_figure(self.figure, path, dpi=DOTS_PER_INCH)
 
     def _show(self, index: int) -> None:
         self._image.set_data(self.picture.frame(index))
@@ -106,10 +106,13 @@ class Annotation:
     def _row_key(self) -> None:
         rows = sorted({mount.row for mount in self.picture.recording.scene.mounts})
         top = self._edge + 84 * self._unit
-        for place, row in enumerate(rows):
+        key = [(f"row {ROWS[row]}", canvas.ROW_COLORS[row]) for row in rows]
+        if self.picture.recording.unstable:
+            key.append(("unstable, drawn unbent", canvas.UNSTABLE_COLOR))
+        for place, (words, color) in enumerate(key):
             y = top + 26 * self._unit * place
-            self._line([self._edge, self._edge + 30 * self._unit], [y, y], canvas.ROW_COLORS[row], 4)
-            self._text(self._edge + 40 * self._unit, y, f"row {ROWS[row]}", size=15, va="center_baseline")
+            self._line([self._edge, self._edge + 30 * self._unit], [y, y], color, 4)
+            self._text(self._edge + 40 * self._unit, y, words, size=15, va="center_baseline")
 
     def _moment_bar(self) -> None:
         left, top, long, wide = self._edge, self._edge + 84 * self._unit, 220 * self._unit, 16 * self._unit

@@ -15,13 +15,14 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from brainbench.core.errors import UsageError, listing, unknown_name
+from brainbench.core.figures.style import check_format
 from brainbench.core.progress import Progress
 from brainbench.stimuli.engines import DEFAULT_ENGINE
 from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.engines.protocol import WhiskerEngine
 from brainbench.stimuli.figures.annotation import Annotation
 from brainbench.stimuli.figures.camera import Camera, Lens
-from brainbench.stimuli.figures.canvas import MOMENT_MAP, ROW_COLORS, check_format, round_up
+from brainbench.stimuli.figures.canvas import MOMENT_MAP, ROW_COLORS, UNSTABLE_COLOR, round_up
 from brainbench.stimuli.figures.films import require_writer, write_film
 from brainbench.stimuli.figures.raster import RasterLayer, Triangles, draw
 from brainbench.stimuli.figures.shading import floor, lamp, paint, shade
@@ -139,18 +140,18 @@ class Picture:
 
         found = []
         recording = self.recording
-        for mount, joints, moments in zip(recording.scene.mounts, recording.joints, recording.moments, strict=True):
-            points = joints[index]
+        whiskers = zip(recording.scene.mounts, recording.joints, recording.moments, strict=True)
+        for which, (mount, joints, moments) in enumerate(whiskers):
+            points, row, known = joints[index], np.array(to_rgb(ROW_COLORS[mount.row])), True
             if not np.isfinite(points).all():
-                continue
-            row = np.array(to_rgb(ROW_COLORS[mount.row]))
-            along = np.column_stack([points, np.linspace(0.0, 1.0, len(points)), moments[index]])
+                points, row, known = recording.unbent(which, index), np.array(to_rgb(UNSTABLE_COLOR)), False
+            along = np.column_stack([points, np.linspace(0.0, 1.0, len(points)), np.nan_to_num(moments[index])])
             *line, share, bending = smoothed(along, _PER_LINK).T
             line = np.stack(line, axis=-1)
             radii = self.style.thickness * mount.whisker.radius(share * mount.whisker.arc_length)
             thinnest = _THINNEST * self.style.supersampling * lens.pixel_size(line)
             colors = np.broadcast_to(row, line.shape)
-            if self.style.color == "moment":
+            if self.style.color == "moment" and known:
                 colors = self._moment_colors(bending)
             found.append(tube(line, np.maximum(radii, thinnest), colors))
             ink = 0.45 * row if self.style.color == "row" else np.full(3, 0.25)
@@ -232,7 +233,7 @@ def render(
     require_writer(suffix)
     recording = record(scene, times, fidelity=fidelity, backend=backend, progress=progress, cache=cache)
     if recording.unstable:
-        _LOG.warning("unstable whiskers are not drawn from then on: %s", listing(recording.unstable))
+        _LOG.warning("unstable whiskers are drawn black and unbent from then on: %s", listing(recording.unstable))
     picture = Picture(recording, camera, style)
     annotation = Annotation(picture)
     if suffix == ".png":

@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 
 from brainbench.core.contracts import CHANNELS, GRID_SHAPE, check_stimulus_set
 from brainbench.core.errors import UsageError, unknown_name
-from brainbench.stimuli.figures.canvas import INK, PALE, check_format, new_figure, round_up, save_figure
+from brainbench.core.figures.style import INK, PALE, check_format, new_figure, save_figure
+from brainbench.stimuli.figures.canvas import round_up
 from brainbench.stimuli.whiskers.selection import ROWS
 
 if TYPE_CHECKING:
@@ -73,14 +74,17 @@ def plot(
     if stimulus is not None and stimulus not in labels:
         raise unknown_name("stimulus", stimulus, labels)
     dataset = _within(dataset, window)
-    largest = float(np.nanmax(np.abs(_values(dataset, channel)), initial=0.0))
-    limit = round_up(largest) if largest else 1.0
+    values = _values(dataset, channel)
+    largest = float(np.nanmax(np.abs(values), initial=0.0)) or 1.0
+    # Each side ends where its values end, but never so close to 0 that its number would overlap that of 0.
+    low, high = (max(float(np.nanmax(side * values, initial=0.0)), 0.2 * largest) for side in (-1, 1))
+    limits = (0.0 if channel in _UNITS else -round_up(low), round_up(high))
     chosen = labels if stimulus is None else [stimulus]
     several = len(chosen) > 1
     names = [re.sub(r"[^\w.+-]+", "_", label) for label in chosen]
     paths = [path.with_name(f"{path.stem}-{name}{path.suffix}") if several else path for name in names]
     for label, one in zip(chosen, paths, strict=True):
-        save_figure(_figure(dataset.isel(stimulus=labels.index(label)), label, channel, limit, size), one)
+        save_figure(_figure(dataset.isel(stimulus=labels.index(label)), label, channel, limits, size), one)
     return tuple(paths)
 
 
@@ -110,7 +114,9 @@ def _values(dataset: xr.Dataset, channel: str) -> NDArray[np.float64]:
     return np.linalg.norm(values, axis=-1, keepdims=True) if channel in _UNITS else values
 
 
-def _figure(stimulus: xr.Dataset, label: str, channel: str, limit: float, size: tuple[int, int]) -> Figure:
+def _figure(
+    stimulus: xr.Dataset, label: str, channel: str, limits: tuple[float, float], size: tuple[int, int]
+) -> Figure:
     figure = new_figure(*size)
     rows, cols = GRID_SHAPE
     unit = size[0] / 1600
@@ -128,9 +134,10 @@ def _figure(stimulus: xr.Dataset, label: str, channel: str, limit: float, size: 
         # Only panels at an edge of the layout carry numbers.
         panel.tick_params(labelleft=(row, col - 1) not in cells, labelbottom=(row + 1, col) not in cells)
     times = stimulus["time"].values * 1e3
-    lower = 0.0 if channel in _UNITS else -limit
-    panels[0, 0].set(xlim=(times[0], times[-1]), ylim=(lower - 0.04 * limit, 1.04 * limit))
-    panels[0, 0].set_yticks([lower, 0, limit] if lower else [0, limit / 2, limit])
+    lower, upper = limits
+    margin = 0.04 * (upper - lower)
+    panels[0, 0].set(xlim=(times[0], times[-1]), ylim=(lower - margin, upper + margin))
+    panels[0, 0].set_yticks([lower, 0, upper] if lower else [0, upper / 2, upper])
     panels[0, 0].locator_params(axis="x", nbins=4)
     # The attribute begins with the axes, "world axes; …" or "follicle axes; …".
     axes = str(stimulus.attrs.get("frame", "world")).split()[0]
@@ -146,15 +153,18 @@ def _panel(panel: Axes, whisker: xr.Dataset, values: NDArray[np.float64], name: 
             times, 0, 1, where=touching, step="mid", transform=panel.get_xaxis_transform(), color=CONTACT_COLOR, lw=0
         )
     panel.axhline(0, color=PALE, linewidth=0.8 * points)
+    corner: dict[str, Any] = {"transform": panel.transAxes, "va": "top", "ha": "right"}
+    stable = "status" not in whisker or str(whisker["status"].values) == "ok"
+    if stable and "contact" in whisker and not whisker["contact"].values.any():
+        panel.text(0.97, 0.95, "no contact", fontsize=13 * points, color=PALE, **corner)
     colors = LINE_COLORS if values.shape[1] > 1 else (INK,)
     for line, color in zip(values.T, colors, strict=True):
         panel.plot(times, line, color=color, linewidth=1.9 * points)
     panel.text(
         0.03, 0.95, name, transform=panel.transAxes, fontsize=17 * points, fontweight="bold", color=INK, va="top"
     )
-    if "status" in whisker and str(whisker["status"].values) != "ok":
-        where = {"transform": panel.transAxes, "va": "top", "ha": "right"}
-        panel.text(0.97, 0.95, "unstable", fontsize=14 * points, color="#b00020", **where)
+    if not stable:
+        panel.text(0.97, 0.95, "unstable", fontsize=14 * points, color="#b00020", **corner)
     panel.tick_params(labelsize=13 * points, length=4 * points, colors=INK)
     for side in ("top", "right"):
         panel.spines[side].set_visible(False)

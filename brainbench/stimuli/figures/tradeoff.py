@@ -7,7 +7,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
-from brainbench.stimuli.figures.canvas import new_figure, save_figure
+from brainbench.core.figures.style import COLORS, panels, save_figure
 from brainbench.stimuli.tradeoff import collision_points, front, preset_of
 
 
@@ -18,11 +18,10 @@ def plot_tradeoff(points: Iterable[dict[str, Any]], path: str | os.PathLike[str]
     """
     measured = [{"solver": "dynamic", **point} for point in points if point["error"] is not None]
     hollow, bench = collision_points(measured), [point for point in measured if not point.get("collision")]
-    figure = new_figure(1100 if hollow else 700, 450)
-    figure.set_layout_engine("constrained")
-    axes = figure.subplots(1, 2 if hollow else 1, squeeze=False)[0]
+    figure, (axes,) = panels(1, 2 if hollow else 1, (10.5 if hollow else 6, 4.6))
     for number, group in enumerate(sorted({(point["solver"], point["backend"]) for point in bench})):
-        _draw_bench(axes[0], [p for p in bench if (p["solver"], p["backend"]) == group], f"C{number}")
+        _draw_bench(axes[0], [p for p in bench if (p["solver"], p["backend"]) == group], COLORS[number])
+    _label(axes[0], "bench tests: largest error against exact solutions", "largest relative error")
     if hollow:
         _draw_collisions(axes[1], hollow)
     return save_figure(figure, Path(path), dpi=150)
@@ -33,14 +32,15 @@ def _draw_bench(axes: Any, points: Sequence[dict[str, Any]], colour: str) -> Non
     still = points[0]["solver"] == "quasistatic"
     label = f"{points[0]['backend']}{', without inertia' if still else ''}"
     best = front(points)
-    axes.scatter([p["cost"] for p in points], [p["error"] for p in points], s=16, color=colour, label=label)
-    axes.step([p.cost for p in best], [p.error for p in best], where="post", color=colour, lw=1, zorder=0)
+    axes.scatter([p["cost"] for p in points], [p["error"] for p in points], s=14, color=colour, alpha=0.45, lw=0)
+    line = {"where": "post", "color": colour, "lw": 1.2, "ms": 4, "label": label}
+    axes.step([p.cost for p in best], [p.error for p in best], "o-", **line)
     for point in points:
-        place = (point["cost"], point["error"])
-        axes.annotate(
-            preset_of(point), place, xytext=(5, 5), textcoords="offset points", color=colour, fontsize="small"
-        )
-    _label(axes, "bench tests, and the front of each backend", "largest relative error")
+        if name := preset_of(point):
+            place, box = (point["cost"], point["error"]), {"facecolor": "white", "alpha": 0.8, "lw": 0, "pad": 0.5}
+            axes.plot(*place, "o", ms=8, mfc="none", mec=colour)
+            shift = {"xytext": (0, 8), "textcoords": "offset points", "ha": "center"}
+            axes.annotate(name, place, color=colour, fontsize=8.5, bbox=box, **shift)
 
 
 def _draw_collisions(axes: Any, points: Sequence[dict[str, Any]]) -> None:
@@ -49,14 +49,18 @@ def _draw_collisions(axes: Any, points: Sequence[dict[str, Any]]) -> None:
     for marker, backend in zip("os^Dv", sorted({point["backend"] for point in points}), strict=False):
         for number, geometry in enumerate(geometries):
             some = [point for point in points if (point["backend"], point["collision"]) == (backend, geometry)]
-            axes.scatter([p["cost"] for p in some], [p["error"] for p in some], s=22, marker=marker, color=f"C{number}")
+            place = [p["cost"] for p in some], [p["error"] for p in some]
+            axes.scatter(*place, s=22, marker=marker, color=COLORS[number])
         axes.scatter([], [], s=22, marker=marker, color="0.5", label=backend)
     for number, geometry in enumerate(geometries):
-        axes.scatter([], [], s=22, marker="s", color=f"C{number}", label=geometry)
-    _label(axes, "whisking into a hollow, by collision geometry", "relative error of the base moment")
+        parts = f"convex parts, concavity {geometry.partition('-')[2]}"
+        name = {"exact": "exact surface", "hull": "convex hull"}.get(geometry, parts)
+        axes.scatter([], [], s=22, marker="s", color=COLORS[number], label=name)
+    _label(axes, "whisking into a hollow, by collision surface", "relative error of the base moment")
 
 
 def _label(axes: Any, title: str, error: str) -> None:
-    axes.set(xscale="log", yscale="log", title=title, xlabel="processor seconds per whisker-second", ylabel=error)
-    axes.margins(x=0.12)
-    axes.legend(frameon=False, fontsize="small", loc="upper center", bbox_to_anchor=(0.5, -0.14), ncol=4)
+    axes.set(xscale="log", yscale="log", title=title, ylabel=error)
+    axes.set_xlabel("processor time per second of one whisker (s/s)")
+    axes.margins(x=0.12, y=0.12)
+    axes.legend(frameon=False, fontsize=8.5, loc="upper center", bbox_to_anchor=(0.5, -0.15), ncol=2)

@@ -168,6 +168,11 @@ class Recorded:
     initial: Mapping[str, Vector] = field(default_factory=dict)
     """Starting angles (θ, φ, ζ) [rad] by side and name (``RC2``), as :func:`load_initial_angles` reads them."""
 
+    @property
+    def finest(self) -> float:
+        """Shortest period of anything in the motion (s): two samples."""
+        return 2 / self.trajectory.rate
+
     def line(self, mount: MountedWhisker) -> str:
         """Return the name of the line that moves ``mount`` (see the module); none is a :class:`UsageError`."""
         name = mount.full_name

@@ -59,6 +59,9 @@ class _Motion:
 class Still(_Motion):
     """Nothing moves."""
 
+    finest: ClassVar[float] = math.inf
+    """Shortest period of anything in the motion (s), as engines ask for it: nothing ever changes."""
+
     def angles(self, mount: MountedWhisker, times: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the rest angles (θ, φ, ζ) [n, 3] of one whisker."""
         return np.tile(np.array(mount.angles), (len(times), 1))
@@ -105,6 +108,11 @@ class Whisking(_Motion):
                 f"received {self.protraction!r} and {self.retraction!r} rad."
             )
 
+    @property
+    def finest(self) -> float:
+        """Shortest period of anything in the motion (s)."""
+        return min(1 / self.frequency, 2 * self.onset or math.inf)
+
     def azimuth(self, times: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return a(t) [n] (rad), the azimuth relative to rest, positive forward on both sides."""
         times = np.asarray(times, dtype=float)
@@ -137,6 +145,11 @@ class _SteadyMotion(_Motion):
                 f"The velocity of a {name} is three finite numbers in {self._unit}; received {self.velocity!r}."
             )
         _require(f"{name} onset (s)", self.onset)
+
+    @property
+    def finest(self) -> float:
+        """Shortest period of anything in the motion (s); without an onset there is none, and 1 s tells it from rest."""
+        return 2 * self.onset or 1.0
 
     def _moved(self, times: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the integral [n, 3] of the velocity since t = 0."""
@@ -203,6 +216,11 @@ class Path(_Motion):
             raise UsageError(f"The times of a path ascend from 0 and are at least two; received {self.times!r}.")
         object.__setattr__(self, "times", tuple(times.tolist()))
 
+    @property
+    def finest(self) -> float:
+        """Shortest period of anything in the motion (s): two keyframes are half of one."""
+        return 2 * float(np.diff(self.times).min())
+
     def displacement(self, times: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return how far the origin has moved, [n, 3] (m, world); no time may lie beyond the last keyframe."""
         from scipy.interpolate import CubicSpline
@@ -237,6 +255,8 @@ class ArrayFollicle:
     """Displacement of the head [n, 3] (m) at times [n]; None when it stands still."""
     turn: Callable[[NDArray[np.float64]], NDArray[np.float64]] | None = None
     """Rotation of the head [n, 3, 3] about the origin of the array at times [n]; None when it does not turn."""
+    finest: float | None = None
+    """Shortest period of anything in all of these (s); None when unknown."""
 
     def pose(self, times: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return positions [n, 3] (m) and Euler angles (θ, φ, ζ) [n, 3] (rad).

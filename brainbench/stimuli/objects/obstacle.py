@@ -250,7 +250,7 @@ class Obstacle:
         if self.friction is not None and not (math.isfinite(self.friction) and self.friction >= 0):
             raise UsageError(f"friction of an obstacle must be zero or more; received {self.friction!r}.")
 
-    @property
+    @cached_property
     def bounds(self) -> NDArray[np.float64]:
         """Lowest and highest corner [2, 3] (m) of what is touched, in the frame of the obstacle."""
         return bounds_of(self.parts if self.surface is None else (self.surface,))

@@ -15,6 +15,28 @@ from brainbench.stimuli.objects.solid import Solid
 
 
 @dataclass(frozen=True, eq=False)
+class _PlacedMotion:
+    """Motion of a placed body in the frame ``axes`` [3, 3], where its origin is at ``place`` [3] (m) at t = 0."""
+
+    motion: Translation | Spin | Path
+    axes: NDArray[np.float64]
+    place: NDArray[np.float64]
+
+    @property
+    def finest(self) -> float:
+        """Shortest period of anything in the motion (s)."""
+        return self.motion.finest
+
+    def __call__(self, times: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return positions [n, 3] (m) and quaternions [n, 4] at times [n] (s)."""
+        # World displacements and rotations T seen from the frame: Rᵀ x (for rows, x R) and Rᵀ T R.
+        moved = self.motion.displacement(times) @ self.axes
+        if isinstance(self.motion, Translation):
+            return moved, np.tile([1.0, 0.0, 0.0, 0.0], (len(times), 1))
+        return self.place + moved, from_matrices(self.axes.T @ self.motion.turn(times) @ self.axes)
+
+
+@dataclass(frozen=True, eq=False)
 class PlacedObject:
     """A solid in a scene (world frame)."""
 
@@ -49,13 +71,7 @@ class PlacedObject:
         motion = self.motion
         if isinstance(motion, Still):
             return None
-        if isinstance(motion, Translation):
-            return lambda times: (motion.displacement(times) @ axes, np.tile([1.0, 0.0, 0.0, 0.0], (len(times), 1)))
-        # World displacements and rotations T seen from the frame: Rᵀ x (for rows, x R) and Rᵀ T R.
-        return lambda times: (
-            place + motion.displacement(times) @ axes,
-            from_matrices(axes.T @ motion.turn(times) @ axes),
-        )
+        return _PlacedMotion(motion, axes, place)
 
     def config(self) -> dict[str, Any]:
         """Return plain values that determine the physics."""

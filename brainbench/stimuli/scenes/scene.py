@@ -72,6 +72,9 @@ class Scene:
     """More animals among the same objects. Whiskers touch objects only, neither one another nor a face."""
     animal: str = "a"
     """Name of the first animal, whose array, whisking and head stand above; used when there are others."""
+    twist: bool = True
+    """Whether whiskers twist when :attr:`Fidelity.twist` leaves it open. False in recipes with shipped recordings or
+    networks, which were made before whiskers could twist."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "objects", tuple(self.objects))
@@ -146,8 +149,14 @@ class Scene:
         # Row vectors times the matrix are world vectors in the axes of the array; rotations become Rᵀ T R.
         travel = None if isinstance(motion, Still) else lambda times: motion.displacement(times) @ axes
         turn = (lambda times: axes.T @ motion.turn(times) @ axes) if isinstance(motion, Path) else None
+        finest = min(self.whisking.finest, motion.finest)
         return [
-            Job(mount.whisker, ArrayFollicle(mount, self.whisking, travel, turn), obstacles, self.frames.readings)
+            Job(
+                mount.whisker,
+                ArrayFollicle(mount, self.whisking, travel, turn, finest),
+                obstacles,
+                self.frames.readings,
+            )
             for mount in self.array
         ]
 

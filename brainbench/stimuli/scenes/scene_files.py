@@ -3,6 +3,7 @@
 ::
 
     description = "A pole in front of two whiskers"
+    twist = true                 # optional: false computes whiskers that bend but do not twist, as of old
 
     [array]                      # species = "mouse" | "rat"; side = "right" | "left" | "both"
     species = "mouse"
@@ -56,7 +57,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -67,7 +68,7 @@ from brainbench.stimuli.scenes.frames import Frames
 from brainbench.stimuli.scenes.motion_tables import read_head_motion, read_whisking
 from brainbench.stimuli.scenes.object_tables import PLACE, read_object
 from brainbench.stimuli.scenes.scene import Animal, Head, Scene
-from brainbench.stimuli.scenes.toml_tables import MILLI, Keys, TomlTable, mapping, number, tables, text, whole
+from brainbench.stimuli.scenes.toml_tables import MILLI, Keys, TomlTable, boolean, mapping, number, tables, text, whole
 from brainbench.stimuli.sweeps.sweep_scenes import SweepScenes
 from brainbench.stimuli.whiskers.array import WhiskerArray
 
@@ -122,6 +123,7 @@ def _recipe(path: Path, data: dict[str, Any], whiskers: str) -> Recipe:
     top = TomlTable("the scene file", data)
     description = top.take("description", text, "")
     array = _array(top.table("array"))
+    twist = top.take("twist", boolean, True)
     others = tuple(_animal(TomlTable("[[animal]]", item), path.parent) for item in top.take("animal", tables, []))
     shared = {name: top.take(name, mapping, _NOTHING) for name in ("head", "whisking", "frames")}
     common = top.take("object", tables, [])
@@ -129,7 +131,8 @@ def _recipe(path: Path, data: dict[str, Any], whiskers: str) -> Recipe:
     top.finish()
     if not entries:
         raise UsageError("the file has no [[scene]].")
-    scenes = [_scene(entry, array, others, shared, common, path.parent).select(whiskers) for entry in entries]
+    whole = [_scene(entry, array, others, shared, common, path.parent) for entry in entries]
+    scenes = [replace(scene, twist=twist).select(whiskers) for scene in whole]
     repeated = sorted({scene.label for scene in scenes if [s.label for s in scenes].count(scene.label) > 1})
     if repeated:
         raise UsageError(f"several scenes have the label {repeated[0]!r}; labels must differ.")

@@ -94,6 +94,7 @@ def _is_number(value: Any) -> bool:
 
 text = _converter("a text", lambda value: isinstance(value, str))
 whole = _converter("a whole number", lambda value: isinstance(value, int) and not isinstance(value, bool))
+boolean = _converter("true or false", lambda value: isinstance(value, bool))
 mapping = _converter("a table", lambda value: isinstance(value, dict))
 tables = _converter(
     "a list of tables in double brackets",

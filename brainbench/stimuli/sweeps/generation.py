@@ -14,8 +14,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from brainbench.core.errors import DataError, UsageError
-from brainbench.core.files import lock_folder, read_json, to_plain, write_json
+from brainbench.core.files import read_json, to_plain, write_json
 from brainbench.core.progress import Progress
+from brainbench.core.writing.locks import lock_folder
 from brainbench.stimuli.engines import get_engine
 from brainbench.stimuli.sweeps import running
 from brainbench.stimuli.sweeps.manifest import MANIFEST, is_complete, make_manifest
@@ -90,7 +91,6 @@ def write_data_set(
     ``run`` calls ``done`` with the number of sweeps of each shard that it wrote. Errors are those of :func:`generate`.
     """
     folder = Path(out).absolute()
-    folder.mkdir(parents=True, exist_ok=True)
     with lock_folder(folder, wait=False):
         _check_config(plan, folder)
         _clean(folder)

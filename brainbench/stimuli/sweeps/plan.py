@@ -52,6 +52,7 @@ class GenerationSettings:
     (backend ``rod``); 1 leaves them as they are."""
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "fidelity", self.fidelity.resolved(get_engine(self.backend).twists))
         if self.split not in ("object", "sweep"):
             raise unknown_name("split", str(self.split), ("object", "sweep"))
         for name in ("limit", "shard_size"):

@@ -77,6 +77,23 @@ def natural_frequencies(whisker: Whisker, count: int = 3) -> NDArray[np.float64]
     """
     from scipy.linalg import eigh
 
+    stiffness, mass = beam_matrices(whisker)
+    # Rotations scaled by the length make the matrices well conditioned; the base node is clamped.
+    scale = np.tile([1.0, 1 / whisker.arc_length], _ELEMENTS + 1)[2:]
+    stiffness = stiffness[2:, 2:] * np.outer(scale, scale)
+    mass = mass[2:, 2:] * np.outer(scale, scale)
+    # M a = ω⁻² K a: the modes wanted are the largest eigenvalues, which are resolved best.
+    size = len(mass)
+    inverse = eigh(mass, stiffness, eigvals_only=True, subset_by_index=[size - count, size - 1])[::-1]
+    return 1 / np.sqrt(inverse) / (2 * np.pi)
+
+
+def beam_matrices(whisker: Whisker) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return stiffness and mass [2 n, 2 n] of a whisker as a straight free beam of finite elements between n nodes.
+
+    Unknowns are deflection (m) and slope of each node, evenly spaced from the base on; elements as in
+    :func:`natural_frequencies`.
+    """
     size = 2 * _ELEMENTS + 2
     stiffness, mass = np.zeros((size, size)), np.zeros((size, size))
     length = whisker.arc_length / _ELEMENTS
@@ -98,13 +115,7 @@ def natural_frequencies(whisker: Whisker, count: int = 3) -> NDArray[np.float64]
             # K = ∫ E I w″ w″ ds and M = ∫ ρ π r² w w ds of one element, summed over elements that share nodes.
             stiffness[block, block] += weight * length * k * np.outer(bend, bend)
             mass[block, block] += weight * length * m * np.outer(shape, shape)
-    # Rotations scaled by the length make the matrices well conditioned; the base node is clamped.
-    scale = np.tile([1.0, 1 / whisker.arc_length], _ELEMENTS + 1)[2:]
-    stiffness = stiffness[2:, 2:] * np.outer(scale, scale)
-    mass = mass[2:, 2:] * np.outer(scale, scale)
-    # M a = ω⁻² K a: the modes wanted are the largest eigenvalues, which are resolved best.
-    inverse = eigh(mass, stiffness, eigvals_only=True, subset_by_index=[size - 2 - count, size - 3])[::-1]
-    return 1 / np.sqrt(inverse) / (2 * np.pi)
+    return stiffness, mass
 
 
 @lru_cache(maxsize=256)

@@ -207,6 +207,7 @@ def published_whisker(arc_length: float, curvature: float, row: int, col: int, *
         # The published bend angles are negative: the whisker curves towards local −y.
         curvature=-curvature / _MM,
         friction=material["friction"],
+        poisson_ratio=material["poisson_ratio"],
     )
 
 

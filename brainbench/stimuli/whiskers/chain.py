@@ -1,9 +1,11 @@
-"""A whisker as a chain of rigid tapered links joined by pairs of elastic hinges.
+"""A whisker as a chain of rigid tapered links joined by elastic hinges: two for bending, and some for twist.
 
 Joint i stands at arc length i L/N for the bending of the cell around it, half a cell at the base, so its compliance is
 about 1/k = ∫ ds/(E I) over that cell. The virtual work of bending is ∫ M²/(E I) ds; interpolating M² by a parabola
 through three joints instead of a constant per cell makes ten links as good as thirty. Joints lie on the rest curve, so
-the whole intrinsic curvature survives any number of links. Letters: N link, 0 = base.
+the whole intrinsic curvature survives any number of links. Joints 1, 3, 5 … also twist, each for the cells on both
+sides of it: twist is a small part of the deformation, and every second joint makes its error no larger than that of
+bending at half the cost. Letters: N link, 0 = base.
 """
 
 from __future__ import annotations
@@ -44,6 +46,8 @@ class Chain:
     """[N, 2] axial and transverse moment of inertia about the centre of mass (kg·m²)."""
     stiffness: NDArray[np.float64]
     """[N] bending stiffness of each hinge (N·m/rad), the same about both axes."""
+    torsion: NDArray[np.float64]
+    """[N] stiffness against twist (N·m/rad) of joints 1, 3, 5 …; 0 for the others, which do not twist."""
 
     @property
     def links(self) -> int:
@@ -102,8 +106,9 @@ def build_chain(whisker: Whisker, links: int) -> Chain:
     angles = np.arctan2(chords[:, 1], chords[:, 0])
     lengths = np.linalg.norm(chords, axis=1)
     rest_angles, radii = np.diff(angles, prepend=0.0), whisker.radius((nodes[:-1] + nodes[1:]) / 2)
-    frusta, stiffness = _frusta(whisker, nodes, lengths), 1 / _compliance(whisker, links)
-    return Chain(whisker, nodes, points, lengths, rest_angles, radii, *frusta, stiffness)
+    frusta, compliance = _frusta(whisker, nodes, lengths), _compliance(whisker, links)
+    stiffness, torsion = 1 / compliance, whisker.torsion_ratio * _shared_stiffness(compliance)
+    return Chain(whisker, nodes, points, lengths, rest_angles, radii, *frusta, stiffness, torsion)
 
 
 def _compliance(whisker: Whisker, links: int) -> NDArray[np.float64]:
@@ -131,6 +136,18 @@ def _compliance(whisker: Whisker, links: int) -> NDArray[np.float64]:
             total[j] += flexibility @ weight
     # The free tip carries no moment, so what falls on it needs no joint.
     return total[:links]
+
+
+def _shared_stiffness(compliance: NDArray) -> NDArray[np.float64]:
+    """Return the stiffness [N] of joints 1, 3, 5 … that take over half the compliance of each neighbour; 0 of others.
+
+    The base has no neighbour but joint 1, which takes all of it.
+    """
+    shares = np.concatenate([compliance[:1], compliance, [0.0]])
+    whole = compliance + (shares[:-2] + shares[2:]) / 2
+    whole[1] += compliance[0] / 2
+    whole[::2] = np.inf
+    return 1 / whole
 
 
 def _frusta(whisker: Whisker, nodes: NDArray, lengths: NDArray) -> tuple[NDArray, NDArray, NDArray]:

@@ -94,13 +94,16 @@ def fill_contacts(
     dim: wp.array(dtype=wp.int32),
     address: wp.array2d(dtype=wp.int32),
     efc_force: wp.array2d(dtype=wp.float32),
+    cone: wp.array(dtype=wp.types.vector(length=5, dtype=wp.float32)),
     pyramidal: int,
     normal: wp.array(dtype=wp.vec3f),
     force: wp.array(dtype=wp.float32),
+    friction: wp.array(dtype=wp.vec3f),
 ):
-    """Read normal and normal force (N) of every contact. Thread: contact [C].
+    """Read normal, normal force and friction (N) of every contact. Thread: contact [C].
 
-    With a pyramidal cone the normal force is the sum of the forces along its edges.
+    With a pyramidal cone the normal force is the sum of the forces along its edges, and friction along a tangent is the
+    difference of its two edges by the coefficient ``cone``.
     """
     c = wp.tid()
     if c >= count[0]:
@@ -118,3 +121,16 @@ def fill_contacts(
         if row >= 0:
             total += efc_force[env[c], row]
     force[c] = total
+    slip = wp.vec3f(0.0)
+    if dim[c] > 1:
+        for axis in range(2):
+            tangent = wp.vec3f(rows[axis + 1, 0], rows[axis + 1, 1], rows[axis + 1, 2])
+            one = address[c, axis + 1]
+            if pyramidal == 1:
+                one = address[c, 2 * axis]
+                two = address[c, 2 * axis + 1]
+                if one >= 0 and two >= 0:
+                    slip += cone[c][axis] * (efc_force[env[c], one] - efc_force[env[c], two]) * tangent
+            elif one >= 0:
+                slip += efc_force[env[c], one] * tangent
+    friction[c] = slip

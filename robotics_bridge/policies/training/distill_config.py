@@ -8,12 +8,16 @@ from typing import Any
 
 from brainbench.core.errors import UsageError, unknown_name
 from robotics_bridge.hands.observations import observation_type
+from robotics_bridge.policies.contract import MOST_TWIST
 from robotics_bridge.policies.encoders.arms import AUTO, EncoderConfig
 from robotics_bridge.policies.student import EMBEDDERS
+from robotics_bridge.sensors.taxels.sensors import PUBLISHED_TWIST
 from robotics_bridge.tasks.settings import StudentSettings
 
 LOSSES = ("mse", "inv_var_mse")
 """``inv_var_mse``: each action's squared error over the variance of the teacher's action in the rollout."""
+EARLIER_TWIST = PUBLISHED_TWIST
+"""N·m·s, where a stored student does not state its law."""
 MOST = {"learning_rate": 1.0, "clip": 100.0, "max_grad_norm": 1e6}
 """Largest value of settings that are numbers above 0."""
 
@@ -41,6 +45,9 @@ class DistillConfig:
     """Number of taxels: ``low``, ``med`` or ``high``."""
     noisy: bool = False
     """Taxels with the published noise (table 4.12)."""
+    twist: float | None = None
+    """Torsional friction of the force taxels [N·m·s]; by default the task's own. Runs of versions that did not state
+    it had the published 2 (:data:`EARLIER_TWIST`)."""
     encoder: str = AUTO
     """Tactile encoder: an arm of :data:`~robotics_bridge.policies.encoders.arms.ARMS`, or a network's name."""
     encoder_settings: Mapping[str, Any] = field(default_factory=dict)
@@ -92,6 +99,8 @@ class DistillConfig:
                 raise unknown_name(name, value, allowed)
         if not 0 <= self.teacher_share <= 1:
             raise UsageError(f"The teacher's share lies between 0 and 1; received {self.teacher_share!r}.")
+        if self.twist is not None and not 0 <= self.twist <= MOST_TWIST:
+            raise UsageError(f"twist lies between 0 and {MOST_TWIST:g} N·m·s; received {self.twist!r}.")
         for name in ("learning_rate", "clip", "max_grad_norm"):
             value = getattr(self, name)
             if value is not None and not (isinstance(value, (int, float)) and 0 < value <= MOST[name]):
@@ -124,6 +133,11 @@ class DistillConfig:
         open_fields = ("iterations", "learning_rate", "epochs", "gradient_length", "clip", "max_grad_norm", "loss")
         own = {name: getattr(settings, name) for name in open_fields if getattr(self, name) is None}
         return replace(self, **own)
+
+    @property
+    def knobs(self) -> dict[str, Any]:
+        """Settings of the tactile sensors that differ from the task's."""
+        return {} if self.twist is None else {"twist": self.twist}
 
     @property
     def tactile(self) -> EncoderConfig | None:

@@ -9,7 +9,6 @@ from typing import Any
 import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
-from tensordict import TensorDict
 
 from brainbench.core.errors import BrainbenchError, DataError
 from brainbench.core.files import atomic_path
@@ -19,7 +18,7 @@ from robotics_bridge.policies.encoders.arms import EncoderConfig
 from robotics_bridge.policies.schema import Values
 from robotics_bridge.policies.shipped import policy_path
 from robotics_bridge.policies.student import TACTILE, TactilePolicy
-from robotics_bridge.policies.training.distill_config import DistillConfig
+from robotics_bridge.policies.training.distill_config import EARLIER_TWIST, DistillConfig
 
 CONFIG, MODEL = "config.json", "model.safetensors"
 
@@ -38,7 +37,7 @@ def build_student(
     Raises:
         UsageError: the shapes do not fit the tactile encoder.
     """
-    example = TensorDict({name: torch.zeros(1, *shapes[name]) for name in groups}, batch_size=[1])
+    example: Any = {name: torch.zeros(1, *shapes[name]) for name in groups}
     tactile = config.tactile
     return TactilePolicy(
         example, {"student": groups}, "student", actions, hidden_dims=config.hidden, embedder=config.embedder,
@@ -71,7 +70,7 @@ def load_student(folder: str | Path, *, device: str = "cpu") -> tuple[TactilePol
     if not (folder / MODEL).is_file():
         raise DataError(f"The student in {str(folder)!r} has no weights yet; its run was interrupted early.")
     given = described.part("distill")
-    config = DistillConfig.of(given.fields(DistillConfig))
+    config = DistillConfig.of({"twist": EARLIER_TWIST, **given.fields(DistillConfig)})
     if config.encoder_settings:
         given.part("encoder_settings").fields(EncoderConfig)
     shapes, actions = described.shapes("groups", MOST_NUMBERS), described.whole("actions", 1, JOINTS)

@@ -76,7 +76,7 @@ def train_student(
     env = tasks.make(
         config.task, num_envs=config.num_envs, device=device, hand=config.hand, config=config.variant,
         observe=config.observe, placement=config.placement, resolution=config.resolution, noisy=config.noisy,
-        seed=config.seed,
+        seed=config.seed, knobs=config.knobs,
     )  # fmt: skip
     teacher = load_teacher(config.teacher, env)
     config = calibrated(config, env, teacher, out)

@@ -13,7 +13,7 @@ import logging
 import math
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -22,7 +22,9 @@ import torch
 from brainbench.core.errors import BrainbenchError, DataError, DataFileNotFoundError, UsageError, missing_dependency
 from brainbench.core.files import file_hash, provenance, read_json, write_json
 from brainbench.core.reading.tensors import check_finite
+from brainbench.core.writing.locks import lock_folder
 from robotics_bridge.envs.rsl_rl import RslRlEnv
+from robotics_bridge.policies.acting import ActingModel
 from robotics_bridge.policies.evaluate import Policy
 from robotics_bridge.policies.schema import Values
 from robotics_bridge.policies.shipped import policy_path
@@ -34,8 +36,6 @@ if TYPE_CHECKING:
 
 _LOG = logging.getLogger(__name__)
 RESUME = "resume.safetensors"
-_ACTOR = ("hidden", "initial_std", "std_type", "std_range")
-"""Settings of the actor's network."""
 
 
 @dataclass(frozen=True)
@@ -250,6 +250,17 @@ def train(
         DataError: the start does not fit.
     """
     settings, options = settings or env.task.teacher, options or TeacherRun()
+    with lock_folder(run, wait=False):
+        return _train(env, run, options, settings, progress)
+
+
+def _train(
+    env: Env,
+    run: Path,
+    options: TeacherRun,
+    settings: TeacherSettings,
+    progress: Callable[[int, int, str], None] | None,
+) -> TeacherResult:
     total = options.iterations or settings.iterations
     trainer = Trainer(env, settings, seed=options.seed)
     env.goals.start_curriculum()
@@ -257,7 +268,6 @@ def train(
     if options.start is not None and not (run / RESUME).is_file():
         trainer.begin_from(options.start, std=options.start_std)
         origin = {"file": str(model_file(options.start)), "hash": file_hash(model_file(options.start))}
-    run.mkdir(parents=True, exist_ok=True)
     facts = {
         "kind": "teacher", "task": env.task.name, "hand": env.hand.name, "hand_path": str(env.hand.path or ""),
         "num_envs": env.num_envs, "seed": options.seed, "settings": asdict(settings), "rsl_rl": trainer.config,
@@ -371,21 +381,18 @@ def load_teacher(run: str | Path, env: Env) -> Policy:
     file = model_file(path)
     facts = Values.read(file.parent / "config.json")
     found = _plain(facts.part("settings").fields(TeacherSettings))
-    # Who only acts needs the actor; other settings would take memory for learning.
-    settings = replace(env.task.teacher, **{name: found[name] for name in _ACTOR if name in found})
+    hidden = found.get("hidden", env.task.teacher.hidden)
     weights = state_tree.load(file).get("actor")
     weights = weights if isinstance(weights, dict) else {}
     check_finite(weights, str(file))
-    biases = [weights.get(f"mlp.{2 * layer}.bias") for layer in range(len(settings.hidden))]
-    if [list(getattr(bias, "shape", ())) for bias in biases] != [[width] for width in settings.hidden]:
+    biases = [weights.get(f"mlp.{2 * layer}.bias") for layer in range(len(hidden))]
+    if [list(getattr(bias, "shape", ())) for bias in biases] != [[width] for width in hidden]:
         raise DataError(f"The weights in {str(file)!r} are of another policy than config.json describes.")
-    # To learn, a trainer seeds random numbers and spreads the first episodes; who only acts finds all as it was.
-    ages = env.episode_length_buf.clone()
     try:
-        with torch.random.fork_rng(devices=[env.device] if env.device.type == "cuda" else []):
-            trainer = Trainer(env, settings)
-        env.episode_length_buf.copy_(ages)
-        trainer.algorithm.get_policy().load_state_dict(weights)
+        # Who only acts finds random numbers and episodes as they were.
+        with torch.random.fork_rng(devices=[]):
+            actor = ActingModel(env.observations, env.task.groups, "actor", env.num_actions, hidden)
+        actor.load_state_dict({name: value for name, value in weights.items() if not name.startswith("distribution.")})
     except (RuntimeError, TypeError, ValueError, LookupError, AttributeError) as error:
         if isinstance(error, BrainbenchError):
             raise
@@ -394,7 +401,7 @@ def load_teacher(run: str | Path, env: Env) -> Policy:
             f"The policy of {str(path)!r} was trained on {task!r} with hand {hand!r} and does not "
             f"fit this environment ({env.task.name!r}, {env.hand.name!r})."
         ) from error
-    return Policy(trainer.algorithm.get_policy().to(env.device))
+    return Policy(actor.to(env.device))
 
 
 def _named(curriculum: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:

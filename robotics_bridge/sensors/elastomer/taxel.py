@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class Layer:
-    """Terms of a real gel pad that the published equations lack; derived in docs/tactile.md.
+    """Terms of a real gel pad that the published equations lack; derived in docs/elastomers.md.
 
     Raises:
         UsageError: a number lies outside its range.

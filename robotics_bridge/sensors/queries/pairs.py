@@ -14,6 +14,11 @@ from robotics_bridge.sensors.queries.kernels.pairs import CONTACTS, PairArrays, 
 from robotics_bridge.sensors.queries.solids import Solids
 
 _LISTED = 16
+"""Geometries in contact with one link that are listed where lists of all would be too long."""
+_LIST_BYTES = 2**28
+"""Most memory for lists of all (bytes)."""
+_PLACE_BYTES = 76
+"""Memory of one place of a list (bytes)."""
 
 
 class PairTable:
@@ -21,17 +26,26 @@ class PairTable:
 
     Sensors on one link that track the same geometries in the same way share a slot. Arrays are made by
     :meth:`freeze`, when all sensors have asked.
+
+    Args:
+        solids: the geometries.
+        num_envs: B.
+        device: where.
+        listed: geometries in contact with one link that are listed at once; None lists all, where that takes at most
+            256 MiB, and 16 otherwise.
     """
 
-    def __init__(self, solids: Solids, num_envs: int, device: Any) -> None:
-        self._solids, self._num_envs, self._device = solids, num_envs, device
+    def __init__(self, solids: Solids, num_envs: int, device: Any, listed: int | None = None) -> None:
+        self._solids, self._num_envs, self._device, self._listed = solids, num_envs, device, listed
         self._slots: list[dict[str, Any]] = []
         self.struct: Any = None
         """The Warp structure ``PairArrays``; None before :meth:`freeze`."""
         self.plan: Any = None
         """The Warp structure ``SlotArrays``; None before :meth:`freeze`."""
         self.crowded: Any = None
-        """Warp array [B]: 1 where more geometries met a sensor than its list holds."""
+        """Warp array [B]: the most geometries that ever met a sensor whose list holds fewer; 0 where none was lost."""
+        self.diverged: Any = None
+        """Warp array [B]: 1 where the state held numbers that are not finite since the last reset."""
 
     def slot(
         self,
@@ -73,13 +87,15 @@ class PairTable:
     @property
     def state_bytes(self) -> int:
         """Memory per environment [bytes]."""
-        return 4 * (sum(self._rooms) * 19 + len(self._slots) * (1 + self._words))
+        return _PLACE_BYTES * sum(self._rooms) + 4 * len(self._slots) * (1 + self._words) + 4
 
     def freeze(self) -> None:
         """Make the arrays."""
         wp, device, slots, envs = warp(), self._device, self._slots, self._num_envs
-        # Contacts of one link with many geometries at once are rare; all of a short list always fit.
-        self._rooms = [max(1, min(len(s["members"]), _LISTED) if s["contact"] else len(s["members"])) for s in slots]
+        most = self._listed
+        if most is None and envs * _PLACE_BYTES * sum(len(s["members"]) for s in slots) > _LIST_BYTES:
+            most = _LISTED
+        self._rooms = [max(1, len(s["members"][: most if s["contact"] else None])) for s in slots]
         self._words = max([1, *(-(-len(s["members"]) // 32) for s in slots)])
         count = max(len(slots), 1)
         place = np.full((count, self._solids.kinds.shape[1]), -1)
@@ -110,12 +126,12 @@ class PairTable:
             setattr(found, name, wp.zeros(listed, dtype=wp.vec3f, device=device))
         self.struct = found
         self._bits = wp.zeros((envs, count * self._words), dtype=int, device=device)
-        self.crowded = wp.zeros(envs, dtype=int, device=device)
+        self.crowded, self.diverged = (wp.zeros(envs, dtype=int, device=device) for _ in range(2))
 
     def start(self, state: HandState, age: Any) -> None:
         """Count an update, refresh the state's status and mark contacts."""
         contacts, room = self.contacts_needed, state.contact_env.shape[0]
-        inputs = [self.plan, state.arrays, self._words, self._bits, age]
+        inputs = [self.plan, state.arrays, self._words, self._bits, age, self.diverged]
         dim = max(self._num_envs, -(-room // CONTACTS)) if contacts else self._num_envs
         warp().launch(start_kernel(contacts, self._apart), dim=dim, inputs=inputs, device=self._device)
 
@@ -123,6 +139,7 @@ class PairTable:
         """List what every slot meets now; contacts were marked by :meth:`start`."""
         if not self._slots:
             return
-        inputs = [self.plan, self._solids.struct, state.arrays, self._words, self._bits, self.struct, self.crowded]
+        inputs = [self.plan, self._solids.struct, state.arrays, self._words, self._bits, self.struct]
+        inputs += [self.crowded, self.diverged]
         dim = self._num_envs * (len(self._slots) + self._apart * state.num_links)
         warp().launch(pair_kernel(self._apart), dim=dim, inputs=inputs, device=self._device)

@@ -13,7 +13,6 @@ from robotics_bridge.sensors.context import SuiteContext, fill
 from robotics_bridge.sensors.probes.kernels.probe import KinematicParams, kinematic_kernel
 from robotics_bridge.sensors.queries.surface_points import halve, sample_cloud
 from robotics_bridge.sensors.runtime import ProbeRuntime, probe_rows
-from robotics_bridge.sensors.taxels.kernels.contact_load import gather_loads, scale_field, weigh_field
 from robotics_bridge.sensors.taxels.kernels.proximity import CELL, ProximityArrays, ProximityParams, proximity_kernel
 from robotics_bridge.sensors.taxels.sensors import KinematicTaxel, ProximityTaxel
 
@@ -21,25 +20,17 @@ wp = warp()
 
 
 class KinematicRuntime(ProbeRuntime):
-    """Serves kinematic taxels of one group."""
+    """Serves kinematic taxels of one group, each by its own law."""
 
     def __init__(self, sensors: Mapping[str, KinematicTaxel], context: SuiteContext) -> None:
         first = next(iter(sensors.values()))
-        scaled = first.total == "engine"
-        super().__init__(sensors, 6, context, fusable=not scaled)
+        super().__init__(sensors, 6, context)
         self._kernel = kinematic_kernel(
             self.kinds, first.query == "raycast", first.convention == "physical", self.mode, *self.stores,
             context.device.is_cuda,
         )  # fmt: skip
-        laws = [fill(KinematicParams, sensor) for sensor in sensors.values()]
-        self._laws = context.array(laws, KinematicParams)
-        shape = (len(laws), context.num_envs)
-        self._loads: Any = context.zeros(shape, wp.vec3f) if scaled else None
-        self._scales = context.zeros(shape)
-        parts = list(self.slices.values())
-        spans = [(p.start, p.start + p.count, slot) for p, slot in zip(parts, self.slots, strict=True)]
-        self._spans = context.array(spans, wp.vec3i)
-        self._rows = context.array(probe_rows(parts, context, self.mode), wp.vec4i)
+        self._laws = context.array([fill(KinematicParams, sensor) for sensor in sensors.values()], KinematicParams)
+        self._rows = context.array(probe_rows(self.slices.values(), context, self.mode), wp.vec4i)
 
     def update(self, state: HandState, dt: float) -> None:
         """Read the state."""
@@ -47,19 +38,7 @@ class KinematicRuntime(ProbeRuntime):
         c = self.context
         inputs = [self.probes, self._rows, c.solids.struct, c.pairs.struct, self.io, self._laws]
         c.launch(self._kernel, (c.num_envs, self._rows.shape[0]), *inputs)
-        if self._loads is not None:
-            self._scale(state)
         self.finish(dt)
-
-    def _scale(self, state: HandState) -> None:
-        """Make the field push as the engine does."""
-        c, plan = self.context, self.context.pairs.plan
-        self._loads.zero_()
-        room = state.contact_env.shape[0]
-        c.launch(gather_loads, room, self._spans, plan, c.solids.struct.link, state.arrays, self._loads)
-        inputs = [self._spans, plan, state.arrays, self._truth, self._loads, self._scales]
-        c.launch(weigh_field, self._loads.shape, *inputs)
-        self.launch(scale_field, self.part, self._scales, self._truth, self._measured, int(self.noisy))
 
 
 class ProximityRuntime(ProbeRuntime):

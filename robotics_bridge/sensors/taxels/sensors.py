@@ -2,13 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import ClassVar, Literal
+from typing import TYPE_CHECKING, ClassVar, Literal, Self
 
 from brainbench.core.errors import UsageError, unknown_name
+from brainbench.core.plugins import load_object
 from robotics_bridge.sensors.noise.model import GRID_KNOBS, TAXEL_KNOBS
 from robotics_bridge.sensors.sensor import Convention, ProbeSensor, QuerySensor
 
+if TYPE_CHECKING:
+    from robotics_bridge.sensors.context import SuiteContext
+    from robotics_bridge.sensors.runtime import Runtime
+
+PUBLISHED_TWIST = 2.0
+"""k_ω of the published parameters (N·m·s): that of a disc of 1.4 m, which drowns every other moment when an object
+turns."""
 CONVENTIONS = ("physical", "thesis")
 
 
@@ -27,7 +36,7 @@ class KinematicTaxel(QuerySensor):
         f = k_n d^α m + c_n d^α v_n ± k_t v_t,    τ = x × f ± k_ω (ω·m) m
 
     ``physical`` takes plus signs (friction drags the sensor along) and never pulls; ``thesis`` takes the published
-    minus signs. Defaults are the published parameters (4.10).
+    minus signs. Defaults are the published parameters (4.10), but for k_ω in the physical convention.
 
     Raises:
         UsageError: the convention or the total is unknown, or the exponent is not positive.
@@ -41,12 +50,15 @@ class KinematicTaxel(QuerySensor):
     """α."""
     shear: float = 2.0
     """k_t, N·s/m."""
-    twist: float = 2.0
-    """k_ω, N·m·s."""
+    twist: float | None = None
+    """k_ω, N·m·s. None is that of a disc of the largest sensing radius R that slips with k_t, k_t R²/2 (1.6e-5 at
+    4 mm), and with ``thesis`` :data:`PUBLISHED_TWIST`."""
     convention: Convention = "physical"
     total: Literal["law", "engine"] = "law"
-    """``law``: each taxel by itself, as published. ``engine``: the field is scaled so that it pushes with just the
-    normal force that the physics engine resolved between the link and what it tracks."""
+    """``law``: each taxel by itself, as published. ``engine``: the taxels of a sensor add up to the forces, friction at
+    rest included, of the engine's contacts between its link and what it tracks. Each contact is spread over the taxels
+    that feel that body from that side, by d^α; stiffness, damping, shear and twist play no part. A taxel without such
+    a contact reads 0, and a contact with no taxel near it is felt by none (``SensorSuite.unfelt``)."""
 
     channels: ClassVar[int] = 6
     units: ClassVar[str] = "N, N m"
@@ -54,11 +66,22 @@ class KinematicTaxel(QuerySensor):
     shared: ClassVar[tuple[str, ...]] = ("query", "convention", "total")
     runtime: ClassVar[str] = "robotics_bridge.sensors.taxels.runtime:KinematicRuntime"
 
+    @classmethod
+    def build(cls, sensors: Mapping[str, Self], context: SuiteContext) -> Runtime:
+        """Return the runtime that serves these sensors (by name) together."""
+        if next(iter(sensors.values())).total == "law":
+            return super().build(sensors, context)
+        return load_object("robotics_bridge.sensors.taxels.contact_load:ContactLoadRuntime", "runtime")(sensors, context)
+
     def __post_init__(self) -> None:
         super().__post_init__()
         _check_convention(self.convention)
         if self.total not in ("law", "engine"):
             raise unknown_name("total of a force field", self.total, ("law", "engine"))
+        if self.twist is None:
+            radius = float(self.probes.radius.max(initial=0.0))
+            published = self.convention == "thesis"
+            object.__setattr__(self, "twist", PUBLISHED_TWIST if published else self.shear * radius**2 / 2)
         if not self.exponent > 0:
             raise UsageError(f"The exponent of a contact law is positive; received {self.exponent!r}.")
 

@@ -56,12 +56,13 @@ class TemperatureRuntime(Runtime):
         heat.link_diffusivity = context.array([item.diffusivity for item in materials], float)
         heat.link_temperature = context.array(temperatures, float)
         heat.number, heat.kept = context.zeros(many, int), context.zeros((*many, CAPACITY), int)
-        heat.touched, heat.conductance, heat.inflow = (context.zeros(shape) for _ in range(3))
+        heat.touched, heat.covered, heat.conductance, heat.inflow = (context.zeros(shape) for _ in range(4))
         heat.temperature, heat.element = (context.zeros(shape, wp.float64) for _ in range(2))
         self.heat = heat
         """Warp structure of contacts, bodies and fields."""
         self._buffers = [context.zeros(shape, wp.float64) for _ in range(2)]
-        self.lasting = [*self._buffers, heat.temperature, heat.element, heat.touched, heat.conductance, heat.inflow]
+        self.lasting = [*self._buffers, heat.temperature, heat.element, heat.touched, heat.covered]
+        self.lasting += [heat.conductance, heat.inflow]
         self.lasting += [heat.number, heat.kept, heat.link_temperature]
         self._axes = [axis for axis in range(3) if any(sensor.cells[axis] > 1 for sensor in self._sensors)]
         if not self.noisy and any(_lags(sensor) for sensor in self._sensors):
@@ -81,7 +82,7 @@ class TemperatureRuntime(Runtime):
         return fill(
             ThermalParams, sensor, link=self.context.scene.link_index(sensor.link), first=first,
             shape=wp.vec3i(*sensor.cells), low=wp.vec3f(*low), cell=wp.vec3f(*edges), conductivity=own.conductivity,
-            capacity=capacity, emissivity=own.emissivity if sensor.radiates else 0.0,
+            diffusivity=own.diffusivity, capacity=capacity, emissivity=own.emissivity if sensor.radiates else 0.0,
             ambient=sensor.ambient_temperature, base=sensor.base_temperature, contact=contact,
             bluntness=sensor.contact_radius, published=int(sensor.conduction == "thesis"), cold=cold, warm=warm,
         )  # fmt: skip
@@ -114,7 +115,8 @@ class TemperatureRuntime(Runtime):
         c, heat, cells = self.context, self.heat, (self.context.num_envs, self.count)
         heat.number.zero_()
         c.launch(collect_contacts, state.contact_env.shape[0], state.arrays, heat)
-        c.launch(conduct_contacts, heat.kept.shape, state.arrays, heat, self.io)
+        for measure in (1, 0):
+            c.launch(conduct_contacts, heat.kept.shape, measure, state.arrays, heat, self.io)
         # Sources, contacts and surfaces first, then diffusion axis by axis: the exponentials of the axes commute, so
         # their order does not matter. Cells read their neighbours, hence two buffers in turn.
         now, spare = self._buffers

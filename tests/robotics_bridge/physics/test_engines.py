@@ -86,7 +86,7 @@ def test_states_refuse_what_does_not_fit() -> None:
         state.set_contacts([0, 1], [[0, 1], [0, 1]])
     with pytest.raises(UsageError, match=r"shape \(2, 3, 7\)"):
         state.set_pose(np.zeros((3, 3, 7)))
-    with pytest.raises(UsageError, match="has no 'colour'"):
+    with pytest.raises(UsageError, match="'colour'"):
         state.set_contacts([0], [[0, 1]], colour=[1])
 
 

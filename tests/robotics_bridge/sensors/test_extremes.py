@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import warnings
+
 import numpy as np
 import pytest
 
-from robotics_bridge.physics import Geometry, HandState, TouchScene, Variants
+from brainbench.core.errors import UsageError
+from robotics_bridge.physics import Geometry, HandState, MujocoEngine, TouchScene, Variants
 from robotics_bridge.sensors import (
     ContactDepthProbe,
     ElastomerTaxel,
@@ -109,11 +112,76 @@ def test_more_touching_geometries_than_are_listed_are_said() -> None:
     balls = [Geometry(name=f"b{i}", link=f"b{i}", kind="sphere", size=(0.002,)) for i in range(40)]
     scene = pad_scene(*balls)
     probe = Probes([[0, 0, 0.005]], [[0, 0, 1.0]], 0.001)
-    suite = SensorSuite(scene, {"d": ContactDepthProbe(link="hand", probes=probe)}, num_envs=2)
     state = state_of(scene, poses_at(42, {}, 2), touch=False)
     state.set_contacts([0] * 40 + [1] * 3, [(0, i + 1) for i in [*range(40), 0, 1, 2]])
+    short = SensorSuite(scene, {"d": ContactDepthProbe(link="hand", probes=probe)}, num_envs=2, listed=16)
+    with pytest.warns(RuntimeWarning, match="listed=40"):
+        short.update(state)
+    assert short.crowded.tolist() == [True, False]
+    with warnings.catch_warnings(action="error"):
+        short.update(state)
+    # Unless it is told otherwise, a suite looks at all of them.
+    suite = SensorSuite(scene, {"d": ContactDepthProbe(link="hand", probes=probe)}, num_envs=2)
     suite.update(state)
-    assert suite.crowded.tolist() == [True, False]
+    assert not suite.crowded.any()
+
+
+def test_an_engine_that_runs_out_of_room_says_once_how_much_it_needs() -> None:
+    import mujoco
+
+    balls = "".join(
+        f'<body pos="{0.03 * i} 0 .0099"><freejoint/><geom type="sphere" size=".01"/></body>' for i in range(9)
+    )
+    model = mujoco.MjModel.from_xml_string(
+        f'<mujoco><worldbody><geom type="plane" size="1 1 1"/>{balls}</worldbody></mujoco>'
+    )
+    with pytest.warns(RuntimeWarning, match="contacts=9"):
+        engine = MujocoEngine(model, 2, contacts=4)
+    with warnings.catch_warnings(action="error"):
+        engine.forward()
+        MujocoEngine(model, 2, contacts=9)
+
+
+def test_an_environment_that_was_lost_reads_nan_until_its_reset() -> None:
+    ball = Geometry(name="ball", link="ball", kind="sphere", size=(0.01,))
+    probe = Probes([[0, 0, 0.005]], [[0, 0, 1.0]], 0.001)
+    scene = pad_scene(ball)
+    suite = SensorSuite(scene, {"d": SurfaceDistanceProbe(link="hand", probes=probe)}, num_envs=2)
+    good = poses_at(3, {2: (0, 0, 0.02)}, 2)
+    bad = good.copy()
+    bad[0, 2, 0] = np.nan
+    state = state_of(scene, bad)
+    suite.update(state)
+    state.set_pose(good)
+    for _ in range(2):
+        suite.update(state)
+        assert suite.read("d").isnan().flatten().tolist() == [True, False]
+    suite.reset([1])
+    suite.update(state)
+    assert suite.diverged.tolist() == [True, False]
+    suite.reset([0])
+    suite.update(state)
+    np.testing.assert_allclose(suite.read("d").flatten(), 0.005, atol=1e-7)
+
+
+def test_poses_are_normalised_and_contacts_start_afresh() -> None:
+    ball = Geometry(name="ball", link="ball", kind="sphere", size=(0.01,))
+    state = state_of(pad_scene(ball), poses_at(3, {}), touch=False)
+    pose = poses_at(3, {})
+    pose[..., 3:] = [2, 0, 0, 2]
+    state.set_pose(pose)
+    np.testing.assert_allclose(state.pose_torch[0, 1], [0, 0, 0, 0, 0, np.sqrt(0.5), np.sqrt(0.5)], atol=1e-7)
+    pose[0, 2, 3:] = 0
+    with pytest.raises(UsageError, match=r"\(0, 2\)"):
+        state.set_pose(pose)
+    state.set_contacts([0], [(0, 1)], force=[3.0], distance=[-1.0], position=[(1, 2, 3)], normal=[(0, 0, 1)])
+    state.set_contacts([0], [(0, 1)])
+    blank = HandState.empty(1, 3, 1)
+    for name in ("force", "distance", "position", "normal", "friction"):
+        kept, empty = (getattr(s, f"contact_{name}").numpy()[:1] for s in (state, blank))
+        np.testing.assert_array_equal(kept, empty)
+    with pytest.raises(UsageError, match="0 to 0; received 7"):
+        state.set_contacts([7], [(0, 1)])
 
 
 def test_objects_that_differ_between_environments_are_each_their_own() -> None:

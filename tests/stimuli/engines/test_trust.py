@@ -7,6 +7,8 @@ import numpy as np
 import pytest
 
 from brainbench.core.errors import UsageError
+from brainbench.stimuli.engines import get_engine
+from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.engines.protocol import Job, StillFollicle
 from brainbench.stimuli.engines.reach import reachable
 from brainbench.stimuli.engines.trust import (
@@ -14,10 +16,9 @@ from brainbench.stimuli.engines.trust import (
     BENT,
     GOT_INSIDE,
     LOST,
-    OK,
     STARTED_INSIDE,
-    RunFacts,
     Verdict,
+    check_jobs,
     force_change,
     halved,
     judge,
@@ -30,6 +31,7 @@ from brainbench.stimuli.engines.trust import (
 )
 from brainbench.stimuli.objects.obstacle import Capsule, Obstacle, Sphere, TriangleMesh
 from brainbench.stimuli.whiskers.whisker import Whisker
+from tests.factories.trust import facts
 
 WHISKER = Whisker(0.02, 50e-6, 5e-6, young_modulus=4e9, density=1260.0, damping_ratio=0.3)
 TIMES = np.linspace(0.0, 0.01, 11)
@@ -89,15 +91,6 @@ def test_a_surface_without_parts_is_refused_in_words():
         require_parts([Job(WHISKER, StillFollicle(), (parts, bare), TIMES[1:])], "mujoco")
 
 
-def _facts(**changed):
-    """Facts of one whisker in good order but for what is changed."""
-    values = {
-        "status": OK, "failed": 0.0, "strength": 0.0, "strong_at": np.inf, "strongest": 30.0, "travel": 0.0,
-        "fast_at": np.inf, "residual": 0.01, "crowded": 0, "steps": 100, "depth": 1e-5, "peak": 1e-3,
-    }  # fmt: skip
-    return RunFacts(**{name: np.array([value]) for name, value in (values | changed).items()})
-
-
 @pytest.mark.parametrize(
     ("changed", "until", "retryable", "words"),
     [
@@ -122,7 +115,7 @@ def _facts(**changed):
 def test_what_goes_wrong_first_is_told_and_finer_steps_are_tried_where_they_may_mend_it(
     changed, until, retryable, words
 ):
-    verdict = judge(_facts(**changed))
+    verdict = judge(facts(**changed))
     assert verdict.until.tolist() == [until]
     assert verdict.retryable.tolist() == [retryable]
     assert verdict.unstable.tolist() == [until < np.inf]
@@ -146,11 +139,11 @@ def test_the_residual_is_what_changed_last_over_the_forces():
     ],
 )
 def test_whiskers_near_a_limit_are_suspicious_and_those_beyond_it_are_not(changed, suspicious):
-    assert judge(_facts(**changed)).suspicious.tolist() == [suspicious]
+    assert judge(facts(**changed)).suspicious.tolist() == [suspicious]
 
 
 def test_a_force_that_changes_by_a_fifth_with_half_the_step_is_flagged_and_tried_again():
-    verdict, which = judge(_facts(depth=3e-4)), np.array([True])
+    verdict, which = judge(facts(depth=3e-4)), np.array([True])
     kept = halved(verdict, np.array([0.19]), which)
     assert (kept.unstable.tolist(), kept.suspicious.tolist(), kept.reasons[0]) == ([False], [False], "")
     for change, words in ((0.23, "by 23%"), (np.nan, "beyond what can be trusted")):
@@ -192,3 +185,12 @@ def test_whiskers_that_may_be_mended_are_simulated_again_at_most_twice(retry, fi
     assert run_with_retries(simulate, retry).finer.tolist() == finest
     again = [([False, True, True, True, False], 5), ([False, False, True, True, False], 10)]
     assert calls == [(None, 1), *(again if retry > 1 else [])]
+
+
+def test_an_engine_whose_whiskers_only_bend_refuses_twist():
+    jobs = [Job(WHISKER, StillFollicle(), (), TIMES[1:])]
+    engine = get_engine("bullet")
+    check_jobs(engine, jobs, Fidelity(), None)
+    check_jobs(engine, jobs, Fidelity(twist=False), None)
+    with pytest.raises(UsageError, match=r"'bullet'.*'rod'"):
+        check_jobs(engine, jobs, Fidelity(twist=True), None)

@@ -94,7 +94,7 @@ def test_moments_colour_the_whiskers():
     assert not ((image[..., 0] > 180) & (image[..., 1] > 130) & (image[..., 2] < 90)).any()
 
 
-def test_whiskers_of_unknown_shape_are_left_out_and_said_aloud(caplog, tmp_path, monkeypatch):
+def test_whiskers_of_unknown_shape_are_drawn_black_and_unbent_and_said_aloud(caplog, tmp_path, monkeypatch):
     recording = record(SCENE, [0.0], fidelity=FAST, cache=False)
     broken = (np.full_like(recording.joints[0], np.nan), recording.joints[1])
     recording = Recording(recording.scene, recording.times, broken, recording.moments)
@@ -102,6 +102,13 @@ def test_whiskers_of_unknown_shape_are_left_out_and_said_aloud(caplog, tmp_path,
     monkeypatch.setattr(module, "record", lambda *args, **options: recording)
     render(SCENE, tmp_path / "a.png", times=[0.0], camera=ABOVE, style=SMALL)
     assert re.search("unstable .*'C1'", caplog.text)
+    # Both still rest at t = 0, so the one whose shape is not known lies where it lay.
+    whole = record(SCENE, [0.0], fidelity=FAST, cache=False)
+    np.testing.assert_allclose(recording.unbent(0, 0), whole.joints[0][0], atol=1e-7)
+    pictures = [Picture(some, ABOVE, SMALL) for some in (whole, recording)]
+    known, unknown = (picture._whiskers(0, picture.lens) for picture in pictures)
+    assert len(known.corners) == len(unknown.corners)
+    assert unknown.colors.reshape(-1, 3).min(axis=1).min() < known.colors.reshape(-1, 3).max(axis=1).min()
 
 
 def test_a_picture_is_written_whole_and_the_same_every_time(tmp_path):

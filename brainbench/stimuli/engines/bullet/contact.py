@@ -64,6 +64,9 @@ def _sweep(yielding: NDArray, free: NDArray, friction: NDArray, force: NDArray) 
         change = 0.0
         for contact, limit in enumerate(friction.tolist()):
             n = 3 * contact
+            # At the base point a force has no lever and moves nothing.
+            if not yielding[n, n]:
+                continue
             # Exact solution of the one normal row, held at a force of zero: one step of projected Gauss–Seidel.
             step = max(-force[n], -moved[n] / yielding[n, n])
             if step:

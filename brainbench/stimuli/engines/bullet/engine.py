@@ -109,6 +109,8 @@ class _Run:
         self.arc = np.full(self.steps, np.nan)
         self.penetration = 0.0
         self.failed, self.reason = self.steps, ""
+        # From there on nothing is used, and contact at the base point has no lever.
+        self.last = stepped.overlap[0]
         self.shapes: dict[int, NDArray] = {}
         self._shapes_at = shapes_at
         self._beyond = (chain.whisker.arc_length - np.repeat(chain.nodes[:-1], 2)) * MILLI
@@ -129,6 +131,8 @@ class _Run:
             if n in self._shapes_at or not n:
                 self.world.place([*self.path[n], *self.hinges])
                 self.shapes[n] = self.world.shape()
+            if n == self.last:
+                return
             problem = self._advance(n)
             if problem:
                 self.failed, self.reason = n, f"at {self.times[n]:.6g} s {problem}"

@@ -16,8 +16,10 @@ from importlib import import_module
 import numpy as np
 from numpy.typing import NDArray
 
+from brainbench.core.rotations import euler_matrix
 from brainbench.stimuli.engines.mujoco.drive import ARMATURE
 from brainbench.stimuli.engines.mujoco.model import SLOT_WIDTH, WhiskerModel, build_model, engine
+from brainbench.stimuli.engines.planarity import stays_in_plane
 from brainbench.stimuli.engines.protocol import Job, Trace
 from brainbench.stimuli.engines.stepping import SteppedEngine, SteppedJob
 from brainbench.stimuli.engines.trust import LARGEST_BEND, state_fault, strongest_force
@@ -35,6 +37,7 @@ class MujocoWhiskerEngine(SteppedEngine):
     """Runs whisker jobs in MuJoCo."""
 
     name = "mujoco"
+    twists = True
     package = "mujoco-core"
 
     @contextlib.contextmanager
@@ -51,8 +54,11 @@ class MujocoWhiskerEngine(SteppedEngine):
     def simulate(self, stepped: SteppedJob) -> Trace:
         """See :meth:`SteppedEngine.simulate`."""
         job, chain = stepped.job, stepped.chain
-        built = build_model(job, chain, stepped.reach, stepped.step, stepped.times)
-        sensors, hinges, failed, reason = _integrate(built, job, chain.links, stepped.times)
+        twists = stepped.fidelity.twist is not False
+        if twists:
+            twists = not stays_in_plane(job, stepped.reach, *stepped.pose, stepped.times)
+        built = build_model(job, chain, stepped.reach, stepped.step, stepped.times, twists=twists)
+        sensors, hinges, failed, reason = _integrate(built, job, stepped.times)
         failed, reason = stepped.end(failed, reason)
         frames = stepped.frames(failed)
         share, nearest = frames.share, frames.nearest
@@ -84,9 +90,9 @@ def _wrench(built: WhiskerModel, sensors: NDArray, steps: NDArray) -> NDArray[np
 
 
 def _integrate(
-    built: WhiskerModel, job: Job, links: int, times: NDArray
+    built: WhiskerModel, job: Job, times: NDArray
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], int, str]:
-    """Step the model; return sensors [n, …] and hinge angles [n, 2N] before every step, first bad step, reason.
+    """Step the model; return sensors [n, …] and hinge angles [n, hinge] before every step, first bad step, reason.
 
     The first bad step is n, and the reason empty, when all went well.
     """
@@ -95,7 +101,7 @@ def _integrate(
     data = mujoco.MjData(model)
     steps, strongest = len(times) - 1, strongest_force(job.whisker) * MILLI
     sensors = np.zeros((steps, model.nsensordata))
-    hinges = np.zeros((steps, 2 * links))
+    hinges = np.zeros((steps, 2 * len(built.twisting) + np.count_nonzero(built.twisting)))
     spec = int(mujoco.mjtState.mjSTATE_QFRC_APPLIED)
     if job.loads:
         spec |= int(mujoco.mjtState.mjSTATE_XFRC_APPLIED)
@@ -159,12 +165,20 @@ def _control(built: WhiskerModel, job: Job, times: NDArray, first: int) -> NDArr
 
 
 def _shape(built: WhiskerModel, chain: Chain, hinges: NDArray, steps: NDArray) -> NDArray[np.float64]:
-    """Return joint and tip positions [n, N + 1, 3] (mm, world) from the hinge angles [n, 2N] before ``steps`` [n]."""
+    """Return joint and tip positions [n, N + 1, 3] (mm, world) from hinge angles [n, hinge] before ``steps`` [n]."""
     frame = built.rotation[steps]
     points = [built.base[steps]]
-    for i in range(chain.links):
-        # Rest bend about z, then the hinges about y and z, as in the model.
-        frame = frame @ _rotation_zyz(chain.rest_angles[i], hinges[:, 2 * i], hinges[:, 2 * i + 1])
+    first = 0
+    for i, twists in enumerate(built.twisting):
+        # Rest bend about z, then the hinges about y and z, as in the model; twist comes before half of the rest bend.
+        half = chain.rest_angles[i] / 2 if twists else 0.0
+        frame = frame @ _rotation_zyz(chain.rest_angles[i] - half, hinges[:, first], hinges[:, first + 1])
+        if twists:
+            # Rotations about x turn y and z; two columns are combined in place of a matrix product.
+            c, s = np.cos(hinges[:, first + 2])[:, None], np.sin(hinges[:, first + 2])[:, None]
+            x, y, z = np.moveaxis(frame, -1, 0)
+            frame = np.stack([x, c * y + s * z, c * z - s * y], axis=-1) @ euler_matrix((0.0, 0.0, half))
+        first += 2 + int(twists)
         points.append(points[-1] + frame[:, :, 0] * chain.lengths[i] * MILLI)
     return np.stack(points, axis=1)
 

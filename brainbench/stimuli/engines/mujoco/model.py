@@ -2,7 +2,7 @@
 
 These units keep every number near one; with kilograms MuJoCo rejects thin tips as massless. Body tree:
 world → only the follicle joints that move → base, which carries the force and torque sensors → link 0
-→ … → link N − 1, each with two hinges. Letters: n time step, N link.
+→ … → link N − 1, each with two hinges, and a third where the chain twists. Letters: n time step, N link.
 """
 
 from __future__ import annotations
@@ -67,6 +67,8 @@ class WhiskerModel:
     """Body on which each load of the job acts."""
     margins: NDArray[np.float64]
     """[N] thickness (mm) of each link beyond the core from which contact distances are counted."""
+    twisting: NDArray[np.bool_]
+    """[N] True for joints with a third hinge."""
 
 
 def engine() -> Any:
@@ -88,8 +90,10 @@ def engine() -> Any:
     return module
 
 
-def build_model(job: Job, chain: Chain, reach: Reach, time_step: float, times: NDArray[np.float64]) -> WhiskerModel:
-    """Compile the model of ``job`` for the step times [n + 1] (s)."""
+def build_model(
+    job: Job, chain: Chain, reach: Reach, time_step: float, times: NDArray[np.float64], *, twists: bool = False
+) -> WhiskerModel:
+    """Compile the model of ``job`` for the step times [n + 1] (s), with or without the hinges for twist."""
     step = time_step * MILLI
     position, euler = (np.asarray(values, dtype=float) for values in job.follicle.pose(times))
     position = position * MILLI
@@ -118,7 +122,8 @@ def build_model(job: Job, chain: Chain, reach: Reach, time_step: float, times: N
     _add(base, "site", name="base", size=1e-3)
     travel = _travel(job, reach, times, position, euler)
     cores = [_thickness(chain, link, travel) for link in range(chain.links)]
-    _add_links(base, assets, job, chain, chain.damping(time_step), reach.nearest, cores)
+    twisting = (chain.torsion > 0) & twists
+    _add_links(base, assets, job, chain, chain.damping(time_step), reach.nearest, cores, twisting)
     sensors = _add(root, "sensor")
     _add(sensors, "force", site="base")
     _add(sensors, "torque", site="base")
@@ -132,6 +137,7 @@ def build_model(job: Job, chain: Chain, reach: Reach, time_step: float, times: N
         rotation=base_rotation(euler)[:-1],
         loads=tuple(model.body(f"load{index}").id for index in range(len(job.loads))),
         margins=np.array([margin for _, margin in cores]),
+        twisting=twisting,
     )
 
 
@@ -165,17 +171,30 @@ def _add_follicle(world: Element, position: NDArray, euler: NDArray) -> tuple[El
 
 
 def _add_links(
-    base: Element, assets: Element, job: Job, chain: Chain, damping: NDArray, nearest: float, cores: list
+    base: Element,
+    assets: Element,
+    job: Job,
+    chain: Chain,
+    damping: NDArray,
+    nearest: float,
+    cores: list,
+    twisting: NDArray[np.bool_],
 ) -> None:
     body, end = base, 0.0
     for i in range(chain.links):
         body = _add(body, "body", pos=(end, 0, 0), quat=_quaternion(chain.rest_angles[i], (0.0, 0.0, 1.0)))
         end = chain.lengths[i] * MILLI
-        # Bending about two axes across the link with the chain's lumped stiffness; twist is left out.
-        spring = {"stiffness": chain.stiffness[i] * MICRO, "damping": damping[i] * MICRO * MILLI}
-        for axis in ((0, 1, 0), (0, 0, 1)):
-            _add(body, "joint", type="hinge", axis=axis, **spring)
-        # Twist is rigid, so the minute axial inertia of a tip only has to pass MuJoCo's lower limit.
+        # Bending about two axes across the rod with the chain's lumped stiffness, then twist. A joint that twists has
+        # its axes halfway between both links: turned back from the body's by half the rest bend.
+        half = chain.rest_angles[i] / 2 if twisting[i] else 0.0
+        axes = [(np.sin(half), np.cos(half), 0), (0, 0, 1), (np.cos(half), -np.sin(half), 0)]
+        springs = [chain.stiffness[i], chain.stiffness[i], chain.torsion[i]]
+        for axis, spring in list(zip(axes, springs, strict=True))[: 2 + int(twisting[i])]:
+            # Damping is proportional to stiffness.
+            lag = damping[i] / chain.stiffness[i]
+            how = {"stiffness": spring * MICRO, "damping": lag * spring * MICRO * MILLI}
+            _add(body, "joint", type="hinge", axis=axis, **how)
+        # The minute axial inertia of a tip has to pass MuJoCo's lower limit.
         axial, transverse = np.maximum(chain.inertias[i] * MICRO * MILLI**2, 1e-14)
         inertia = {"mass": chain.masses[i] * MICRO, "diaginertia": (axial, transverse, transverse)}
         _add(body, "inertial", pos=(chain.centres[i] * MILLI, 0, 0), **inertia)

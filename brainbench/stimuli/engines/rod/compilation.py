@@ -16,6 +16,7 @@ def load_kernels(
     capacity: int,
     needs: int = MESHES,
     *,
+    hinges: int = 2,
     compiling: Callable[[bool], None] | None = None,
     **options: Any,
 ) -> Any:
@@ -32,9 +33,9 @@ def load_kernels(
 
     with BUILDING:
         if device.is_cuda:
-            kernels = build_kernels(real, capacity, needs, cuda=True, **options)
+            kernels = build_kernels(real, capacity, needs, cuda=True, hinges=hinges, **options)
         else:
-            kernels = build_kernels(real, capacity, sliced=options.get("sliced", False))
+            kernels = build_kernels(real, capacity, sliced=options.get("sliced", False), hinges=hinges)
     if device.is_cuda and options:  # compiled at their launch, for the blocks that it asks for
         return kernels
     block = 1 if device.is_cpu else None

@@ -16,13 +16,24 @@ from brainbench.core.devices import pick_device, usable_processors
 from brainbench.core.progress import Progress as NamedProgress
 from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.engines.job_pool import run_groups
+from brainbench.stimuli.engines.motion_pieces import KNOT, Cutting
+from brainbench.stimuli.engines.planarity import stays_in_plane
 from brainbench.stimuli.engines.protocol import Job, Progress, Trace, WhiskerEngine
 from brainbench.stimuli.engines.reach import Reach, reachable
 from brainbench.stimuli.engines.rod.compilation import load_kernels
 from brainbench.stimuli.engines.rod.launch import LaunchResult, WhiskerSolver, real_type
-from brainbench.stimuli.engines.rod.limits import WIDEST
-from brainbench.stimuli.engines.rod.packing import KNOT, PackedJobs, PackedMotions, capacity_for, follicle_knots
-from brainbench.stimuli.engines.rod.shapes import PackedShapes
+from brainbench.stimuli.engines.rod.limits import FINEST, WIDEST
+from brainbench.stimuli.engines.rod.packing import (
+    GRID,
+    PackedJobs,
+    PackedMotions,
+    Track,
+    body_track,
+    capacity_for,
+    follicle_track,
+    still_track,
+)
+from brainbench.stimuli.engines.rod.shapes import PackedShapes, TrackedObstacle
 from brainbench.stimuli.engines.stepping import is_silent, silent_trace
 from brainbench.stimuli.engines.sweep_batch import SweepBatch
 from brainbench.stimuli.engines.trust import check_jobs, run_with_retries, step_travel
@@ -51,6 +62,7 @@ class RodEngine(WhiskerEngine):
     package = "warp-lang"
     devices = ("cpu", "cuda")
     solvers = ("dynamic", "quasistatic")
+    twists = True
     surfaces = True
     retries = True
     batches = True
@@ -66,7 +78,10 @@ class RodEngine(WhiskerEngine):
             what = f"compiling the whisker solver for {capacity} links (once; it is kept)"
             tell = progress or (lambda done, total, what: None)
             real = real_type(fidelity)
-            load_kernels(device, real, capacity, compiling=lambda begins: tell(0 if begins else 1, 1, what))
+            hinges = 2 + (fidelity.twist is not False)
+            load_kernels(
+                device, real, capacity, hinges=hinges, compiling=lambda begins: tell(0 if begins else 1, 1, what)
+            )
 
         with ThreadPoolExecutor(max_workers=max(1, len(sizes))) as pool:
             list(pool.map(load, sizes))
@@ -114,34 +129,49 @@ class _Task:
     """A job that must be simulated."""
 
     job: Job
-    reach: Reach
-    times: NDArray[np.float64]
-    """[n] s at which base and obstacles were looked at."""
-    pose: tuple[NDArray[np.float64], NDArray[np.float64]]
-    """Base point [n, 3] (m) and angles [n, 3] (rad) at these times."""
+    chain: Chain
+    base: Track
+    bodies: tuple[TrackedObstacle, ...]
+    """What is in reach."""
+    names: tuple[int, ...]
+    """What tells these from other bodies."""
+    limit: NDArray[np.float64] | None
+    """[cell] longest step from each cell of the motions on (s); None for any."""
+    fast: tuple[float, float]
+    """When (s) an object first moves further against the whisker in the shortest step than contacts are looked for, inf
+    if never, and how far (m)."""
+    twists: bool
+    """Whether it may leave its plane, and may twist at this fidelity."""
 
 
 def _simulate(
     jobs: dict[int, Job], retry: int, fidelity: Fidelity, device: Any, record_shape: bool
 ) -> dict[int, Trace]:
     """Run jobs that share their readings and their capacity in one launch, and return their traces."""
-    first = next(iter(jobs.values()))
-    stop = first.times[-1]
-    # Base and obstacles are looked at about once per knot of their motion to find what is in reach.
-    seen = np.linspace(first.start, stop, max(2, math.ceil((stop - first.start) / KNOT)))
     tasks: dict[int, _Task] = {}
     traces: dict[int, Trace] = {}
+    bodies: dict[Any, tuple[NDArray, Track]] = {}
+    spent: dict[int, float] = {}
     for index, job in jobs.items():
         started = time.thread_time()
-        position, euler = (np.asarray(values, dtype=float) for values in job.follicle.pose(seen))
-        reach = reachable(job.whisker, position, job.obstacles, seen, surfaces=True)
-        if is_silent(job, reach, position, euler):
+        task = _task(job, fidelity, bodies)
+        if task is None:
             traces[index] = silent_trace(job, fidelity, record_shape, time.thread_time() - started)
         else:
-            tasks[index] = _Task(job, reach, seen, (position, euler))
-    if not tasks:
-        return traces
-    given, seconds = list(tasks.values()), np.zeros(len(tasks))
+            tasks[index] = task
+            spent[index] = time.thread_time() - started
+    for twists in (False, True):
+        some = {index: task for index, task in tasks.items() if task.twists == twists}
+        seconds = np.array([spent[index] for index in some])
+        traces |= _simulate_alike(some, seconds, retry, fidelity, device, record_shape) if some else {}
+    return traces
+
+
+def _simulate_alike(
+    tasks: dict[int, _Task], seconds: NDArray, retry: int, fidelity: Fidelity, device: Any, record_shape: bool
+) -> dict[int, Trace]:
+    """Run tasks of which all or none twist in one launch; ``seconds`` [task] is the processor time of each so far."""
+    given = list(tasks.values())
 
     def launch(which: NDArray[np.bool_] | None, finer: int) -> LaunchResult:
         rows = np.arange(len(given)) if which is None else np.flatnonzero(which[:, 0])
@@ -151,7 +181,57 @@ def _simulate(
 
     result = run_with_retries(launch, retry)
     found = (_trace(result, row, task.job, fidelity, seconds[row]) for row, task in enumerate(given))
-    return traces | dict(zip(tasks, found, strict=True))
+    return dict(zip(tasks, found, strict=True))
+
+
+def _task(job: Job, fidelity: Fidelity, bodies: dict[Any, tuple[NDArray, Track]]) -> _Task | None:
+    """Return what a job needs of its scene, None when it feels nothing.
+
+    ``bodies`` keeps anchor and track of obstacles that move by their id, of what stands still by its place.
+    """
+    start, stop = job.start, float(job.times[-1])
+    chain = fidelity.chain(job.whisker)
+    step = fidelity.step_of(chain)
+    cutting = Cutting(start, stop, step, fidelity.time_step)
+    base = follicle_track(job.follicle, job.whisker.arc_length, cutting)
+
+    # All that stands still is one body, near the base of the whisker and of its neighbours.
+    place = tuple((np.round(base.knots[0, :3] / GRID) * GRID / MILLI).tolist())
+    if place not in bodies:
+        bodies[place] = np.array(place), still_track(np.array(place))
+    moving = [obstacle for obstacle in job.obstacles if obstacle.motion is not None]
+    for obstacle in moving:
+        if id(obstacle) not in bodies:
+            anchor = obstacle.bounds.mean(axis=0)
+            bodies[id(obstacle)] = anchor, body_track(obstacle, anchor, cutting)
+    # What moves is looked at wherever its motion, or that of the base, has a knot.
+    ends = np.array([start, stop])
+    seen = np.unique(
+        np.concatenate([track.times for track in (base, *(bodies[id(item)][1] for item in moving))] + [ends])
+    )
+    position, euler = (np.asarray(values, dtype=float) for values in job.follicle.pose(seen))
+    reach = reachable(job.whisker, position, job.obstacles, seen, surfaces=True)
+    if is_silent(job, reach, position, euler):
+        return None
+    near = tuple(
+        TrackedObstacle(obstacle, *bodies[place if obstacle.motion is None else id(job.obstacles[which])])
+        for which, obstacle in zip(reach.indices, reach.obstacles, strict=True)
+    )
+    names = tuple(
+        id(part)
+        for body in near
+        for part in (body.track, body.obstacle.friction, body.obstacle.surface, *body.obstacle.parts)
+    )
+    per_period = fidelity.steps_per_period if fidelity.solver == "dynamic" else None
+    pieces = [track.pieces for track in (base, *(body.track for body in near)) if track.pieces is not None]
+    limits = [some.longest_steps(step, per_period) for some in pieces if some.needed.max() > 1]
+    limit = np.min(limits, axis=0) if limits else None
+    shortest = np.full(len(seen) - 1, step)
+    if limit is not None:
+        shortest = limit[np.clip(((seen[:-1] - start) / KNOT).astype(int), 0, len(limit) - 1)]
+    fast = _too_fast(job, reach, (position, euler), seen, shortest / FINEST)
+    twists = fidelity.twist is not False and not stays_in_plane(job, reach, position, euler, seen)
+    return _Task(job, chain, base, near, names, limit, fast, twists)
 
 
 def _launch(
@@ -160,38 +240,32 @@ def _launch(
     """Simulate tasks and return their results, a row each, with the processor time (s) that it took."""
     started = time.thread_time()
     first = tasks[0].job
-    start, stop = first.start, float(first.times[-1])
     motions, shapes = PackedMotions(), PackedShapes()
     chains: dict[Any, Chain] = {}
     scenes: dict[Any, int] = {}
     places = []
     for task in tasks:
-        job, obstacles = task.job, task.reach.obstacles
-        if job.whisker not in chains:
-            chains[job.whisker] = fidelity.chain(job.whisker)
-        alike = tuple((id(item.motion), item.friction, *map(id, (item.surface, *item.parts))) for item in obstacles)
-        if alike not in scenes:
-            scenes[alike] = shapes.add_scene(obstacles, motions, start, stop)
-        knots, spacing = follicle_knots(job.follicle, start, stop)
-        base = motions.add(knots, start * MILLI, spacing)
-        places.append((list(chains).index(job.whisker), scenes[alike], base))
+        chains.setdefault(task.job.whisker, task.chain)
+        if task.names not in scenes:
+            scenes[task.names] = shapes.add_scene(task.bodies, motions)
+        places.append((list(chains).index(task.job.whisker), scenes[task.names], motions.add(task.base)))
     whisker, scene, base = np.array(places, dtype=np.int32).T
     count = len(tasks)
     row = np.arange(count, dtype=np.int32)
-    packed = PackedJobs(whisker, scene, base, row, np.zeros_like(row), [task.job.loads for task in tasks])
+    loads, limits = [task.job.loads for task in tasks], [task.limit for task in tasks]
+    packed = PackedJobs(whisker, scene, base, row, np.zeros_like(row), loads, limits)
     # Compiling is done once; it is no cost of a whisker.
     paused = time.thread_time()
-    solver = WhiskerSolver(list(chains.values()), fidelity, device, shapes.needs)
+    solver = WhiskerSolver(list(chains.values()), fidelity, device, shapes.needs, twists=tasks[0].twists)
     started += time.thread_time() - paused
-    shortest = solver.shortest[whisker].tolist()
-    fast = np.array([_too_fast(task, step) for task, step in zip(tasks, shortest, strict=True)])
+    fast = np.array([task.fast for task in tasks])
     result = solver.launch(
         packed,
         motions,
         shapes,
         first.times,
         (count, 1),
-        start=start,
+        start=first.start,
         gravity=first.gravity,
         finer=finer,
         fast_at=fast[:, :1],
@@ -201,18 +275,19 @@ def _launch(
     return result, time.thread_time() - started
 
 
-def _too_fast(task: _Task, shortest: float) -> tuple[float, float]:
-    """Return when (s) an object first moves further against the whisker in the shortest step (s) than contacts are
-    looked for, inf if never, and how far (m).
-    """
-    spans = np.diff(task.times)
-    share = np.divide(shortest, spans, out=np.zeros_like(spans), where=spans > 0)
-    for obstacle in task.reach.obstacles:
+def _too_fast(
+    job: Job, reach: Reach, pose: tuple[NDArray, NDArray], times: NDArray, shortest: NDArray
+) -> tuple[float, float]:
+    """Return :attr:`_Task.fast` from the base's ``pose`` at ``times`` [n] (s) and the shortest steps [n − 1] (s)."""
+    share = shortest / np.diff(times)
+    still = [obstacle for obstacle in reach.obstacles if obstacle.motion is None]
+    # Against all that stands still the whisker moves alike.
+    for obstacle in [*still[:1], *(obstacle for obstacle in reach.obstacles if obstacle.motion is not None)]:
         # Ways between knots, scaled to the shortest step that a retry may take.
-        travel = step_travel(task.job.whisker, *task.pose, obstacle, task.times) * share
+        travel = step_travel(job.whisker, *pose, obstacle, times) * share
         if (travel > WIDEST / MILLI).any():
             first = int(np.argmax(travel > WIDEST / MILLI))
-            return float(task.times[first]), float(travel[first])
+            return float(times[first]), float(travel[first])
     return math.inf, 0.0
 
 
@@ -224,6 +299,7 @@ def _trace(result: LaunchResult, row: int, job: Job, fidelity: Fidelity, seconds
     touching = (arc >= 0) & good
     reason = str(result.verdict.reasons[row, 0])
     shape, felt = result.points, result.contact_wrench
+    base = None if shape is None else np.asarray(job.follicle.pose(job.times)[0], dtype=float)[:, None]
     nodes = fidelity.link_count(job.whisker.arc_length) + 1
     return Trace(
         wrench=np.where(good[:, None], result.wrench[row, :, 0].astype(float), np.nan),
@@ -234,6 +310,6 @@ def _trace(result: LaunchResult, row: int, job: Job, fidelity: Fidelity, seconds
         reason=reason,
         steps=int(result.steps[row, 0]),
         seconds=seconds,
-        link_positions=None if shape is None else np.where(good[:, None, None], shape[row, :, :nodes], np.nan),
+        link_positions=None if shape is None else np.where(good[:, None, None], base + shape[row, :, :nodes], np.nan),
         contact_wrench=None if felt is None else np.where(good[:, None], felt[row], np.nan),
     )

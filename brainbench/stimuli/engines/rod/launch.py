@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from brainbench.core.devices import to_struct, warp
 from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.engines.rod.compilation import load_kernels
-from brainbench.stimuli.engines.rod.limits import FINEST, LIGHT
+from brainbench.stimuli.engines.rod.limits import FINEST, LIGHT, LONGEST_SPAN
 from brainbench.stimuli.engines.rod.packing import PackedJobs, PackedMotions, capacity_for, pack_chains
 from brainbench.stimuli.engines.rod.scheduling import Slices, allocate, make_problems
 from brainbench.stimuli.engines.rod.shapes import PackedShapes
@@ -46,7 +46,7 @@ class LaunchResult:
     retried: NDArray[np.bool_]
     """[row, column] True where a whisker was simulated again."""
     points: NDArray[np.floating] | None = None
-    """[row, reading, node, 3] joints and tip (m), when shapes were asked for."""
+    """[row, reading, node, 3] joints and tip (m) from the base point, when shapes were asked for."""
     contact_wrench: NDArray[np.floating] | None = None
     """[row, reading, 6] force and moment of all contacts (N, N·m), when shapes were asked for."""
     seconds: dict[str, float] = field(default_factory=dict)
@@ -99,6 +99,7 @@ class WhiskerSolver:
         device: Any,
         needs: int,
         *,
+        twists: bool = True,
         block: int | None = None,
         sliced: bool = False,
         **options: Any,
@@ -108,6 +109,7 @@ class WhiskerSolver:
         Args:
             chains, fidelity: whiskers, with their time step, precision and solver.
             device, needs, options: as for :func:`brainbench.stimuli.engines.rod.compilation.load_kernels`.
+            twists: False when nothing twists the whiskers: their joints then have two hinges instead of three.
             block: threads of a block on a GPU; Warp's choice when None.
             sliced: True when whiskers pause for distances and contact forces (:class:`.scheduling.Slices`).
         """
@@ -115,10 +117,11 @@ class WhiskerSolver:
         self.real = real_type(fidelity)
         self.capacity = capacity_for(max(chain.links for chain in chains))
         self.quasistatic = fidelity.solver == "quasistatic"
+        hinges = 2 + twists
         if options:
             options["sliced"] = sliced
-        self.kernels = load_kernels(device, self.real, self.capacity, needs, **options)
-        packed = pack_chains(self.capacity, self.chains, self.quasistatic)
+        self.kernels = load_kernels(device, self.real, self.capacity, needs, hinges=hinges, **options)
+        packed = pack_chains(self.capacity, self.chains, self.quasistatic, hinges)
         self.chain_arrays = to_struct(self.kernels.structs.ChainArrays, packed, device)
         self.block = {} if block is None else {"block_dim": block}
         self.steps = np.array([fidelity.step_of(chain) * MILLI for chain in self.chains])
@@ -172,7 +175,6 @@ class WhiskerSolver:
         )
         out.contact = wp.full((size[0], frames, size[1]), -1.0, dtype=real, device=device)
         options = structs.StepOptions()
-        options.start = start * MILLI
         options.quasistatic = int(self.quasistatic)
         weight = LIGHT if self.quasistatic else 1.0
         # Quasistatic whiskers have masses that are scaled by LIGHT; gravity is scaled back, so that their weight stays.
@@ -183,9 +185,9 @@ class WhiskerSolver:
             self.chain_arrays,
             to_struct(structs.MotionArrays, motions.arrays(), device),
             to_struct(structs.ShapeArrays, shapes.arrays(), device),
-            to_struct(structs.JobArrays, jobs.arrays(self.chains, self.steps[jobs.whisker] / finer), device),
+            to_struct(structs.JobArrays, jobs.arrays(self.chains, self.steps[jobs.whisker], start, finer), device),
             options,
-            wp.array(readings * MILLI, dtype=real, device=device),
+            to_struct(structs.ReadingArrays, _readings(readings - start), device),
             out,
             make_problems(self.kernels, self.capacity, count, device),
         ]
@@ -211,7 +213,8 @@ class WhiskerSolver:
         force = np.sqrt(np.einsum("...d,...d", wrench[..., :3], wrench[..., :3]))
         facts = RunFacts(
             counts["status"],
-            table(numbers["failed"].astype(float)) / MILLI,
+            # Single precision rounds a late time; the reading at it must not pass for one before it.
+            start + table(numbers["failed"].astype(float)) * (1 - 2e-7) / MILLI,
             *_strong(force, table(self.strongest[jobs.whisker]), readings),
             travel=np.zeros(size) if travel is None else travel,
             fast_at=np.full(size, np.inf) if fast_at is None else fast_at,
@@ -234,6 +237,23 @@ class WhiskerSolver:
 def real_type(fidelity: Fidelity) -> type:
     """Return Warp's type of the numbers that a simulation calculates with."""
     return warp().float32 if fidelity.precision == "single" else warp().float64
+
+
+def _readings(times: NDArray[np.float64]) -> dict[str, NDArray]:
+    """Return what the kernel's ``ReadingArrays`` hold, for times (s) since the start."""
+    times = times * MILLI
+    before = np.concatenate([[0.0], times[:-1]])
+    # Within a span single precision keeps time; longer ones are divided, in equal parts.
+    parts = np.maximum(np.ceil((times - before) / LONGEST_SPAN - 1e-9), 1).astype(int)
+    which = np.repeat(np.arange(len(times)), parts)
+    last = np.cumsum(parts) - 1
+    share = (np.arange(len(which)) - last[which]) / parts[which] + 1
+    all_times = before[which] + (times - before)[which] * share
+    all_times[last] = times
+    tick = np.floor(all_times)
+    row = np.full(len(which), -1, dtype=np.int32)
+    row[last] = np.arange(len(times))
+    return {"time": np.stack([tick, all_times - tick], axis=1), "row": row}
 
 
 def _strong(

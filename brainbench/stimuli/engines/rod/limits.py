@@ -40,10 +40,19 @@ ANYWHERE = 1e6
 """The same (mm) for a link that may have got inside unseen: the nearest triangle tells inside from outside."""
 PARTS = 8
 """Parts of a link at whose ends its overlap with a surface is measured."""
+LONGEST_SPAN = 32.0
+"""Longest time (ms) between two places where time is kept exactly."""
 TRAVEL = 0.25
 """Longest way (mm) of any point of a whisker in one step while something is near; steps are shortened to keep it."""
 FINEST = 16
 """Most parts into which a step is split for that."""
+AFTERMATH = 10.0
+"""Longest steps after a contact for which steps stay split so."""
+LISTED = 32
+"""Shapes nearest to a whisker that it looks at in each step where there are more; the others wait until it has moved
+far enough."""
+STALE = 0.5
+"""Way (mm) after which they are listed again, once one of them may be within reach of a contact."""
 WIDEST = 0.8
 """Widest search for contacts (mm)."""
 CREVICE = 0.02

@@ -2,69 +2,75 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from brainbench.core import rotations
+from brainbench.stimuli.engines.motion_pieces import Cutting, MotionPieces, side_of
 from brainbench.stimuli.engines.protocol import Follicle, Load, base_rotation
 from brainbench.stimuli.engines.rod.limits import LIGHT
 from brainbench.stimuli.engines.units import MICRO, MILLI
 from brainbench.stimuli.objects.obstacle import Obstacle
 from brainbench.stimuli.whiskers.chain import Chain
 
-KNOT = 1e-3
-"""Spacing of the knots of a motion (s); cubic pieces between them follow whisking at 20 Hz to 1e-7 of its way."""
 CAPACITIES = (12, 24, 48, 100)
 """Links for which kernels are compiled; a chain takes the smallest that holds it."""
 Pose = Callable[[NDArray[np.float64]], tuple[NDArray, NDArray]]
 """Times [n] (s) → places [n, 3] (m) and rotations [n, …] of a base or a body."""
-_SIDE = 1e-5
-"""Distance (s) of the instants whose difference is a velocity."""
+GRID = 32.0
+"""Knots are kept as a multiple of this (mm), exact in single precision up to kilometres, and the rest."""
 
 
 @dataclass
 class PackedMotions:
-    """Motions as cubic pieces: knots of all tracks one behind the other."""
+    """Motions as cubic pieces, all from the start of the launch: knots and cells of all tracks one behind the other."""
 
     first: list[int] = field(default_factory=list)
     count: list[int] = field(default_factory=list)
-    start: list[float] = field(default_factory=list)
-    spacing: list[float] = field(default_factory=list)
+    cells: list[NDArray[np.int32]] = field(default_factory=list)
+    """Per moving track the first knot of each cell, and the last knot of all."""
     knots: list[NDArray[np.float64]] = field(default_factory=list)
-    """Per track [count, 16]: place, velocity, quaternion, angular velocity, angular acceleration (mm, ms)."""
+    """Per track [knot, 16]: place, velocity, quaternion, angular velocity, angular acceleration (mm, ms)."""
+    _sizes: list[int] = field(default_factory=lambda: [0, 0])
+    """Knots and entries of ``cells`` so far."""
 
-    def add(self, knots: NDArray[np.float64], start: float, spacing: float) -> int:
-        """Append a track and return its index; ``start`` and ``spacing`` in ms."""
-        self.first.append(self.first[-1] + self.count[-1] if self.first else 0)
-        self.count.append(len(knots))
-        self.start.append(start)
-        self.spacing.append(spacing)
-        self.knots.append(knots)
+    def add(self, track: Track) -> int:
+        """Append a track and return its index."""
+        if len(track.knots) == 1:
+            return int(self.add_straight(track.knots)[0])
+        self.first.append(self._sizes[1])
+        self.count.append(len(track.cells))
+        self.cells.append(track.cells + np.int32(self._sizes[0]))
+        self._append(track.knots)
+        self._sizes[1] += len(track.cells)
         return len(self.first) - 1
 
     def add_straight(self, knots: NDArray[np.float64]) -> NDArray[np.int32]:
-        """Append bodies [body, 16] that stand or move straight from time 0; return their tracks [body]."""
+        """Append bodies [body, 16] that stand or move straight from the start; return their tracks [body]."""
         new = np.arange(len(self.first), len(self.first) + len(knots), dtype=np.int32)
-        begin = self.first[-1] + self.count[-1] if self.first else 0
-        self.first.extend(range(begin, begin + len(knots)))
+        self.first.extend(range(self._sizes[0], self._sizes[0] + len(knots)))
         self.count.extend([1] * len(knots))
-        self.start.extend([0.0] * len(knots))
-        self.spacing.extend([1.0] * len(knots))
-        self.knots.append(knots)
+        self._append(knots)
         return new
+
+    def _append(self, knots: NDArray[np.float64]) -> None:
+        self.knots.append(knots)
+        self._sizes[0] += len(knots)
 
     def arrays(self) -> dict[str, NDArray]:
         """Return what the kernel's ``MotionArrays`` hold."""
         knots = np.concatenate(self.knots)
+        coarse = np.round(knots[:, :3] / GRID) * GRID
         return {
             "first": np.array(self.first, dtype=np.int32),
             "count": np.array(self.count, dtype=np.int32),
-            "start": np.array(self.start),
-            "spacing": np.array(self.spacing),
-            "place": knots[:, :3],
+            "cell": np.concatenate(self.cells or [np.zeros(1, dtype=np.int32)]),
+            "coarse": coarse,
+            "place": knots[:, :3] - coarse,
             "velocity": knots[:, 3:6],
             "turn": knots[:, 6:10],
             "spin": knots[:, 10:13],
@@ -77,7 +83,7 @@ def capacity_for(links: int) -> int:
     return next(capacity for capacity in CAPACITIES if capacity >= links)
 
 
-def still_knots(position: NDArray, quaternion: NDArray) -> NDArray[np.float64]:
+def still_knots(position: NDArray, quaternion: ArrayLike) -> NDArray[np.float64]:
     """Return the one knot [1, 16] of a body at rest; position in metres."""
     knot = np.zeros((1, 16))
     knot[0, :3] = np.asarray(position) * MILLI
@@ -85,51 +91,87 @@ def still_knots(position: NDArray, quaternion: NDArray) -> NDArray[np.float64]:
     return knot
 
 
-def follicle_knots(follicle: Follicle, start: float, stop: float) -> tuple[NDArray[np.float64], float]:
-    """Return the knots [n, 16] of a follicle between two times (s), and their spacing (ms)."""
-    times, spacing = _knot_times(start, stop)
-    position, euler = (np.asarray(values, dtype=float) for values in follicle.pose(times))
-    if np.ptp(position, axis=0).max() == 0 and np.ptp(euler, axis=0).max() == 0:
-        return still_knots(position[0], rotations.from_matrices(base_rotation(euler[:1]))[0]), spacing
-    return _knots(follicle.pose, base_rotation, times, start), spacing
+@dataclass(frozen=True, eq=False)
+class Track:
+    """Motion of a base or a body as cubic pieces, from the start of a launch."""
+
+    knots: NDArray[np.float64]
+    """[knot, 16] as in :class:`PackedMotions`; one for a body that stands or moves straight."""
+    cells: NDArray[np.int32]
+    """[cell + 1] first knot of each cell, and the last knot."""
+    times: NDArray[np.float64]
+    """[n] s at which anything may change: those of the knots."""
+    pieces: MotionPieces | None = None
+    """None for a body that stands still."""
 
 
-def body_knots(obstacle: Obstacle, start: float, stop: float) -> tuple[NDArray[np.float64], float]:
-    """Return the knots [n, 16] of an obstacle between two times (s), and their spacing (ms)."""
-    if obstacle.motion is None:
-        return still_knots(np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0])), KNOT * MILLI
-    times, spacing = _knot_times(start, stop)
-    knots = _knots(obstacle.motion, rotations.to_matrices, times, start)
-    straight = np.abs(np.diff(knots[:, 3:6], axis=0)).max(initial=0) < 1e-9 and not knots[:, 10:13].any()
-    return (knots[:1], spacing) if straight else (knots, spacing)
+def follicle_track(follicle: Follicle, size: float, cutting: Cutting) -> Track:
+    """Return the track of a follicle whose whisker has the arc length ``size`` (m)."""
+    if getattr(follicle, "finest", None) == math.inf:
+        place, euler = (np.asarray(values, dtype=float) for values in follicle.pose(np.array([cutting.start])))
+        return still_track(place[0], rotations.from_matrices(base_rotation(euler))[0])
+
+    return _track(follicle.pose, base_rotation, cutting.follicle(follicle, size), cutting.start)
 
 
-def _knot_times(start: float, stop: float) -> tuple[NDArray[np.float64], float]:
-    # One knot beyond the end: the last step looks at the pose behind it.
-    count = max(2, int(np.ceil((stop - start) / KNOT - 1e-9)) + 2)
-    return np.asarray(start + KNOT * np.arange(count), dtype=np.float64), KNOT * MILLI
+def body_track(obstacle: Obstacle, anchor: NDArray[np.float64], cutting: Cutting) -> Track:
+    """Return the track of the point ``anchor`` [3] (m) of an obstacle that moves."""
+    motion = obstacle.motion
+    assert motion is not None
+
+    def pose(times: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        place, turn = motion(times)
+        turn = rotations.to_matrices(np.asarray(turn, dtype=float))
+        return np.asarray(place) + turn @ anchor, turn
+
+    return _track(pose, np.asarray, cutting.obstacle(obstacle, anchor), cutting.start)
 
 
-def _knots(pose: Pose, to_matrices: Callable[[NDArray], NDArray], times: NDArray, start: float) -> NDArray[np.float64]:
-    """Return knots [n, 16] of a pose from its places and rotations just before, at and just after the knot times."""
+def still_track(place: NDArray[np.float64], quaternion: ArrayLike = (1.0, 0.0, 0.0, 0.0)) -> Track:
+    """Return the track of what stands at ``place`` [3] (m)."""
+    return Track(still_knots(place, quaternion), np.zeros(1, dtype=np.int32), np.zeros(0))
+
+
+def _track(pose: Pose, to_matrices: Callable[[NDArray], NDArray], pieces: MotionPieces, start: float) -> Track:
+    times, cells = pieces.times(start)
+    if not pieces.moves:
+        place, turn = (np.asarray(values, dtype=float) for values in pose(times[:1]))
+        return still_track(place[0], rotations.from_matrices(to_matrices(turn))[0])
+    sides = side_of(np.append(np.repeat(pieces.count, pieces.count), pieces.count[-1]))
+    knots = _knots(pose, to_matrices, times, sides)
+    straight = np.abs(np.diff(knots[:, 3:6], axis=0)).max() < 1e-9 and not knots[:, 10:13].any()
+    # Further away one straight piece would lose digits.
+    straight = straight and np.linalg.norm(knots[-1, :3] - knots[0, :3]) < 10 * GRID
+    return Track(knots[:1] if straight else knots, cells, times, pieces)
+
+
+def _knots(
+    pose: Pose, to_matrices: Callable[[NDArray], NDArray], times: NDArray, sides: NDArray
+) -> NDArray[np.float64]:
+    """Return knots [n, 16] of a pose from its places and rotations ``sides`` [n] (s) before, at and after the knots."""
+    # At the very start there is no instant before: values there are those of the line through two differences.
+    early = times[0] >= 0 and times[0] < sides[0]
     around = []
-    for side in (-_SIDE, 0.0, _SIDE):
-        place, turn = pose(np.maximum(times + side, 0.0) if start >= 0 else times + side)
+    for side in (-sides, 0.0, sides):
+        place, turn = pose(np.maximum(times + side, times[0]) if early else times + side)
         around.append((np.asarray(place, dtype=float), to_matrices(np.asarray(turn, dtype=float))))
     (place0, turn0), (place, turn), (place1, turn1) = around
-    # At the very start there may be no instant before: the difference is then one-sided.
-    clipped = start >= 0
-    back = np.where(clipped & (times < _SIDE), times, _SIDE)[:, None]
-    span = back + _SIDE
-    spin0, spin1 = _spin(turn0, turn) / np.maximum(back, 1e-12), _spin(turn, turn1) / _SIDE
-    spin0 = np.where(back > 0, spin0, spin1)
+    span = sides[:, None]
+    spin0, spin1 = _spin(turn0, turn) / span, _spin(turn, turn1) / span
+    # Central differences, whose error is of second order; m per s are mm per ms.
+    velocity = (place1 - place0) / (2 * span)
+    if early:
+        place2, turn2 = pose(times[:1] + 2 * sides[:1])
+        there = (np.asarray(place2, dtype=float) - place1[:1]) / sides[0]
+        beyond = _spin(turn1[:1], to_matrices(np.asarray(turn2, dtype=float))) / sides[0]
+        velocity[0] = (3 * (place1[0] - place[0]) / sides[0] - there[0]) / 2
+        spin0[0] = 2 * spin1[0] - beyond[0]
     knots = np.empty((len(times), 16))
     knots[:, :3] = place * MILLI
-    # Central differences over 20 µs, whose error is of second order; m per s are mm per ms.
-    knots[:, 3:6] = (place1 - place0) / span
+    knots[:, 3:6] = velocity
     knots[:, 6:10] = _continuous(rotations.from_matrices(turn))
-    knots[:, 10:13] = _spin(turn0, turn1) / span / MILLI
-    knots[:, 13:16] = (spin1 - spin0) / (span / 2) / MILLI**2
+    knots[:, 10:13] = (spin0 + spin1) / 2 / MILLI
+    knots[:, 13:16] = (spin1 - spin0) / span / MILLI**2
     return knots
 
 
@@ -149,22 +191,22 @@ def _continuous(quaternion: NDArray[np.float64]) -> NDArray[np.float64]:
     return quaternion * np.concatenate([[1.0], flips])[:, None]
 
 
-def pack_chains(capacity: int, chains: Sequence[Chain], quasistatic: bool) -> dict[str, NDArray]:
+def pack_chains(capacity: int, chains: Sequence[Chain], quasistatic: bool, hinges: int) -> dict[str, NDArray]:
     """Return what the kernel's ``ChainArrays`` hold: whiskers as chains, [link, whisker] of ``capacity`` links."""
     count = len(chains)
     mass = LIGHT if quasistatic else 1.0
-    build, inertia, taper = (np.zeros((capacity, count, 4)) for _ in range(3))
+    build, inertia, taper = (np.zeros((capacity, count, width)) for width in (4, 2 + hinges, 4))
     for w, chain in enumerate(chains):
         n = chain.links
         # kg to mg, kg·m² to mg·mm², N·m to µN·m.
-        lengths = chain.lengths * MILLI
+        # A joint that twists does so between two halves of its rest bend.
+        bends = chain.rest_angles / np.where((chain.torsion > 0) & (hinges == 3), 2, 1)
         build[:n, w] = np.stack(
-            [lengths, np.cos(chain.rest_angles), np.sin(chain.rest_angles), chain.masses * (mass * MICRO)],
-            axis=1,
+            [chain.lengths * MILLI, np.cos(bends), np.sin(bends), chain.masses * (mass * MICRO)], axis=1
         )
+        springs = (chain.stiffness * MICRO, chain.torsion * MICRO)[: hinges - 1]
         inertia[:n, w] = np.stack(
-            [chain.centres * MILLI, *(chain.inertias.T * (mass * MICRO * MILLI**2)), chain.stiffness * MICRO],
-            axis=1,
+            [chain.centres * MILLI, *(chain.inertias.T * (mass * MICRO * MILLI**2)), *springs], axis=1
         )
         radii = chain.whisker.radius(chain.nodes) * MILLI
         taper[:n, w] = np.stack([radii[:-1], radii[1:], chain.nodes[:-1] * MILLI, np.diff(chain.nodes) * MILLI], axis=1)
@@ -197,12 +239,19 @@ class PackedJobs:
     """[job] second index of the results."""
     loads: Sequence[Sequence[Load]] = ()
     """[job] point forces; none for any when empty."""
+    limits: Sequence[NDArray[np.float64] | None] = ()
+    """[job] longest step (s) from each cell of the motions on; None for any, for all when empty."""
 
     def __len__(self) -> int:
         return len(self.whisker)
 
-    def arrays(self, chains: Sequence[Chain], step: NDArray[np.float64]) -> dict[str, NDArray]:
-        """Return what the kernel's ``JobArrays`` hold, with the longest ``step`` [job] (ms) of each job."""
+    def arrays(
+        self, chains: Sequence[Chain], step: NDArray[np.float64], start: float, finer: int
+    ) -> dict[str, NDArray]:
+        """Return what the kernel's ``JobArrays`` hold.
+
+        ``step`` [job] (ms) is the longest of each job, ``finer`` divides it; the launch begins at ``start`` (s).
+        """
         counts = [len(loads) for loads in self.loads] or [0] * len(self)
         loads = [(load, chains[which]) for which, some in zip(self.whisker, self.loads, strict=False) for load in some]
         # A load at a joint belongs to the link before it.
@@ -211,12 +260,17 @@ class PackedJobs:
             (load.arc - c.nodes[link]) / (c.nodes[link + 1] - c.nodes[link])
             for (load, c), link in zip(loads, links, strict=True)
         ]
+        limits = [np.zeros(0) if limit is None else limit * MILLI / finer for limit in self.limits] or [
+            np.zeros(0)
+        ] * len(self)
         return {
             **{name: getattr(self, name) for name in ("whisker", "scene", "base", "row", "column")},
-            "step": step,
+            "step": step / finer,
+            "limit_first": np.cumsum([0, *map(len, limits)], dtype=np.int32),
+            "limit": np.concatenate(limits),
             "load_first": np.cumsum([0, *counts], dtype=np.int32),
             "load_link": np.array(links, dtype=np.int32),
             "load_share": np.array(shares),
             "load_force": np.array([np.multiply(load.force, MILLI) for load, _ in loads]).reshape(-1, 3),
-            "load_stop": np.minimum([load.stop * MILLI for load, _ in loads], 1e30),
+            "load_stop": np.minimum([(load.stop - start) * MILLI for load, _ in loads], 1e30),
         }

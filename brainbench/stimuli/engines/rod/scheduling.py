@@ -52,7 +52,7 @@ class Slices:
             **dict.fromkeys(("queue", "next_queue", "problem_queue"), queues),
             **dict.fromkeys(("queue_size", "problem_size", "next_queue_size", "next_problem_size"), 3),
             **dict.fromkeys(("query_count", "next_query_count"), 1),
-            **dict.fromkeys(("state", "query_time", "query_margin"), lanes),
+            **dict.fromkeys(("state", "query_frame", "query_margin"), lanes),
             link=links,
             **dict.fromkeys(("query", "answer"), self.queries),
         )

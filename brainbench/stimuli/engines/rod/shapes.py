@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -13,7 +14,7 @@ from brainbench.core import rotations
 from brainbench.geometry.mesh import hull_faces
 from brainbench.stimuli.engines.rod import limits
 from brainbench.stimuli.engines.rod.mesh_bvh import spatial_order, tree_boxes
-from brainbench.stimuli.engines.rod.packing import PackedMotions, body_knots
+from brainbench.stimuli.engines.rod.packing import PackedMotions, Track
 from brainbench.stimuli.engines.units import MILLI
 from brainbench.stimuli.objects.obstacle import Box, Capsule, ConvexPart, Cylinder, Obstacle, Sphere, TriangleMesh
 
@@ -45,6 +46,16 @@ class PackedSurface:
         return cls(corners, pseudo_normals(vertices, faces), tree_boxes(corners), outline, radius)
 
 
+@dataclass(frozen=True, eq=False)
+class TrackedObstacle:
+    """An obstacle and the track of a point of it, about which its shapes are kept."""
+
+    obstacle: Obstacle
+    anchor: NDArray[np.float64]
+    """[3] (m) in the frame of the obstacle."""
+    track: Track
+
+
 @dataclass
 class PackedShapes:
     """Shapes of all scenes, and the surfaces among them."""
@@ -55,25 +66,31 @@ class PackedShapes:
     surfaces: list[PackedSurface] = field(default_factory=list)
     triangles: int = 0
     boxes: int = 0
-    _known: dict[int, dict[str, int]] = field(default_factory=dict)
+    _known: dict[int, dict[str, Any]] = field(default_factory=dict)
 
-    def add_scene(self, obstacles: Sequence[Obstacle], motions: PackedMotions, start: float, stop: float) -> int:
+    def add_scene(self, bodies: Sequence[TrackedObstacle], motions: PackedMotions) -> int:
         """Append the shapes of one scene and return its index."""
-        count = 0
-        for obstacle in obstacles:
-            knots, spacing = body_knots(obstacle, start, stop)
-            track = motions.add(knots, start * MILLI, spacing)
-            solids = obstacle.parts if obstacle.surface is None else (obstacle.surface,)
-            for solid in solids:
-                row = self._row(solid)
-                # Fastest that any point can be: speed of the origin plus spin times the farthest distance from it.
-                reach = float(np.linalg.norm(np.abs(solid.bounds()).max(axis=0))) * MILLI
-                speed = np.linalg.norm(knots[:, 3:6], axis=1) + np.linalg.norm(knots[:, 10:13], axis=1) * reach
-                row |= {"radius": reach, "speed": float(speed.max()), "track": track}
-                row["friction"] = -1.0 if obstacle.friction is None else obstacle.friction
-                self.columns.append({name: np.array([value]) for name, value in row.items()})
-                count += 1
-        self.first.append(self.first[-1] + count)
+        rows: list[dict[str, Any]] = []
+        tracks: dict[int, tuple[int, NDArray, NDArray]] = {}
+        for body in bodies:
+            obstacle, knots = body.obstacle, body.track.knots
+            if id(knots) not in tracks:
+                speeds = (np.linalg.norm(knots[:, some], axis=1) for some in (slice(3, 6), slice(10, 13)))
+                tracks[id(knots)] = motions.add(body.track), *speeds
+            track, linear, angular = tracks[id(knots)]
+            friction = -1.0 if obstacle.friction is None else obstacle.friction
+            for solid in obstacle.parts if obstacle.surface is None else (obstacle.surface,):
+                row = self._row(solid) | {"track": track, "friction": friction, "anchor": body.anchor, "speed": 0.0}
+                if len(knots) > 1 or linear[0]:
+                    # Fastest that any point can be: speed of the anchor plus spin times the farthest distance from it.
+                    far = math.dist(row["place"], body.anchor * MILLI) + row["radius"]
+                    row["speed"] = (linear + angular * far).max()
+                rows.append(row)
+        if rows:
+            columns = {name: np.array([row[name] for row in rows]) for name in rows[0]}
+            columns["place"] = columns["place"] - columns.pop("anchor") * MILLI
+            self.columns.append(columns)
+        self.first.append(self.first[-1] + len(rows))
         return len(self.first) - 2
 
     def add_placed(self, surface: PackedSurface, **columns: Any) -> None:
@@ -90,18 +107,21 @@ class PackedShapes:
         self.first.extend(range(self.first[-1] + 1, self.first[-1] + count + 1))
 
     def _row(self, solid: ConvexPart | Sphere | Capsule | Cylinder | Box | TriangleMesh) -> dict[str, Any]:
+        """Return the columns of a solid in its body, but for those that its motion and friction give."""
         row: dict[str, Any] = {"size": np.ones(3), "place": np.zeros(3), "turn": np.array([1.0, 0, 0, 0])}
         row |= {"scale": 1.0, "face": 0, "faces": 0, "box": 0}
         match solid:
             case Sphere():
+                radius = solid.radius * MILLI
                 return row | {
                     "kind": limits.SPHERE,
-                    "size": np.full(3, solid.radius * MILLI),
+                    "size": np.full(3, radius),
                     "place": _mm(solid.centre),
+                    "radius": radius,
                 }
             case Box():
                 box = {"kind": limits.BOX, "size": _mm(solid.half_sizes), "place": _mm(solid.centre)}
-                return row | box | {"turn": np.array(solid.quaternion)}
+                return row | box | {"turn": np.array(solid.quaternion), "radius": math.hypot(*box["size"])}
             case Capsule() | Cylinder():
                 ends = _mm(solid.start), _mm(solid.end)
                 # Capsules and cylinders are kept by half length, middle and a turn from z, so that the kernel measures
@@ -110,11 +130,16 @@ class PackedShapes:
                 kind = limits.CAPSULE if isinstance(solid, Capsule) else limits.CYLINDER
                 size = np.array([solid.radius * MILLI, half, 0.0])
                 turn = rotations.from_z_axis((ends[1] - ends[0]) / (2 * half))
-                return row | {"kind": kind, "size": size, "place": (ends[0] + ends[1]) / 2, "turn": turn}
+                place, radius = (ends[0] + ends[1]) / 2, math.hypot(size[0], half)
+                radius = size[0] + half if kind == limits.CAPSULE else radius
+                return row | {"kind": kind, "size": size, "place": place, "turn": turn, "radius": radius}
             case _:
                 if id(solid) not in self._known:
                     faces = solid.faces if isinstance(solid, TriangleMesh) else hull_faces(solid.vertices)
-                    self._known[id(solid)] = self.add_mesh(PackedSurface.of(solid.vertices * MILLI, faces))
+                    # About its own middle, where single precision is finest.
+                    middle = solid.bounds().mean(axis=0) * MILLI
+                    surface = PackedSurface.of(solid.vertices * MILLI - middle, faces)
+                    self._known[id(solid)] = self.add_mesh(surface) | {"place": middle, "radius": surface.radius}
                 return row | self._known[id(solid)] | {"kind": limits.MESH}
 
     def add_mesh(self, surface: PackedSurface) -> dict[str, int]:

@@ -66,7 +66,8 @@ class SweepLauncher:
         """Elapsed time of the last launch for placing objects, uploading, and computing."""
         mounts = list(scenes.array)
         chains = [fidelity.chain(mount.whisker) for mount in mounts]
-        self.solver = WhiskerSolver(chains, fidelity, self.device, against, block=BLOCK, sliced=sliced, bounds=bounds)
+        how = {"twists": fidelity.twist is not False, "block": BLOCK, "sliced": sliced, "bounds": bounds}
+        self.solver = WhiskerSolver(chains, fidelity, self.device, against, **how)
         self._head = grid.head.matrix
         self._origin = np.asarray(grid.head.position)
         self._objects: dict[str, tuple[float, PackedSurface]] = {}
@@ -90,7 +91,7 @@ class SweepLauncher:
         """
         started = time.perf_counter()
         motions, shapes = PackedMotions(), PackedShapes()
-        bases = np.array([motions.add(knot, 0.0, 1.0) for knot in self._bases], dtype=np.int32)
+        bases = motions.add_straight(np.concatenate(self._bases))
         prepared = self._prepare([name for name, _ in objects])
         for name, sweeps in objects:
             if len(sweeps):

@@ -93,8 +93,9 @@ def excite_modes(own: ContactSoundArrays, io: ReadoutArrays, samples: int):
     k, env, s = wp.tid()
     source = own.sources[s]
     earlier = own.before[env, s]
+    # What is held when an episode begins was not struck: the first update only takes note of the force.
     if io.age[env] == 0:
-        earlier = float(0.0)
+        earlier = own.force[env, s]
     # Source and filter: a rise of force is an impact and excites the modes with an impulse, sliding excites them with
     # noise.
     rise = own.force[env, s] - earlier

@@ -1,6 +1,6 @@
 """Kernels of the elastomer: indentation, spreading over the grid, and the sum.
 
-Thesis 4.17–4.21, and the layer terms derived in docs/tactile.md. Vectors are in the frame of the sensor link.
+Thesis 4.17–4.21, and the layer terms derived in docs/elastomers.md. Vectors are in the frame of the sensor link.
 Letters: B environment, N marker, P surface point, S sensor of the group.
 """
 

@@ -115,16 +115,22 @@ def start_kernel(contacts: bool, apart: bool) -> Any:
         words: int,
         bits: wp.array2d(dtype=wp.int32),
         age: wp.array(dtype=wp.int32),
+        diverged: wp.array(dtype=wp.int32),
     ):
         tid = wp.tid()
         room = state.contact_env.shape[0]
         count = state.contact_count[0]
         if tid < state.pose.shape[0]:
             age[tid] = age[tid] + 1
-            if wp.static(apart):
-                state.status[tid] = wp.where(count > room, 2, 0)
-            else:
-                state.status[tid] = status_of(state, tid)
+            flags = wp.where(count > room, 2, 0)
+            if wp.static(not apart):
+                flags = status_of(state, tid)
+            # An environment that was lost once stays so until its reset: engines put it back in ways of their own, and
+            # memories of sensors would mix what was before with what is now.
+            if age[tid] > 0:
+                flags = flags | diverged[tid]
+            diverged[tid] = flags & 1
+            state.status[tid] = flags
         if wp.static(contacts):
             # All is asked for before anything is looked at; neighbouring threads read neighbouring contacts.
             threads = (room + wp.static(CONTACTS - 1)) // wp.static(CONTACTS)
@@ -188,6 +194,7 @@ def pair_kernel(apart: bool) -> Any:
         bits: wp.array2d(dtype=wp.int32),
         out: PairArrays,
         crowded: wp.array(dtype=wp.int32),
+        diverged: wp.array(dtype=wp.int32),
     ):
         tid = wp.tid()
         listed = state.pose.shape[0] * slots.link.shape[0]
@@ -196,6 +203,7 @@ def pair_kernel(apart: bool) -> Any:
                 owner = (tid - listed) // state.pose.shape[1]
                 if link_fails(state, owner, (tid - listed) % state.pose.shape[1]):
                     wp.atomic_or(state.status, owner, 1)
+                    wp.atomic_or(diverged, owner, 1)
                 return
         env = tid // slots.link.shape[0]
         slot = tid % slots.link.shape[0]
@@ -249,7 +257,7 @@ def pair_kernel(apart: bool) -> Any:
                         out.spin[env, at] = wp.quat_rotate_inv(turn, spin - own_spin)
                     found += 1
         if found > room:
-            crowded[env] = 1
+            wp.atomic_max(crowded, env, found)
         out.count[env, slot] = wp.min(found, room)
 
     return pairs

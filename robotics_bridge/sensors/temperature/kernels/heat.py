@@ -13,6 +13,8 @@ wp.set_module_options({"fuse_fp": False})
 
 CAPACITY = 48
 """M: contacts of one sensor that are looked at."""
+PIECES = 8
+"""A patch is cut into this many pieces along each of its two directions, each of which lies in one cell."""
 
 
 @wp.struct
@@ -30,6 +32,8 @@ class ThermalParams:
     """Edges of a cell (m)."""
     conductivity: wp.float32
     """W/(m K)."""
+    diffusivity: wp.float32
+    """m²/s."""
     capacity: wp.float32
     """Heat capacity of a cell (J/K)."""
     emissivity: wp.float32
@@ -45,7 +49,7 @@ class ThermalParams:
     """Radius R of the surfaces at a contact point (m)."""
     depth_weight: wp.float32
     published: wp.int32
-    """1: equations 4.38, 4.39; 0: half a cell and the touched half-space in series."""
+    """1: equations 4.38, 4.39; 0: the cell and the touched half-space in series."""
     tau: wp.float32
     """Time constant of the sensing element (s)."""
     cold: wp.float32
@@ -79,6 +83,8 @@ class HeatArrays:
     """[B, S, M] their numbers in the state."""
     touched: wp.array2d(dtype=wp.float32)
     """[B, N] time since a contact began (s)."""
+    covered: wp.array2d(dtype=wp.float32)
+    """[B, N] area of the contacts of a cell (m²)."""
     conductance: wp.array2d(dtype=wp.float32)
     """[B, N] of the contacts of a cell (W/K)."""
     inflow: wp.array2d(dtype=wp.float32)
@@ -127,9 +133,73 @@ def spot_area(distance: float, radius: float) -> float:
     return wp.pi * depth * (float(2.0) * radius - depth)
 
 
+@wp.func
+def slab_length(spread: float, across: float, share: float) -> float:
+    """Return ℓ (m): a cell at the mean T gives k (T − T_face) / ℓ to a face that was touched when it was level.
+
+    Early, heat comes from the skin alone, as from a half-space: √(π α t) for the initial temperature, less what the
+    mean of the cell has fallen, of which the covered share of the face tells the rest (Carslaw & Jaeger 1959, 3.3).
+    The two meet at √(α t) = √π/4 of the cell; much later it is half of it.
+
+    Args:
+        spread: √(α t) (m).
+        across: Depth of the cell (m).
+        share: Part of its face that is touched.
+    """
+    x = spread / across
+    s = wp.min(x, float(0.4431135))
+    early = float(1.7724539) * s - float(2.0) * share * s * s
+    fade = s / x
+    return across * (float(0.5) - wp.max(float(0.5) - early, float(0.0)) * fade * fade)
+
+
+@wp.func
+def conductance_of(
+    state: StateArrays,
+    heat: HeatArrays,
+    io: ReadoutArrays,
+    env: int,
+    s: int,
+    c: int,
+    index: int,
+    other: int,
+    whole: float,
+) -> float:
+    """Return the conductance per area (W/(m² K)) of a contact c of area ``whole`` within one cell."""
+    grid = heat.sensors[s]
+    k_own = grid.conductivity
+    k_other = heat.link_conductivity[other]
+    volume = grid.cell[0] * grid.cell[1] * grid.cell[2]
+    if grid.published == 1:
+        # 4.38 and 4.39: harmonic conductivity over the length L = V / A of the whole contact, shared by area.
+        return float(2.0) * k_own * k_other / (k_own + k_other) * whole / volume
+    facing = wp.quat_rotate_inv(wp.transform_get_rotation(state.pose[env, grid.link]), state.contact_normal[c])
+    across = wp.abs(facing[0]) * grid.cell[0] + wp.abs(facing[1]) * grid.cell[1] + wp.abs(facing[2]) * grid.cell[2]
+    share = wp.min(heat.covered[env, index] * across / volume, float(1.0))
+    # Mean of 1/√t over the step, which its middle misses by 29 % in the first one.
+    past = float(0.0)
+    if io.age[env] > 0:
+        past = heat.touched[env, index]
+    root = float(0.5) * (wp.sqrt(past) + wp.sqrt(past + io.dt))
+    # A spot of area A spreads its heat as an isothermal disc, 4 k √(A/π); within a cell only where it leaves room.
+    disc = float(4.0) / wp.sqrt(wp.pi * whole)
+    length = slab_length(root * wp.sqrt(grid.diffusivity), across, share)
+    # Resistances in series: the cell, the interface, the touched body. A sum of resistances stays finite and positive
+    # for any pair of materials.
+    resistance = float(1.0) / (k_own * (float(1.0) / length + (float(1.0) - share) * disc))
+    if grid.contact > float(0.0):
+        resistance = resistance + float(1.0) / grid.contact
+    # A half-space that gives heat through a disc: planar at first, spreading later.
+    planar = float(1.0) / (root * wp.sqrt(wp.pi * heat.link_diffusivity[other]))
+    return float(1.0) / (resistance + float(1.0) / (k_other * (planar + disc)))
+
+
 @wp.kernel
-def conduct_contacts(state: StateArrays, heat: HeatArrays, io: ReadoutArrays):
-    """Add the conductance of every contact (W/K) to the cell it lies in. Thread: a kept contact [B, S, M]."""
+def conduct_contacts(measure: int, state: StateArrays, heat: HeatArrays, io: ReadoutArrays):
+    """Add the conductance of every contact (W/K) to the cells it covers. Thread: a kept contact [B, S, M].
+
+    Launched first to ``measure`` the area that is touched in each cell (1), then to add conductances (0).
+    """
     env, s, i = wp.tid()
     count = wp.min(heat.number[env, s], heat.kept.shape[2])
     if i >= count or (io.status[env] & 1) != 0:
@@ -158,16 +228,22 @@ def conduct_contacts(state: StateArrays, heat: HeatArrays, io: ReadoutArrays):
             spots = spots + spot_area(state.contact_distance[d], grid.bluntness)
             deepest = wp.max(deepest, -state.contact_distance[d])
     center = center / float(points)
-    area = spots
+    here = state.contact_position[c] - center
+    n = wp.normalize(normal)
+    u = wp.cross(n, wp.vec3f(float(1.0), float(0.0), float(0.0)))
+    if wp.length(u) < float(0.5):
+        u = wp.cross(n, wp.vec3f(float(0.0), float(1.0), float(0.0)))
+    u = wp.normalize(u)
+    v = wp.cross(n, u)
+    whole = spots
+    area = spots / float(points)
+    # The contact's own part of a polygon: the triangle of the centre, itself and the next point.
+    following = here
+    filled = int(0)
     if points >= 3:
         # Polygon about the centre, by polar angle: each point spans a triangle with the next one.
-        n = wp.normalize(normal)
-        u = wp.cross(n, wp.vec3f(float(1.0), float(0.0), float(0.0)))
-        if wp.length(u) < float(0.5):
-            u = wp.cross(n, wp.vec3f(float(0.0), float(1.0), float(0.0)))
-        u = wp.normalize(u)
-        v = wp.cross(n, u)
         polygon = float(0.0)
+        own = float(0.0)
         for j in range(count):
             d = heat.kept[env, s, j]
             if other_link(state.contact_geom[d], heat.link_of, grid.link) == other:
@@ -191,46 +267,48 @@ def conduct_contacts(state: StateArrays, heat: HeatArrays, io: ReadoutArrays):
                             least = turn
                             nx = qx
                             ny = qy
-                polygon = polygon + float(0.5) * (x * ny - y * nx)
-        area = wp.max(area, polygon)
+                triangle = float(0.5) * (x * ny - y * nx)
+                polygon = polygon + triangle
+                if d == c:
+                    own = triangle
+                    following = nx * u + ny * v
+        if polygon > spots:
+            whole = polygon
+            area = own
+            filled = 1
     if grid.published == 1:
         # The published floor π d_w δ lacks a length; the radius supplies it.
-        area = wp.max(area, wp.pi * grid.depth_weight * wp.max(deepest, float(0.0)) * grid.bluntness)
-    whole = area
-    area = area / float(points)
-    if area > float(0.0):
-        local = wp.transform_point(wp.transform_inverse(frame), state.contact_position[c])
-        index = int(0)
-        for axis in range(3):
-            cell = int(wp.floor((local[axis] - grid.low[axis]) / grid.cell[axis]))
-            index = index * grid.shape[axis] + wp.clamp(cell, 0, grid.shape[axis] - 1)
-        index = grid.first + index
-        k_own = grid.conductivity
-        k_other = heat.link_conductivity[other]
-        g = float(0.0)
-        if grid.published == 1:
-            volume = grid.cell[0] * grid.cell[1] * grid.cell[2]
-            # 4.38 and 4.39: harmonic conductivity over the length L = V / A of the whole contact, shared among its
-            # points.
-            g = float(2.0) * k_own * k_other / (k_own + k_other) * whole * area / volume
-        else:
-            facing = wp.quat_rotate_inv(wp.transform_get_rotation(frame), state.contact_normal[c])
-            across = wp.abs(facing[0]) * grid.cell[0] + wp.abs(facing[1]) * grid.cell[1]
-            across = across + wp.abs(facing[2]) * grid.cell[2]
-            # The spot spreads within its cell as it does in the touched body.
-            disc = float(4.0) * wp.sqrt(whole / wp.pi) / float(points)
-            # Resistances in series: half a cell and the spot within it, the interface, the touched body. A sum of
-            # resistances stays finite and positive for any pair of materials.
-            resistance = float(1.0) / (k_own * (float(2.0) * area / across + disc))
-            if grid.contact > float(0.0):
-                resistance = resistance + float(1.0) / (grid.contact * area)
-            # A half-space that gives heat through a disc: planar at first, spreading later.
-            time = heat.touched[env, index] + float(0.5) * io.dt
-            planar = area / wp.sqrt(wp.pi * heat.link_diffusivity[other] * time)
-            resistance = resistance + float(1.0) / (k_other * (planar + disc))
-            g = float(1.0) / resistance
-        wp.atomic_add(heat.conductance, env, index, g)
-        wp.atomic_add(heat.inflow, env, index, g * heat.link_temperature[env, other])
+        floor = wp.pi * grid.depth_weight * wp.max(deepest, float(0.0)) * grid.bluntness
+        if floor > whole:
+            whole = floor
+            area = floor / float(points)
+            filled = 0
+    if area <= float(0.0):
+        return
+    # Pieces of equal area: of the triangle by rows towards the centre, of a disc by rings and angles.
+    inverse = wp.transform_inverse(frame)
+    radius = wp.sqrt(area / wp.pi)
+    piece = area / float(wp.static(PIECES * PIECES))
+    for i in range(wp.static(PIECES)):
+        outward = wp.sqrt((float(i) + float(0.5)) / float(wp.static(PIECES)))
+        for j in range(wp.static(PIECES)):
+            along = (float(j) + float(0.5)) / float(wp.static(PIECES))
+            place = center + outward * (here + along * (following - here))
+            if filled == 0:
+                angle = wp.tau * (along + float(0.5 / PIECES) * float(i % 2))
+                place = state.contact_position[c] + radius * outward * (wp.cos(angle) * u + wp.sin(angle) * v)
+            local = wp.transform_point(inverse, place)
+            index = int(0)
+            for axis in range(3):
+                cell = int(wp.floor((local[axis] - grid.low[axis]) / grid.cell[axis]))
+                index = index * grid.shape[axis] + wp.clamp(cell, 0, grid.shape[axis] - 1)
+            index = grid.first + index
+            if measure == 1:
+                wp.atomic_add(heat.covered, env, index, piece)
+            else:
+                g = piece * conductance_of(state, heat, io, env, s, c, index, other, whole)
+                wp.atomic_add(heat.conductance, env, index, g)
+                wp.atomic_add(heat.inflow, env, index, g * heat.link_temperature[env, other])
 
 
 @wp.func
@@ -252,6 +330,7 @@ def exchange_heat(heat: HeatArrays, io: ReadoutArrays, out: wp.array2d(dtype=wp.
         t = wp.float64(grid.base)
     g = heat.conductance[env, n]
     inflow = heat.inflow[env, n]
+    heat.covered[env, n] = float(0.0)
     heat.conductance[env, n] = float(0.0)
     heat.inflow[env, n] = float(0.0)
     if (io.status[env] & 1) != 0 or not wp.isfinite(inflow):

@@ -123,6 +123,19 @@ def test_sliding_colours_the_same_resonances_and_grows_with_speed_and_force():
     assert spectrum[near].sum() > 0.8 * spectrum.sum()
 
 
+def test_what_is_held_at_a_reset_makes_no_sound_and_what_strikes_afterwards_does():
+    suite, state = _make()
+    _touch(state, 30.0)
+    for _ in range(2):
+        suite.reset()
+        for _ in range(3):
+            suite.update(state, DT)
+            assert np.all(suite.read("sound").numpy() == 0)
+    _touch(state, 40.0)
+    suite.update(state, DT)
+    assert suite.read("sound").abs().max() > 0
+
+
 def test_modes_beyond_half_the_sample_rate_are_left_out():
     sensor = ContactAudio(link="box", modes=Modes((500.0, 20_000.0), (5.0, 5.0), (1.0, 100.0)), samples=K)
     suite, state = SensorSuite(_scene(), {"sound": sensor}, num_envs=1), HandState.empty(1, 3, 4)

@@ -12,9 +12,9 @@ STEP = 0.5
 
 
 def _passes(chain, accelerations, load=None):
-    """Joint accelerations [n, link, 2], wrenches on the base [n, 6] and accelerations of the tip [n, 3]."""
-    kernels = in_double("articulated_body")
-    real, vec2, vec3 = wp.float64, kernels.vec2, kernels.vec3
+    """Joint accelerations [n, hinge], wrenches on the base [n, 6] and accelerations of the tip [n, 3]."""
+    kernels = in_double("articulated_body", hinges=chain.hinges)
+    real, JointVector, vec3 = wp.float64, kernels.JointVector, kernels.vec3
     ChainArrays, JobArrays, StepOptions = kernels.ChainArrays, kernels.JobArrays, kernels.StepOptions
     WhiskerJob, WhiskerState, ChainState = kernels.WhiskerJob, kernels.WhiskerState, kernels.ChainState
     ProximityState, ContactCandidates, BodyMotion = (
@@ -32,12 +32,12 @@ def _passes(chain, accelerations, load=None):
         jobs: JobArrays,
         options: StepOptions,
         pose: BodyMotion,
-        angle: wp.array(dtype=vec2),
-        rate: wp.array(dtype=vec2),
+        angle: wp.array(dtype=JointVector),
+        rate: wp.array(dtype=JointVector),
         acceleration: wp.array2d(dtype=vec3),
         h: real,
         loads: int,
-        joints: wp.array2d(dtype=vec2),
+        joints: wp.array2d(dtype=JointVector),
         wrench: wp.array2d(dtype=vec3),
         tip: wp.array(dtype=vec3),
     ):
@@ -74,19 +74,20 @@ def _passes(chain, accelerations, load=None):
     pose = BodyMotion()
     pose.turn, pose.spin, pose.velocity = chain.base_turn, chain.base_twist[:3], chain.base_twist[3:]
     n = len(accelerations)
-    joints, wrench = wp.zeros((n, chain.links), dtype=vec2), wp.zeros((n, 2), dtype=vec3)
+    joints, wrench = wp.zeros((n, chain.links), dtype=JointVector), wp.zeros((n, 2), dtype=vec3)
     tip = wp.zeros(n, dtype=vec3)
     inputs = [
         to_struct(ChainArrays, chain.arrays(), "cpu"), to_struct(JobArrays, loads, "cpu"), StepOptions(), pose,
-        wp.array(chain.angle, dtype=vec2), wp.array(chain.rate, dtype=vec2),
+        wp.array(chain.angle, dtype=JointVector), wp.array(chain.rate, dtype=JointVector),
         wp.array(np.reshape(accelerations, (n, 2, 3)), dtype=vec3), STEP, int(load is not None), joints, wrench, tip,
     ]  # fmt: skip
     wp.launch(passes, n, inputs, device="cpu")
-    return joints.numpy(), wrench.numpy().reshape(n, 6), tip.numpy()
+    return joints.numpy()[:, chain.free], wrench.numpy().reshape(n, 6), tip.numpy()
 
 
-def test_the_articulated_inertia_is_the_schur_complement_of_the_mass_matrix():
-    chain = DenseChain.random()
+@pytest.mark.parametrize("hinges", [2, 3])
+def test_the_articulated_inertia_is_the_schur_complement_of_the_mass_matrix(hinges):
+    chain = DenseChain.random(hinges=hinges)
     chain.rate[:], chain.base_twist[:] = 0, 0
     _, wrench, _ = _passes(chain, np.vstack([np.zeros(6), np.eye(6)]))
     found = (wrench[1:] - wrench[0]).T
@@ -97,8 +98,9 @@ def test_the_articulated_inertia_is_the_schur_complement_of_the_mass_matrix():
 
 @pytest.mark.parametrize("beta", [0.1, 2.0])
 @pytest.mark.parametrize("loaded", [False, True])
-def test_joints_accelerate_as_the_dense_equation_of_motion_says(beta, loaded):
-    chain = DenseChain.random(links=8, seed=1)
+@pytest.mark.parametrize("hinges", [2, 3])
+def test_joints_accelerate_as_the_dense_equation_of_motion_says(beta, loaded, hinges):
+    chain = DenseChain.random(links=8, seed=1, hinges=hinges)
     chain.beta = beta
     rng = np.random.default_rng(2)
     given = rng.normal(size=(4, 6))
@@ -106,7 +108,7 @@ def test_joints_accelerate_as_the_dense_equation_of_motion_says(beta, loaded):
     joints, wrench, tip = _passes(chain, given, load)
     dense, bias, (implicit, spring) = chain.mass_matrix(), chain.bias(), chain.implicit(STEP)
     nodes, _, _ = chain.pose()
-    pushed = np.zeros(6 + 2 * chain.links)
+    pushed = np.zeros(6 + chain.axes_count)
     if load is not None:
         point = nodes[load[0]] + load[1] * (nodes[load[0] + 1] - nodes[load[0]])
         pushed = chain.point_jacobian(point, load[0])[3:].T @ load[2]
@@ -116,11 +118,11 @@ def test_joints_accelerate_as_the_dense_equation_of_motion_says(beta, loaded):
         base = base + np.concatenate([np.zeros(3), np.cross(spin, velocity)])
         force = spring + (pushed - bias)[6:] - dense[6:, :6] @ base
         expected = np.linalg.solve(implicit, force)
-        np.testing.assert_allclose(joints[k].ravel(), expected, rtol=1e-8, atol=1e-8 * np.abs(expected).max())
+        np.testing.assert_allclose(joints[k], expected, rtol=1e-8, atol=1e-8 * np.abs(expected).max())
         # Newton and Euler for all links together.
         total = dense[:6, :6] @ base + dense[:6, 6:] @ expected + (bias - pushed)[:6]
         np.testing.assert_allclose(wrench[k], total, rtol=1e-8, atol=1e-8 * np.abs(total).max())
     # Of two runs that differ in the acceleration of the base alone, the tips differ by what the Jacobian says.
     jacobian = chain.point_jacobian(nodes[-1], chain.links - 1)[3:]
-    change = np.concatenate([given[1] - given[0], (joints[1] - joints[0]).ravel()])
+    change = np.concatenate([given[1] - given[0], joints[1] - joints[0]])
     np.testing.assert_allclose(tip[1] - tip[0], jacobian @ change, atol=1e-8)

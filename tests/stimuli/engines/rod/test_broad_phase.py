@@ -25,7 +25,8 @@ def _run(chain, centres, radii, velocity):
     ChainArrays, MotionArrays, ShapeArrays = kernels.ChainArrays, kernels.MotionArrays, kernels.ShapeArrays
     StepOptions, PausedWhiskers, WhiskerJob = kernels.StepOptions, kernels.PausedWhiskers, kernels.WhiskerJob
     ChainState, ProximityState, WhiskerState = kernels.ChainState, kernels.ProximityState, kernels.WhiskerState
-    ContactCandidates, row, pose_at = kernels.ContactCandidates, kernels.row, kernels.pose_at
+    ContactCandidates, NearShapes, row = kernels.ContactCandidates, kernels.NearShapes, kernels.row
+    instant, pose_at = kernels.instant, in_double("motion").pose_at
     search_range, count_near_links = kernels.search_range, kernels.count_near_links
     lower_clearance, find_candidates = kernels.lower_clearance, kernels.find_candidates
     forward_kinematics = passes.forward_kinematics
@@ -55,21 +56,35 @@ def _run(chain, centres, radii, velocity):
         job.object_speed = speed
         chain = ChainState()
         proximity = ProximityState()
+        near = NearShapes()
         candidates = ContactCandidates()
         state = WhiskerState()
         for i in range(job.links):
             chain.angle[i] = angle[i]
             chain.rate[i] = rate[i]
         for t in range(nodes.shape[0]):
-            now = real(t) * h
-            pose = pose_at(motions, 0, now)
+            when = instant(0, real(t) * h)
+            pose = pose_at(motions, 0, when)
             forward_kinematics(chains, job, pose, chain, proximity, state)
             reach = search_range(job, options, state, h)
             measured[t] = count_near_links(chains, job, proximity, reach)
-            lower_clearance(job, proximity, reach)
+            lower_clearance(job, proximity, near, reach)
             state.last_step = h
             found = find_candidates(
-                chains, motions, shapes, job, paused, chain, proximity, candidates, state, pose, reach.margin, now, h
+                chains,
+                motions,
+                shapes,
+                job,
+                paused,
+                chain,
+                proximity,
+                near,
+                candidates,
+                state,
+                pose,
+                reach.margin,
+                when,
+                h,
             )
             margin[t] = reach.margin
             for j in range(found):
@@ -85,7 +100,8 @@ def _run(chain, centres, radii, velocity):
     still = np.tile([1.0, 0, 0, 0], (count + 1, 1))
     motions = {
         "first": np.arange(count + 1, dtype=np.int32), "count": np.ones(count + 1, dtype=np.int32),
-        "start": np.zeros(count + 1), "spacing": np.ones(count + 1), "place": np.vstack([np.zeros(3), centres]),
+        "cell": np.zeros(1, dtype=np.int32), "coarse": np.zeros((count + 1, 3)),
+        "place": np.vstack([np.zeros(3), centres]),
         "velocity": np.vstack([chain.base_twist[3:], velocity]), "turn": still,
         "spin": np.zeros((count + 1, 3)), "surge": np.zeros((count + 1, 3)),
     }  # fmt: skip

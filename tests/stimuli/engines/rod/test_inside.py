@@ -154,7 +154,7 @@ def test_an_object_that_moves_through_the_base_point_is_flagged_with_the_time(ki
 
 
 def test_an_object_that_passes_behind_the_base_is_not_in_its_way():
-    thing = _moved(lambda t: np.outer(t - 0.02, [0.0, 0.2, 0.0]) + [-5e-4, 0.0, 0.0],
+    thing = _moved(lambda t: np.add([-5e-4, 0.0, 0.0], np.outer(t - 0.02, [0.0, 0.2, 0.0])),
                    Capsule((0.0, 0.0, -0.01), (0.0, 0.0, 0.01), 2e-4))  # fmt: skip
     times = np.arange(1, 41) * 1e-3
     trace = RodEngine().run([Job(C2, StillFollicle(), (thing,), times)], Fidelity(links=10, time_step=2e-4))[0]
@@ -164,8 +164,12 @@ def test_an_object_that_passes_behind_the_base_is_not_in_its_way():
 
 @pytest.mark.parametrize("jump", [3e-3, 1e-2, 2e-2])
 def test_an_object_that_jumps_onto_the_whisker_is_never_missed(jump):
-    """Positions without a velocity: whatever the bounds of the distances say, the depth is found."""
-    ball = _moved(lambda t: np.where(t[:, None] < 0.01, [[0.008, jump + 0.0015, 0.0]], [[0.008, 0.0015, 0.0]]),
+    """It takes a tenth of a millisecond, far less than a step; a jump in no time is refused (test_motion_pieces)."""
+
+    def left(t):
+        return jump * (1 - np.clip((t - 0.01) / 1e-4, 0, 1))
+
+    ball = _moved(lambda t: np.add([0.008, 0.0015, 0.0], np.outer(left(t), [0.0, 1.0, 0.0])),
                   Sphere((0.0, 0.0, 0.0), 0.004))  # fmt: skip
     trace = RodEngine().run([Job(C2, StillFollicle(), (ball,), np.arange(1, 31) * 1e-3)], COARSE)[0]
     assert trace.status == "unstable"
@@ -175,7 +179,7 @@ def test_an_object_that_jumps_onto_the_whisker_is_never_missed(jump):
 
 def test_a_push_that_no_force_can_resolve_is_not_called_solved():
     """A straight chain does not yield along itself. Forces beyond 1 kN were dropped, and the step called solved."""
-    ball = _moved(lambda t: np.outer(np.minimum(t, 0.016), [-0.05, 0, 0]) + [C2.arc_length + 0.0055, 0, 0],
+    ball = _moved(lambda t: np.add([C2.arc_length + 0.0055, 0, 0], np.outer(np.minimum(t, 0.016), [-0.05, 0, 0])),
                   Sphere((0.0, 0.0, 0.0), 0.005))  # fmt: skip
     trace = RodEngine().run([Job(C2, StillFollicle(), (ball,), np.arange(1, 31) * 1e-3)], COARSE)[0]
     assert trace.penetration < 5e-4

@@ -64,6 +64,7 @@ def build_kernels(
     bounds: tuple[int, int] | None = None,
     sliced: bool = False,
     cuda: bool = False,
+    hinges: int = 2,
 ) -> Kernels:
     """Return the kernels for chains of at most ``capacity`` links in one precision; each is compiled by itself.
 
@@ -74,9 +75,10 @@ def build_kernels(
         sliced: whether a whisker pauses wherever it needs a distance from a mesh or contact forces, so that both are
             done for all whiskers by kernels of their own; results are the same. One shape a scene.
         cuda: compile for a GPU: with approximate divisions and roots, and groups of threads that find contact forces.
+        hinges: hinges of a joint, 2 for bending alone or 3 for bending and twist.
     """
     most = contacts_for(capacity)
-    common = {"real": real, "capacity": capacity, "against": against, "sliced": sliced, "cuda": cuda}
+    common = {"real": real, "capacity": capacity, "against": against, "sliced": sliced, "cuda": cuda, "hinges": hinges}
     whole = {"max_contacts": most, "bounds": bounds, **common}
     run, structs = specialize("step", **whole).run, specialize("state", **whole)
     if not sliced:

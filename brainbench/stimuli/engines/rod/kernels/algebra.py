@@ -4,7 +4,7 @@ from typing import Any
 
 import warp as wp
 
-from .parameters import real
+from .parameters import hinges, real
 
 vec2: Any = wp.types.vector(2, real)
 vec3: Any = wp.types.vector(3, real)
@@ -12,6 +12,10 @@ vec4: Any = wp.types.vector(4, real)
 vec5: Any = wp.types.vector(5, real)
 vec6: Any = wp.types.vector(6, real)
 mat33: Any = wp.types.matrix((3, 3), real)
+JointVector: Any = wp.types.vector(hinges, real)
+"""One number for each hinge of a joint: bending about y, bending about z, twist about x."""
+JointInverse: Any = wp.types.vector(hinges + 1, real)
+"""Inverse inertia of a joint: (11, 12, 22) of bending, then that of twist."""
 single = real is wp.float32
 
 
@@ -36,6 +40,12 @@ def symmetric_outer(a: vec3, b: vec3, c: vec3, d: vec3) -> vec6:
         a[0] * b[2] + c[0] * d[2],
         a[1] * b[2] + c[1] * d[2],
     )
+
+
+@wp.func
+def upper_outer(a: vec3, b: vec3) -> vec6:
+    """Return the diagonal and the upper half of the matrix a bᵀ."""
+    return vec6(a[0] * b[0], a[1] * b[1], a[2] * b[2], a[0] * b[1], a[0] * b[2], a[1] * b[2])
 
 
 @wp.func

@@ -1,8 +1,9 @@
 """Articulated-body algorithm: three passes over the chain of one thread, O(links).
 
 Featherstone, Rigid Body Dynamics Algorithms (2008), table 7.1, in world axes about the base point: spatial vectors are
-(rotation, translation at the base point), so nothing is transformed between links. Joints are universal, with two
-axes; in the names below S = (s, m) is an axis and its moment, Iᴬ = (ia ib; ibᵀ ic), pᴬ = (pw, pv), U = IᴬS.
+(rotation, translation at the base point), so nothing is transformed between links. Joints bend about two axes and, with
+three ``hinges``, every second one (1, 3, 5 …) then twists about the mean direction of both links, as a joint of its own
+behind the other; in the names below S = (s, m) is an axis and its moment, Iᴬ = (ia ib; ibᵀ ic), pᴬ = (pw, pv), U = IᴬS.
 
 Joint springs and dampers act at the end of the step (linearly implicit), so the joint-space inertia is
 D = SᵀU + h d + h² k, with stiffness k and damping d = βk, and stiffness limits no time step.
@@ -13,6 +14,8 @@ import warp as wp
 from brainbench.stimuli.engines.rod.limits import BENT, FOLD, LARGEST_BEND, LOST, STOP
 
 from .algebra import (
+    JointInverse,
+    JointVector,
     SpatialAcceleration,
     Twist,
     Wrench,
@@ -23,23 +26,73 @@ from .algebra import (
     sine,
     symmetric_outer,
     symmetric_times,
-    vec2,
+    upper_outer,
     vec3,
     vec6,
 )
 from .motion import BodyMotion
-from .parameters import real
+from .parameters import hinges, real
 from .state import (
     ChainArrays,
-    ChainState,
     ContactCandidates,
     JobArrays,
-    ProximityState,
+    PerLink1,
+    PerLink3,
+    PerLinkInt,
+    PerLinkInverse,
+    PerLinkJoint,
+    PerNode3,
     StepOptions,
     WhiskerJob,
     WhiskerState,
     row,
 )
+
+
+@wp.struct
+class ChainState:
+    """State of the joints, and what one step keeps of each link between its passes."""
+
+    angle: PerLinkJoint
+    rate: PerLinkJoint
+    axis2: PerLink3
+    """Second axis of the joint."""
+    node: PerNode3
+    """Joints and tip, from the base point."""
+    gain1_w: PerLink3
+    """U D⁻¹ of each axis (``articulated_body``), rotation and translation."""
+    gain1_v: PerLink3
+    gain2_w: PerLink3
+    gain2_v: PerLink3
+    if hinges == 3:
+        axis3: PerLink3
+        gain3_w: PerLink3
+        gain3_v: PerLink3
+    acceleration: PerLinkJoint
+    """D⁻¹u of the joint, then its accelerations."""
+
+
+@wp.func
+def hinge_direction(chain: wp.ref[ChainState], i: int) -> vec3:
+    """Return the direction of the axis normal to both bending hinges of a joint, of any length."""
+    if wp.static(hinges == 3):
+        return row(chain.axis3, i)
+    return row(chain.node, i + 1) - row(chain.node, i)
+
+
+@wp.struct
+class ProximityState:
+    """State of each link that only contact needs; without objects a kernel leaves it out."""
+
+    inverse_inertia: PerLinkInverse
+    """Inverse inertia D⁻¹ of the joint."""
+    clearance: PerLink1
+    """Lower bound of the distance from all objects; at rest, the time until which nothing can come near."""
+    leaf: PerLinkInt
+    """Leaf of the search tree where the last search ended (+ 1)."""
+    safe_until: PerLink1
+    end_speed: PerLink1
+    """Speed of the faster end."""
 
 
 @wp.func(inline=True)
@@ -83,6 +136,18 @@ def forward_kinematics(
         turned = x * cb + y * sb
         y = y * cb - x * sb
         x = turned
+        if wp.static(hinges == 3):
+            chain.axis3[i] = x
+            if i % 2 == 1:
+                # Half of the rest bend comes before the hinges, half behind them.
+                ct = cosine(angle[2])
+                st = sine(angle[2])
+                vw = vw + x * rate[2]
+                vv = vv + wp.cross(at, x) * rate[2]
+                turned = y * ct + z * st
+                z = z * ct - y * st
+                y = turned * link.bend_cosine - x * link.bend_sine
+                x = x * link.bend_cosine + turned * link.bend_sine
         at = at + x * link.length
         # Velocity is linear along a rigid link, so its faster end is the fastest of its points.
         end_speed = wp.length_sq(vv + wp.cross(vw, at))
@@ -160,10 +225,49 @@ def articulated_inertia(
                     pull = jobs.load_force[load]
                     pw = pw - wp.cross(at + xa * (link.length * jobs.load_share[load]), pull)
                     pv = pv - pull
+        k = inertia.stiffness
         angle = row(chain.angle, i)
+        rate = row(chain.rate, i)
+        # Springs and dampers at the end of the step: τ = −k (q + lag q̇), D gains h k lag.
+        lag = h + step_damping
+        force = JointVector()
+        inverse = JointInverse()
+        x = xa
+        if wp.static(hinges == 3):
+            x = row(chain.axis3, i)
+            if i % 2 == 1:
+                m3 = wp.cross(at, x)
+                u3w = symmetric_times(ia, x) + ib * m3
+                u3v = x * ib + symmetric_times(ic, m3)
+                soft3 = h * lag * inertia.torsion
+                spring3 = angle[2] + lag * rate[2]
+                twist = wp.abs(angle[2])
+                if twist > real(wp.static(FOLD)):
+                    soft3 = soft3 * real(1.0 + wp.static(STOP))
+                    past = angle[2] * (one - real(wp.static(FOLD)) / twist)
+                    spring3 = spring3 + real(wp.static(STOP)) * (past + lag * rate[2])
+                i33 = one / (wp.dot(x, u3w) + wp.dot(m3, u3v) + soft3)
+                f3 = i33 * (-inertia.torsion * spring3 - wp.dot(x, pw) - wp.dot(m3, pv))
+                g3w = u3w * i33
+                g3v = u3v * i33
+                chain.gain3_w[i] = g3w
+                chain.gain3_v[i] = g3v
+                force[2] = f3
+                inverse[3] = i33
+                s3 = x * rate[2]
+                m3 = m3 * rate[2]
+                cw = wp.cross(vw, s3)
+                cv = wp.cross(vw, m3) + wp.cross(vv, s3)
+                vw = vw - s3
+                vv = vv - m3
+                ia = ia - upper_outer(u3w, g3w)
+                ic = ic - upper_outer(u3v, g3v)
+                ib = ib - wp.outer(u3w, g3v)
+                pw = pw + symmetric_times(ia, cw) + ib * cv + u3w * f3
+                pv = pv + cw * ib + symmetric_times(ic, cv) + u3v * f3
         s2 = row(chain.axis2, i)
         # First axis of the joint: the y axis of the link before the turn about the second axis.
-        s1 = wp.cross(s2, xa) * cosine(angle[1]) + xa * sine(angle[1])
+        s1 = wp.cross(s2, x) * cosine(angle[1]) + x * sine(angle[1])
         m1 = wp.cross(at, s1)
         m2 = wp.cross(at, s2)
         # U = IᴬS of both axes.
@@ -171,11 +275,7 @@ def articulated_inertia(
         u1v = s1 * ib + symmetric_times(ic, m1)
         u2w = symmetric_times(ia, s2) + ib * m2
         u2v = s2 * ib + symmetric_times(ic, m2)
-        k = inertia.stiffness
-        # Springs and dampers at the end of the step: τ = −k (q + lag q̇), D gains h k lag.
-        lag = h + step_damping
         soft = h * k * lag
-        rate = row(chain.rate, i)
         spring1 = angle[0] + lag * rate[0]
         spring2 = angle[1] + lag * rate[1]
         # A joint bent beyond FOLD stiffens.
@@ -192,7 +292,7 @@ def articulated_inertia(
             soft2 = soft * real(1.0 + wp.static(STOP))
             past = angle[1] * (one - real(wp.static(FOLD)) / bend)
             spring2 = spring2 + real(wp.static(STOP)) * (past + lag * rate[1])
-        # D of both axes, its inverse, and u = τ − Sᵀpᴬ.
+        # D of the axes, its inverse, and u = τ − Sᵀpᴬ.
         d11 = wp.dot(s1, u1w) + wp.dot(m1, u1v) + soft1
         d12 = wp.dot(s1, u2w) + wp.dot(m1, u2v)
         d22 = wp.dot(s2, u2w) + wp.dot(m2, u2v) + soft2
@@ -209,13 +309,18 @@ def articulated_inertia(
         g1v = u1v * i11 + u2v * i12
         g2w = u1w * i12 + u2w * i22
         g2v = u1v * i12 + u2v * i22
+        force[0] = f1
+        force[1] = f2
         chain.gain1_w[i] = g1w
         chain.gain1_v[i] = g1v
         chain.gain2_w[i] = g2w
         chain.gain2_v[i] = g2v
-        chain.acceleration[i] = vec2(f1, f2)
+        chain.acceleration[i] = force
         if candidate_count > 0:
-            proximity.inverse_inertia[i] = vec3(i11, i12, i22)
+            inverse[0] = i11
+            inverse[1] = i12
+            inverse[2] = i22
+            proximity.inverse_inertia[i] = inverse
         # Velocity-product acceleration of the joint.
         # Going up, the twist of the link before is that of this link less what the joint adds.
         jw = s1 * rate[0] + s2 * rate[1]
@@ -241,7 +346,7 @@ def articulated_inertia(
 
 @wp.func(inline=True)
 def integrate_joint(
-    chain: wp.ref[ChainState], state: wp.ref[WhiskerState], i: int, a: vec2, h: real, end: real, quasistatic: int
+    chain: wp.ref[ChainState], state: wp.ref[WhiskerState], i: int, a: JointVector, h: real, end: real, quasistatic: int
 ):
     """Move a joint by its accelerations to the end of the step."""
     # The new rate moves the angle: together with the implicit springs this is a backward Euler step.
@@ -249,10 +354,14 @@ def integrate_joint(
     angle = row(chain.angle, i) + rate * h
     # Each quasi-static step starts at rest, so nothing swings past its balance.
     if quasistatic == 1:
-        rate = vec2(real(0.0), real(0.0))
+        rate = JointVector()
     chain.rate[i] = rate
     chain.angle[i] = angle
     bend = wp.max(wp.abs(angle[0]), wp.abs(angle[1]))
+    fastest = wp.max(wp.abs(rate[0]), wp.abs(rate[1]))
+    if wp.static(hinges == 3):
+        bend = wp.max(bend, wp.abs(angle[2]))
+        fastest = wp.max(fastest, wp.abs(rate[2]))
     # A value that is no number must not slip through a comparison.
     if not (bend < real(wp.static(LARGEST_BEND))):
         if state.status == 0:
@@ -260,7 +369,7 @@ def integrate_joint(
             if not (bend < real(1e30)):
                 state.status = wp.static(LOST)
             state.failed_at = end
-    state.largest_change = wp.max(state.largest_change, wp.max(bend, wp.max(wp.abs(rate[0]), wp.abs(rate[1]))))
+    state.largest_change = wp.max(state.largest_change, wp.max(bend, fastest))
 
 
 @wp.func(inline=True)
@@ -288,7 +397,7 @@ def joint_accelerations(
     for i in range(job.links):
         at = row(chain.node, i)
         s2 = row(chain.axis2, i)
-        s1 = first_axis(s2, row(chain.node, i + 1) - at, row(chain.angle, i)[1])
+        s1 = first_axis(s2, hinge_direction(chain, i), row(chain.angle, i)[1])
         m1 = wp.cross(at, s1)
         m2 = wp.cross(at, s2)
         rate = row(chain.rate, i)
@@ -304,12 +413,27 @@ def joint_accelerations(
         f = row(chain.acceleration, i)
         a1 = f[0] - wp.dot(row(chain.gain1_w, i), aw) - wp.dot(row(chain.gain1_v, i), av)
         a2 = f[1] - wp.dot(row(chain.gain2_w, i), aw) - wp.dot(row(chain.gain2_v, i), av)
+        a = JointVector()
+        a[0] = a1
+        a[1] = a2
         aw = aw + s1 * a1 + s2 * a2
         av = av + m1 * a1 + m2 * a2
+        if wp.static(hinges == 3):
+            if i % 2 == 1:
+                s3 = row(chain.axis3, i)
+                m3 = wp.cross(at, s3)
+                aw = aw + wp.cross(vw, s3) * rate[2]
+                av = av + (wp.cross(vw, m3) + wp.cross(vv, s3)) * rate[2]
+                a3 = f[2] - wp.dot(row(chain.gain3_w, i), aw) - wp.dot(row(chain.gain3_v, i), av)
+                aw = aw + s3 * a3
+                av = av + m3 * a3
+                vw = vw + s3 * rate[2]
+                vv = vv + m3 * rate[2]
+                a[2] = a3
         if candidate_count > 0:
-            chain.acceleration[i] = vec2(a1, a2)
+            chain.acceleration[i] = a
         else:
-            integrate_joint(chain, state, i, vec2(a1, a2), h, now + h, options.quasistatic)
+            integrate_joint(chain, state, i, a, h, now + h, options.quasistatic)
         for j in range(candidate_count):
             if row(candidates.link, j) == i:
                 # Gravity was added to the base's acceleration; it moves nothing by itself.

@@ -2,35 +2,44 @@
 
 Each link keeps a lower bound of its distance from all objects (``clearance``). Links and objects come nearer by no more
 than their speeds allow, so a link is measured again only when its bound comes near its radius. A contact takes part
-before it closes (g + h vₙ ≥ 0, gap g, approach vₙ), so nothing passes through anything within a step.
+before it closes (g + h vₙ ≥ 0, gap g, approach vₙ), so nothing passes through anything within a step. Of many shapes
+only the nearest are looked at; a bound tells when another may have come near (``list_shapes``).
 """
 
 import warp as wp
 
 from brainbench.stimuli.engines.rod.limits import (
     AT_BASE,
+    CAPSULE,
+    CLOSED,
+    CYLINDER,
     GOT_INSIDE,
     LARGEST_OVERLAP,
     LARGEST_START_OVERLAP,
+    LISTED,
+    STALE,
     STARTED_INSIDE,
     WIDEST,
 )
 from brainbench.stimuli.engines.units import MILLI
 
 from .algebra import first_axis, rotate, vec3
-from .motion import BodyMotion, pose_at
+from .articulated_body import ChainState, ProximityState, hinge_direction
+from .distances import segments
+from .motion import BodyMotion, elapsed, instant, pose_from
 from .narrow_phase import link_shape_distance
-from .parameters import real, sliced
+from .parameters import hinges, real, sliced
 from .state import (
     WAIT_DISTANCES,
     WAIT_SLICE,
     ChainArrays,
-    ChainState,
     ContactCandidates,
+    Instant,
     LinkDistance,
     MotionArrays,
     PausedWhiskers,
-    ProximityState,
+    PerListed1,
+    PerListedInt,
     ShapeArrays,
     StepOptions,
     WhiskerJob,
@@ -38,6 +47,22 @@ from .state import (
     most_candidates,
     row,
 )
+
+
+@wp.struct
+class NearShapes:
+    """The shapes nearest to a whisker, where a scene has more than are looked at in each step."""
+
+    shape: PerListedInt
+    """In the order of the scene."""
+    distance: PerListed1
+    """Bound of the distance from the whisker's axis when they were listed."""
+    count: wp.int32
+    """0: there is no list; all shapes are looked at."""
+    room: real
+    """Least distance of all others from the whisker's axis then."""
+    moved: real
+    """How much nearer any of them may have come since."""
 
 
 @wp.struct
@@ -94,11 +119,91 @@ def count_near_links(
 
 
 @wp.func(inline=True)
-def lower_clearance(job: WhiskerJob, proximity: wp.ref[ProximityState], reach: SearchRange):
-    """Lower the bound of each link by how much nearer it may have come."""
+def lower_clearance(job: WhiskerJob, proximity: wp.ref[ProximityState], near: wp.ref[NearShapes], reach: SearchRange):
+    """Lower the bound of each link, and that of the shapes left out, by how much nearer they may have come."""
+    most = real(0.0)
     for i in range(job.links):
         nearer = reach.time * (row(proximity.end_speed, i) + reach.unknown_speed)
         proximity.clearance[i] = row(proximity.clearance, i) - nearer
+        most = wp.max(most, nearer)
+    near.moved = near.moved + most
+
+
+@wp.func
+def from_segment(point: vec3, end: vec3) -> vec3:
+    """Return the way from the nearest point of the segment from the origin to ``end``."""
+    share = wp.clamp(wp.dot(point, end) / wp.length_sq(end), real(0.0), real(1.0))
+    return point - end * share
+
+
+@wp.func(inline=True)
+def list_shapes(
+    motions: MotionArrays,
+    shapes: ShapeArrays,
+    job: WhiskerJob,
+    chain: wp.ref[ChainState],
+    near: wp.ref[NearShapes],
+    pose: BodyMotion,
+    now: Instant,
+):
+    """List the shapes nearest to the whisker, and how far off all others are.
+
+    A shape counts as the ball around it, a capsule or a cylinder as the capsule around it.
+    """
+    near.count = 0
+    near.room = real(1e20)
+    near.moved = real(0.0)
+    worst = int(0)
+    # All of the whisker is near the chord from base to tip.
+    chord = row(chain.node, job.links)
+    sag = real(0.0)
+    for i in range(1, job.links):
+        sag = wp.max(sag, wp.length(from_segment(row(chain.node, i), chord)))
+    body = BodyMotion()
+    last_track = int(-1)
+    for s in range(job.first_shape, job.end_shape):
+        if shapes.track[s] != last_track:
+            last_track = shapes.track[s]
+            body = pose_from(motions, last_track, now, pose)
+        centre = body.place + rotate(body.turn, shapes.place[s])
+        round = shapes.radius[s]
+        full = near.count == wp.static(LISTED)
+        if full:
+            beyond = wp.length(from_segment(centre, chord)) - sag - round
+            if beyond >= row(near.distance, worst):
+                near.room = wp.min(near.room, beyond)
+                continue
+        along = vec3(real(0.0), real(0.0), real(0.0))
+        slender = shapes.kind[s] == wp.static(CAPSULE) or shapes.kind[s] == wp.static(CYLINDER)
+        if slender:
+            round = shapes.size[s][0]
+            along = rotate(body.turn, rotate(shapes.turn[s], vec3(real(0.0), real(0.0), shapes.size[s][1])))
+        square = real(1e20)
+        for i in range(job.links):
+            start = row(chain.node, i)
+            link = row(chain.node, i + 1) - start
+            away = from_segment(centre - start, link)
+            if slender:
+                pair = segments(start, link, centre - along, real(2.0) * along)
+                away = start + link * pair[0] - (centre + along * (real(2.0) * pair[1] - real(1.0)))
+            square = wp.min(square, wp.length_sq(away))
+        distance = wp.sqrt(square) - round
+        if full:
+            near.room = wp.min(near.room, wp.max(distance, row(near.distance, worst)))
+        if not full or distance < row(near.distance, worst):
+            # The one that is furthest makes room; the others keep their order.
+            if full:
+                for j in range(worst, wp.static(LISTED - 1)):
+                    near.shape[j] = row(near.shape, j + 1)
+                    near.distance[j] = row(near.distance, j + 1)
+                near.count = near.count - 1
+            near.shape[near.count] = s
+            near.distance[near.count] = distance
+            near.count = near.count + 1
+            worst = int(0)
+            for j in range(1, near.count):
+                if row(near.distance, j) > row(near.distance, worst):
+                    worst = j
 
 
 @wp.func(inline=True)
@@ -110,8 +215,8 @@ def query_distances(
     proximity: wp.ref[ProximityState],
     state: wp.ref[WhiskerState],
     reach: SearchRange,
-    origin: vec3,
-    now: real,
+    pose: BodyMotion,
+    now: Instant,
     near_count: int,
 ) -> int:
     """Ask for the distances of these links; return what to wait for: the next slice, when there is no room for more."""
@@ -123,12 +228,14 @@ def query_distances(
         if may_be_near(chains, job, proximity, reach, i):
             paused.query[place].job = job.index
             paused.query[place].link = i
-            paused.query[place].start = row(chain.node, i) + origin
-            paused.query[place].stop = row(chain.node, i + 1) + origin
+            paused.query[place].start = row(chain.node, i)
+            paused.query[place].stop = row(chain.node, i + 1)
             nearer = reach.time * (row(proximity.end_speed, i) + reach.unknown_speed)
             paused.query[place].bound = row(proximity.clearance, i) - nearer
             place = place + 1
-    paused.query_time[job.index] = now
+    paused.query_frame[job.index].time = now
+    paused.query_frame[job.index].coarse = pose.coarse
+    paused.query_frame[job.index].place = pose.place
     paused.query_margin[job.index] = reach.margin
     return WAIT_DISTANCES
 
@@ -189,18 +296,18 @@ def find_candidates(
     paused: PausedWhiskers,
     chain: wp.ref[ChainState],
     proximity: wp.ref[ProximityState],
+    near: wp.ref[NearShapes],
     candidates: wp.ref[ContactCandidates],
     state: wp.ref[WhiskerState],
     pose: BodyMotion,
     margin: real,
-    now: real,
+    now: Instant,
     h: real,
 ) -> int:
     """Find the contact candidates of all links and renew their bounds; return the number of candidates."""
     zero = real(0.0)
     # Counts that the compiler does not know keep it from writing loops out.
     sides = int(2) + wp.min(0, job.index)
-    origin = pose.place
     count = int(0)
     deepest = zero
     crossing = int(0)
@@ -208,39 +315,63 @@ def find_candidates(
     query = state.first_query
     angular = pose.spin
     linear = pose.velocity
+    looked_at = job.end_shape - job.first_shape
+    others = real(1e20)
+    enough = margin + chains.taper[0, job.whisker].start_radius
+    if wp.static(not sliced) and looked_at > wp.static(LISTED):
+        stale = near.room - near.moved <= enough
+        if near.moved > real(wp.static(STALE)):
+            for place in range(near.count):
+                stale = stale or row(near.distance, place) - near.moved <= enough
+        if stale:
+            list_shapes(motions, shapes, job, chain, near, pose, now)
+        # More of them within the margin than are listed: all are looked at.
+        if near.room - near.moved > enough:
+            looked_at = near.count
+            others = near.room - near.moved
     for i in range(job.links):
         rate = row(chain.rate, i)
         joint = row(chain.node, i)
         link = row(chain.node, i + 1) - joint
         e2 = row(chain.axis2, i)
         # Twist of the link: what its joint adds to that of the link before.
-        spun = first_axis(e2, link, row(chain.angle, i)[1]) * rate[0] + e2 * rate[1]
+        spun = first_axis(e2, hinge_direction(chain, i), row(chain.angle, i)[1]) * rate[0] + e2 * rate[1]
+        if wp.static(hinges == 3):
+            if i % 2 == 1:
+                spun = spun + row(chain.axis3, i) * rate[2]
         angular = angular + spun
         linear = linear + wp.cross(joint, spun)
         taper = chains.taper[i, job.whisker]
         if row(proximity.clearance, i) <= margin + taper.start_radius:
             # One shape after the other, each at two places: between the ends, and at the far end.
-            closest = real(1e20)
-            for s in range(job.first_shape, job.end_shape):
-                body = pose_at(motions, shapes.track[s], now)
+            closest = others
+            for place in range(looked_at):
+                s = job.first_shape + place
+                if others < real(1e20):
+                    s = row(near.shape, place)
+                    away = row(near.distance, place) - near.moved
+                    if away > enough:
+                        closest = wp.min(closest, away)
+                        continue
+                # Places count from the base, where the digits are needed.
+                body = pose_from(motions, shapes.track[s], now, pose)
                 turn_s = shapes.turn[s]
                 found = LinkDistance()
                 if wp.static(sliced):
                     found = paused.answer[query]
                     query = query + 1
                 else:
-                    a = joint + origin
-                    b = row(chain.node, i + 1) + origin
                     bound = row(proximity.clearance, i)
                     leaf = row(proximity.leaf, i)
-                    found = link_shape_distance(shapes, s, body, a, b, taper, margin, bound, leaf, 0, 1)
+                    end = joint + link
+                    found = link_shape_distance(shapes, s, body, joint, end, taper, margin, bound, leaf, 0, 1)
                 proximity.leaf[i] = found.leaf
                 closest = wp.min(closest, found.clearance)
                 deepest = wp.max(deepest, found.depth)
                 crossing = wp.max(crossing, found.crossing)
                 if i == 0 and found.start == 1 and found.start_gap < margin:
                     way = rotate(body.turn, rotate(turn_s, found.start_normal))
-                    approach = wp.dot(way, pose.velocity - body.velocity - wp.cross(body.spin, origin - body.place))
+                    approach = wp.dot(way, pose.velocity - body.velocity - wp.cross(body.spin, -body.place))
                     base_gap = wp.min(base_gap, found.start_gap + h * wp.min(approach, zero))
                 for which in range(sides):
                     offered = found.between
@@ -259,11 +390,15 @@ def find_candidates(
                         # The force acts on the skin of the whisker: its radius is the lever of friction.
                         point = joint + link * share - normal * radius
                         # The object's velocity in the middle of the step.
-                        half = pose_at(motions, shapes.track[s], now + real(0.5) * h)
-                        object_velocity = half.velocity + wp.cross(half.spin, point + origin - half.place)
+                        middle = instant(now.tick, now.part + real(0.5) * h)
+                        half = pose_from(motions, shapes.track[s], middle, pose)
+                        object_velocity = half.velocity + wp.cross(half.spin, point - half.place)
                         approach = wp.dot(normal, linear + wp.cross(angular, point) - object_velocity)
                         # Where the gap will be: tells apart what only passes by.
                         ahead = gap + real(1.5) * h * wp.min(approach, zero)
+                        if gap + real(1.5) * job.longest_step * wp.min(approach, zero) <= real(wp.static(CLOSED)):
+                            state.closes = 1
+                            state.closing_speed = wp.max(state.closing_speed, shapes.speed[s])
                         slot = candidate_slot(candidates, count, point, normal, ahead, link)
                         if slot == count:
                             count = count + 1
@@ -280,5 +415,5 @@ def find_candidates(
                             candidates.object_velocity[slot] = object_velocity
                             candidates.normal[slot] = normal
             proximity.clearance[i] = closest
-    judge_overlap(state, deepest, crossing, base_gap, now)
+    judge_overlap(state, deepest, crossing, base_gap, elapsed(now))
     return count

@@ -5,14 +5,13 @@ import warp as wp
 from brainbench.stimuli.engines.rod.limits import GROUPS
 
 from .algebra import Wrench, first_axis, vec3
-from .parameters import capacity, cuda, real
+from .articulated_body import ChainState, ProximityState, hinge_direction
+from .parameters import capacity, cuda, hinges, real
 from .state import (
     ChainArrays,
-    ChainState,
     ContactCandidates,
     ContactProblems,
     PausedWhiskers,
-    ProximityState,
     WhiskerJob,
     WhiskerState,
     most_candidates,
@@ -59,7 +58,7 @@ def write_problem(
     for i in range(job.links):
         at = row(chain.node, i)
         s2 = row(chain.axis2, i)
-        s1 = first_axis(s2, row(chain.node, i + 1) - at, row(chain.angle, i)[1])
+        s1 = first_axis(s2, hinge_direction(chain, i), row(chain.angle, i)[1])
         joint = index * wp.static(capacity) + i
         problems.joint[joint].axis1 = s1
         problems.joint[joint].axis2 = s2
@@ -69,6 +68,13 @@ def write_problem(
         problems.joint[joint].gain1_v = row(chain.gain1_v, i)
         problems.joint[joint].gain2_w = row(chain.gain2_w, i)
         problems.joint[joint].gain2_v = row(chain.gain2_v, i)
+        if wp.static(hinges == 3):
+            if i % 2 == 1:
+                s3 = row(chain.axis3, i)
+                problems.joint[joint].axis3 = s3
+                problems.joint[joint].moment3 = wp.cross(at, s3)
+                problems.joint[joint].gain3_w = row(chain.gain3_w, i)
+                problems.joint[joint].gain3_v = row(chain.gain3_v, i)
         problems.joint[joint].inverse_inertia = row(proximity.inverse_inertia, i)
         problems.free_acceleration[index, i] = row(chain.acceleration, i)
     for j in range(count):

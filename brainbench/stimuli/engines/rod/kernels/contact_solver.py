@@ -32,7 +32,7 @@ from .delassus import (
     stride,
 )
 from .parameters import group_size, max_contacts, module_options, queue, real
-from .state import ContactProblems, PausedWhiskers, PerLink2
+from .state import ContactProblems, PausedWhiskers, PerLinkJoint
 from .thread_groups import broadcast, group_max, group_or, group_sum, warp_max
 
 
@@ -396,7 +396,7 @@ def solve_contacts(problems: ContactProblems, index: int, part: int, live: int):
     matrix = DelassusRows()
     normals = NormalMatrix()
     work = NormalMatrix()
-    joint_change = PerLink2()
+    joint_change = PerLinkJoint()
     rounds_most = int(wp.static(CONTACT_ROUNDS)) + solver.unknown_zero
     more = live
     for round_ in range(rounds_most):

@@ -12,9 +12,9 @@ import warp as wp
 
 from brainbench.stimuli.engines.rod.limits import CLOSED, CREVICE
 
-from .algebra import reader, vec2, vec3, vec6
-from .parameters import capacity, group_size, max_contacts, real
-from .state import ContactProblems, PerLink2, most_candidates
+from .algebra import JointInverse, JointVector, reader, vec3, vec6
+from .parameters import capacity, group_size, hinges, max_contacts, real
+from .state import ContactProblems, PerLinkJoint, most_candidates
 from .thread_groups import broadcast, group_sum, warp_max
 
 own_contacts = max_contacts if group_size == 1 else 1
@@ -85,7 +85,7 @@ class SolverState:
 
 
 row = reader(
-    (PerLink2, vec2),
+    (PerLinkJoint, JointVector),
     (PerContact1, real),
     (PerContact3, vec3),
     (PerContact6, vec6),
@@ -178,8 +178,10 @@ def build_delassus(
     fv = PerRow3()
     ju1 = PerRow1()
     ju2 = PerRow1()
+    ju3 = PerRow1()
     wu1 = PerRow1()
     wu2 = PerRow1()
+    wu3 = PerRow1()
     # w, v: the unit force of each row as it is below the present link; ju: its joint rates; wu: h D⁻¹ of them.
     for r in range(3 * each):
         for e in range(3 * count):
@@ -194,17 +196,24 @@ def build_delassus(
             s2 = none
             m1 = none
             m2 = none
-            inv = none
+            s3 = none
+            m3 = none
+            inv = JointInverse()
             if reached:
                 s1 = problems.joint[joint].axis1
                 s2 = problems.joint[joint].axis2
                 m1 = problems.joint[joint].moment1
                 m2 = problems.joint[joint].moment2
                 inv = problems.joint[joint].inverse_inertia
+                if wp.static(hinges == 3):
+                    if i % 2 == 1:
+                        s3 = problems.joint[joint].axis3
+                        m3 = problems.joint[joint].moment3
             for a in range(3):
                 r = 3 * k + a
                 u1 = zero
                 u2 = zero
+                u3 = zero
                 if reached:
                     w = fw[r]
                     v = fv[r]
@@ -212,6 +221,11 @@ def build_delassus(
                     if row(own.link, k) == i:
                         v = row(own.axis, r)
                         w = wp.cross(row(own.point, k), v)
+                    if wp.static(hinges == 3):
+                        if i % 2 == 1:
+                            u3 = wp.dot(s3, w) + wp.dot(m3, v)
+                            w = w - problems.joint[joint].gain3_w * u3
+                            v = v - problems.joint[joint].gain3_v * u3
                     u1 = wp.dot(s1, w) + wp.dot(m1, v)
                     u2 = wp.dot(s2, w) + wp.dot(m2, v)
                     fw[r] = w - problems.joint[joint].gain1_w * u1 - problems.joint[joint].gain2_w * u2
@@ -220,15 +234,25 @@ def build_delassus(
                 ju2[r] = u2
                 wu1[r] = solver.step * (inv[0] * u1 + inv[1] * u2)
                 wu2[r] = solver.step * (inv[1] * u1 + inv[2] * u2)
+                if wp.static(hinges == 3):
+                    if i % 2 == 1:
+                        ju3[r] = u3
+                        wu3[r] = solver.step * inv[3] * u3
         # Both contacts share this joint: its part of G. One thread alone computes the lower half.
         for e in range(count):
             if wp.static(group_size > 1) or row(own.link, e) >= i:
                 for b in range(3):
                     o1 = broadcast(ju1[wp.static(3 * stride) * e + b], e)
                     o2 = broadcast(ju2[wp.static(3 * stride) * e + b], e)
-                    for r in range(wp.static(3 * stride) * e, 3 * each):
-                        c = r * wp.static(row_size) + 3 * e + b
-                        matrix[c] = row(matrix, c) + wu1[r] * o1 + wu2[r] * o2
+                    if wp.static(hinges == 3) and i % 2 == 1:
+                        o3 = broadcast(ju3[wp.static(3 * stride) * e + b], e)
+                        for r in range(wp.static(3 * stride) * e, 3 * each):
+                            c = r * wp.static(row_size) + 3 * e + b
+                            matrix[c] = row(matrix, c) + wu1[r] * o1 + wu2[r] * o2 + wu3[r] * o3
+                    else:
+                        for r in range(wp.static(3 * stride) * e, 3 * each):
+                            c = r * wp.static(row_size) + 3 * e + b
+                            matrix[c] = row(matrix, c) + wu1[r] * o1 + wu2[r] * o2
     if wp.static(group_size == 1):
         for r in range(3 * count):
             for e in range(r):
@@ -295,7 +319,7 @@ def apply_forces(
     problems: ContactProblems,
     solver: wp.ref[SolverState],
     own: wp.ref[ThreadContacts],
-    joint_change: wp.ref[PerLink2],
+    joint_change: wp.ref[PerLinkJoint],
     last: int,
     active: int,
 ) -> int:
@@ -319,8 +343,14 @@ def apply_forces(
                 tw = tw + wp.cross(row(own.point, k), force_k)
         u1 = zero
         u2 = zero
+        u3 = zero
         if i < solver.links:
             joint = problems.joint[first_joint + i]
+            if wp.static(hinges == 3):
+                if i % 2 == 1:
+                    u3 = wp.dot(joint.axis3, tw) + wp.dot(joint.moment3, tv)
+                    tw = tw - joint.gain3_w * u3
+                    tv = tv - joint.gain3_v * u3
             u1 = wp.dot(joint.axis1, tw) + wp.dot(joint.moment1, tv)
             u2 = wp.dot(joint.axis2, tw) + wp.dot(joint.moment2, tv)
             tw = tw - joint.gain1_w * u1 - joint.gain2_w * u2
@@ -328,9 +358,14 @@ def apply_forces(
         # Joint accelerations D⁻¹u of all contacts' forces.
         u1 = group_sum(u1)
         u2 = group_sum(u2)
+        if wp.static(hinges == 3):
+            u3 = group_sum(u3)
         if i < solver.links:
             inv = problems.joint[first_joint + i].inverse_inertia
-            joint_change[i] = vec2(inv[0] * u1 + inv[1] * u2, inv[1] * u1 + inv[2] * u2)
+            joint_change[i, 0] = inv[0] * u1 + inv[1] * u2
+            joint_change[i, 1] = inv[1] * u1 + inv[2] * u2
+            if wp.static(hinges == 3):
+                joint_change[i, 2] = inv[3] * u3
     tw = vec3(group_sum(tw[0]), group_sum(tw[1]), group_sum(tw[2]))
     tv = vec3(group_sum(tv[0]), group_sum(tv[1]), group_sum(tv[2]))
     # The forces that no joint takes up reach the base (tw, tv); they are subtracted from its wrench below.
@@ -340,7 +375,7 @@ def apply_forces(
         aw = none
         av = none
         for i in range(solver.links):
-            extra = vec2(zero, zero)
+            extra = JointVector()
             # Joints behind the last contact are only carried along.
             if i <= solver.last_link:
                 extra = row(joint_change, i)
@@ -349,8 +384,16 @@ def apply_forces(
             a2 = extra[1] - wp.dot(joint.gain2_w, aw) - wp.dot(joint.gain2_v, av)
             aw = aw + joint.axis1 * a1 + joint.axis2 * a2
             av = av + joint.moment1 * a1 + joint.moment2 * a2
-            if solver.thread == 0:
-                problems.added_acceleration[solver.job, i] = vec2(a1, a2)
+            if wp.static(hinges == 3):
+                a3 = real(0.0)
+                if i % 2 == 1:
+                    a3 = extra[2] - wp.dot(joint.gain3_w, aw) - wp.dot(joint.gain3_v, av)
+                    aw = aw + joint.axis3 * a3
+                    av = av + joint.moment3 * a3
+                if solver.thread == 0:
+                    problems.added_acceleration[solver.job, i] = JointVector(a1, a2, a3)
+            elif solver.thread == 0:
+                problems.added_acceleration[solver.job, i] = JointVector(a1, a2)
             if solver.contacts < solver.candidates:
                 for j in range(solver.candidates):
                     if problems.candidate_link[first_candidate + j] == i and (solver.selected >> j) % 2 == 0:

@@ -1,23 +1,82 @@
-"""Motion of bases and objects: cubic Hermite pieces between equally spaced knots.
+"""Motion of bases and objects: cubic Hermite pieces, of equal length within each cell of a millisecond.
 
-A track with one knot stands still, or moves straight at the knot's velocity. Units: mm, ms, rad.
+A track with one knot stands still, or moves straight at the knot's velocity. Times count from the start of the launch
+as whole milliseconds and a rest, places as a coarse grid and a rest, so that both keep their digits in single precision
+however long a simulation lasts and wherever it stands. Units: mm, ms, rad.
 """
 
 import warp as wp
 
 from .algebra import vec3, vec4
 from .parameters import real
-from .state import MotionArrays
+
+
+@wp.struct
+class Instant:
+    """A time since the start of the launch."""
+
+    tick: wp.int32
+    """Whole milliseconds."""
+    part: real
+    """The rest; it may be negative or more than one."""
+
+
+@wp.struct
+class MotionArrays:
+    """Motions of bases and objects, see ``motion``: knots of all tracks one behind the other."""
+
+    first: wp.array(dtype=wp.int32)
+    """[track] first of its cells; of a track with one knot that knot."""
+    count: wp.array(dtype=wp.int32)
+    """[track] number of cells + 1; 1 of a track with one knot."""
+    cell: wp.array(dtype=wp.int32)
+    """[cell] first knot; behind the cells of each track its last knot."""
+    coarse: wp.array(dtype=vec3)
+    """[knot] part of the position on a coarse grid."""
+    place: wp.array(dtype=vec3)
+    """[knot] the rest of it."""
+    velocity: wp.array(dtype=vec3)
+    """[knot]"""
+    turn: wp.array(dtype=vec4)
+    """[knot] unit quaternion (w, x, y, z), without jumps of sign."""
+    spin: wp.array(dtype=vec3)
+    """[knot] angular velocity, world axes."""
+    surge: wp.array(dtype=vec3)
+    """[knot] angular acceleration, world axes."""
 
 
 @wp.struct
 class BodyMotion:
     """Position, velocity, quaternion and angular velocity of a body at one time."""
 
+    coarse: vec3
+    """Part of the position on a coarse grid."""
     place: vec3
+    """The rest of it."""
     velocity: vec3
     turn: vec4
     spin: vec3
+
+
+@wp.func
+def instant(tick: int, part: real) -> Instant:
+    """Return a time."""
+    when = Instant()
+    when.tick = tick
+    when.part = part
+    return when
+
+
+@wp.func
+def elapsed(when: Instant) -> real:
+    """Return the time since the start in one number; its last digits are lost when it is long."""
+    return real(when.tick) + when.part
+
+
+@wp.func
+def cell_at(when: Instant, count: int) -> int:
+    """Return the cell that holds a time; the first and the last go on outside."""
+    return wp.clamp(when.tick + int(wp.floor(when.part)), 0, count - 1)
 
 
 @wp.func
@@ -33,23 +92,27 @@ def turning(q: vec4, w: vec3) -> vec4:
 
 
 @wp.func
-def pose_at(motions: MotionArrays, index: int, time: real) -> BodyMotion:
+def pose_at(motions: MotionArrays, index: int, when: Instant) -> BodyMotion:
     """Return the motion of a track at a time."""
     first = motions.first[index]
     count = motions.count[index]
     pose = BodyMotion()
     if count == 1:
         pose.velocity = motions.velocity[first]
-        pose.place = motions.place[first] + pose.velocity * (time - motions.start[index])
+        pose.coarse = motions.coarse[first]
+        pose.place = motions.place[first] + pose.velocity * elapsed(when)
         pose.turn = motions.turn[first]
         pose.spin = vec3(real(0.0), real(0.0), real(0.0))
         return pose
-    spacing = motions.spacing[index]
-    place = (time - motions.start[index]) / spacing
+    cell = cell_at(when, count - 1)
+    a = motions.cell[first + cell]
+    pieces = motions.cell[first + cell + 1] - a
+    spacing = real(1.0) / real(pieces)
+    place = (real(when.tick - cell) + when.part) * real(pieces)
     # Outside the knots the first or the last piece goes on.
-    i = wp.clamp(int(wp.floor(place)), 0, count - 2)
+    i = wp.clamp(int(wp.floor(place)), 0, pieces - 1)
     u = place - real(i)
-    a = first + i
+    a = a + i
     b = a + 1
     one = real(1.0)
     two = real(2.0)
@@ -63,9 +126,12 @@ def pose_at(motions: MotionArrays, index: int, time: real) -> BodyMotion:
     dv = real(6.0) * u * (u - one) / spacing
     ds0 = (one - u) * (one - three * u)
     ds1 = u * (three * u - two)
-    pose.place = motions.place[a] * v0 + motions.velocity[a] * s0 + motions.place[b] * v1 + motions.velocity[b] * s1
+    # From the first knot on: differences keep the digits that the places themselves would lose.
+    way = (motions.coarse[b] - motions.coarse[a]) + (motions.place[b] - motions.place[a])
+    pose.coarse = motions.coarse[a]
+    pose.place = motions.place[a] + way * v1 + motions.velocity[a] * s0 + motions.velocity[b] * s1
     # The derivatives of both value weights differ in sign only.
-    pose.velocity = (motions.place[a] - motions.place[b]) * dv + motions.velocity[a] * ds0 + motions.velocity[b] * ds1
+    pose.velocity = motions.velocity[a] * ds0 + motions.velocity[b] * ds1 - way * dv
     turn = (
         motions.turn[a] * v0
         + turning(motions.turn[a], motions.spin[a]) * s0
@@ -75,4 +141,13 @@ def pose_at(motions: MotionArrays, index: int, time: real) -> BodyMotion:
     # A cubic between quaternions is nearly one; normalised.
     pose.turn = turn / wp.length(turn)
     pose.spin = motions.spin[a] * v0 + motions.surge[a] * s0 + motions.spin[b] * v1 + motions.surge[b] * s1
+    return pose
+
+
+@wp.func
+def pose_from(motions: MotionArrays, index: int, when: Instant, origin: BodyMotion) -> BodyMotion:
+    """Return the motion of a track at a time, with its place from that of ``origin`` on."""
+    pose = pose_at(motions, index, when)
+    pose.place = (pose.coarse - origin.coarse) + (pose.place - origin.place)
+    pose.coarse = vec3(real(0.0), real(0.0), real(0.0))
     return pose

@@ -12,7 +12,7 @@ from brainbench.stimuli.engines.rod.mesh_bvh import WIDE
 from .algebra import unrotate, vec2, vec3, vec4
 from .distances import primitive, segment_primitive
 from .mesh_bvh import NearestTriangles, nearest_triangles
-from .motion import BodyMotion, pose_at
+from .motion import BodyMotion, pose_from
 from .parameters import against, group_size, module_options, real
 from .state import ChainArrays, JobArrays, LinkDistance, LinkTaper, MotionArrays, PausedWhiskers, ShapeArrays
 from .thread_groups import warp_max
@@ -259,7 +259,7 @@ def measure_distances(
 ):
     """Answer all queries: ``group_size`` threads take one link after the other, ``threads`` in all.
 
-    Reads ``paused.query``, ``query_time`` and ``query_margin``, and the links' last leaves; writes ``paused.answer``.
+    Reads ``paused.query``, ``query_frame`` and ``query_margin``, and the links' last leaves; writes ``paused.answer``.
     Scenes have one shape each.
     """
     thread = wp.tid()
@@ -276,7 +276,10 @@ def measure_distances(
         index = paused.query[which].job
         i = paused.query[which].link
         s = shapes.first[jobs.scene[index]]
-        body = pose_at(motions, shapes.track[s], paused.query_time[index])
+        base = BodyMotion()
+        base.coarse = paused.query_frame[index].coarse
+        base.place = paused.query_frame[index].place
+        body = pose_from(motions, shapes.track[s], paused.query_frame[index].time, base)
         margin = paused.query_margin[index]
         start = paused.query[which].start
         stop = paused.query[which].stop

@@ -9,6 +9,8 @@ real = wp.float32
 """Type of all numbers: ``warp.float32`` or ``warp.float64``."""
 capacity = 12
 """Links that fit."""
+hinges = 2
+"""Hinges of a joint: two for bending; with three, the last lets the whisker twist."""
 against = MESHES
 """Kinds of shapes that there are to touch, see ``limits``."""
 sliced = False

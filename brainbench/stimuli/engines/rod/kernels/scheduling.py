@@ -8,12 +8,11 @@ import warp as wp
 
 from brainbench.stimuli.engines.rod.limits import AFTER_CONTACTS, AFTER_DISTANCES, AFTER_OTHERS, WARP
 
+from .articulated_body import ChainState, ProximityState
 from .state import (
     WAIT_DISTANCES,
     WAIT_FORCES,
-    ChainState,
     PausedWhiskers,
-    ProximityState,
     WhiskerState,
     row,
 )

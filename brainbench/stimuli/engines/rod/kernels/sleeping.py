@@ -8,18 +8,17 @@ import warp as wp
 
 from brainbench.stimuli.engines.rod.limits import NOTHING
 
-from .algebra import rotate, vec2, vec3
-from .motion import pose_at
+from .algebra import JointVector, rotate, vec3
+from .articulated_body import ChainState, ProximityState
+from .motion import BodyMotion, elapsed, pose_at, pose_from
 from .narrow_phase import link_shape_distance
-from .parameters import against, real, sliced
+from .parameters import against, hinges, real, sliced
 from .state import (
     WAIT_REST,
     WAIT_SLICE,
     ChainArrays,
-    ChainState,
     MotionArrays,
     PausedWhiskers,
-    ProximityState,
     ShapeArrays,
     WhiskerJob,
     WhiskerState,
@@ -36,6 +35,7 @@ def query_rest_distances(
     fresh: int,
     upto: real,
     far: real,
+    pose: BodyMotion,
 ) -> int:
     """Ask for the distances of links whose time is over, or of all (``fresh``); return what to wait for."""
     near_count = int(0)
@@ -45,7 +45,9 @@ def query_rest_distances(
     state.first_query = wp.atomic_add(paused.next_query_count, 0, near_count)
     if state.first_query + near_count > paused.query.shape[0]:
         return WAIT_SLICE
-    paused.query_time[job.index] = state.reading_time
+    paused.query_frame[job.index].time = state.reading_time
+    paused.query_frame[job.index].coarse = pose.coarse
+    paused.query_frame[job.index].place = pose.place
     paused.query_margin[job.index] = -far
     return WAIT_REST
 
@@ -60,35 +62,34 @@ def check_rest(
     chain: wp.ref[ChainState],
     proximity: wp.ref[ProximityState],
     state: wp.ref[WhiskerState],
-    start: real,
     upto: real,
     end: real,
 ) -> int:
     """Find in ``state.safe_until`` the time until which nothing can come near; return what to wait for, 0 nothing.
 
-    ``start`` and ``end`` are the times of the launch, ``upto`` that of the next reading.
+    ``end`` is the end of the launch, ``upto`` the time of the next reading.
     """
     zero = real(0.0)
     one = real(1.0)
-    before = state.reading_time
+    before = elapsed(state.reading_time)
     idle_before = state.safe_until
     state.safe_until = real(1e30)
     # Without objects nothing of this remains in the kernel, nor what it keeps.
     # Objects that never move need to be looked at only once.
-    if wp.static(against > NOTHING) and (job.object_speed > zero or before == start):
-        pose = pose_at(motions, job.base, before)
+    if wp.static(against > NOTHING) and (job.object_speed > zero or before == zero):
+        pose = pose_at(motions, job.base, state.reading_time)
         x = rotate(pose.turn, vec3(one, zero, zero))
         y = rotate(pose.turn, vec3(zero, one, zero))
-        at = pose.place
+        at = vec3(zero, zero, zero)
         # Nothing can come near after the last reading.
         far = job.object_speed * (end - before) + real(0.5)
         fresh = int(0)
-        if idle_before == zero or before == start:
+        if idle_before == zero or before == zero:
             fresh = 1
         wait = int(0)
         if wp.static(sliced):
             if state.waiting_for != WAIT_REST:
-                wait = query_rest_distances(paused, job, proximity, state, fresh, upto, far)
+                wait = query_rest_distances(paused, job, proximity, state, fresh, upto, far, pose)
         place = state.first_query
         links = job.links
         if wait == WAIT_SLICE:
@@ -100,6 +101,11 @@ def check_rest(
             turned = x * link.bend_cosine + y * link.bend_sine
             y = y * link.bend_cosine - x * link.bend_sine
             x = turned
+            if wp.static(hinges == 3):
+                if i % 2 == 1:
+                    turned = x * link.bend_cosine + y * link.bend_sine
+                    y = y * link.bend_cosine - x * link.bend_sine
+                    x = turned
             end_at = at + x * link.length
             proximity.safe_until[i] = row(proximity.clearance, i)
             if fresh == 1 or row(proximity.clearance, i) < upto:
@@ -121,7 +127,7 @@ def check_rest(
                         proximity.leaf[i] = paused.answer[place].leaf
                     else:
                         for s in range(job.first_shape, job.end_shape):
-                            body = pose_at(motions, shapes.track[s], before)
+                            body = pose_from(motions, shapes.track[s], state.reading_time, pose)
                             found = link_shape_distance(
                                 shapes, s, body, at, end_at, taper, -far, bound, row(proximity.leaf, i), 0, 1
                             )
@@ -161,6 +167,6 @@ def check_rest(
     # What is left of a bend (below REST) is dropped, so that rest does not drift.
     if upto <= state.safe_until:
         for i in range(job.links):
-            chain.angle[i] = vec2(zero, zero)
-            chain.rate[i] = vec2(zero, zero)
+            chain.angle[i] = JointVector()
+            chain.rate[i] = JointVector()
     return 0

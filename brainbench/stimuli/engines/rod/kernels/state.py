@@ -11,28 +11,32 @@ from typing import Any
 
 import warp as wp
 
-from brainbench.stimuli.engines.rod.limits import SPARE, contacts_for
+from brainbench.stimuli.engines.rod.limits import LISTED, SPARE, contacts_for
 
-from .algebra import mat33, reader, vec2, vec3, vec4
-from .parameters import capacity, real
+from .algebra import JointInverse, JointVector, mat33, reader, vec3, vec4
+from .motion import Instant, MotionArrays  # noqa: F401 — launches take all arrays from here
+from .parameters import capacity, hinges, real
 
 WAIT_DISTANCES, WAIT_SLICE, WAIT_FORCES, WAIT_REST = 1, 2, 3, 4
 """Reasons to pause: distances of near links, its next slice, contact forces, distances at rest."""
 
 most_candidates = contacts_for(capacity) + SPARE
 PerLink1: Any = wp.types.vector(capacity, real)
-PerLink2: Any = wp.types.matrix((capacity, 2), real)
+PerLinkJoint: Any = wp.types.matrix((capacity, hinges), real)
+PerLinkInverse: Any = wp.types.matrix((capacity, hinges + 1), real)
 PerLink3: Any = wp.types.matrix((capacity, 3), real)
 PerLinkInt: Any = wp.types.vector(capacity, wp.int32)
 PerNode3: Any = wp.types.matrix((capacity + 1, 3), real)
 PerCandidate1: Any = wp.types.vector(most_candidates, real)
 PerCandidate3: Any = wp.types.matrix((most_candidates, 3), real)
 PerCandidateInt: Any = wp.types.vector(most_candidates, wp.int32)
-
+PerListed1: Any = wp.types.vector(LISTED, real)
+PerListedInt: Any = wp.types.vector(LISTED, wp.int32)
 
 row = reader(
-    (PerLink1, real), (PerLink2, vec2), (PerLink3, vec3), (PerLinkInt, wp.int32), (PerNode3, vec3),
-    (PerCandidate1, real), (PerCandidate3, vec3), (PerCandidateInt, wp.int32),
+    (PerLink1, real), (PerLinkJoint, JointVector), (PerLinkInverse, JointInverse), (PerLink3, vec3),
+    (PerLinkInt, wp.int32), (PerNode3, vec3), (PerCandidate1, real), (PerCandidate3, vec3), (PerCandidateInt, wp.int32),
+    (PerListed1, real), (PerListedInt, wp.int32),
 )  # fmt: skip
 
 
@@ -42,7 +46,7 @@ class LinkBuild:
 
     length: real
     bend_cosine: real
-    """Cosine and sine of the angle at rest to the link before."""
+    """Cosine and sine of the angle at rest to the link before; of half that angle at a joint that twists."""
     bend_sine: real
     mass: real
 
@@ -56,6 +60,9 @@ class LinkInertia:
     axial: real
     transverse: real
     stiffness: real
+    if hinges == 3:
+        torsion: real
+        """Of joints 1, 3, 5 …"""
 
 
 @wp.struct
@@ -70,7 +77,7 @@ class LinkTaper:
 
 @wp.struct
 class ChainArrays:
-    """Whiskers as chains of rigid links with universal joints."""
+    """Whiskers as chains of rigid links with elastic joints."""
 
     links: wp.array(dtype=wp.int32)
     """[whisker]"""
@@ -86,30 +93,6 @@ class ChainArrays:
     """[link, whisker]"""
     taper: wp.array2d(dtype=LinkTaper)
     """[link, whisker]"""
-
-
-@wp.struct
-class MotionArrays:
-    """Motions of bases and objects, see ``motion``: knots of all tracks one behind the other."""
-
-    first: wp.array(dtype=wp.int32)
-    """[track] index of the first knot."""
-    count: wp.array(dtype=wp.int32)
-    """[track] number of knots."""
-    start: wp.array(dtype=real)
-    """[track] time of the first knot."""
-    spacing: wp.array(dtype=real)
-    """[track] time between knots."""
-    place: wp.array(dtype=vec3)
-    """[knot] position."""
-    velocity: wp.array(dtype=vec3)
-    """[knot]"""
-    turn: wp.array(dtype=vec4)
-    """[knot] unit quaternion (w, x, y, z), without jumps of sign."""
-    spin: wp.array(dtype=vec3)
-    """[knot] angular velocity, world axes."""
-    surge: wp.array(dtype=vec3)
-    """[knot] angular acceleration, world axes."""
 
 
 @wp.struct
@@ -129,7 +112,7 @@ class ShapeArrays:
     scale: wp.array(dtype=real)
     """[shape] length of one unit of the shape (mm)."""
     radius: wp.array(dtype=real)
-    """[shape] farthest point of the shape from the body's origin (mm)."""
+    """[shape] farthest point of the shape from its origin (mm)."""
     speed: wp.array(dtype=real)
     """[shape] fastest that any of its points ever moves."""
     friction: wp.array(dtype=real)
@@ -164,6 +147,10 @@ class JobArrays:
     """[job] motion of the base."""
     step: wp.array(dtype=real)
     """[job] longest time step."""
+    limit_first: wp.array(dtype=wp.int32)
+    """[job + 1] first limit of each job."""
+    limit: wp.array(dtype=real)
+    """[limit] longest step from each cell of the motions on; a job without is limited by ``step`` alone."""
     row: wp.array(dtype=wp.int32)
     """[job] first index of its results."""
     column: wp.array(dtype=wp.int32)
@@ -184,7 +171,6 @@ class JobArrays:
 class StepOptions:
     """Options that all jobs of a launch share."""
 
-    start: real
     gravity: vec3
     axes: mat33
     """Rotation of the results."""
@@ -192,6 +178,16 @@ class StepOptions:
     """1: rates are forgotten after each step, and a reading takes the wrench of the step that ends at it."""
     shape: wp.int32
     """1: shapes and contact wrenches are recorded."""
+
+
+@wp.struct
+class ReadingArrays:
+    """Times at which whiskers are read, ascending, and some between them so that none are far apart."""
+
+    time: wp.array(dtype=Instant)
+    """[reading]"""
+    row: wp.array(dtype=wp.int32)
+    """[reading] where the results go; negative for none."""
 
 
 @wp.struct
@@ -236,6 +232,8 @@ class WhiskerJob:
     links: wp.int32
     beta: real
     longest_step: real
+    first_limit: wp.int32
+    limits: wp.int32
     first_shape: wp.int32
     end_shape: wp.int32
     object_speed: real
@@ -253,15 +251,21 @@ class WhiskerState:
     reading: wp.int32
     """Reading that the whisker is on its way to."""
     pending_reading: wp.int32
-    """Reading that the next step writes: it takes the wrench of the step that begins at its time."""
-    reading_time: real
+    """Result that the next step writes: it takes the wrench of the step that begins at its time."""
+    reading_time: Instant
     """Time of the last reading."""
     time_left: real
     """Time left to the next reading, when the whisker paused."""
     contacts: wp.int32
     """Contacts of the last step."""
-    is_near: wp.int32
-    """1: some link may be near an object."""
+    split_time: real
+    """Time for which steps stay split, because an object was about to be touched."""
+    near_speed: real
+    """Speed of the fastest such object."""
+    closes: wp.int32
+    """1: a candidate of this step may close within it."""
+    closing_speed: real
+    """Speed of the fastest object among these."""
     top_speed: real
     """Speed of the fastest point."""
     velocity_jump: real
@@ -275,8 +279,9 @@ class WhiskerState:
     """One of the ``WAIT_`` constants; 0 before the whisker first pauses and once it has what it waited for."""
     first_query: wp.int32
     """First of its distance queries."""
-    step_is_near: wp.int32
-    """``is_near`` and ``top_speed`` in the step whose contact forces are awaited."""
+    step_split_time: real
+    """``split_time``, ``near_speed`` and ``top_speed`` of the step whose contact forces are awaited."""
+    step_near_speed: real
     step_top_speed: real
     largest_change: real
     """Largest bend or rate in a step."""
@@ -289,40 +294,6 @@ class WhiskerState:
     unsolved: wp.int32
     miss: real
     load: real
-
-
-@wp.struct
-class ChainState:
-    """State of the joints, and what one step keeps of each link between its passes."""
-
-    angle: PerLink2
-    rate: PerLink2
-    axis2: PerLink3
-    """Second axis of the joint."""
-    node: PerNode3
-    """Joints and tip, from the base point."""
-    gain1_w: PerLink3
-    """U D⁻¹ of each axis (``articulated_body``), rotation and translation."""
-    gain1_v: PerLink3
-    gain2_w: PerLink3
-    gain2_v: PerLink3
-    acceleration: PerLink2
-    """D⁻¹u of the joint, then its accelerations."""
-
-
-@wp.struct
-class ProximityState:
-    """State of each link that only contact needs; without objects a kernel leaves it out."""
-
-    inverse_inertia: PerLink3
-    """Inverse inertia D⁻¹ of the joint (11, 12, 22)."""
-    clearance: PerLink1
-    """Lower bound of the distance from all objects; at rest, the time until which nothing can come near."""
-    leaf: PerLinkInt
-    """Leaf of the search tree where the last search ended (+ 1)."""
-    safe_until: PerLink1
-    end_speed: PerLink1
-    """Speed of the faster end."""
 
 
 @wp.struct
@@ -398,7 +369,12 @@ class JointRecord:
     gain1_v: vec3
     gain2_w: vec3
     gain2_v: vec3
-    inverse_inertia: vec3
+    if hinges == 3:
+        axis3: vec3
+        moment3: vec3
+        gain3_w: vec3
+        gain3_v: vec3
+    inverse_inertia: JointInverse
 
 
 @wp.struct
@@ -463,9 +439,9 @@ class ContactProblems:
     """[job · candidate] gap at the end of the step."""
     held: wp.array2d(dtype=HeldContact)
     """[job, contact] of the last step; then of this one."""
-    free_acceleration: wp.array2d(dtype=vec2)
+    free_acceleration: wp.array2d(dtype=JointVector)
     """[job, link] acceleration of the joint without contact forces."""
-    added_acceleration: wp.array2d(dtype=vec2)
+    added_acceleration: wp.array2d(dtype=JointVector)
     """[job, link] acceleration that they add."""
     solution: wp.array(dtype=ContactSolution)
     """[job]"""
@@ -475,8 +451,8 @@ class ContactProblems:
 class PausedLink:
     """Joint, clearance and leaf of a link, see :class:`ChainState` and :class:`ProximityState`."""
 
-    angle: vec2
-    rate: vec2
+    angle: JointVector
+    rate: JointVector
     clearance: real
     leaf: wp.int32
 
@@ -491,6 +467,15 @@ class DistanceQuery:
     stop: vec3
     bound: real
     """Lower bound of its distance, as far as that is known; 0 or less: it may be inside."""
+
+
+@wp.struct
+class QueryFrame:
+    """When distances are asked for, and the point from which the ends of the links count: the base."""
+
+    time: Instant
+    coarse: vec3
+    place: vec3
 
 
 @wp.struct
@@ -519,8 +504,8 @@ class PausedWhiskers:
     """[job]"""
     link: wp.array2d(dtype=PausedLink)
     """[link, job]"""
-    query_time: wp.array(dtype=real)
-    """[job] time for which distances are asked."""
+    query_frame: wp.array(dtype=QueryFrame)
+    """[job]"""
     query_margin: wp.array(dtype=real)
     """[job] gap up to which a contact takes part; at rest negative: how far to search."""
     query: wp.array(dtype=DistanceQuery)

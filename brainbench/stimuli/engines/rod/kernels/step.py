@@ -8,14 +8,21 @@ Units: mg, mm, ms, mN, µN·m; results are in N, N·m and m.
 
 import warp as wp
 
-from brainbench.stimuli.engines.rod.limits import FINEST, NOTHING, REST, TRAVEL
+from brainbench.stimuli.engines.rod.limits import AFTERMATH, FINEST, NOTHING, REST, TRAVEL
 
 from .algebra import SpatialAcceleration, Twist, Wrench, vec3
-from .articulated_body import articulated_inertia, forward_kinematics, integrate_joint, joint_accelerations
-from .broad_phase import count_near_links, find_candidates, lower_clearance, query_distances, search_range
+from .articulated_body import (
+    ChainState,
+    ProximityState,
+    articulated_inertia,
+    forward_kinematics,
+    integrate_joint,
+    joint_accelerations,
+)
+from .broad_phase import NearShapes, count_near_links, find_candidates, lower_clearance, query_distances, search_range
 from .contact_problem import any_gap_closes, queue_problem, read_solution, write_problem
 from .contact_solver import solve_contacts
-from .motion import pose_at
+from .motion import cell_at, elapsed, instant, pose_at
 from .parameters import against, bounds, module_options, real, sliced
 from .scheduling import next_job, pause, resume
 from .sleeping import check_rest
@@ -24,13 +31,13 @@ from .state import (
     WAIT_FORCES,
     WAIT_SLICE,
     ChainArrays,
-    ChainState,
     ContactCandidates,
     ContactProblems,
+    Instant,
     JobArrays,
     MotionArrays,
     PausedWhiskers,
-    ProximityState,
+    ReadingArrays,
     ResultArrays,
     ShapeArrays,
     StepOptions,
@@ -53,6 +60,8 @@ def load_job(
     job.links = chains.links[job.whisker]
     job.beta = chains.beta[job.whisker]
     job.longest_step = jobs.step[index]
+    job.first_limit = jobs.limit_first[index]
+    job.limits = jobs.limit_first[index + 1] - job.first_limit
     scene = jobs.scene[index]
     job.first_shape = shapes.first[scene]
     # Times 0 in a kernel against nothing: the compiler then drops the loops over shapes.
@@ -69,12 +78,15 @@ def load_job(
 
 
 @wp.func(inline=True)
-def preferred_step(job: WhiskerJob, state: wp.ref[WhiskerState]) -> real:
-    """Return the step to take: near an object, no point of the whisker moves further in it than contacts are sought."""
+def preferred_step(jobs: JobArrays, job: WhiskerJob, state: wp.ref[WhiskerState], now: Instant) -> real:
+    """Return the step to take: short enough for the motions, and near an object no point of the whisker moves further
+    in it than contacts are sought."""
     wanted = job.longest_step
-    pace = state.top_speed + job.object_speed
-    if state.is_near == 1 and pace * job.longest_step > real(wp.static(TRAVEL)):
-        wanted = wp.max(job.longest_step / real(wp.static(FINEST)), real(wp.static(TRAVEL)) / pace)
+    if job.limits > 0:
+        wanted = wp.min(wanted, jobs.limit[job.first_limit + cell_at(now, job.limits)])
+    pace = state.top_speed + state.near_speed
+    if state.split_time > real(0.0) and pace * wanted > real(wp.static(TRAVEL)):
+        wanted = wp.max(wanted / real(wp.static(FINEST)), real(wp.static(TRAVEL)) / pace)
     return wanted
 
 
@@ -87,7 +99,6 @@ def write_reading(
     job: WhiskerJob,
     chain: wp.ref[ChainState],
     reading: int,
-    origin: vec3,
     base_wrench: Wrench,
     force_sum: real,
     arc_sum: real,
@@ -109,7 +120,7 @@ def write_reading(
         results.contact[first, reading, column] = real(1e-3) * arc_sum / force_sum
     if options.shape == 1:
         for i in range(job.links + 1):
-            results.points[reading, i, index] = origin + row(chain.node, i)
+            results.points[reading, i, index] = row(chain.node, i)
         results.contact_wrench[reading, 0, index] = none
         results.contact_wrench[reading, 1, index] = none
         if solved == 1:
@@ -124,7 +135,7 @@ def run(
     shapes: ShapeArrays,
     jobs: JobArrays,
     options: StepOptions,
-    readings: wp.array(dtype=real),
+    readings: ReadingArrays,
     results: ResultArrays,
     problems: ContactProblems,
     paused: PausedWhiskers,
@@ -132,7 +143,7 @@ def run(
     """Take each whisker to its last reading, or to where it pauses.
 
     Without slices thread and job have one number and ``problems`` is each thread's room; with slices threads follow the
-    queues of ``paused``. ``readings`` are times (ms), ascending.
+    queues of ``paused``.
     """
     index = wp.tid()
     if wp.static(sliced):
@@ -144,37 +155,41 @@ def run(
     job = load_job(chains, motions, shapes, jobs, options, index)
     chain = ChainState()
     proximity = ProximityState()
+    near = NearShapes()
     candidates = ContactCandidates()
     state = WhiskerState()
     if wp.static(sliced):
         state = paused.state[index]
         resume(paused, index, job.links, chain, proximity)
     if state.waiting_for == 0:
-        state.reading_time = options.start
-        state.safe_until = options.start
         state.at_rest = job.can_rest
         # A reading takes the wrench of the step that begins at its time, so one more step follows the last.
         state.pending_reading = int(-1)
     used = int(0)
     wait = int(0)
     first_reading = state.reading
-    for reading in range(first_reading, readings.shape[0] + 1):
-        until = state.reading_time + job.longest_step
-        if reading < readings.shape[0]:
-            until = readings[reading]
-        span = until - state.reading_time
+    count_readings = readings.time.shape[0]
+    for reading in range(first_reading, count_readings + 1):
+        until = instant(state.reading_time.tick, state.reading_time.part + job.longest_step)
+        result = int(-1)
+        if reading < count_readings:
+            until = readings.time[reading]
+            result = readings.row[reading]
+        span = real(until.tick - state.reading_time.tick) + (until.part - state.reading_time.part)
         if span <= zero:
             # A reading at the very start.
-            state.pending_reading = reading
+            state.pending_reading = result
             continue
-        if state.at_rest == 1 and until > state.safe_until and state.time_left == zero:
-            end = readings[readings.shape[0] - 1]
-            wait = check_rest(chains, motions, shapes, job, paused, chain, proximity, state, options.start, until, end)
+        if state.at_rest == 1 and elapsed(until) > state.safe_until and state.time_left == zero:
+            end = elapsed(readings.time[count_readings - 1])
+            wait = check_rest(
+                chains, motions, shapes, job, paused, chain, proximity, state, elapsed(until), end
+            )  # fmt: skip
             if wp.static(sliced):
                 if wait != 0:
                     state.reading = reading
                     break
-        if state.at_rest == 1 and until <= state.safe_until and state.time_left == zero:
+        if state.at_rest == 1 and elapsed(until) <= state.safe_until and state.time_left == zero:
             # At rest, and nothing can have come near: the wrench stays zero.
             state.reading_time = until
             state.pending_reading = int(-1)
@@ -191,35 +206,34 @@ def run(
                     wait = WAIT_SLICE
                     break
                 used = used + 1
-            now = until - left
+            now = instant(until.tick, until.part - left)
             # Equal steps up to the next reading.
             # The thousandth keeps rounding from adding a step.
-            steps = wp.max(1, int(wp.ceil(left / preferred_step(job, state) - real(1e-3))))
+            steps = wp.max(1, int(wp.ceil(left / preferred_step(jobs, job, state, now) - real(1e-3))))
             h = left / real(steps)
             left_whole = left
             left = left - h
             if steps == 1:
                 last = 1
-                if options.quasistatic == 1 and reading < readings.shape[0]:
-                    state.pending_reading = reading
+                if options.quasistatic == 1:
+                    state.pending_reading = result
             state.largest_change = zero
             count = int(0)
             solved = int(0)
-            origin = none
             base_wrench = Wrench()
             tip_acceleration = none
             if wp.static(sliced) and state.waiting_for == WAIT_FORCES:
                 # The forces of this step have been found meanwhile.
                 state.waiting_for = 0
                 state.time_left = zero
-                state.is_near = state.step_is_near
+                state.split_time = state.step_split_time
+                state.near_speed = state.step_near_speed
                 state.top_speed = state.step_top_speed
                 count = 1
                 solved = 1
             else:
                 pose = pose_at(motions, job.base, now)
-                later = pose_at(motions, job.base, now + h)
-                origin = pose.place
+                later = pose_at(motions, job.base, instant(now.tick, now.part + h))
                 moving = Twist()
                 moving.angular = pose.spin
                 moving.linear = pose.velocity
@@ -232,35 +246,54 @@ def run(
                     (later.velocity - moving.linear) / h - wp.cross(moving.angular, moving.linear) - options.gravity
                 )
                 # A whisker that pauses takes this step again: with these restored, the step has the same length.
-                previously_near = state.is_near
+                previous_split = state.split_time
+                previous_near_speed = state.near_speed
                 previous_speed = state.top_speed
                 tip = forward_kinematics(chains, job, pose, chain, proximity, state)
-                state.is_near = 0
                 if wp.static(against > NOTHING):
                     reach = search_range(job, options, state, h)
                     near_count = count_near_links(chains, job, proximity, reach)
-                    state.is_near = wp.min(near_count, 1)
                     if wp.static(sliced):
                         if near_count > 0 and state.waiting_for != WAIT_DISTANCES:
                             wait = query_distances(
-                                chains, job, paused, chain, proximity, state, reach, origin, now, near_count
+                                chains, job, paused, chain, proximity, state, reach, pose, now, near_count
                             )
-                            state.is_near = previously_near
                             state.top_speed = previous_speed
                             break
-                    lower_clearance(job, proximity, reach)
+                    lower_clearance(job, proximity, near, reach)
                     state.last_step = h
+                    state.closes = 0
+                    state.closing_speed = zero
                     if near_count > 0:
                         count = find_candidates(
-                            chains, motions, shapes, job, paused, chain, proximity, candidates, state, pose,
+                            chains, motions, shapes, job, paused, chain, proximity, near, candidates, state, pose,
                             reach.margin, now, h
                         )  # fmt: skip
                 if wp.static(sliced):
                     state.waiting_for = 0
                     state.time_left = zero
-                base_wrench = articulated_inertia(chains, jobs, job, chain, proximity, tip, base, now, h, count)
+                # Steps are split only for what is about to be touched: whatever else stands near changes nothing.
+                if wp.static(against > NOTHING):
+                    if state.closes == 1 and state.split_time <= zero:
+                        if (state.top_speed + state.closing_speed) * h > real(wp.static(TRAVEL)):
+                            # Too long for what comes: the same step again, split.
+                            state.split_time = real(2.0) * job.longest_step
+                            state.near_speed = state.closing_speed
+                            left = left_whole
+                            last = int(0)
+                            continue
+                    if state.closes == 1:
+                        state.split_time = wp.max(state.split_time, real(2.0) * job.longest_step)
+                        state.near_speed = wp.max(state.near_speed, state.closing_speed)
+                    else:
+                        state.split_time = wp.max(state.split_time - h, zero)
+                        if state.split_time == zero:
+                            state.near_speed = zero
+                base_wrench = articulated_inertia(
+                    chains, jobs, job, chain, proximity, tip, base, elapsed(now), h, count
+                )
                 tip_acceleration = joint_accelerations(
-                    job, options, chain, candidates, state, moving, base, now, h, count
+                    job, options, chain, candidates, state, moving, base, elapsed(now), h, count
                 )
                 if wp.static(against > NOTHING) and count > 0:
                     solved = any_gap_closes(candidates, count, h)
@@ -271,9 +304,11 @@ def run(
                         )  # fmt: skip
                         if wp.static(sliced):
                             wait = WAIT_FORCES
-                            state.step_is_near = state.is_near
+                            state.step_split_time = state.split_time
+                            state.step_near_speed = state.near_speed
                             state.step_top_speed = state.top_speed
-                            state.is_near = previously_near
+                            state.split_time = previous_split
+                            state.near_speed = previous_near_speed
                             state.top_speed = previous_speed
                             state.time_left = left_whole
                             queue_problem(paused, index, count)
@@ -293,19 +328,23 @@ def run(
                 arc_sum = problems.solution[index].arc_sum
                 if force_sum > zero:
                     touched = 1
+                    # A whisker that slips off swings back fast.
+                    state.split_time = real(wp.static(AFTERMATH)) * job.longest_step
             # What contact did to the tip's speed, and may do again.
             state.velocity_jump = wp.max(h * wp.length(tip_acceleration), real(0.5) * state.velocity_jump)
             state.touching = state.touching + touched
             if state.pending_reading >= 0:
                 write_reading(
-                    results, jobs, options, problems, job, chain, state.pending_reading, origin, base_wrench,
+                    results, jobs, options, problems, job, chain, state.pending_reading, base_wrench,
                     force_sum, arc_sum, solved
                 )  # fmt: skip
                 state.pending_reading = int(-1)
             state.steps = state.steps + 1
             if count > 0:
                 for i in range(job.links):
-                    integrate_joint(chain, state, i, row(chain.acceleration, i), h, now + h, options.quasistatic)
+                    integrate_joint(
+                        chain, state, i, row(chain.acceleration, i), h, elapsed(now) + h, options.quasistatic
+                    )
             state.at_rest = int(0)
             if touched == 0 and state.largest_change < real(wp.static(REST)) and job.can_rest == 1:
                 state.at_rest = 1
@@ -317,7 +356,7 @@ def run(
             break
         state.reading_time = until
         if options.quasistatic == 0:
-            state.pending_reading = reading
+            state.pending_reading = result
         if state.status != 0:
             break
     if wp.static(sliced):

@@ -1,0 +1,78 @@
+"""Commands killed with SIGKILL at times over the whole run, repeated, and compared with unbroken runs.
+
+    python -m benchmarks.scores.kills --out kills [--write]
+
+The commands are those of ``tests/factories/kill_jobs.py``; one that stands in the folder of ``--out`` is not killed
+again.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+from typing import Any
+
+from benchmarks.report import table, write_section
+from brainbench.core.files import write_json
+from tests.factories.kill_jobs import JOBS, TIMES
+
+TITLE = "Kills"
+HEAD = [
+    "command", "unbroken", "kills", "resumed", "repeated", "files that differ", "left over", "failed", "two at once",
+]  # fmt: skip
+
+
+def kill(name: str, cache: Path) -> dict[str, Any]:
+    """Kill one command as often as its slow test does, in a process of its own."""
+    environment = {**os.environ, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "BRAINBENCH_CACHE": str(cache)}
+    with tempfile.TemporaryDirectory() as folder:
+        words = [sys.executable, "-m", "tests.factories.kill_jobs", name, str(Path(folder) / "work")]
+        found = subprocess.run(words, env=environment, stdout=subprocess.PIPE, text=True, check=True)
+    return json.loads(found.stdout.splitlines()[-1])
+
+
+def row(found: dict[str, Any]) -> list[str]:
+    """Return a line of the table."""
+    counts = [str(found[name]) for name in ("kills", "resumed", "repeated")]
+    faults = [str(len(found[name])) for name in ("different", "left", "failed")]
+    return [found["name"], f"{found['seconds']:.1f} s", *counts, *faults, "; ".join(found["together"]) or "whole"]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--out", type=Path, required=True, help="Folder for the outcome of each command.")
+    parser.add_argument("--write", action="store_true", help="Write the section of RESULTS.md.")
+    chosen = parser.parse_args()
+    found = []
+    for job in JOBS:
+        path = chosen.out / f"{job.name.replace(',', '').replace(' ', '-')}.json"
+        if not path.is_file():
+            write_json(path, kill(job.name, chosen.out / "cache"))
+        found.append(json.loads(path.read_text()))
+        print(found[-1], flush=True)
+    rows = [row(item) for item in found]
+    total = [str(sum(item[name] for item in found)) for name in ("kills", "resumed", "repeated")]
+    faults = [str(sum(len(item[name]) for item in found)) for name in ("different", "left", "failed")]
+    text = f"{NOTE}\n\n{table(HEAD, [*rows, ['all', '', *total, *faults, '']])}"
+    print(text)
+    if chosen.write:
+        write_section(TITLE, "python -m benchmarks.scores.kills --out kills --write", text, subject="commands")
+
+
+NOTE = (
+    "Each command runs in a process that is killed (SIGKILL) at a time drawn with a fixed seed over the duration of an "
+    "unbroken run, and is then given again. *Resumed*: finished parts stood there and were kept; *repeated*: done "
+    "anew. The result is compared with an unbroken run's, file by file and to the byte, but for "
+    f"{', '.join(f'`{name}`' for name in TIMES)} in JSON files, pages (`.html`) that state the time, and TensorBoard's "
+    "files. *Two at once*: two processes on one folder (and cache) finish, or one is refused in a sentence, and the "
+    "result is whole."
+)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,210 @@
+"""A score as text: what was found in the first three lines, the statistics behind it after them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+from brainbench.cli.output import spanned, table, table_of
+from brainbench.core.records import ResultRecord, Score
+
+RAW_INPUT = "raw input"
+
+
+def score_text(record: ResultRecord) -> str:
+    """Lay out a result record."""
+    score = record.score
+    parts = ["\n".join(_headline(record)), table("", ["", "", ""], list(_rows(score)))]
+    parts += _details(score.provenance.statistics)
+    if notes := list(_notes(record)):
+        parts.append("\n".join(f"Note: {note}." for note in notes))
+    if record.animal_to_animal is not None and score.estimator == "default" and score.subjects:
+        from brainbench.metrics.inference.equivalence import turing_test
+
+        alike = turing_test(score, record.animal_to_animal).summary()
+        parts.append(f"As much like the animals as they are like one another? {alike}")
+    if walk := score.provenance.statistics.get("estimator_walk"):
+        parts.append(walk_text(walk))
+    others = {"animal to animal": record.animal_to_animal, **record.baselines}
+    rows = [[name, _scaled_text(item), _p(item.p), item.status] for name, item in others.items() if item is not None]
+    if rows:
+        parts.append(table("Baselines, same metric and animals", ["", "score", "p", "status"], rows))
+    return "\n\n".join(parts)
+
+
+def _headline(record: ResultRecord) -> Iterator[str]:
+    """Yield what was scored, whether it is told apart from the raw input, the score, and what limits it."""
+    from leaderboards.ranking import CHANCE_LEVEL
+
+    score, animals = record.score, record.animal_to_animal
+    known = score.subjects or (animals.subjects if animals else ())
+    name = score.provenance.recordings_name
+    count = f"{len(known)} animal{'s' * (len(known) != 1)}"
+    yield f"{score.name}{_weights(record)}  ·  {len(score.stimuli)} stimuli  ·  {count}  ·  {name}"
+    yield _against_raw_input(record)
+    if score.status == "undefined":
+        yield "No score: it is undefined."
+    else:
+        apart = f"{'not ' * (score.p > CHANCE_LEVEL)}told apart from chance, p = {_p(score.p)}"
+        chance = "" if math.isnan(score.p) else f"; {apart}"
+        scale = " (0 = chance, 1 = all that is reliable)" if math.isfinite(score.scaled) else " (no common scale)"
+        yield f"Score {_scaled_text(score)}{scale}{chance}"
+    if record.synthetic:
+        yield "Synthetic recordings: ranks on them say nothing about brains."
+    yield from left_out(score.provenance.recordings)
+
+
+def _weights(record: ResultRecord) -> str:
+    """Return what the weights of a network are; empty for features computed elsewhere."""
+    card = record.card
+    if card is None or (card.objective is None and card.family != "user module"):
+        return ""
+    seed = f", seed {card.seed}" if card.seed is not None else ""
+    if card.family == "user module":
+        return f" (your code{seed})"
+    return f" (random weights{seed})" if card.objective == "untrained" else f" (trained: {card.objective})"
+
+
+def _against_raw_input(record: ResultRecord) -> str:
+    """Say whether a score is told apart from that of the raw input, by the test that boards use."""
+    from leaderboards.ranking import compare, lacking
+
+    score, raw = record.score, record.baselines.get(RAW_INPUT)
+    if raw is None:
+        return "Not compared with raw input: these features came without the input that they were computed from."
+    for one in (score, raw):
+        if one.status != "ok":
+            return f"Not compared with raw input: the score of {one.name} is {one.status} ({'; '.join(one.reasons)})."
+    if (found := compare(score, raw)) is None:
+        lacks = lacking(sum(item.status == "ok" for item in score.subjects), len(score.stimuli))
+        return f"Not compared with raw input: this needs {lacks or 'values of single animals and stimuli'}."
+    low, high = found.interval.low, found.interval.high
+    verdict = "Above" if low > 0 else "Below" if high < 0 else "Not told apart from"
+    return f"{verdict} raw input: difference {spanned(found.difference, found.interval)}, p = {_p(found.p)}"
+
+
+def _rows(score: Score) -> Iterator[list[str]]:
+    """Yield name, number and explanation of each statistic that exists."""
+    yield ["status", score.status, "; ".join(score.reasons)]
+    if math.isfinite(score.value):
+        limits = f"chance {_number(score.chance)}, attainable {_number(score.attainable)}"
+        yield ["value", spanned(score.value, score.interval), f"{score.metric}; {limits}"]
+    if math.isfinite(score.r):
+        ceiling = score.ceiling
+        shown = f"noise ceiling {_number(ceiling.lower)} to {_number(ceiling.upper)}" if ceiling else "no noise ceiling"
+        yield ["raw r", _number(score.r), shown]
+    if math.isfinite(score.reliability):
+        reliability = spanned(score.reliability, score.reliability_interval, most=1.0)
+        yield ["reliability", reliability, "of the animals' RDMs: split halves, Spearman-Brown, mean"]
+    if math.isfinite(score.p):
+        yield ["permutation p", _p(score.p), f"{score.p_method}; smallest possible {_p(score.p_smallest)}"]
+    if score.layer is not None:
+        yield ["layer", score.layer, score.layer_rule]
+    if score.best_layer is not None:
+        yield ["best layer", _number(score.best_layer_value), f"{score.best_layer}: optimistic maximum, not a result"]
+    yield ["estimator", score.estimator, "" if math.isfinite(score.value) else score.metric]
+
+
+def _notes(record: ResultRecord) -> Iterator[str]:
+    """Yield notes on intervals that run past what can exist."""
+    score, span = record.score, record.score.reliability_interval
+    if span is not None and span.high > 1:
+        yield "the interval of the reliability is cut at 1, the largest that can exist"
+    named = {"the score": score, "animal to animal": record.animal_to_animal, **record.baselines}
+    spans = {name: item.scaled_interval for name, item in named.items() if item is not None}
+    beyond = [name for name, found in spans.items() if found is not None and found.high > 1]
+    if beyond:
+        yield (
+            f"an interval above 1 ({', '.join(beyond)}) runs past all that is reliable, because the reliability that "
+            "scores are divided by is itself an estimate"
+        )
+
+
+def left_out(recordings: Mapping[str, Any]) -> Iterator[str]:
+    """Yield what was not used of recordings, by their provenance: trials and units by rule, files by reason."""
+    removed = recordings.get("removed") or {}
+    if told := [f"{rule} ({number:,})" for rule, number in removed.items() if number]:
+        yield f"Left out: {'; '.join(told)}."
+    yield from (f"Skipped: {reason}" for reason in recordings.get("skipped") or ())
+
+
+def walk_text(steps: list[dict[str, Any]]) -> str:
+    """Lay out the walk from the published estimator to the default one."""
+    columns = {
+        ">value": lambda step: "–" if step["value"] is None else f"{step['value']:.3f}",
+        "step": "{0[change]}",
+        "status": "{0[status]}",
+        "": "{0[detail]}",
+    }
+    return f"From the published estimator to the default, one fault at a time\n{table_of('', steps, columns)}"
+
+
+def _details(statistics: Mapping[str, Any]) -> list[str]:
+    """Lay out what single metrics and options add: accuracies by property, shares of variance, times."""
+    parts = []
+    if course := statistics.get("time_course"):
+        parts.append(_over_time(course))
+    if accuracies := statistics.get("decoding"):
+        columns = {
+            "property": "{0[property]}",
+            ">accuracy": "{0[accuracy]:.2f}",
+            ">without information": "{0[expected]:.2f}",
+            ">1 / classes": "{0[chance]:.2f}",
+            ">p": "{0[p]:.2g}",
+        }
+        parts.append(table_of("Decoding of stimuli left out", accuracies, columns))
+    if shares := statistics.get("variance_partition"):
+        parts.append(
+            f"Variance of the animals' RDMs: {shares['total']:.2f} explained; by the model alone "
+            f"{shares['unique_model']:.2f} (by luck {shares['chance']:.2f}), by {', '.join(shares['nuisances'])} alone "
+            f"{shares['unique_nuisance']:.2f}, by either {shares['shared']:.2f}"
+        )
+    return parts
+
+
+def _over_time(course: Mapping[str, Any]) -> str:
+    """Lay out the best time and the latency of each layer that matches at some lag."""
+    known = [(_scaled(point), point["time"]) for point in course["points"] if _is_known(point)]
+    clear = sum(point["p"] is not None and point["p"] <= 0.05 for point in course["points"])
+    text = f"Over time, {len(course['points'])} bins of {course['bin']:g} s: "
+    if known:
+        best, when = max(known)
+        text += f"{clear} differ from chance (p of the best {course['p']:.2g}, corrected for all times); the best "
+        text += f"score, {best:.2f} between chance (0) and all that is reliable (1), is at {when:.3g} s"
+    else:
+        text += "no animal is reliable in any bin"
+    columns = {
+        "layer": "{0[layer]}",
+        ">latency": lambda row: "–" if row["latency"] is None else f"{1000 * row['latency']:.0f} ms",
+        "interval": lambda row: (
+            f"[{1000 * row['interval']['low']:.0f}, {1000 * row['interval']['high']:.0f}]" if row["interval"] else ""
+        ),
+        ">p": lambda row: "–" if row["p"] is None else f"{row['p']:.2g}",
+        "": "{0[reason]}",
+    }
+    rows = table_of("Neurons follow the model by", course["latencies"], columns)
+    return "\n".join([text, *course["reasons"], "", rows])
+
+
+def _is_known(point: Mapping[str, Any]) -> bool:
+    return point["value"] is not None and point["chance"] is not None and point["chance"] < 1
+
+
+def _scaled(point: Mapping[str, Any]) -> float:
+    """Return the score at one time between chance (0) and all that is reliable (1)."""
+    return (point["value"] - point["chance"]) / (1 - point["chance"])
+
+
+def _number(value: float) -> str:
+    return f"{value:.3g}" if math.isfinite(value) else "–"
+
+
+def _p(value: float) -> str:
+    return f"{value:.2g}" if math.isfinite(value) else "–"
+
+
+def _scaled_text(score: Score) -> str:
+    """Return the score on the scale that all metrics share; its value where there is none."""
+    placed = math.isfinite(score.scaled)
+    return spanned(*((score.scaled, score.scaled_interval) if placed else (score.value, score.interval)))

@@ -1,0 +1,1 @@
+"""Figures: ``style`` holds the look that all charts share."""

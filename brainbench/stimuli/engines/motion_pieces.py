@@ -1,0 +1,267 @@
+"""How finely a motion must be cut into cubic pieces, and how short the steps through it must be.
+
+Time is divided into cells of :data:`KNOT`. Each is cut into 1, 2, 4 … :data:`MOST_PIECES` equal Hermite pieces until
+these follow the motion: its velocity to :data:`SPEED_ERROR` of the greatest and its position to :data:`PLACE_ERROR`.
+Corners (jumps of velocity) are kept within one piece of the finest; jumps of position are refused.
+
+A function can be seen only where it is evaluated. One that says nothing about itself is looked at every 8 µs, or once
+per time step where that is shorter; what lies wholly between two looks is not seen. One with an attribute ``finest``,
+its shortest period (s; twice the width of a pulse), is looked at 16 times in it. Letters: n time, c cell, k coordinate.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from brainbench.core.errors import UsageError
+from brainbench.core.rotations import to_matrices
+from brainbench.stimuli.engines.protocol import Follicle
+from brainbench.stimuli.engines.units import MILLI
+from brainbench.stimuli.objects.obstacle import Obstacle
+
+KNOT = 1e-3
+"""Length of a cell (s); one cubic piece follows whisking at 20 Hz to 1e-7 of its way."""
+SPEED_ERROR = 1e-4
+"""Largest error of the velocity, as a share of the greatest speed of the motion."""
+PLACE_ERROR = 1e-4
+"""Largest error of the position (mm)."""
+MOST_PIECES = 512
+"""Pieces of a cell at most: they follow about 20 kHz."""
+LOOKS = 128
+"""Looks per cell at a motion that says nothing about itself, and wherever one piece does not follow."""
+PIECES_PER_PERIOD = 27
+"""Pieces in one period of a sinusoid that are just followed: the velocity of a cubic is wrong by √3/216 (ω h)³."""
+LEAST_STEPS = 10
+"""Steps per period of a motion where the fidelity names none."""
+_AT_ONCE = 400_000
+"""Looks at a time: bounds the memory."""
+_SLOW = 1e-6
+"""Speed (mm/ms) whose errors never count."""
+_INSIDE = 16
+"""Parts of a piece in which a corner or a jump is looked for."""
+
+Path = Callable[[NDArray[np.float64]], NDArray[np.float64]]
+"""Times [n] (s) → coordinates [n, k] (mm; angles times a length)."""
+
+
+@dataclass(frozen=True, eq=False)
+class MotionPieces:
+    """Pieces of the cells of one motion, from its start."""
+
+    count: NDArray[np.int32]
+    """[c] equal pieces into which each cell is cut."""
+    needed: NDArray[np.int32]
+    """[c] the same without regard to corners: a measure of how fast the motion changes."""
+    moves: bool
+    """False for a motion that stands still."""
+
+    def times(self, start: float) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
+        """Return the times [n] (s) of all knots, and the first knot of each cell with that of the end [c + 1]."""
+        first = np.concatenate([[0], np.cumsum(self.count)]).astype(np.int32)
+        cell = np.repeat(np.arange(len(self.count)), self.count)
+        within = (np.arange(first[-1]) - first[cell]) / self.count[cell]
+        return start + KNOT * np.concatenate([cell + within, [float(len(self.count))]]), first
+
+    def longest_steps(self, step: float, per_period: float | None) -> NDArray[np.float64]:
+        """Return the longest step [c] (s) from each cell on, at most ``step``: so many in a period of the motion."""
+        limit = np.minimum(step, KNOT / self.needed * (PIECES_PER_PERIOD / (per_period or LEAST_STEPS)))
+        limit[self.needed == 1] = step
+        # A step that begins before a fast cell must not reach across it.
+        before = limit.copy()
+        for back in range(1, math.ceil(step / KNOT - 1e-9) + 1):
+            limit[:-back] = np.minimum(limit[:-back], before[back:])
+        return limit
+
+
+def side_of(count: NDArray[np.int32] | int) -> NDArray[np.float64]:
+    """Return the distance (s) of the instants whose difference is a velocity, where a cell has so many pieces."""
+    return np.minimum(1e-5, KNOT / (8 * np.asarray(count, dtype=float)))
+
+
+def cut(
+    path: Path, start: float, stop: float, *, step: float, tail: float, finest: float | None, what: str
+) -> MotionPieces:
+    """Cut a motion from ``start`` to ``stop`` (s) into pieces, for time steps of ``step`` (s).
+
+    Args:
+        path: the motion; not evaluated before 0 when it starts at 0 or later.
+        start, stop, step: as above.
+        tail: time (s) behind ``stop`` at whose end the last step may look at the pose.
+        finest: shortest period (s) of anything in it, None when unknown.
+        what: its name in messages.
+
+    Raises:
+        UsageError: the motion is not finite, its position jumps, or the finest pieces do not follow it.
+    """
+    cells = max(1, math.ceil((stop - start) / KNOT - 1e-9)) + max(1, math.ceil(tail / KNOT - 1e-9))
+    wanted = KNOT / min(step, KNOT / LOOKS) if finest is None else 16 * KNOT / finest
+    looks = int(2 ** math.ceil(math.log2(min(max(wanted, 4), 4 * MOST_PIECES))))
+    motion = _Sampled(path, start, what)
+    errors, speed, moves = np.empty((2, cells)), 0.0, False
+    some = max(1, _AT_ONCE // looks)
+    for first in range(0, cells, some):
+        which = np.arange(first, min(first + some, cells))
+        place, rate, fastest = motion.errors(which, 1, looks)
+        errors[:, which] = place[:, 0], rate[:, 0]
+        speed = max(speed, fastest)
+    moves = speed > 0
+    limit = SPEED_ERROR * speed + _SLOW
+    count = np.ones(cells, dtype=np.int32)
+    needed = count.copy()
+    left = np.flatnonzero((errors[0] > PLACE_ERROR) | (errors[1] > limit))
+    some = _AT_ONCE // (4 * MOST_PIECES)
+    for first in range(0, len(left), some):
+        which = left[first : first + some]
+        count[which], needed[which] = _refine(motion, which, max(looks, LOOKS), limit)
+    return MotionPieces(count, needed, moves)
+
+
+@dataclass(frozen=True)
+class Cutting:
+    """When motions are followed, and in which steps. Seconds."""
+
+    start: float
+    stop: float
+    step: float
+    longest_step: float
+    """Of all whiskers that may share a motion: the last step looks at the pose so far behind ``stop``."""
+
+    def follicle(self, follicle: Follicle, size: float) -> MotionPieces:
+        """Cut the motion of a base whose whisker has the arc length ``size`` (m); errors as :func:`cut`."""
+
+        def path(times: NDArray[np.float64]) -> NDArray[np.float64]:
+            position, euler = follicle.pose(times)
+            return np.concatenate([np.asarray(position), np.asarray(euler) * size], axis=1) * MILLI
+
+        return self._cut(path, follicle, "the base of a whisker")
+
+    def obstacle(self, obstacle: Obstacle, anchor: NDArray[np.float64]) -> MotionPieces:
+        """Cut the motion of an obstacle, by that of its point ``anchor`` [3] (m) and its turns; errors as above."""
+        motion = obstacle.motion
+        assert motion is not None
+        size = float(np.linalg.norm(obstacle.bounds - anchor, axis=1).max())
+
+        def path(times: NDArray[np.float64]) -> NDArray[np.float64]:
+            place, turn = motion(times)
+            turn = to_matrices(np.asarray(turn, dtype=float))
+            return np.concatenate([np.asarray(place) + turn @ anchor, turn.reshape(-1, 9) * size], axis=1) * MILLI
+
+        return self._cut(path, motion, "an object")
+
+    def _cut(self, path: Path, motion: object, what: str) -> MotionPieces:
+        finest = getattr(motion, "finest", None)
+        return cut(path, self.start, self.stop, step=self.step, tail=self.longest_step, finest=finest, what=what)
+
+
+@dataclass(frozen=True, eq=False)
+class _Sampled:
+    """A motion where it is evaluated."""
+
+    path: Path
+    start: float
+    what: str
+
+    def at(self, times: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return coordinates [..., k] at times [...] (s)."""
+        found = np.asarray(self.path(times.ravel()), dtype=float)
+        if not np.isfinite(found).all():
+            bad = times.ravel()[~np.isfinite(found).all(axis=1)][0]
+            raise UsageError(f"The motion of {self.what} is not finite at {bad:.6g} s; give finite poses at all times.")
+        return found.reshape(*times.shape, -1)
+
+    def errors(
+        self, cells: NDArray[np.int_], pieces: int, looks: int
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
+        """Return the errors of position [c, piece] (mm) and velocity (mm/ms), and the greatest speed, of some cells."""
+        looks = max(looks, 4 * pieces)
+        begin = self.start + KNOT * cells[:, None]
+        knots = begin + KNOT * np.arange(pieces + 1) / pieces
+        side = side_of(pieces)
+        early = (self.start >= 0) & (knots < side)
+        before = np.where(early, knots, knots - side)
+        ahead = self.at(knots + side)
+        slope = (ahead - self.at(before)) / (knots + side - before)[..., None]
+        if early.any():
+            # At the very start there is no instant before: the line through two differences.
+            slope[early] = 2 * slope[early] - (self.at(knots[early] + 2 * side) - self.at(knots[early])) / (2 * side)
+        x = self.at(begin + KNOT * np.arange(looks + 1) / looks)
+        each = looks // pieces
+        x = x[:, np.arange(pieces)[:, None] * each + np.arange(each + 1)]
+        u, width = (np.arange(each + 1) / each)[:, None], KNOT / pieces
+        a, b = x[:, :, :1], x[:, :, -1:]
+        # Cubic Hermite piece through both ends.
+        fit = a + (b - a) * u * u * (3 - 2 * u)
+        fit += width * u * (1 - u) * (slope[:, :-1, None] * (1 - u) - slope[:, 1:, None] * u)
+        miss = x - fit
+        rate = np.abs(np.diff(miss, axis=2)).max(axis=(2, 3)) / (width / each) * 1e-3
+        speed = float(np.abs(np.diff(x, axis=2)).max(initial=0.0)) / (width / each) * 1e-3
+        return np.abs(miss).max(axis=(2, 3)), rate, speed
+
+
+def _refine(
+    motion: _Sampled, cells: NDArray[np.int_], looks: int, limit: float
+) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+    """Return the pieces of cells that one piece does not follow, and those needed without their corners."""
+    count = np.full(len(cells), MOST_PIECES, dtype=np.int32)
+    needed = np.zeros(len(cells), dtype=np.int32)
+    left, tried = np.arange(len(cells)), []
+    levels = [2**k for k in range(int(math.log2(MOST_PIECES)) + 1)]
+    for pieces in levels:
+        place, rate, _ = motion.errors(cells[left], pieces, looks)
+        follows = (place <= PLACE_ERROR) & (rate <= limit)
+        tried.append((left, follows))
+        done = follows.all(axis=1)
+        count[left[done]] = needed[left[done]] = pieces
+        left = left[~done]
+        if not len(left):
+            return count, needed
+    corner = ~tried[-1][1][np.isin(tried[-1][0], left)]
+    _require_corners(motion, cells[left], corner, limit)
+    # What else there is in a cell with corners is told by the pieces that hold none.
+    for pieces, (rows, follows) in zip(levels, tried, strict=True):
+        holds = corner.reshape(len(left), pieces, -1).any(axis=2)
+        fits = (follows[np.isin(rows, left)] | holds).all(axis=1) & (needed[left] == 0)
+        needed[left[fits]] = pieces
+    return count, needed
+
+
+def _require_corners(motion: _Sampled, cells: NDArray[np.int_], bad: NDArray[np.bool_], limit: float) -> None:
+    """Refuse pieces ``bad`` [c, piece] of the finest that hold something else than one corner.
+
+    ``limit`` is the error of the velocity that is allowed (mm/ms).
+    """
+    row, piece = np.nonzero(bad)
+    begin = motion.start + KNOT * (cells[row] + piece / MOST_PIECES)
+    width = KNOT / MOST_PIECES
+    parts = np.arange(_INSIDE + 1) / _INSIDE
+    x = motion.at(begin[:, None] + width * parts)
+    way = np.linalg.norm(np.diff(x, axis=1), axis=2)
+    # A jump stays as high however closely it is looked at; the way of anything else shrinks.
+    at, span = begin, width
+    for _ in range(3):
+        at = at + span / _INSIDE * way.argmax(axis=1)
+        span /= _INSIDE
+        way = np.linalg.norm(np.diff(motion.at(at[:, None] + span * parts), axis=1), axis=2)
+    jumps = way.max(axis=1) > PLACE_ERROR
+    if jumps.any():
+        first = int(np.argmax(jumps))
+        raise UsageError(
+            f"The position of {motion.what} jumps by {way[first].max():.3g} mm at {at[first]:.6g} s; a motion must be "
+            "continuous: let it take some time, .1 ms at least."
+        )
+    bends = np.linalg.norm(np.diff(x, n=2, axis=1), axis=2)
+    # A corner between two looks shows in two neighbouring differences.
+    share = (bends[:, :-1] + bends[:, 1:]).max(axis=1) / np.maximum(bends.sum(axis=1), 1e-300)
+    # Beside a corner that falls on a knot a piece is straight, but for the slope there.
+    fast = (share < 0.8) & (bends.sum(axis=1) * _INSIDE / width * 1e-3 > limit)
+    if fast.any():
+        raise UsageError(
+            f"The motion of {motion.what} changes too fast at {begin[np.argmax(fast)]:.6g} s: cubic pieces of "
+            f"{1e6 * width:.3g} µs do not follow its velocity to {SPEED_ERROR:.0e} of the greatest; keep it below "
+            "20 kHz."
+        )

@@ -1,0 +1,108 @@
+"""Bench tests of bending and twist together: a curved whisker is loaded out of its plane, by a force or by a peg."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from brainbench.core.errors import UsageError
+from brainbench.stimuli.engines import DEFAULT_ENGINE, get_engine
+from brainbench.stimuli.engines.fidelity import Fidelity
+from brainbench.stimuli.engines.protocol import Job, Load, StillFollicle
+from brainbench.stimuli.motion.trajectories import smooth_step
+from brainbench.stimuli.objects.obstacle import Capsule, Obstacle
+from brainbench.stimuli.validation import references
+from brainbench.stimuli.validation.bench_tests import BenchTest, PointLoad, run_stable
+from brainbench.stimuli.validation.kirchhoff import KirchhoffRod, RodEquilibrium, load_rod, press_rod
+from brainbench.stimuli.whiskers.whisker import Whisker
+
+
+def load_aside(
+    whisker: Whisker,
+    at: float,
+    force: float,
+    *,
+    backend: str = DEFAULT_ENGINE,
+    fidelity: Fidelity | str = "balanced",
+) -> PointLoad:
+    """Load a whisker with ``force`` (N) across its plane at arc length ``at`` (m); compare with the Kirchhoff rod.
+
+    The deflection is that of the loaded point along the force; its relative error is that of the stiffness.
+
+    Raises:
+        UsageError: ``at`` lies beyond the whisker, or ``at`` or ``force`` is not positive.
+        DataError: the rod has no equilibrium, or the simulation was unstable.
+    """
+    _check(whisker, at=at, force=force)
+    expected = load_rod(KirchhoffRod.of(whisker), at, (0.0, 0.0, force))
+    times, loads = np.array([_settling_time(whisker)]), (Load(at, (0.0, 0.0, force)),)
+    job = Job(replace(whisker, damping_ratio=1.0), StillFollicle(), (), times, loads=loads)
+    trace = run_stable(get_engine(backend), [job], Fidelity.of(fidelity), record_shape=True)[0]
+    assert trace.link_positions is not None
+    nodes = np.linspace(0, whisker.arc_length, trace.link_positions.shape[1])
+    deflection = float(np.interp(at, nodes, trace.link_positions[-1, :, 2]))
+    return PointLoad(trace.wrench[-1], expected.wrench, at, trace, deflection, float(expected.point[2]))
+
+
+def push_aside(
+    whisker: Whisker,
+    at: float,
+    offset: float,
+    *,
+    peg_radius: float = 2.5e-4,
+    backend: str = DEFAULT_ENGINE,
+    fidelity: Fidelity | str = "balanced",
+) -> BenchTest:
+    """Push a whisker out of its plane and compare with the Kirchhoff rod (:mod:`.kirchhoff`).
+
+    The base stands still. A long frictionless round peg lies in parallel to the whisker's plane and normal to the
+    whisker at arc length ``at`` (m). It moves along the plane's normal by ``offset`` (m, positive) from touching the
+    unbent whisker, and rests there. The end state is quasi-static, without gravity.
+
+    Raises:
+        UsageError: ``at`` lies beyond the whisker, or ``offset`` or ``peg_radius`` is not positive.
+        DataError: the whisker slips off the peg, or the simulation was unstable.
+    """
+    _check(whisker, at=at, offset=offset, peg_radius=peg_radius)
+    expected, axis, way = _expected(whisker, at, offset, peg_radius), _axis(whisker, at), np.array([0.0, 0.0, 1.0])
+    touch = np.append(whisker.centre_line(at), -peg_radius - float(whisker.radius(at)))
+    # The peg is slow against the first mode.
+    settling = _settling_time(whisker)
+    duration = max(0.1, 4 * settling)
+
+    def motion(times: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        return touch + np.outer(smooth_step(times, duration) * offset, way), np.tile([1.0, 0, 0, 0], (len(times), 1))
+
+    ends = (tuple((side * whisker.arc_length * axis).tolist()) for side in (-1, 1))
+    rod = Obstacle((Capsule(*ends, peg_radius),), motion, friction=0.0)
+    job = Job(replace(whisker, damping_ratio=1.0), StillFollicle(), (rod,), np.array([duration + settling]))
+    trace = run_stable(get_engine(backend), [job], Fidelity.of(fidelity), record_shape=True)[0]
+    return BenchTest(trace.wrench[-1], expected.wrench, float(trace.contact_arc[-1]), trace)
+
+
+def _check(whisker: Whisker, at: float, **others: float) -> None:
+    for name, value in {"at": at, **others}.items():
+        if not (math.isfinite(value) and value > 0):
+            raise UsageError(f"{name} of the test must be a positive number in SI units; received {value!r}.")
+    if at > whisker.arc_length:
+        raise UsageError(f"The arc length {at:g} m lies beyond this whisker of {whisker.arc_length:g} m.")
+
+
+def _settling_time(whisker: Whisker) -> float:
+    """Return the time (s) after which the first mode, critically damped, is at rest: six periods."""
+    return 6 / float(references.natural_frequencies(whisker, 1)[0])
+
+
+def _axis(whisker: Whisker, at: float) -> NDArray[np.float64]:
+    """Return the direction [3] in the whisker's plane that is normal to it at ``at`` (m)."""
+    angle = float(whisker.tangent_angle(at))
+    return np.array([-math.sin(angle), math.cos(angle), 0.0])
+
+
+@lru_cache(maxsize=256)
+def _expected(whisker: Whisker, at: float, offset: float, peg_radius: float) -> RodEquilibrium:
+    return press_rod(KirchhoffRod.of(whisker), at, _axis(whisker, at), (0.0, 0.0, 1.0), offset, peg_radius)

@@ -1,0 +1,94 @@
+"""Runtime of taxels that add up to the contact forces of the engine."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from scipy.spatial import KDTree
+
+from brainbench.core.devices import warp
+from robotics_bridge.physics.state import HandState
+from robotics_bridge.sensors.context import SuiteContext
+from robotics_bridge.sensors.probes.placement import Probes
+from robotics_bridge.sensors.runtime import ProbeRuntime
+from robotics_bridge.sensors.taxels.kernels import contact_load as kernels
+from robotics_bridge.sensors.taxels.sensors import KinematicTaxel
+
+wp = warp()
+
+
+class ContactLoadRuntime(ProbeRuntime):
+    """Serves kinematic taxels with ``total="engine"``: contact forces, spread by the depths of the law."""
+
+    def __init__(self, sensors: Mapping[str, KinematicTaxel], context: SuiteContext) -> None:
+        # Readings of one taxel depend on others, so no kernel can finish one of them, noise included, by itself.
+        super().__init__(sensors, 6, context, fusable=False)
+        first, configs = next(iter(sensors.values())), list(sensors.values())
+        self._kernel = kernels.press_kernel(self.kinds, first.query == "raycast", self.mode)
+        links = [context.scene.link_index(sensor.link) for sensor in configs]
+        order = [links[:number].count(link) for number, link in enumerate(links)]
+        self._most = max(order) + 1
+        places = np.full((len(context.scene.links), self._most), -1)
+        places[links, order] = np.arange(len(links))
+        spans = [(p.start, p.start + p.count, slot) for p, slot in zip(self.slices.values(), self.slots, strict=True)]
+        plan = kernels.SpreadPlan()
+        plan.sensors, plan.link = context.array(places, int), context.array(links, int)
+        plan.order, plan.spans = context.array(order, int), context.array(spans, wp.vec3i)
+        plan.reach = context.array(np.concatenate([contact_reach(sensor.probes) for sensor in configs]), float)
+        plan.exponent = context.array([sensor.exponent for sensor in configs], float)
+        plan.slip = 1.0 if first.convention == "physical" else -1.0
+        self._plan = plan
+        shape = (context.num_envs, self.count)
+        self._press = press = kernels.PressArrays()
+        press.weight, press.total = context.zeros(shape), context.zeros(shape)
+        press.noisy = context.zeros(shape if self.noisy else (1, 1))
+        press.normal, press.body = context.zeros(shape, wp.vec3f), context.zeros(shape, int)
+        self.scratch = [press.weight, press.total, press.normal, press.body, *([press.noisy] if self.noisy else [])]
+        self._nodes = self._make_nodes(0)
+
+    def update(self, state: HandState, dt: float) -> None:
+        """Read the state."""
+        self.begin(state, dt)
+        c, room = self.context, state.contact_env.shape[0]
+        if self._nodes.felt.shape[0] != 2 * room:
+            self._nodes = self._make_nodes(room)
+        plan, nodes, press, link_of = self._plan, self._nodes, self._press, c.solids.struct.link
+        nodes.head.fill_(-1)
+        known = [plan, c.pairs.plan, link_of, self.probes, state.arrays]
+        c.launch(kernels.list_contacts, 2 * room, *known, state.contact_friction, nodes)
+        if c.device.is_cuda:
+            c.launch(kernels.sort_contacts, nodes.head.shape, nodes)
+        self.launch(
+            self._kernel, self.probes, c.solids.struct, c.pairs.struct, state.arrays, self.io, plan, nodes, press
+        )
+        c.launch(kernels.share_contacts, (2 * room, self._most), *known, press, nodes)
+        self.launch(kernels.spread_contacts, plan, self.probes, press, nodes, int(self.noisy), self.io)
+        self.finish(dt)
+
+    def _make_nodes(self, room: int) -> Any:
+        """Return the lists for a state with room for some contacts."""
+        c, nodes = self.context, kernels.ContactNodes()
+        nodes.head = c.zeros((c.num_envs, len(c.scene.links)), int)
+        for name in ("follower", "felt", "other"):
+            setattr(nodes, name, c.zeros(2 * room, int))
+        for name in ("point", "normal", "force"):
+            setattr(nodes, name, c.zeros(2 * room, wp.vec3f))
+        nodes.load, nodes.share = c.zeros(2 * room), c.zeros((2 * room, self._most), wp.vec4f)
+        return nodes
+
+
+def contact_reach(probes: Probes) -> np.ndarray:
+    """Return how near [N] a contact must be to be felt (m): the sensing radius, or the corner of a taxel's own cell.
+
+    Fillers get −1. The corner of a square cell is 1/√2 of the pitch away; of a grid's three nearest neighbours the
+    third lies along its wider pitch.
+    """
+    reach, active = np.full(len(probes.radius), -1.0), np.asarray(probes.active, dtype=bool)
+    places = np.asarray(probes.position)[active]
+    cell = np.zeros(len(places))
+    if len(places) > 1:
+        cell = KDTree(places).query(places, k=min(4, len(places)))[0][:, -1] / np.sqrt(2)
+    reach[active] = np.maximum(probes.radius[active], cell)
+    return reach

@@ -1,0 +1,330 @@
+"""Commands that are killed at any instant: what each needs, what it does, and what it must leave.
+
+``python -m tests.factories.kill_jobs NAME FOLDER --kills N`` loads the modules of a command once; every run is a fork,
+so that a kill hits the work and not the loading. It prints one JSON object.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import random
+import shutil
+import signal
+import sys
+import time
+import traceback
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+from brainbench.core.errors import BrainbenchError
+from tests.factories.sweep_batches import files_of
+
+TIMES = ("time", "seconds", "sweeps_per_second", "collect_s", "learn_s")
+"""Fields of JSON files that hold times and durations; all else is compared by its bytes."""
+
+
+@dataclass(frozen=True)
+class KillJob:
+    """A command with small inputs."""
+
+    name: str
+    kills: int
+    """Kills of the slow test."""
+    run: Callable[[Path, Path], None]
+    """Does the work, from a folder of inputs into a folder."""
+    prepare: Callable[[Path], None] = lambda inputs: None
+    """Makes the inputs."""
+    modules: tuple[str, ...] = ()
+    """Loaded before the first run."""
+    resumes: bool = False
+    """True where finished parts are kept; else all is done again."""
+    apart: tuple[str, ...] = ()
+    """Names of files that hold times, which are only there or not."""
+
+
+@dataclass
+class Outcome:
+    """What became of a command that was killed."""
+
+    name: str
+    seconds: float = 0.0
+    """Duration of an unbroken run after loading."""
+    kills: int = 0
+    """Kills that met a running process."""
+    resumed: int = 0
+    repeated: int = 0
+    different: list[str] = field(default_factory=list)
+    """Files that differ from those of an unbroken run, after the repetition."""
+    left: list[str] = field(default_factory=list)
+    """Files that an unbroken run does not leave."""
+    failed: list[str] = field(default_factory=list)
+    """Last lines of repetitions that failed."""
+    together: list[str] = field(default_factory=list)
+    """What was wrong after two runs at once."""
+
+
+def content(folder: Path, job: KillJob) -> dict[str, Any]:
+    """Return the files of a folder, by name: bytes, or JSON without its times."""
+    found: dict[str, Any] = {}
+    for name, data in files_of(folder).items():
+        if "events.out.tfevents" in name:
+            # TensorBoard names its files by time and process, and begins a new one in every run.
+            continue
+        if name.endswith((".json", ".jsonl")):
+            found[name] = [_without_times(json.loads(line, parse_constant=str)) for line in _documents(name, data)]
+        else:
+            found[name] = b"" if any(part in name for part in job.apart) else data
+    return found
+
+
+def measure(job: KillJob, folder: Path, kills: int) -> Outcome:
+    """Kill a command so often, at times drawn with a fixed seed, and repeat it each time."""
+    for module in job.modules:
+        import_module(module)
+    inputs, whole = folder / "inputs", folder / "whole"
+    inputs.mkdir(parents=True)
+    _finish(_fork(lambda: job.prepare(inputs), folder / "prepare.log"), folder / "prepare.log")
+    # The first run may compile what later ones find in the machine's own caches.
+    _finish(_fork(lambda: job.run(inputs, folder / "first"), folder / "first.log"), folder / "first.log")
+    begin = time.monotonic()
+    _finish(_fork(lambda: job.run(inputs, whole), folder / "whole.log"), folder / "whole.log")
+    outcome = Outcome(job.name, time.monotonic() - begin)
+    expected = content(whole, job)
+    outcome.different += [f"two unbroken runs: {name}" for name in _differ(content(folder / "first", job), expected)]
+    draw = random.Random(f"{job.name} {kills}")
+    for place in range(5 * kills):
+        if outcome.kills == kills:
+            break
+        out, log = folder / str(place), folder / f"{place}.log"
+        child = _fork(lambda out=out: job.run(inputs, out), log)
+        time.sleep(draw.uniform(0.0, outcome.seconds))
+        os.kill(child, signal.SIGKILL)
+        met = os.WIFSIGNALED(os.waitpid(child, 0)[1])
+        outcome.kills += met
+        there = out.is_dir() and any(not Path(name).name.startswith(".") for name in files_of(out))
+        outcome.resumed += met and there and job.resumes
+        outcome.repeated += met and not (there and job.resumes)
+        status = os.waitpid(_fork(lambda out=out: job.run(inputs, out), log), 0)[1]
+        now = content(out, job) if out.is_dir() else {}
+        # What was finished before the kill may refuse to be written once more.
+        if status and now != expected:
+            outcome.failed.append(log.read_text(errors="replace").strip().splitlines()[-1:][0])
+        outcome.left += sorted(now.keys() - expected.keys())
+        outcome.different += [name for name in _differ(now, expected) if name in expected]
+        shutil.rmtree(out, ignore_errors=True)
+    _run_together(job, inputs, folder, expected, outcome)
+    return outcome
+
+
+def _run_together(job: KillJob, inputs: Path, folder: Path, expected: dict[str, Any], outcome: Outcome) -> None:
+    """Run a command twice at once into one folder: both finish, or one is refused in a sentence."""
+    out, logs = folder / "together", [folder / f"together-{place}.log" for place in range(2)]
+    children = [_fork(lambda: job.run(inputs, out), log) for log in logs]
+    failed = [log.read_text() for child, log in zip(children, logs, strict=True) if os.waitpid(child, 0)[1]]
+    if len(failed) > 1:
+        outcome.together.append("none finished")
+    outcome.together += [text.strip()[-300:] for text in failed if "Traceback" in text]
+    outcome.together += _differ(content(out, job), expected)
+
+
+def _fork(run: Callable[[], None], log: Path) -> int:
+    child = os.fork()
+    if child:
+        return child
+    status = 1
+    try:
+        handle = os.open(log, os.O_CREAT | os.O_WRONLY | os.O_TRUNC)
+        os.dup2(handle, 1)
+        os.dup2(handle, 2)
+        sys.stdout, sys.stderr = open(1, "w", closefd=False), open(2, "w", closefd=False)  # noqa: SIM115
+        run()
+        status = 0
+    except SystemExit as end:
+        status = int(end.code or 0)
+    except BrainbenchError as error:
+        sys.stderr.write(f"{error}\n")
+    except BaseException:  # noqa: BLE001 - whatever ends a run is told
+        traceback.print_exc()
+    finally:
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(status)
+
+
+def _finish(child: int, log: Path) -> None:
+    if os.waitpid(child, 0)[1]:
+        raise SystemExit(f"An unbroken run failed: {log.read_text(errors='replace')[-2000:]}")
+
+
+def _differ(one: dict[str, Any], other: dict[str, Any]) -> list[str]:
+    return sorted(name for name in one.keys() | other.keys() if one.get(name) != other.get(name))
+
+
+def _documents(name: str, data: bytes) -> list[bytes]:
+    return data.splitlines() if name.endswith(".jsonl") else [data]
+
+
+def _without_times(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _without_times(item) for key, item in value.items() if key not in TIMES}
+    return [_without_times(item) for item in value] if isinstance(value, list) else value
+
+
+def _command(*words: object) -> None:
+    from brainbench.cli import main
+
+    sys.argv = ["brainbench", *map(str, words)]
+    main()
+
+
+def _generate(inputs: Path, out: Path) -> None:
+    from brainbench.stimuli.sweeps.generation import generate
+    from tests.factories.sweep_batches import killed_plan
+
+    generate(killed_plan(), out, workers=1)
+
+
+def _train(inputs: Path, out: Path) -> None:
+    import torch
+
+    from brainbench.models.training.config import TrainingConfig
+    from brainbench.models.training.trainer import train
+    from tests.factories.training_sweeps import tiny
+
+    torch.set_num_threads(1)
+    options: dict[str, Any] = {"epochs": 3, "batch_size": 8, "optimizer": "adamw", "learning_rate": 1e-3}
+    options |= {"checkpoint_seconds": 0.0, "augmentation": "physical", "precision": "float32"}
+    train(TrainingConfig.published("zhuang-small", "supervised", **options), tiny(), out=out, device="cpu")
+
+
+def _train_policy(inputs: Path, out: Path) -> None:
+    import torch
+
+    from robotics_bridge import tasks
+    from robotics_bridge.policies.training.teacher import TeacherRun, train
+    from robotics_bridge.tasks.settings import TeacherSettings
+
+    torch.set_num_threads(1)
+    small = TeacherSettings(num_envs=2, steps_per_env=4, iterations=4, epochs=1, minibatches=1, hidden=(8,))
+    env = tasks.make(tasks.load("in_palm_rotate"), num_envs=2, threads=1, seed=0)
+    train(env, out, TeacherRun(iterations=4, save_every=1), settings=small)
+
+
+def _write_records(inputs: Path) -> None:
+    from leaderboards import write_record
+    from tests.factories.records import make_record
+
+    for index in range(24):
+        write_record(make_record(f"net-{index}", 0.3 + 0.02 * index), inputs / "records")
+
+
+def _score(inputs: Path, out: Path) -> None:
+    import torch
+
+    torch.set_num_threads(1)
+    os.environ["BRAINBENCH_CACHE"] = str(out / "cache")
+    words = ("--conditions", "trials:stimulus", "--stimuli", "rodgers", "--whiskers", "C2", "--fidelity", "fast")
+    _command("score", "zhuang-small", "-r", inputs / "rec.h5", *words, "--out", out / "records", "--json")
+
+
+def _write_recordings(inputs: Path) -> None:
+    import numpy as np
+
+    from brainbench.datasets import write_recordings
+    from brainbench.datasets.sessions import make_session
+    from tests.factories.recordings import LABELS
+
+    random_numbers = np.random.default_rng(0)
+    start = 2.0 * np.arange(48)
+    table = {"start_time": start, "stop_time": start + 1, "stimulus": np.resize(np.array(LABELS), 48)}
+    spikes = [np.sort(np.r_[0.0, 98.0, random_numbers.uniform(0, 98, 400)]) for _ in range(8)]
+    write_recordings(inputs / "rec.h5", make_session("m", "1", spikes, {"trials": table}))
+
+
+def _write_checkpoint(inputs: Path) -> None:
+    import torch
+
+    from brainbench.models.registry import load_model
+    from tests.factories.published_files import lightning_state
+
+    state = lightning_state(load_model("s4-small", seed=5, classes=9))
+    torch.save({"state_dict": state, "epoch": 6, "global_step": 50}, inputs / "x.ckpt")
+
+
+def _write_set(inputs: Path) -> None:
+    from tests.factories.published_sweeps import write_tree
+
+    write_tree(inputs / "tree", sizes=(40, 20, 20))
+    _command("stimuli", "convert", inputs / "tree" / "train", inputs / "set.h5", "--json")
+
+
+def _write_tree(inputs: Path) -> None:
+    from tests.factories.published_sweeps import write_tree
+
+    write_tree(inputs / "tree", sizes=(40, 20, 20))
+
+
+def _import(inputs: Path, out: Path) -> None:
+    _command("models", "import", inputs / "x.ckpt", "--architecture", "s4-small", "--out", out, "--json")
+
+
+def _convert(inputs: Path, out: Path) -> None:
+    os.environ["BRAINBENCH_CACHE"] = str(out.with_name(f"cache-{out.name}"))
+    _command("stimuli", "convert", inputs / "tree", out, "--json")
+
+
+def _export(inputs: Path, out: Path) -> None:
+    _command("export", "zhuang-small", "--format", "torch", "--out", out / "step.pt2", "--json")
+
+
+def _convert_set(inputs: Path, out: Path) -> None:
+    _command("stimuli", "convert", inputs / "set.h5", out / "run", "-s", "00000000", "--json")
+
+
+_CLI = ("torch", "brainbench.cli")
+_TRAINER = ("brainbench.models.training.trainer", "tests.factories.training_sweeps")
+_SCORE = ("brainbench.scoring.scores", "brainbench.stimuli", "brainbench.models.zoo", "brainbench.datasets", "warp")
+_TEACHER = ("mujoco", "robotics_bridge.envs", "robotics_bridge.policies.training.teacher", "rsl_rl")
+
+JOBS = (
+    KillJob(
+        "stimulus generation", 12, _generate, modules=("brainbench.stimuli.sweeps.generation", "mujoco"), resumes=True
+    ),
+    KillJob("train", 12, _train, modules=_TRAINER, resumes=True),
+    KillJob("policy train", 6, _train_policy, modules=_TEACHER, resumes=True),
+    KillJob(
+        "leaderboard add", 16, lambda inputs, out: _command("leaderboard", "add", inputs / "records", "--to", out),
+        _write_records, (*_CLI, "leaderboards"), resumes=True,
+    ),
+    KillJob(
+        "leaderboard build", 16, lambda inputs, out: _command("leaderboard", "build", inputs / "records", "--out", out),
+        _write_records, (*_CLI, "leaderboards.site"),
+    ),
+    KillJob(
+        "score, empty cache", 12, _score, _write_recordings, (*_CLI, *_SCORE), resumes=True, apart=(".html",)
+    ),
+    KillJob("models export", 8, _export, modules=(*_CLI, "torch.export", "brainbench.models.export")),
+    KillJob("stimuli convert, sweeps", 12, _convert, _write_tree, (*_CLI, "h5py", "brainbench.stimuli"), resumes=True),
+    KillJob("stimuli convert, a run", 8, _convert_set, _write_set, (*_CLI, "h5netcdf", "brainbench.stimuli")),
+    KillJob("models import", 12, _import, _write_checkpoint, (*_CLI, "brainbench.models.published.importing")),
+)  # fmt: skip
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("name", choices=[job.name for job in JOBS])
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("--kills", type=int)
+    chosen = parser.parse_args()
+    job = next(item for item in JOBS if item.name == chosen.name)
+    found = measure(job, chosen.folder, job.kills if chosen.kills is None else chosen.kills)
+    sys.stdout.write(json.dumps(asdict(found)) + "\n")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,132 @@
+"""The table of docs/stimuli.md that says what is flagged and what is not: each of its rows is simulated, or judged."""
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from brainbench.stimuli.engines import get_engine
+from brainbench.stimuli.engines.fidelity import Fidelity
+from brainbench.stimuli.engines.protocol import Job, Load, StillFollicle
+from brainbench.stimuli.engines.trust import LARGEST_OVERLAP, LARGEST_STRAIN, LOST, halved, judge
+from brainbench.stimuli.objects.obstacle import Capsule, Obstacle, Sphere, TriangleMesh
+from tests.factories.trust import facts
+from tests.factories.whiskers import C2
+
+pytest.importorskip("warp")
+
+PAGE = Path(__file__).parents[3] / "docs" / "stimuli.md"
+TIMES = np.arange(1, 31) * 1e-3
+
+
+def _reason(*obstacles, loads=(), step=2e-4, engine="rod"):
+    job = Job(C2, StillFollicle(), obstacles, TIMES, loads=loads)
+    (trace,) = get_engine(engine).run([job], Fidelity(links=10, time_step=step))
+    assert (trace.status == "ok") == (trace.reason == "") == np.isfinite(trace.wrench).all()
+    return trace.reason
+
+
+def _judged(**changed):
+    return judge(facts(**changed)).reasons[0]
+
+
+def _moving(start, velocity, part):
+    def motion(times):
+        return np.add(start, np.outer(times, velocity)), np.tile([1.0, 0.0, 0.0, 0.0], (len(times), 1))
+
+    return Obstacle((part,), motion, friction=0.0)
+
+
+def _ball(overlap):
+    """A ball beside the whisker, 8 mm from its base."""
+    return Obstacle((Sphere((0.008, 0.005 + float(C2.radius(0.008)) - overlap, 0.0), 0.005),), friction=0.0)
+
+
+def _peg(radius):
+    return Capsule((0.0, 0.0, -0.02), (0.0, 0.0, 0.02), radius)
+
+
+def _overlapping_boxes():
+    """One closed mesh of two overlapping boxes: the whisker lies in the first, beside a face of the second."""
+    import trimesh
+
+    boxes = [((-0.05, -0.05, -0.05), (0.05, 0.05, 0.05)), ((-0.06, -0.06, 0.002), (0.06, 0.06, 0.06))]
+    mesh = trimesh.util.concatenate([trimesh.creation.box(bounds=some) for some in boxes])
+    return Obstacle((), surface=TriangleMesh(np.asarray(mesh.vertices), np.asarray(mesh.faces)))
+
+
+FLAGGED = {
+    "starts in an object": ("starts 0.11 mm deep", lambda **some: _reason(_ball(1.1002e-4), **some)),
+    "gets deep into one": (
+        "mm deep in an object at 0.0",
+        lambda: _reason(_moving((C2.arc_length + 0.0055, 0, 0), (-0.1, 0, 0), Sphere((0, 0, 0), 0.005))),
+    ),
+    "has an object at its base": (
+        "base point",
+        lambda **some: _reason(_moving((0, -2e-3, 0), (0, 0.2, 0), _peg(2e-4)), **some),
+    ),
+    "bears too much": ("stretch", lambda: _reason(_moving((5e-4, -1e-3, 0), (0, 0.1, 0), _peg(1e-4)))),
+    "unsolved contacts": ("missed by 6%", lambda: _judged(residual=0.06)),
+    "contacts without a solution": (
+        "missed by 1000%",
+        lambda: _reason(_moving((C2.arc_length + 0.0055, 0, 0), (-0.025, 0, 0), Sphere((0, 0, 0), 0.005))),
+    ),
+    "too many contacts": ("more contacts", lambda: _judged(crowded=3)),
+    "folds": ("bent by", lambda: _reason(loads=(Load(C2.arc_length, (0.0, 1.0, 0.0)),))),
+    "is no number": ("finite", lambda: _judged(status=LOST, failed=0.1)),
+    "meets something too fast": (
+        "further than contacts are looked for",
+        lambda: _reason(_moving((0.008, -0.1, 0), (0, 10.0, 0), _peg(1e-3)), step=2e-3),
+    ),
+    "changes at half the step": (
+        "changes by 30%",
+        lambda: halved(judge(facts(depth=3e-4)), np.array([0.3]), np.array([True])).reasons[0],
+    ),
+}
+"""Row of the table: words of the reason, and how it comes about."""
+
+NOT_FLAGGED = {
+    "starts in touch": lambda: _reason(_ball(1e-5)),
+    "overlaps for a step": lambda: _judged(depth=0.9 * LARGEST_OVERLAP),
+    "has an object behind its base": lambda: _reason(Obstacle((Sphere((-1.1e-3, 0.0, 0.0), 1e-3),))),
+    "sticks at another time": lambda: str(judge(facts()).suspicious[0] or ""),
+    "lies in bodies that overlap": lambda: _reason(_overlapping_boxes()),
+}
+
+
+def _rows(title):
+    """First cells of the table under a line of the page that begins with ``title``."""
+    text = PAGE.read_text(encoding="utf-8")
+    table = text.split(title, 1)[1].split("\n\n")[1]
+    return [re.match(r"\| *(.*?) *\|", line)[1] for line in table.splitlines()[2:]]
+
+
+def test_the_page_has_these_rows_and_no_others():
+    assert _rows("**Flagged**") == list(FLAGGED)
+    assert _rows("**Not flagged**") == list(NOT_FLAGGED)
+
+
+@pytest.mark.parametrize("row", FLAGGED)
+def test_what_the_page_calls_flagged_is_flagged(row):
+    words, found = FLAGGED[row]
+    assert words in found()
+
+
+@pytest.mark.parametrize("row", NOT_FLAGGED)
+def test_what_the_page_calls_not_flagged_is_not(row):
+    assert NOT_FLAGGED[row]() == ""
+
+
+@pytest.mark.parametrize("engine", ["mujoco", "bullet"])
+@pytest.mark.parametrize("row", ["starts in an object", "has an object at its base"])
+def test_other_engines_share_these_rows(engine, row):
+    if engine == "bullet":
+        pytest.importorskip("pybullet")
+    assert FLAGGED[row][0] in FLAGGED[row][1](engine=engine)
+
+
+def test_the_numbers_of_the_page_are_those_of_the_rule():
+    text = PAGE.read_text(encoding="utf-8").split("**Flagged**")[1]
+    for number in (f"{LARGEST_OVERLAP * 1e3:g}"[1:] + " mm", f"{LARGEST_STRAIN * 100:g} %"):
+        assert number in text

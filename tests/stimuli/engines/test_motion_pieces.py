@@ -1,0 +1,122 @@
+"""Motions are cut so finely that cubic pieces follow them, and steps with them; what cannot be followed is refused."""
+
+import numpy as np
+import pytest
+
+from brainbench.core.errors import UsageError
+from brainbench.stimuli.engines.fidelity import Fidelity
+from brainbench.stimuli.engines.motion_pieces import KNOT, MOST_PIECES, SPEED_ERROR, cut
+from brainbench.stimuli.engines.protocol import Job, StillFollicle
+from brainbench.stimuli.engines.rod.engine import RodEngine
+from brainbench.stimuli.engines.stepping import SteppedJob
+from brainbench.stimuli.motion.trajectories import Whisking
+from brainbench.stimuli.objects.obstacle import Obstacle, Sphere
+from tests.factories.swing import FLAT, Oscillation
+from tests.factories.whiskers import C2
+
+
+def _cut(motion, stop=0.05, *, step=1e-4, finest=None):
+    return cut(lambda t: motion(t)[:, None], 0.0, stop, step=step, tail=step, finest=finest, what="a test")
+
+
+def _pulse(at, width, height=1.0):
+    return lambda t: np.where((t > at) & (t < at + width), height * np.sin(np.pi * (t - at) / width) ** 4, 0.0)
+
+
+@pytest.mark.parametrize("frequency", [20.0, 200.0, 1000.0, 2000.0])
+def test_pieces_follow_the_velocity_of_a_sinusoid(frequency):
+    omega = 2 * np.pi * frequency
+    pieces = _cut(lambda t: np.sin(omega * t))
+    times, first = pieces.times(0.0)
+    assert len(first) == len(pieces.count) + 1
+    # SciPy's Hermite spline through the same knots.
+    from scipy.interpolate import CubicHermiteSpline
+
+    spline = CubicHermiteSpline(times, np.sin(omega * times), omega * np.cos(omega * times))
+    fine = np.linspace(0, 0.05, 100_003)
+    assert np.abs(spline(fine, 1) - omega * np.cos(omega * fine)).max() < 2 * SPEED_ERROR * omega
+    assert (pieces.count > 1).any() == (frequency > 100)
+    # No more than twice as fine as needed.
+    coarser = CubicHermiteSpline(times[::4], np.sin(omega * times[::4]), omega * np.cos(omega * times[::4]))
+    assert np.abs(coarser(fine, 1) - omega * np.cos(omega * fine)).max() > SPEED_ERROR * omega
+
+
+def test_a_pulse_between_the_milliseconds_is_seen_and_cut_where_it_is():
+    pieces = _cut(_pulse(0.5302, 1e-4), stop=1.0)
+    fast = np.flatnonzero(pieces.count > 1)
+    assert fast.tolist() == [530]
+    limit = pieces.longest_steps(2e-3, 25)
+    # Two milliseconds before it steps must not reach across it.
+    assert np.flatnonzero(limit < 2e-3).tolist() == [528, 529, 530]
+    assert limit[530] <= 1e-4 / 25
+
+
+def test_a_motion_that_says_how_fine_it_is_is_looked_at_less_often():
+    seen = []
+
+    def motion(times):
+        seen.append(len(times))
+        return np.sin(40 * np.pi * times)
+
+    _cut(motion, finest=0.05)
+    told = sum(seen)
+    seen.clear()
+    _cut(motion)
+    assert sum(seen) > 10 * told
+    assert Whisking(frequency=8.0, onset=0.01).finest == 0.02
+
+
+def test_corners_are_kept_and_do_not_shorten_the_steps():
+    corners = np.array([0.0, 0.0103, 0.02, 0.0307, 1.0])
+    pieces = _cut(lambda t: np.interp(t, corners, [0.0, 1.0, 0.3, 0.3, 0.3]))
+    assert np.flatnonzero(pieces.count == MOST_PIECES).tolist() == [10, 19, 20, 30] or set(
+        np.flatnonzero(pieces.count == MOST_PIECES)
+    ) <= {10, 19, 20, 30}
+    assert (pieces.longest_steps(1e-4, 25) == 1e-4).all()
+
+
+@pytest.mark.parametrize(
+    ("motion", "culprit"),
+    [
+        (lambda t: np.where(t < 0.0123, 0.0, 0.5), "jumps by 0.5 mm at 0.0123 s"),
+        (lambda t: 1e-3 * np.sin(2 * np.pi * 60e3 * t), "20 kHz"),
+        (lambda t: np.where(t < 0.0123, 0.0, np.nan), "not finite at 0.01"),
+    ],
+)
+def test_what_cannot_be_followed_is_refused(motion, culprit):
+    with pytest.raises(UsageError, match=culprit):
+        _cut(motion)
+
+
+def _push(width, reach=1e-3):
+    """A ball that lies just beside the whisker and is pushed against it once."""
+
+    def motion(times):
+        place = np.zeros((len(times), 3))
+        place[:, 1] = _pulse(0.0102, width, reach)(times)
+        return place, np.tile([1.0, 0.0, 0.0, 0.0], (len(times), 1))
+
+    return Obstacle((Sphere((0.008, -1.2e-3, 0.0), 1e-3),), motion)
+
+
+@pytest.mark.parametrize("fidelity", ["fast", "balanced"])
+def test_an_obstacle_pulse_of_a_tenth_of_a_millisecond_is_felt(fidelity):
+    job = Job(C2, StillFollicle(), (_push(1e-4),), np.arange(1, 31) * 1e-3)
+    trace = RodEngine().run([job], Fidelity.preset(fidelity))[0]
+    if trace.status == "ok":
+        assert np.abs(trace.wrench).max() > 1e-7
+    else:
+        assert trace.reason
+
+
+@pytest.mark.parametrize("amplitude", [1e-6, 0.0])
+def test_equal_steps_follow_a_shake_too(amplitude):
+    shake = Oscillation(shift=(0.0, amplitude, 0.0), rest=FLAT, frequency=1000.0)
+    fidelity = Fidelity.preset("balanced")
+    stepped = SteppedJob(Job(C2, shake, (), np.array([0.01])), fidelity, record_shape=False)
+    given = fidelity.step_of(stepped.chain)
+    if amplitude:
+        assert 0.4 * KNOT / fidelity.steps_per_period < stepped.step <= KNOT / fidelity.steps_per_period
+        assert stepped.step < given
+    else:
+        assert stepped.step == given
