@@ -47,6 +47,11 @@ def test_a_scene_overrides_shared_tables_key_by_key(tmp_path):
     assert len(free.objects) == 1
 
 
+def test_a_friction_below_zero_is_refused(tmp_path):
+    with pytest.raises(UsageError, match=r"friction.*-1"):
+        load_scene(_write(tmp_path, POLE.replace("friction = 0.3", "friction = -1")))
+
+
 def test_whiskers_can_be_chosen_at_loading(tmp_path):
     assert load_scene(_write(tmp_path, POLE), whiskers="C1-C2").scenes[0].array.names == ("C1", "C2")
 
