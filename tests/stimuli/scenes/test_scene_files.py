@@ -57,6 +57,11 @@ def test_a_file_may_state_that_its_whiskers_do_not_twist_and_what_they_are_made_
         load_scene(_write(tmp_path, "twist = 0\n" + POLE))
 
 
+def test_a_friction_below_zero_is_refused(tmp_path):
+    with pytest.raises(UsageError, match=r"friction.*-1"):
+        load_scene(_write(tmp_path, POLE.replace("friction = 0.3", "friction = -1")))
+
+
 def test_whiskers_can_be_chosen_at_loading(tmp_path):
     assert load_scene(_write(tmp_path, POLE), whiskers="C1-C2").scenes[0].array.names == ("C1", "C2")
 
