@@ -1,8 +1,8 @@
 """One whisker among obstacles as a Bullet multi-body, in mg, mm and ms, so in mN and µN·m.
 
 Joint tree: world → three slides along x, y, z → three turns (θ − π/2 about z, φ about −y, ζ + π/2 about x)
-→ link 0 → … → link N − 1, each link on two hinges. The first six joints are the follicle, whose motion is
-prescribed; their reactions are the base wrench. Letters: n time step, N link.
+→ link 0 → … → link N − 1, each link on two hinges: like WHISKiT's, these whiskers do not twist. The first six joints
+are the follicle, whose motion is prescribed; their reactions are the base wrench. Letters: n time step, N link.
 """
 
 from __future__ import annotations
