@@ -14,6 +14,7 @@ from typing import Any
 from benchmarks.models.campaign import CURVES, DONE, ROOT
 from benchmarks.models.campaign_jobs import campaign
 from benchmarks.report import table, write_section
+from brainbench.core.figures.style import panels, save_figure
 
 PICTURE = ROOT / "docs" / "images" / "training-curves.png"
 
@@ -59,34 +60,33 @@ def results_table(lines: list[dict[str, Any]]) -> str:
 
 def draw(curves: list[dict[str, Any]], path: Path) -> None:
     """Draw the validation accuracy of the networks of seed 0 over their epochs."""
-    import matplotlib as mpl
-
-    mpl.use("agg")
-    from matplotlib import pyplot as plt
-
     series: dict[str, list[dict[str, Any]]] = defaultdict(list)
     for line in curves:
         if line["job"].endswith(".seed0") and line.get("validation") is not None:
             series[line["job"].removesuffix(".seed0")].append(line)
-    titles = {"supervised": "labels", "simclr": "SimCLR", "ae": "autoencoder", "simsiam": "SimSiam"}
+    titles = {
+        "supervised": "trained on labels",
+        "simclr": "SimCLR",
+        "ae": "autoencoder",
+        "simsiam": "SimSiam",
+    }
     shown = [objective for objective in titles if any(name.endswith(f".{objective}") for name in series)]
-    size = (4.5 * len(shown), 4.2)
-    figure, axes = plt.subplots(1, len(shown), figsize=size, constrained_layout=True, squeeze=False)
-    models = sorted({name.partition(".")[0] for name in series})
+    figure, axes = panels(1, len(shown), (4.8 * len(shown), 4.4))
+    encoders = sorted({name.partition(".")[0].partition("+")[0] for name in series})
     for name, lines in sorted(series.items()):
         model, _, objective = name.partition(".")
         if objective not in shown:
             continue
-        index = models.index(model)
-        style = {"color": f"C{index % 10}", "linestyle": ("-", "--", ":")[index // 10]}
+        # One colour for each encoder; dashed and dotted with an attender.
+        encoder, attender, _ = model.partition("+")
+        style = {"color": f"C{encoders.index(encoder)}", "linestyle": {"": "-", "gpt": "--"}.get(attender, ":")}
         epochs, accuracy = [line["epoch"] for line in lines], [100 * line["validation"] for line in lines]
         axes[0, shown.index(objective)].plot(epochs, accuracy, label=model, **style)
     for axis, objective in zip(axes[0], shown, strict=True):
         axis.set(title=titles[objective], xlabel="epoch", ylabel="validation accuracy (%)", ylim=(0, 100))
-        axis.spines[["top", "right"]].set_visible(False)
     handles = {label: line for axis in axes[0] for line, label in zip(*axis.get_legend_handles_labels(), strict=True)}
-    figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=3, fontsize=7, frameon=False)
-    figure.savefig(path, dpi=110)
+    figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=3, fontsize=8.5, frameon=False)
+    save_figure(figure, path, dpi=120)
 
 
 def main() -> None:

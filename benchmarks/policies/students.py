@@ -53,7 +53,7 @@ CONTRASTS = (
 """Arms whose differences are tested."""
 _TAR = 15 << 20
 _SMOOTH = 8
-"""Iterations over which curves are averaged."""
+"""Last iterations over which a loss and a success are averaged."""
 _PICTURES = Path(__file__).resolve().parents[2] / "docs" / "images"
 _PER_EVALUATION = 60.0
 """Seconds kept for making the environments of a student and for its evaluation."""
@@ -201,7 +201,6 @@ def lay_out(options: argparse.Namespace) -> None:
     print(body)
     if options.write:
         report.draw(results, _PICTURES / "policy-students.png", agents=agents)
-        curves(logs, _PICTURES / "policy-students-learning.png")
         command = f"python -m benchmarks.policies.students --teacher {options.teacher} --config careful"
         write_section(f"Students of {options.task}", command, body, where=options.device, subject="policies")
     if options.records is not None:
@@ -293,46 +292,6 @@ def seen(log: list[dict[str, Any]], iteration: int) -> float:
     """Return the success in training over the last iterations up to one."""
     own = [row for row in log if row["kind"] == "episode" and iteration - _SMOOTH < row["step"] <= iteration]
     return sum(row["episodes"] * row["success"] for row in own) / sum(row["episodes"] for row in own)
-
-
-def curves(logs: dict[tuple[str, int], list[dict[str, Any]]], path: Path) -> None:
-    """Draw success in training and the loss of imitation over the iterations of every student."""
-    import matplotlib as mpl
-    import numpy as np
-
-    mpl.use("Agg")
-    from matplotlib import pyplot as plt
-
-    figure, axes = plt.subplots(1, 2, figsize=(9, 3.6), constrained_layout=True)
-    told, spans, most = set(), [], []
-    for (arm, seed), rows in logs.items():
-        color = f"C{list(ARMS).index(arm)}"
-        for axis, kind, key in ((axes[0], "episode", "success"), (axes[1], "loss", "behaviour")):
-            own = [row for row in rows if row["kind"] == kind and key in row]
-            if not own:
-                continue
-            weights = np.array([row.get("episodes", 1.0) for row in own])
-            window = np.ones(min(_SMOOTH, len(own)))
-            means = np.convolve(weights * [row[key] for row in own], window, "valid")
-            means /= np.convolve(weights, window, "valid")
-            label = arm if axis is axes[0] and arm not in told else None
-            axis.plot([row["step"] for row in own][len(window) - 1 :], means, color=color, label=label, lw=1)
-            if axis is axes[1]:
-                spans.append((0.95 * float(means.min()), 1.05 * float(np.quantile(means, 0.9))))
-                most.append((max(row[key] for row in own), f"{arm}, seed {seed}"))
-        told.add(arm)
-    # One loss that explodes would leave the others no height; it is named instead.
-    top = max(high for _, high in spans)
-    far = [f"{name}: one iteration reaches {loss:.0e}" for loss, name in most if loss > 100 * top]
-    axes[1].set_ylim(min(low for low, _ in spans), top)
-    axes[1].text(0.98, 0.98, "\n".join(far), fontsize=7, ha="right", va="top", transform=axes[1].transAxes)
-    axes[0].set(ylabel="success in training", xlabel="iteration", ylim=(0, None))
-    axes[1].set(ylabel="imitation loss", xlabel="iteration")
-    figure.legend(frameon=False, fontsize=7, ncols=len(told), loc="outside lower center", handlelength=1.2)
-    for axis in axes:
-        axis.spines[["top", "right"]].set_visible(False)
-    figure.savefig(path, dpi=110)
-    plt.close(figure)
 
 
 def main() -> None:

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.report import table
+from brainbench.core.figures.style import COLORS, PALE, panels, save_figure
 
 Rows = Sequence[dict[str, Any]]
 AXES = ("taxels", "environments", "triangles (raycast)", "triangles (sdf)", "points (proximity)", "points (elastomer)")
@@ -98,38 +99,36 @@ _LAYOUTS = {
 
 
 def plot_scaling(rows: Rows, path: Path) -> None:
-    """Draw cost against taxels, environments, triangles and points, one line per device."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(9.6, 3.0), dpi=110, facecolor="white", layout="constrained")
-    FigureCanvasAgg(figure)
-    panels = (("taxels", AXES[:1]), ("environments", AXES[1:2]), ("triangles", AXES[2:4]), ("points", AXES[4:]))
-    colours = ("#c1440e", "#2b6cb0")
+    """Draw time against taxels, environments, triangles and points; dotted lines are proportional to what grows."""
+    kinds = {
+        "raycast": "each triangle",
+        "sdf": "distance field",
+        "proximity": "proximity taxels",
+        "elastomer": "elastomer",
+    }
+    groups = {"taxels": AXES[:1], "environments": AXES[1:2], "triangles": AXES[2:4], "points": AXES[4:]}
+    figure, axes = panels(1, 4, (12, 3.4))
     devices = list(dict.fromkeys(row["device"] for row in rows))
-    for number, (title, axes_of) in enumerate(panels):
-        axes = figure.add_subplot(1, 4, number + 1)
+    for (title, cases), one in zip(groups.items(), axes[0], strict=True):
+        whole = title == "environments"
         for device, marker in zip(devices, "os^", strict=False):
-            for axis, colour in zip(axes_of, colours, strict=False):
-                kept = {row["value"]: row for row in rows if row["case"] == axis and row["device"] == device}
+            for case, colour in zip(cases, COLORS, strict=False):
+                kept = {row["value"]: row for row in rows if row["case"] == case and row["device"] == device}
                 if not kept:
                     continue
                 x = sorted(kept)
-                per = 1e3 if title == "environments" else 1e-3
-                y = [kept[value]["ms"] / (per if title == "environments" else per * kept[value]["envs"]) for value in x]
-                name = axis.split("(")[-1].rstrip(")") if "(" in axis else ""
-                label = " ".join(part for part in (name, device if len(devices) > 1 else "") if part)
-                axes.loglog(x, y, marker + "-", color=colour, markersize=4, linewidth=1, label=label or None)
-                if number < 2:
-                    scale = y[-1] / x[-1]
+                y = [kept[value]["ms"] if whole else 1e3 * kept[value]["ms"] / kept[value]["envs"] for value in x]
+                kind = case.partition("(")[2].rstrip(")")
+                name = kinds.get(kind, kind)
+                label = ", ".join(part for part in (name, device if len(devices) > 1 else "") if part)
+                one.loglog(x, y, marker + "-", color=colour, markersize=4, linewidth=1.2, label=label or None)
+                if title in ("taxels", "environments"):
                     ends = [x[0], x[-1]]
-                    axes.loglog(ends, [scale * end for end in ends], ":", color="#888888", linewidth=1)
-        axes.set_title(title, fontsize=9)
-        axes.set_ylabel("s / update" if title == "environments" else "µs / update and environment", fontsize=8)
-        low, high = axes.get_ylim()
-        axes.set_ylim(10 ** math.floor(math.log10(low)), 10 ** math.ceil(math.log10(high)))
-        axes.tick_params(labelsize=7)
-        axes.spines[["top", "right"]].set_visible(False)
-        if axes.get_legend_handles_labels()[0]:
-            axes.legend(fontsize=7, frameon=False)
-    figure.savefig(path)
+                    one.loglog(ends, [y[-1] * end / x[-1] for end in ends], ":", color=PALE, linewidth=1)
+        one.set_xlabel(f"number of {title}" if title != "points" else "number of surface points")
+        one.set_ylabel("time per update (ms)" if whole else "time per update and environment (µs)")
+        low, high = one.get_ylim()
+        one.set_ylim(10 ** math.floor(math.log10(low)), 10 ** math.ceil(math.log10(high)))
+        if one.get_legend_handles_labels()[0]:
+            one.legend(fontsize=8.5, frameon=False)
+    save_figure(figure, path, dpi=120)

@@ -1,7 +1,7 @@
 """Measure every preset against the elastica, the slip-off depth, the Euler-Bernoulli frequencies, and a shaken beam.
 
 Run from the repository root: ``python -m benchmarks.whiskers.validation``; it rewrites its sections of RESULTS.md, one
-per ``--backend`` and part. The gates (base moment/force of pegs, slip-off, frequencies, damping ratio, peak moment of a
+per ``--backend`` and ``--part``. Gates (base moment and force of pegs, slip-off, frequencies, damping, peak moment of a
 base that is shaken or pushed) are :data:`GATES`.
 """
 
@@ -35,8 +35,8 @@ PULSES = (1e-4, 6e-4)
 """Frequencies (Hz) and widths (s) of sideways motions of the base by 10 µm."""
 GATES = {
     "accurate": {"moment": 0.01, "force": 0.02, "slip": 0.03, "frequency": 0.01, "damping": 0.05, "shake": 0.02},
-    "balanced": dict.fromkeys(("moment", "force", "slip", "frequency", "damping", "shake"), 0.05),
-    "fast": dict.fromkeys(("moment", "force", "slip", "frequency", "damping", "shake"), 0.15),
+    "balanced": {**dict.fromkeys(("moment", "force", "slip", "frequency", "damping"), 0.05), "shake": 0.1},
+    "fast": {**dict.fromkeys(("moment", "force", "slip", "frequency", "damping"), 0.15), "shake": 0.2},
 }
 """Largest relative errors allowed where the contact slope is at most 60° and the depth at most .9 of slip-off."""
 

@@ -1,7 +1,7 @@
 """The ``brainbench`` command. One thin module per command; heavy imports happen inside them.
 
-Exit status: 0 done; 1 the request was fine but the job failed (unusable data, interrupted);
-2 the request itself was wrong (unknown name, option or file).
+Exit status: 0 done; 1 the request was fine but the job failed (unusable data);
+2 the request itself was wrong (unknown name, option or file); 130 interrupted (Ctrl-C).
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ from brainbench.cli import (
     power,
     recordings,
     recovery,
+    requirements,
     score,
     stimuli,
     tactile,
@@ -51,6 +52,14 @@ app.add_typer(tactile.app, name="tactile")
 app.add_typer(policy.app, name="policy")
 app.add_typer(tradeoff.app, name="tradeoff")
 app.add_typer(leaderboard.app, name="leaderboard")
+requirements.guard(app)
+
+INTERRUPTED = 130
+"""Exit status after Ctrl-C, as shells count it: 128 and the number of the signal."""
+GO_ON = (
+    "interrupted; no file was left half-written. Give the same command again: what it had finished (simulations, "
+    "checkpoints, shards of a data set) is kept and not made again."
+)
 
 
 def _version(show: bool) -> None:
@@ -82,9 +91,11 @@ def main() -> None:
     except BrainbenchError as error:
         print(f"brainbench: {error}", file=sys.stderr)
         sys.exit(error.exit_code)
-    except KeyboardInterrupt:
-        print("brainbench: interrupted; nothing was half-written.", file=sys.stderr)
-        sys.exit(1)
+    except SystemExit as stop:
+        # typer turns Ctrl-C into this status, without a word.
+        if stop.code == INTERRUPTED:
+            print(f"\nbrainbench: {GO_ON}", file=sys.stderr)
+        raise
     except BrokenPipeError:
         # The reader (head, less) has gone; Python would otherwise complain again at shutdown.
         sys.stderr.close()

@@ -10,8 +10,9 @@ import typer
 
 from brainbench.cli.destinations import out_file, out_folder
 from brainbench.cli.model_card import model_card
-from brainbench.cli.output import JsonOption, emit, facts, list_without_command, table, table_of
+from brainbench.cli.output import JsonOption, emit, facts, list_without_command, progress_bar, table, table_of
 from brainbench.core.files import to_plain
+from brainbench.core.progress import track
 
 if TYPE_CHECKING:
     from brainbench.models.registry import ModelDescription
@@ -34,7 +35,8 @@ def list_(
 
     here = shipped()
     names = [*list_models(pattern), *(name for name in here if fnmatchcase(name, pattern))]
-    records = [describe_model(name) for name in names]
+    with progress_bar() as progress:
+        records = [describe_model(name) for name in track(names, "measuring models", progress)]
     if as_json:
         tags = {name: [str(Architecture.parse(one).tag) for one in list_recipes(f"{name}.*")] for name in names}
         emit([{**to_plain(item), "recipes": tags[item.name]} for item in records], "", as_json=True)
@@ -49,6 +51,9 @@ def list_(
         if name not in here:
             sizes[plain] = sizes.get(plain) or _size(describe_model(plain))
             rows.append([name, "needs training", *sizes[plain]])
+    if not rows:
+        print(f"No model has a name like {pattern!r}; see them all with: brainbench models")
+        return
     rows.sort(key=lambda row: ("trained", "your code", "untrained", "needs training").index(row[1]))
     print(table("", ["model", "weights", "parameters", "MACs/step"], rows, right=(2, 3)))
     print("\ntrained: weights come with the package; untrained: random weights, drawn from --seed;")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import math
 import sys
+import time as clock
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -108,11 +109,15 @@ def table(title: str, columns: list[str], rows: list[list[str]], *, right: tuple
     return "\n".join(line.rstrip() for line in buffer.getvalue().splitlines())
 
 
+FIRST_LINE, NEXT_LINE = 2.0, 10.0
+"""Seconds until progress is told in a line where no bar can be drawn, and between such lines."""
+
+
 @contextlib.contextmanager
 def progress_bar() -> Iterator[Progress]:
-    """Yield a progress callback that draws a bar on stderr when that is a terminal."""
+    """Yield a progress callback that draws a bar on stderr when that is a terminal, and else writes a line at times."""
     if not sys.stderr.isatty():
-        yield lambda done, total, what: None
+        yield _progress_lines()
         return
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
@@ -135,3 +140,17 @@ def progress_bar() -> Iterator[Progress]:
             bar.update(tasks[what], completed=done, total=total)
 
         yield update
+
+
+def _progress_lines() -> Progress:
+    start = clock.monotonic()
+    due = start + FIRST_LINE
+
+    def update(done: int, total: int, what: str) -> None:
+        nonlocal due
+        if (now := clock.monotonic()) < due:
+            return
+        due = now + NEXT_LINE
+        print(f"brainbench: {what}, {done:,} of {total:,} ({now - start:.0f} s)", file=sys.stderr, flush=True)
+
+    return update

@@ -34,7 +34,9 @@ def inspect(
     """Show what a file holds and which --conditions could label its trials."""
     from brainbench.datasets import inspect as inspect_file
 
-    inspection = inspect_file(_found(path), strict=strict)
+    found = _found(path)
+    with progress_bar() as progress:
+        inspection = inspect_file(found, strict=strict, progress=progress)
     emit(inspection, str(inspection), as_json=as_json)
 
 
@@ -102,7 +104,9 @@ def check(
     """
     from brainbench.datasets import check as check_files
 
-    checkup = check_files(_found(source), conditions=conditions)
+    found = _found(source)
+    with progress_bar() as progress:
+        checkup = check_files(found, conditions=conditions, progress=progress)
     told = ("verdict", "source", "sessions", "findings")
     emit({name: getattr(checkup, name) for name in told}, str(checkup), as_json=as_json)
     if checkup.count("error") or (strict and checkup.count("warning")):

@@ -70,9 +70,9 @@ def train(
     if sweep is not None:
         job = (0, 1) if sweep == "all" else part_of(sweep, "--sweep takes 'all', or")
         runs = sweep_runs(chosen, where, job=job, warmup=wanted.endswith("-warmup"))
-    source = SweepFolder(data)
     results: dict[str, TrainingResult] = {}
     with progress_bar() as progress:
+        source = SweepFolder(data, progress)
         for item, folder in runs:
             told = _named(progress, folder.name) if sweep is not None else progress
             results[str(folder)] = run(
@@ -110,11 +110,13 @@ def train(
 
 
 class SweepFolder:
-    """The splits of a folder of sweeps, as training asks for them."""
+    """The splits of a folder of sweeps, as training asks for them; damaged shards are told first."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, progress: Progress | None = None) -> None:
         self.folder = folder
         whole = self._open("all", batch_size=1)
+        if os.environ.get("RANK", "0") == "0":
+            whole.verify(again=False, progress=progress)
         self.classes = whole.classes
         self.manifest = whole.manifest
 

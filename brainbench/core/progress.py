@@ -2,7 +2,33 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
+from itertools import count
+from typing import TypeVar
 
 Progress = Callable[[int, int, str], None]
 """Called with the steps done, the steps in all, and what is being done."""
+
+Item = TypeVar("Item")
+
+
+def track(items: Sequence[Item], what: str, progress: Progress | None) -> Iterator[Item]:
+    """Yield items and report how many of them are done."""
+    for done, item in enumerate(items):
+        if progress is not None:
+            progress(done, len(items), what)
+        yield item
+    if progress is not None:
+        progress(len(items), len(items), what)
+
+
+def stages(total: int, what: str, progress: Progress | None) -> Callable[[], None]:
+    """Return a function to be called after each stage of a job; the beginning is reported at once."""
+    done = count()
+
+    def stage_done() -> None:
+        if progress is not None:
+            progress(next(done), total, what)
+
+    stage_done()
+    return stage_done

@@ -254,11 +254,11 @@ class Score(_NullIsNaN, _Document):
             ("reliability", _number(self.reliability)),
             ("permutation p", _number(self.p)),
             ("noise ceiling (raw r)", _span(self.ceiling) if self.ceiling else "none"),
-            ("layer", f"{self.layer} ({self.layer_rule})"),
-            ("optimistic maximum", f"{_number(self.best_layer_value)} at {self.best_layer}"),
+            ("layer", self.layer_rule if self.layer is None else f"{self.layer} ({self.layer_rule})"),
+            ("optimistic maximum", f"{_number(self.best_layer_value)} at {self.best_layer}" if self.best_layer else ""),
             ("estimator", f"{self.estimator}; {self.metric}"),
         ]
-        body = "".join(f"<tr><th>{escape(key)}</th><td>{escape(text)}</td></tr>" for key, text in rows)
+        body = "".join(f"<tr><th>{escape(key)}</th><td>{escape(text)}</td></tr>" for key, text in rows if text)
         return f"<table><caption>{escape(self.name)}</caption>{body}</table>"
 
 

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from brainbench.core.errors import DataError
 from brainbench.core.files import to_json
+from brainbench.core.progress import Progress, track
 from brainbench.datasets import hdf5
 from brainbench.datasets.layouts.published_npz import LAYOUT, is_published, open_published
 from brainbench.datasets.layouts.registry import RecordingLayout
@@ -154,7 +155,7 @@ class Inspection:
                 yield f"{' ' if place else '→'} --conditions {item.conditions}   {counted}"
 
 
-def inspect(path: str | os.PathLike[str], *, strict: bool = False) -> Inspection:
+def inspect(path: str | os.PathLike[str], *, strict: bool = False, progress: Progress | None = None) -> Inspection:
     """Describe the recordings of a file, a folder or a glob. Reads tables and spike times, no raw data.
 
     Problems inside a table or in the units are reported, not raised, so that a damaged or unsuitable
@@ -163,6 +164,7 @@ def inspect(path: str | os.PathLike[str], *, strict: bool = False) -> Inspection
     Args:
         path: What is described.
         strict: Refuse files among several that hold no recordings; they are skipped and named by default.
+        progress: Called with (files read, files, what).
 
     Raises:
         DataFileNotFoundError: there is no such file.
@@ -173,7 +175,7 @@ def inspect(path: str | os.PathLike[str], *, strict: bool = False) -> Inspection
     formats: dict[str, None] = {}
     layouts: set[str | None] = set()
     paths, skipped = suitable_files(find_files(path), strict=strict)
-    for file_path in paths:
+    for file_path in track(paths, "reading recordings", progress):
         if is_published(file_path):
             return _counted(open_published(file_path), file_path, f"published .npz, layout {LAYOUT.name}")
         with open_file(file_path) as file:

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, NoReturn
 
 from brainbench.core.contracts import check_recordings
 from brainbench.core.errors import DataError, UsageError, listing, unknown_name
+from brainbench.core.progress import Progress, track
 from brainbench.datasets import hdf5
 from brainbench.datasets.inspection import propose
 from brainbench.datasets.layouts.published_npz import is_published, open_published
@@ -44,6 +45,7 @@ def open_recordings(
     window: Window | str | None = None,
     bin: float | None = None,
     strict: bool = False,
+    progress: Progress | None = None,
 ) -> xr.Dataset:
     """Read recordings into counted trials.
 
@@ -59,6 +61,7 @@ def open_recordings(
         bin: bin width, s; None counts each window as one bin.
         strict: refuse files among several that hold no recordings (another kind of file, a damaged one, no units),
             which are skipped and named by default.
+        progress: called with (files read, files, what).
 
     A layout is used when it is named, or when every file has its layout and ``conditions`` are left out
     or use its table; an argument replaces the layout's part. Labels follow the layout's fixed
@@ -94,7 +97,7 @@ def open_recordings(
         strict=strict,
     )
     suitable, reader.skipped = suitable_files(paths, strict=strict)
-    for path in suitable:
+    for path in track(suitable, "reading recordings", progress):
         reader.read(path)
     return reader.dataset(", ".join(map(str, paths)) if len(paths) < 4 else f"{len(paths)} files, {paths[0]} …")
 

@@ -133,10 +133,11 @@ def open_neural_responses(recordings: Any, *, progress: Progress | None, **selec
 
         return NeuralResponses(check_recordings(recordings), "data set")
     if isinstance(recordings, str) and recordings in DEMOS:
-        return NeuralResponses(open_recordings(demo_recordings(recordings, progress=progress), **selection), recordings)
+        folder = demo_recordings(recordings, progress=progress)
+        return NeuralResponses(open_recordings(folder, **selection, progress=progress), recordings)
     several = not isinstance(recordings, (str, os.PathLike))
     name = ", ".join(map(_short, recordings if several else [recordings]))
-    return NeuralResponses(open_recordings(recordings, **selection), name)
+    return NeuralResponses(open_recordings(recordings, **selection, progress=progress), name)
 
 
 def _short(source: str | os.PathLike[str]) -> str:

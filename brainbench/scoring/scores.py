@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from brainbench.core.errors import UsageError, unknown_name
 from brainbench.core.files import provenance, to_plain
-from brainbench.core.progress import Progress
+from brainbench.core.progress import Progress, stages
 from brainbench.core.provenance import Provenance
 from brainbench.core.records import ESTIMATOR_VERSION, ResultRecord, Score
 from brainbench.scoring.options import ScoreOptions
@@ -22,6 +22,9 @@ from brainbench.scoring.options import ScoreOptions
 if TYPE_CHECKING:
     from brainbench.metrics import Metric
     from brainbench.scoring.neural_responses import NeuralResponses
+
+STAGES = 5
+"""Stages of a score that progress is told of: model, recordings, its responses, the animals' RDMs, comparisons."""
 
 
 def score(
@@ -82,6 +85,7 @@ def score_record(
     from brainbench.stimuli.sources import prepare_stimuli
 
     started = clock.perf_counter()
+    stage_done = stages(STAGES, "scoring", progress)
     options = ScoreOptions.of({**vars(options or ScoreOptions()), **changes})
     # The simulation gets ready in a thread while the network loads, if any will be needed.
     if isinstance(options.recordings, str) and options.recordings in DEMOS:
@@ -92,20 +96,25 @@ def score_record(
     metric = _metric(options)
     options = replace(options, metric=metric)
     resolved = resolve_model(model, seed=options.model_seed)
+    stage_done()
     brain = open_neural_responses(options.recordings, progress=progress, **options.selection)
     brain = replace(brain, title=options.title)
+    stage_done()
     # Recordings name the stimuli that the animals felt; the caller's choice goes first.
     options = replace(options, stimuli=brain.stimuli if options.stimuli is None else options.stimuli)
     network = resolved.respond(options, progress=progress)
+    stage_done()
     pairs = brain.pairs(network.labels, options.match)
     kept = tuple(pairs)
     rows = [network.labels.index(label) for label in pairs.values()]
     animals = brain.animals(kept, metric, options)
+    stage_done()
 
     features = network.features(rows)
     named = {network.card.name: features, **(network.baseline_features(rows, options.seed) if baselines else {})}
     layer = network.card.layer
     scores, between = _compare(named, brain, animals, metric, kept, options, layer=layer, agreement=baselines)
+    stage_done()
     settings = {"estimator_version": ESTIMATOR_VERSION, "model": model if isinstance(model, str) else None}
     origin = Provenance.of(
         provenance(

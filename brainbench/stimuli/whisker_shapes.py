@@ -75,8 +75,8 @@ def record(
     from brainbench.stimuli.simulation import cache_path
 
     times = np.atleast_1d(np.asarray(times, dtype=float))
-    fidelity = Fidelity.of(fidelity)
     engine = get_engine(backend) if isinstance(backend, str) else backend
+    fidelity = Fidelity.of(fidelity).resolved(engine.twists and scene.twist)
     jobs = [replace(job, times=times) for job in scene.jobs()]
     path = None
     if cache and isinstance(backend, str):

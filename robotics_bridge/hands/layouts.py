@@ -133,7 +133,7 @@ def read_probes(path: str | os.PathLike[str]) -> Layout:
             if not isinstance(link, str) or any(len(row) != shape[1] for row in rows):
                 raise DataError(f"{name}: link {shown(link)} needs a name and rows of equal length.")
             position, normal, radius = ([cell[key] for cell in cells] for key in ("pos", "normal", "radius"))
-            probes = Probes(*(np.array(values, dtype=float) for values in (position, normal, radius)), shape)
+            probes = Probes(np.array(position, float), np.array(normal, float), np.array(radius, float), shape)
         except DataError:
             raise
         except (LookupError, TypeError, ValueError) as error:

@@ -21,6 +21,9 @@ _LEAST = 1e-2
 class ObservationNormaliser(nn.Module):
     """Centre and scale observations [B, n] by the mean and deviation that were seen in training."""
 
+    _mean: torch.Tensor
+    _std: torch.Tensor
+
     def __init__(self, size: int) -> None:
         super().__init__()
         for name, value in (("_mean", 0.0), ("_var", 1.0), ("_std", 1.0)):

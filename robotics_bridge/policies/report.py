@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 
 from brainbench.core.errors import DataError, DataFileNotFoundError
+from brainbench.core.figures.style import COLORS, PALE, panels, save_figure
 from brainbench.core.files import content_hash, provenance, read_json
 from brainbench.core.provenance import Provenance
 from brainbench.core.records import Interval, ModelCard, ResultRecord, Score, SubjectScore
@@ -409,26 +410,18 @@ def draw(results: Sequence[StudentResult], path: str | Path, *, agents: Sequence
 
     A mark is a mean, a dot the success of one training seed.
     """
-    import matplotlib as mpl
-
-    mpl.use("Agg")
-    from matplotlib import pyplot as plt
-
-    panels: dict[tuple[str, str], list[StudentResult]] = defaultdict(list)
+    groups: dict[tuple[str, str], list[StudentResult]] = defaultdict(list)
     for result in results:
-        panels[result.config.task, result.config.hand].append(result)
-    longest = max(len(found) for found in panels.values())
+        groups[result.config.task, result.config.hand].append(result)
+    longest = max(len(found) for found in groups.values())
     turning = any("turn_rate" in result.graded for result in results)
-    figure, axes = plt.subplots(
-        len(panels), 1 + turning, figsize=(4.6 + 3.2 * turning, (1.6 + 0.34 * longest) * len(panels)), squeeze=False,
-        layout="constrained", sharey="row",
-    )  # fmt: skip
-    for row, ((task, hand), found) in zip(axes, panels.items(), strict=True):
-        others = [item for item in agents if item["task"] == task]
+    size = (5.4 + 3.6 * turning, (1.7 + 0.38 * longest) * len(groups))
+    figure, axes = panels(len(groups), 1 + turning, size, sharey="row")
+    for row, ((task, hand), found) in zip(axes, groups.items(), strict=True):
         for height, result in enumerate(reversed(found)):
             interval = result.interval
             low, high = (result.value,) * 2 if interval is None else (interval.low, interval.high)
-            color = "0.55" if result.config.observe == "none" else "tab:blue"
+            color = PALE if result.config.observe == "none" else COLORS[0]
             row[0].plot([low, high], [height, height], color=color, lw=1.5)
             row[0].plot(result.value, height, "|", color=color, ms=11, mew=2)
             row[0].plot(result.success, [height] * len(result.success), "o", color=color, ms=4, mec="white", mew=0.5)
@@ -436,22 +429,27 @@ def draw(results: Sequence[StudentResult], path: str | Path, *, agents: Sequence
                 mean, half = result.graded["turn_rate"]
                 row[1].plot([mean - half, mean + half], [height, height], color=color, lw=1.5)
                 row[1].plot(mean, height, "|", color=color, ms=11, mew=2)
-        for axis, name in zip(row, ("success_rate", "turn_rate"), strict=False):
-            for number, item in enumerate(item for item in others if name in item):
-                label = Path(item["agent"]).name
-                axis.axvline(item[name], color=f"C{number + 1}", lw=1, ls=(0, (4, 2)), label=label)
-            axis.spines[["top", "right"]].set_visible(False)
-        row[0].set_yticks(range(len(found)), [_label(result) for result in reversed(found)], fontsize=7)
+        others = [item for item in agents if item["task"] == task]
+        for number, item in enumerate(others, start=1):
+            name, color = Path(item["agent"]).name, COLORS[number % len(COLORS)]
+            label = {"zero": "no movement", "random": "random movement"}.get(name, name)
+            row[0].axvline(item["success_rate"], color=color, lw=1, ls=(0, (4, 2)), label=label)
+            row[0].axvspan(*item["success_interval"], color=color, alpha=0.15, lw=0)
+            if turning and "turn_rate" in item:
+                half = item.get("turn_rate_half_width", 0.0)
+                row[1].axvline(item["turn_rate"], color=color, lw=1, ls=(0, (4, 2)))
+                row[1].axvspan(item["turn_rate"] - half, item["turn_rate"] + half, color=color, alpha=0.15, lw=0)
+        row[0].set_yticks(range(len(found)), [_label(result) for result in reversed(found)])
         row[0].set_xlabel("share of successful episodes")
-        row[0].set_title(f"{task}, {hand}", fontsize=9)
-        row[-1].set_xlabel("share of successful episodes" if not turning else "rotation about the axis (rad/s)")
+        row[0].set_title(f"task {task}, hand {hand}")
+        if turning:
+            row[1].set_xlabel("rotation about the axis (rad/s)")
         if others:
-            row[0].legend(fontsize=7, frameon=False, ncols=len(others), loc="upper left", bbox_to_anchor=(0, -0.18))
+            place = {"loc": "upper left", "bbox_to_anchor": (0, -0.18), "ncols": len(others)}
+            row[0].legend(fontsize=8.5, frameon=False, **place)
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=130)
-    plt.close(figure)
-    return path
+    return save_figure(figure, path, dpi=130)
 
 
 def _label(result: StudentResult) -> str:

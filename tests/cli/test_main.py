@@ -1,6 +1,8 @@
 import json
+import signal
 import subprocess
 import sys
+import time
 
 import pytest
 
@@ -71,3 +73,20 @@ def test_shell_completion_can_be_shown():
         [sys.executable, "-c", code, "--show-completion", "bash"], capture_output=True, text=True, check=False
     )
     assert "complete" in done.stdout.lower() + done.stderr.lower()
+
+
+def test_ctrl_c_is_answered_in_one_sentence_that_says_how_to_go_on(tmp_path):
+    model, begun = tmp_path / "slow.py", tmp_path / "begun"
+    model.write_text(f"import pathlib, time\npathlib.Path({str(begun)!r}).touch()\ntime.sleep(60)\n")
+    words = [sys.executable, "-m", "brainbench", "models", "add", f"{model}:make", "--name", "slow"]
+    # A shell's background jobs ignore Ctrl-C; what is started from here must not.
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    with subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as running:
+        signal.signal(signal.SIGINT, before)
+        while running.poll() is None and not begun.exists():
+            time.sleep(0.05)
+        running.send_signal(signal.SIGINT)
+        _, err = running.communicate(timeout=60)
+    assert running.returncode == 130
+    assert len(err.strip().splitlines()) == 1
+    assert "same command" in err

@@ -1,7 +1,11 @@
 import json
+import os
+import shutil
 
+import h5py
 import pytest
 
+from brainbench.datasets.whisking.files import Shard
 from brainbench.stimuli.sweeps.generation import generate
 from tests.factories.sweep_batches import small_plan
 
@@ -45,6 +49,32 @@ def test_a_stopped_run_goes_on_and_options_come_from_a_file(run, folder, tmp_pat
     for _ in range(8):
         done = json.loads(run("train", "s4-small", *options, "--json").out)
     assert next(iter(done["runs"].values()))["status"] == "finished"
+
+
+def test_a_damaged_shard_is_named_before_training_and_only_changed_ones_are_read_again(
+    run, folder, tmp_path, monkeypatch
+):
+    monkeypatch.setenv("BRAINBENCH_CACHE", str(tmp_path / "cache"))
+    data = shutil.copytree(folder, tmp_path / "data")
+    read = []
+    verify = Shard.verify
+    monkeypatch.setattr(Shard, "verify", lambda shard: (read.append(shard.path.name), verify(shard)))
+    options = (*_options(str(data), tmp_path / "run"), "--stop-after", "0")
+    assert run("train", "s4-small", *options).status == 0
+    names = sorted(path.name for path in data.glob("*.h5"))
+    assert sorted(read) == names
+    # One bit of the first force; size and time of the change stay as they were.
+    shard = data / names[-1]
+    state, content = shard.stat(), bytearray(shard.read_bytes())
+    with h5py.File(shard) as file:
+        place = file["wrench"].id.get_offset()
+    content[place] ^= 1
+    shard.write_bytes(content)
+    os.utime(shard, ns=(state.st_atime_ns, state.st_mtime_ns))
+    read.clear()
+    outcome = run("train", "s4-small", *options)
+    assert (outcome.status, read) == (1, [shard.name])
+    assert shard.name in outcome.err
 
 
 def test_wrong_requests_are_answered_in_one_line(run, folder, tmp_path):

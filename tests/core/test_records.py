@@ -115,6 +115,7 @@ def test_the_summary_says_undefined_and_why():
 def test_html_of_a_score_escapes_what_it_shows():
     html = _make_score(name="<script>alert(1)</script>")._repr_html_()
     assert "<script>" not in html
+    assert "None" not in _make_score(layer=None, best_layer=None)._repr_html_()
     assert "0.8" in html
     assert json.loads(_make_score().to_json())["value"] == 0.8
 

@@ -15,7 +15,6 @@ from robotics_bridge.hands.layouts import read_probes, write_probes
 from robotics_bridge.policies.contract import PolicyContract
 from robotics_bridge.policies.training.student_files import load_student
 from robotics_bridge.policies.training.sweep import StudentSweep, read_sweep
-from robotics_bridge.sensors.calibration.calibrate import calibrate
 from robotics_bridge.sensors.calibration.log import read_log
 from robotics_bridge.sensors.noise.model import Noise
 from robotics_bridge.tasks.overrides import apply_overrides
@@ -101,16 +100,6 @@ def _log(folder: Path) -> Path:
     return folder / "log.csv"
 
 
-def _bad_calibration(found: Any) -> bool:
-    log, calibration = found
-    return not_finite(log) or not_finite(calibration.noise)
-
-
-def _read_log(path: Path) -> Any:
-    log = read_log(path)
-    return log, calibrate(log)
-
-
 def _noise(folder: Path) -> Path:
     Noise.preset("published-elastomer").save(folder / "noise.json", sensor="x")
     return folder / "noise.json"
@@ -181,7 +170,7 @@ ROBOTS = (
     Surface("hand, URDF", written("hand.urdf", URDF), _read_hand, _bad_hand),
     Surface("hand, MJCF", written("hand.xml", MJCF), _read_hand, _bad_hand),
     Surface("probe layout", _probes, read_probes, _bad_layout),
-    Surface("calibration log", _log, _read_log, _bad_calibration),
+    Surface("calibration log", _log, read_log, not_finite),
     Surface("noise preset", _noise, Noise.load, _bad_noise),
     Surface("contract", written_json("policy.onnx.json", contract_of()), PolicyContract.read, _bad_contract),
     Surface("student, configuration", _student("config.json"), _load_student, not_finite),

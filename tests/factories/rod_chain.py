@@ -108,7 +108,7 @@ class DenseChain:
         }  # fmt: skip
 
     def pose(self, time=0.0):
-        """Base frame, joints [link + 1, 3], axes (per link, [hinge, 3]) and frames [link, 3, 3] a time later at steady rates."""
+        """Base frame, joints [link + 1, 3], axes (a list [hinge, 3] per link) and frames [link, 3, 3], a time later."""
         w, *v = self.base_turn
         k = np.cross(AXES, v)
         frame = np.eye(3) + 2 * w * k + 2 * k @ k

@@ -1,4 +1,5 @@
 import dataclasses
+import json
 import logging
 import os
 import re
@@ -23,6 +24,7 @@ from brainbench.stimuli.engines.protocol import base_rotation
 from brainbench.stimuli.motion.trajectories import ArrayFollicle, Still, Translation, Whisking
 from brainbench.stimuli.objects.placed_object import PlacedObject
 from brainbench.stimuli.objects.primitives import sphere
+from brainbench.stimuli.scenes.recipes import get_recipe
 from brainbench.stimuli.scenes.scene import Frames, Head, Scene
 from brainbench.stimuli.simulation import simulate
 from brainbench.stimuli.whiskers.array import WhiskerArray
@@ -283,3 +285,14 @@ def test_a_changed_number_in_the_cache_is_noticed(engine, tmp_path, caplog):
 def test_scenes_that_do_not_fit_together_are_refused(scenes, message):
     with pytest.raises(UsageError, match=message):
         _simulate(scenes)
+
+
+def test_new_scenes_twist_and_shipped_recipes_state_that_they_do_not():
+    new = simulate([_scene("new")], fidelity="fast", cache=False)
+    assert json.loads(new.attrs["fidelity"])["twist"] is True
+    pinned = [scene.select("C1") for scene in get_recipe("rodgers").scenes[:1]]
+    kept = simulate(pinned, fidelity="fast", cache=False)
+    assert "twist" not in json.loads(kept.attrs["fidelity"])
+    asked = simulate(pinned, fidelity="fast,twist=true", cache=False)
+    assert asked.attrs["config_hash"] != kept.attrs["config_hash"]
+    assert not np.array_equal(asked["wrench"].values, kept["wrench"].values)

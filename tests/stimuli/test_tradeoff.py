@@ -64,10 +64,11 @@ def test_collision_geometries_of_a_concave_object_are_measured_beside_the_bench_
     bench, exact, cut, hull = tradeoff.measure_tradeoff(path, chosen)
     assert exact["concave_error"] == exact["error"] == 0
     assert exact["pieces"] == 24
-    # A hull fills the hollow that the whisker moves in.
-    assert cut["error"] < 0.2 < 1 < hull["error"]
+    # A hull fills the hollow that the whisker moves in: it starts inside and cannot be trusted.
+    assert cut["error"] < 0.2
+    assert hull["error"] is None
+    assert "deep in an object" in hull["note"]
     assert 1 < cut["pieces"] < 24
-    assert hull["pieces"] == 1
     assert [point.settings["links"] for point in tradeoff.front([bench, exact, cut, hull])] == [8]
     assert tradeoff.collision_points([bench, exact, cut, hull]) == [exact, cut, hull]
     # Kept points are not measured again.

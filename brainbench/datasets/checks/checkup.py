@@ -14,6 +14,7 @@ from pathlib import Path
 
 from brainbench.core.errors import DataError
 from brainbench.core.files import to_json
+from brainbench.core.progress import Progress, track
 from brainbench.datasets import hdf5
 from brainbench.datasets.checks.clock import check_clock
 from brainbench.datasets.checks.findings import SEVERITIES, Finding, repeats, some
@@ -85,7 +86,7 @@ def _ranges(messages: list[str]) -> str:
     return _NUMBER.sub(lambda _: next(texts), messages[0])
 
 
-def check(source: Source, *, conditions: str | Conditions | None = None) -> Checkup:
+def check(source: Source, *, conditions: str | Conditions | None = None, progress: Progress | None = None) -> Checkup:
     """Look for what would make scores of these recordings wrong.
 
     Files that cannot be read become findings, so that a folder is judged as a whole.
@@ -93,6 +94,7 @@ def check(source: Source, *, conditions: str | Conditions | None = None) -> Chec
     Args:
         source: as in :func:`~brainbench.datasets.open_recordings`.
         conditions: table and columns that label the trials, to check the labels; the layout's by default.
+        progress: called with (files checked, files, what).
 
     Raises:
         DataFileNotFoundError: the source names nothing.
@@ -102,7 +104,7 @@ def check(source: Source, *, conditions: str | Conditions | None = None) -> Chec
     wanted = Conditions.parse(conditions) if isinstance(conditions, str) else conditions
     findings: list[Finding] = []
     names: list[str] = []
-    for path in paths:
+    for path in track(paths, "checking recordings", progress):
         try:
             findings += _check_file(path, layout, wanted, names)
         except DataError as error:

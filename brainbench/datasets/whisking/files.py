@@ -13,7 +13,7 @@ import numpy as np
 
 from brainbench.core.contracts import CHANNELS, GRID_SHAPE, SWEEPS_FORMAT, SWEEPS_SCHEMA
 from brainbench.core.errors import DataError, DataFileNotFoundError, shown
-from brainbench.core.files import hash_arrays, read_json
+from brainbench.core.files import cache_dir, content_hash, hash_arrays, read_json, write_text
 from brainbench.core.reading.hdf5 import open_hdf5
 from brainbench.core.reading.ranges import check_number
 from brainbench.core.reading.regular import readable
@@ -63,6 +63,15 @@ class Shard:
                 f"The numbers in {str(self.path)!r} do not match the hash in the manifest: it was damaged or edited; "
                 "remove it and give the command that made the data set again."
             )
+
+    def verify_once(self) -> None:
+        """Verify, unless the file was found whole before and did not change since; the cache remembers it."""
+        state = self.path.stat()
+        stamps = [state.st_size, state.st_mtime_ns, state.st_ctime_ns, state.st_ino]
+        mark = cache_dir("verified") / content_hash([str(self.path.absolute()), stamps, self.content_hash], length=24)
+        if not mark.exists():
+            self.verify()
+            write_text(mark, "")
 
 
 def read_manifest(folder: Path) -> Mapping[str, Any]:

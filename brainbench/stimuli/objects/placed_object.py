@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from brainbench.core.errors import UsageError
 from brainbench.core.rotations import euler_matrix, from_matrices
 from brainbench.stimuli.motion.trajectories import Path, Spin, Still, Translation
 from brainbench.stimuli.objects.obstacle import Obstacle, RigidMotion, Vector
@@ -38,7 +40,7 @@ class _PlacedMotion:
 
 @dataclass(frozen=True, eq=False)
 class PlacedObject:
-    """A solid in a scene (world frame)."""
+    """A solid in a scene (world frame); a friction below 0 is a :class:`UsageError`."""
 
     solid: Solid
     position: Vector = (0.0, 0.0, 0.0)
@@ -49,6 +51,10 @@ class PlacedObject:
     """Motion from there; the object turns about its solid's origin."""
     friction: float | None = None
     """Coulomb coefficient of its contacts; None takes each whisker's own."""
+
+    def __post_init__(self) -> None:
+        if self.friction is not None and not 0 <= self.friction < math.inf:
+            raise UsageError(f"The friction of an object is a finite number of at least 0; received {self.friction!r}.")
 
     def obstacle(self, frame: tuple[ArrayLike, ArrayLike] | None = None) -> Obstacle:
         """Return what the physics sees.

@@ -133,6 +133,19 @@ def press_rod(
     return RodEquilibrium(force, moment, float(at[0]), _integrate(rod, force, moment, float(at[0]))[0])
 
 
+def trace_rod(
+    rod: KirchhoffRod, equilibrium: RodEquilibrium, arcs: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Return points [n, 3] (m), axes of the cross-section [n, 3, 3] (columns) and twist [n] (rad) of an equilibrium.
+
+    ``arcs`` [n] (m) increase from 0 to the place of the force at most.
+    """
+    points, frames, moments = _paths(rod, equilibrium.force, equilibrium.moment, arcs)
+    rates = np.einsum("nd,nd->n", moments, frames[:, :, 0]) / [rod.torsion(float(s)) for s in arcs]
+    twist = np.concatenate([[0.0], np.cumsum((rates[1:] + rates[:-1]) / 2 * np.diff(arcs))])
+    return points, frames, twist
+
+
 def _solve(residual: Callable[[NDArray], NDArray], start: NDArray) -> NDArray[np.float64]:
     from scipy.optimize import root
 
@@ -145,10 +158,20 @@ def _solve(residual: Callable[[NDArray], NDArray], start: NDArray) -> NDArray[np
 def _integrate(
     rod: KirchhoffRod, force: NDArray, moment: NDArray, arc: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Return point, tangent and moment [3] at ``arc`` of the rod with this moment at its base."""
+    """Return point, tangent and moment [3] at ``arc`` of the rod with this moment at its base; NaN beyond its ends."""
+    if not 0 < arc <= rod.length:
+        return (np.full(3, np.nan),) * 3
+    points, frames, moments = _paths(rod, force, moment, np.array([arc]))
+    return points[-1], frames[-1, :, 0], moments[-1]
+
+
+def _paths(
+    rod: KirchhoffRod, force: NDArray, moment: NDArray, arcs: NDArray
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Return points [n, 3], axes [n, 3, 3] and moments [n, 3] at ``arcs`` [n]."""
     from scipy.integrate import solve_ivp
 
-    unit = rod.bending(0.0) / rod.length
+    unit, most = rod.bending(0.0) / rod.length, 100 / rod.length
     pull = force * rod.length / unit
 
     def slope(s: float, y: NDArray) -> NDArray:
@@ -156,12 +179,17 @@ def _integrate(
         turn, held = y[3:12].reshape(3, 3), y[12:]
         local = held @ turn * unit
         at = s * rod.length
-        u1, u2 = local[0] / rod.torsion(at), local[1] / rod.bending(at)
-        u3 = rod.curvature(at) + local[2] / rod.bending(at)
+        torsion, bending = rod.torsion(at), rod.bending(at)
+        # What shooting tries may coil a soft tip up without end.
+        u1, u2, u3 = (
+            max(-most, min(most, value))
+            for value in (local[0] / torsion, local[1] / bending, rod.curvature(at) + local[2] / bending)
+        )
         t, n, b = turn.T
         change = np.stack([u3 * n - u2 * b, u1 * b - u3 * t, u2 * t - u1 * n], axis=1)
         return np.concatenate([t, (change * rod.length).ravel(), np.cross(pull, t)])
 
     start = np.concatenate([np.zeros(3), np.eye(3).ravel(), moment / unit])
-    end = solve_ivp(slope, (0.0, arc / rod.length), start, method="DOP853", rtol=1e-10, atol=1e-12).y[:, -1]
-    return end[:3] * rod.length, end[3:12].reshape(3, 3)[:, 0], end[12:] * unit
+    places = arcs / rod.length
+    path = solve_ivp(slope, (0.0, places[-1]), start, method="DOP853", rtol=1e-9, atol=1e-11, t_eval=places).y.T
+    return path[:, :3] * rod.length, path[:, 3:12].reshape(-1, 3, 3), path[:, 12:] * unit

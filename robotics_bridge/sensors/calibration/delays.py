@@ -8,6 +8,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from brainbench.core.errors import DataError
 from robotics_bridge.sensors.calibration.likelihood import Aligned, Fit
 from robotics_bridge.sensors.calibration.log import Episode
 
@@ -76,6 +77,11 @@ def find_lags(
         gain = fit.gains[place : place + n]
         place += n
         rows = np.arange(lags[-1], len(x))
+        if not len(rows):
+            raise DataError(
+                f"An episode of the log has {len(x)} readings, no more than twice the delay that would explain it "
+                f"({guess[1]} readings); record longer ones, or allow shorter delays."
+            )
         shown = model[rows[:, None] - lags]
         noise = dynamics.white**2 + dynamics.walk**2
         level = _level(y[rows] - np.outer(model[rows - middle], gain), np.ptp(shown, axis=1), noise)

@@ -15,6 +15,8 @@ from numpy.typing import NDArray
 from brainbench.core.errors import DataError, UsageError, listing
 from brainbench.core.reading.tables import read_columns
 
+LARGEST = 1e12
+"""Magnitude of times and readings beyond which a log is taken to be damaged."""
 Episode = tuple["NDArray[np.float64]", "NDArray[np.float64]"]
 
 
@@ -67,6 +69,8 @@ def read_log(path: str | os.PathLike[str]) -> Log:
         )
     if len(table) < 20:
         raise DataError(f"{name} holds {len(table)} readings; a calibration needs at least 20 (better thousands).")
+    if (np.abs(table) > LARGEST).any():
+        raise DataError(f"{name} holds a number beyond ±{LARGEST:g}, which no device reads; remove its row.")
     columns = {cell.lower(): table[:, index] for index, cell in enumerate(header)}
     readings = np.stack([table[:, header.index(probe)] for probe in probes], axis=1)
     episode = None

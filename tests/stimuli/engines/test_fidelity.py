@@ -99,3 +99,25 @@ def test_a_wrong_text_is_answered_in_words(text, message):
 def test_a_value_that_came_later_leaves_old_hashes_alone():
     assert "solver" not in to_plain(Fidelity())
     assert to_plain(Fidelity(solver="quasistatic"))["solver"] == "quasistatic"
+
+
+def test_twist_is_in_hashes_only_where_it_is_on():
+    pinned = to_plain(Fidelity(twist=False))
+    assert "twist" not in pinned
+    assert to_plain(Fidelity(twist=True)) == {**pinned, "twist": True}
+
+
+@pytest.mark.parametrize(("text", "twist"), [("true", True), ("False", False), ("none", None)])
+def test_twist_is_stated_in_a_text(text, twist):
+    assert Fidelity.parse(f"fast,twist={text}").twist is twist
+
+
+def test_a_twist_that_is_neither_true_nor_false_is_refused():
+    with pytest.raises(UsageError, match="received 'maybe'"):
+        Fidelity.parse("fast,twist=maybe")
+
+
+@pytest.mark.parametrize("twist", [True, False])
+def test_only_a_fidelity_that_leaves_twist_open_takes_that_of_the_scenes(twist):
+    assert Fidelity().resolved(twist).twist is twist
+    assert Fidelity(twist=not twist).resolved(twist).twist is not twist

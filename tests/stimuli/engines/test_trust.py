@@ -7,6 +7,8 @@ import numpy as np
 import pytest
 
 from brainbench.core.errors import UsageError
+from brainbench.stimuli.engines import get_engine
+from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.engines.protocol import Job, StillFollicle
 from brainbench.stimuli.engines.reach import reachable
 from brainbench.stimuli.engines.trust import (
@@ -16,6 +18,7 @@ from brainbench.stimuli.engines.trust import (
     LOST,
     STARTED_INSIDE,
     Verdict,
+    check_jobs,
     force_change,
     halved,
     judge,
@@ -182,3 +185,12 @@ def test_whiskers_that_may_be_mended_are_simulated_again_at_most_twice(retry, fi
     assert run_with_retries(simulate, retry).finer.tolist() == finest
     again = [([False, True, True, True, False], 5), ([False, False, True, True, False], 10)]
     assert calls == [(None, 1), *(again if retry > 1 else [])]
+
+
+def test_an_engine_whose_whiskers_only_bend_refuses_twist():
+    jobs = [Job(WHISKER, StillFollicle(), (), TIMES[1:])]
+    engine = get_engine("bullet")
+    check_jobs(engine, jobs, Fidelity(), None)
+    check_jobs(engine, jobs, Fidelity(twist=False), None)
+    with pytest.raises(UsageError, match=r"'bullet'.*'rod'"):
+        check_jobs(engine, jobs, Fidelity(twist=True), None)

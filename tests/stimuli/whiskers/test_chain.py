@@ -12,7 +12,7 @@ from brainbench.core.errors import UsageError
 from brainbench.stimuli.validation.references import natural_frequencies
 from brainbench.stimuli.whiskers.chain import build_chain
 from brainbench.stimuli.whiskers.whisker import Whisker
-from tests.factories.whiskers import C2, NEEDLE
+from tests.factories.whiskers import C2, NEEDLE, H
 
 
 @pytest.mark.parametrize("links", [3, 10, 25])
@@ -104,3 +104,12 @@ def test_a_step_too_long_to_damp_so_little_is_told():
 def test_one_link_cannot_bend():
     with pytest.raises(UsageError, match="at least 2 links"):
         build_chain(C2, 1)
+
+
+@pytest.mark.parametrize("links", [4, 11, 20])
+def test_every_second_joint_takes_over_the_twist_of_its_neighbours(links):
+    chain = build_chain(replace(H, poisson_ratio=0.25), links)
+    assert np.array_equal(chain.torsion > 0, np.arange(links) % 2 == 1)
+    # GJ = EI/(1 + ν); of an odd number of links half the last cell, next to the free tip, is left out.
+    whole = np.sum(1 / chain.stiffness) - (links % 2) / 2 / chain.stiffness[-1]
+    assert np.sum(1 / chain.torsion[1::2]) == pytest.approx(1.25 * whole, rel=1e-12)

@@ -8,6 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from brainbench.core.errors import UsageError
+from brainbench.core.files import content_hash, to_plain
 from brainbench.stimuli.whiskers.whisker import Whisker
 
 
@@ -58,6 +59,18 @@ def test_a_curvature_of_the_other_sign_mirrors_the_shape():
     np.testing.assert_allclose(down, up * [1, -1], atol=1e-18)
 
 
+def test_the_torsional_stiffness_of_a_cylinder_is_its_shear_modulus_times_polar_moment():
+    whisker = _make_whisker(tip_radius=50e-6, poisson_ratio=0.3)
+    shear = 3e9 / (2 * 1.3)
+    assert whisker.torsional_stiffness(0.01) == pytest.approx(shear * math.pi * 50e-6**4 / 2, rel=1e-12)
+
+
+def test_poissons_ratio_is_in_hashes_only_where_it_is_not_the_default():
+    assert content_hash(_make_whisker()) == content_hash(_make_whisker(poisson_ratio=0.4))
+    assert "poisson_ratio" not in to_plain(_make_whisker())
+    assert content_hash(_make_whisker()) != content_hash(_make_whisker(poisson_ratio=0.3))
+
+
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
@@ -69,6 +82,10 @@ def test_a_curvature_of_the_other_sign_mirrors_the_shape():
         ({"damping_ratio": -0.1}, r"damping_ratio .*received -0"),
         ({"curvature": math.inf}, r"curvature .*received inf"),
         ({"base_radius": 0.05}, "no slender rod"),
+        ({"poisson_ratio": 0.6}, r"poisson_ratio .*received 0.6"),
+        ({"poisson_ratio": -1.0}, r"poisson_ratio .*received -1"),
+        ({"poisson_ratio": math.nan}, r"poisson_ratio .*received nan"),
+        ({"poisson_ratio": "0.4"}, r"poisson_ratio .*received '0.4'"),
     ],
 )
 def test_impossible_values_are_refused_by_name(changes, message):

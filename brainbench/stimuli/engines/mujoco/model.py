@@ -93,8 +93,7 @@ def engine() -> Any:
 def build_model(
     job: Job, chain: Chain, reach: Reach, time_step: float, times: NDArray[np.float64], *, twists: bool = False
 ) -> WhiskerModel:
-    """Compile the model of ``job`` for the step times [n + 1] (s); with ``twists`` the joints of the chain that twist do.
-    """
+    """Compile the model of ``job`` for the step times [n + 1] (s), with or without the hinges for twist."""
     step = time_step * MILLI
     position, euler = (np.asarray(values, dtype=float) for values in job.follicle.pose(times))
     position = position * MILLI

@@ -33,7 +33,7 @@ from brainbench.stimuli.engines.rod.packing import (
     follicle_track,
     still_track,
 )
-from brainbench.stimuli.engines.rod.shapes import Body, PackedShapes
+from brainbench.stimuli.engines.rod.shapes import PackedShapes, TrackedObstacle
 from brainbench.stimuli.engines.stepping import is_silent, silent_trace
 from brainbench.stimuli.engines.sweep_batch import SweepBatch
 from brainbench.stimuli.engines.trust import check_jobs, run_with_retries, step_travel
@@ -131,7 +131,7 @@ class _Task:
     job: Job
     chain: Chain
     base: Track
-    bodies: tuple[Body, ...]
+    bodies: tuple[TrackedObstacle, ...]
     """What is in reach."""
     names: tuple[int, ...]
     """What tells these from other bodies."""
@@ -214,7 +214,7 @@ def _task(job: Job, fidelity: Fidelity, bodies: dict[Any, tuple[NDArray, Track]]
     if is_silent(job, reach, position, euler):
         return None
     near = tuple(
-        Body(obstacle, *bodies[place if obstacle.motion is None else id(job.obstacles[which])])
+        TrackedObstacle(obstacle, *bodies[place if obstacle.motion is None else id(job.obstacles[which])])
         for which, obstacle in zip(reach.indices, reach.obstacles, strict=True)
     )
     names = tuple(
@@ -299,7 +299,7 @@ def _trace(result: LaunchResult, row: int, job: Job, fidelity: Fidelity, seconds
     touching = (arc >= 0) & good
     reason = str(result.verdict.reasons[row, 0])
     shape, felt = result.points, result.contact_wrench
-    base = None if shape is None else np.asarray(job.follicle.pose(job.times)[0], dtype=float)[:, None]
+    base = np.asarray(job.follicle.pose(job.times)[0], dtype=float)[:, None]
     nodes = fidelity.link_count(job.whisker.arc_length) + 1
     return Trace(
         wrench=np.where(good[:, None], result.wrench[row, :, 0].astype(float), np.nan),

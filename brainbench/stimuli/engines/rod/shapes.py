@@ -47,7 +47,7 @@ class PackedSurface:
 
 
 @dataclass(frozen=True, eq=False)
-class Body:
+class TrackedObstacle:
     """An obstacle and the track of a point of it, about which its shapes are kept."""
 
     obstacle: Obstacle
@@ -68,7 +68,7 @@ class PackedShapes:
     boxes: int = 0
     _known: dict[int, dict[str, Any]] = field(default_factory=dict)
 
-    def add_scene(self, bodies: Sequence[Body], motions: PackedMotions) -> int:
+    def add_scene(self, bodies: Sequence[TrackedObstacle], motions: PackedMotions) -> int:
         """Append the shapes of one scene and return its index."""
         rows: list[dict[str, Any]] = []
         tracks: dict[int, tuple[int, NDArray, NDArray]] = {}

@@ -163,7 +163,9 @@ def test_without_friction_the_forces_are_those_of_the_only_consistent_set_of_con
     np.testing.assert_allclose(forces, n * np.sum(forces * n, axis=1)[:, None], atol=1e-9 * scale)
     # What is applied to the joints is what these forces do.
     np.testing.assert_allclose(
-        added[: problem.chain.links][problem.chain.free], moved @ forces.ravel(), atol=1e-9 * max(np.abs(added).max(), 1e-9)
+        added[: problem.chain.links][problem.chain.free],
+        moved @ forces.ravel(),
+        atol=1e-9 * max(np.abs(added).max(), 1e-9),
     )
 
 

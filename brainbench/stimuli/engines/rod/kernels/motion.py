@@ -9,7 +9,40 @@ import warp as wp
 
 from .algebra import vec3, vec4
 from .parameters import real
-from .state import Instant, MotionArrays
+
+
+@wp.struct
+class Instant:
+    """A time since the start of the launch."""
+
+    tick: wp.int32
+    """Whole milliseconds."""
+    part: real
+    """The rest; it may be negative or more than one."""
+
+
+@wp.struct
+class MotionArrays:
+    """Motions of bases and objects, see ``motion``: knots of all tracks one behind the other."""
+
+    first: wp.array(dtype=wp.int32)
+    """[track] first of its cells; of a track with one knot that knot."""
+    count: wp.array(dtype=wp.int32)
+    """[track] number of cells + 1; 1 of a track with one knot."""
+    cell: wp.array(dtype=wp.int32)
+    """[cell] first knot; behind the cells of each track its last knot."""
+    coarse: wp.array(dtype=vec3)
+    """[knot] part of the position on a coarse grid."""
+    place: wp.array(dtype=vec3)
+    """[knot] the rest of it."""
+    velocity: wp.array(dtype=vec3)
+    """[knot]"""
+    turn: wp.array(dtype=vec4)
+    """[knot] unit quaternion (w, x, y, z), without jumps of sign."""
+    spin: wp.array(dtype=vec3)
+    """[knot] angular velocity, world axes."""
+    surge: wp.array(dtype=vec3)
+    """[knot] angular acceleration, world axes."""
 
 
 @wp.struct

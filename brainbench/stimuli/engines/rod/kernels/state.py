@@ -14,6 +14,7 @@ import warp as wp
 from brainbench.stimuli.engines.rod.limits import LISTED, SPARE, contacts_for
 
 from .algebra import JointInverse, JointVector, mat33, reader, vec3, vec4
+from .motion import Instant, MotionArrays  # noqa: F401 — launches take all arrays from here
 from .parameters import capacity, hinges, real
 
 WAIT_DISTANCES, WAIT_SLICE, WAIT_FORCES, WAIT_REST = 1, 2, 3, 4
@@ -92,40 +93,6 @@ class ChainArrays:
     """[link, whisker]"""
     taper: wp.array2d(dtype=LinkTaper)
     """[link, whisker]"""
-
-
-@wp.struct
-class Instant:
-    """A time since the start of the launch."""
-
-    tick: wp.int32
-    """Whole milliseconds."""
-    part: real
-    """The rest; it may be negative or more than one."""
-
-
-@wp.struct
-class MotionArrays:
-    """Motions of bases and objects, see ``motion``: knots of all tracks one behind the other."""
-
-    first: wp.array(dtype=wp.int32)
-    """[track] first of its cells; of a track with one knot that knot."""
-    count: wp.array(dtype=wp.int32)
-    """[track] number of cells + 1; 1 of a track with one knot."""
-    cell: wp.array(dtype=wp.int32)
-    """[cell] first knot; behind the cells of each track its last knot."""
-    coarse: wp.array(dtype=vec3)
-    """[knot] part of the position on a coarse grid."""
-    place: wp.array(dtype=vec3)
-    """[knot] the rest of it."""
-    velocity: wp.array(dtype=vec3)
-    """[knot]"""
-    turn: wp.array(dtype=vec4)
-    """[knot] unit quaternion (w, x, y, z), without jumps of sign."""
-    spin: wp.array(dtype=vec3)
-    """[knot] angular velocity, world axes."""
-    surge: wp.array(dtype=vec3)
-    """[knot] angular acceleration, world axes."""
 
 
 @wp.struct
@@ -327,22 +294,6 @@ class WhiskerState:
     unsolved: wp.int32
     miss: real
     load: real
-
-
-@wp.struct
-class NearShapes:
-    """The shapes nearest to a whisker, where a scene has more than are looked at in each step."""
-
-    shape: PerListedInt
-    """In the order of the scene."""
-    distance: PerListed1
-    """Bound of the distance from the whisker's axis when they were listed."""
-    count: wp.int32
-    """0: there is no list; all shapes are looked at."""
-    room: real
-    """Least distance of all others from the whisker's axis then."""
-    moved: real
-    """How much nearer any of them may have come since."""
 
 
 @wp.struct

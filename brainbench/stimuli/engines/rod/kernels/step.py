@@ -19,7 +19,7 @@ from .articulated_body import (
     integrate_joint,
     joint_accelerations,
 )
-from .broad_phase import count_near_links, find_candidates, lower_clearance, query_distances, search_range
+from .broad_phase import NearShapes, count_near_links, find_candidates, lower_clearance, query_distances, search_range
 from .contact_problem import any_gap_closes, queue_problem, read_solution, write_problem
 from .contact_solver import solve_contacts
 from .motion import cell_at, elapsed, instant, pose_at
@@ -36,7 +36,6 @@ from .state import (
     Instant,
     JobArrays,
     MotionArrays,
-    NearShapes,
     PausedWhiskers,
     ReadingArrays,
     ResultArrays,

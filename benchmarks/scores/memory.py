@@ -1,0 +1,170 @@
+"""Largest memory and duration of common jobs, each in a process of its own.
+
+python -m benchmarks.scores.memory --out memory [--write]
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import resource
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from benchmarks.report import table, write_section
+from brainbench.core.files import write_json
+from tests.factories.recordings import LABELS
+
+TITLE = "Memory per job"
+UNITS, TRIALS, BIN = 1000, 600, 0.01
+RECORDS = 1000
+
+
+def write_big(path: Path, *, seconds: float = 1.0, least: float = 1.0) -> None:
+    """Write a recording of 1,000 units and 600 trials; trials last between ``least`` and 1 of ``seconds``."""
+    from brainbench.datasets import write_recordings
+    from brainbench.datasets.sessions import make_session
+
+    draw = np.random.default_rng(0)
+    label, start = np.arange(TRIALS) % len(LABELS), 2 * seconds * np.arange(TRIALS)
+    rates = draw.gamma(2.0, 4.0, (len(LABELS), UNITS))
+    spikes = []
+    for unit in range(UNITS):
+        counts = draw.poisson(seconds * rates[label, unit])
+        times = np.repeat(start, counts) + draw.uniform(0, seconds, counts.sum())
+        spikes.append(np.sort(np.r_[0.0, times, 2 * seconds * TRIALS]))
+    ends = start + seconds * draw.uniform(least, 1.0, TRIALS)
+    table = {"start_time": start, "stop_time": ends, "stimulus": np.array(LABELS)[label]}
+    write_recordings(path, make_session("m", "1", spikes, {"trials": table}))
+
+
+def score_big(folder: Path, *, seconds: float = 1.0, least: float = 1.0, **options: Any) -> None:
+    """Score features against the recording, in bins of 10 ms."""
+    import brainbench
+
+    path = folder / "big.h5"
+    subprocess.run(
+        [sys.executable, "-m", "benchmarks.scores.memory", "--prepare", str(path), str(seconds), str(least)], check=True
+    )
+    features = {"layer": np.random.default_rng(1).normal(size=(len(LABELS), 110, 50))}
+    how: dict[str, Any] = {"stimuli": "rodgers", "whiskers": "C2", "fidelity": "fast", "bin": BIN, **options}
+    found = brainbench.score(features, recordings=str(path), conditions="trials:stimulus", **how)
+    assert np.isfinite(found.value), found
+
+
+def score_demo(folder: Path) -> None:
+    import brainbench
+
+    brainbench.score("zhuang-intersection-ln-small", stimuli=None, recordings="demo-rodgers", fidelity="fast")
+
+
+def train_small(folder: Path) -> None:
+    from brainbench.models.training.config import TrainingConfig
+    from brainbench.models.training.trainer import train
+    from tests.factories.training_sweeps import tiny
+
+    config = TrainingConfig.published("zhuang-small+gpt", "supervised", epochs=1, batch_size=64, precision="float32")
+    train(config, tiny(train=256, validation=64, test=64), out=folder / "run", device="cpu")
+
+
+def generate_sweeps(folder: Path) -> None:
+    from brainbench.stimuli.sweeps.generation import generate
+    from tests.factories.sweep_batches import small_plan
+
+    generate(small_plan(("brick:24", "cone:24"), whiskers="C2,C3,D1", shard_size=32), folder / "set", workers=1)
+
+
+def build_board(folder: Path) -> None:
+    from leaderboards import build_leaderboard, read_records, write_record
+    from tests.factories.records import make_record
+
+    for index in range(RECORDS):
+        write_record(make_record(f"net-{index}", 0.3 + 0.0005 * index), folder / "records")
+    build_leaderboard(read_records(folder / "records"), folder / "site")
+
+
+def explain_score(folder: Path) -> None:
+    import brainbench
+
+    brainbench.score(
+        "zhuang-intersection-ln-small", recordings="demo-rodgers", fidelity="fast", metric="rsa-correlation",
+        explain=True,
+    )  # fmt: skip
+
+
+JOBS: dict[str, Callable[[Path], None]] = {
+    "score (demo, small network)": score_demo,
+    "score, time averaged": score_big,
+    "score, every time step kept": lambda folder: score_big(folder, time="concatenate"),
+    "score, every time step kept, crossnobis": lambda folder: score_big(
+        folder, time="concatenate", metric="rsa-crossnobis"
+    ),
+    "score, every time step kept, trials of unequal length": lambda folder: score_big(
+        folder, time="concatenate", least=0.7
+    ),
+    "score, every time step kept, windows of 2 s": lambda folder: score_big(folder, time="concatenate", seconds=2.0),
+    "score over time": lambda folder: score_big(folder, over_time=True),
+    "explain": explain_score,
+    "stimuli sweep (192 sweeps)": generate_sweeps,
+    "train (small, 256 sweeps)": train_small,
+    f"leaderboard build ({RECORDS:,} records)": build_board,
+}
+
+
+def measure(name: str) -> dict[str, Any]:
+    """Run a job in a process and return its largest memory [GB], which that process tells."""
+    words = [sys.executable, "-m", "benchmarks.scores.memory", "--job", name]
+    environment = {**os.environ, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
+    begin = time.monotonic()
+    found = subprocess.run(words, stdout=subprocess.PIPE, text=True, check=True, env=environment)
+    return json.loads(found.stdout.splitlines()[-1]) | {"seconds": time.monotonic() - begin}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--out", type=Path, default=Path("memory"), help="Folder; jobs measured there are kept.")
+    parser.add_argument("--job", help="Run one job here and print its memory.")
+    parser.add_argument("--prepare", nargs=3, help="Write a recording: file, seconds, least share of them.")
+    parser.add_argument("--write", action="store_true", help="Write the section of RESULTS.md.")
+    chosen = parser.parse_args()
+    if chosen.prepare:
+        path, seconds, least = chosen.prepare
+        write_big(Path(path), seconds=float(seconds), least=float(least))
+        return
+    if chosen.job:
+        with tempfile.TemporaryDirectory() as folder:
+            JOBS[chosen.job](Path(folder))
+        print(json.dumps({"gigabytes": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e9}))
+        return
+    rows = []
+    for place, name in enumerate(JOBS):
+        path = chosen.out / f"{place:02d}.json"
+        if not path.is_file():
+            write_json(path, measure(name))
+        found = json.loads(path.read_text())
+        rows.append([name, f"{found['gigabytes']:.2f}", f"{found['seconds']:.0f}"])
+        print(rows[-1], flush=True)
+    text = f"{NOTE}\n\n{table(['job', 'largest memory [GB]', 'duration [s]'], rows)}"
+    print(text)
+    if chosen.write:
+        write_section(TITLE, "python -m benchmarks.scores.memory --out memory --write", text, subject="commands")
+
+
+NOTE = (
+    "Largest resident memory of a process that does one job (PyTorch, NumPy and the rest of the program, .4 to .7 GB, "
+    f"are in it). Where nothing else is said, scores are of one session of {UNITS:,} units × {TRIALS} trials × 1 s in "
+    f"bins of {BIN:g} s. Durations are with other work on the machine. At commit ad20c3f the same took 2.9 GB (every "
+    "time step kept), 4.3 (crossnobis), 3.7 (trials of unequal length) and 1.5 (over time)."
+)
+
+
+if __name__ == "__main__":
+    main()

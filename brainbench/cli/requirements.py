@@ -1,0 +1,143 @@
+"""What each command needs beside its input: packages of extras, and a cache that can be written.
+
+One table for all commands; it is asked when the command line is read, before anything slow.
+"""
+
+from __future__ import annotations
+
+import functools
+import os
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from importlib.util import find_spec
+from typing import Any
+
+import typer
+
+from brainbench.core.errors import FileWriteError, missing_dependency, shown
+from brainbench.core.files import CACHE_VARIABLE, cache_dir
+
+
+@dataclass(frozen=True)
+class Requirement:
+    """Packages that some options of a command need."""
+
+    packages: tuple[str, ...]
+    """Names of modules."""
+    extra: str
+    purpose: str
+    when: Callable[[Mapping[str, Any]], bool] = lambda values: True
+    """Whether the values of the command's parameters need them."""
+
+
+def _given(*names: str) -> Callable[[Mapping[str, Any]], bool]:
+    return lambda values: any(values.get(name) is not None for name in names)
+
+
+def _ends(name: str, *suffixes: str) -> Callable[[Mapping[str, Any]], bool]:
+    return lambda values: str(values.get(name) or "").lower().endswith(suffixes)
+
+
+DISTRIBUTIONS = {
+    "rsl_rl": "rsl-rl-lib", "imageio_ffmpeg": "imageio-ffmpeg", "sklearn": "scikit-learn", "skfem": "scikit-fem",
+}  # fmt: skip
+"""Packages whose name for pip is another one than that of the module."""
+_ONNX = ("onnx", "onnxscript", "onnxruntime")
+_CLUSTER = Requirement(("distributed",), "cluster", "A --scheduler", _given("scheduler"))
+_PLOT = Requirement(("matplotlib",), "report", "Drawing pictures", _given("plot"))
+
+EXTRAS: dict[str, tuple[Requirement, ...]] = {
+    "export": (Requirement(_ONNX, "export", "Exporting to ONNX", lambda values: values.get("format") == "onnx"),),
+    "policy export": (
+        Requirement(_ONNX, "export", "Exporting to ONNX", lambda values: values.get("format", "onnx") == "onnx"),
+    ),
+    "policy train": (Requirement(("rsl_rl", "tensordict", "tensorboard"), "policies", "Training policies"),),
+    "policy distill": (Requirement(("rsl_rl", "tensordict"), "policies", "Training policies"),),
+    "policy sweep": (
+        Requirement(
+            ("rsl_rl", "tensordict"), "policies", "Training policies",
+            lambda values: not (values.get("count") or values.get("names")),
+        ),
+    ),
+    "policy play": (
+        Requirement(("matplotlib",), "report", "Drawing pictures", _given("video", "strip")),
+        Requirement(("imageio_ffmpeg",), "report", "Writing an MP4", _ends("video", ".mp4")),
+    ),
+    "policy report": (Requirement(("matplotlib",), "report", "Drawing pictures", _given("picture")),),
+    "policy deploy": (Requirement(("pyarrow",), "board", "Writing a LeRobot data set", _given("record")),),
+    "stimuli render": (
+        Requirement(("matplotlib",), "report", "Drawing pictures"),
+        Requirement(("imageio_ffmpeg",), "report", "Writing an MP4", _ends("out", ".mp4")),
+    ),
+    "stimuli plot": (Requirement(("matplotlib",), "report", "Drawing pictures"),),
+    "stimuli separability": (Requirement(("sklearn",), "learn", "Separability"),),
+    "stimuli sweep": (_CLUSTER,),
+    "recovery": (_CLUSTER, Requirement(("matplotlib",), "report", "Drawing pictures", _given("out"))),
+    "leaderboard add": (_CLUSTER,),
+    "leaderboard report": (
+        Requirement(
+            ("weasyprint",), "board", "A report as PDF",
+            lambda values: (values.get("format") or str(values.get("out") or "").rpartition(".")[2]) == "pdf",
+        ),
+    ),
+    "tradeoff whisker": (_PLOT,),
+    "tradeoff tactile": (_PLOT,),
+    "tactile demo": (Requirement(("matplotlib",), "report", "Drawing pictures"),),
+}  # fmt: skip
+
+CACHED = (
+    "score", "power", "recovery", "train", "stimuli simulate", "stimuli render", "stimuli plot", "stimuli separability",
+    "stimuli hand", "tactile demo", "tactile bench", "policy play", "policy train", "policy evaluate", "policy distill",
+    "tradeoff score", "tradeoff model", "leaderboard add", "leaderboard verify",
+)  # fmt: skip
+"""Commands that keep what they compute in the cache."""
+
+
+def check_cache() -> None:
+    """Raise :class:`FileWriteError` unless files can be written into the cache folder."""
+    folder = cache_dir()
+    if not os.access(folder, os.W_OK | os.X_OK):
+        raise FileWriteError(
+            f"The cache folder {shown(str(folder))} may not be written by this user; name another with the environment "
+            f"variable {CACHE_VARIABLE}."
+        )
+
+
+def check_requirements(command: str, values: Mapping[str, Any]) -> None:
+    """Check what a command needs for the values of its parameters.
+
+    Raises:
+        MissingDependencyError: a package of an extra is not installed.
+        FileWriteError: the cache cannot be made or written.
+    """
+    for item in EXTRAS.get(command, ()):
+        for module in item.packages if item.when(values) else ():
+            if find_spec(module) is None:
+                raise missing_dependency(DISTRIBUTIONS.get(module, module), extra=item.extra, purpose=item.purpose)
+    if command in CACHED:
+        check_cache()
+
+
+def guard(app: typer.Typer) -> None:
+    """Let every command check what it needs before it runs."""
+    for name, command in commands(app):
+        if command.callback is not None and (name in EXTRAS or name in CACHED):
+            command.callback = _checked(name, command.callback)
+
+
+def commands(app: typer.Typer, path: str = "") -> Iterator[tuple[str, Any]]:
+    """Yield the name of each command, those of its groups before it, and what typer knows of it."""
+    for item in app.registered_commands:
+        yield f"{path}{item.name}", item
+    for group in app.registered_groups:
+        if group.typer_instance is not None:
+            yield from commands(group.typer_instance, f"{path}{group.name} ")
+
+
+def _checked(name: str, callback: Callable[..., Any]) -> Callable[..., Any]:
+    @functools.wraps(callback)
+    def run(*args: Any, **values: Any) -> Any:
+        check_requirements(name, values)
+        return callback(*args, **values)
+
+    return run

@@ -1,0 +1,61 @@
+"""Engines against the Kirchhoff rod: curved whiskers loaded across their plane."""
+
+from dataclasses import replace
+
+import pytest
+
+from brainbench.core.errors import UsageError
+from brainbench.stimuli.validation import references
+from brainbench.stimuli.validation.out_of_plane import load_aside, push_aside
+from brainbench.stimuli.whiskers.array import WhiskerArray
+
+MOUSE, RAT = WhiskerArray.mouse()["C5"].whisker, WhiskerArray.rat()["D4"].whisker
+
+
+def _force(whisker, at, share):
+    """Force (N) that would bend the straight whisker by a share of its length."""
+    straight = replace(whisker, curvature=0.0)
+    return share * whisker.arc_length / references.point_load_deflection(straight, 1.0, at)
+
+
+@pytest.mark.parametrize("backend", ["rod", "mujoco"])
+@pytest.mark.parametrize("whisker", [MOUSE, RAT], ids=["mouse", "rat"])
+def test_a_whisker_yields_to_a_force_across_its_plane_as_the_rod_does(whisker, backend):
+    at = 0.8 * whisker.arc_length
+    test = load_aside(whisker, at, _force(whisker, at, 0.1), backend=backend, fidelity="accurate")
+    assert test.deflection == pytest.approx(test.reference_deflection, rel=0.003)
+    assert test.moment_error < 0.005
+
+
+@pytest.mark.parametrize(("whisker", "least"), [(MOUSE, 0.01), (RAT, 0.015)], ids=["mouse", "rat"])
+def test_without_twist_it_is_too_stiff(whisker, least):
+    at = 0.8 * whisker.arc_length
+    test = load_aside(whisker, at, _force(whisker, at, 0.1), fidelity="accurate,twist=false")
+    assert test.deflection < (1 - least) * test.reference_deflection
+
+
+@pytest.mark.parametrize("whisker", [MOUSE, RAT], ids=["mouse", "rat"])
+def test_a_peg_that_pushes_it_aside_is_felt_as_by_the_rod(whisker):
+    test = push_aside(whisker, 0.5 * whisker.arc_length, 0.1 * whisker.arc_length, fidelity="accurate")
+    assert test.force_error < 0.005
+    assert test.moment_error < 0.005
+
+
+def test_poissons_ratio_softens_twist():
+    at = 0.8 * RAT.arc_length
+    force = _force(RAT, at, 0.05)
+    soft, hard = (
+        load_aside(replace(RAT, poisson_ratio=ratio), at, force, fidelity="accurate") for ratio in (0.5, -0.5)
+    )
+    assert soft.deflection > 1.01 * hard.deflection
+    for test in (soft, hard):
+        assert test.deflection == pytest.approx(test.reference_deflection, rel=0.003)
+
+
+def test_places_and_forces_without_meaning_are_refused():
+    with pytest.raises(UsageError, match="offset"):
+        push_aside(RAT, 0.01, -0.001)
+    with pytest.raises(UsageError, match="force"):
+        load_aside(RAT, 0.01, 0.0)
+    with pytest.raises(UsageError, match="beyond"):
+        load_aside(RAT, 0.1, 1e-6)
