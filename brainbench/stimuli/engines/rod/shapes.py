@@ -18,6 +18,11 @@ from brainbench.stimuli.engines.rod.packing import PackedMotions, Track
 from brainbench.stimuli.engines.units import MILLI
 from brainbench.stimuli.objects.obstacle import Box, Capsule, ConvexPart, Cylinder, Obstacle, Sphere, TriangleMesh
 
+SLIVER = 1e-6
+"""Height over longest side below which a triangle has no direction of its own: vertices are rounded to some 1e-9."""
+SLIVER_ROUNDS = 32
+"""Slivers beside one another that are looked through."""
+
 
 @dataclass(frozen=True, eq=False)
 class PackedSurface:
@@ -181,9 +186,12 @@ def pseudo_normals(vertices: NDArray[np.float64], faces: NDArray[np.integer]) ->
     Angle-weighted (Baerentzen & Aanaes 2005): their sign tells inside from outside at every closest point.
     """
     corners = vertices[faces]
-    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    size = np.linalg.norm(normals, axis=1, keepdims=True)
-    normals = normals / np.where(size > 0, size, 1.0)
+    # Each edge gets one number from its two corners: both faces at it add to the same sum.
+    edges = np.sort(np.stack([faces[:, [1, 2]], faces[:, [2, 0]], faces[:, [0, 1]]], axis=1), axis=2)
+    names = edges[..., 0].astype(np.int64) * len(vertices) + edges[..., 1]
+    _, which = np.unique(names, return_inverse=True)
+    which = which.reshape(-1, 3)
+    faced, at_corner, across = _face_normals(corners, which)
     at_vertex = np.zeros_like(vertices)
     for k in range(3):
         to_next, to_last = corners[:, (k + 1) % 3] - corners[:, k], corners[:, (k + 2) % 3] - corners[:, k]
@@ -191,17 +199,53 @@ def pseudo_normals(vertices: NDArray[np.float64], faces: NDArray[np.integer]) ->
         # not.
         angle = np.arctan2(np.linalg.norm(np.cross(to_next, to_last), axis=1), np.sum(to_next * to_last, axis=1))
         for axis in range(3):
-            at_vertex[:, axis] += np.bincount(faces[:, k], normals[:, axis] * angle, len(vertices))
-    # Each edge gets one number from its two corners: both faces at it add to the same sum.
-    edges = np.sort(np.stack([faces[:, [1, 2]], faces[:, [2, 0]], faces[:, [0, 1]]], axis=1), axis=2)
-    names = edges[..., 0].astype(np.int64) * len(vertices) + edges[..., 1]
-    _, which = np.unique(names, return_inverse=True)
-    which = which.reshape(-1, 3)
-    spread = np.repeat(normals, 3, axis=0)
+            at_vertex[:, axis] += np.bincount(faces[:, k], at_corner[:, axis] * angle, len(vertices))
+    spread = across.reshape(-1, 3)
     at_edge = np.stack([np.bincount(which.ravel(), spread[:, axis]) for axis in range(3)], axis=1)
-    found = np.concatenate([normals[:, None], at_vertex[faces], at_edge[which]], axis=1)
+    found = np.concatenate([faced[:, None], at_vertex[faces], at_edge[which]], axis=1)
     length = np.linalg.norm(found, axis=2, keepdims=True)
     return found / np.where(length > 0, length, 1.0)
+
+
+def _face_normals(
+    corners: NDArray[np.float64], which: NDArray[np.integer]
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Return the direction of each face [face, 3], and what it adds at its corners [face, 3] and edges [face, 3, 3].
+
+    All are the face's own normal, but for triangles without a width, which hulls of flat faces hold: their normals are
+    rounding. Where such a triangle lies in a sharp edge, its neighbours on the two sides stand for it.
+
+    Args:
+        corners: [face, 3, 3].
+        which: [face, 3] number of the edge opposite to each corner.
+    """
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    size = np.linalg.norm(normals, axis=1, keepdims=True)
+    normals = normals / np.where(size > 0, size, 1.0)
+    across = np.repeat(normals[:, None], 3, axis=1)
+    length = np.linalg.norm(np.roll(corners, -1, axis=1) - np.roll(corners, 1, axis=1), axis=2)
+    slivers = np.flatnonzero(size[:, 0] < SLIVER * length.max(axis=1) ** 2)
+    if not len(slivers):
+        return normals, normals, across
+    longest = length[slivers].argmax(axis=1)
+    rows = np.arange(len(slivers))
+    at_corner = normals.copy()
+    # Neighbours may be slivers themselves: what lies beyond them comes nearer by one in every round.
+    across[slivers] = at_corner[slivers] = 0.0
+    for _ in range(SLIVER_ROUNDS):
+        sums = np.stack([np.bincount(which.ravel(), across[..., axis].ravel()) for axis in range(3)], axis=1)
+        seen = sums[which[slivers]] - across[slivers]
+        beyond = seen[rows, longest]
+        before = seen.sum(axis=1) - beyond
+        before /= np.maximum(np.linalg.norm(before, axis=1, keepdims=True), 1e-12)
+        # Through its longest edge one sees what lies at the others, through these what lies at the longest.
+        passed = np.repeat(beyond[:, None], 3, axis=1)
+        passed[rows, longest] = before
+        if np.array_equal(passed, across[slivers]):
+            break
+        across[slivers], at_corner[slivers] = passed, beyond
+    normals[slivers] = across[slivers].sum(axis=1)
+    return normals, at_corner, across
 
 
 def _mm(vector: Any) -> NDArray[np.float64]:
