@@ -31,9 +31,8 @@ def measure(name: str, backend: str) -> dict[tuple[float, float, str], tuple[flo
             # The force that would bend a straight whisker by the offset.
             force = offset * length / references.point_load_deflection(straight, 1.0, at * length)
             for setting in SETTINGS:
-                how = {"backend": backend, "fidelity": setting}
-                load = load_aside(whisker, at * length, force, **how)
-                peg = push_aside(whisker, at * length, offset * length, **how)
+                load = load_aside(whisker, at * length, force, backend=backend, fidelity=setting)
+                peg = push_aside(whisker, at * length, offset * length, backend=backend, fidelity=setting)
                 stiffness = load.deflection / load.reference_deflection - 1
                 found[at, offset, setting] = stiffness, peg.force_error, peg.moment_error
     return found

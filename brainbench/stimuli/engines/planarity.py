@@ -18,7 +18,7 @@ from brainbench.stimuli.engines.reach import Reach
 from brainbench.stimuli.objects.obstacle import Capsule, Cylinder, Obstacle, Sphere
 
 _TINY = 1e-9
-"""Share of a length, or sine of an angle, that counts as none."""
+"""Share of a length, length (m) of a way, or sine of an angle, that counts as none."""
 
 
 def stays_in_plane(
@@ -29,10 +29,7 @@ def stays_in_plane(
     ``position`` [n, 3] (m) and ``euler`` [n, 3] (rad) are the base at ``times`` [n] (s), ``reach`` what it may touch.
     """
     turns = base_rotation(euler)
-    poses = [
-        (obstacle, *((None, None) if obstacle.motion is None else map(np.asarray, obstacle.motion(times))))
-        for obstacle in reach.obstacles
-    ]
+    paths = [None if obstacle.motion is None else obstacle.motion(times) for obstacle in reach.obstacles]
     forces = [np.asarray(job.gravity, dtype=float), *(np.asarray(load.force, dtype=float) for load in job.loads)]
     length = job.whisker.arc_length
     for normal in _normals(job, reach, turns[0], forces):
@@ -40,7 +37,10 @@ def stays_in_plane(
             np.abs(turns @ (turns[0].T @ normal) - normal).max() < _TINY
             and np.abs((position - position[0]) @ normal).max() < _TINY * length
             and all(abs(force @ normal) <= _TINY * np.linalg.norm(force) for force in forces)
-            and all(_mirrored(*pose, position[0], normal, job.whisker.base_radius) for pose in poses)
+            and all(
+                _mirrored(obstacle, path, position[0], normal, job.whisker.base_radius)
+                for obstacle, path in zip(reach.obstacles, paths, strict=True)
+            )
         ):
             return True
     return False
@@ -64,8 +64,7 @@ def _axis(part: Capsule | Cylinder) -> NDArray[np.float64]:
 
 def _mirrored(
     obstacle: Obstacle,
-    place: NDArray | None,
-    turn: NDArray | None,
+    path: tuple[NDArray, NDArray] | None,
     base: NDArray,
     normal: NDArray,
     thickness: float,
@@ -77,10 +76,10 @@ def _mirrored(
     if obstacle.surface is not None:
         return False
     shift, first = np.zeros(3), np.eye(3)
-    if place is not None and turn is not None:
-        turns = to_matrices(np.asarray(turn, dtype=float))
+    if path is not None:
+        place, turns = np.asarray(path[0], dtype=float), to_matrices(np.asarray(path[1], dtype=float))
         shift, first = place[0], turns[0]
-        across = np.abs((place - shift) @ normal).max() / np.linalg.norm(shift - base + normal)
+        across = np.abs((place - shift) @ normal).max()
         if max(across, np.abs(turns @ (first.T @ normal) - normal).max()) >= _TINY:
             return False
     for part in obstacle.parts:

@@ -160,7 +160,8 @@ def _integrate(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """Return point, tangent and moment [3] at ``arc`` of the rod with this moment at its base; NaN beyond its ends."""
     if not 0 < arc <= rod.length:
-        return (np.full(3, np.nan),) * 3
+        nowhere = np.full(3, np.nan)
+        return nowhere, nowhere, nowhere
     points, frames, moments = _paths(rod, force, moment, np.array([arc]))
     return points[-1], frames[-1, :, 0], moments[-1]
 

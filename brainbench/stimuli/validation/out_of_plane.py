@@ -77,8 +77,8 @@ def push_aside(
     def motion(times: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         return touch + np.outer(smooth_step(times, duration) * offset, way), np.tile([1.0, 0, 0, 0], (len(times), 1))
 
-    ends = (tuple((side * whisker.arc_length * axis).tolist()) for side in (-1, 1))
-    rod = Obstacle((Capsule(*ends, peg_radius),), motion, friction=0.0)
+    x, y, z = (whisker.arc_length * axis).tolist()
+    rod = Obstacle((Capsule((-x, -y, -z), (x, y, z), peg_radius),), motion, friction=0.0)
     job = Job(replace(whisker, damping_ratio=1.0), StillFollicle(), (rod,), np.array([duration + settling]))
     trace = run_stable(get_engine(backend), [job], Fidelity.of(fidelity), record_shape=True)[0]
     return BenchTest(trace.wrench[-1], expected.wrench, float(trace.contact_arc[-1]), trace)
