@@ -54,7 +54,9 @@ class TactileObservation:
         kind = observation_type(observe)
         taxels = hand.layout(options.resolution, options.placement)
         taxels = {link: probes for link, probes in taxels.items() if probes.active.any()}
-        sensors = sensors_for(observe, taxels, noisy=options.noisy, track=model.objects, **{"twist": twist, **options.knobs})
+        sensors = sensors_for(
+            observe, taxels, noisy=options.noisy, track=model.objects, **{"twist": twist, **options.knobs}
+        )
         self.suite = SensorSuite(simulation.engine.scene, sensors, num_envs=num_envs, device=device, seed=options.seed)
         self._name, self.links = observe, tuple(taxels)
         """Links with taxels, in the order of their columns."""

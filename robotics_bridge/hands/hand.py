@@ -200,6 +200,9 @@ def from_file(path: Path) -> Hand:
     """
     with readable(path, "URDF or MJCF file"):
         model = read_mjspec(path).compile()
+        for name in ("geom_friction", "dof_damping", "dof_armature"):
+            if (getattr(model, name) < 0).any():
+                raise DataError(f"{shown(str(path))} has a {name} below 0; a number of at least 0 is needed.")
     children: dict[int, list[int]] = {body: [] for body in range(model.nbody)}
     for body in range(1, model.nbody):
         children[int(model.body_parentid[body])].append(body)

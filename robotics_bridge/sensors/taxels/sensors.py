@@ -71,7 +71,9 @@ class KinematicTaxel(QuerySensor):
         """Return the runtime that serves these sensors (by name) together."""
         if next(iter(sensors.values())).total == "law":
             return super().build(sensors, context)
-        return load_object("robotics_bridge.sensors.taxels.contact_load:ContactLoadRuntime", "runtime")(sensors, context)
+        return load_object("robotics_bridge.sensors.taxels.contact_load:ContactLoadRuntime", "runtime")(
+            sensors, context
+        )
 
     def __post_init__(self) -> None:
         super().__post_init__()
