@@ -81,6 +81,35 @@ def half_spaces() -> list[list[str]]:
     return rows
 
 
+def taken_up() -> list[list[str]]:
+    """Heat that a pad of default cells takes up in short touches, over that of two half-spaces (Carslaw & Jaeger)."""
+    rows, half = [], (0.2, 0.2, 0.01)
+    shapes = (
+        Geometry(name="pad", link="pad", kind="box", size=half),
+        Geometry(name="object", link="object", kind="sphere", size=(0.04,)),
+    )
+    for own in ("silicone", "skin", "glass"):
+        for name in ("aluminium", "steel", "wood"):
+            grid = TemperatureGrid(
+                link="pad", material=own, convection=0.0, radiates=False, base_temperature=33.0,
+                bodies={"object": ThermalBody(name, 13.0)},
+            )  # fmt: skip
+            suite = SensorSuite(TouchScene(("pad", "object"), shapes), {"t": grid}, num_envs=1)
+            state = HandState.empty(1, 2, 4)
+            corners = [[x, y, half[2]] for x in (-half[0], half[0]) for y in (-half[1], half[1])]
+            state.set_contacts([0] * 4, [[0, 1]] * 4, position=corners, normal=[[0, 0, 1.0]] * 4)
+            thermal, e2, found = material(own), material(name).effusivity, []
+            unit = thermal.density * thermal.specific_heat * np.prod(half) * 8
+            for step in range(1, 501):
+                suite.update(state, 0.01)
+                if step in (1, 10, 100, 500):
+                    heat = unit * (33 - suite.read_ground_truth("t").double().mean().item())
+                    e1, root = thermal.effusivity, math.sqrt(step * 0.01 / math.pi)
+                    found.append(f"{heat / (40 * 0.16 * e1 * e2 / (e1 + e2) * root):.3f}")
+            rows.append([f"{own} on {name}", *found])
+    return rows
+
+
 def planted() -> list[list[str]]:
     truth = Noise(
         white=0.02, walk=0.002, bias=0.05, quantum=0.01, gain=(0.8, 1.2), dead_probability=0.15, dead_range=(0.1, 0.6),
@@ -150,6 +179,11 @@ def main() -> None:
             "A grid touches a half-space (33 °C on 13 °C; largest error over 240 cells, of the step of 20 K)",
             ["contact", "closed form", "found", "error"],
             half_spaces(),
+        ),
+        (
+            "Heat taken up by a pad of 2 × 2 × 2 cells (each 10 mm deep, steps of 10 ms) over that of two half-spaces",
+            ["contact", ".01 s", ".1 s", "1 s", "5 s"],
+            taken_up(),
         ),
         ("Calibration of planted noise (6000 readings, 60 probes)", ["knob", "planted", "found", "95 %"], planted()),
         (

@@ -1,4 +1,4 @@
-"""Cost of twist, and what it changes: ``python -m benchmarks.whiskers.twist [--sweeps 24] [--write]``."""
+"""Cost of twist, and what it changes: ``python -m benchmarks.whiskers.twist [--sweeps 8] [--write]``."""
 
 from __future__ import annotations
 
@@ -37,8 +37,8 @@ def cost(run: Callable[[Fidelity], object], repeats: int) -> tuple[float, float]
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--sweeps", type=int, default=24)
-    parser.add_argument("--repeats", type=int, default=5)
+    parser.add_argument("--sweeps", type=int, default=8)
+    parser.add_argument("--repeats", type=int, default=3)
     parser.add_argument("--write", action="store_true")
     args = parser.parse_args()
     recipe, engine = get_recipe("rodgers").scenes, get_engine("rod")

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from brainbench.cli.output import JsonOption, emit, table
+from brainbench.core.errors import install_command
 
 OPTIONAL = {
     "pynwb": ("nwb", "checking NWB files against the schema"),
@@ -33,16 +34,21 @@ OPTIONAL = {
 def doctor(as_json: JsonOption = False) -> None:
     """Show versions, devices, folders and optional parts."""
     data = diagnose()
-    rows = [[name, version or "missing: reinstall brainbench", ""] for name, version in data["required"].items()]
+    rows = [[name, version or "missing: reinstall brainbench", "", ""] for name, version in data["required"].items()]
     for name, part in data["optional"].items():
-        note = "" if part["version"] else f"enables {part['enables']}; {part['install']}"
-        rows.append([name, part["version"] or "not installed", note])
+        note = ["", ""] if part["version"] else [OPTIONAL[name][0], part["enables"]]
+        rows.append([name, part["version"] or "not installed", *note])
     head = [
         f"brainbench {data['version']}, Python {data['python']}, {data['machine']}",
         f"processors {data['processors']}, CUDA {', '.join(data['cuda']) or 'none (not needed)'}",
         f"cache {data['cache']} ({data['cache_bytes'] / 1e6:.1f} MB)",
     ]
-    emit(data, "\n".join(head) + "\n\n" + table("", ["part", "version", ""], rows), as_json=as_json)
+    told = f"\n\nAn extra is installed, in the checkout of brainbench, with: {install_command('EXTRA')}"
+    emit(
+        data,
+        "\n".join(head) + "\n\n" + table("", ["part", "version", "extra", "enables"], rows) + told,
+        as_json=as_json,
+    )
 
 
 def diagnose() -> dict[str, Any]:
@@ -59,7 +65,7 @@ def diagnose() -> dict[str, Any]:
         "cache_bytes": sum(item.stat().st_size for item in cache.rglob("*") if item.is_file()),
         "required": {name: _version(name) for name in _required()},
         "optional": {
-            name: {"version": _version(name), "enables": purpose, "install": f"pip install 'brainbench[{extra}]'"}
+            name: {"version": _version(name), "enables": purpose, "install": install_command(extra)}
             for name, (extra, purpose) in OPTIONAL.items()
         },
     }

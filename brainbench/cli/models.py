@@ -51,6 +51,9 @@ def list_(
         if name not in here:
             sizes[plain] = sizes.get(plain) or _size(describe_model(plain))
             rows.append([name, "needs training", *sizes[plain]])
+    if not rows:
+        print(f"No model has a name like {pattern!r}; see them all with: brainbench models")
+        return
     rows.sort(key=lambda row: ("trained", "your code", "untrained", "needs training").index(row[1]))
     print(table("", ["model", "weights", "parameters", "MACs/step"], rows, right=(2, 3)))
     print("\ntrained: weights come with the package; untrained: random weights, drawn from --seed;")

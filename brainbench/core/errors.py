@@ -106,9 +106,18 @@ def check_name(kind: str, name: object, options: Iterable[str], *, hint: str = "
         raise unknown_name(kind, name, choices, hint=hint)
 
 
+def install_command(extra: str) -> str:
+    """Return the command that installs an extra, to be given where this package was checked out.
+
+    >>> install_command("report")
+    "pip install -c constraints.txt '.[report]'"
+    """
+    return f"pip install -c constraints.txt '.[{extra}]'"
+
+
 def missing_dependency(package: str, *, extra: str, purpose: str) -> MissingDependencyError:
     """Build the error for an optional package, naming the extra that installs it."""
     return MissingDependencyError(
         f"{purpose} needs the package {package!r}, which is not installed; "
-        f"install it with: pip install 'brainbench[{extra}]'."
+        f"install it, in the checkout of brainbench, with: {install_command(extra)}"
     )

@@ -8,7 +8,7 @@ import shutil
 import subprocess
 from pathlib import Path
 
-from brainbench.core.errors import DataError, MissingDependencyError, UsageError, unknown_name
+from brainbench.core.errors import DataError, MissingDependencyError, UsageError, install_command, unknown_name
 from brainbench.datasets.layouts.registry import get_layout, list_layouts
 
 
@@ -36,7 +36,7 @@ def fetch(name: str, folder: str | os.PathLike[str] = ".", *, assets: str | None
     if client is None:
         raise MissingDependencyError(
             "Downloading from the DANDI archive needs its client, which is not installed: "
-            f"pip install 'brainbench[dandi]'. Or get DANDI:{number} elsewhere: every other command works on files, "
+            f"{install_command('dandi')}; or get DANDI:{number} elsewhere: every other command works on files, "
             "without a network."
         )
     pattern = assets or pattern

@@ -31,6 +31,8 @@ Source = str | os.PathLike[str] | Sequence[str | os.PathLike[str]]
 SUFFIXES = ((".nwb",), (".h5", ".hdf5"))
 """Endings searched for in a folder, in this order; other tools also leave ``.h5`` files beside NWB."""
 
+_DEMOS = ("demo", "demo-rodgers")
+"""Names of recordings that are made on first use, above this package."""
 _SELECTIONS = {"none": EVERYTHING, "default": DEFAULT}
 
 
@@ -51,6 +53,8 @@ def find_recordings(source: Source) -> tuple[RecordingLayout | None, list[Path]]
     layout = load_layout(prefix) if in_file else None
     if not rest:
         raise UsageError(f"The source {source!r} names a layout but no file; write {prefix}:PATH.")
+    if rest in _DEMOS:
+        raise UsageError(f"The demo recordings have a layout of their own; write {rest!r} without {prefix}:.")
     return layout or get_layout(prefix), find_files(rest)
 
 
@@ -175,7 +179,7 @@ def _expand(source: str) -> list[Path]:
         if not (found := [item for item in matches if item.is_file()]):
             raise DataFileNotFoundError(f"The pattern {source!r} matches no file.")
         return found
-    if source in ("demo", "demo-rodgers"):
+    if source in _DEMOS:
         raise UsageError(
             f"The demo recordings are made from simulated stimuli on first use: ask for recordings={source!r} in "
             "brainbench.score, or pass the folder that brainbench.scoring.demo.demo_recordings returns."

@@ -11,13 +11,12 @@ from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
 
-import numpy as np
-
 from brainbench.core.devices import mujoco_module
 from brainbench.core.errors import DataError, UsageError, shown, unknown_name
 from brainbench.core.reading.regular import check_file, readable
 from brainbench.core.reading.texts import read_text
-from robotics_bridge.hands.layouts import Layout, check_names, pad_probes, palm_side, read_probes, select
+from robotics_bridge.hands.facing import palmar_directions
+from robotics_bridge.hands.layouts import Layout, check_names, pad_probes, read_probes, select
 from robotics_bridge.hands.spec import HandSpec, build
 
 _AUTO_GRIDS = {
@@ -30,8 +29,6 @@ _NAMES = {"name", "class", "childclass", "joint", "body", "link", "geom", "site"
 """Attributes of URDF and MJCF that hold words."""
 _LARGEST = 1e15
 """Magnitude of numbers in a hand's file that no hand has."""
-_CROSSED = 0.012
-"""Joints nearer to each other (m) act on a link together."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,11 +87,11 @@ class Hand:
         """Return the probes of each link.
 
         Our hands have exactly the counts of the thesis (table 4.11). On any other hand, grids are cast onto the
-        palmar side of the links, which is where they move when their joints flex; see :meth:`with_probes` for a
-        layout of your own.
+        palmar side of the links, which is where they move when their joints flex or jaws close; see
+        :meth:`with_probes` for a layout of your own.
 
         Raises:
-            UsageError: resolution or placement are unknown.
+            UsageError: resolution or placement are unknown, or no link of the placement gets a probe (it says why).
         """
         links = self.links(placement)
         if resolution in self.probes:
@@ -125,18 +122,29 @@ class Hand:
         from robotics_bridge.hands.surface import cast_grid, geoms_of
 
         found: Layout = {}
+        reasons: list[str] = []
         facing = palmar_directions(self.model, self.palm, self.fingers)
         for link in links:
             place = "palm" if link == self.palm else "tips" if link in self.tips else "fingers"
             rows, columns, radius = _AUTO_GRIDS[resolution][place]
-            if link not in facing or not geoms_of(self.model, self.model.body(link).id):
-                continue
-            for extent in (0.8, 0.4):
-                with contextlib.suppress(UsageError):
-                    found[link] = cast_grid(
-                        self.model, link, rows, columns, facing=facing[link], radius=radius, extent=extent
-                    )
-                    break
+            if not geoms_of(self.model, self.model.body(link).id):
+                reasons.append(f"{link!r} has no geometry")
+            elif link not in facing:
+                reasons.append(f"no joint tells which side of {link!r} touches")
+            else:
+                for extent in (0.8, 0.4):
+                    with contextlib.suppress(UsageError):
+                        found[link] = cast_grid(
+                            self.model, link, rows, columns, facing=facing[link], radius=radius, extent=extent
+                        )
+                        break
+                else:
+                    reasons.append(f"{link!r} has no surface on its inner side")
+        if not found:
+            raise UsageError(
+                f"Hand {self.name!r} gets no taxels on {', '.join(links)}: {'; '.join(reasons)}. Place them with "
+                "Hand.with_probes (a probe file, or link → Probes)."
+            )
         return found
 
 
@@ -217,8 +225,10 @@ def from_file(path: Path) -> Hand:
         children[int(model.body_parentid[body])].append(body)
     jointed = {body: _joints_below(model, body, children) for body in range(model.nbody)}
     branches = {body: [child for child in children[body] if jointed[child]] for body in range(model.nbody)}
-    # The palm is the body with most branches that have joints; of equals the one with the lowest number.
-    palm = max(range(model.nbody), key=lambda body: (len(branches[body]), -body))
+    # The palm is the body with most branches that have joints; of equals the one with the lowest number. Without any
+    # fork it is the body before the last joint: a fixed jaw, with whatever arm below it.
+    most = max(len(branches[body]) for body in branches)
+    palm = max(branches, key=lambda body: (len(branches[body]), body if most == 1 else -body))
     if not branches[palm]:
         raise DataError(f"{str(path)!r} holds no hand: it has no joints.")
     fingers: dict[str, tuple[str, ...]] = {}
@@ -227,7 +237,11 @@ def from_file(path: Path) -> Hand:
         while following := [child for child in children[body] if jointed[child] or model.body_geomnum[child]]:
             body = max(following, key=lambda child: (jointed[child], model.body_geomnum[child]))
             chain.append(body)
-        chain = [body for body in chain if model.body_geomnum[body]] or chain[-1:]
+        # Pads that are fixed beside the chain belong to it too, each after its parent.
+        every = [chain[0]]
+        for body, parent in zip(chain[1:], chain, strict=False):
+            every += [child for child in children[parent] if child not in chain and not jointed[child]] + [body]
+        chain = [body for body in every if model.body_geomnum[body]] or chain[-1:]
         names = tuple(model.body(body).name for body in chain)
         fingers[names[-1]] = names
     return Hand(path.stem, model.body(palm).name, fingers, path=path)
@@ -236,72 +250,3 @@ def from_file(path: Path) -> Hand:
 def _joints_below(model: Any, body: int, children: dict[int, list[int]]) -> int:
     own = sum(int(model.jnt_type[index]) in (2, 3) for index in range(model.njnt) if model.jnt_bodyid[index] == body)
     return own + sum(_joints_below(model, child, children) for child in children[body])
-
-
-def palmar_directions(model: Any, palm: str, fingers: Mapping[str, tuple[str, ...]]) -> dict[str, np.ndarray]:
-    """Return link → the direction [3] of its palmar side, in the link's frame.
-
-    A link's palmar side is where it moves when its joint flexes (of two crossed joints, the one with more range
-    counts). A joint that swings as far to both sides spreads or twists the finger and tells nothing: such links
-    face as the next one towards the tip does. The palm faces where the finger tips go, along the nearest axis of
-    its frame.
-    """
-    mujoco = mujoco_module()
-
-    data = mujoco.MjData(model)
-    mujoco.mj_kinematics(model, data)
-    towards: dict[str, np.ndarray] = {}
-    tips = []
-    for chain in fingers.values():
-        known: np.ndarray | None = None
-        for place in reversed(range(len(chain))):
-            body = model.body(chain[place]).id
-            following = data.xpos[model.body(chain[place + 1]).id] if place + 1 < len(chain) else None
-            world = _flexed(model, data, body, following)
-            if world is None and known is None and place + 1 == len(chain):
-                world = _flexed(model, data, body, following, symmetric=True)
-            known = known if world is None else world
-            if known is not None:
-                towards[chain[place]] = data.xmat[body].reshape(3, 3).T @ known
-                tips += [known] if place + 1 == len(chain) else []
-    if tips and np.linalg.norm(np.mean(tips, axis=0)) > 0.1:
-        # Mean flexion of the finger tips in the palm's frame, snapped to the nearest of its axes.
-        turned = data.xmat[model.body(palm).id].reshape(3, 3).T @ np.mean(tips, axis=0)
-        face = np.argmax(np.abs(turned))
-        towards[palm] = np.sign(turned[face]) * np.eye(3)[face]
-    return towards
-
-
-def _flexed(
-    model: Any, data: Any, body: int, following: np.ndarray | None, *, symmetric: bool = False
-) -> np.ndarray | None:
-    """Return where a body goes [3] (world) when its joint flexes; None if that is not known."""
-    from robotics_bridge.hands.surface import link_points
-
-    own = link_points(model, body)
-    joint = _flexion(model, body)
-    if joint < 0 or not len(own):
-        return None
-    low, high = (float(value) for value in model.jnt_range[joint])
-    if not symmetric and abs(high + low) < 0.2 * (high - low):
-        return None
-    end = following
-    if end is None or np.linalg.norm(end - data.xpos[body]) < 1e-6:
-        end = data.xpos[body] + data.xmat[body].reshape(3, 3) @ own.mean(axis=0)
-    axis = data.xmat[model.jnt_bodyid[joint]].reshape(3, 3) @ model.jnt_axis[joint]
-    world = palm_side(axis, end - data.xpos[body], (low, high))
-    return world if np.any(world) else None
-
-
-def _flexion(model: Any, body: int) -> int:
-    """Return the joint that flexes a body: of its own and those that cross them, the one with the largest range."""
-    best, most = -1, 0.0
-    while body > 0:
-        for joint in range(int(model.body_jntadr[body]), int(model.body_jntadr[body]) + int(model.body_jntnum[body])):
-            span = float(np.ptp(model.jnt_range[joint])) if model.jnt_limited[joint] else 2 * np.pi
-            if int(model.jnt_type[joint]) == 3 and span > most:
-                best, most = joint, span
-        if best >= 0 and np.linalg.norm(model.body_pos[body]) > _CROSSED:
-            break
-        body = int(model.body_parentid[body])
-    return best

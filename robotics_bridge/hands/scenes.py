@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from typing import Any
 
 import numpy as np
@@ -108,8 +109,10 @@ def palm_surface(hand: Hand) -> tuple[NDArray[np.float64], NDArray[np.float64], 
     if hand.palm not in facing:
         raise UsageError(f"The joints of hand {hand.name!r} do not tell which side of {hand.palm!r} the palm is.")
     up = facing[hand.palm]
-    pad = hand.layout("low", "palm").get(hand.palm)
-    surface = pad.position[pad.active].mean(axis=0) if pad is not None else np.zeros(3)
+    surface = np.zeros(3)
+    with contextlib.suppress(UsageError):
+        pad = hand.layout("low", "palm")[hand.palm]
+        surface = pad.position[pad.active].mean(axis=0)
     data = mujoco.MjData(hand.model)
     mujoco.mj_kinematics(hand.model, data)
     palm = hand.model.body(hand.palm).id

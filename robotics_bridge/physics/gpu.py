@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from brainbench.core.cuda_graphs import record_launches
 from brainbench.core.devices import pick_device, warp
-from brainbench.core.errors import MissingDependencyError, UsageError, unknown_name
+from brainbench.core.errors import MissingDependencyError, UsageError, install_command, unknown_name
 from robotics_bridge.physics.kernels.state import fill_contacts, fill_links
 from robotics_bridge.physics.scene import TouchScene
 from robotics_bridge.physics.state import MOST_ENVS, HandState
@@ -199,7 +199,7 @@ def _mujoco_warp() -> Any:
         import mujoco_warp
     except ImportError as error:
         raise MissingDependencyError(
-            "Simulation on a GPU needs mujoco-warp; install it with: pip install 'brainbench[gpu]'"
+            f"Simulation on a GPU needs mujoco-warp; install it with: {install_command('gpu')}"
         ) from error
     return mujoco_warp
 

@@ -191,6 +191,23 @@ class TouchScene:
             found |= {low + high - own for low, high in self.included if own in (low, high)}
         return tuple(sorted(found))
 
+    def surroundings(self, link: str) -> tuple[int, ...]:
+        """Return the numbers of the geometries that a link may meet without regard to contacts.
+
+        Those of :meth:`candidates`; for a link that collides with nothing, what collides of every other link that is
+        not barred, or all that it has.
+        """
+        if found := self.candidates(link):
+            return found
+        here = self.link_index(link)
+        barred = {low + high - here for low, high in self.excluded if here in (low, high)} | {here}
+        kept: list[int] = []
+        for other in range(len(self.links)):
+            mine = [] if other in barred else np.flatnonzero(self.link_of == other).tolist()
+            mine = [g for g in mine if self.geometries[g].kind != "other"]
+            kept += [g for g in mine if self.geometries[g].collides] or mine
+        return tuple(sorted(kept))
+
     @classmethod
     def from_mujoco(cls, model: Any, others: Sequence[Any] = (), assignment: Sequence[int] = ()) -> TouchScene:
         """Read the scene out of a compiled ``mujoco.MjModel``; link 0 is the world.

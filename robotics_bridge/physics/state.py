@@ -23,7 +23,7 @@ DIVERGED = 1
 CROWDED = 2
 """Bit of :attr:`HandState.status`: contacts were lost because there was no room for them."""
 UNFELT = 4
-"""Bit of :attr:`HandState.status`: a contact pushed a link that has taxels with ``total="engine"`` where none felt it."""
+"""Bit of :attr:`HandState.status`: a contact pushed a link with taxels of ``total="engine"`` where none felt it."""
 _CONTACT = {"distance": 0.0, "force": float("nan"), "position": 0.0, "normal": 0.0, "friction": 0.0}
 """What may be told of a contact, and what it is where nobody tells."""
 MOST_ENVS = 1_000_000
@@ -58,7 +58,7 @@ class HandState:
     time: Any
     """Warp array [B] float32 (s)."""
     status: Any
-    """Warp array [B] int32 of :data:`DIVERGED`, :data:`CROWDED` and :data:`UNFELT`, as of the last update of a suite."""
+    """Warp array [B] int32 of :data:`DIVERGED`, :data:`CROWDED` and :data:`UNFELT`, as of a suite's last update."""
 
     @classmethod
     def empty(cls, num_envs: int, num_links: int, contacts: int = 0, device: Any = "cpu") -> HandState:
@@ -182,7 +182,7 @@ class HandState:
             )
         if len(pairs) != count:
             raise UsageError(f"Every contact needs one pair of geometries; received {count} and {len(pairs)}.")
-        if count and not (0 <= environments.min() and environments.max() < self.num_envs):
+        if count and not (environments.min() >= 0 and environments.max() < self.num_envs):
             raise UsageError(
                 f"Environments of contacts are 0 to {self.num_envs - 1}; received {environments.min()} to "
                 f"{environments.max()}."

@@ -89,7 +89,8 @@ class ProbeSensor(Sensor):
     probes: Probes
     """Places of its probes, in the frame of the link."""
     track: tuple[str, ...] = ()
-    """Links it looks at; empty means everything that may touch its link."""
+    """Links it looks at; empty means everything that may touch its link (and everything else, where that collides with
+    nothing and contacts do not matter)."""
 
     knobs: ClassVar[frozenset[str]] = PROBE_KNOBS
     contact_only: ClassVar[bool] = False
@@ -108,7 +109,7 @@ class ProbeSensor(Sensor):
         """Return the numbers of the geometries it looks at."""
         scene.link_index(self.link)
         if not self.track:
-            return scene.candidates(self.link)
+            return scene.candidates(self.link) if self.contact_only else scene.surroundings(self.link)
         return tuple(sorted({g for link in self.track for g in scene.geometries_of(link)}))
 
 

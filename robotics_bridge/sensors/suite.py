@@ -244,8 +244,8 @@ class SensorSuite:
         if not self._warned and (most := int(wp.to_torch(self.pairs.crowded).max())):
             self._warned = True
             warnings.warn(
-                f"{most} geometries touched one sensor link at once, more than are listed; some were not felt. Make the "
-                f"suite with listed={most}.",
+                f"{most} geometries touched one sensor link at once, more than are listed; some were not felt. Make "
+                f"the suite with listed={most}.",
                 RuntimeWarning,
                 stacklevel=3,
             )

@@ -11,6 +11,7 @@ from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from brainbench.core.devices import mujoco_module
+from robotics_bridge.sensors.taxels.sensors import PUBLISHED_TWIST
 from robotics_bridge.tasks import terms
 from robotics_bridge.tasks.objects import ball
 from robotics_bridge.tasks.registry import register, register_bounded
@@ -82,6 +83,7 @@ def with_thermal(thermal: ThermalSettings) -> Task:
         carriage={axis: (span, 2000.0, 120.0, 100.0) for axis, span in _SPANS.items()},
         furniture=bin_walls,
         task_state=partial(Thermometers, thermal=thermal),
+        taxel_twist=PUBLISHED_TWIST,
         rewards={
             "reach": Reward(1.0, reach, {"sigma": 0.1}),
             "warmth": Reward(5.0, extra, {"name": "progress"}),

@@ -64,7 +64,7 @@ def test_fetching_without_the_client_says_how_to_get_it(run, monkeypatch, tmp_pa
     monkeypatch.setenv("PATH", str(tmp_path))
     result = run("recordings", "fetch", "rodgers", "--out", str(tmp_path / "data"))
     assert result.status == 1
-    assert "pip install 'brainbench[dandi]'" in result.err
+    assert "pip install -c constraints.txt '.[dandi]'" in result.err
     assert "did you mean 'rodgers'" in run("recordings", "fetch", "rogers").err
 
 

@@ -22,7 +22,7 @@ def test_the_nearest_name_ignores_case_and_returns_the_allowed_spelling():
 
 def test_a_missing_package_names_the_extra_that_installs_it():
     error = errors.missing_dependency("pynwb", extra="nwb", purpose="Checking a file")
-    assert "pip install 'brainbench[nwb]'" in str(error)
+    assert "pip install -c constraints.txt '.[nwb]'" in str(error)
     assert isinstance(error, ImportError)
 
 

@@ -28,6 +28,7 @@ class TouchWorld:
         student = ("proprio", "goal", "tactile") if self.touch else ("proprio", "goal")
         self.task = SimpleNamespace(
             groups={"student": student},
+            taxel_twist=None,
             decoders=(SimpleNamespace(target="aux_aim", weight=0.5, scale=2.0, hidden=(16,)),),
             student=SimpleNamespace(
                 iterations=4, learning_rate=1e-3, epochs=2, gradient_length=2, clip=None, max_grad_norm=None, loss="mse"

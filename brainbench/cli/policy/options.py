@@ -65,8 +65,8 @@ def check_paths(video: Path | None, strip: Path | None) -> None:
         UsageError: a path has another ending than .mp4 or .gif (film) or .png (strip), or cannot be written.
         MissingDependencyError: what writes this format is not installed.
     """
-    from brainbench.core.files import check_folder
     from brainbench.core.figures.style import check_format
+    from brainbench.core.files import check_folder
     from brainbench.stimuli.figures.films import require_writer
 
     for path, endings, option in ((video, (".mp4", ".gif"), "--video"), (strip, (".png",), "--strip")):

@@ -75,7 +75,8 @@ def layouts(
         chosen, resolutions = chosen.with_probes(probes), ("custom",)
     counts, rows, detail = {}, [], []
     for resolution in resolutions:
-        layout = {place: chosen.layout(resolution, place) for place in layouts.PLACEMENTS}
+        whole = chosen.layout(resolution)
+        layout = {place: layouts.select(whole, chosen.links(place)) for place in layouts.PLACEMENTS}
         counts[resolution] = {place: layouts.active_count(layout[place]) for place in layouts.PLACEMENTS}
         rows.append([resolution, *(str(counts[resolution][place]) for place in layouts.PLACEMENTS)])
         for link, item in layout["hand"].items():

@@ -46,7 +46,7 @@ def save_figure(figure: Figure, path: Path, **options: Any) -> Path:
     return path
 
 
-def panels(rows: int, columns: int, inches: tuple[float, float], **options: Any) -> tuple[Figure, Any]:
+def panels(rows: int, columns: int, inches: tuple[float, float], **options: Any) -> tuple[Any, Any]:
     """Return a figure of this size in inches and its axes [rows, columns], in the common style.
 
     Further options are matplotlib's ``subplots``. Without matplotlib it is a :class:`MissingDependencyError`.

@@ -18,7 +18,7 @@ from typing import Any
 import torch
 from torch import nn
 
-from brainbench.core.errors import DataError, UsageError
+from brainbench.core.errors import DataError, UsageError, install_command
 from brainbench.core.files import atomic_path, read_json, write_json, write_text
 from brainbench.core.reading.regular import check_file, readable
 
@@ -135,7 +135,7 @@ class RunLog:
         try:
             from torch.utils.tensorboard import SummaryWriter
         except ImportError:
-            _log.info("TensorBoard is not installed (pip install 'brainbench[train]'); %s is written alone.", LOG)
+            _log.info("TensorBoard is not installed (%s); %s is written alone.", install_command("train"), LOG)
         else:
             self._writer = SummaryWriter(str(folder / "tensorboard"), purge_step=step + 1)
 

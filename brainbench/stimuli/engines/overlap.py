@@ -69,7 +69,7 @@ def overlap_fault(
         depth = max(depth, float(here.max()))
         reached = np.flatnonzero(obstacle_depth(obstacle, position, times)[:-1] > -chain.whisker.base_radius)
         if len(reached) and reached[0] < first:
-            first, reason = int(reached[0]), fault(AT_BASE, times[reached[0]], 0.0)
+            first, reason = int(reached[0]), fault(AT_BASE, float(times[reached[0]]), 0.0)
     if depth > LARGEST_START_OVERLAP:
-        first, reason = 0, fault(STARTED_INSIDE, times[0], depth)
+        first, reason = 0, fault(STARTED_INSIDE, float(times[0]), depth)
     return first, reason, depth

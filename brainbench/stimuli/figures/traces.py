@@ -155,8 +155,6 @@ def _panel(panel: Axes, whisker: xr.Dataset, values: NDArray[np.float64], name: 
     panel.axhline(0, color=PALE, linewidth=0.8 * points)
     corner: dict[str, Any] = {"transform": panel.transAxes, "va": "top", "ha": "right"}
     stable = "status" not in whisker or str(whisker["status"].values) == "ok"
-    if stable and "contact" in whisker and not whisker["contact"].values.any():
-        panel.text(0.97, 0.95, "no contact", fontsize=13 * points, color=PALE, **corner)
     colors = LINE_COLORS if values.shape[1] > 1 else (INK,)
     for line, color in zip(values.T, colors, strict=True):
         panel.plot(times, line, color=color, linewidth=1.9 * points)
@@ -165,6 +163,8 @@ def _panel(panel: Axes, whisker: xr.Dataset, values: NDArray[np.float64], name: 
     )
     if not stable:
         panel.text(0.97, 0.95, "unstable", fontsize=14 * points, color="#b00020", **corner)
+    elif "contact" in whisker and not whisker["contact"].values.any():
+        panel.text(0.97, 0.95, "no contact", fontsize=13 * points, color=PALE, **corner)
     panel.tick_params(labelsize=13 * points, length=4 * points, colors=INK)
     for side in ("top", "right"):
         panel.spines[side].set_visible(False)

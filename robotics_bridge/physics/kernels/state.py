@@ -3,6 +3,8 @@
 Letters: B environment, L link, C contact. World axes, metres, seconds, newtons; Warp's quaternions are (x, y, z, w).
 """
 
+from typing import Any
+
 from brainbench.core.devices import warp
 
 wp = warp()
@@ -94,7 +96,7 @@ def fill_contacts(
     dim: wp.array(dtype=wp.int32),
     address: wp.array2d(dtype=wp.int32),
     efc_force: wp.array2d(dtype=wp.float32),
-    cone: wp.array(dtype=wp.types.vector(length=5, dtype=wp.float32)),
+    cone: wp.array(dtype=Any),
     pyramidal: int,
     normal: wp.array(dtype=wp.vec3f),
     force: wp.array(dtype=wp.float32),

@@ -18,6 +18,8 @@ if TYPE_CHECKING:
 PUBLISHED_TWIST = 2.0
 """k_ω of the published parameters (N·m·s): that of a disc of 1.4 m, which drowns every other moment when an object
 turns."""
+ENGINE_RUNTIME = "robotics_bridge.sensors.taxels.contact_load:ContactLoadRuntime"
+"""Serves taxels with ``total="engine"``."""
 CONVENTIONS = ("physical", "thesis")
 
 
@@ -71,9 +73,7 @@ class KinematicTaxel(QuerySensor):
         """Return the runtime that serves these sensors (by name) together."""
         if next(iter(sensors.values())).total == "law":
             return super().build(sensors, context)
-        return load_object("robotics_bridge.sensors.taxels.contact_load:ContactLoadRuntime", "runtime")(
-            sensors, context
-        )
+        return load_object(ENGINE_RUNTIME, "runtime")(sensors, context)
 
     def __post_init__(self) -> None:
         super().__post_init__()

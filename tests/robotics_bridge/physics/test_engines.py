@@ -8,6 +8,7 @@ import pytest
 
 from brainbench.core.errors import UsageError
 from robotics_bridge.physics import HandState, MujocoEngine, MujocoWarpEngine, TouchScene
+from robotics_bridge.physics.kernels.state import fill_contacts
 from robotics_bridge.sensors import SensorSuite
 from tests.factories.touch_scenes import falling, pyramid
 
@@ -35,10 +36,47 @@ def test_state_holds_what_mujoco_computed() -> None:
             wrench = np.zeros(6)
             mujoco.mj_contactForce(model, data, c, wrench)
             assert engine.state.contact_force.numpy()[total] == pytest.approx(wrench[0], abs=1e-4)
+            slip = data.contact[c].frame.reshape(3, 3)[1:].T @ wrench[1:3]
+            np.testing.assert_allclose(engine.state.contact_friction.numpy()[total], slip, atol=1e-4)
             assert engine.state.contact_geom.numpy()[total].tolist() == data.contact.geom[c].tolist()
             assert engine.state.contact_env.numpy()[total] == env
             total += 1
     assert int(engine.state.contact_count.numpy()[0]) == total > 3
+
+
+@pytest.mark.parametrize("cone", ["pyramidal", "elliptic"])
+def test_the_kernel_of_the_gpu_engine_reads_forces_as_mujoco_does(cone: str) -> None:
+    """Constraint forces of C MuJoCo in the arrays of MuJoCo Warp, whose own type of five numbers is derived."""
+    import warp as wp
+
+    class Five(wp.types.vector(length=5, dtype=wp.float32)):
+        pass
+
+    model = mujoco.MjModel.from_xml_string(TWO.replace("<option", f'<option cone="{cone}"', 1))
+    assert model.opt.cone == (cone == "elliptic")
+    engine = MujocoEngine(model, 1)
+    engine.set(qvel=np.random.default_rng(0).normal(size=(1, model.nv)))
+    engine.step(20)
+    engine.forward()
+    data, count = engine.data[0], engine.data[0].ncon
+    assert count >= 3
+    contact, many = data.contact, 10
+    rows = np.where(np.arange(many) < np.where(contact.dim > 1, 2 * (contact.dim - 1), 1)[:, None], np.arange(many), -1)
+    address = np.where((rows >= 0) & (contact.efc_address[:, None] >= 0), contact.efc_address[:, None] + rows, -1)
+    normal, friction = (wp.zeros(count, dtype=wp.vec3f) for _ in range(2))
+    force = wp.zeros(count, dtype=float)
+    inputs = [
+        wp.array([count], dtype=int), wp.zeros(count, dtype=int),
+        wp.array(contact.frame.reshape(-1, 3, 3), dtype=wp.mat33f),
+        wp.array(contact.dim, dtype=int), wp.array(address, dtype=int), wp.array(data.efc_force[None], dtype=float),
+        wp.array(contact.friction, dtype=Five), int(model.opt.cone == 0), normal, force, friction,
+    ]  # fmt: skip
+    wp.launch(fill_contacts, dim=count, inputs=inputs)
+    state = engine.state
+    for found, known in ((normal, state.contact_normal), (force, state.contact_force)):
+        np.testing.assert_allclose(found.numpy(), known.numpy()[:count], rtol=1e-5, atol=1e-4)
+    np.testing.assert_allclose(friction.numpy(), state.contact_friction.numpy()[:count], rtol=1e-5, atol=1e-4)
+    assert np.abs(friction.numpy()).max() > 0.1
 
 
 def test_threads_do_not_change_the_outcome() -> None:

@@ -45,6 +45,30 @@ def test_every_student_feels_what_its_task_gives_and_exports(name: str, tmp_path
     assert export_policy(student, tmp_path / "policy", deployment=facts["deployment"]).difference < 1e-5
 
 
+def test_students_keep_the_force_law_that_they_learned_with(tmp_path: Path) -> None:
+    """Those of versions that did not state it had the published 2 N·m·s; the default of new ones is physical."""
+    from brainbench.cli.policy.options import touch_of
+    from brainbench.core.files import write_json
+    from robotics_bridge.policies.contract import PolicyContract
+    from robotics_bridge.policies.schema import Values
+
+    facts = read_json(FOLDER / "in_palm_rotate.force-torque-hand" / "config.json")
+    for stated in (True, False):
+        if not stated:
+            del facts["distill"]["twist"], facts["deployment"]["twist"]
+        write_json(tmp_path / "config.json", facts)
+        touch = touch_of([str(tmp_path)])
+        assert touch["knobs"] == {"twist": 2.0}
+        contract = {"inputs": [["proprio", [29]]], "format": "onnx", "deployment": facts["deployment"]}
+        assert PolicyContract.of(Values("c", contract)).more["twist"] == 2.0
+    env = tasks.make("in_palm_rotate", num_envs=1, threads=1, **touch)
+    assert {sensor.twist for sensor in env.touch.suite.sensors.values()} == {2.0}
+    env = tasks.make("in_palm_rotate", num_envs=1, threads=1, observe="force_torque")
+    assert {sensor.twist for sensor in env.touch.suite.sensors.values()} == {2.0 * 0.004**2 / 2}
+    env = tasks.make("in_palm_rotate", config="published", num_envs=1, threads=1, observe="force_torque")
+    assert {sensor.twist for sensor in env.touch.suite.sensors.values()} == {2.0}
+
+
 def test_a_name_stands_for_its_folder_and_paths_for_themselves(tmp_path: Path) -> None:
     assert policy_path("teacher", "in_palm_rotate.careful") == FOLDER / "in_palm_rotate.careful"
     assert policy_path("teacher", tmp_path) == tmp_path

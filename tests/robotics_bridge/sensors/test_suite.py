@@ -139,6 +139,7 @@ def test_a_diverged_environment_reads_nan_and_harms_no_other() -> None:
     for name in sensors:
         assert suite.read(name)[1].isnan().all()
         assert torch.equal(suite.read(name)[2], alone.read(name)[0])
+    suite.reset([1])
     suite.update(state_of(suite.scene, _touching(3)))
     assert torch.equal(suite.read("depth")[1], alone.read("depth")[0])
 

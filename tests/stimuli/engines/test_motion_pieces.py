@@ -6,6 +6,7 @@ import pytest
 from brainbench.core.errors import UsageError
 from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.engines.motion_pieces import KNOT, MOST_PIECES, SPEED_ERROR, cut
+from brainbench.stimuli.engines.mujoco.engine import MujocoWhiskerEngine
 from brainbench.stimuli.engines.protocol import Job, StillFollicle
 from brainbench.stimuli.engines.rod.engine import RodEngine
 from brainbench.stimuli.engines.stepping import SteppedJob
@@ -67,11 +68,10 @@ def test_a_motion_that_says_how_fine_it_is_is_looked_at_less_often():
 
 
 def test_corners_are_kept_and_do_not_shorten_the_steps():
-    corners = np.array([0.0, 0.0103, 0.02, 0.0307, 1.0])
-    pieces = _cut(lambda t: np.interp(t, corners, [0.0, 1.0, 0.3, 0.3, 0.3]))
-    assert np.flatnonzero(pieces.count == MOST_PIECES).tolist() == [10, 19, 20, 30] or set(
-        np.flatnonzero(pieces.count == MOST_PIECES)
-    ) <= {10, 19, 20, 30}
+    corners = np.array([0.0, 0.0103, 0.02, 1.0])
+    pieces = _cut(lambda t: np.interp(t, corners, [0.0, 1.0, 0.3, 0.3]))
+    found = set(np.flatnonzero(pieces.count == MOST_PIECES).tolist())
+    assert {10} < found <= {10, 19, 20}
     assert (pieces.longest_steps(1e-4, 25) == 1e-4).all()
 
 
@@ -99,14 +99,17 @@ def _push(width, reach=1e-3):
     return Obstacle((Sphere((0.008, -1.2e-3, 0.0), 1e-3),), motion)
 
 
-@pytest.mark.parametrize("fidelity", ["fast", "balanced"])
-def test_an_obstacle_pulse_of_a_tenth_of_a_millisecond_is_felt(fidelity):
-    job = Job(C2, StillFollicle(), (_push(1e-4),), np.arange(1, 31) * 1e-3)
-    trace = RodEngine().run([job], Fidelity.preset(fidelity))[0]
-    if trace.status == "ok":
-        assert np.abs(trace.wrench).max() > 1e-7
-    else:
-        assert trace.reason
+def test_an_obstacle_pulse_of_a_tenth_of_a_millisecond_is_felt_by_all_engines_alike():
+    """Readings of .1 ms; engines share the motion and nothing else. Before, no engine felt it."""
+    job = Job(C2, StillFollicle(), (_push(1e-4),), np.arange(1, 201) * 1e-4)
+    runs = ((RodEngine(), "accurate"), (RodEngine(), "balanced"), (MujocoWhiskerEngine(), "balanced"))
+    traces = [engine.run([job], Fidelity.preset(fidelity))[0] for engine, fidelity in runs]
+    assert [trace.status for trace in traces] == ["ok"] * 3
+    assert all(trace.contact.any() for trace in traces)
+    fine, rod, mujoco = (np.abs(trace.wrench[:, 3:]).max() for trace in traces)
+    assert fine > 1e-6
+    assert rod == pytest.approx(fine, rel=0.03)
+    assert mujoco == pytest.approx(fine, rel=0.1)
 
 
 @pytest.mark.parametrize("amplitude", [1e-6, 0.0])

@@ -36,7 +36,7 @@ def _panels(figure):
 
 
 def test_every_whisker_has_its_panel_on_the_grid_to_one_scale(dataset):
-    figure = module._figure(dataset.isel(stimulus=0), "one", "Fxyz", 40.0, (800, 480))
+    figure = module._figure(dataset.isel(stimulus=0), "one", "Fxyz", (-40.0, 40.0), (800, 480))
     panels = _panels(figure)
     assert len(figure.axes) == 35
     assert len(panels) == 30
@@ -52,11 +52,11 @@ def test_every_whisker_has_its_panel_on_the_grid_to_one_scale(dataset):
 def test_lines_are_the_channels_in_millinewtons_and_micronewton_metres(few):
     one = few.isel(stimulus=0)
     for channel, picked, factor in (("Fxyz", slice(0, 3), 1e3), ("My", slice(4, 5), 1e6)):
-        (panel, *_) = _panels(module._figure(one, "one", channel, 1.0, (800, 480)))
+        (panel, *_) = _panels(module._figure(one, "one", channel, (-1.0, 1.0), (800, 480)))
         drawn = np.stack([line.get_ydata() for line in panel.lines[1:]], axis=-1)
         np.testing.assert_allclose(drawn, one["wrench"].values[:, 0, picked] * factor, rtol=1e-6)
         np.testing.assert_allclose(panel.lines[1].get_xdata(), one["time"].values * 1e3)
-    (panel, *_) = _panels(module._figure(one, "one", "M", 1.0, (800, 480)))
+    (panel, *_) = _panels(module._figure(one, "one", "M", (0.0, 1.0), (800, 480)))
     np.testing.assert_allclose(
         panel.lines[1].get_ydata(), np.linalg.norm(one["wrench"].values[:, 0, 3:], axis=-1) * 1e6, rtol=1e-6
     )
@@ -67,15 +67,19 @@ def test_contacts_are_shaded_and_only_they(dataset):
     touched = one["contact"].values.any(axis=0)
     assert touched.any()
     assert not touched.all()
-    panels = _panels(module._figure(one, "one", "F", 1.0, (800, 480)))
+    panels = _panels(module._figure(one, "one", "F", (0.0, 1.0), (800, 480)))
     shaded = [any(len(item.get_paths()) for item in panel.collections) for panel in panels]
     np.testing.assert_array_equal(shaded, touched)
 
 
 def test_unstable_whiskers_say_so():
     broken = _simulate(unstable={3: "energy grew"}, array=WhiskerArray.mouse(whiskers="A*"))
-    panels = _panels(module._figure(broken.isel(stimulus=0), "one", "F", 1.0, (800, 480)))
-    assert [[text.get_text() for text in panel.texts][1:] for panel in panels] == [[], [], [], ["unstable"], []]
+    panels = _panels(module._figure(broken.isel(stimulus=0), "one", "F", (0.0, 1.0), (800, 480)))
+    said = [[text.get_text() for text in panel.texts][1:] for panel in panels]
+    assert ["unstable" in texts for texts in said] == [False, False, False, True, False]
+    assert [texts == ["no contact"] for texts in said] == [
+        not touched and index != 3 for index, touched in enumerate(broken["contact"].values[0].any(axis=0))
+    ]
 
 
 @pytest.mark.parametrize("suffix", ["png", "svg", "pdf"])

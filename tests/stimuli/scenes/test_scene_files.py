@@ -47,6 +47,16 @@ def test_a_scene_overrides_shared_tables_key_by_key(tmp_path):
     assert len(free.objects) == 1
 
 
+def test_a_file_may_state_that_its_whiskers_do_not_twist_and_what_they_are_made_of(tmp_path):
+    assert [scene.twist for scene in load_scene(_write(tmp_path, POLE)).scenes] == [True, True]
+    text = "twist = false\n" + POLE.replace("young_modulus = 3.3e9", "young_modulus = 3.3e9\npoisson_ratio = 0.3")
+    near, free = load_scene(_write(tmp_path, text)).scenes
+    assert (near.twist, free.twist) == (False, False)
+    assert near.array["C2"].whisker.poisson_ratio == 0.3
+    with pytest.raises(UsageError, match=r"'twist'.*true or false"):
+        load_scene(_write(tmp_path, "twist = 0\n" + POLE))
+
+
 def test_a_friction_below_zero_is_refused(tmp_path):
     with pytest.raises(UsageError, match=r"friction.*-1"):
         load_scene(_write(tmp_path, POLE.replace("friction = 0.3", "friction = -1")))

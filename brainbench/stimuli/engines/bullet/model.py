@@ -1,8 +1,8 @@
 """One whisker among obstacles as a Bullet multi-body, in mg, mm and ms, so in mN and µN·m.
 
 Joint tree: world → three slides along x, y, z → three turns (θ − π/2 about z, φ about −y, ζ + π/2 about x)
-→ link 0 → … → link N − 1, each link on two hinges. The first six joints are the follicle, whose motion is
-prescribed; their reactions are the base wrench. Letters: n time step, N link.
+→ link 0 → … → link N − 1, each link on two hinges: like WHISKiT's, these whiskers do not twist. The first six joints
+are the follicle, whose motion is prescribed; their reactions are the base wrench. Letters: n time step, N link.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from brainbench.core.errors import MissingDependencyError, UsageError, missing_dependency
+from brainbench.core.errors import MissingDependencyError, UsageError, install_command, missing_dependency
 from brainbench.stimuli.engines.tapered_links import LEAST_TAPER, cone_vertices
 from brainbench.stimuli.engines.units import MICRO, MILLI
 from brainbench.stimuli.objects.obstacle import Box, Capsule, ConvexPart, Cylinder, Obstacle, Part, Sphere
@@ -42,7 +42,7 @@ def engine() -> Any:
         if sys.version_info >= (3, 12):
             raise MissingDependencyError(
                 "The whisker backend 'bullet' needs PyBullet, which is made for Python below 3.12; "
-                "use Python 3.11 with pip install 'brainbench[bullet]', or the backend 'mujoco'."
+                f"use Python 3.11 with {install_command('bullet')}, or the backend 'mujoco'."
             ) from error
         raise missing_dependency("pybullet", extra="bullet", purpose="The whisker backend 'bullet'") from error
 

@@ -299,7 +299,7 @@ def _trace(result: LaunchResult, row: int, job: Job, fidelity: Fidelity, seconds
     touching = (arc >= 0) & good
     reason = str(result.verdict.reasons[row, 0])
     shape, felt = result.points, result.contact_wrench
-    base = None if shape is None else np.asarray(job.follicle.pose(job.times)[0], dtype=float)[:, None]
+    base = np.asarray(job.follicle.pose(job.times)[0], dtype=float)[:, None]
     nodes = fidelity.link_count(job.whisker.arc_length) + 1
     return Trace(
         wrench=np.where(good[:, None], result.wrench[row, :, 0].astype(float), np.nan),

@@ -133,6 +133,7 @@ def list_contacts(
                 for n in range(span[0], span[1]):
                     if wp.length(probes.position[n] - point) <= plan.reach[n] + overlap:
                         felt = felt | bit
+                        break
     load = state.contact_force[c]
     if felt != tracked and load > 0.0:
         wp.atomic_or(state.status, env, 4)
@@ -150,7 +151,7 @@ def list_contacts(
 
 @wp.kernel
 def sort_contacts(nodes: ContactNodes):
-    """Bring lists into the order of contacts, so that sums do not depend on threads. Thread: environment, link [B, L]."""
+    """Bring lists into the order of contacts, so that sums do not depend on threads. Thread: [B, L]."""
     env, link = wp.tid()
     first = int(-1)
     node = nodes.head[env, link]

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from robotics_bridge.physics import Geometry, HandState, MujocoEngine, TouchScene
+from robotics_bridge.physics import Geometry, HandState, MujocoEngine, MujocoWarpEngine, TouchScene
 from robotics_bridge.sensors import KinematicTaxel, Noise, Probes, SensorSuite
 from tests.factories.touch_scenes import pad_scene, poses_at, rotation_of
 
@@ -170,9 +170,8 @@ MODEL = """<mujoco><option timestep="0.002" cone="{cone}" gravity="0 0 -9.81" im
 THINGS = ('type="box" size=".005 .006 .005"', 'type="cylinder" size=".005 .005"')
 
 
-@pytest.mark.parametrize("seed", range(6))
-def test_taxels_carry_weight_and_friction_of_what_rests_on_a_slope(seed: int) -> None:
-    """MuJoCo's own sum of contact forces (mj_contactForce) and, at rest, m g: normal and along the slope."""
+def _slope(seed: int) -> Any:
+    """Two boxes and a cylinder at rest on a tilted pad, with one of the two friction cones."""
     import mujoco
 
     rng = np.random.default_rng(seed)
@@ -185,9 +184,29 @@ def test_taxels_carry_weight_and_friction_of_what_rests_on_a_slope(seed: int) ->
         f'<geom {THINGS[n % 2]} mass="{m}" condim="{condim}" friction="1 .01 .001"/></body>'
         for n, ((x, y), m) in enumerate(zip(places, rng.uniform(0.05, 0.5, 3), strict=True))
     )
-    engine = MujocoEngine(
-        mujoco.MjModel.from_xml_string(MODEL.format(cone=cone, condim=condim, tilt=tilt, objects=objects)), 1
-    )
+    return mujoco.MjModel.from_xml_string(MODEL.format(cone=cone, condim=condim, tilt=tilt, objects=objects))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [0, 1])
+def test_the_engine_of_the_gpu_tells_the_same_friction(seed: int) -> None:
+    pytest.importorskip("mujoco_warp")
+    model, totals = _slope(seed), []
+    for engine in (MujocoEngine(model, 1), MujocoWarpEngine(model, 1, device="cpu")):
+        engine.step(400)
+        suite = SensorSuite(engine.scene, {"t": KinematicTaxel(link="hand", probes=TOP, total="engine")}, num_envs=1)
+        suite.update(engine.state)
+        totals.append(suite.read("t").sum((0, 1, 2)).numpy()[:3])
+    assert abs(totals[0][0]) > 0.1
+    np.testing.assert_allclose(totals[1], totals[0], atol=0.02 * np.abs(totals[0]).max())
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_taxels_carry_weight_and_friction_of_what_rests_on_a_slope(seed: int) -> None:
+    """MuJoCo's own sum of contact forces (mj_contactForce) and, at rest, m g: normal and along the slope."""
+    import mujoco
+
+    engine = MujocoEngine(_slope(seed), 1)
     engine.step(400)
     model, data = engine.model, engine.data[0]
     expected, force = np.zeros(3), np.zeros(6)
@@ -197,9 +216,7 @@ def test_taxels_carry_weight_and_friction_of_what_rests_on_a_slope(seed: int) ->
         sign = -1 if data.contact[index].geom1 == 0 else 1
         expected += sign * data.contact[index].frame.reshape(3, 3).T @ force[:3]
     hand = rotation_of(data.body("hand").xquat)
-    suite = SensorSuite(
-        engine.scene, {"t": KinematicTaxel(link="hand", probes=TOP, total="engine")}, num_envs=1
-    )
+    suite = SensorSuite(engine.scene, {"t": KinematicTaxel(link="hand", probes=TOP, total="engine")}, num_envs=1)
     suite.update(engine.state)
     total = hand.apply(suite.read("t").sum((0, 1, 2)).numpy()[:3])
     weight = float(model.body_mass.sum()) - float(model.body("hand").mass[0])

@@ -160,6 +160,44 @@ def test_touching_a_half_space_gives_the_temperatures_of_two_half_spaces(name):
     assert read[-1] == pytest.approx(interface, abs=0.03 * 20)
 
 
+@pytest.mark.parametrize("own", ["silicone", "skin", "glass"])
+@pytest.mark.parametrize("other", ["aluminium", "steel", "wood"])
+def test_short_touches_take_up_the_heat_of_two_half_spaces(own, other):
+    """Carslaw & Jaeger: Q = 2 ΔT A e₁e₂/(e₁ + e₂) √(t/π), on default cells."""
+    half, found = (0.2, 0.2, 0.01), []
+    e1, e2 = material(own).effusivity, material(other).effusivity
+    for dt in (0.002, 0.01):
+        suite, state = _make(
+            half=half, contacts=4, material=own, base_temperature=33.0, bodies={"object": ThermalBody(other, 13.0)}
+        )
+        _face(state, 0.2, height=0.01)
+        capacity = material(own).density * material(own).specific_heat * 8 * math.prod(half) / 8
+        for step in range(1, round((1 if dt == 0.002 else 5) / dt) + 1):
+            suite.update(state, dt)
+            if round(step * dt, 6) in (0.01, 0.1, 1.0, 5.0):
+                heat = capacity * float((33 - suite.runtimes[0].heat.temperature.numpy()).sum())
+                found.append(heat / (40 * 0.16 * e1 * e2 / (e1 + e2) * math.sqrt(step * dt / math.pi)))
+    assert len(found) == 7
+    np.testing.assert_allclose(found, 1, atol=0.01)
+
+
+def test_a_patch_warms_every_cell_that_it_covers_and_no_other():
+    pad = {"cells": (6, 6, 1), "half": (0.03, 0.03, 0.005), "bodies": {"object": ThermalBody("steel", 60.0)}}
+    suite, state = _make(contacts=4, **pad)
+    _face(state, 0.02, height=0.005)
+    suite.update(state, 1e-3)
+    warmed = suite.read_ground_truth("grid")[0, :, :, 0].numpy() - 22
+    inner = warmed[1:5, 1:5]
+    assert inner.min() == pytest.approx(inner.max(), rel=0.2)
+    assert inner.min() > 100 * max(warmed[0].max(), warmed[:, -1].max())
+    # A single point is a disc: as large as several cells, it reaches all of them.
+    suite, state = _make(contacts=1, contact_radius=1.0, **pad)
+    state.set_contacts([0], [[0, 1]], distance=[-2e-4], position=[[0, 0, 0.005]], normal=[[0, 0, 1.0]])
+    suite.update(state, 1e-3)
+    warmed = suite.read_ground_truth("grid")[0, :, :, 0].numpy() - 22
+    assert (warmed[1:5, 1:5] > 0).all()
+
+
 def test_metal_feels_colder_than_wood_at_the_same_temperature():
     felt = {}
     for name in ("aluminium", "glass", "wood"):
@@ -239,6 +277,12 @@ def test_the_element_lags_exactly_and_reads_less_upward_than_downward():
             suite.update(state, step)
             assert float(suite.read("grid")) == pytest.approx(30 - 10 * math.exp(-count * step / 0.4), abs=1e-4)
         assert float(suite.read_ground_truth("grid")) == pytest.approx(30, abs=1e-4)
+    # A source warms evenly at 3 K/s; the element follows by τ, whatever the step.
+    for step in (1e-3, 0.1, 0.6):
+        suite, state = _make(cells=(1, 1, 1), tau=0.4, base_temperature=22.0, source=3e6)
+        for _ in range(round(1.2 / step)):
+            suite.update(state, step)
+        assert float(suite.read("grid")) == pytest.approx(22 + 3 * (1.2 - 0.4 * (1 - math.exp(-3))), abs=1e-3)
     suite, state = _make(cells=(1, 1, 2), warm_range=5.0, cold_range=15.0, base_temperature=30.0)
     suite.update(state, 1e-3)
     _field(suite, np.array([80.0, -40.0]))
@@ -266,6 +310,9 @@ def test_environments_are_reset_and_break_alone():
     assert after[1].max() < read[1].max()
     assert np.all(np.abs(after[2].numpy() - 22) < 1e-4)
     pose[0, 1, 0] = 0.0
+    suite.update(state, 0.02)
+    assert suite.read("grid")[0].isnan().all()
+    suite.reset([0])
     suite.update(state, 0.02)
     assert suite.read("grid")[0].isfinite().all()
 

@@ -1,0 +1,132 @@
+"""Which side of a link touches: where it goes when fingers flex, or towards the opposite jaw."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from brainbench.core.devices import mujoco_module
+from robotics_bridge.hands.layouts import palm_side
+from robotics_bridge.hands.surface import link_points
+
+mujoco = mujoco_module()
+
+_CROSSED = 0.012
+"""Joints nearer to each other (m) act on a link together."""
+_SNAP = 0.9
+"""Cosine from which a direction counts as that of an axis of its link: jaws have flat faces."""
+
+
+def palmar_directions(model: Any, palm: str, fingers: Mapping[str, tuple[str, ...]]) -> dict[str, np.ndarray]:
+    """Return link → the direction [3] of its palmar side, in the link's frame.
+
+    A link's palmar side is where it moves when its joint flexes (of two crossed joints, the one with more range
+    counts). A joint that swings as far to both sides spreads or twists the finger and tells nothing: such links
+    face as the next one towards the tip does. What slides, and tips of which no joint tells, face the other fingers.
+    The palm faces where the finger tips go, along the nearest axis of its frame, or the tips of jaws.
+    """
+    data = mujoco.MjData(model)
+    # Jaws stand half open, so that one lies on each side.
+    for joint in np.flatnonzero((model.jnt_type == mujoco.mjtJoint.mjJNT_SLIDE) & (model.jnt_limited != 0)):
+        data.qpos[model.jnt_qposadr[joint]] = model.jnt_range[joint].mean()
+    mujoco.mj_kinematics(model, data)
+    towards: dict[str, np.ndarray] = {}
+    tips = []
+    for name, chain in fingers.items():
+        known: np.ndarray | None = None
+        for place in reversed(range(len(chain))):
+            body = model.body(chain[place]).id
+            following = data.xpos[model.body(chain[place + 1]).id] if place + 1 < len(chain) else None
+            world = _flexed(model, data, body, following)
+            if world is None and known is None and place + 1 == len(chain):
+                others = [other[-1] for key, other in fingers.items() if key != name] or [palm]
+                world = _opposite(model, data, body, [model.body(other).id for other in others])
+                if world is None:
+                    world = _flexed(model, data, body, following, symmetric=True)
+            known = known if world is None else world
+            if known is not None:
+                towards[chain[place]] = data.xmat[body].reshape(3, 3).T @ known
+                tips += [known] if place + 1 == len(chain) else []
+    if tips:
+        mean, body = np.mean(tips, axis=0), model.body(palm).id
+        if np.linalg.norm(mean) <= 0.1:
+            # Jaws go towards each other: the palm faces what lies between them.
+            ends = [_middle(model, data, model.body(chain[-1]).id) for chain in fingers.values()]
+            mean = np.mean(ends, axis=0) - _middle(model, data, body)
+        elif list(map(len, fingers.values())) == [1]:
+            # A single jaw closes on the palm itself.
+            mean = -mean
+        if np.linalg.norm(mean) > 1e-6:
+            # In the palm's frame, snapped to the nearest of its axes.
+            turned = data.xmat[body].reshape(3, 3).T @ mean
+            face = np.argmax(np.abs(turned))
+            towards[palm] = np.sign(turned[face]) * np.eye(3)[face]
+    return towards
+
+
+def _middle(model: Any, data: Any, body: int) -> NDArray[np.float64]:
+    """Return the middle of a body's solids [3] (world, m), its origin where it has none."""
+    own = link_points(model, body)
+    local = (own.min(axis=0) + own.max(axis=0)) / 2 if len(own) else np.zeros(3)
+    return data.xpos[body] + data.xmat[body].reshape(3, 3) @ local
+
+
+def _opposite(model: Any, data: Any, body: int, others: list[int]) -> NDArray[np.float64] | None:
+    """Return the direction [3] (world) from a tip to the others: along its slide, else along an axis of its frame."""
+    away = np.mean([_middle(model, data, other) for other in others], axis=0) - _middle(model, data, body)
+    length = float(np.linalg.norm(away))
+    if length < 1e-6:
+        return None
+    slide = _joint_of(model, body, mujoco.mjtJoint.mjJNT_SLIDE)
+    if slide >= 0:
+        axis = data.xmat[model.jnt_bodyid[slide]].reshape(3, 3) @ model.jnt_axis[slide]
+        along = float(axis @ away)
+        return np.sign(along) * axis if abs(along) > 0.1 * length else None
+    axes = data.xmat[body].reshape(3, 3).T
+    cosine = axes @ away / length
+    face = int(np.argmax(np.abs(cosine)))
+    return np.sign(cosine[face]) * axes[face] if abs(cosine[face]) > _SNAP else away / length
+
+
+def _joint_of(model: Any, body: int, kind: Any) -> int:
+    """Return the joint that moves a body, of its own or of what it is fixed to, if it is of a kind; −1 otherwise."""
+    body = int(model.body_weldid[body])
+    joint = int(model.body_jntadr[body])
+    return joint if joint >= 0 and int(model.jnt_type[joint]) == int(kind) else -1
+
+
+def _flexed(
+    model: Any, data: Any, body: int, following: np.ndarray | None, *, symmetric: bool = False
+) -> np.ndarray | None:
+    """Return where a body goes [3] (world) when its joint flexes; None if that is not known."""
+    own = link_points(model, body)
+    joint = _flexion(model, body)
+    slides = _joint_of(model, body, mujoco.mjtJoint.mjJNT_SLIDE) >= 0
+    if joint < 0 or slides or not len(own):
+        return None
+    low, high = (float(value) for value in model.jnt_range[joint])
+    if not symmetric and abs(high + low) < 0.2 * (high - low):
+        return None
+    end, start = following, int(model.body_weldid[body])
+    if end is None or start != body or np.linalg.norm(end - data.xpos[body]) < 1e-6:
+        end = data.xpos[body] + data.xmat[body].reshape(3, 3) @ own.mean(axis=0)
+    axis = data.xmat[model.jnt_bodyid[joint]].reshape(3, 3) @ model.jnt_axis[joint]
+    world = palm_side(axis, end - data.xpos[start], (low, high))
+    return world if np.any(world) else None
+
+
+def _flexion(model: Any, body: int) -> int:
+    """Return the joint that flexes a body: of its own and those that cross them, the one with the largest range."""
+    best, most = -1, 0.0
+    while body > 0:
+        for joint in range(int(model.body_jntadr[body]), int(model.body_jntadr[body]) + int(model.body_jntnum[body])):
+            span = float(np.ptp(model.jnt_range[joint])) if model.jnt_limited[joint] else 2 * np.pi
+            if int(model.jnt_type[joint]) == 3 and span > most:
+                best, most = joint, span
+        if best >= 0 and np.linalg.norm(model.body_pos[body]) > _CROSSED:
+            break
+        body = int(model.body_parentid[body])
+    return best
