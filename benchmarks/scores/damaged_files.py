@@ -104,8 +104,8 @@ NOTE = (
     "attributes in HDF5; other headers, values and objects in archives of arrays and weights; and a folder, FIFO, "
     "endless device or broken link in place of the file. *memory*: more than 2 GiB beyond the process; *hang*: more "
     "than 10 s of work, or 30 s by the clock; *silent*: a number that is not finite or out of range was accepted; "
-    "*wordy*: an error of more than 1,000 characters. Before: for the first 29 surfaces the code of 2026-11-21, for "
-    "those marked * the code of commit ad20c3f."
+    "*wordy*: an error of more than 1,000 characters. Before is the code of 2026-11-21; for surfaces that came later "
+    "(site manifest, commitment, trainings, and all after the seeds text) it is commit ad20c3f."
 )
 
 

@@ -27,6 +27,8 @@ _AUTO_GRIDS = {
 """Rows, columns and radius (m) on a link of a hand without a layout of its own."""
 _NAMES = {"name", "class", "childclass", "joint", "body", "link", "geom", "site", "mesh", "material", "file"}
 """Attributes of URDF and MJCF that hold words."""
+_LARGEST = 1e15
+"""Magnitude of numbers in a hand's file that no hand has."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -191,11 +193,18 @@ def _check_xml(path: Path) -> None:
                 _check_xml(path.parent / element.get("file", ""))
             for key, value in element.items():
                 for word in value.split() if key not in _NAMES else ():
-                    if word.lstrip("+-").lower() in ("nan", "inf", "infinity"):
+                    if _is_absurd(word):
                         raise DataError(
                             f"{key!r} of <{shown(element.tag, quoted=False)}> in {shown(str(path))} is {shown(value)}; "
-                            "finite numbers are needed."
+                            f"finite numbers of at most {_LARGEST:g} are needed."
                         )
+
+
+def _is_absurd(word: str) -> bool:
+    try:
+        return not abs(float(word)) <= _LARGEST
+    except ValueError:
+        return False
 
 
 def from_file(path: Path) -> Hand:
@@ -208,6 +217,9 @@ def from_file(path: Path) -> Hand:
     """
     with readable(path, "URDF or MJCF file"):
         model = read_mjspec(path).compile()
+        for name in ("geom_friction", "dof_damping", "dof_armature"):
+            if (getattr(model, name) < 0).any():
+                raise DataError(f"{shown(str(path))} has a {name} below 0; give 0 or more.")
     children: dict[int, list[int]] = {body: [] for body in range(model.nbody)}
     for body in range(1, model.nbody):
         children[int(model.body_parentid[body])].append(body)
