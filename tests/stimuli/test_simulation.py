@@ -151,7 +151,7 @@ def test_an_engine_gets_ready_before_it_runs_and_not_for_what_is_in_the_cache(mo
             thread.join()
     simulate(scene, fidelity=fidelity, backend="fake")
     lengths = sorted({mount.whisker.arc_length for mount in scene.mounts})
-    assert engine.ready == [(lengths, fidelity, 0)] * 2
+    assert engine.ready == [(lengths, fidelity.resolved(engine.twists), 0)] * 2
     simulation.prepare([scene], fidelity=fidelity, backend="fake")
     simulate(scene, fidelity=fidelity, backend="fake")
     assert len(engine.ready) == 2

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from brainbench.cli.tactile import figures
-from brainbench.core.figures.style import save_figure
+from brainbench.core.figures.style import panels, save_figure
 from brainbench.stimuli.figures.camera import Camera
 from brainbench.stimuli.figures.films import write_film
 from brainbench.stimuli.figures.raster import Triangles
@@ -95,7 +95,7 @@ def write_strip(path: Path, frames: Sequence[NDArray[np.uint8]], times: Sequence
     """Write a PNG of frames side by side, each with its time (s)."""
     height, width = frames[0].shape[:2]
     scale = 2.2
-    figure, axes = figures.panels(len(frames), (scale * len(frames) * width / height, scale))
+    figure, (axes,) = panels(1, len(frames), (scale * len(frames) * width / height, scale))
     for ax, frame, time in zip(axes, frames, times, strict=True):
         ax.imshow(frame)
         ax.set_title(f"{time:.1f} s", fontsize=8)

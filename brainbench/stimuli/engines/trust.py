@@ -36,7 +36,8 @@ LARGEST_START_OVERLAP = 2e-5
 """The same at the start, where nothing has moved yet: what one step undoes, far more than rounding."""
 LARGEST_STRAIN = 0.01
 """Stretch of the base from which a base force cannot be right. A chain cannot stretch, which beyond this is a worse
-error than any preset has, and keratin yields at some 2 %. Whiskers that brush past objects reach .0003."""
+error than any preset has, and keratin yields at some 2 %. Whiskers that brush past objects reach .0001
+(benchmarks/RESULTS.md)."""
 SUSPICIOUS_SHARE = 0.4
 """Share of the largest overlap, residual and base force from which a reliable whisker is suspicious."""
 LARGEST_CHANGE = 0.2

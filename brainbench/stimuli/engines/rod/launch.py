@@ -99,7 +99,7 @@ class WhiskerSolver:
         device: Any,
         needs: int,
         *,
-        twists: bool = True,
+        twists: bool | None = None,
         block: int | None = None,
         sliced: bool = False,
         **options: Any,
@@ -109,7 +109,8 @@ class WhiskerSolver:
         Args:
             chains, fidelity: whiskers, with their time step, precision and solver.
             device, needs, options: as for :func:`brainbench.stimuli.engines.rod.compilation.load_kernels`.
-            twists: False when nothing twists the whiskers: their joints then have two hinges instead of three.
+            twists: False when nothing twists the whiskers: their joints then have two hinges instead of three. As the
+                fidelity says when None.
             block: threads of a block on a GPU; Warp's choice when None.
             sliced: True when whiskers pause for distances and contact forces (:class:`.scheduling.Slices`).
         """
@@ -117,7 +118,7 @@ class WhiskerSolver:
         self.real = real_type(fidelity)
         self.capacity = capacity_for(max(chain.links for chain in chains))
         self.quasistatic = fidelity.solver == "quasistatic"
-        hinges = 2 + twists
+        hinges = 2 + (fidelity.twist is not False if twists is None else twists)
         if options:
             options["sliced"] = sliced
         self.kernels = load_kernels(device, self.real, self.capacity, needs, hinges=hinges, **options)

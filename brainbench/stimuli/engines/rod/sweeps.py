@@ -66,8 +66,7 @@ class SweepLauncher:
         """Elapsed time of the last launch for placing objects, uploading, and computing."""
         mounts = list(scenes.array)
         chains = [fidelity.chain(mount.whisker) for mount in mounts]
-        how = {"twists": fidelity.twist is not False, "block": BLOCK, "sliced": sliced, "bounds": bounds}
-        self.solver = WhiskerSolver(chains, fidelity, self.device, against, **how)
+        self.solver = WhiskerSolver(chains, fidelity, self.device, against, block=BLOCK, sliced=sliced, bounds=bounds)
         self._head = grid.head.matrix
         self._origin = np.asarray(grid.head.position)
         self._objects: dict[str, tuple[float, PackedSurface]] = {}
