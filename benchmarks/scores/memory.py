@@ -164,8 +164,9 @@ def main() -> None:
 NOTE = (
     "Largest resident memory of a process that does one job (PyTorch, NumPy and the rest of the program, .4 to .7 GB, "
     f"are in it). Where nothing else is said, scores are of one session of {UNITS:,} units × {TRIALS} trials × 1 s in "
-    f"bins of {BIN:g} s. Durations are with other work on the machine. At commit ad20c3f the same took 2.9 GB (every "
-    "time step kept), 4.3 (crossnobis), 3.7 (trials of unequal length) and 1.5 (over time)."
+    f"bins of {BIN:g} s. Durations are with other work on the machine. At commit ad20c3f recordings of these "
+    "sizes took 2.9 GB (every time step kept), 4.3 (crossnobis), 3.7 (trials of unequal length) and 1.5 (over "
+    "time), by a script of the same calls. Lines that are missing were not measured yet."
 )
 
 
