@@ -290,9 +290,8 @@ class _Whisk:
 
     def pose(self, times: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return base points [n, 3] (m), all at the origin, and angles (θ, φ, ζ) [n, 3] (rad) at times [n] (s)."""
-        swing = self.amplitude * (1 - np.cos(2 * np.pi * 20 * times) * smooth_step(times, 0.025))
         euler = np.tile([math.pi / 2, 0.0, -math.pi / 2], (len(times), 1))
-        euler[:, 0] += swing - swing[0]
+        euler[:, 0] -= self.amplitude * np.cos(2 * np.pi * 20 * times) * smooth_step(times, 0.025)
         return np.zeros((len(times), 3)), euler
 
 
