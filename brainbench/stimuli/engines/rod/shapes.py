@@ -41,14 +41,20 @@ class PackedSurface:
 
     @classmethod
     def of(cls, vertices: NDArray[np.float64], faces: NDArray[np.integer]) -> PackedSurface:
-        """Order the triangles of a surface; its unit of length stays."""
+        """Order the triangles of a surface; its unit of length stays.
+
+        Those without a width, which hulls of flat faces hold, are left out: their neighbours hold all of their points.
+        """
         from scipy.spatial import ConvexHull
 
         faces = faces[spatial_order(vertices[faces])]
-        corners = vertices[faces]
+        wide = ~slivers(vertices[faces])
+        if not wide.any():
+            wide[:] = True
+        corners = vertices[faces[wide]]
         outline = vertices[ConvexHull(vertices[:, :2]).vertices, :2]
         radius = float(np.linalg.norm(vertices, axis=1).max())
-        return cls(corners, pseudo_normals(vertices, faces), tree_boxes(corners), outline, radius)
+        return cls(corners, pseudo_normals(vertices, faces)[wide], tree_boxes(corners), outline, radius)
 
 
 @dataclass(frozen=True, eq=False)
@@ -191,7 +197,7 @@ def pseudo_normals(vertices: NDArray[np.float64], faces: NDArray[np.integer]) ->
     names = edges[..., 0].astype(np.int64) * len(vertices) + edges[..., 1]
     _, which = np.unique(names, return_inverse=True)
     which = which.reshape(-1, 3)
-    faced, at_corner, across = _face_normals(corners, which)
+    at_corner, across = _face_normals(corners, which)
     at_vertex = np.zeros_like(vertices)
     for k in range(3):
         to_next, to_last = corners[:, (k + 1) % 3] - corners[:, k], corners[:, (k + 2) % 3] - corners[:, k]
@@ -202,18 +208,24 @@ def pseudo_normals(vertices: NDArray[np.float64], faces: NDArray[np.integer]) ->
             at_vertex[:, axis] += np.bincount(faces[:, k], at_corner[:, axis] * angle, len(vertices))
     spread = across.reshape(-1, 3)
     at_edge = np.stack([np.bincount(which.ravel(), spread[:, axis]) for axis in range(3)], axis=1)
-    found = np.concatenate([faced[:, None], at_vertex[faces], at_edge[which]], axis=1)
+    found = np.concatenate([at_corner[:, None], at_vertex[faces], at_edge[which]], axis=1)
     length = np.linalg.norm(found, axis=2, keepdims=True)
     return found / np.where(length > 0, length, 1.0)
 
 
+def slivers(corners: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Return which triangles [face, 3, 3] have no width, so that their direction is rounding."""
+    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    return area < SLIVER * np.max(np.sum((corners - np.roll(corners, 1, axis=1)) ** 2, axis=2), axis=1)
+
+
 def _face_normals(
     corners: NDArray[np.float64], which: NDArray[np.integer]
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Return the direction of each face [face, 3], and what it adds at its corners [face, 3] and edges [face, 3, 3].
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return what each face adds to the directions at its corners [face, 3] and at its edges [face, 3, 3].
 
-    All are the face's own normal, but for triangles without a width, which hulls of flat faces hold: their normals are
-    rounding. Where such a triangle lies in a sharp edge, its neighbours on the two sides stand for it.
+    Both are the face's own normal, but for :func:`slivers`. Where one of them lies in a sharp edge, the faces on its
+    two sides are the neighbours: through its longest edge one sees what lies at the others, and the other way round.
 
     Args:
         corners: [face, 3, 3].
@@ -223,29 +235,23 @@ def _face_normals(
     size = np.linalg.norm(normals, axis=1, keepdims=True)
     normals = normals / np.where(size > 0, size, 1.0)
     across = np.repeat(normals[:, None], 3, axis=1)
-    length = np.linalg.norm(np.roll(corners, -1, axis=1) - np.roll(corners, 1, axis=1), axis=2)
-    slivers = np.flatnonzero(size[:, 0] < SLIVER * length.max(axis=1) ** 2)
-    if not len(slivers):
-        return normals, normals, across
-    longest = length[slivers].argmax(axis=1)
-    rows = np.arange(len(slivers))
-    at_corner = normals.copy()
+    slim = np.flatnonzero(slivers(corners))
+    rows = np.arange(len(slim))
+    edges = np.roll(corners[slim], -1, axis=1) - np.roll(corners[slim], 1, axis=1)
+    longest = np.linalg.norm(edges, axis=2).argmax(axis=1)
+    across[slim] = normals[slim] = 0.0
     # Neighbours may be slivers themselves: what lies beyond them comes nearer by one in every round.
-    across[slivers] = at_corner[slivers] = 0.0
-    for _ in range(SLIVER_ROUNDS):
+    for _ in range(SLIVER_ROUNDS if len(slim) else 0):
         sums = np.stack([np.bincount(which.ravel(), across[..., axis].ravel()) for axis in range(3)], axis=1)
-        seen = sums[which[slivers]] - across[slivers]
+        seen = sums[which[slim]] - across[slim]
         beyond = seen[rows, longest]
         before = seen.sum(axis=1) - beyond
-        before /= np.maximum(np.linalg.norm(before, axis=1, keepdims=True), 1e-12)
-        # Through its longest edge one sees what lies at the others, through these what lies at the longest.
         passed = np.repeat(beyond[:, None], 3, axis=1)
-        passed[rows, longest] = before
-        if np.array_equal(passed, across[slivers]):
+        passed[rows, longest] = before / np.maximum(np.linalg.norm(before, axis=1, keepdims=True), 1e-12)
+        if np.array_equal(passed, across[slim]):
             break
-        across[slivers], at_corner[slivers] = passed, beyond
-    normals[slivers] = across[slivers].sum(axis=1)
-    return normals, at_corner, across
+        across[slim], normals[slim] = passed, beyond
+    return normals, across
 
 
 def _mm(vector: Any) -> NDArray[np.float64]:
