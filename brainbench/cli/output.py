@@ -96,12 +96,15 @@ def table(title: str, columns: list[str], rows: list[list[str]], *, right: tuple
         grid.add_column(column, justify="right" if index in right else "left", overflow="fold", no_wrap=not index)
     for row in rows:
         grid.add_row(*row)
+    first = max((len(row[0]) for row in rows if row), default=0)
+    needed = first + 80 if first > 40 else 0
     terminal = sys.stdout.isatty()
     buffer = StringIO()
     Console(
         file=buffer,
         force_terminal=terminal,
-        width=None if terminal else 120,
+        # The first column is not folded, and the others keep their room beside a long name.
+        width=max(Console().width, needed) if terminal else max(120, needed),
         highlight=False,
         markup=False,
         emoji=False,

@@ -195,11 +195,12 @@ def locate_model(name: str, pretrained: str | os.PathLike[str] | None = None) ->
     given = Path(pretrained) if pretrained is not None and Path(pretrained).is_dir() else None
     folder = find_folder(name) if is_path else given or (shipped().get(name) if pretrained is None else None)
     trained = None if folder is None else read_config(folder)
-    parts, known = Architecture.parse(trained["architecture"] if is_path and trained else name), _known()
+    asked = trained["architecture"] if is_path and trained else name
+    parts, known = Architecture.parse(asked), _known()
     if parts.untrained not in known:
         # A tag stays in the suggestion: the untrained model is another one.
         choices = known if parts.tag is None else [*shipped(), *(f"{item}.{parts.tag}" for item in known)]
-        raise unknown_name("model", name, choices, hint="See them all with: brainbench models")
+        raise unknown_name("model", asked, choices, hint="See them all with: brainbench models")
     if parts.tag is not None and parts.tag not in OBJECTIVES:
         raise unknown_name(f"weights tag of {parts.untrained!r}", parts.tag, OBJECTIVES)
     if parts.tag is None and pretrained is not None:

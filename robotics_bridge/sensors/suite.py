@@ -241,7 +241,7 @@ class SensorSuite:
         return wp.to_torch(self.pairs.crowded) != 0
 
     def _warn_crowded(self) -> None:
-        if not self._warned and (most := int(wp.to_torch(self.pairs.crowded).max())):
+        if not self._warned and (most := int(self.pairs.crowded.numpy().max())):
             self._warned = True
             warnings.warn(
                 f"{most} geometries touched one sensor link at once, more than are listed; some were not felt. Make "

@@ -94,7 +94,7 @@ def test_more_classes_than_there_are_cannot_be_told_apart():
 
 def test_without_scikit_learn_the_extra_is_named(monkeypatch):
     monkeypatch.setitem(sys.modules, "sklearn.svm", None)
-    with pytest.raises(MissingDependencyError, match=r"brainbench\[learn\]"):
+    with pytest.raises(MissingDependencyError, match=r"\[learn\]"):
         separate(*_made(), count=2, names=NAMES)
 
 

@@ -87,7 +87,7 @@ def test_no_scheduler_at_the_address_is_said(tmp_path, monkeypatch):
 
 def test_without_dask_the_extra_is_named(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "distributed", None)
-    with pytest.raises(MissingDependencyError, match=r"brainbench\[cluster\]"):
+    with pytest.raises(MissingDependencyError, match=r"\[cluster\]"):
         generate(small_plan(), tmp_path, scheduler="tcp://127.0.0.1:9")
 
 

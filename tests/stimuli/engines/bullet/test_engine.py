@@ -44,7 +44,7 @@ def _scale(wrench):
 
 def test_without_pybullet_the_error_names_the_extra_or_the_python(monkeypatch):
     monkeypatch.setitem(sys.modules, "pybullet", None)
-    with pytest.raises(MissingDependencyError, match=r"brainbench\[bullet\]"):
+    with pytest.raises(MissingDependencyError, match=r"\[bullet\]"):
         model.engine()
     monkeypatch.setattr(sys, "version_info", (3, 12, 0, "final", 0))
     with pytest.raises(MissingDependencyError, match=r"'bullet' .*3\.12.*'mujoco'"):
