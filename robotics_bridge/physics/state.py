@@ -153,7 +153,7 @@ class HandState:
         if not values.is_cuda and bool((length == 0).any()):
             where = tuple((length[..., 0] == 0).nonzero()[0].tolist())
             raise UsageError(f"The quaternion of the pose {where} is zero, which is no orientation; use (1, 0, 0, 0).")
-        # What is a unit quaternion but for rounding stays as it is, so that a state that was kept comes back to the bit.
+        # A unit quaternion stays as it is but for rounding, so that a state that was kept comes back to the bit.
         length = torch.where((length - 1).abs() < 1e-6, torch.ones_like(length), length)
         self.pose_torch.copy_(torch.cat([values[..., :3], values[..., [4, 5, 6, 3]] / length], dim=-1))
 
