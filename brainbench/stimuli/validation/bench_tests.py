@@ -139,8 +139,8 @@ def point_load(
     if force == 0 or not math.isfinite(force):
         raise UsageError(f"force must be a finite number of newtons other than zero; received {force!r}.")
     expected = references.point_load_deflection(whisker, force, at)
-    job = replace(_at_rest(whisker, np.array([_settling_time(whisker)])), loads=(Load(at, (0.0, force, 0.0)),))
-    trace = _run(backend, job, fidelity)
+    job = replace(job_at_rest(whisker, np.array([settling_time(whisker)])), loads=(Load(at, (0.0, force, 0.0)),))
+    trace = run_one(backend, job, fidelity)
     assert trace.link_positions is not None
     links = trace.link_positions.shape[1] - 1
     place = at / whisker.arc_length * links
@@ -176,12 +176,12 @@ def peg(
     end = np.array(references.peg_centre(whisker, contact, peg_radius))
     # Straight below the end point, touching the undeformed rod.
     start = np.array([end[0], -math.copysign(peg_radius + float(whisker.radius(end[0])), offset)])
-    settling = _settling_time(whisker)
+    settling = settling_time(whisker)
     # Slow against the first mode, so that little swings when the peg stops.
     duration = max(0.1, 4 * settling)
     motion = _sliding(lambda times: start + smooth_step(times, duration)[:, None] * (end - start))
     rod = _peg_obstacle(whisker, peg_radius, motion)
-    trace = _run(backend, _at_rest(whisker, np.array([duration + settling]), rod), fidelity)
+    trace = run_one(backend, job_at_rest(whisker, np.array([duration + settling]), rod), fidelity)
     return BenchTest(trace.wrench[-1], contact.wrench, float(trace.contact_arc[-1]), trace)
 
 
@@ -207,7 +207,7 @@ def slip_off(
     _check_peg(whisker, peg_radius)
     touch = -(peg_radius + float(whisker.radius(at)))
     expected = references.slip_off_offset(whisker, at, peg_radius=peg_radius) - touch
-    settling = _settling_time(whisker)
+    settling = settling_time(whisker)
     # Near the end it creeps, because the last fold takes the longer the nearer it is to equilibrium.
     duration, approach = 70 * settling, 10 * settling
 
@@ -216,7 +216,7 @@ def slip_off(
 
     times = np.linspace(0, duration, 2001)[1:]
     rod = _pulley(whisker, peg_radius, _sliding(lambda t: np.column_stack([np.full(len(t), at), touch + depth(t)])))
-    trace = _run(backend, _at_rest(whisker, times, rod), fidelity)
+    trace = run_one(backend, job_at_rest(whisker, times, rod), fidelity)
     held = np.flatnonzero(trace.contact)
     if not len(held) or held[-1] == len(times) - 1:
         raise DataError(
@@ -267,7 +267,7 @@ def ringdown(
     times = release + np.arange(1.0, math.ceil(10 / (whisker.damping_ratio * 2 * math.pi * expected) / step)) * step
     # Half a step before the release: rounding cannot let the load act for one step more.
     load = Load(whisker.arc_length, (0.0, force, 0.0), stop=release - step / 2)
-    trace = _run(backend, Job(whisker, StillFollicle(), (), times, loads=(load,)), fidelity)
+    trace = run_one(backend, Job(whisker, StillFollicle(), (), times, loads=(load,)), fidelity)
     times = times - release
     # Stiffness-proportional damping kills the second mode much sooner: one period is enough.
     kept = times > 1 / expected
@@ -302,7 +302,7 @@ def _ring_mode(
     loads = tuple(
         Load(float(arc), (0.0, float(force), 0.0)) for arc, force in zip(chain.nodes[1:], forces, strict=True)
     )
-    trace = _run(backend, Job(light, StillFollicle(), (), times, loads=loads), fine)
+    trace = run_one(backend, Job(light, StillFollicle(), (), times, loads=loads), fine)
     assert trace.link_positions is not None
     # The mode swings about its static bend under the loads.
     tip = trace.link_positions[:, -1, 1] - float(levers[:, -1] @ bends)
@@ -313,7 +313,7 @@ def _relative(measured: NDArray, reference: NDArray) -> float:
     return float(np.linalg.norm(measured - reference) / np.linalg.norm(reference))
 
 
-def _at_rest(whisker: Whisker, times: NDArray[np.float64], *obstacles: Obstacle) -> Job:
+def job_at_rest(whisker: Whisker, times: NDArray[np.float64], *obstacles: Obstacle) -> Job:
     """Return the job of a static test: critical damping changes only how soon the end state is reached."""
     return Job(replace(whisker, damping_ratio=1.0), StillFollicle(), obstacles, times)
 
@@ -369,13 +369,14 @@ def _fit_decay(times: NDArray, signal: NDArray, frequency: float, ratio: float) 
     return float(found[0]) / (2 * math.pi), float(found[1])
 
 
-def _settling_time(whisker: Whisker) -> float:
+def settling_time(whisker: Whisker) -> float:
     """Return the time (s) in which the first mode decays far below 1e-6 at critical damping."""
     # Critically damped, (1 + ω t) e^(−ω t) of a swing is left: 2e-15 after six periods.
     return 6.0 / float(references.natural_frequencies(whisker, 1)[0])
 
 
-def _run(backend: str, job: Job, fidelity: Fidelity | str) -> Trace:
+def run_one(backend: str, job: Job, fidelity: Fidelity | str) -> Trace:
+    """Run one job with its shapes; an unstable one is a :class:`DataError`."""
     return run_stable(get_engine(backend), [job], Fidelity.of(fidelity), record_shape=True)[0]
 
 

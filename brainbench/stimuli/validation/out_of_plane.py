@@ -10,13 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brainbench.core.errors import UsageError
-from brainbench.stimuli.engines import DEFAULT_ENGINE, get_engine
+from brainbench.stimuli.engines import DEFAULT_ENGINE
 from brainbench.stimuli.engines.fidelity import Fidelity
-from brainbench.stimuli.engines.protocol import Job, Load, StillFollicle
+from brainbench.stimuli.engines.protocol import Load
 from brainbench.stimuli.motion.trajectories import smooth_step
 from brainbench.stimuli.objects.obstacle import Capsule, Obstacle
-from brainbench.stimuli.validation import references
-from brainbench.stimuli.validation.bench_tests import BenchTest, PointLoad, run_stable
+from brainbench.stimuli.validation.bench_tests import BenchTest, PointLoad, job_at_rest, run_one, settling_time
 from brainbench.stimuli.validation.kirchhoff import KirchhoffRod, RodEquilibrium, load_rod, press_rod
 from brainbench.stimuli.whiskers.whisker import Whisker
 
@@ -39,9 +38,8 @@ def load_aside(
     """
     _check(whisker, at=at, force=force)
     expected = load_rod(KirchhoffRod.of(whisker), at, (0.0, 0.0, force))
-    times, loads = np.array([_settling_time(whisker)]), (Load(at, (0.0, 0.0, force)),)
-    job = Job(replace(whisker, damping_ratio=1.0), StillFollicle(), (), times, loads=loads)
-    trace = run_stable(get_engine(backend), [job], Fidelity.of(fidelity), record_shape=True)[0]
+    job = replace(job_at_rest(whisker, np.array([settling_time(whisker)])), loads=(Load(at, (0.0, 0.0, force)),))
+    trace = run_one(backend, job, fidelity)
     assert trace.link_positions is not None
     nodes = np.linspace(0, whisker.arc_length, trace.link_positions.shape[1])
     deflection = float(np.interp(at, nodes, trace.link_positions[-1, :, 2]))
@@ -71,7 +69,7 @@ def push_aside(
     expected, axis, way = _expected(whisker, at, offset, peg_radius), _axis(whisker, at), np.array([0.0, 0.0, 1.0])
     touch = np.append(whisker.centre_line(at), -peg_radius - float(whisker.radius(at)))
     # The peg is slow against the first mode.
-    settling = _settling_time(whisker)
+    settling = settling_time(whisker)
     duration = max(0.1, 4 * settling)
 
     def motion(times: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -79,8 +77,7 @@ def push_aside(
 
     x, y, z = (whisker.arc_length * axis).tolist()
     rod = Obstacle((Capsule((-x, -y, -z), (x, y, z), peg_radius),), motion, friction=0.0)
-    job = Job(replace(whisker, damping_ratio=1.0), StillFollicle(), (rod,), np.array([duration + settling]))
-    trace = run_stable(get_engine(backend), [job], Fidelity.of(fidelity), record_shape=True)[0]
+    trace = run_one(backend, job_at_rest(whisker, np.array([duration + settling]), rod), fidelity)
     return BenchTest(trace.wrench[-1], expected.wrench, float(trace.contact_arc[-1]), trace)
 
 
@@ -90,11 +87,6 @@ def _check(whisker: Whisker, at: float, **others: float) -> None:
             raise UsageError(f"{name} of the test must be a positive number in SI units; received {value!r}.")
     if at > whisker.arc_length:
         raise UsageError(f"The arc length {at:g} m lies beyond this whisker of {whisker.arc_length:g} m.")
-
-
-def _settling_time(whisker: Whisker) -> float:
-    """Return the time (s) after which the first mode, critically damped, is at rest: six periods."""
-    return 6 / float(references.natural_frequencies(whisker, 1)[0])
 
 
 def _axis(whisker: Whisker, at: float) -> NDArray[np.float64]:

@@ -48,10 +48,11 @@ class PackedSurface:
         from scipy.spatial import ConvexHull
 
         faces = faces[spatial_order(vertices[faces])]
-        wide = ~slivers(vertices[faces])
+        corners = vertices[faces]
+        wide = ~slivers(corners)
         if not wide.any():
             wide[:] = True
-        corners = vertices[faces[wide]]
+        corners = corners[wide]
         outline = vertices[ConvexHull(vertices[:, :2]).vertices, :2]
         radius = float(np.linalg.norm(vertices, axis=1).max())
         return cls(corners, pseudo_normals(vertices, faces)[wide], tree_boxes(corners), outline, radius)
