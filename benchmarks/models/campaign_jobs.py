@@ -36,7 +36,7 @@ SHIPPED = (
 )  # fmt: skip
 """Networks of seed 0 that come with the package, 15 MB in all."""
 _MILLISECONDS = {"zhuang": 16, "ugrnn": 24, "intersection": 24, "gru": 30, "lstm": 30, "resnet18": 4, "s4": 8}
-_ATTENDER = {None: 0, "gpt": 13, "mamba": 32}
+_ATTENDER = {None: 0, "gpt": 13, "mamba": 8}
 """A step of 1,024 sweeps on one H200 takes about the sum of both."""
 
 
