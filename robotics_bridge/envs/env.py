@@ -30,11 +30,7 @@ _ADVICE = (
 
 
 def make(
-    name: str | Task,
-    *,
-    hand: str | os.PathLike[str] | hands.Hand = "xhand1",
-    config: str = "default",
-    **options: Any,
+    name: str | Task, *, hand: str | os.PathLike[str] | hands.Hand = "xhand1", config: str = "default", **options: Any
 ) -> Env:
     """Return the batched environment of a task.
 
@@ -59,11 +55,6 @@ def make(
 
 class Env:
     """A batch of environments; environments that end are reset within the same step.
-
-    Args:
-        task: what to do.
-        hand: with which hand.
-        options: how it is simulated, and what of it is observed.
 
     Raises:
         UsageError: task, hand and options do not fit.
@@ -96,8 +87,6 @@ class Env:
         self.reset()
         self.observation_shapes = {name: tuple(value.shape[1:]) for name, value in self.observations.items()}
         """Group → shape per environment."""
-
-    # --- facts -------------------------------------------------------------------------------------------------
 
     @property
     def num_actions(self) -> int:
@@ -161,8 +150,6 @@ class Env:
     def episode_length_buf(self, value: torch.Tensor) -> None:
         if value is not self.state.episode.age:
             self.state.episode.age.copy_(value)
-
-    # --- life --------------------------------------------------------------------------------------------------
 
     def reset(self, mask: torch.Tensor | None = None) -> dict[str, torch.Tensor]:
         """Start new episodes in some environments ([B] bool; all by default) and return the observations."""

@@ -86,11 +86,6 @@ class EpisodeState:
 class EnvState:
     """A batch of environments of a task: what resets, steps and observations read and write.
 
-    Args:
-        task: What to do.
-        hand: With which hand.
-        options: How it is simulated, and what of it is observed.
-
     Raises:
         UsageError: task, hand and options do not fit.
     """
@@ -169,8 +164,7 @@ class EnvState:
 
     def draw(self, count: int, low: float, high: float) -> torch.Tensor:
         """Return uniform random numbers [B, count]."""
-        # Numbers are drawn for all environments, whoever needs them: the draws of one do not depend on the resets of
-        # others.
+        # For all environments, whoever needs them: the draws of one do not depend on the resets of others.
         numbers = torch.rand(self.num_envs, count, generator=self.generator, device=self.device)
         return low + (high - low) * numbers
 

@@ -29,11 +29,8 @@ class MujocoWarpEngine:
     On CUDA the step and the filling of the state are one recorded graph.
 
     Args:
-        model: a compiled ``mujoco.MjModel``, or variants of one that differ in numbers only.
-        num_envs: number of environments B.
+        model: as of ``MujocoEngine``; so are ``num_envs``, ``assignment`` and ``fields``, which MuJoCo Warp must batch.
         device: ``cuda``, ``cuda:1`` or ``cpu`` (slow; for tests).
-        fields: values per environment [B, ...] of model fields that MuJoCo Warp batches.
-        assignment: variant of environment e is ``assignment[e % len(assignment)]``; each in turn by default.
         contacts: room for contacts per environment, on average; by default sixteen, and nine per moving link.
         constraints: room for constraint rows in each environment; by default enough for that many contacts.
 

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from numpy.typing import ArrayLike
 
-from brainbench.core.errors import UsageError, unknown_name
+from brainbench.core.errors import UsageError, check_name
 from brainbench.core.statistics import wilson_interval
 from robotics_bridge.envs.env import Env
 from robotics_bridge.policies.shipped import AGENTS
@@ -61,13 +61,8 @@ class PolicyEvaluation:
         return found.low, found.high
 
     def mean(self, name: str) -> tuple[float, float]:
-        """Return mean and half width of its 95 % interval over episodes of one of :data:`QUANTITIES`.
-
-        Raises:
-            UsageError: there is no such quantity.
-        """
-        if name not in QUANTITIES:
-            raise unknown_name("quantity of an episode", name, QUANTITIES)
+        """Return mean and half width of its 95 % interval over episodes of one of :data:`QUANTITIES`."""
+        check_name("quantity of an episode", name, QUANTITIES)
         return mean_of_episodes(getattr(self, name))
 
     def summary(self) -> dict[str, Any]:
@@ -112,13 +107,8 @@ class Policy:
 
 
 def agent(name: str, env: Env, *, seed: int = 0) -> Callable[[Mapping[str, torch.Tensor]], torch.Tensor]:
-    """Return the agent ``zero`` (rest position) or ``random`` (standard normal actions, as an untrained policy).
-
-    Raises:
-        UsageError: there is no such agent.
-    """
-    if name not in AGENTS:
-        raise unknown_name("agent", name, AGENTS)
+    """Return the agent ``zero`` (rest position) or ``random`` (standard normal actions, as an untrained policy)."""
+    check_name("agent", name, AGENTS)
     generator = torch.Generator(device=env.device)
     generator.manual_seed(seed)
     still = torch.zeros(env.num_envs, env.num_actions, device=env.device)
@@ -145,8 +135,8 @@ def evaluate(
     Args:
         env: the environments.
         policy: observations → actions [B, A]; its ``reset(mask)``, if any, is called when episodes end.
-        episodes: at least so many for every seed.
-        seed: of the environments; several are run one after the other.
+        episodes: at least so many for every seed of the environments.
+        seed: several are run one after the other.
         name: of the agent, for reports.
         progress: called with seeds done, seeds and a word.
 
@@ -182,8 +172,7 @@ def evaluate(
             # Episodes beyond an environment's share are not counted: fast failures would otherwise be counted more
             # often.
             left -= done.long()
-        threshold = env.task.success.threshold
-        rates.append(sum(row[0] >= threshold for row in found) / len(found))
+        rates.append(sum(row[0] >= env.task.success.threshold for row in found) / len(found))
         rows += found
         if progress:
             progress(index + 1, len(seeds), f"evaluating {name}")

@@ -60,17 +60,12 @@ class Goal(abc.ABC):
             )
 
     def first(self, quat: torch.Tensor, draw: torch.Tensor) -> torch.Tensor:
-        """Return the goals [B, 4] (w, x, y, z) of new episodes: what follows the object's own orientation.
-
-        Args:
-            quat: orientation of the object [B, 4].
-            draw: uniform random numbers in [0, 1) [B, 2].
-        """
+        """Return the goals [B, 4] (w, x, y, z) of new episodes: what follows the object's orientations ``quat``."""
         return self.following(quat, quat, draw)
 
     @abc.abstractmethod
     def following(self, quat: torch.Tensor, goal: torch.Tensor, draw: torch.Tensor) -> torch.Tensor:
-        """Return the goals [B, 4] that follow the present ones ``goal`` [B, 4]; other arguments as for the first."""
+        """Return the goals [B, 4] that follow the present ones; ``draw`` [B, 2] are uniform numbers in [0, 1)."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -90,8 +85,7 @@ class SteppingRotation(Goal):
         # A turn about a world axis multiplies from the left. The step starts from the last goal, not from the object,
         # so that errors of reached goals do not add up.
         turn = about(constant(self.axis or (0.0, 0.0, 1.0), quat), constant(self.step, quat))
-        # Quaternions are not normalised here: a product of unit ones stays one to rounding over the few goals of an
-        # episode.
+        # Not normalised: a product of unit quaternions stays one to rounding over the few goals of an episode.
         return multiply(turn.expand_as(goal), goal)
 
 

@@ -15,11 +15,7 @@ _OWN = ("in_palm_rotate", "in_hand_repose", "screwdriver", "hot_ball")
 
 
 def register(name: str, config: str = "default") -> Callable[[Maker], Maker]:
-    """Register a function without arguments that returns a :class:`Task`.
-
-    Args:
-        name: of the task.
-        config: of this configuration of it; every task needs ``default``.
+    """Register a function without arguments that returns a :class:`Task`; every task needs the config ``default``.
 
     Raises:
         UsageError: the task has such a configuration already.
