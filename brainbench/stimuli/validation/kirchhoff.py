@@ -49,13 +49,8 @@ class KirchhoffRod:
         s = np.linspace(0, whisker.arc_length, 401)
         # Of the parabola y = A x²: κ₀ = 2A cos³ψ with the tangent's angle ψ.
         curvature = CubicSpline(s, 2 * whisker.curvature * np.cos(whisker.tangent_angle(s)) ** 3)
-        return cls(
-            whisker.arc_length,
-            lambda s: float(curvature(s)),
-            lambda s: float(whisker.bending_stiffness(s)),
-            lambda s: float(whisker.torsional_stiffness(s)),
-            lambda s: float(whisker.radius(s)),
-        )
+        laws = (curvature, whisker.bending_stiffness, whisker.torsional_stiffness, whisker.radius)
+        return cls(whisker.arc_length, *(lambda s, law=law: float(law(s)) for law in laws))
 
 
 @dataclass(frozen=True, eq=False)
