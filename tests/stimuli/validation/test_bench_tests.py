@@ -91,7 +91,15 @@ def test_the_whisker_slips_off_at_the_depth_of_the_elastica(name, share, preset,
     assert result.error == pytest.approx(0, abs=promise)
 
 
-@pytest.mark.parametrize(("at", "offset", "radius"), [(0.3, 0.02, 5e-5), (0.3, 0.02, 2.5e-4), (0.5, 0.2, 1.5e-3)])
+@pytest.mark.parametrize(
+    ("at", "offset", "radius"),
+    [
+        pytest.param(0.3, 0.02, 5e-5, marks=pytest.mark.slow),
+        (0.3, 0.02, 1e-4),
+        (0.3, 0.02, 2.5e-4),
+        (0.5, 0.2, 1.5e-3),
+    ],
+)
 def test_a_peg_of_any_radius_at_a_joint_of_the_chain_meets_a_smooth_taper(at, offset, radius):
     # A staircase of capsules turned this force by up to 15 %.
     result = bench_tests.peg(C2, at * C2.arc_length, offset * C2.arc_length, peg_radius=radius, fidelity="accurate")
