@@ -56,11 +56,7 @@ def write_record(record: ResultRecord, folder: str | os.PathLike[str]) -> Path:
 
 
 def record_text(record: ResultRecord) -> str:
-    """Return the content of a record's file.
-
-    Raises:
-        DataError: the record contradicts itself.
-    """
+    """Return the content of a record's file; raise DataError if the record contradicts itself."""
     text = record.to_json() + "\n"
     _parse(text, Path(record.file_name))
     return text

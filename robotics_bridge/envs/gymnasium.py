@@ -34,11 +34,7 @@ REACH = 2.0
 
 
 class GymVectorEnv(VectorEnv):
-    """The environments of a task as numpy arrays; observations are a dictionary of the task's groups.
-
-    Args:
-        env: made with ``keep_final=True``.
-        groups: observation groups to show; all by default.
+    """The environments of a task as numpy arrays; observations are a dictionary of some groups, by default all.
 
     Raises:
         UsageError: the environment does not keep final observations, or has no such group.

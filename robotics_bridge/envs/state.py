@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from brainbench.core.devices import warp
 from brainbench.core.errors import UsageError
 from brainbench.core.rotations import conjugate, from_xyzw, multiply, rotate
 from robotics_bridge.envs.actuators import Actuators
@@ -161,6 +162,19 @@ class EnvState:
         self._palm = scene.link_index(self.hand.palm)
         links = () if self.touch is None else self.touch.links
         self._tactile_links = integers([scene.link_index(link) for link in links])
+
+    def memory(self) -> dict[str, torch.Tensor]:
+        """Return the tensors themselves that the future depends on, by name, of all parts but the physics."""
+        parts = {"actuators": self.actuators, "goals": self.goals, "contacts": self.contacts}
+        if self.task_state is not None:
+            parts["task_state"] = self.task_state
+        found = self.episode.tensors()
+        found |= {f"{part}.{name}": value for part, owner in parts.items() for name, value in owner.memory().items()}
+        if self.touch is not None:
+            clock, wp = self.touch.suite.clock, warp()
+            found |= {"touch.age": wp.to_torch(clock.age), "touch.episode": wp.to_torch(clock.episode)}
+            found["touch.reading"] = self.touch.reading
+        return found
 
     def draw(self, count: int, low: float, high: float) -> torch.Tensor:
         """Return uniform random numbers [B, count]."""

@@ -14,12 +14,7 @@ from brainbench.core.devices import warp
 from robotics_bridge.envs.options import EnvOptions
 from robotics_bridge.envs.simulation import Simulation
 from robotics_bridge.hands import Hand
-from robotics_bridge.hands.observations import (
-    PATCH_FORCE_SCALE,
-    TAXELS_IN_CONTACT,
-    observation_type,
-    sensors_for,
-)
+from robotics_bridge.hands.observations import PATCH_FORCE_SCALE, TAXELS_IN_CONTACT, observation_type, sensors_for
 from robotics_bridge.physics.state import HandState
 from robotics_bridge.sensors import SensorSuite
 from robotics_bridge.tasks.scenes import TaskModel

@@ -46,11 +46,7 @@ _DENSE = 2e5
 
 @dataclass(frozen=True, eq=False)
 class Explored:
-    """An object to explore.
-
-    Raises:
-        UsageError: it has neither or both of geometry and mesh.
-    """
+    """An object to explore; neither or both of geometry and mesh is a :class:`UsageError`."""
 
     label: str
     geometry: Geometry | None = None

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from brainbench.core.devices import mujoco_module
 from brainbench.core.errors import UsageError
+from brainbench.core.reading.ranges import check_number
 from brainbench.core.rotations import to_matrices
 from robotics_bridge.hands.hand import Hand, palmar_directions
 
@@ -35,8 +36,7 @@ def holding_spec(hand: Hand, *, radius: float = 0.03, timestep: float = 0.002, r
     Raises:
         UsageError: the palm's side is unknown, or the radius is not positive.
     """
-    if not radius > 0:
-        raise UsageError(f"A ball has a positive radius (m); received {radius!r}.")
+    check_number("radius of the ball (m)", radius, above=0)
     up, surface, step = palm_surface(hand)
     # Between the middle of the palm and the roots of the fingers, where these reach it when they close.
     surface = surface + reach * step

@@ -133,11 +133,7 @@ class Joint:
 
 @dataclass(frozen=True)
 class HandSpec:
-    """A complete hand.
-
-    Raises:
-        UsageError: a joint or finger names a link that does not exist.
-    """
+    """A complete hand; a joint or finger that names a link which does not exist is a :class:`UsageError`."""
 
     name: str
     palm: str

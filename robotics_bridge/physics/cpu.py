@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from brainbench.core.devices import mujoco_module
 from brainbench.core.errors import UsageError
+from brainbench.core.reading.ranges import check_number
 from robotics_bridge.physics.scene import TouchScene
 from robotics_bridge.physics.state import MOST_ENVS, HandState
 from robotics_bridge.physics.variants import check_fields
@@ -50,8 +51,7 @@ class MujocoEngine:
         assignment: Sequence[int] = (),
         contacts: int = 64,
     ) -> None:
-        if not 1 <= num_envs <= MOST_ENVS:
-            raise UsageError(f"An engine has 1 to {MOST_ENVS:,} environments; received {num_envs}.")
+        check_number("environments of an engine", num_envs, least=1, most=MOST_ENVS, whole=True)
         models = list(model) if isinstance(model, (list, tuple)) else [model]
         self.model: Any = models[0]
         """The model, or the first of its variants."""

@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike
 from brainbench.core.cuda_graphs import record_launches
 from brainbench.core.devices import pick_device, warp
 from brainbench.core.errors import MissingDependencyError, UsageError, install_command, unknown_name
+from brainbench.core.reading.ranges import check_number
 from robotics_bridge.physics.kernels.state import fill_contacts, fill_links
 from robotics_bridge.physics.scene import TouchScene
 from robotics_bridge.physics.state import MOST_ENVS, HandState
@@ -51,8 +52,7 @@ class MujocoWarpEngine:
         constraints: int | None = None,
     ) -> None:
         self._engine = _mujoco_warp()
-        if not 1 <= num_envs <= MOST_ENVS:
-            raise UsageError(f"An engine has 1 to {MOST_ENVS:,} environments; received {num_envs}.")
+        check_number("environments of an engine", num_envs, least=1, most=MOST_ENVS, whole=True)
         wp = warp()
         self._device = pick_device(device)
         models = list(model) if isinstance(model, (list, tuple)) else [model]

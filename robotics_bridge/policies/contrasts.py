@@ -31,10 +31,7 @@ class Contrast:
 
 
 def pooled_spread(groups: Sequence[Sequence[float]]) -> tuple[float, int]:
-    """Return the standard deviation within groups and its degrees of freedom.
-
-    Args:
-        groups: Success of each training seed, one sequence per student; students of one seed add nothing.
+    """Return the standard deviation and its degrees of freedom within groups: a student's success by training seed.
 
     Raises:
         UsageError: no student has two training seeds.

@@ -12,10 +12,13 @@ import torch
 from numpy.typing import ArrayLike
 
 from brainbench.core.errors import UsageError, check_name
+from brainbench.core.progress import Progress
 from brainbench.core.statistics import wilson_interval
 from robotics_bridge.envs.env import Env
 from robotics_bridge.policies.shipped import AGENTS
 
+Acting = Callable[[Mapping[str, torch.Tensor]], torch.Tensor]
+"""Observations by group → actions [B, A]."""
 QUANTITIES = ("metric", "returns", "lengths", "goals", "turn_rate", "seconds", "dropped")
 """Quantities of each episode beside its success."""
 _Z = 1.959964
@@ -84,11 +87,7 @@ def mean_of_episodes(values: ArrayLike) -> tuple[float, float]:
 
 
 class Policy:
-    """A trained teacher or student as a function of observation groups that may remember; returns actions [B, A].
-
-    Args:
-        actor: Module of groups of observations, with a method ``reset``; put into evaluation mode.
-    """
+    """A trained teacher or student (a module with ``reset``) that acts on observation groups and may remember."""
 
     def __init__(self, actor: torch.nn.Module) -> None:
         self.actor: Any = actor.eval()
@@ -106,7 +105,7 @@ class Policy:
         self.actor.reset(dones)
 
 
-def agent(name: str, env: Env, *, seed: int = 0) -> Callable[[Mapping[str, torch.Tensor]], torch.Tensor]:
+def agent(name: str, env: Env, *, seed: int = 0) -> Acting:
     """Return the agent ``zero`` (rest position) or ``random`` (standard normal actions, as an untrained policy)."""
     check_name("agent", name, AGENTS)
     generator = torch.Generator(device=env.device)
@@ -120,21 +119,16 @@ def agent(name: str, env: Env, *, seed: int = 0) -> Callable[[Mapping[str, torch
 
 
 def evaluate(
-    env: Env,
-    policy: Callable[[Mapping[str, torch.Tensor]], torch.Tensor],
-    *,
-    episodes: int = 100,
-    seed: int | Sequence[int] = (0, 1, 2),
-    name: str = "policy",
-    progress: Callable[[int, int, str], None] | None = None,
-) -> PolicyEvaluation:
+    env: Env, policy: Acting, *, episodes: int = 100, seed: int | Sequence[int] = (0, 1, 2), name: str = "policy",
+    progress: Progress | None = None,
+) -> PolicyEvaluation:  # fmt: skip
     """Run whole episodes and return how they went.
 
     Each environment contributes equally many episodes, so that short ones are not counted more often.
 
     Args:
         env: the environments.
-        policy: observations → actions [B, A]; its ``reset(mask)``, if any, is called when episodes end.
+        policy: its ``reset(mask)``, if any, is called when episodes end.
         episodes: at least so many for every seed of the environments.
         seed: several are run one after the other.
         name: of the agent, for reports.

@@ -17,7 +17,7 @@ import torch
 from torch import nn
 
 from brainbench.core.errors import UsageError, check_name
-from robotics_bridge.policies.encoders.arms import EncoderConfig, TactileEncoder, perceptron
+from robotics_bridge.policies.encoders.arms import EncoderConfig, Stepped, TactileEncoder, perceptron
 from robotics_bridge.policies.exported import JitPolicy, StepPolicy
 
 if TYPE_CHECKING:
@@ -51,9 +51,7 @@ class GroupEncoder(nn.Module):
             self.cell, self.net = nn.LSTMCell(size, _LSTM), nn.Linear(_LSTM, _EMBEDDING)
             self.state_size = 2 * _LSTM
 
-    def unroll(
-        self, x: torch.Tensor, h_in: torch.Tensor, ended: torch.Tensor | None
-    ) -> tuple[torch.Tensor, torch.Tensor]:
+    def unroll(self, x: torch.Tensor, h_in: torch.Tensor, ended: torch.Tensor | None) -> Stepped:
         """Return (embeddings [L, B, …], h_out) of L steps [L, B, n]; memory is forgotten where ``ended`` [L, B]."""
         if self.cell is None:
             return self.net(x), h_in
@@ -94,22 +92,13 @@ class PolicyCore(nn.Module):
         return sum(self.splits[:-2]) or 1
 
     def unroll(
-        self,
-        flat: Sequence[torch.Tensor],
-        taxels: torch.Tensor | None,
-        h_in: torch.Tensor,
-        ended: torch.Tensor | None = None,
-        *,
-        kept: bool = False,
-    ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return (latents [L, B, D], h_out) of L steps.
+        self, flat: Sequence[torch.Tensor], taxels: torch.Tensor | None, h_in: torch.Tensor,
+        ended: torch.Tensor | None = None, *, kept: bool = False,
+    ) -> Stepped:  # fmt: skip
+        """Return (latents [L, B, D], h_out) of normalised flat groups [L, B, n] and readings [L, B, S, N, C].
 
-        Args:
-            flat: Normalised flat groups [L, B, n].
-            taxels: Readings [L, B, S, N, C], or kept features [L, B, F].
-            h_in: Memory [B, H]; [B, ``kept_size``] with kept features.
-            ended: Where [L, B] the memory is forgotten after a step; None for nowhere.
-            kept: ``taxels`` holds features.
+        With ``kept``, ``taxels`` are features [L, B, F] and the memory has ``kept_size``. It is forgotten after a step
+        where ``ended`` [L, B]; None for nowhere.
         """
         sizes = [*self.splits[:-2], h_in.shape[1] - sum(self.splits[:-2])] if kept else self.splits
         states = list(h_in.split(sizes, 1))
@@ -127,9 +116,7 @@ class PolicyCore(nn.Module):
             parts.append(y.float() if mixed else y)
         return torch.cat(parts, -1), torch.cat([state.to(h_in.dtype) for state in states], 1)
 
-    def forward(
-        self, flat: Sequence[torch.Tensor], taxels: torch.Tensor | None, h_in: torch.Tensor
-    ) -> tuple[torch.Tensor, torch.Tensor]:
+    def forward(self, flat: Sequence[torch.Tensor], taxels: torch.Tensor | None, h_in: torch.Tensor) -> Stepped:
         """Return (latent [B, D], h_out [B, H]) of one step; arguments as of :meth:`unroll`, without L."""
         latents, h_out = self.unroll([x[None] for x in flat], None if taxels is None else taxels[None], h_in)
         return latents[0], h_out
@@ -200,9 +187,7 @@ class TactilePolicy(MLPModel):
             found[TACTILE] = self.core.tactile.shape
         return found
 
-    def advance(
-        self, obs: Any, h_in: torch.Tensor, features: torch.Tensor | None = None
-    ) -> tuple[torch.Tensor, torch.Tensor]:
+    def advance(self, obs: Any, h_in: torch.Tensor, features: torch.Tensor | None = None) -> Stepped:
         """Return (latent [B, D], h_out [B, H]) of one step; :meth:`unroll` without L, not remembered in the model."""
         read = self.shapes if features is None else self.obs_groups
         kept = None if features is None else features[None]
@@ -211,14 +196,11 @@ class TactilePolicy(MLPModel):
 
     def unroll(
         self, obs: Any, h_in: torch.Tensor, ended: torch.Tensor | None = None, features: torch.Tensor | None = None
-    ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return (latents [L, B, D], h_out [B, H]) of L steps.
+    ) -> Stepped:
+        """Return (latents [L, B, D], h_out [B, H]) of groups [L, B, …] from a memory of zeros before the first step.
 
-        Args:
-            obs: Groups [L, B, …].
-            h_in: Memory [B, H], zeros before the first step; [B, ``core.kept_size``] with features.
-            ended: Where [L, B] an episode ended after a step, so that memory starts anew; None for nowhere.
-            features: What the frozen encoder gave [L, B, F], instead of its readings.
+        It starts anew after a step where ``ended`` [L, B]. With ``features`` [L, B, F] of the frozen encoder instead of
+        its readings, the memory is [B, ``core.kept_size``].
         """
         flat = self._normalised(obs)
         if features is not None:

@@ -37,17 +37,18 @@ def register(name: str, config: str = "default") -> Callable[[Maker], Maker]:
     return keep
 
 
+def bounded(task: Task) -> Task:
+    """Return a published task with bounded actions and physical taxels, as all have on which we train."""
+    return replace(task, action_limit=ACTION_LIMIT, taxel_twist=None)
+
+
 def register_bounded(name: str, published: Maker) -> None:
-    """Register the default, on which we train: the published task with bounded actions and physical taxels."""
-    register(name)(lambda: replace(published(), action_limit=ACTION_LIMIT, taxel_twist=None))
+    """Register the default, on which we train: the published task, :func:`bounded`."""
+    register(name)(lambda: bounded(published()))
 
 
 def forget(name: str) -> None:
-    """Remove a task that was registered.
-
-    Raises:
-        UsageError: no such task was registered; tasks of the package stay.
-    """
+    """Remove a task that was registered; raise UsageError for any other, since tasks of the package stay."""
     if name not in _MADE or name in _OWN:
         raise unknown_name("task of yours", name, [n for n in _MADE if n not in _OWN])
     del _MADE[name]

@@ -12,6 +12,7 @@ import numpy as np
 
 from brainbench.core.devices import warp
 from brainbench.core.errors import UsageError
+from brainbench.core.reading.ranges import check_number
 from robotics_bridge.sensors.temperature.grid import TemperatureGrid, link_temperature
 from robotics_bridge.sensors.temperature.materials import ThermalBody, ThermalMaterial
 
@@ -57,8 +58,7 @@ class ThermalSettings:
     def __post_init__(self) -> None:
         if not self.hot > self.ambient:
             raise UsageError(f"The target is hotter than the room; received {self.hot} and {self.ambient} °C.")
-        if not 0 < self.margin < 1:
-            raise UsageError(f"The latch's margin lies between 0 and 1; received {self.margin!r}.")
+        check_number("The latch's margin", self.margin, above=0, below=1)
 
     @property
     def material(self) -> ThermalMaterial:

@@ -61,11 +61,9 @@ class ShapeNet:
     """Names of the id list that the tree does not hold."""
 
     def __iter__(self) -> Iterator[ShapeNetModel]:
-        """Iterate over the models."""
         return iter(self.models)
 
     def __len__(self) -> int:
-        """Count the models."""
         return len(self.models)
 
     @property

@@ -34,6 +34,8 @@ AUTO = "auto"
 _HIDDEN, _CHANNELS, _KERNEL = 64, (16, 32), 3
 _COUNTED = 1 << 24
 """Values per channel whose squares are added up at a time."""
+Stepped = tuple[torch.Tensor, torch.Tensor]
+"""What a step gives, and the memory after it."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -134,19 +136,14 @@ class TactileEncoder(nn.Module):
         self.shape: tuple[int, int, int] = (config.slots, sum(counts), kind.channels)
         """(S, N, C)."""
 
-    def forward(self, taxels: torch.Tensor, h_in: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    def forward(self, taxels: torch.Tensor, h_in: torch.Tensor) -> Stepped:
         """Return (embedding [B, F], h_out [B, H])."""
         raise NotImplementedError
 
-    def unroll(
-        self, taxels: torch.Tensor, h_in: torch.Tensor, ended: torch.Tensor | None = None
-    ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return (embeddings [L, B, F], h_out [B, H]) of L steps, with as few and as large products as there can be.
+    def unroll(self, taxels: torch.Tensor, h_in: torch.Tensor, ended: torch.Tensor | None = None) -> Stepped:
+        """Return (embeddings [L, B, F], h_out [B, H]) of readings [L, B, S, N, C], in few and large products.
 
-        Args:
-            taxels: Readings [L, B, S, N, C].
-            h_in: Memory.
-            ended: Where [L, B] the memory is forgotten after a step; None for nowhere.
+        The memory is forgotten after a step where ``ended`` [L, B]; None for nowhere.
         """
         found = []
         for step, reading in enumerate(taxels):
@@ -205,9 +202,7 @@ class _Learned(TactileEncoder):
     def observe_scale(self, taxels: torch.Tensor) -> None:
         self.scale.update(taxels)
 
-    def unroll(
-        self, taxels: torch.Tensor, h_in: torch.Tensor, ended: torch.Tensor | None = None
-    ) -> tuple[torch.Tensor, torch.Tensor]:
+    def unroll(self, taxels: torch.Tensor, h_in: torch.Tensor, ended: torch.Tensor | None = None) -> Stepped:
         if self.state_size:
             return super().unroll(taxels, h_in, ended)
         # Without memory all steps are one batch.
@@ -250,6 +245,7 @@ class _Images(_Learned):
 
     index: torch.Tensor
     """Item in every cell of every link's image; N for none."""
+    head: nn.Linear
 
     def __init__(self, config: EncoderConfig, *, canvas: bool = False) -> None:
         super().__init__(config)
@@ -294,6 +290,14 @@ class _Images(_Learned):
         cells = torch.cat((planes, torch.zeros_like(planes[..., :1])), 2)[..., self.index]
         return cells.unflatten(2, (self.images, self.rows, self.columns)).transpose(1, 2).flatten(0, 1)
 
+    def _head_of(self, channels: int) -> nn.Linear:
+        # A canvas is one picture whose places differ in meaning; a link's grid is read as a whole.
+        return nn.Linear(channels * (self.rows * self.columns if self.canvas else self.images), self.features)
+
+    def answer(self, maps: torch.Tensor, batch: int) -> torch.Tensor:
+        """Return the embedding [batch, F] of maps [batch·images, channels, rows, columns]."""
+        return self.head((maps if self.canvas else maps.mean((2, 3))).reshape(batch, -1))
+
 
 class _Convolution(_Images):
     """Two convolutions (published channels 16 and 32, kernel 3) on each link's grid, averaged over it."""
@@ -305,14 +309,10 @@ class _Convolution(_Images):
             nn.Conv2d(self.planes, first, _KERNEL, padding=1), nn.ELU(),
             nn.Conv2d(first, second, _KERNEL, padding=1), nn.ELU(),
         )  # fmt: skip
-        # A canvas is one picture whose places differ in meaning; a link's grid is read as a whole.
-        places = self.rows * self.columns if self.canvas else self.images
-        self.head = nn.Linear(second * places, self.features)
+        self.head = self._head_of(second)
 
     def forward(self, taxels: torch.Tensor, h_in: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        maps = self.net(self.pictures(taxels))
-        values = maps if self.canvas else maps.mean((2, 3))
-        return self.head(values.reshape(taxels.shape[0], -1)), h_in
+        return self.answer(self.net(self.pictures(taxels)), taxels.shape[0]), h_in
 
 
 class _ConvRecurrent(_Images):
@@ -321,8 +321,7 @@ class _ConvRecurrent(_Images):
     def __init__(self, config: EncoderConfig, *, canvas: bool = False) -> None:
         super().__init__(config, canvas=canvas)
         self.cell = GRU(self.planes, _CHANNELS[0], kernel_size=_KERNEL, layer_norm=True)
-        places = self.rows * self.columns if self.canvas else self.images
-        self.head = nn.Linear(_CHANNELS[0] * places, self.features)
+        self.head = self._head_of(_CHANNELS[0])
         self.state_size = self.images * _CHANNELS[0] * self.rows * self.columns
         small = self.rows * self.columns <= MOST_CELLS
         self.products: ConvGRUProducts | None = ConvGRUProducts(self.rows, self.columns, _KERNEL) if small else None
@@ -330,11 +329,9 @@ class _ConvRecurrent(_Images):
     def forward(self, taxels: torch.Tensor, h_in: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         state = h_in.reshape(-1, _CHANNELS[0], self.rows, self.columns)
         y, state = self.cell(self.pictures(taxels), state)
-        return self._answer(y, taxels.shape[0]), state.reshape(h_in.shape)
+        return self.answer(y, taxels.shape[0]), state.reshape(h_in.shape)
 
-    def unroll(
-        self, taxels: torch.Tensor, h_in: torch.Tensor, ended: torch.Tensor | None = None
-    ) -> tuple[torch.Tensor, torch.Tensor]:
+    def unroll(self, taxels: torch.Tensor, h_in: torch.Tensor, ended: torch.Tensor | None = None) -> Stepped:
         # Processors convolve faster than they multiply.
         if self.products is None or not taxels.is_cuda:
             return super().unroll(taxels, h_in, ended)
@@ -342,7 +339,7 @@ class _ConvRecurrent(_Images):
 
     def unroll_as_products(
         self, taxels: torch.Tensor, h_in: torch.Tensor, ended: torch.Tensor | None = None
-    ) -> tuple[torch.Tensor, torch.Tensor]:
+    ) -> Stepped:
         """Return what :meth:`unroll` returns, by matrix products."""
         assert self.products is not None
         steps, batch = taxels.shape[:2]
@@ -350,10 +347,7 @@ class _ConvRecurrent(_Images):
         gone = None if ended is None else ended.repeat_interleave(self.images, 1)
         y, state = self.products(self.cell, pictures, h_in.reshape(pictures.shape[1], -1), gone)
         y = y.flatten(0, 1).unflatten(1, (-1, self.rows, self.columns))
-        return self._answer(y, steps * batch).unflatten(0, (steps, batch)), state.reshape(h_in.shape)
-
-    def _answer(self, y: torch.Tensor, batch: int) -> torch.Tensor:
-        return self.head((y if self.canvas else y.mean((2, 3))).reshape(batch, -1))
+        return self.answer(y, steps * batch).unflatten(0, (steps, batch)), state.reshape(h_in.shape)
 
 
 class _Network(TactileEncoder):

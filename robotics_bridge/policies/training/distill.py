@@ -32,7 +32,8 @@ from robotics_bridge.policies.student import TACTILE, TactilePolicy
 from robotics_bridge.policies.training.cuda_graph_step import ChunkStep
 from robotics_bridge.policies.training.distill_config import EARLIER_TWIST, DistillConfig
 from robotics_bridge.policies.training.rollouts import Recorder, Rollout
-from robotics_bridge.policies.training.student_files import CONFIG, MODEL, build_student, save_student
+from robotics_bridge.policies.training.state_tree import write_tensors
+from robotics_bridge.policies.training.student_files import CONFIG, MODEL, build_student
 
 _log = logging.getLogger(__name__)
 
@@ -77,8 +78,7 @@ def distill(
         out: The run's folder.
         env: Environment of :func:`robotics_bridge.tasks.make` with the configuration's observation type.
         teacher: Of :func:`robotics_bridge.policies.training.teacher.load_teacher`.
-        stop_after: Seconds of this session.
-        stop_at: Iterations.
+        stop_after, stop_at: When to stop, where that is before the end.
         graphs: On CUDA, record a step of learning and replay it.
         progress: Called with (iterations done, iterations in all, what).
 
@@ -304,7 +304,7 @@ class _Run:
                 rollout.save(path)
         plain = {"iteration": self.iteration, "loss": self.loss, "rollouts": numbers}
         save_state(self.out / STATE, self.learner, self.optimizer, plain)
-        save_student(self.out / MODEL, self.student)
+        write_tensors(self.out / MODEL, self.student.state_dict())
         for path in (self.out / "rollouts").glob("*.safetensors"):
             if int(path.stem) not in numbers:
                 path.unlink()

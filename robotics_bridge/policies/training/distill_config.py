@@ -25,11 +25,7 @@ MOST = {"learning_rate": 1.0, "clip": 100.0, "max_grad_norm": 1e6}
 
 @dataclass(frozen=True, kw_only=True)
 class DistillConfig:
-    """A student. Settings of None are the task's own (thesis, table 4.4).
-
-    Raises:
-        UsageError: a value is not allowed.
-    """
+    """A student, with the task's own settings for those of None (thesis, table 4.4); UsageError for a bad value."""
 
     task: str
     teacher: str = ""

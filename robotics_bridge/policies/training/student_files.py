@@ -8,10 +8,8 @@ from typing import Any
 
 import torch
 from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
 
 from brainbench.core.errors import BrainbenchError, DataError
-from brainbench.core.files import atomic_path
 from brainbench.core.reading.tensors import read_tensors
 from robotics_bridge.policies.contract import JOINTS, MOST_NUMBERS
 from robotics_bridge.policies.encoders.arms import EncoderConfig
@@ -37,13 +35,6 @@ def build_student(
         example, {"student": groups}, "student", actions, hidden_dims=config.hidden, embedder=config.embedder,
         tactile=tactile.plain() if tactile is not None else None,
     )  # fmt: skip
-
-
-def save_student(path: Path, student: TactilePolicy) -> None:
-    """Write a student's weights and normalisers."""
-    state = {name: value.detach().cpu().contiguous().clone() for name, value in student.state_dict().items()}
-    with atomic_path(path) as temporary:
-        save_file(state, temporary)
 
 
 def load_student(folder: str | Path, *, device: str = "cpu") -> tuple[TactilePolicy, dict[str, Any]]:

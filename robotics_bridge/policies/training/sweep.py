@@ -42,21 +42,21 @@ class SweepEntry:
     """Further fields of every student, such as ``iterations``."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class StudentSweep:
     """A file of students."""
 
     name: str
     entries: tuple[SweepEntry, ...]
-    types: tuple[str, ...]
+    types: tuple[str, ...] = ()
     """Observation types, each at every placement of an entry."""
-    extra_types: tuple[str, ...]
+    extra_types: tuple[str, ...] = ()
     """Types beyond the published ones."""
-    resolutions: tuple[str, ...]
+    resolutions: tuple[str, ...] = ("med",)
     """Resolutions of the taxels, in the subset ``all`` and in that of one type."""
-    noisy: tuple[bool, ...]
+    noisy: tuple[bool, ...] = (False,)
     """Without noise, with it, or both; in the same subsets."""
-    seeds: tuple[int, ...]
+    seeds: tuple[int, ...] = (0,)
     """Training seeds, every student once with each."""
     pinned_resolution: str
     """The one resolution of the subsets ``types`` and ``encoders``."""
@@ -66,9 +66,9 @@ class StudentSweep:
     """Observation types of the subset ``encoders``."""
     arms: tuple[Mapping[str, Any], ...]
     """Encoder and its settings, for the subset ``encoders``."""
-    variant: str
+    variant: str = "default"
     """Configuration of the tasks."""
-    teacher: str
+    teacher: str = "teachers/{task}-{hand}"
     """Folder of a teacher's run, with ``{task}`` and ``{hand}``."""
 
     def students(self, subset: str = "all") -> list[DistillConfig]:
@@ -142,21 +142,14 @@ def _sweep(path: Path, document: Mapping[str, Any]) -> StudentSweep:
     pinned, encoders = document.get("pinned", {}), document.get("encoders", {})
     _check_keys(pinned, {"resolution", "noisy"}, "key of 'pinned'")
     _check_keys(encoders, {"types", "arms"}, "key of 'encoders'")
+    lists = ("types", "extra_types", "resolutions", "noisy", "seeds")
     sweep = StudentSweep(
-        name=path.stem,
-        entries=entries,
-        types=tuple(document.get("types", ())),
-        extra_types=tuple(document.get("extra_types", ())),
-        resolutions=tuple(document.get("resolutions", ("med",))),
-        noisy=tuple(document.get("noisy", (False,))),
-        seeds=tuple(document.get("seeds", (0,))),
-        pinned_resolution=pinned.get("resolution", "med"),
-        pinned_noisy=bool(pinned.get("noisy", False)),
-        encoder_types=tuple(encoders.get("types", ())),
+        name=path.stem, entries=entries, pinned_resolution=pinned.get("resolution", "med"),
+        pinned_noisy=bool(pinned.get("noisy", False)), encoder_types=tuple(encoders.get("types", ())),
         arms=tuple(encoders.get("arms", ())),
-        variant=document.get("variant", "default"),
-        teacher=document.get("teacher", "teachers/{task}-{hand}"),
-    )
+        **{key: tuple(document[key]) for key in lists if key in document},
+        **{key: document[key] for key in ("variant", "teacher") if key in document},
+    )  # fmt: skip
     for kind in (*sweep.types, *sweep.extra_types, *sweep.encoder_types):
         observation_type(kind)
     for entry in entries:
