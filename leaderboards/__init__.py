@@ -20,13 +20,7 @@ if TYPE_CHECKING:
     from leaderboards.site.score_page import write_report
     from leaderboards.store import read_records, write_record
 
-__all__ = [
-    "build_leaderboard",
-    "rank",
-    "read_records",
-    "write_record",
-    "write_report",
-]
+__all__ = ["build_leaderboard", "rank", "read_records", "write_record", "write_report"]
 
 _EXPORTS = {
     "rank": ".boards",

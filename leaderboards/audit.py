@@ -23,6 +23,9 @@ TOLERANCE = 1e-3
 """Two runs of one computation agree within this on every machine: float32 sums differ in their last digits."""
 MOST_NAMED = 3
 """Most contradicting records that are named for one."""
+_SETTINGS = (
+    "time", "seed", "layers", "layer", "units_reliability", "normalize", "whiskers", "estimator_version", "readout"
+)  # fmt: skip
 
 
 def remarks(stored: Iterable[StoredRecord]) -> dict[str, tuple[str, ...]]:
@@ -58,24 +61,13 @@ def conflicting(record: ResultRecord, others: Iterable[ResultRecord]) -> Iterato
 def computation(record: ResultRecord) -> tuple[Any, ...]:
     """Return what was computed from what, as a key: equal keys must have equal numbers."""
     score, card, origin = record.score, record.card, record.score.provenance
+    inputs = (origin.recordings_hash, origin.stimuli_hash, score.stimuli, card.weights if card else None)
     return (
-        origin.recordings_hash,
-        origin.stimuli_hash,
-        score.stimuli,
-        score.estimator,
-        score.metric,
-        score.name,
-        card.weights if card else None,
-        origin.version,
-        *(
-            str(origin.settings.get(name))
-            for name in (
-                "time", "seed", "layers", "layer", "units_reliability", "normalize", "whiskers", "estimator_version",
-                "readout",
-            )
-        ),
+        *inputs,
+        *(score.estimator, score.metric, score.name, origin.version),
+        *(str(origin.settings.get(name)) for name in _SETTINGS),
         *(str(origin.recordings.get(name)) for name in ("window", "selection")),
-    )  # fmt: skip
+    )
 
 
 def older(version: str, than: str) -> bool:
@@ -91,12 +83,11 @@ def older(version: str, than: str) -> bool:
 
 
 def _stale(record: ResultRecord, schema: int, newest: dict[tuple[Any, ...], tuple[str, str]]) -> list[str]:
-    score = record.score
+    score, version = record.score, record.score.provenance.version
     settings = score.provenance.settings
     reasons = []
     if schema < RECORD_SCHEMA:
         reasons.append(f"the file has the layout of version {schema}, now {RECORD_SCHEMA}")
-    version = score.provenance.version
     if older(version, __version__):
         reasons.append(f"made by brainbench {version}, this is {__version__}")
     estimator = settings.get("estimator_version")

@@ -73,9 +73,7 @@ class Board:
 def rank(records: Iterable[ResultRecord], remarks: Mapping[str, Sequence[str]] | None = None) -> list[Board]:
     """Sort records into boards and rank the entries of each; the largest board comes first.
 
-    Args:
-        records: Records of any boards.
-        remarks: Doubts about records by identity (:func:`leaderboards.audit.remarks`), kept as notes of entries.
+    Remarks are doubts about records by identity (:func:`leaderboards.audit.remarks`), kept as notes of entries.
     """
     groups: dict[tuple[Any, ...], list[ResultRecord]] = defaultdict(list)
     for record in records:
@@ -172,15 +170,10 @@ def _baselines(records: list[ResultRecord]) -> list[Baseline]:
         counts = Counter(map(_outcome, scores))
         usual = counts.most_common(1)[0][0]
         score = next(score for score in scores if _outcome(score) == usual)
-        notes: tuple[str, ...] = ()
-        if len(counts) > 1:
-            values = [value for _, value in counts if value is not None]
-            notes = (
-                f"the records disagree: {len(counts)} different values"
-                + (f" from {min(values):.3f} to {max(values):.3f}" if values else "")
-                + f"; shown is that of {counts[usual]} of {len(scores)} records",
-            )
-        baselines.append(Baseline(name, score, kind, notes))
+        values = [value for _, value in counts if value is not None]
+        span = f" from {min(values):.3f} to {max(values):.3f}" if values else ""
+        note = f"the records disagree: {len(counts)} different values{span}; shown is that of {counts[usual]} of "
+        baselines.append(Baseline(name, score, kind, (f"{note}{len(scores)} records",) if len(counts) > 1 else ()))
     return baselines
 
 

@@ -163,12 +163,10 @@ class Entry:
 def fold_seeds(
     records: Iterable[ResultRecord], board: Sequence[object], remarks: Mapping[str, Sequence[str]]
 ) -> list[Entry]:
-    """Return one entry per model, in any order.
+    """Return one entry per model of a board, in any order.
 
-    Args:
-        records: Records of one board.
-        board: What tells the board from others, for the addresses of pages.
-        remarks: Doubts about records by identity (:func:`leaderboards.audit.remarks`), kept as notes.
+    The key of the board is for the addresses of pages; remarks are doubts about records by identity
+    (:func:`leaderboards.audit.remarks`), kept as notes.
     """
     groups: dict[tuple[object, ...], list[ResultRecord]] = defaultdict(list)
     taken: dict[tuple[object, ...], int] = defaultdict(int)
@@ -217,18 +215,11 @@ def _kind(record: ResultRecord) -> tuple[object, ...]:
 
 
 def _entry(
-    key: tuple[object, ...],
-    records: list[ResultRecord],
-    board: Sequence[object],
-    remarks: Mapping[str, Sequence[str]],
+    key: tuple[object, ...], records: list[ResultRecord], board: Sequence[object], remarks: Mapping[str, Sequence[str]]
 ) -> Entry:
     records = sorted(records, key=lambda record: ((record.card and record.card.seed) or 0, record.identity))
-    slug = records[0].file_name.rpartition("--")[0]
+    page = f"{records[0].file_name.rpartition('--')[0]}--{content_hash([*map(str, (*board, *key))], length=10)}.html"
     notes = list(dict.fromkeys(note for record in records for note in remarks.get(record.identity, ())))
     if key[-1]:
         notes.append("an earlier record of a model that stands above or below once more")
-    return Entry(
-        tuple(records),
-        f"{slug}--{content_hash([str(part) for part in (*board, *key)], length=10)}.html",
-        tuple(notes),
-    )
+    return Entry(tuple(records), page, tuple(notes))

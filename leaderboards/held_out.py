@@ -41,11 +41,7 @@ class Commitment:
 
     @classmethod
     def read(cls, path: str | os.PathLike[str]) -> Commitment:
-        """Read a published commitment.
-
-        Raises:
-            DataError: the file is missing or is no commitment.
-        """
+        """Read a published commitment; raise DataError if the file is missing or is none."""
         try:
             found = msgspec.convert(read_json(path, "commitment"), cls)
         except msgspec.ValidationError as error:

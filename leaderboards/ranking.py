@@ -49,12 +49,8 @@ class Sample:
         left_out = [[score.on_scale(value) for value in score.without_stimulus] for score in scores]
         alike = len({len(values) for values in left_out}) == 1
         seeds = tuple(score.scaled for score in scores)
-        return cls(
-            float(np.mean(seeds)),
-            {name: float(np.mean([one[name] for one in found])) for name in shared},
-            np.mean(left_out, axis=0) if alike else np.empty(0),
-            seeds,
-        )
+        animals = {name: float(np.mean([one[name] for one in found])) for name in shared}
+        return cls(float(np.mean(seeds)), animals, np.mean(left_out, axis=0) if alike else np.empty(0), seeds)
 
     @property
     def seed_variance(self) -> tuple[float, float]:
@@ -135,12 +131,8 @@ def lacking(animals: int, stimuli: int) -> str:
     >>> lacking(10, 6)
     'at least 10 stimuli (here 6)'
     """
-    needs = [
-        f"at least {fewest} {what} (here {count})"
-        for what, fewest, count in (("animals", FEWEST_ANIMALS, animals), ("stimuli", FEWEST_STIMULI, stimuli))
-        if count < fewest
-    ]
-    return " and ".join(needs)
+    rules = (("animals", FEWEST_ANIMALS, animals), ("stimuli", FEWEST_STIMULI, stimuli))
+    return " and ".join(f"at least {fewest} {what} (here {n})" for what, fewest, n in rules if n < fewest)
 
 
 def _tests(samples: Sequence[Sample]) -> tuple[NDArray[np.float64], ...]:

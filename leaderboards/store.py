@@ -23,7 +23,7 @@ from leaderboards.writing import write_files
 _ROUNDING = 1e-6
 _LARGEST = 1e100
 """Largest absolute number of a score: squares and sums of such are still finite."""
-_MAKE_ONE = "make one with: brainbench score MODEL --out FOLDER"
+MAKE_ONE = "make one with: brainbench score MODEL --out FOLDER"
 
 
 @dataclass(frozen=True)
@@ -56,11 +56,7 @@ def write_record(record: ResultRecord, folder: str | os.PathLike[str]) -> Path:
 
 
 def record_text(record: ResultRecord) -> str:
-    """Return the content of a record's file.
-
-    Raises:
-        DataError: the record contradicts itself.
-    """
+    """Return the content of a record's file; raise DataError if the record contradicts itself."""
     text = record.to_json() + "\n"
     _parse(text, Path(record.file_name))
     return text
@@ -105,14 +101,13 @@ def read_records(source: str | os.PathLike[str] | Iterable[str | os.PathLike[str
     for item in sources:
         if not item.exists():
             raise DataFileNotFoundError(
-                f"There is no file or folder {os.fspath(item)!r} to read result records from; {_MAKE_ONE}"
+                f"There is no file or folder {os.fspath(item)!r} to read result records from; {MAKE_ONE}"
             )
         # A hidden name is another process's unfinished write.
-        found = (path for path in item.rglob("*.json") if not path.name.startswith(".")) if item.is_dir() else [item]
-        paths += found
+        paths += [path for path in item.rglob("*.json") if path.name[0] != "."] if item.is_dir() else [item]
     if not paths:
         places = ", ".join(repr(os.fspath(item)) for item in sources) or "the empty list of files"
-        raise DataFileNotFoundError(f"No result records (*.json) in {places}; {_MAKE_ONE}")
+        raise DataFileNotFoundError(f"No result records (*.json) in {places}; {MAKE_ONE}")
     stored: dict[str, StoredRecord] = {}
     for path in sorted(set(paths)):
         try:

@@ -154,14 +154,10 @@ def ways_to_get(record: ResultRecord) -> list[str]:
 def training_rows(card: ModelCard) -> list[tuple[str, str]]:
     """Return what the card says of the training, as label and text."""
     stated = {key: value for key, value in card.training.items() if value not in (None, "", {}, [])}
-    rows = [("objective", card.objective or ""), ("augmentation", card.augmentation or "")] if stated else []
-    rows += [
-        (key.replace("_", " "), _inline(value))
-        for key, value in sorted(stated.items())
-        if key not in ("augmentation", "objective")
-    ]
-    rows += [("untrained twin", card.twin)] if stated and card.twin else []
-    return [(label, text) for label, text in rows if text]
+    facts = {key.replace("_", " "): _inline(value) for key, value in sorted(stated.items())}
+    facts = {"objective": "", "augmentation": ""} | facts
+    facts |= {"objective": card.objective, "augmentation": card.augmentation, "untrained twin": card.twin}
+    return [(label, text) for label, text in facts.items() if stated and text]
 
 
 def provenance_rows(provenance: Mapping[str, Any]) -> list[tuple[str, str]]:

@@ -18,10 +18,8 @@ _TEMPORARY = re.compile(r"\.(?P<stem>.+)-[0-9a-f]{16}(?P<suffix>\.[^.]*)?")
 def write_files(files: Mapping[Path, str | bytes], *, swept: bool = True) -> list[Path]:
     """Write files so that all are whole before the first appears, and return their paths.
 
-    Args:
-        files: Path → content.
-        swept: Remove what a killed process that wrote the same files left. This lists their folders, so records, of
-            which a folder may hold thousands, go without; ``leaderboard add`` sweeps once.
+    If ``swept``, what a killed process that wrote the same files left is removed. This lists their folders, so records,
+    of which a folder may hold thousands, go without; ``leaderboard add`` sweeps once.
 
     Raises:
         DataError: they cannot be written; what was there is still there.

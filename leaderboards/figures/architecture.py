@@ -28,9 +28,8 @@ def diagram(graph: ModelGraph, title: str) -> Drawing:
     """Draw a model's graph."""
     boxes = _folded(graph)
     place = {name: index for index, box in enumerate(boxes) for name in box.names}
-    edges = {
-        (place[e.source], place[e.target], e.feedback) for e in graph.edges if e.source in place and e.target in place
-    }
+    inside = [edge for edge in graph.edges if edge.source in place and edge.target in place]
+    edges = {(place[edge.source], place[edge.target], edge.feedback) for edge in inside}
     skips = sorted((e for e in edges if not e[2] and e[1] - e[0] > 1), key=lambda e: (e[1] - e[0], e[0]))
     loops = sorted((e for e in edges if e[2] or e[1] < e[0]), key=lambda e: (abs(e[0] - e[1]), e[1]))
     right, left = _lanes(skips), _lanes(loops)

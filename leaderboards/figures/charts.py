@@ -33,10 +33,12 @@ from leaderboards.figures.svg import Drawing, Scale, scale_of, tick_text
 from leaderboards.standing import DOUBTFUL
 from leaderboards.text import number, span
 
+_Told = Callable[[Entry], str]
+
 
 def board_figures(board: Board) -> list[Figure]:
     """Return all figures of a board, drawn or with what they lack."""
-    entries = board.entries
+    entries, title = board.entries, "Augmentation ablation (as figure 3.8 c)"
     return [
         fit_per_model(board),
         layer_fit(entries),
@@ -47,7 +49,7 @@ def board_figures(board: Board) -> list[Figure]:
         accuracy_against_fit(entries, supervised=True),
         parameters_against_fit(entries),
         parameters_against_accuracy(entries),
-        _ablation("augmentation", "Augmentation ablation (as figure 3.8 c)", entries, _augmentation, _any_masking),
+        _ablation("augmentation", title, entries, _augmentation, _any_masking, "augmentation"),
         _ablation("masking", "Temporal masking", entries, _masking, _augmentation, "share of masked steps"),
     ]
 
@@ -119,7 +121,7 @@ def layer_fit(entries: Sequence[Entry]) -> Figure:
     caption = (
         "Mean noise-corrected score of each layer, in the network's order: encoder blue, attender orange, decoder "
         "green. A layer without a bar has no defined score. For reading only: picking the best layer here would "
-        "flatter a model." + cut_words(many, 24)
+        f"flatter a model.{cut_words(many, 24)}"
     )
     return Figure(key, title, caption, drawing)
 
@@ -129,12 +131,12 @@ def accuracy(entries: Sequence[Entry]) -> Figure:
     key, title = "accuracy", "Task accuracy (as figure 3.6)"
     stated = sorted((e for e in entries if e.card.top1 is not None), key=lambda e: -(e.card.top1 or 0))
     if not stated:
-        lacking = "no record states a task accuracy (top1 on its model card); trained models do"
-        return Figure(key, title, lacking=lacking)
+        return Figure(
+            key, title, lacking="no record states a task accuracy (top1 on its model card); trained models do"
+        )
     # Untrained networks are drawn as twins; a board of such alone still shows them.
     stated = [e for e in stated if e.trained] or stated
-    models = stated[:SHOWN]
-    untrained = twins(entries)
+    models, untrained = stated[:SHOWN], twins(entries)
     found = [_twin_accuracy(entry, untrained) for entry in models]
     colour = colours(map(_objective, models))
     rows = []
@@ -158,14 +160,7 @@ def accuracy(entries: Sequence[Entry]) -> Figure:
     return Figure(key, title, caption, drawing)
 
 
-def _ablation(
-    key: str,
-    title: str,
-    entries: Sequence[Entry],
-    level: Callable[[Entry], str],
-    held: Callable[[Entry], str],
-    what: str = "augmentation",
-) -> Figure:
+def _ablation(key: str, title: str, entries: Sequence[Entry], level: _Told, held: _Told, what: str) -> Figure:
     """Draw the fit of models trained at several levels of one thing, on the same data, the other (``held``) fixed."""
     groups: dict[tuple[str, ...], dict[str, Entry]] = {}
     for entry in entries:

@@ -126,18 +126,14 @@ def colours(names: Iterable[str]) -> dict[str, str]:
     return dict.fromkeys(found, "c1") if len(found) == 1 else found
 
 
-_NAMES = dict(
-    zip(
-        [f"c{i}" for i in range(COLOURS + 1)],
-        ("grey", "blue", "orange", "teal", "violet", "ochre", "pink", "green", "sky"),
-        strict=True,
-    )
-)
+_NAMES = ("grey", "blue", "orange", "teal", "violet", "ochre", "pink", "green", "sky")
+"""Of the classes ``c0`` to ``c8``."""
 
 
 def legend_words(colour: dict[str, str]) -> str:
     """Return the sentence that says what the colours mean."""
-    return "Colours: " + ", ".join(f"{name} {_NAMES[kind]}" for name, kind in colour.items()) + "." if colour else ""
+    told = ", ".join(f"{name} {_NAMES[int(kind[1:])]}" for name, kind in colour.items())
+    return f"Colours: {told}." if told else ""
 
 
 def cut_words(count: int, shown: int = SHOWN) -> str:

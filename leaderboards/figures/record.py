@@ -37,13 +37,10 @@ def raw(record: ResultRecord) -> Drawing:
     return _chart(record, "raw r; the band is the noise ceiling", "r", lambda _: (float, None), band)
 
 
-def _chart(
-    record: ResultRecord,
-    label: str,
-    name: str,
-    reading: Callable[[Score], tuple[Callable[[float], float], Interval | None]],
-    band: Interval | None,
-) -> Drawing:
+_Reading = Callable[[Score], tuple[Callable[[float], float], Interval | None]]
+
+
+def _chart(record: ResultRecord, label: str, name: str, reading: _Reading, band: Interval | None) -> Drawing:
     """Draw one row per score; ``name`` is the field of scores and animals that is drawn."""
     named = [(record.score.name, "c1", "dot", record.score)]
     named += [("animal-to-animal", "c7", "square", record.animal_to_animal)] if record.animal_to_animal else []

@@ -85,29 +85,20 @@ def regression(x: Sequence[float], y: Sequence[float]) -> tuple[float, float, fl
 
 
 def scatter(
-    key: str,
-    title: str,
-    points: Sequence[tuple[float, float, Entry]],
-    label: str,
-    *,
-    up_label: str = "neural fit",
-    log: bool = False,
-    fit: bool = False,
-) -> Figure:
+    key: str, title: str, points: Sequence[tuple[float, float, Entry]], label: str, up_label: str = "neural fit",
+    *, log: bool = False, fit: bool = False,
+) -> Figure:  # fmt: skip
     """Return a scatter plot of entries, with a regression line where one is asked for."""
-    height, left, bottom = 400.0, 56.0, 352.0
+    height, left, right, bottom = 400.0, 56.0, WIDTH - 190, 352.0
     drawing = Drawing(WIDTH, height, f"{title}: {len(points)} models")
     xs, ys = [x for x, *_ in points], [y for _, y, _ in points]
-    if log:
-        across = Scale(min(xs) / 1.4, max(xs) * 1.4, left, WIDTH - 190, log=True)
-    else:
-        across = scale_of(xs, left, WIDTH - 190)
+    across = Scale(min(xs) / 1.4, max(xs) * 1.4, left, right, log=True) if log else scale_of(xs, left, right)
     up = scale_of(ys, bottom, 16, floor=None)
-    left_axis(drawing, up, left, WIDTH - 190)
+    left_axis(drawing, up, left, right)
     for tick in across.ticks:
         drawing.line(across.at(tick), 16, across.at(tick), bottom, "grid")
         drawing.text(across.at(tick), bottom + 18, tick_text(tick), "mid quiet")
-    drawing.text((left + WIDTH - 190) / 2, height - 8, label, "mid")
+    drawing.text((left + right) / 2, height - 8, label, "mid")
     drawing.text(left - 44, 12, up_label, "")
     caption = fitted(drawing, across, up, xs, ys) if fit else ""
     colour = colours(encoder_of(entry) for *_, entry in points)

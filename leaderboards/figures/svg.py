@@ -54,15 +54,7 @@ class Drawing:
         self.parts.append(f'<line x1="{_n(x1)}" y1="{_n(y1)}" x2="{_n(x2)}" y2="{_n(y2)}"{_class(kind)}/>')
 
     def rect(
-        self,
-        x: float,
-        y: float,
-        width: float,
-        height: float,
-        kind: str = "",
-        *,
-        rx: float = 0,
-        tip: str = "",
+        self, x: float, y: float, width: float, height: float, kind: str = "", *, rx: float = 0, tip: str = ""
     ) -> None:
         """Draw a rectangle with corners of radius ``rx``; ``tip`` is shown on hovering."""
         round_ = f' rx="{_n(rx)}"' if rx else ""

@@ -58,7 +58,7 @@ def _curve(drawing: Drawing, points: Sequence[Mapping[str, Any]], across: Scale)
     for x, value, ends, point in shown:
         if ends:
             drawing.line(x, up.at(ends[0]), x, up.at(ends[1]), "span c1")
-        clear = _finite(point["p"]) and _number(point["p"]) <= ALPHA
+        clear = _number(point["p"]) <= ALPHA
         tip = f"{_number(point['time']):.3g} s: {value:.2f}, p = {_number(point['p']):.2g}"
         drawing.mark(x, up.at(value), "dot", "c1" if clear else "c1 open", tip, 3.5)
 
@@ -90,11 +90,6 @@ def _number(value: Any) -> float:
     return math.nan if value is None else float(value)
 
 
-def _finite(value: Any) -> bool:
-    return math.isfinite(_number(value))
-
-
 def _ends(interval: Mapping[str, Any] | None) -> tuple[float, ...]:
-    if interval is None or not (_finite(interval["low"]) and _finite(interval["high"])):
-        return ()
-    return _number(interval["low"]), _number(interval["high"])
+    ends = () if interval is None else (_number(interval["low"]), _number(interval["high"]))
+    return ends if all(map(math.isfinite, ends)) else ()

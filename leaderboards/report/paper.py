@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from brainbench.core.errors import DataError, missing_dependency, unknown_name
+from brainbench.core.errors import DataError, check_name, missing_dependency
 from brainbench.core.records import ResultRecord
 from leaderboards import text as words
 from leaderboards.boards import Board, rank
@@ -53,17 +53,11 @@ def write_paper(
     format: str | None = None,
     title: str = "Leaderboard report",
 ) -> list[Path]:
-    """Write a report and return its files, the main one first.
+    """Write a report of stored records, or records in memory, and return its files, the main one first.
 
     All files appear together. Markdown comes with a folder of SVG files and the citations as ``.bib``; HTML and PDF
     hold their figures, and bring a ``.bib`` too. A single record gives the report of that model, with its
-    architecture and layers.
-
-    Args:
-        records: What :func:`leaderboards.read_records` returned, or records in memory.
-        path: The main file.
-        format: ``md``, ``html`` or ``pdf``; by the file's suffix if not given.
-        title: Heading.
+    architecture and layers. The format is ``md``, ``html`` or ``pdf``, by the file's suffix if not given.
 
     Raises:
         UsageError: there is no such format.
@@ -72,8 +66,7 @@ def write_paper(
     """
     path = Path(path)
     kind = format or path.suffix.removeprefix(".").lower()
-    if kind not in FORMATS:
-        raise unknown_name("report format", kind, FORMATS)
+    check_name("report format", kind, FORMATS)
     found = [item.record if isinstance(item, StoredRecord) else item for item in records]
     usable = [record for record in found if record is not None]
     if not usable:

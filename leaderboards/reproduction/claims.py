@@ -17,19 +17,11 @@ import numpy as np
 from brainbench.core.statistics import wilson_interval
 from leaderboards.figures.scatter import regression
 from leaderboards.ranking import lacking
+from leaderboards.reproduction import measures
 from leaderboards.reproduction.campaign import Campaign, NetworkKey
 from leaderboards.reproduction.comparisons import COMPARISONS, each
 from leaderboards.reproduction.contrasts import Effect, Verdict, contrast, judge
-from leaderboards.reproduction.measures import (
-    Measured,
-    accuracies,
-    fits,
-    layer_orders,
-    parameters,
-    published,
-    published_accuracy,
-    published_parameters,
-)
+from leaderboards.reproduction.measures import Measured
 
 SYNTHETIC_REASON = "the animals are synthetic"
 FIT_MEASURES = ("fit", "accuracy-fit", "parameters-fit", "layers", "blocks")
@@ -73,20 +65,23 @@ class Judgement:
 def published_claims() -> list[PublishedClaim]:
     """Return the claims in the order of the study."""
     known = [item.name for item in fields(PublishedClaim)]
-    return [PublishedClaim(**{name: told[name] for name in known if name in told}) for told in published()["claims"]]
+    return [
+        PublishedClaim(**{name: told[name] for name in known if name in told})
+        for told in measures.published()["claims"]
+    ]
 
 
 def judge_accuracy(campaign: Campaign) -> list[Judgement]:
     """Judge the claims on accuracy and training, and those that no record can test."""
-    ours, theirs = accuracies(campaign), published_accuracy()
+    ours, theirs = measures.accuracies(campaign), measures.published_accuracy()
     found = []
     for claim in published_claims():
         effect = other = None
         if claim.measure == "accuracy":
             effect, other = _compare(claim, ours), _compare(claim, theirs)
         elif claim.measure == "parameters-accuracy":
-            effect = _correlate(parameters(campaign), ours, "supervised")
-            other = _correlate(published_parameters(), theirs, "supervised")
+            effect = _correlate(measures.parameters(campaign), ours, "supervised")
+            other = _correlate(measures.published_parameters(), theirs, "supervised")
         elif claim.measure == "divergence":
             effect = _divergence(campaign)
         elif claim.measure != "none":
@@ -101,15 +96,15 @@ def judge_fit(campaign: Campaign, place: int) -> list[Judgement]:
     claims = [claim for claim in published_claims() if claim.measure in FIT_MEASURES]
     if not campaign.boards:
         return [Judgement(claim, None, "not trained yet", "not trained yet") for claim in claims]
-    board, fit = campaign.boards[place], fits(campaign, place)
+    board, fit = campaign.boards[place], measures.fits(campaign, place)
     lacks = lacking(max((len(entry.score.subjects) for entry in board.entries), default=0), len(board.conditions))
-    accuracy = {key: item.value for key, item in accuracies(campaign).networks.items()}
+    accuracy = {key: item.value for key, item in measures.accuracies(campaign).networks.items()}
     measured: dict[str, Callable[[PublishedClaim], Effect | None]] = {
         "fit": lambda claim: _compare(claim, fit),
         "accuracy-fit": lambda claim: _correlate(accuracy, fit, "supervised"),
-        "parameters-fit": lambda claim: _correlate(parameters(campaign, place), fit, None),
-        "layers": lambda claim: _compare(claim, layer_orders(campaign, place)),
-        "blocks": lambda claim: _compare(claim, layer_orders(campaign, place, "attender.block")),
+        "parameters-fit": lambda claim: _correlate(measures.parameters(campaign, place), fit, None),
+        "layers": lambda claim: _compare(claim, measures.layer_orders(campaign, place)),
+        "blocks": lambda claim: _compare(claim, measures.layer_orders(campaign, place, "attender.block")),
     }
     found = []
     for claim in claims:

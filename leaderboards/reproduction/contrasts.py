@@ -93,14 +93,9 @@ def contrast(
     level: float = LEVEL,
     detail: str = "",
 ) -> Effect | None:
-    """Return the mean of comparisons with its interval; None without any.
+    """Return the mean of comparisons with its interval of a level, and words beside it; None without any.
 
-    Args:
-        comparisons: Matched comparisons.
-        pool: Networks over which the variance over seeds is pooled.
-        paired: Take differences seed by seed.
-        level: Coverage of the interval.
-        detail: Words that stand beside it.
+    The variance over seeds is pooled over ``pool``; ``paired`` takes differences seed by seed.
     """
     from scipy.special import stdtrit
 

@@ -96,14 +96,8 @@ def _effect(effect: Effect | None) -> str:
 
 
 def _accuracy_row(item: Judgement) -> tuple[str, ...]:
-    return (
-        item.claim.claim,
-        _published(item),
-        number(item.published_effect.value) if item.published_effect else "–",
-        _effect(item.effect),
-        _above(item) or "–",
-        _verdict(item),
-    )
+    theirs = number(item.published_effect.value) if item.published_effect else "–"
+    return item.claim.claim, _published(item), theirs, _effect(item.effect), _above(item) or "–", _verdict(item)
 
 
 def _above(item: Judgement) -> str:

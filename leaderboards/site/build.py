@@ -27,7 +27,7 @@ from leaderboards.site.folder import rebuilt
 from leaderboards.site.page import render, script_json
 from leaderboards.site.score_page import model_page
 from leaderboards.site.table import COLUMNS, board_label, page_data, table_csv, table_rows
-from leaderboards.store import StoredRecord, record_text
+from leaderboards.store import MAKE_ONE, StoredRecord, record_text
 
 PAGE = 50
 """Rows of the table shown at once."""
@@ -51,11 +51,7 @@ def build_leaderboard(
     an earlier build that are no longer needed are removed if they are as the manifest says. Equal records give equal
     files.
 
-    Args:
-        records: What :func:`leaderboards.read_records` returned, or records in memory. Those with problems
-            are listed on the first page and left out of the boards.
-        folder: Folder of the site; made if it is not there.
-        title: Heading of the first page.
+    Records are stored ones or in memory; those with problems are listed on the first page and left out of the boards.
 
     Raises:
         DataError: there is nothing to show, or the site cannot be written.
@@ -63,10 +59,7 @@ def build_leaderboard(
     """
     stored = [_stored(item) if isinstance(item, ResultRecord) else item for item in records]
     if not stored:
-        raise DataError(
-            "There are no result records to build a leaderboard from; make one with: "
-            "brainbench score MODEL --out FOLDER"
-        )
+        raise DataError(f"There are no result records to build a leaderboard from; {MAKE_ONE}")
     root = Path(folder)
     try:
         _write(stored, root, title)

@@ -15,7 +15,7 @@ from pathlib import Path
 import msgspec
 
 from brainbench.core.errors import DataError, UsageError
-from brainbench.core.files import atomic_path, read_json, write_json
+from brainbench.core.files import atomic_path, file_hash, read_json, write_json
 from brainbench.core.writing.locks import lock_folder
 from leaderboards.writing import final_name, in_one_sentence, sweep
 
@@ -78,7 +78,7 @@ def check_site(root: Path) -> tuple[_Hashes, set[str]]:
         if name == MANIFEST or (temporary and not path.is_symlink()):
             continue
         listed = (known or {}).get(name, [])
-        if path.is_symlink() or not path.is_file() or _hash(path) not in listed:
+        if path.is_symlink() or not path.is_file() or file_hash(path, length=64) not in listed:
             what = "was changed since the last build" if listed else "no build of a leaderboard wrote"
             raise UsageError(
                 f"The folder {str(root)!r} holds {name[-80:]!r}, which {what}; move it away or give a new folder."
@@ -107,8 +107,3 @@ def _read(root: Path) -> _Hashes | None:
 
 def _write(root: Path, hashes: _Hashes) -> None:
     write_json(root / MANIFEST, {name: sorted(set(hashes[name])) for name in hashes})
-
-
-def _hash(path: Path) -> str:
-    with path.open("rb") as stream:
-        return hashlib.file_digest(stream, "sha256").hexdigest()

@@ -60,20 +60,13 @@ def script_json(value: Any) -> Any:
 @cache
 def _environment() -> Environment:
     environment = Environment(
-        loader=FileSystemLoader(_TEMPLATES),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
+        loader=FileSystemLoader(_TEMPLATES), autoescape=True, undefined=StrictUndefined, trim_blocks=True,
         lstrip_blocks=True,
-    )
-    for helper in (words.number, words.probability, words.count, words.span, words.level):
-        environment.filters[helper.__name__] = helper
-    environment.globals |= {
-        "STANDING": MEANINGS,
-        "SYNTHETIC": words.SYNTHETIC,
-        "p_sentence": words.p_sentence,
-        "colour_stops": colour_stops(),
-    }
+    )  # fmt: skip
+    helpers = (words.number, words.probability, words.count, words.span, words.level)
+    environment.filters |= {helper.__name__: helper for helper in helpers}
+    environment.globals |= {"STANDING": MEANINGS, "SYNTHETIC": words.SYNTHETIC, "p_sentence": words.p_sentence}
+    environment.globals["colour_stops"] = colour_stops()
     return environment
 
 

@@ -118,44 +118,26 @@ def _rules(board: Board) -> str:
 
 
 def _about(board: Board) -> list[str]:
-    parts = [f"{board.recordings}: {len(board.conditions)} stimuli, estimator {board.estimator}."]
-    if board.stimuli:
-        parts.append(board.stimuli)
-    parts.append(
-        f"Hash of the recordings {board.recordings_hash or 'unknown'}, "
-        f"of the stimuli {board.stimuli_hash or 'unknown'}."
-    )
-    return parts
+    first = f"{board.recordings}: {len(board.conditions)} stimuli, estimator {board.estimator}."
+    brain, shown = board.recordings_hash or "unknown", board.stimuli_hash or "unknown"
+    return [*filter(None, (first, board.stimuli)), f"Hash of the recordings {brain}, of the stimuli {shown}."]
 
 
 def _entry_row(entry: Entry) -> dict[str, Any]:
     score, card = entry.score, entry.card
     low, high = interval_ends(entry.interval) or (None, None)
-    return _score_row(score) | {name: getattr(card, name) for name in _CARD} | {
-        "kind": "model",
-        "rank_first": entry.first,
-        "rank_last": entry.last,
-        "name": entry.name,
-        "scaled": entry.scaled,
-        "scaled_low": low,
-        "scaled_high": high,
-        "standing": entry.standing,
-        "same_as": entry.same_as or None,
-        "unranked_because": entry.unranked_because or None,
-        "notes": "; ".join(entry.notes) or None,
-        "p": entry.p,
-        "spread": entry.spread,
-        "value": entry.value,
-        "r": entry.r,
-        "layer": entry.layer or None,
-        "seeds": entry.seeds,
-        "seed": card.seed if entry.seeds == 1 else None,
-        "weights": card.weights if entry.seeds == 1 else None,
-        "version": score.provenance.version or None,
+    # Where there are several seeds, what one of them states does not stand for all.
+    alone = {"low": None, "high": None} if entry.seeds > 1 else {"seed": card.seed, "weights": card.weights}
+    own = ("name", "scaled", "standing", "p", "spread", "value", "r", "seeds", "page")
+    return {
+        **_score_row(score), **{name: getattr(card, name) for name in _CARD},
+        **{name: getattr(entry, name) for name in own},
+        **{name: getattr(entry, name) or None for name in ("same_as", "unranked_because", "layer")},
+        "kind": "model", "rank_first": entry.first, "rank_last": entry.last, "scaled_low": low, "scaled_high": high,
+        "notes": "; ".join(entry.notes) or None, "version": score.provenance.version or None,
         "get": "; ".join(ways_to_get(entry.records[0])),
-        "page": entry.page,
-        "records": " ".join(record.identity for record in entry.records),
-    } | ({"low": None, "high": None} if entry.seeds > 1 else {})  # fmt: skip
+        "records": " ".join(record.identity for record in entry.records), **alone,
+    }  # fmt: skip
 
 
 def _baseline_row(baseline: Baseline) -> dict[str, Any]:

@@ -74,26 +74,20 @@ class Actuators:
         self._qpos, self._qvel, self._target, self._random, self._ctrl, self._power = map(wp.from_torch, shared)
 
     def reset(self, mask: torch.Tensor, draw: Any) -> None:
-        """Draw imperfections anew in some environments [B] bool.
-
-        Args:
-            mask: which.
-            draw: ``draw(n, low, high)`` returns uniform random numbers [B, n].
-        """
+        """Draw imperfections anew in some environments [B] bool; ``draw(n, low, high)`` returns numbers [B, n]."""
         column, joints = mask.unsqueeze(1), self.target.shape[1]
         position, c = self._simulation.qpos[:, self.qpos_columns], self._changes
-        values = {"stiffness": self.nominal["stiffness"], "damping": self.nominal["damping"]}
+        values = {name: self.nominal[name] for name in ("stiffness", "damping")}
+        values |= {"play": torch.zeros_like(self.target), "before": position, "strength": torch.ones_like(self.target)}
         if c is not None:
-            values = {
+            values |= {
                 "stiffness": self.nominal["stiffness"] * draw(joints, *c.stiffness),
                 "damping": self.nominal["damping"] * draw(joints, *c.damping),
                 "strength": draw(joints, *c.strength), "bias": draw(joints, *c.position_bias),
                 "deadband": draw(joints, *c.deadband), "backlash": draw(joints, *c.backlash),
                 "kick": c.kick * draw(joints, *c.kick_ratio),
             }  # fmt: skip
-        else:
-            values["strength"] = torch.ones_like(self.target)
-        for name, value in {**values, "play": torch.zeros_like(self.target), "before": position}.items():
+        for name, value in values.items():
             own = self.values[name]
             own.copy_(torch.where(column, value, own))
         self.target.copy_(torch.where(column, position, self.target))

@@ -33,15 +33,10 @@ class Contacts:
         self._tips = len(tips)
         self.tip_links = torch.as_tensor([scene.link_index(tip) for tip in tips], device=simulation.device)
         """[F] numbers of the links of finger tips."""
-        probes = {
-            tip: SurfaceDistanceProbe(
-                link=tip,
-                probes=Probes(np.array([point]), np.array([[0.0, 0.0, 1.0]]), np.array([0.5]), (1,)),
-                track=model.objects,
-                max_range=_REACH,
-            )
-            for tip, point in model.tips.items()
-        }
+        up, radius, probes = np.array([[0.0, 0.0, 1.0]]), np.array([0.5]), {}
+        for tip, point in model.tips.items():
+            place = Probes(np.array([point]), up, radius, (1,))
+            probes[tip] = SurfaceDistanceProbe(link=tip, probes=place, track=model.objects, max_range=_REACH)
         self._suite = SensorSuite(scene, probes, num_envs=simulation.num_envs, device=device, seed=seed)
         (runtime,) = self._suite.runtimes
         self.planes: torch.Tensor = wp.to_torch(runtime.measured())
@@ -52,9 +47,8 @@ class Contacts:
         for row, link in enumerate((*tips, *model.objects)):
             rows[list(scene.geometries_of(link))] = row
         self._rows = wp.array(rows, dtype=wp.int32, device=device)
-        self._forces: Any = wp.zeros(
-            (simulation.num_envs, len(tips) + len(model.objects)), dtype=wp.vec3f, device=device
-        )
+        shape = (simulation.num_envs, len(tips) + len(model.objects))
+        self._forces: Any = wp.zeros(shape, dtype=wp.vec3f, device=device)
         self.forces: torch.Tensor = wp.to_torch(self._forces)
         """[B, F + K, 3] net normal contact forces on finger tips, then on objects, world axes (N); a view."""
 

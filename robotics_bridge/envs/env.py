@@ -14,7 +14,6 @@ import torch
 from brainbench.core.cuda_graphs import CudaGraphStep, warp_recorder
 from brainbench.core.errors import UsageError
 from robotics_bridge import hands
-from robotics_bridge.envs.checkpoint import load_state, save_state
 from robotics_bridge.envs.observations import observe
 from robotics_bridge.envs.options import EnvOptions
 from robotics_bridge.envs.reset import EpisodeReset
@@ -30,11 +29,7 @@ _ADVICE = (
 
 
 def make(
-    name: str | Task,
-    *,
-    hand: str | os.PathLike[str] | hands.Hand = "xhand1",
-    config: str = "default",
-    **options: Any,
+    name: str | Task, *, hand: str | os.PathLike[str] | hands.Hand = "xhand1", config: str = "default", **options: Any
 ) -> Env:
     """Return the batched environment of a task.
 
@@ -59,11 +54,6 @@ def make(
 
 class Env:
     """A batch of environments; environments that end are reset within the same step.
-
-    Args:
-        task: what to do.
-        hand: with which hand.
-        options: how it is simulated, and what of it is observed.
 
     Raises:
         UsageError: task, hand and options do not fit.
@@ -96,8 +86,6 @@ class Env:
         self.reset()
         self.observation_shapes = {name: tuple(value.shape[1:]) for name, value in self.observations.items()}
         """Group → shape per environment."""
-
-    # --- facts -------------------------------------------------------------------------------------------------
 
     @property
     def num_actions(self) -> int:
@@ -162,8 +150,6 @@ class Env:
         if value is not self.state.episode.age:
             self.state.episode.age.copy_(value)
 
-    # --- life --------------------------------------------------------------------------------------------------
-
     def reset(self, mask: torch.Tensor | None = None) -> dict[str, torch.Tensor]:
         """Start new episodes in some environments ([B] bool; all by default) and return the observations."""
         if mask is None:
@@ -218,9 +204,25 @@ class Env:
         return {"episodes": episodes, **dict(zip(names, means, strict=True))}
 
     def state_dict(self) -> dict[str, torch.Tensor]:
-        """Return everything that the future depends on, but for the memory of noisy or slow tactile sensors."""
-        return save_state(self.state)
+        """Return copies of all that the future depends on, but for the memory of noisy or slow tactile sensors."""
+        state = self.state
+        own = {name: value.clone() for name, value in state.memory().items()}
+        own["generator"] = state.generator.get_state()
+        own |= {f"simulation.{name}": value for name, value in state.simulation.state_dict().items()}
+        return own | {f"observations.{name}": value.clone() for name, value in state.observations.items()}
 
     def load_state_dict(self, values: Mapping[str, torch.Tensor]) -> None:
         """Take up what :meth:`state_dict` returned."""
-        load_state(self.state, values)
+        state = self.state
+
+        def under(part: str) -> dict[str, torch.Tensor]:
+            return {name.removeprefix(part): value for name, value in values.items() if name.startswith(part)}
+
+        for name, value in state.memory().items():
+            value.copy_(values[name])
+        state.generator.set_state(values["generator"].cpu())
+        state.simulation.load_state_dict(under("simulation."))
+        if state.task_state is not None:
+            state.task_state.restored()
+        state.started = True
+        state.observations = {name: value.to(state.device) for name, value in under("observations.").items()}

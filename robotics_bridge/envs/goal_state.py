@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import torch
+from torch import nn
 
 from brainbench.core.rotations import angle_of, conjugate, multiply, rotate, twist_and_swing
 from robotics_bridge.tasks.task import Task
@@ -35,8 +36,7 @@ class GoalState:
         self.allowed_off_axis = float(getattr(task.goal, "allowed_off_axis", float("inf")))
         self._axis = None
         if self.goal is not None and self.goal.axis is not None:
-            self._axis = torch.tensor(self.goal.axis, device=device)
-            self._axis = self._axis / self._axis.norm()
+            self._axis = nn.functional.normalize(torch.tensor(self.goal.axis, device=device), dim=0)
         self._turn = None if task.turn_axis is None else torch.tensor(task.turn_axis, device=device)
         window = task.turn_window if self._turn is not None else 1
         self._ring = torch.full((window, num_envs), float("inf"), device=device)

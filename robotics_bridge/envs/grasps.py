@@ -66,12 +66,9 @@ def grasps_for(task: Task, hand: Hand, model: TaskModel, *, seed: int = 0) -> di
         DataError: too few grasps were found.
     """
     settings = SETTINGS.get(hand.name, SETTINGS["xhand1"])
-    numbers = [
-        getattr(m, f) for m in model.models for f in ("geom_size", "geom_pos", "body_pos", "body_quat", "body_mass")
-    ]
-    key = content_hash(
-        asdict(settings), task.name, seed, *(np.round(n, 6).tolist() for n in numbers), model.rest.tolist()
-    )
+    fields = ("geom_size", "geom_pos", "body_pos", "body_quat", "body_mass")
+    numbers = [np.round(getattr(m, name), 6).tolist() for m in model.models for name in fields]
+    key = content_hash(asdict(settings), task.name, seed, *numbers, model.rest.tolist())
     path = cache_dir("grasps") / f"{hand.name}-{key}.npz"
     if (found := read_sealed(path, "grasps")) is not None:
         return found
@@ -97,11 +94,9 @@ def sample(
     for _ in range(settings.tries):
         if len(found["joints"]) == count:
             break
-        # Candidates by rejection: random joints, places and turns about the reference, of which only those that hold
-        # are kept.
-        joints = np.clip(
-            model.rest + rng.uniform(-settings.perturb, settings.perturb, len(model.rest)), model.low, model.high
-        )
+        # Candidates by rejection: random joints, places and turns, of which only those that hold are kept.
+        change = rng.uniform(-settings.perturb, settings.perturb, len(model.rest))
+        joints = np.clip(model.rest + change, model.low, model.high)
         place = np.append(rng.uniform(-settings.shift, settings.shift, 2), 0.0)
         held = trial.run(joints, place, rng.uniform(-np.pi, np.pi))
         if held is not None:
@@ -149,11 +144,9 @@ class _Trial:
             return None
         return {"joints": d.qpos[self._joints].copy(), "target": target, "object": pose}
 
-    def _opened(
-        self, joints: NDArray[np.float64], place: NDArray[np.float64], yaw: float
-    ) -> NDArray[np.float64] | None:
-        """Return joints at which no finger starts inside the tool, and note which way they close."""
-        chosen = joints.copy()
+    def _opened(self, joints: NDArray[np.float64], place: NDArray[np.float64], yaw: float) -> Any:
+        """Return joints at which no finger starts inside the tool (None without), and note which way they close."""
+        chosen, flexed = joints.copy(), np.sign(self._model.high + self._model.low)
         self._closing = np.zeros(len(joints))
         for _ in range(12):
             self._put(chosen, place, yaw)
@@ -163,11 +156,11 @@ class _Trial:
                 break
             for columns, value in zip(self._chains, depth, strict=True):
                 if value > 1e-3:
-                    chosen[columns] -= 0.05 * np.sign(self._model.high[columns] + self._model.low[columns])
+                    chosen[columns] -= 0.05 * flexed[columns]
             chosen = np.clip(chosen, self._model.low, self._model.high)
         for columns in self._chains:
             if any(self._model.joints[c] in self._model.moved for c in columns):
-                self._closing[columns] = np.sign(self._model.high[columns] + self._model.low[columns])
+                self._closing[columns] = flexed[columns]
         return chosen if self._penetration() <= self._settings.max_penetration else None
 
     def _put(self, joints: NDArray[np.float64], place: NDArray[np.float64], yaw: float) -> None:
@@ -189,16 +182,14 @@ class _Trial:
 
     def _above(self, body: int) -> NDArray[np.int64]:
         """Return the numbers of the flexing joints that move a body; those that spread a finger are left alone."""
-        found = []
+        model, found = self._model, []
+        # A joint whose range lies about its zero spreads the finger; flexion has a one-sided range.
+        flexes = np.abs(model.low + model.high) >= 0.5 * (model.high - model.low)
+        owners = np.array([self._m.jnt_bodyid[self._m.joint(name).id] for name in model.joints])
         while body > 0:
-            for column, name in enumerate(self._model.joints):
-                low, high = self._model.low[column], self._model.high[column]
-                # A joint whose range lies about its zero spreads the finger; flexion has a one-sided range.
-                spreads = abs(low + high) < 0.5 * (high - low)
-                if self._m.jnt_bodyid[self._m.joint(name).id] == body and not spreads:
-                    found.append(column)
+            found.append(np.flatnonzero((owners == body) & flexes))
             body = int(self._m.body_parentid[body])
-        return np.array(found, dtype=np.int64)
+        return np.concatenate(found)
 
     def _contacts(self) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
         """Return the other body and the depth (m) of every contact of the tool."""
@@ -211,13 +202,10 @@ class _Trial:
 
     def _near(self) -> int:
         """Return how many finger tips are near the tool."""
-        d, close = self._d, 0
-        geoms = np.flatnonzero(self._m.geom_bodyid == self._object)
-        for body, point in self._tips:
-            world = d.xpos[body] + d.xmat[body].reshape(3, 3) @ point
-            distance = min(self._distance(int(geom), world) for geom in geoms)
-            close += distance < self._settings.near
-        return close
+        d = self._d
+        geoms = np.flatnonzero(self._m.geom_bodyid == self._object).tolist()
+        places = [d.xpos[body] + d.xmat[body].reshape(3, 3) @ point for body, point in self._tips]
+        return sum(min(self._distance(geom, place) for geom in geoms) < self._settings.near for place in places)
 
     def _distance(self, geom: int, point: NDArray[np.float64]) -> float:
         """Return the distance of a point from a cylinder or capsule (m)."""

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from brainbench.core.errors import UsageError, missing_dependency
+from brainbench.core.errors import UsageError, check_name, missing_dependency
 from robotics_bridge import tasks
 from robotics_bridge.envs.env import Env
 
@@ -34,11 +34,7 @@ REACH = 2.0
 
 
 class GymVectorEnv(VectorEnv):
-    """The environments of a task as numpy arrays; observations are a dictionary of the task's groups.
-
-    Args:
-        env: made with ``keep_final=True``.
-        groups: observation groups to show; all by default.
+    """The environments of a task as numpy arrays; observations are a dictionary of some groups, by default all.
 
     Raises:
         UsageError: the environment does not keep final observations, or has no such group.
@@ -47,23 +43,17 @@ class GymVectorEnv(VectorEnv):
     def __init__(self, env: Env, groups: tuple[str, ...] = ()) -> None:
         if not env.options.keep_final:
             raise UsageError("Gymnasium needs the last observations of episodes: tasks.make(..., keep_final=True).")
-        missing = [name for name in groups if name not in env.observation_shapes]
-        if missing:
-            raise UsageError(
-                f"The task has no observation group {missing[0]!r}; it has {list(env.observation_shapes)}."
-            )
+        for name in groups:
+            check_name("observation group of the task", name, env.observation_shapes)
         self.native = env
         """The native environment."""
         self.num_envs = env.num_envs
         self.metadata = {"autoreset_mode": AutoresetMode.SAME_STEP, "render_modes": []}
         self._groups = groups or tuple(env.observation_shapes)
-        infinite = float("inf")
-        spaces: dict[str, gymnasium.Space[Any]] = {
-            name: gymnasium.spaces.Box(-infinite, infinite, env.observation_shapes[name], np.float32)
-            for name in self._groups
-        }
+        shapes, box = env.observation_shapes, gymnasium.spaces.Box
+        spaces: Any = {name: box(-np.inf, np.inf, shapes[name], np.float32) for name in self._groups}
         self.single_observation_space = gymnasium.spaces.Dict(spaces)
-        self.single_action_space = gymnasium.spaces.Box(-REACH, REACH, (env.num_actions,), np.float32)
+        self.single_action_space = box(-REACH, REACH, (env.num_actions,), np.float32)
         batch = gymnasium.vector.utils.batch_space
         self.observation_space = batch(self.single_observation_space, self.num_envs)
         self.action_space = batch(self.single_action_space, self.num_envs)
@@ -71,11 +61,7 @@ class GymVectorEnv(VectorEnv):
     def reset(
         self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-        """Start new episodes; ``options={"reset_mask": [B] bool}`` starts some.
-
-        Raises:
-            UsageError: seeds differ between environments, whose random numbers are drawn together.
-        """
+        """Start new episodes, some with ``options={"reset_mask": [B] bool}``; UsageError for a list of seeds."""
         super().reset(seed=None)
         if isinstance(seed, list):
             raise UsageError("Environments draw their random numbers together: give one seed, not a list.")
@@ -101,27 +87,15 @@ class GymVectorEnv(VectorEnv):
             facts |= {"final_obs": rows, "_final_obs": ended}
             metric = {"metric": info["metric"].cpu().numpy(), "return": info["return"].cpu().numpy()}
             facts |= {"final_info": metric, "_final_info": ended}
-        return (
-            self._numpy(observations),
-            reward.cpu().numpy().astype(np.float64),
-            terminated.cpu().numpy(),
-            truncated.cpu().numpy(),
-            facts,
-        )
+        ends = (terminated.cpu().numpy(), truncated.cpu().numpy())
+        return self._numpy(observations), reward.cpu().numpy().astype(np.float64), *ends, facts
 
     def _numpy(self, observations: dict[str, Any]) -> dict[str, np.ndarray]:
         return {name: observations[name].detach().cpu().numpy().copy() for name in self._groups}
 
 
 class GymEnv(gymnasium.Env):
-    """One environment of a task; the user resets it when an episode has ended.
-
-    Args:
-        vector: a vector of one.
-
-    Raises:
-        UsageError: the vector holds more than one.
-    """
+    """The one environment of a vector (else UsageError); the user resets it when an episode has ended."""
 
     def __init__(self, vector: GymVectorEnv) -> None:
         if vector.num_envs != 1:

@@ -57,10 +57,6 @@ def _properties(state: EnvState) -> torch.Tensor:
     return torch.cat(parts, dim=1)
 
 
-def _privileged_joints(state: EnvState) -> torch.Tensor:
-    return torch.cat((_joints(state, noisy=False), state.contacts.tip_force.flatten(1)), dim=1)
-
-
 def _tilt(state: EnvState) -> torch.Tensor:
     quat = state.target_pose[:, 3:]
     axis = constant(state.task.turn_axis or (0.0, 0.0, -1.0), quat)
@@ -72,7 +68,7 @@ _GROUPS: dict[str, Callable[[EnvState], torch.Tensor]] = {
     "tactile": lambda state: state.touch.reading,  # type: ignore[union-attr]
     "link_pose": lambda state: state.link_pose,
     "goal": _goal,
-    "priv_proprio": _privileged_joints,
+    "priv_proprio": lambda state: torch.cat((_joints(state, noisy=False), state.contacts.tip_force.flatten(1)), dim=1),
     "priv_obj_state": _object,
     "priv_obj_props": _properties,
     "thermal": lambda state: state.task_state.observe("thermal"),  # type: ignore[union-attr]

@@ -7,7 +7,8 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from brainbench.core.devices import pick_device
-from brainbench.core.errors import UsageError, unknown_name
+from brainbench.core.errors import UsageError, check_name
+from brainbench.core.reading.ranges import check_number
 from robotics_bridge.hands.observations import observation_type
 from robotics_bridge.physics.state import MOST_ENVS
 
@@ -16,11 +17,7 @@ ENGINES = ("mujoco", "warp")
 
 @dataclass(frozen=True, kw_only=True)
 class EnvOptions:
-    """Options of the simulation of a task, and of what is observed.
-
-    Raises:
-        UsageError: a name or number is not valid.
-    """
+    """Options of the simulation of a task, and of what is observed; a value that is not valid is a UsageError."""
 
     num_envs: int = 1
     """Environments B."""
@@ -53,11 +50,9 @@ class EnvOptions:
     """
 
     def __post_init__(self) -> None:
-        if not 1 <= self.num_envs <= MOST_ENVS:
-            raise UsageError(f"There are 1 to {MOST_ENVS:,} environments; received {self.num_envs}.")
+        check_number("num_envs", self.num_envs, least=1, most=MOST_ENVS, whole=True)
         object.__setattr__(self, "engine", self.engine or ("mujoco" if self.device == "cpu" else "warp"))
-        if self.engine not in ENGINES:
-            raise unknown_name("engine", self.engine or "", ENGINES)
+        check_name("engine", self.engine, ENGINES)
         observation_type(self.observe)
         if self.link_pose and self.observe == "none":
             raise UsageError("Poses of tactile links belong to tactile sensors; choose an observation type.")

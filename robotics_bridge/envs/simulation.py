@@ -23,14 +23,7 @@ FIELDS = ("body_mass", "body_inertia", "body_subtreemass", "body_invweight0", "g
 
 
 class Simulation:
-    """Batched physics.
-
-    Args:
-        models: a ``mujoco.MjModel`` per shape of the object.
-        num_envs: B.
-        device: ``cpu`` or ``cuda``.
-        engine: ``mujoco`` or ``warp``.
-        threads: of C MuJoCo; None takes all processors.
+    """Batched physics by the engine ``mujoco`` or ``warp``, with a ``mujoco.MjModel`` per shape of the object.
 
     Raises:
         UsageError: the engine does not run on the device.
@@ -107,12 +100,7 @@ class Simulation:
         self.engine.kinematics()
 
     def reset(self, mask: torch.Tensor, qpos: torch.Tensor) -> None:
-        """Put some environments to positions, at rest, and make changed ``fields`` valid there.
-
-        Args:
-            mask: which [B] bool.
-            qpos: positions [B, nq]; rows of other environments are not looked at.
-        """
+        """Put some environments [B] bool to positions [B, nq], at rest, and make changed ``fields`` valid there."""
         column = mask.unsqueeze(1)
         self.qpos.copy_(torch.where(column, qpos, self.qpos))
         self.qvel.masked_fill_(column, 0.0)
@@ -159,10 +147,8 @@ class Simulation:
         # C MuJoCo takes the inertia of free bodies from here, not from their masses.
         inertia = np.array(self.engine.model_of(env).dof_M0)
         for body, first in self._free.items():
-            inertia[first : first + 3], inertia[first + 3 : first + 6] = (
-                values["body_mass"][body],
-                values["body_inertia"][body],
-            )
+            inertia[first : first + 3] = values["body_mass"][body]
+            inertia[first + 3 : first + 6] = values["body_inertia"][body]
         self.engine.set_fields(env, {**values, "dof_M0": inertia})
 
     def _pull(self) -> None:

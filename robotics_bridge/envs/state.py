@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from brainbench.core.devices import warp
 from brainbench.core.errors import UsageError
 from brainbench.core.rotations import conjugate, from_xyzw, multiply, rotate
 from robotics_bridge.envs.actuators import Actuators
@@ -85,11 +86,6 @@ class EpisodeState:
 
 class EnvState:
     """A batch of environments of a task: what resets, steps and observations read and write.
-
-    Args:
-        task: What to do.
-        hand: With which hand.
-        options: How it is simulated, and what of it is observed.
 
     Raises:
         UsageError: task, hand and options do not fit.
@@ -167,10 +163,22 @@ class EnvState:
         links = () if self.touch is None else self.touch.links
         self._tactile_links = integers([scene.link_index(link) for link in links])
 
+    def memory(self) -> dict[str, torch.Tensor]:
+        """Return the tensors themselves that the future depends on, by name, of all parts but the physics."""
+        parts = {"actuators": self.actuators, "goals": self.goals, "contacts": self.contacts}
+        if self.task_state is not None:
+            parts["task_state"] = self.task_state
+        found = self.episode.tensors()
+        found |= {f"{part}.{name}": value for part, owner in parts.items() for name, value in owner.memory().items()}
+        if self.touch is not None:
+            clock, wp = self.touch.suite.clock, warp()
+            found |= {"touch.age": wp.to_torch(clock.age), "touch.episode": wp.to_torch(clock.episode)}
+            found["touch.reading"] = self.touch.reading
+        return found
+
     def draw(self, count: int, low: float, high: float) -> torch.Tensor:
         """Return uniform random numbers [B, count]."""
-        # Numbers are drawn for all environments, whoever needs them: the draws of one do not depend on the resets of
-        # others.
+        # For all environments, whoever needs them: the draws of one do not depend on the resets of others.
         numbers = torch.rand(self.num_envs, count, generator=self.generator, device=self.device)
         return low + (high - low) * numbers
 

@@ -14,30 +14,16 @@ from brainbench.core.devices import warp
 from robotics_bridge.envs.options import EnvOptions
 from robotics_bridge.envs.simulation import Simulation
 from robotics_bridge.hands import Hand
-from robotics_bridge.hands.observations import (
-    PATCH_FORCE_SCALE,
-    TAXELS_IN_CONTACT,
-    observation_type,
-    sensors_for,
-)
+from robotics_bridge.hands.observations import PATCH_FORCE_SCALE, TAXELS_IN_CONTACT, observation_type, sensors_for
 from robotics_bridge.physics.state import HandState
 from robotics_bridge.sensors import SensorSuite
 from robotics_bridge.tasks.scenes import TaskModel
 
 
 class TactileObservation:
-    """The tactile sensors of an environment, read after every physics step.
+    """The tactile sensors of an environment, read after every physics step; the observation type is not ``none``.
 
-    Args:
-        model: physics of the task.
-        hand: the hand.
-        simulation: what moves the hand.
-        options: of the environments, with an observation type other than ``none``.
-        substeps: S.
-        twist: torsional friction of the task's force taxels (N·m·s), where the options' knobs name none.
-
-    Raises:
-        UsageError: a name is unknown.
+    ``twist`` is the torsional friction of the task's force taxels (N·m·s), where the options' knobs name none.
     """
 
     def __init__(
@@ -48,15 +34,14 @@ class TactileObservation:
         options: EnvOptions,
         *,
         substeps: int,
-        twist: float | None = None,
+        twist: float | None,
     ) -> None:
         observe, num_envs, device = options.observe, options.num_envs, simulation.warp_device
         kind = observation_type(observe)
         taxels = hand.layout(options.resolution, options.placement)
         taxels = {link: probes for link, probes in taxels.items() if probes.active.any()}
-        sensors = sensors_for(
-            observe, taxels, noisy=options.noisy, track=model.objects, **{"twist": twist, **options.knobs}
-        )
+        knobs = {"twist": twist, **options.knobs}
+        sensors = sensors_for(observe, taxels, noisy=options.noisy, track=model.objects, **knobs)
         self.suite = SensorSuite(simulation.engine.scene, sensors, num_envs=num_envs, device=device, seed=options.seed)
         self._name, self.links = observe, tuple(taxels)
         """Links with taxels, in the order of their columns."""

@@ -10,7 +10,7 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
-from brainbench.core.errors import unknown_name
+from brainbench.core.errors import check_name
 
 
 @dataclass(frozen=True)
@@ -82,11 +82,6 @@ PROCEDURES: Mapping[str, Procedure] = {
 
 
 def find_procedure(name: str) -> Procedure:
-    """Return a procedure by name.
-
-    Raises:
-        UsageError: there is none of this name.
-    """
-    if name not in PROCEDURES:
-        raise unknown_name("exploratory procedure", name, PROCEDURES)
+    """Return a procedure by name; raise UsageError if there is none of this name."""
+    check_name("exploratory procedure", name, PROCEDURES)
     return PROCEDURES[name]

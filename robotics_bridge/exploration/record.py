@@ -46,11 +46,7 @@ _DENSE = 2e5
 
 @dataclass(frozen=True, eq=False)
 class Explored:
-    """An object to explore.
-
-    Raises:
-        UsageError: it has neither or both of geometry and mesh.
-    """
+    """An object to explore; neither or both of geometry and mesh is a :class:`UsageError`."""
 
     label: str
     geometry: Geometry | None = None
@@ -111,11 +107,7 @@ class HandRecording:
         return HandCalibration.fit(self.grid())
 
     def dataset(self, calibration: HandCalibration | None = None) -> xr.Dataset:
-        """Return a stimulus set whose whiskers are the 35 sites, in a network's units.
-
-        Args:
-            calibration: From newtons on the hand to a whisker's; :meth:`calibration` if None.
-        """
+        """Return a stimulus set whose whiskers are the 35 sites, in a network's units by a :meth:`calibration`."""
         used = calibration or self.calibration()
         gains = np.array(used.gains(1), dtype=np.float32)
         rows, cols = np.divmod(np.arange(SITES), GRID_SHAPE[1])
@@ -172,12 +164,10 @@ def record_exploration(
         objects: What to explore; labels differ.
         procedures: Names of :data:`~robotics_bridge.exploration.procedures.PROCEDURES`.
         hand: Name or file of the hand.
-        resolution: Of its taxels.
-        placement: Of its taxels.
-        noisy: With the published imperfections of force taxels.
+        resolution: Of its taxels, as ``placement``.
+        noisy: With the published imperfections of force taxels, drawn by ``seed``.
         twist: Torsional friction of a taxel (N·m·s); the other parameters are the published ones.
         frames: T, of 9 ms; a procedure is stretched over them.
-        seed: Of the noise.
         progress: Called with (frames done, frames, what).
 
     Raises:
@@ -256,14 +246,12 @@ class _World:
             data.qpos[self._at : self._at + 7] = self._held(pose, item)
             # Velocity by a forward difference over 1 ‰ of the procedure: friction needs the speed of an object that is
             # put in place.
-            rates = [
-                (getattr(after, name) - getattr(pose, name)) / (step * self.span) for name in ("x", "y", "z", "yaw")
-            ]
-            data.qvel[self._speed : self._speed + 3] = rates[:3]
+            names, span = ("x", "y", "z", "yaw"), step * self.span
+            *rates, spin = [(getattr(after, name) - getattr(pose, name)) / span for name in names]
+            data.qvel[self._speed : self._speed + 3] = rates
             # MuJoCo wants the angular velocity in the body's own axes.
-            data.qvel[self._speed + 3 : self._speed + 6] = (
-                rates[3] * to_matrices(data.qpos[self._at + 3 : self._at + 7])[2]
-            )
+            upright = to_matrices(data.qpos[self._at + 3 : self._at + 7])[2]
+            data.qvel[self._speed + 3 : self._speed + 6] = spin * upright
             data.ctrl[self._drives] = pose.closing * self._closed
         self.engine.step()
 

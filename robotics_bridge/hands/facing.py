@@ -122,7 +122,7 @@ def _flexion(model: Any, body: int) -> int:
     """Return the joint that flexes a body: of its own and those that cross them, the one with the largest range."""
     best, most = -1, 0.0
     while body > 0:
-        for joint in range(int(model.body_jntadr[body]), int(model.body_jntadr[body]) + int(model.body_jntnum[body])):
+        for joint in np.flatnonzero(model.jnt_bodyid == body).tolist():
             span = float(np.ptp(model.jnt_range[joint])) if model.jnt_limited[joint] else 2 * np.pi
             if int(model.jnt_type[joint]) == 3 and span > most:
                 best, most = joint, span

@@ -12,7 +12,7 @@ from typing import Any
 from xml.etree import ElementTree
 
 from brainbench.core.devices import mujoco_module
-from brainbench.core.errors import DataError, UsageError, shown, unknown_name
+from brainbench.core.errors import DataError, UsageError, check_name, shown
 from brainbench.core.reading.regular import check_file, readable
 from brainbench.core.reading.texts import read_text
 from robotics_bridge.hands.facing import palmar_directions
@@ -114,8 +114,7 @@ class Hand:
         layout = source if isinstance(source, dict) else read_probes(source)
         known = [self.model.body(index).name for index in range(1, self.model.nbody)]
         for link in layout:
-            if link not in known:
-                raise unknown_name("link", link, known)
+            check_name("link", link, known)
         return Hand(self.name, self.palm, self.fingers, self.spec, self.path, {**self.probes, resolution: layout})
 
     def _cast(self, resolution: str, links: tuple[str, ...]) -> Layout:
@@ -132,11 +131,10 @@ class Hand:
             elif link not in facing:
                 reasons.append(f"no joint tells which side of {link!r} touches")
             else:
+                settings = {"facing": facing[link], "radius": radius}
                 for extent in (0.8, 0.4):
                     with contextlib.suppress(UsageError):
-                        found[link] = cast_grid(
-                            self.model, link, rows, columns, facing=facing[link], radius=radius, extent=extent
-                        )
+                        found[link] = cast_grid(self.model, link, rows, columns, **settings, extent=extent)
                         break
                 else:
                     reasons.append(f"{link!r} has no surface on its inner side")
@@ -159,7 +157,6 @@ def read_mjspec(path: Path) -> Any:
         DataError: MuJoCo cannot read it.
     """
     mujoco = mujoco_module()
-
     _check_xml(path)
     folder = path.parent
     with readable(path, "URDF or MJCF file"):

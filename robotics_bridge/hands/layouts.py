@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from brainbench.core.errors import DataError, UsageError, shown, unknown_name
+from brainbench.core.errors import DataError, UsageError, check_name, shown
 from brainbench.core.files import read_json, write_json
 from brainbench.core.reading.regular import reason
 from robotics_bridge.hands.spec import BoxGeometry, CapsuleGeometry, Grid, Link, Pad
@@ -25,11 +25,7 @@ Layout = dict[str, Probes]
 
 
 def pad_probes(link: Link, grid: Grid) -> Probes:
-    """Lay a grid on the pad of a link.
-
-    Raises:
-        UsageError: the link has no pad.
-    """
+    """Lay a grid on the pad of a link; raise UsageError if it has none."""
     if link.pad is None or not link.solids:
         raise UsageError(f"Link {link.name!r} has no sensing pad.")
     solid = link.solids[0]
@@ -108,10 +104,8 @@ def active_count(layout: Mapping[str, Probes]) -> int:
 
 def check_names(resolution: str, placement: str) -> None:
     """Raise UsageError for an unknown resolution or placement."""
-    if resolution not in RESOLUTIONS:
-        raise unknown_name("resolution", resolution, RESOLUTIONS)
-    if placement not in PLACEMENTS:
-        raise unknown_name("placement", placement, PLACEMENTS)
+    check_name("resolution", resolution, RESOLUTIONS)
+    check_name("placement", placement, PLACEMENTS)
 
 
 def read_probes(path: str | os.PathLike[str]) -> Layout:
@@ -161,10 +155,7 @@ def write_probes(path: str | os.PathLike[str], layout: Mapping[str, Probes]) -> 
 def palm_side(axis: Any, reach: Any, limits: tuple[float, float]) -> NDArray[np.float64]:
     """Return the direction [3] in which a link moves when its joint flexes: its palmar side.
 
-    Args:
-        axis: [3] of the joint.
-        reach: [3] from the joint to the far end of the link.
-        limits: Of the joint [rad]; the longer side is flexion.
+    ``reach`` [3] leads from the joint to the far end of the link; the longer side of its limits [rad] is flexion.
     """
     sign = 1.0 if abs(limits[1]) >= abs(limits[0]) else -1.0
     # Velocity of the far end under a turn about the joint, ω × r; its sign follows the longer side of the range.

@@ -11,7 +11,7 @@ from typing import Any
 
 import torch
 
-from brainbench.core.errors import UsageError, unknown_name
+from brainbench.core.errors import UsageError, check_name
 from robotics_bridge import sensors
 from robotics_bridge.hands.layouts import Layout
 from robotics_bridge.sensors.sensor import Sensor
@@ -53,13 +53,8 @@ OBSERVATIONS: dict[str, ObservationType] = {
 
 
 def observation_type(name: str) -> ObservationType:
-    """Return an observation type by name.
-
-    Raises:
-        UsageError: there is none of this name.
-    """
-    if name not in OBSERVATIONS:
-        raise unknown_name("observation type", name, OBSERVATIONS)
+    """Return an observation type by name; raise UsageError if there is none of this name."""
+    check_name("observation type", name, OBSERVATIONS)
     return OBSERVATIONS[name]
 
 
@@ -77,8 +72,7 @@ def sensors_for(
         layout: Link → probes.
         noisy: With the published imperfections of the type (table 4.12), the release threshold included.
         track: Links that are looked at; empty means everything that may touch.
-        **knobs: Further settings of the sensor class, e.g. ``convention="thesis"`` or ``points=500``;
-            ``twist`` is left out where there is no force law.
+        **knobs: Further settings of the sensor class; ``twist`` is left out where there is no force law.
 
     Raises:
         UsageError: there is no such type, or a knob has a wrong value.
@@ -123,8 +117,7 @@ def observe(name: str, readings: Mapping[str, torch.Tensor], layout: Layout) -> 
         return torch.zeros(batch, 0)
     parts = []
     for link, probes in layout.items():
-        if link not in readings:
-            raise unknown_name("link among the readings", link, readings)
+        check_name("link among the readings", link, readings)
         reading, count = readings[link], len(probes)
         if reading[0].numel() % count:
             shape = tuple(reading.shape)

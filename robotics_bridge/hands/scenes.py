@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from brainbench.core.devices import mujoco_module
 from brainbench.core.errors import UsageError
+from brainbench.core.reading.ranges import check_number
 from brainbench.core.rotations import to_matrices
 from robotics_bridge.hands.hand import Hand, palmar_directions
 
@@ -29,19 +30,13 @@ def holding(hand: Hand, **settings: float) -> Any:
 def holding_spec(hand: Hand, *, radius: float = 0.03, timestep: float = 0.002, reach: float = 0.6) -> Any:
     """Return the ``mujoco.MjSpec`` behind :func:`holding`: the palm's surface below the ball is at z = 0.
 
-    A hand whose file has no drives (a URDF) gets a weak position servo on every hinge.
-
-    Args:
-        hand: Any hand.
-        radius: Of the ball of 100 g [m].
-        timestep: Of the engine [s].
-        reach: Place of the ball between the middle of the palm (0) and the roots of the fingers (1).
+    A hand whose file has no drives (a URDF) gets a weak position servo on every hinge. The ball of 100 g has a
+    ``radius`` [m] and lies between the middle of the palm (``reach`` 0) and the roots of the fingers (1).
 
     Raises:
         UsageError: the palm's side is unknown, or the radius is not positive.
     """
-    if not radius > 0:
-        raise UsageError(f"A ball has a positive radius (m); received {radius!r}.")
+    check_number("radius of the ball (m)", radius, above=0)
     up, surface, step = palm_surface(hand)
     # Between the middle of the palm and the roots of the fingers, where these reach it when they close.
     surface = surface + reach * step

@@ -133,11 +133,7 @@ class Joint:
 
 @dataclass(frozen=True)
 class HandSpec:
-    """A complete hand.
-
-    Raises:
-        UsageError: a joint or finger names a link that does not exist.
-    """
+    """A complete hand; a joint or finger that names a link which does not exist is a :class:`UsageError`."""
 
     name: str
     palm: str
@@ -202,7 +198,6 @@ def build(hand: HandSpec) -> Any:
         UsageError: the links form no tree.
     """
     mujoco = mujoco_module()
-
     spec = mujoco.MjSpec()
     spec.modelname = hand.name
     spec.compiler.degree = False
@@ -241,25 +236,21 @@ def build(hand: HandSpec) -> Any:
 
 def _add_solids(body: Any, link: Link) -> None:
     """Attach the solids; each gets its share of the link's mass by volume."""
-    mujoco = mujoco_module()
-
+    kinds = mujoco_module().mjtGeom
     volumes = np.array([_volume(solid) for solid in link.solids])
     if not link.solids:
         body.explicitinertial = True
         body.mass, body.inertia = link.mass, (1e-8, 1e-8, 1e-8)
     for index, solid in enumerate(link.solids):
-        common = {"name": f"{link.name}_{index}", "mass": float(link.mass * volumes[index] / volumes.sum())}
-        if isinstance(solid, CapsuleGeometry):
-            body.add_geom(
-                type=mujoco.mjtGeom.mjGEOM_CAPSULE,
-                fromto=(*solid.start, *solid.end),
-                size=(solid.radius, 0, 0),
-                **common,
-            )
-        elif isinstance(solid, BoxGeometry):
-            body.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, pos=solid.center, size=solid.half, **common)
+        form: dict[str, Any]
+        if isinstance(solid, BoxGeometry):
+            form = {"type": kinds.mjGEOM_BOX, "pos": solid.center, "size": solid.half}
+        elif isinstance(solid, SphereGeometry):
+            form = {"type": kinds.mjGEOM_SPHERE, "pos": solid.center, "size": (solid.radius, 0, 0)}
         else:
-            body.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, pos=solid.center, size=(solid.radius, 0, 0), **common)
+            ends = (*solid.start, *solid.end)
+            form = {"type": kinds.mjGEOM_CAPSULE, "fromto": ends, "size": (solid.radius, 0, 0)}
+        body.add_geom(name=f"{link.name}_{index}", mass=float(link.mass * volumes[index] / volumes.sum()), **form)
 
 
 def _volume(solid: Solid) -> float:

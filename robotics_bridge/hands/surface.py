@@ -31,21 +31,13 @@ def link_points(model: Any, body: int) -> NDArray[np.float64]:
 
 def geoms_of(model: Any, body: int) -> list[int]:
     """Return the geometries of a body that collide, or all of them where none does."""
-    first, count = int(model.body_geomadr[body]), int(model.body_geomnum[body])
-    mine = list(range(first, first + count)) if count else []
+    mine = np.flatnonzero(model.geom_bodyid == body).tolist()
     solid = [geom for geom in mine if model.geom_contype[geom] or model.geom_conaffinity[geom]]
     return solid or mine
 
 
 def cast_grid(
-    model: Any,
-    link: str,
-    rows: int,
-    columns: int,
-    *,
-    facing: ArrayLike,
-    radius: float,
-    extent: float = 0.8,
+    model: Any, link: str, rows: int, columns: int, *, facing: ArrayLike, radius: float, extent: float = 0.8
 ) -> Probes:
     """Lay a grid on the side of a link that faces a direction.
 

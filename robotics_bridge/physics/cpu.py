@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from brainbench.core.devices import mujoco_module
 from brainbench.core.errors import UsageError
+from brainbench.core.reading.ranges import check_number
 from robotics_bridge.physics.scene import TouchScene
 from robotics_bridge.physics.state import MOST_ENVS, HandState
 from robotics_bridge.physics.variants import check_fields
@@ -30,7 +31,7 @@ class MujocoEngine:
     Args:
         model: a compiled ``mujoco.MjModel``, or variants of one that differ in numbers only (see
             :func:`~robotics_bridge.physics.variants.compile_variants`).
-        num_envs: number of environments B.
+        num_envs: B.
         threads: how many work at once; every processor by default.
         fields: values per environment [B, ...] of any model field, e.g. ``{"body_mass": …}``.
         assignment: variant of environment e is ``assignment[e % len(assignment)]``; each in turn by default.
@@ -50,8 +51,7 @@ class MujocoEngine:
         assignment: Sequence[int] = (),
         contacts: int = 64,
     ) -> None:
-        if not 1 <= num_envs <= MOST_ENVS:
-            raise UsageError(f"An engine has 1 to {MOST_ENVS:,} environments; received {num_envs}.")
+        check_number("environments of an engine", num_envs, least=1, most=MOST_ENVS, whole=True)
         models = list(model) if isinstance(model, (list, tuple)) else [model]
         self.model: Any = models[0]
         """The model, or the first of its variants."""
@@ -62,9 +62,8 @@ class MujocoEngine:
         self._models = [models[order[env % len(order)]] for env in range(num_envs)]
         self._own_models = bool(varied)
         if varied:
-            self._models = [
-                _with_fields(m, {k: v[env] for k, v in varied.items()}) for env, m in enumerate(self._models)
-            ]
+            own = [{name: rows[env] for name, rows in varied.items()} for env in range(num_envs)]
+            self._models = list(map(_with_fields, self._models, own))
         self._data = [mujoco.MjData(m) for m in self._models]
         self.state: HandState = HandState.empty(num_envs, self.model.nbody, contacts * num_envs, "cpu")
         """Refreshed by :meth:`step`, :meth:`forward` and :meth:`reset`."""
@@ -112,11 +111,7 @@ class MujocoEngine:
         return self._models[env]
 
     def set_fields(self, env: int, values: Mapping[str, ArrayLike]) -> None:
-        """Write model fields of one environment; derived constants are the caller's business.
-
-        Raises:
-            UsageError: the engine was made without ``fields``, so that environments share their model.
-        """
+        """Write model fields of one environment, in an engine made with ``fields``, but no derived constants."""
         if not self._own_models:
             raise UsageError("The environments share one model; make the engine with fields={...} to change them.")
         for name, value in values.items():
@@ -206,17 +201,9 @@ class _Gatherer:
         self._contacts[env] = ()
         if data.ncon:
             c = data.contact
-            self._contacts[env] = (
-                c.geom.copy(),
-                c.dist.copy(),
-                c.pos.copy(),
-                c.frame[:, :3].copy(),
-                c.efc_address.copy(),
-                c.dim.copy(),
-                data.efc_force.copy(),
-                c.frame[:, 3:].reshape(-1, 2, 3).copy(),
-                c.friction[:, :2].copy(),
-            )
+            tangents = c.frame[:, 3:].reshape(-1, 2, 3)
+            parts = (c.geom, c.dist, c.pos, c.frame[:, :3], c.efc_address, c.dim, data.efc_force, tangents)
+            self._contacts[env] = tuple(part.copy() for part in (*parts, c.friction[:, :2]))
 
     def _forces(self, found: Sequence[tuple[NDArray[Any], ...]]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return normal force [C] and friction [C, 3] of every contact, by its rows among the constraint forces."""
@@ -262,13 +249,9 @@ class _Gatherer:
         state.contact_count.fill_(total)
         if total > room and not self._warned:
             self._warned = True
-            most = max(len(parts[1]) for parts in found)
-            warnings.warn(
-                f"The engine found {total} contacts and has room for {room}; the last ones are lost. Make it with "
-                f"contacts={max(most, -(-total // len(self._data)))}.",
-                RuntimeWarning,
-                stacklevel=2,
-            )
+            enough = max(*(len(parts[1]) for parts in found), -(-total // len(self._data)))
+            text = f"The engine found {total} contacts and has room for {room}; the last ones are lost. "
+            warnings.warn(f"{text}Make it with contacts={enough}.", RuntimeWarning, stacklevel=2)
 
 
 def _with_fields(model: Any, values: Mapping[str, NDArray]) -> Any:

@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike
 from brainbench.core.cuda_graphs import record_launches
 from brainbench.core.devices import pick_device, warp
 from brainbench.core.errors import MissingDependencyError, UsageError, install_command, unknown_name
+from brainbench.core.reading.ranges import check_number
 from robotics_bridge.physics.kernels.state import fill_contacts, fill_links
 from robotics_bridge.physics.scene import TouchScene
 from robotics_bridge.physics.state import MOST_ENVS, HandState
@@ -29,11 +30,8 @@ class MujocoWarpEngine:
     On CUDA the step and the filling of the state are one recorded graph.
 
     Args:
-        model: a compiled ``mujoco.MjModel``, or variants of one that differ in numbers only.
-        num_envs: number of environments B.
+        model: as of ``MujocoEngine``; so are ``num_envs``, ``assignment`` and ``fields``, which MuJoCo Warp must batch.
         device: ``cuda``, ``cuda:1`` or ``cpu`` (slow; for tests).
-        fields: values per environment [B, ...] of model fields that MuJoCo Warp batches.
-        assignment: variant of environment e is ``assignment[e % len(assignment)]``; each in turn by default.
         contacts: room for contacts per environment, on average; by default sixteen, and nine per moving link.
         constraints: room for constraint rows in each environment; by default enough for that many contacts.
 
@@ -54,8 +52,7 @@ class MujocoWarpEngine:
         constraints: int | None = None,
     ) -> None:
         self._engine = _mujoco_warp()
-        if not 1 <= num_envs <= MOST_ENVS:
-            raise UsageError(f"An engine has 1 to {MOST_ENVS:,} environments; received {num_envs}.")
+        check_number("environments of an engine", num_envs, least=1, most=MOST_ENVS, whole=True)
         wp = warp()
         self._device = pick_device(device)
         models = list(model) if isinstance(model, (list, tuple)) else [model]

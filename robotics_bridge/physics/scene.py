@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from brainbench.core.devices import mujoco_module
-from brainbench.core.errors import UsageError, unknown_name
+from brainbench.core.errors import UsageError, check_name
 from brainbench.geometry import Mesh
 
 mujoco = mujoco_module()
@@ -56,8 +56,7 @@ class Geometry:
     affinity: int = 1
 
     def __post_init__(self) -> None:
-        if self.kind not in KINDS:
-            raise unknown_name("kind of geometry", self.kind, KINDS)
+        check_name("kind of geometry", self.kind, KINDS)
         needed = _SIZES[self.kind]
         if len(self.size) < needed or not all(np.isfinite(s) and s > 0 for s in self.size[:needed]):
             raise UsageError(
@@ -112,8 +111,7 @@ class Variants:
     def __post_init__(self) -> None:
         if not self.choices:
             raise UsageError("Variants of a geometry need at least one choice.")
-        wrong = [index for index in self.assignment if not 0 <= index < len(self.choices)]
-        if wrong:
+        if wrong := [index for index in self.assignment if not 0 <= index < len(self.choices)]:
             raise UsageError(f"There are {len(self.choices)} variants; the assignment names variant {wrong[0]}.")
 
     def of(self, env: int) -> Geometry:
@@ -145,10 +143,7 @@ class TouchScene:
             if repeated:
                 raise UsageError(f"The scene has two of the {what} {repeated[0]!r}; names must differ.")
         for geometry in self.geometries:
-            if geometry.link not in self._links:
-                raise unknown_name(
-                    "link", geometry.link, self.links, hint=f"Geometry {geometry.name!r} is fixed to it."
-                )
+            check_name("link", geometry.link, self.links, hint=f"Geometry {geometry.name!r} is fixed to it.")
 
     @cached_property
     def _links(self) -> dict[str, int]:
@@ -161,8 +156,7 @@ class TouchScene:
 
     def link_index(self, name: str) -> int:
         """Return the number of a link; an unknown name raises UsageError."""
-        if name not in self._links:
-            raise unknown_name("link", name, self.links)
+        check_name("link", name, self.links)
         return self._links[name]
 
     def geometries_of(self, link: str) -> tuple[int, ...]:
@@ -179,9 +173,7 @@ class TouchScene:
 
     def candidates(self, link: str) -> tuple[int, ...]:
         """Return the numbers of all geometries that may come into contact with a link."""
-        here = self.link_index(link)
-        barred = {low + high - here for low, high in self.excluded if here in (low, high)} | {here}
-        free = ~np.isin(self.link_of, list(barred))
+        free = ~np.isin(self.link_of, list(self._barred(link)))
         found: set[int] = set()
         for own in self.geometries_of(link):
             kind, affinity = self._bits[own]
@@ -191,6 +183,11 @@ class TouchScene:
             found |= {low + high - own for low, high in self.included if own in (low, high)}
         return tuple(sorted(found))
 
+    def _barred(self, link: str) -> set[int]:
+        """Return the numbers of the links that never collide with a link, its own among them."""
+        here = self.link_index(link)
+        return {low + high - here for low, high in self.excluded if here in (low, high)} | {here}
+
     def surroundings(self, link: str) -> tuple[int, ...]:
         """Return the numbers of the geometries that a link may meet without regard to contacts.
 
@@ -199,12 +196,9 @@ class TouchScene:
         """
         if found := self.candidates(link):
             return found
-        here = self.link_index(link)
-        barred = {low + high - here for low, high in self.excluded if here in (low, high)} | {here}
         kept: list[int] = []
-        for other in range(len(self.links)):
-            mine = [] if other in barred else np.flatnonzero(self.link_of == other).tolist()
-            mine = [g for g in mine if self.geometries[g].kind != "other"]
+        for other in {*range(len(self.links))} - self._barred(link):
+            mine = [g for g in np.flatnonzero(self.link_of == other).tolist() if self.geometries[g].kind != "other"]
             kept += [g for g in mine if self.geometries[g].collides] or mine
         return tuple(sorted(kept))
 
@@ -212,10 +206,7 @@ class TouchScene:
     def from_mujoco(cls, model: Any, others: Sequence[Any] = (), assignment: Sequence[int] = ()) -> TouchScene:
         """Read the scene out of a compiled ``mujoco.MjModel``; link 0 is the world.
 
-        Args:
-            model: the model, or the first of several variants that differ in numbers only.
-            others: the further variants.
-            assignment: variant of each environment, as in :class:`Variants`; empty means each in turn.
+        ``others`` are further variants that differ in numbers only, assigned to environments as in :class:`Variants`.
 
         Raises:
             UsageError: the variants have different links or geometries, or the time step is no sensible time.
@@ -225,20 +216,21 @@ class TouchScene:
                 f"A step of the engine lasts more than 0 s, at most {LONGEST_STEP:g} s; received {timestep}."
             )
         links = tuple(_name(model, 1, index) for index in range(model.nbody))
-        geometries = _geometries(model, links)
-        variants: dict[int, Variants] = {}
         for other in others:
             if other.nbody != model.nbody or other.ngeom != model.ngeom:
                 raise UsageError(
                     f"Variants of a scene need the same links and geometries; one has {other.nbody} links and "
                     f"{other.ngeom} geometries, the first {model.nbody} and {model.ngeom}."
                 )
-        if others:
-            rows = [geometries, *(_geometries(other, links) for other in others)]
-            for index, column in enumerate(zip(*rows, strict=True)):
-                if any(_differs(column[0], shape) for shape in column[1:]):
-                    variants[index] = Variants(tuple(column), tuple(int(a) for a in assignment))
-        return cls(links, geometries, _never(model), _always(model), variants)
+        geometries, *rows = (_geometries(each, links) for each in (model, *others))
+        variants = {
+            index: Variants((first, *rest), tuple(int(a) for a in assignment))
+            for index, (first, *rest) in enumerate(zip(geometries, *rows, strict=True))
+            if any(_differs(first, shape) for shape in rest)
+        }
+        pairs = zip(model.pair_geom1.tolist(), model.pair_geom2.tolist(), strict=True)
+        always = frozenset((min(pair), max(pair)) for pair in pairs)
+        return cls(links, geometries, _never(model), always, variants)
 
 
 def _name(model: Any, what: int, index: int) -> str:
@@ -253,30 +245,25 @@ def _geometries(model: Any, links: tuple[str, ...]) -> tuple[Geometry, ...]:
         data = int(model.geom_dataid[index])
         if kind == "mesh" and data not in meshes:
             meshes[data] = _mesh(model, data)
+        size, position, quaternion = (
+            tuple(getattr(model, f"geom_{name}")[index].tolist()) for name in ("size", "pos", "quat")
+        )
         found.append(
             Geometry(
-                name=_name(model, int(mujoco.mjtObj.mjOBJ_GEOM), index),
-                link=links[model.geom_bodyid[index]],
-                kind=kind,
-                size=tuple(model.geom_size[index].tolist()),
-                position=tuple(model.geom_pos[index].tolist()),
-                quaternion=tuple(model.geom_quat[index].tolist()),
-                mesh=meshes[data] if kind == "mesh" else None,
-                contype=int(model.geom_contype[index]),
+                name=_name(model, int(mujoco.mjtObj.mjOBJ_GEOM), index), link=links[model.geom_bodyid[index]],
+                kind=kind, size=size, position=position, quaternion=quaternion,
+                mesh=meshes[data] if kind == "mesh" else None, contype=int(model.geom_contype[index]),
                 affinity=int(model.geom_conaffinity[index]),
             )
-        )
+        )  # fmt: skip
     return tuple(found)
 
 
 def _mesh(model: Any, index: int) -> Mesh:
     first, count = int(model.mesh_vertadr[index]), int(model.mesh_vertnum[index])
     face, faces = int(model.mesh_faceadr[index]), int(model.mesh_facenum[index])
-    return Mesh(
-        model.mesh_vert[first : first + count].astype(float),
-        model.mesh_face[face : face + faces],
-        _name(model, 7, index),
-    )
+    vertices = model.mesh_vert[first : first + count].astype(float)
+    return Mesh(vertices, model.mesh_face[face : face + faces], _name(model, 7, index))
 
 
 def _differs(first: Geometry, second: Geometry) -> bool:
@@ -286,9 +273,15 @@ def _differs(first: Geometry, second: Geometry) -> bool:
     return not same
 
 
+def excluded_links(model: Any) -> set[tuple[int, int]]:
+    """Return the pairs of body numbers (low, high) that a model excludes by name from collisions."""
+    pairs = ((int(signature) >> 16, int(signature) & 0xFFFF) for signature in model.exclude_signature)
+    return {(min(pair), max(pair)) for pair in pairs}
+
+
 def _never(model: Any) -> frozenset[tuple[int, int]]:
     """Return the pairs of links that MuJoCo excludes: named ones, parents with children, links welded together."""
-    pairs = {tuple(sorted((int(s) >> 16, int(s) & 0xFFFF))) for s in model.exclude_signature}
+    pairs = excluded_links(model)
     weld, parent = model.body_weldid, model.body_parentid
     filtering = not model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_FILTERPARENT
     for body in range(model.nbody):
@@ -299,10 +292,4 @@ def _never(model: Any) -> frozenset[tuple[int, int]]:
         # MuJoCo lets children of the world collide with it.
         if filtering and weld[body] and above:
             pairs |= {(min(body, o), max(body, o)) for o in np.flatnonzero(weld == above).tolist()}
-    return frozenset(pairs)  # type: ignore[arg-type]
-
-
-def _always(model: Any) -> frozenset[tuple[int, int]]:
-    return frozenset(
-        (min(int(a), int(b)), max(int(a), int(b))) for a, b in zip(model.pair_geom1, model.pair_geom2, strict=True)
-    )
+    return frozenset(pairs)

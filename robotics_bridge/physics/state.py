@@ -15,7 +15,7 @@ import torch
 from numpy.typing import ArrayLike
 
 from brainbench.core.devices import pick_device, warp
-from brainbench.core.errors import UsageError, unknown_name
+from brainbench.core.errors import UsageError, check_name
 from robotics_bridge.physics.kernels.state import StateArrays
 
 DIVERGED = 1
@@ -62,13 +62,7 @@ class HandState:
 
     @classmethod
     def empty(cls, num_envs: int, num_links: int, contacts: int = 0, device: Any = "cpu") -> HandState:
-        """Return a state with every link at the origin, at rest, without contacts.
-
-        Args:
-            num_envs: B.
-            num_links: L.
-            contacts: room C for contacts of all environments together.
-            device: ``cpu`` or ``cuda``.
+        """Return a state of B environments with L links at the origin, at rest, and room C for all contacts together.
 
         Raises:
             UsageError: no or too many environments, no link, or negative room.
@@ -83,23 +77,16 @@ class HandState:
         # Unit quaternion in Warp's order (x, y, z, w).
         pose[..., 6] = 1
         room = max(contacts, 1)
-
-        def zeros(dtype: Any) -> Any:
-            return wp.zeros(room, dtype=dtype, device=device)
-
+        sizes = {
+            "velocity": ((num_envs, num_links), wp.spatial_vectorf), "time": (num_envs, wp.float32),
+            "status": (num_envs, wp.int32), "contact_count": (1, wp.int32), "contact_env": (room, wp.int32),
+            "contact_geom": (room, wp.vec2i), "contact_distance": (room, wp.float32),
+            **{f"contact_{name}": (room, wp.vec3f) for name in ("position", "normal", "friction")},
+        }  # fmt: skip
         return cls(
             pose=wp.array(pose, dtype=wp.transformf, device=device),
-            velocity=wp.zeros((num_envs, num_links), dtype=wp.spatial_vectorf, device=device),
-            contact_geom=zeros(wp.vec2i),
-            contact_env=zeros(wp.int32),
-            contact_distance=zeros(wp.float32),
-            contact_position=zeros(wp.vec3f),
-            contact_normal=zeros(wp.vec3f),
             contact_force=wp.full(room, float("nan"), dtype=wp.float32, device=device),
-            contact_friction=zeros(wp.vec3f),
-            contact_count=wp.zeros(1, dtype=wp.int32, device=device),
-            time=wp.zeros(num_envs, dtype=wp.float32, device=device),
-            status=wp.zeros(num_envs, dtype=wp.int32, device=device),
+            **{name: wp.zeros(size, dtype=kind, device=device) for name, (size, kind) in sizes.items()},
         )
 
     @cached_property
@@ -190,8 +177,7 @@ class HandState:
                 f"{environments.max()}."
             )
         for name in optional:
-            if name not in _CONTACT:
-                raise unknown_name("quantity of a contact", name, tuple(_CONTACT))
+            check_name("quantity of a contact", name, _CONTACT)
         for name, values in {"env": environments, "geom": pairs, **_CONTACT, **optional}.items():
             view = wp.to_torch(getattr(self, f"contact_{name}"))[:count]
             if isinstance(values, float):

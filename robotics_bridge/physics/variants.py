@@ -43,12 +43,7 @@ def check_fields(model: Any, fields: Mapping[str, ArrayLike], num_envs: int) -> 
 
 
 def differing_fields(models: Sequence[Any], order: Sequence[int], num_envs: int) -> dict[str, NDArray]:
-    """Stack per environment [B, ...] every field in which variants of a model differ.
-
-    Args:
-        models: compiled variants of one model.
-        order: variant of environment e is ``order[e % len(order)]``.
-        num_envs: B.
+    """Stack per environment e [B, ...] every field in which compiled variants ``order[e % len(order)]`` differ.
 
     Raises:
         UsageError: variants differ in structure, not only in numbers.
@@ -76,10 +71,9 @@ def compile_variants(spec: Any, geometry: str, shapes: Sequence[Geometry], *, de
     follow from the density.
 
     Args:
-        spec: a ``mujoco.MjSpec`` that has the geometry; it is not changed.
-        geometry: name of the geometry that is replaced.
-        shapes: what to put there; name, link and pose are those of the spec. MuJoCo Warp needs equal kinds, C MuJoCo
-            takes any.
+        spec: a ``mujoco.MjSpec``; it is not changed.
+        geometry: name of what is replaced there.
+        shapes: what to put there, with the link and pose of the spec. MuJoCo Warp needs equal kinds.
         density: kg/m³.
 
     Raises:
@@ -92,11 +86,8 @@ def compile_variants(spec: Any, geometry: str, shapes: Sequence[Geometry], *, de
         copy = spec.copy()
         for index, other in enumerate(shapes):
             if other.mesh is not None:
-                copy.add_mesh(
-                    name=f"variant{index}",
-                    uservert=other.mesh.vertices.ravel().tolist(),
-                    userface=other.mesh.faces.ravel().tolist(),
-                )
+                vertices, faces = other.mesh.vertices.ravel().tolist(), other.mesh.faces.ravel().tolist()
+                copy.add_mesh(name=f"variant{index}", uservert=vertices, userface=faces)
         target = next((g for g in copy.geoms if g.name == geometry), None)
         if target is None:
             raise unknown_name("geometry", geometry, [g.name for g in copy.geoms if g.name])

@@ -36,18 +36,7 @@ class ObservationNormaliser(nn.Module):
 
 
 class ActingModel(nn.Module):
-    """The part of rsl_rl's ``MLPModel`` that acts.
-
-    Args:
-        obs: Observations [B, …] by group, for their shapes.
-        obs_groups: Observation set → groups.
-        obs_set: The set that this model reads.
-        output_dim: A.
-        hidden_dims: Widths of the perceptron.
-        activation: ``elu``, the only one.
-        obs_normalization: Normalise the observations.
-        distribution_cfg: Not used: who acts takes the mean.
-    """
+    """The part of rsl_rl's ``MLPModel`` that acts, with its arguments; ``distribution_cfg`` is not used."""
 
     def __init__(
         self,

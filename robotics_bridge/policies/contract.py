@@ -104,9 +104,8 @@ class PolicyContract:
             if not fits:
                 items = len(links) if kind.per_link else "N"
                 raise found.error("inputs.tactile", f"(S, {items}, {kind.channels}) for {observe!r}", shape)
-        more: dict[str, Any] = {
-            name: given.text(name) for name in ("task", "placement", "resolution") if name in given.values
-        }
+        said = ("task", "placement", "resolution")
+        more: dict[str, Any] = {name: given.text(name) for name in said if name in given.values}
         if "sub_steps" in given.values:
             more["sub_steps"] = given.whole("sub_steps", 1, 1000)
         # Contracts of earlier versions say nothing of it: they have the published law.
@@ -132,10 +131,6 @@ def _action_map(given: Values) -> tuple[tuple[str, ...], dict[str, tuple[float, 
 
 
 def check_contract(contract: Mapping[str, Any], name: str) -> None:
-    """Check what is about to be written as the contract ``name``, if it says all that a hand needs.
-
-    Raises:
-        DataError: a value is out of range, not finite or of another kind.
-    """
+    """Check what is about to be written as the contract ``name``, if it says all that a hand needs (errors: ``of``)."""
     if set(REQUIRED) <= set(contract["deployment"]):
         PolicyContract.of(Values(name, json.loads(to_json(contract))))

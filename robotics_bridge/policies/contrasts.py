@@ -31,10 +31,7 @@ class Contrast:
 
 
 def pooled_spread(groups: Sequence[Sequence[float]]) -> tuple[float, int]:
-    """Return the standard deviation within groups and its degrees of freedom.
-
-    Args:
-        groups: Success of each training seed, one sequence per student; students of one seed add nothing.
+    """Return the standard deviation and its degrees of freedom within groups: a student's success by training seed.
 
     Raises:
         UsageError: no student has two training seeds.
@@ -50,13 +47,9 @@ def pooled_spread(groups: Sequence[Sequence[float]]) -> tuple[float, int]:
 
 
 def contrast(one: Sequence[float], other: Sequence[float], spread: float, freedom: int) -> Contrast:
-    """Return the difference of two students' means against a spread of all students.
+    """Return the difference of two students' means, given the success of each training seed.
 
-    Args:
-        one: Success of each training seed of the first student.
-        other: The same of the second.
-        spread: Standard deviation between training seeds (:func:`pooled_spread`).
-        freedom: Its degrees of freedom.
+    The spread is the standard deviation between training seeds of :func:`pooled_spread`, with its degrees of freedom.
     """
     difference = float(np.mean(one) - np.mean(other))
     # Two-sample t with the pooled spread: its degrees of freedom are those of all students, not of these two.

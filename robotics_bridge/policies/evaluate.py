@@ -11,11 +11,14 @@ import numpy as np
 import torch
 from numpy.typing import ArrayLike
 
-from brainbench.core.errors import UsageError, unknown_name
+from brainbench.core.errors import UsageError, check_name
+from brainbench.core.progress import Progress
 from brainbench.core.statistics import wilson_interval
 from robotics_bridge.envs.env import Env
 from robotics_bridge.policies.shipped import AGENTS
 
+Acting = Callable[[Mapping[str, torch.Tensor]], torch.Tensor]
+"""Observations by group → actions [B, A]."""
 QUANTITIES = ("metric", "returns", "lengths", "goals", "turn_rate", "seconds", "dropped")
 """Quantities of each episode beside its success."""
 _Z = 1.959964
@@ -61,13 +64,8 @@ class PolicyEvaluation:
         return found.low, found.high
 
     def mean(self, name: str) -> tuple[float, float]:
-        """Return mean and half width of its 95 % interval over episodes of one of :data:`QUANTITIES`.
-
-        Raises:
-            UsageError: there is no such quantity.
-        """
-        if name not in QUANTITIES:
-            raise unknown_name("quantity of an episode", name, QUANTITIES)
+        """Return mean and half width of its 95 % interval over episodes of one of :data:`QUANTITIES`."""
+        check_name("quantity of an episode", name, QUANTITIES)
         return mean_of_episodes(getattr(self, name))
 
     def summary(self) -> dict[str, Any]:
@@ -89,11 +87,7 @@ def mean_of_episodes(values: ArrayLike) -> tuple[float, float]:
 
 
 class Policy:
-    """A trained teacher or student as a function of observation groups that may remember; returns actions [B, A].
-
-    Args:
-        actor: Module of groups of observations, with a method ``reset``; put into evaluation mode.
-    """
+    """A trained teacher or student (a module with ``reset``) that acts on observation groups and may remember."""
 
     def __init__(self, actor: torch.nn.Module) -> None:
         self.actor: Any = actor.eval()
@@ -111,14 +105,9 @@ class Policy:
         self.actor.reset(dones)
 
 
-def agent(name: str, env: Env, *, seed: int = 0) -> Callable[[Mapping[str, torch.Tensor]], torch.Tensor]:
-    """Return the agent ``zero`` (rest position) or ``random`` (standard normal actions, as an untrained policy).
-
-    Raises:
-        UsageError: there is no such agent.
-    """
-    if name not in AGENTS:
-        raise unknown_name("agent", name, AGENTS)
+def agent(name: str, env: Env, *, seed: int = 0) -> Acting:
+    """Return the agent ``zero`` (rest position) or ``random`` (standard normal actions, as an untrained policy)."""
+    check_name("agent", name, AGENTS)
     generator = torch.Generator(device=env.device)
     generator.manual_seed(seed)
     still = torch.zeros(env.num_envs, env.num_actions, device=env.device)
@@ -130,23 +119,18 @@ def agent(name: str, env: Env, *, seed: int = 0) -> Callable[[Mapping[str, torch
 
 
 def evaluate(
-    env: Env,
-    policy: Callable[[Mapping[str, torch.Tensor]], torch.Tensor],
-    *,
-    episodes: int = 100,
-    seed: int | Sequence[int] = (0, 1, 2),
-    name: str = "policy",
-    progress: Callable[[int, int, str], None] | None = None,
-) -> PolicyEvaluation:
+    env: Env, policy: Acting, *, episodes: int = 100, seed: int | Sequence[int] = (0, 1, 2), name: str = "policy",
+    progress: Progress | None = None,
+) -> PolicyEvaluation:  # fmt: skip
     """Run whole episodes and return how they went.
 
     Each environment contributes equally many episodes, so that short ones are not counted more often.
 
     Args:
         env: the environments.
-        policy: observations → actions [B, A]; its ``reset(mask)``, if any, is called when episodes end.
-        episodes: at least so many for every seed.
-        seed: of the environments; several are run one after the other.
+        policy: its ``reset(mask)``, if any, is called when episodes end.
+        episodes: at least so many for every seed of the environments.
+        seed: several are run one after the other.
         name: of the agent, for reports.
         progress: called with seeds done, seeds and a word.
 
@@ -182,8 +166,7 @@ def evaluate(
             # Episodes beyond an environment's share are not counted: fast failures would otherwise be counted more
             # often.
             left -= done.long()
-        threshold = env.task.success.threshold
-        rates.append(sum(row[0] >= threshold for row in found) / len(found))
+        rates.append(sum(row[0] >= env.task.success.threshold for row in found) / len(found))
         rows += found
         if progress:
             progress(index + 1, len(seeds), f"evaluating {name}")

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
-from brainbench.core.errors import DataError, unknown_name
+from brainbench.core.errors import DataError, check_name
 from brainbench.core.files import atomic_path, file_hash, provenance, write_json
 from brainbench.models.activations import evaluating
 from brainbench.models.export import require_onnx
@@ -55,8 +55,8 @@ def export_policy(
     """Write a policy and compare the file with it, step by step with resets; a file that differs is not kept.
 
     Args:
-        policy: The policy.
-        path: File to write; the suffix of the format is added when there is none.
+        policy: What is written.
+        path: The suffix of the format is added when there is none.
         format: ``onnx`` or ``jit``.
         deployment: What a robot needs besides (rate, joints, limits, …); kept in the contract.
         name: What the contract calls the policy.
@@ -66,10 +66,8 @@ def export_policy(
         MissingDependencyError: a package of the extra ``export`` is missing, for ``onnx``.
         DataError: the file does not compute what the policy does, or the contract has values out of range.
     """
-    if format not in SUFFIXES:
-        raise unknown_name("format of a policy", format, SUFFIXES)
-    target = Path(path)
-    target = target if target.suffix else target.with_suffix(SUFFIXES[format])
+    check_name("format of a policy", format, SUFFIXES)
+    target = Path(path) if Path(path).suffix else Path(path).with_suffix(SUFFIXES[format])
     contract = {
         "policy": name or type(policy).__name__,
         "format": format,
@@ -94,10 +92,8 @@ def export_policy(
                 f"The exported file differs from the policy by {difference:.2g} of the largest action (allowed "
                 f"{TOLERANCE:g}), so it was not kept."
             )
-    file = write_json(
-        target.with_name(f"{target.name}.json"),
-        {**contract, "difference": difference, "sha256": file_hash(target, length=64)},
-    )
+    contract |= {"difference": difference, "sha256": file_hash(target, length=64)}
+    file = write_json(target.with_name(f"{target.name}.json"), contract)
     return PolicyExport(target, file, format, policy.core.state_size, difference)
 
 

@@ -15,11 +15,7 @@ if TYPE_CHECKING:
 
 
 class StepPolicy(nn.Module):
-    """(group …, h_in [B, H]) → (actions [B, A], h_out [B, H]), normalisers, grid, encoder and head inside.
-
-    Args:
-        policy: The policy; copied to the processor, in evaluation mode.
-    """
+    """(group …, h_in [B, H]) → (actions [B, A], h_out [B, H]): a copy of the policy on the processor."""
 
     is_recurrent: bool = True
 
@@ -66,9 +62,6 @@ class JitPolicy(nn.Module):
 
     The step is traced, since encoders are no TorchScript; what remembers is scripted, so ``torch.jit.script`` of the
     whole gives a file with ``forward`` and ``reset``.
-
-    Args:
-        policy: What is exported, in evaluation mode.
     """
 
     def __init__(self, policy: TactilePolicy) -> None:

@@ -88,11 +88,8 @@ def read_results(folders: Iterable[str | Path], *, at_least: int = 0) -> list[St
     """Return the results of all evaluated students below some folders, best first within each task and hand.
 
     Where a student was trained more than once with the same training seed, the one that learned longest counts: two
-    runs of one seed are no two seeds.
-
-    Args:
-        folders: Searched for students at any depth.
-        at_least: Iterations; students that learned fewer are left out. Those that do not say how many stay.
+    runs of one seed are no two seeds. Students that learned fewer iterations than ``at_least`` are left out; those that
+    do not say how many stay.
 
     Raises:
         DataFileNotFoundError: no student was evaluated there, or none of them learned so long.
@@ -163,9 +160,8 @@ def _result(members: Sequence[_Member], left_out: tuple[LeftOut, ...]) -> Studen
     if not members:
         return None
     shares = [float(np.mean([np.mean(item["success"]) for item in member.evaluations])) for member in members]
-    every = [item for member in members for item in member.evaluations]
     graded = {name: found for name in GRADED if (found := _grade(members, name)) is not None}
-    episodes = sum(len(item["success"]) for item in every)
+    episodes = sum(len(item["success"]) for member in members for item in member.evaluations)
     interval = t_interval(shares, over="training seeds")
     note = "" if len(members) >= FEWEST_SEEDS else f"only {len(members)} training seeds"
     if len(members) == 1:
@@ -177,19 +173,17 @@ def _result(members: Sequence[_Member], left_out: tuple[LeftOut, ...]) -> Studen
     metric = graded.get("metric", (math.nan, math.nan))[0]
     learned = tuple(member.learned for member in members)
     fewest = min((number for number in learned if number is not None), default=None)
-    result = StudentResult(
+    if fewest is not None and first.iterations is not None and fewest < first.iterations:
+        note = "; ".join(filter(None, (note, f"{_STOPPED} {_learned(learned)} of {first.iterations} iterations")))
+    return StudentResult(
         first, seeds, tuple(shares), episodes, metric, interval, note, graded=graded, iterations=fewest,
         learned=learned, left_out=left_out,
     )  # fmt: skip
-    if fewest is not None and first.iterations is not None and fewest < first.iterations:
-        stopped = f"{_STOPPED} {_learned(result)} of {first.iterations} iterations"
-        result = replace(result, note="; ".join(filter(None, (note, stopped))))
-    return result
 
 
-def _learned(*results: StudentResult) -> str:
+def _learned(learned: Iterable[int | None]) -> str:
     """Return the fewest and the most iterations that some students learned; empty where none is said."""
-    numbers = sorted({number for result in results for number in result.learned if number is not None})
+    numbers = sorted({number for number in learned if number is not None})
     return " to ".join(str(number) for number in numbers[:: max(len(numbers) - 1, 1)])
 
 
@@ -232,6 +226,14 @@ _SHARED = COLUMNS[: COLUMNS.index("success")]
 """What students have in common stands above a table rather than in each of its rows."""
 
 
+def _pm(value: tuple[float, float] | None) -> str:
+    return "–" if value is None else f"{value[0]:.3g} ± {value[1]:.2g}"
+
+
+def _span(interval: Interval | None) -> str:
+    return "" if interval is None else f" [{interval.low:.3f}, {interval.high:.3f}]"
+
+
 def rows(results: Sequence[StudentResult]) -> list[list[str]]:
     """Return the table of the results as text, in the order of :data:`COLUMNS`."""
     found = []
@@ -244,7 +246,7 @@ def rows(results: Sequence[StudentResult]) -> list[list[str]]:
         found.append(
             [
                 config.task, config.hand, config.observe, *where,
-                _learned(result) or "–", str(len(result.seeds)),
+                _learned(result.learned) or "–", str(len(result.seeds)),
                 f"{result.value:.3f}{_span(result.interval)}",
                 "–" if result.gain is None else f"{result.gain:+.3f}{_span(result.difference)}",
                 *(_pm(result.graded.get(name)) for name in ("goals", "turn_rate", "seconds", "returns")),
@@ -253,24 +255,18 @@ def rows(results: Sequence[StudentResult]) -> list[list[str]]:
     return found
 
 
-def _pm(value: tuple[float, float] | None) -> str:
-    return "–" if value is None else f"{value[0]:.3g} ± {value[1]:.2g}"
-
-
 def read_agents(folders: Iterable[str | Path]) -> list[dict[str, Any]]:
     """Return what stands in the files :data:`AGENTS` below some folders: one summary per agent and task.
 
     Raises:
         DataError: a file is damaged.
     """
-    found = []
+    found, needed = [], {"agent", "task", "success_rate", "success_interval"}
     for root in folders:
         for path in sorted(Path(root).rglob(AGENTS)):
             summaries = read_json(path)
-            if not isinstance(summaries, list) or not all(
-                isinstance(item, dict) and {"agent", "task", "success_rate", "success_interval"} <= set(item)
-                for item in summaries
-            ):
+            whole = isinstance(summaries, list) and all(isinstance(one, dict) and needed <= {*one} for one in summaries)
+            if not whole:
                 raise DataError(
                     f"{str(path)!r} is no list of evaluated agents; brainbench policy evaluate --out writes one."
                 )
@@ -292,20 +288,14 @@ def agent_rows(agents: Sequence[Mapping[str, Any]]) -> list[list[str]]:
 
 
 def concise(table: Sequence[Sequence[str]]) -> tuple[str, list[str], list[list[str]]]:
-    """Return what all rows share, as words, and the columns and rows that are left.
-
-    Args:
-        table: Rows in the order of :data:`COLUMNS`; a dash in one of them says nothing.
-    """
-    said = [{row[index] for row in table} - {"–"} for index in range(len(COLUMNS))]
-    shared = [len(found) <= 1 and name in _SHARED for name, found in zip(COLUMNS, said, strict=True)]
-    words = [
-        f"{name}: {next(iter(found))}"
-        for name, found, drop in zip(COLUMNS, said, shared, strict=True)
-        if drop and found
-    ]
-    kept = [index for index, drop in enumerate(shared) if not drop]
-    return ", ".join(words), [COLUMNS[index] for index in kept], [[row[index] for index in kept] for row in table]
+    """Return what all rows share, as words, and the columns and rows that are left; a dash in a row says nothing."""
+    columns = {name: [row[index] for row in table] for index, name in enumerate(COLUMNS)}
+    words = []
+    for name in _SHARED:
+        if len(said := {*columns[name]} - {"–"}) <= 1:
+            words += [f"{name}: {one}" for one in said]
+            del columns[name]
+    return ", ".join(words), list(columns), [list(row) for row in zip(*columns.values(), strict=True)]
 
 
 def remarks(results: Sequence[StudentResult]) -> list[str]:
@@ -315,7 +305,7 @@ def remarks(results: Sequence[StudentResult]) -> list[str]:
     found = [part for part in parts if not part.startswith(_STOPPED)]
     if early:
         wanted = ", ".join(str(number) for number in sorted({result.config.iterations or 0 for result in early}))
-        found.append(f"{_STOPPED} {_learned(*early)} of {wanted} iterations")
+        found.append(f"{_STOPPED} {_learned(n for result in early for n in result.learned)} of {wanted} iterations")
     return found + [
         f"left out: {result.config.name.rpartition('_seed')[0]}, seed {item.seed}, after "
         f"{'unknown' if item.iterations is None else item.iterations} iterations ({item.reason})"
@@ -324,21 +314,12 @@ def remarks(results: Sequence[StudentResult]) -> list[str]:
     ]
 
 
-def _span(interval: Interval | None) -> str:
-    return "" if interval is None else f" [{interval.low:.3f}, {interval.high:.3f}]"
-
-
 def command(config: DistillConfig, *, stop_at: int | None = None) -> str:
-    """Return the command line that distils a student, but for what only a file of students can set.
-
-    Args:
-        config: What is distilled.
-        stop_at: Iterations that it learned, where those are not all.
-    """
+    """Return the command line that distils a student up to ``stop_at``, but for what only a file of students sets."""
     words: dict[str, Any] = {"teacher": config.teacher, "config": config.variant, "observe": config.observe}
     if config.tactile is not None:
         words |= {"placement": config.placement, "resolution": config.resolution, "encoder": config.encoder}
-        words |= {"noisy": ""} if config.noisy else {}
+        words |= {"noisy": "" if config.noisy else None}
         words |= {name: config.encoder_settings.get(name) for name in ("learning", "time", "pretrained")}
     words |= {"embedder": config.embedder, "hand": config.hand, "envs": config.num_envs, "seed": config.seed}
     words |= {"precision": config.precision, "iterations": config.iterations, "learning-rate": config.learning_rate}
@@ -364,8 +345,22 @@ def records(results: Sequence[StudentResult]) -> list[ResultRecord]:
     for result in results:
         config, tactile = result.config, result.config.tactile
         protocol = {"task": config.task, "hand": config.hand, "variant": config.variant}
-        source = f"{config.task} on {config.hand} ({config.variant})"
+        source = "{task} on {hand} ({variant})".format(**protocol)
         name = config.name.rpartition("_seed")[0]
+        commands = [
+            command(replace(config, seed=seed), stop_at=learned)
+            for seed, learned in zip(result.seeds, result.learned, strict=True)
+        ]
+        settings = {
+            "episodes": result.episodes, "metric": result.metric, "iterations_learned": result.iterations,
+            "seeds": list(result.seeds), **{f"mean_{name}": mean for name, (mean, _) in result.graded.items()},
+            **config.plain(),
+        }  # fmt: skip
+        facts = {
+            "recordings": {"source": source, "content_hash": content_hash(protocol)},
+            "settings": settings,
+            "command": "; ".join(commands),
+        }
         score = Score(
             name=name,
             value=result.value,
@@ -378,24 +373,7 @@ def records(results: Sequence[StudentResult]) -> list[ResultRecord]:
             ),
             estimator="policy-success",
             metric="share of successful episodes",
-            provenance=Provenance.of(
-                {
-                    **provenance(),
-                    "recordings": {"source": source, "content_hash": content_hash(protocol)},
-                    "settings": {
-                        "episodes": result.episodes,
-                        "metric": result.metric,
-                        "iterations_learned": result.iterations,
-                        "seeds": list(result.seeds),
-                        **{f"mean_{name}": mean for name, (mean, _) in result.graded.items()},
-                        **config.plain(),
-                    },
-                    "command": "; ".join(
-                        command(replace(config, seed=seed), stop_at=learned)
-                        for seed, learned in zip(result.seeds, result.learned, strict=True)
-                    ),
-                }
-            ),
+            provenance=Provenance.of(provenance(**facts)),
         )
         card = ModelCard(
             name=name, family="policy", objective="distillation", seed=config.seed,
@@ -422,23 +400,25 @@ def draw(results: Sequence[StudentResult], path: str | Path, *, agents: Sequence
             interval = result.interval
             low, high = (result.value,) * 2 if interval is None else (interval.low, interval.high)
             color = PALE if result.config.observe == "none" else COLORS[0]
-            row[0].plot([low, high], [height, height], color=color, lw=1.5)
-            row[0].plot(result.value, height, "|", color=color, ms=11, mew=2)
-            row[0].plot(result.success, [height] * len(result.success), "o", color=color, ms=4, mec="white", mew=0.5)
+            marks = [(row[0], result.value, low, high)]
             if "turn_rate" in result.graded:
                 mean, half = result.graded["turn_rate"]
-                row[1].plot([mean - half, mean + half], [height, height], color=color, lw=1.5)
-                row[1].plot(mean, height, "|", color=color, ms=11, mew=2)
+                marks.append((row[1], mean, mean - half, mean + half))
+            for axis, mean, low, high in marks:
+                axis.plot([low, high], [height, height], color=color, lw=1.5)
+                axis.plot(mean, height, "|", color=color, ms=11, mew=2)
+            row[0].plot(result.success, [height] * len(result.success), "o", color=color, ms=4, mec="white", mew=0.5)
         others = [item for item in agents if item["task"] == task]
         for number, item in enumerate(others, start=1):
             name, color = Path(item["agent"]).name, COLORS[number % len(COLORS)]
             label = {"zero": "no movement", "random": "random movement"}.get(name, name)
-            row[0].axvline(item["success_rate"], color=color, lw=1, ls=(0, (4, 2)), label=label)
-            row[0].axvspan(*item["success_interval"], color=color, alpha=0.15, lw=0)
+            lines = [(row[0], item["success_rate"], *item["success_interval"])]
             if turning and "turn_rate" in item:
-                half = item.get("turn_rate_half_width", 0.0)
-                row[1].axvline(item["turn_rate"], color=color, lw=1, ls=(0, (4, 2)))
-                row[1].axvspan(item["turn_rate"] - half, item["turn_rate"] + half, color=color, alpha=0.15, lw=0)
+                mean, half = item["turn_rate"], item.get("turn_rate_half_width", 0.0)
+                lines.append((row[1], mean, mean - half, mean + half))
+            for axis, mean, low, high in lines:
+                axis.axvline(mean, color=color, lw=1, ls=(0, (4, 2)), label=label)
+                axis.axvspan(low, high, color=color, alpha=0.15, lw=0)
         row[0].set_yticks(range(len(found)), [_label(result) for result in reversed(found)])
         row[0].set_xlabel("share of successful episodes")
         row[0].set_title(f"task {task}, hand {hand}")
@@ -447,9 +427,7 @@ def draw(results: Sequence[StudentResult], path: str | Path, *, agents: Sequence
         if others:
             place = {"loc": "upper left", "bbox_to_anchor": (0, -0.18), "ncols": len(others)}
             row[0].legend(fontsize=8.5, frameon=False, **place)
-    path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    return save_figure(figure, path, dpi=130)
+    return save_figure(figure, Path(path), dpi=130)
 
 
 def _label(result: StudentResult) -> str:

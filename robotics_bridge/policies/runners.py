@@ -35,7 +35,7 @@ def read_policy(
         path: The file.
         shapes: Group → shape, in the order of the contract's ``inputs``.
         format: ``onnx`` or ``jit``.
-        threads: Threads that ONNX Runtime computes with; its own choice if None.
+        threads: Of ONNX Runtime; its own choice if None.
         actions: A; not checked if None.
 
     Raises:
@@ -71,8 +71,7 @@ class _OnnxRunner:
         check_finite({item.name: onnx.numpy_helper.to_array(item) for item in graph.initializer}, str(path))
         self.session = onnx_session(path, threads)
         inputs = {item.name: item.shape for item in self.session.get_inputs()}
-        missing = sorted({*shapes, "h_in"} - set(inputs))
-        if missing:
+        if missing := sorted({*shapes, "h_in"} - set(inputs)):
             raise DataError(
                 f"The exported policy has no input {missing[0]!r} (it has {', '.join(inputs)}), so a part of the "
                 "policy was lost on the way."

@@ -26,11 +26,7 @@ class Values:
 
     @classmethod
     def read(cls, path: Path) -> Values:
-        """Read a JSON file.
-
-        Raises:
-            DataError: it cannot be read, or holds no names and values.
-        """
+        """Read a JSON file; raise DataError if it cannot be read, or holds no names and values."""
         return cls(path.name, read_mapping(path, "JSON file of names and values"))
 
     def error(self, name: str, allowed: str, received: Any) -> DataError:
@@ -64,18 +60,15 @@ class Values:
         """Return different texts, at least one."""
 
         def good(value: Any) -> bool:
-            texts = isinstance(value, list) and all(isinstance(item, str) and item for item in value)
-            return texts and 0 < len(value) <= most and len(set(value)) == len(value)
+            texts = _list(value, 1, most) and all(isinstance(item, str) and item for item in value)
+            return texts and len(set(value)) == len(value)
 
         return tuple(self.get(name, good, f"1 to {most} different names"))
 
     def whole(self, name: str, low: int, high: int) -> int:
         """Return a whole number."""
-
-        def good(value: Any) -> bool:
-            return type(value) is int and low <= value <= high
-
-        return self.get(name, good, f"a whole number from {low} to {high}")
+        allowed = f"a whole number from {low} to {high}"
+        return self.get(name, lambda value: type(value) is int and low <= value <= high, allowed)
 
     def number(self, name: str, low: float, high: float) -> float:
         """Return a finite number."""
@@ -85,13 +78,13 @@ class Values:
         """Return so many finite numbers."""
 
         def good(value: Any) -> bool:
-            return isinstance(value, list) and len(value) == count and all(_within(item, low, high) for item in value)
+            return _list(value, count, count) and all(_within(item, low, high) for item in value)
 
         return tuple(map(float, self.get(name, good, f"{count} numbers from {low:.4g} to {high:.4g}")))
 
     def shape(self, name: str, received: Any, most: int) -> tuple[int, ...]:
         """Return a shape of one to three axes with at most so many numbers, given as a list."""
-        sizes = received if isinstance(received, list) and 0 < len(received) <= 3 else [0]
+        sizes = received if _list(received, 1, 3) else [0]
         count = 1
         for size in sizes:
             count *= min(size, most + 1) if type(size) is int and size > 0 else 0
@@ -111,11 +104,7 @@ class Values:
         return {key: self.shape(f"{name}.{key}", shape, most) for key, shape in found}
 
     def fields(self, kind: type) -> dict[str, Any]:
-        """Return all values as those of a dataclass's fields, by the annotation of each.
-
-        Raises:
-            UsageError: the dataclass has no field of a name.
-        """
+        """Return all values as those of a dataclass's fields, by the annotation of each; UsageError for others."""
         known = {item.name: str(item.type) for item in fields(kind)}
         for name in self.values:
             check_name(f"setting in {self.where!r}", str(name)[:_SHOWN], known)
@@ -128,6 +117,10 @@ class Values:
             good, empty = _KINDS.get(plain, _KINDS["str"]), bool(optional)
             found[name] = self.get(name, lambda value, g=good, e=empty: g(value) or (e and value is None), annotation)
         return found
+
+
+def _list(value: Any, low: int, high: int) -> bool:
+    return isinstance(value, list) and low <= len(value) <= high
 
 
 def _within(value: Any, low: float, high: float) -> bool:
@@ -143,12 +136,8 @@ _KINDS: dict[str, Callable[[Any], bool]] = {
     "Mapping[str, Any]": lambda value: isinstance(value, dict),
     "HandCalibration": lambda value: value is None or isinstance(value, dict),
     "tuple[int, ...]": lambda value: (
-        isinstance(value, list)
-        and 0 < len(value) <= 32
-        and all(type(item) is int and 0 < item <= 65536 for item in value)
+        _list(value, 1, 32) and all(type(item) is int and 0 < item <= 65536 for item in value)
     ),
-    "tuple[float, float]": lambda value: (
-        isinstance(value, list) and len(value) == 2 and all(_within(item, -1e12, 1e12) for item in value)
-    ),
+    "tuple[float, float]": lambda value: _list(value, 2, 2) and all(_within(item, -1e12, 1e12) for item in value),
 }
 """Annotation of a field → whether a JSON value is of its kind; literals are texts, which their class checks."""

@@ -2,15 +2,13 @@
 
 Name it in a configuration as ``class_name="robotics_bridge.policies.student:TactilePolicy"``. Each flat group passes an
 encoder of its own, ``tactile`` [B, S, N, C] one of :mod:`~robotics_bridge.policies.encoders.arms`; the head is a
-multilayer
-perceptron. All memory is one array [1, B, H], as rsl_rl stores it, and exports are complete: normalisers, taxel grid,
-encoder, head and memory. Letters: B batch, T time, H state, D latent, A action.
+multilayer perceptron. All memory is one array [1, B, H], as rsl_rl stores it, and exports are complete: normalisers,
+taxel grid, encoder, head and memory. Letters: B batch, T time, H state, D latent, A action.
 """
 
 from __future__ import annotations
 
 import copy
-import math
 from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
 from typing import TYPE_CHECKING, Any
@@ -18,8 +16,8 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import nn
 
-from brainbench.core.errors import UsageError, unknown_name
-from robotics_bridge.policies.encoders.arms import EncoderConfig, TactileEncoder, perceptron
+from brainbench.core.errors import UsageError, check_name
+from robotics_bridge.policies.encoders.arms import EncoderConfig, Stepped, TactileEncoder, perceptron
 from robotics_bridge.policies.exported import JitPolicy, StepPolicy
 
 if TYPE_CHECKING:
@@ -39,20 +37,11 @@ _EMBEDDING, _WIDTHS, _LSTM = 64, (512, 256, 128), 128
 
 
 class GroupEncoder(nn.Module):
-    """The embedding of a flat group: nothing, an MLP [512, 256, 128] → 64, or an LSTM 128 → 64.
-
-    Args:
-        size: Numbers n of the group, [B, n].
-        kind: ``none``, ``mlp`` or ``lstm`` (:data:`EMBEDDERS`).
-
-    Raises:
-        UsageError: there is no such kind.
-    """
+    """The embedding of a flat group [B, n]: nothing, an MLP [512, 256, 128] → 64, or an LSTM 128 → 64."""
 
     def __init__(self, size: int, kind: str) -> None:
         super().__init__()
-        if kind not in EMBEDDERS:
-            raise unknown_name("encoder of a flat group", kind, EMBEDDERS)
+        check_name("encoder of a flat group", kind, EMBEDDERS)
         self.features, self.state_size = (_EMBEDDING, 0) if kind != "none" else (size, 0)
         self.cell: nn.LSTMCell | None = None
         self.net: nn.Module = nn.Identity()
@@ -62,17 +51,14 @@ class GroupEncoder(nn.Module):
             self.cell, self.net = nn.LSTMCell(size, _LSTM), nn.Linear(_LSTM, _EMBEDDING)
             self.state_size = 2 * _LSTM
 
-    def unroll(
-        self, x: torch.Tensor, h_in: torch.Tensor, ended: torch.Tensor | None
-    ) -> tuple[torch.Tensor, torch.Tensor]:
+    def unroll(self, x: torch.Tensor, h_in: torch.Tensor, ended: torch.Tensor | None) -> Stepped:
         """Return (embeddings [L, B, …], h_out) of L steps [L, B, n]; memory is forgotten where ``ended`` [L, B]."""
         if self.cell is None:
             return self.net(x), h_in
         hidden, memory = h_in.chunk(2, 1)
         found = []
         for step, each in enumerate(x):
-            # Step by step, since memory may be forgotten between any two steps; what has no memory follows as one
-            # batch.
+            # Memory may be forgotten between any two steps; what has none follows as one batch.
             hidden, memory = self.cell(each, (hidden, memory))
             found.append(hidden)
             if ended is not None:
@@ -82,13 +68,7 @@ class GroupEncoder(nn.Module):
 
 
 class PolicyCore(nn.Module):
-    """Observations → latent, one step, all memory in one array.
-
-    Args:
-        sizes: Flat group → its length, in order.
-        embedder: Encoder of flat groups.
-        tactile: Encoder of touch, or None.
-    """
+    """Observations → latent, all memory in one array; ``sizes`` gives the length of each flat group, in order."""
 
     def __init__(self, sizes: Mapping[str, int], embedder: str, tactile: TactileEncoder | None) -> None:
         super().__init__()
@@ -112,22 +92,13 @@ class PolicyCore(nn.Module):
         return sum(self.splits[:-2]) or 1
 
     def unroll(
-        self,
-        flat: Sequence[torch.Tensor],
-        taxels: torch.Tensor | None,
-        h_in: torch.Tensor,
-        ended: torch.Tensor | None = None,
-        *,
-        kept: bool = False,
-    ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return (latents [L, B, D], h_out) of L steps.
+        self, flat: Sequence[torch.Tensor], taxels: torch.Tensor | None, h_in: torch.Tensor,
+        ended: torch.Tensor | None = None, *, kept: bool = False,
+    ) -> Stepped:  # fmt: skip
+        """Return (latents [L, B, D], h_out) of normalised flat groups [L, B, n] and readings [L, B, S, N, C].
 
-        Args:
-            flat: Normalised flat groups [L, B, n].
-            taxels: Readings [L, B, S, N, C], or kept features [L, B, F].
-            h_in: Memory [B, H]; [B, ``kept_size``] with kept features.
-            ended: Where [L, B] the memory is forgotten after a step; None for nowhere.
-            kept: ``taxels`` holds features.
+        With ``kept``, ``taxels`` are features [L, B, F] and the memory has ``kept_size``. It is forgotten after a step
+        where ``ended`` [L, B]; None for nowhere.
         """
         sizes = [*self.splits[:-2], h_in.shape[1] - sum(self.splits[:-2])] if kept else self.splits
         states = list(h_in.split(sizes, 1))
@@ -145,28 +116,18 @@ class PolicyCore(nn.Module):
             parts.append(y.float() if mixed else y)
         return torch.cat(parts, -1), torch.cat([state.to(h_in.dtype) for state in states], 1)
 
-    def forward(
-        self, flat: Sequence[torch.Tensor], taxels: torch.Tensor | None, h_in: torch.Tensor
-    ) -> tuple[torch.Tensor, torch.Tensor]:
+    def forward(self, flat: Sequence[torch.Tensor], taxels: torch.Tensor | None, h_in: torch.Tensor) -> Stepped:
         """Return (latent [B, D], h_out [B, H]) of one step; arguments as of :meth:`unroll`, without L."""
         latents, h_out = self.unroll([x[None] for x in flat], None if taxels is None else taxels[None], h_in)
         return latents[0], h_out
 
 
 class TactilePolicy(MLPModel):
-    """A policy that feels; a drop-in for rsl_rl's models.
+    """A policy that feels; a drop-in for rsl_rl's models, with two more arguments.
 
     Args:
-        obs: Observations of the environment, for their shapes.
-        obs_groups: Observation set → groups.
-        obs_set: The set that this model reads.
-        output_dim: A.
-        hidden_dims: Of the head.
-        activation: Of the head.
-        obs_normalization: Normalise flat groups by their running mean and deviation.
-        distribution_cfg: Of the actions' distribution, as rsl_rl takes it.
-        tactile: Fields of :class:`~robotics_bridge.policies.encoders.arms.EncoderConfig`; needed when the set has
-        touch.
+        tactile: Fields of :class:`~robotics_bridge.policies.encoders.arms.EncoderConfig`; needed where the set has
+            touch.
         embedder: Encoder of flat groups: ``none``, ``mlp`` or ``lstm``.
 
     Raises:
@@ -221,39 +182,25 @@ class TactilePolicy(MLPModel):
     @property
     def shapes(self) -> dict[str, tuple[int, ...]]:
         """Shape of every group that it reads, per environment."""
-        found: dict[str, tuple[int, ...]] = {
-            name: (size,) for name, size in zip(self.obs_groups, self._sizes, strict=True)
-        }
+        found: dict[str, tuple[int, ...]] = {k: (size,) for k, size in zip(self.obs_groups, self._sizes, strict=True)}
         if self.core.tactile is not None:
             found[TACTILE] = self.core.tactile.shape
         return found
 
-    def advance(
-        self, obs: Any, h_in: torch.Tensor, features: torch.Tensor | None = None
-    ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return (latent [B, D], h_out [B, H]) of one step; arguments as of :meth:`unroll`, without L.
-
-        Nothing is remembered in the model.
-        """
+    def advance(self, obs: Any, h_in: torch.Tensor, features: torch.Tensor | None = None) -> Stepped:
+        """Return (latent [B, D], h_out [B, H]) of one step; :meth:`unroll` without L, not remembered in the model."""
         read = self.shapes if features is None else self.obs_groups
         kept = None if features is None else features[None]
         latents, h_out = self.unroll({name: obs[name][None] for name in read}, h_in, None, kept)
         return latents[0], h_out
 
     def unroll(
-        self,
-        obs: Any,
-        h_in: torch.Tensor,
-        ended: torch.Tensor | None = None,
-        features: torch.Tensor | None = None,
-    ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return (latents [L, B, D], h_out [B, H]) of L steps.
+        self, obs: Any, h_in: torch.Tensor, ended: torch.Tensor | None = None, features: torch.Tensor | None = None
+    ) -> Stepped:
+        """Return (latents [L, B, D], h_out [B, H]) of groups [L, B, …] from a memory of zeros before the first step.
 
-        Args:
-            obs: Groups [L, B, …].
-            h_in: Memory [B, H], zeros before the first step; [B, ``core.kept_size``] with features.
-            ended: Where [L, B] an episode ended after a step, so that memory starts anew; None for nowhere.
-            features: What the frozen encoder gave [L, B, F], instead of its readings.
+        It starts anew after a step where ``ended`` [L, B]. With ``features`` [L, B, F] of the frozen encoder instead of
+        its readings, the memory is [B, ``core.kept_size``].
         """
         flat = self._normalised(obs)
         if features is not None:
@@ -306,10 +253,8 @@ class TactilePolicy(MLPModel):
     def detach_hidden_state(self, dones: torch.Tensor | None = None) -> None:
         """Cut the memory (of environments that are done) off the computation before."""
         if self._state is not None:
-            kept = self._state if dones is not None else self._state.detach()
-            if dones is not None:
-                kept = torch.where(dones.view(1, -1, 1).bool(), self._state.detach(), self._state)
-            self._state = kept
+            cut = self._state.detach()
+            self._state = cut if dones is None else torch.where(dones.view(1, -1, 1).bool(), cut, self._state)
 
     def update_normalization(self, obs: Any) -> None:
         """Take observations [..., B, …] into account in the normalisers; touch may be left out."""
@@ -337,7 +282,7 @@ class TactilePolicy(MLPModel):
             if obs[name].ndim != 2:
                 raise UsageError(f"The group {name!r} must be flat [B, n]; received {list(obs[name].shape)}.")
         # A list of numbers may stand before nn.Module is ready; modules may not.
-        self._sizes = [int(math.prod(obs[name].shape[1:])) for name in names]
+        self._sizes = [int(obs[name].shape[1]) for name in names]
         return names, sum(self._sizes)
 
     def _get_latent_dim(self) -> int:

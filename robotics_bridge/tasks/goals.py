@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from brainbench.core.errors import UsageError
+from brainbench.core.reading.ranges import check_number
 from brainbench.core.rotations import about, constant, multiply, tilted
 
 if TYPE_CHECKING:
@@ -46,31 +47,22 @@ class Goal(abc.ABC):
     """Factor by which it narrows."""
 
     def __post_init__(self) -> None:
-        if not self.threshold > 0:
-            raise UsageError(f"The threshold of a goal is a positive angle (rad); received {self.threshold!r}.")
+        check_number("The threshold of a goal (rad)", self.threshold, above=0)
         if self.start_threshold is not None and not self.threshold <= self.start_threshold:
             raise UsageError(
                 f"Learning begins with a wider threshold than {self.threshold:g} rad; received start_threshold = "
                 f"{self.start_threshold!r}."
             )
-        if not (0 < self.mastered < 1 and 0 < self.narrowing < 1):
-            raise UsageError(
-                "The share 'mastered' and the factor 'narrowing' of a goal lie between 0 and 1; received "
-                f"{self.mastered!r} and {self.narrowing!r}."
-            )
+        check_number("The share 'mastered' of a goal", self.mastered, above=0, below=1)
+        check_number("The factor 'narrowing' of a goal", self.narrowing, above=0, below=1)
 
     def first(self, quat: torch.Tensor, draw: torch.Tensor) -> torch.Tensor:
-        """Return the goals [B, 4] (w, x, y, z) of new episodes: what follows the object's own orientation.
-
-        Args:
-            quat: orientation of the object [B, 4].
-            draw: uniform random numbers in [0, 1) [B, 2].
-        """
+        """Return the goals [B, 4] (w, x, y, z) of new episodes: what follows the object's orientations ``quat``."""
         return self.following(quat, quat, draw)
 
     @abc.abstractmethod
     def following(self, quat: torch.Tensor, goal: torch.Tensor, draw: torch.Tensor) -> torch.Tensor:
-        """Return the goals [B, 4] that follow the present ones ``goal`` [B, 4]; other arguments as for the first."""
+        """Return the goals [B, 4] that follow the present ones; ``draw`` [B, 2] are uniform numbers in [0, 1)."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -90,8 +82,7 @@ class SteppingRotation(Goal):
         # A turn about a world axis multiplies from the left. The step starts from the last goal, not from the object,
         # so that errors of reached goals do not add up.
         turn = about(constant(self.axis or (0.0, 0.0, 1.0), quat), constant(self.step, quat))
-        # Quaternions are not normalised here: a product of unit ones stays one to rounding over the few goals of an
-        # episode.
+        # Not normalised: a product of unit quaternions stays one to rounding over the few goals of an episode.
         return multiply(turn.expand_as(goal), goal)
 
 

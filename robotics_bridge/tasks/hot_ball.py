@@ -43,11 +43,10 @@ def bin_walls(spec: Any) -> None:
     """Add the tilted bin, its floor's middle at the origin."""
     mujoco = mujoco_module()
     body = spec.worldbody.add_body(name="bin", quat=(math.cos(TILT / 2), 0.0, math.sin(TILT / 2), 0.0))
-    edge, half = SIDE / 2, WALL / 2
+    edge, half, top = SIDE / 2, WALL / 2, HEIGHT / 2
     walls = [((0.0, 0.0, -half), (edge, edge, half))]
-    for sign in (-1, 1):
-        walls.append(((sign * (edge - half), 0.0, HEIGHT / 2), (half, edge, HEIGHT / 2)))
-        walls.append(((0.0, sign * (edge - half), HEIGHT / 2), (edge, half, HEIGHT / 2)))
+    for place in (half - edge, edge - half):
+        walls += [((place, 0.0, top), (half, edge, top)), ((0.0, place, top), (edge, half, top))]
     for index, (position, size) in enumerate(walls):
         body.add_geom(name=f"bin_{index}", type=mujoco.mjtGeom.mjGEOM_BOX, pos=position, size=size)
 
@@ -97,10 +96,9 @@ def with_thermal(thermal: ThermalSettings) -> Task:
         episode=20.0,
         noise=ObservationNoise(position=0.005, velocity=0.005),
         groups={
-            "actor": ("priv_proprio", "priv_obj_state", "priv_thermal"),
-            "critic": ("priv_proprio", "priv_obj_state", "priv_thermal"),
-            "rnd_state": ("priv_proprio", "priv_obj_state", "priv_thermal"),
-            "teacher": ("priv_proprio", "priv_obj_state", "priv_thermal"),
+            **dict.fromkeys(
+                ("actor", "critic", "rnd_state", "teacher"), ("priv_proprio", "priv_obj_state", "priv_thermal")
+            ),
             "student": ("proprio", "thermal"),
         },
         teacher=TeacherSettings(iterations=5000),

@@ -13,16 +13,7 @@ from robotics_bridge.tasks.in_palm_rotate import PALM_UP
 from robotics_bridge.tasks.objects import PRIMITIVES
 from robotics_bridge.tasks.registry import register, register_bounded
 from robotics_bridge.tasks.settings import StudentSettings, TeacherSettings
-from robotics_bridge.tasks.task import (
-    Ending,
-    ObjectRandomisation,
-    ObservationNoise,
-    Placement,
-    Push,
-    Reward,
-    Success,
-    Task,
-)
+from robotics_bridge.tasks.task import Ending, ObjectRandomisation, ObservationNoise, Placement, Push, Reward, Task
 
 
 @register("in_hand_repose", "published")
@@ -50,7 +41,6 @@ def published() -> Task:
             "work_penalty": Reward(-0.001, terms.work),
         },
         endings={"obj_dropped": Ending(terms.below, {"height": 0.46})},
-        success=Success(metric="goals", threshold=1.0),
         episode=20.0,
         object_changes=ObjectRandomisation(friction=(0.3, 2.0), mass_offset=(0.0, 0.1), each_reset=False),
         push=Push(x=(-1.0, 1.0), y=(-1.0, 1.0), z=(-1.0, 1.0), interval=(2.0, 4.0)),

@@ -12,19 +12,9 @@ from robotics_bridge.sensors.taxels.sensors import PUBLISHED_TWIST
 from robotics_bridge.tasks import terms
 from robotics_bridge.tasks.goals import SteppingRotation
 from robotics_bridge.tasks.objects import PRIMITIVES
-from robotics_bridge.tasks.registry import register
+from robotics_bridge.tasks.registry import bounded, register
 from robotics_bridge.tasks.settings import AuxiliaryDecoder, StudentSettings, TeacherSettings
-from robotics_bridge.tasks.task import (
-    ACTION_LIMIT,
-    Ending,
-    ObjectRandomisation,
-    ObservationNoise,
-    Placement,
-    Push,
-    Reward,
-    Success,
-    Task,
-)
+from robotics_bridge.tasks.task import Ending, ObjectRandomisation, ObservationNoise, Placement, Push, Reward, Task
 
 PALM_UP = (0.7071067811865476, 0.0, -0.7071067811865475, 0.0)
 """The palm faces up, the fingers point along −x."""
@@ -64,7 +54,6 @@ def published() -> Task:
             "obj_dropped": Ending(terms.below, {"height": 0.45}),
             "reached_max_consecutive_successes": Ending(terms.enough_goals, {"count": GOALS}),
         },
-        success=Success(metric="goals", threshold=1.0),
         episode=10.0,
         object_changes=ObjectRandomisation(friction=(0.5, 1.5), mass_offset=(0.0, 0.1)),
         push=Push(x=(-1.0, 1.0), y=(-1.0, 1.0), z=(-1.0, 1.0), interval=(2.0, 4.0)),
@@ -98,21 +87,18 @@ def default() -> Task:
     nothing. Without the approach to the goal, teachers threw the block round and lost it. Actions are bounded. Taxels
     have the torsional friction of their patch.
     """
-    task = published()
-    rewards = dict(task.rewards)
-    rewards["success_bonus"] = Reward(800.0, terms.goal_reached)
-    rewards["rotation_progress"] = Reward(5.0, terms.rotation_progress, {"clip": 2.5, "penalty_scale": 1.0})
-    rewards["goal_approach"] = Reward(10.0, terms.approach, {"clip": (-1000.0, 2.5), "negative_scale": 1.0})
-    rewards["off_axis_orientation_penalty"] = Reward(-5.0, terms.off_axis)
-    rewards["obj_dist_penalty"] = Reward(-100.0, terms.far_from, {"target": (0.0, 0.0, 0.52), "margin": 0.04})
+    task = bounded(published())
+    rewards = {
+        **task.rewards,
+        "success_bonus": Reward(800.0, terms.goal_reached),
+        "rotation_progress": Reward(5.0, terms.rotation_progress, {"clip": 2.5, "penalty_scale": 1.0}),
+        "goal_approach": Reward(10.0, terms.approach, {"clip": (-1000.0, 2.5), "negative_scale": 1.0}),
+        "off_axis_orientation_penalty": Reward(-5.0, terms.off_axis),
+        "obj_dist_penalty": Reward(-100.0, terms.far_from, {"target": (0.0, 0.0, 0.52), "margin": 0.04}),
+    }
     settings = replace(task.teacher, std_range=(0.2, 1.2))
-    goal = SteppingRotation(
-        axis=(-1.0, 0.0, 0.0), step=1.570795, threshold=0.1, allowed_off_axis=0.5235983333, start_threshold=0.4
-    )
-    return replace(
-        task, joints={"xhand1": CUPPED}, rewards=rewards, teacher=settings, goal=goal, action_limit=ACTION_LIMIT,
-        taxel_twist=None,
-    )  # fmt: skip
+    goal = task.goal and replace(task.goal, start_threshold=0.4)
+    return replace(task, joints={"xhand1": CUPPED}, rewards=rewards, teacher=settings, goal=goal)
 
 
 @register("in_palm_rotate", "careful")
@@ -122,16 +108,13 @@ def careful() -> Task:
     A drop costs twice as much, a goal pays twice as much, squeezing costs less; the goal is narrow from the start.
     """
     task = default()
-    rewards = dict(task.rewards)
-    rewards["is_dropped"] = Reward(-200.0, terms.ended, {"names": ("obj_dropped",)})
-    rewards["success_bonus"] = Reward(1600.0, terms.goal_reached)
-    rewards["obj_force_penalty"] = Reward(-2.0, terms.squeezed, {"threshold": 1.0, "clip": 20.0})
+    rewards = {
+        **task.rewards,
+        "is_dropped": Reward(-200.0, terms.ended, {"names": ("obj_dropped",)}),
+        "success_bonus": Reward(1600.0, terms.goal_reached),
+        "obj_force_penalty": Reward(-2.0, terms.squeezed, {"threshold": 1.0, "clip": 20.0}),
+    }
     settings = replace(
         task.teacher, rnd_weight=50.0, learning_rate=3e-4, learning_rate_range=(1e-4, 3e-3), std_range=(0.2, 1.0)
     )
-    return replace(
-        task,
-        rewards=rewards,
-        teacher=settings,
-        goal=None if task.goal is None else replace(task.goal, start_threshold=None),
-    )
+    return replace(task, rewards=rewards, teacher=settings, goal=published().goal)

@@ -55,18 +55,13 @@ class ObjectShape:
 
     def scaled(self, factor: float) -> ObjectShape:
         """Return the shape with all lengths multiplied."""
+
+        def longer(lengths: tuple[float, ...]) -> Any:
+            return tuple(factor * one for one in lengths)
+
         # Lengths grow by the factor, the density stays: mass grows with its cube.
-        solids = tuple(
-            replace(
-                solid,
-                size=tuple(factor * s for s in solid.size),
-                position=(factor * solid.position[0], factor * solid.position[1], factor * solid.position[2]),
-            )
-            for solid in self.solids
-        )
-        x, y, z = self.extent
-        name = f"{self.name}×{factor:.3g}"
-        return ObjectShape(name, solids, (factor * x, factor * y, factor * z), factor * self.bottom)
+        solids = tuple(replace(one, size=longer(one.size), position=longer(one.position)) for one in self.solids)
+        return ObjectShape(f"{self.name}×{factor:.3g}", solids, longer(self.extent), factor * self.bottom)
 
 
 def box(x: float, y: float, z: float) -> ObjectShape:
@@ -96,12 +91,6 @@ def screwdriver(length: float, handle_length: float, handle_radius: float, shaft
 
     The handle is a cylinder, the shaft a capsule that ends in the tip.
 
-    Args:
-        length: Of the tool, tip to end [m].
-        handle_length: Of the handle, less than that [m].
-        handle_radius: [m].
-        shaft_radius: [m].
-
     Raises:
         UsageError: the handle is not shorter than the tool.
     """
@@ -121,12 +110,7 @@ def screwdriver(length: float, handle_length: float, handle_radius: float, shaft
 
 
 def with_sizes(shapes: Sequence[ObjectShape], span: tuple[float, float], steps: int = 8) -> tuple[ObjectShape, ...]:
-    """Return every shape at several sizes, evenly over a range of factors; (1, 1) leaves them as they are.
-
-    Args:
-        shapes: At factor 1.
-        span: Smallest and largest factor.
-        steps: How many sizes.
+    """Return every shape at several sizes, evenly from the smallest to the largest factor of a span.
 
     Raises:
         UsageError: the range is not positive or falls.
@@ -149,15 +133,10 @@ def slots(shapes: Sequence[ObjectShape]) -> tuple[str, ...]:
 def add_object(
     spec: Any, name: str, shape: ObjectShape, kinds: Sequence[str], *, density: float, **contact: Any
 ) -> None:
-    """Add a free body with the solids of a shape to a ``mujoco.MjSpec``.
+    """Add a free body with the solids of a shape, ``<name>_<number>``, to a ``mujoco.MjSpec``.
 
-    Args:
-        spec: changed in place.
-        name: of the body; its solids are ``<name>_<number>``.
-        shape: what it looks like.
-        kinds: as :func:`slots` gives them for all shapes of the task.
-        density: kg/m³.
-        **contact: settings of the geometries, e.g. ``friction``.
+    The kinds are those of :func:`slots` for all shapes of the task; the density is in kg/m³, ``contact`` holds settings
+    of the geometries, e.g. ``friction``.
     """
     mujoco = mujoco_module()
     body = spec.worldbody.add_body(name=name)

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import fields, is_dataclass, replace
 from typing import Any
 
-from brainbench.core.errors import UsageError, shown, unknown_name
+from brainbench.core.errors import UsageError, check_name, shown, unknown_name
 from robotics_bridge.tasks.task import Ending, Reward, Task
 
 
@@ -47,17 +47,14 @@ def _one(task: Task, path: list[str], value: str) -> Task:
 def _term(name: str, term: Any, rest: list[str], value: str) -> Any:
     if not rest and isinstance(term, Reward):
         return replace(term, weight=_read(name, value, term.weight))
-    if len(rest) != 1 or rest[0] not in term.params:
-        raise unknown_name(f"parameter of {name!r}", ".".join(rest), term.params)
-    (key,) = rest
+    check_name(f"parameter of {name!r}", key := ".".join(rest), term.params)
     return replace(term, params={**term.params, key: _read(f"{name}.{key}", value, term.params[key])})
 
 
 def set_field(subject: Any, path: list[str], value: str) -> Any:
     """Return a frozen dataclass with another value of the field at the end of a path, read as the present one is."""
     first, *rest = path
-    if first not in _names(subject):
-        raise unknown_name(f"field of {type(subject).__name__}", first, _names(subject))
+    check_name(f"field of {type(subject).__name__}", first, _names(subject))
     present = getattr(subject, first)
     if rest:
         if not is_dataclass(present):
@@ -77,8 +74,6 @@ def _read(name: str, text: str, present: Any) -> Any:
     try:
         if isinstance(present, str):
             return text
-        if present is None:
-            return _number(text)
         if isinstance(present, bool):
             return {"true": True, "false": False}[text.lower()]
         if isinstance(present, int):
@@ -86,7 +81,7 @@ def _read(name: str, text: str, present: Any) -> Any:
             if number != int(number):
                 raise ValueError
             return int(number)
-        if isinstance(present, float):
+        if present is None or isinstance(present, float):
             return _number(text)
         if isinstance(present, tuple) and all(isinstance(item, (int, float)) for item in present):
             kind = int if present and all(isinstance(item, int) for item in present) else _number

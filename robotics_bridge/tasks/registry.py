@@ -15,11 +15,7 @@ _OWN = ("in_palm_rotate", "in_hand_repose", "screwdriver", "hot_ball")
 
 
 def register(name: str, config: str = "default") -> Callable[[Maker], Maker]:
-    """Register a function without arguments that returns a :class:`Task`.
-
-    Args:
-        name: of the task.
-        config: of this configuration of it; every task needs ``default``.
+    """Register a function without arguments that returns a :class:`Task`; every task needs the config ``default``.
 
     Raises:
         UsageError: the task has such a configuration already.
@@ -41,17 +37,18 @@ def register(name: str, config: str = "default") -> Callable[[Maker], Maker]:
     return keep
 
 
+def bounded(task: Task) -> Task:
+    """Return a published task with bounded actions and physical taxels, as all have on which we train."""
+    return replace(task, action_limit=ACTION_LIMIT, taxel_twist=None)
+
+
 def register_bounded(name: str, published: Maker) -> None:
-    """Register the default, on which we train: the published task with bounded actions and physical taxels."""
-    register(name)(lambda: replace(published(), action_limit=ACTION_LIMIT, taxel_twist=None))
+    """Register the default, on which we train: the published task, :func:`bounded`."""
+    register(name)(lambda: bounded(published()))
 
 
 def forget(name: str) -> None:
-    """Remove a task that was registered.
-
-    Raises:
-        UsageError: no such task was registered; tasks of the package stay.
-    """
+    """Remove a task that was registered; raise UsageError for any other, since tasks of the package stay."""
     if name not in _MADE or name in _OWN:
         raise unknown_name("task of yours", name, [n for n in _MADE if n not in _OWN])
     del _MADE[name]

@@ -4,15 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import combinations
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from brainbench.core.devices import mujoco_module
-from brainbench.core.errors import UsageError
+from brainbench.core.errors import UsageError, check_name
 from robotics_bridge.hands.hand import Hand
 from robotics_bridge.hands.scenes import palm_surface
+from robotics_bridge.physics.scene import excluded_links
 from robotics_bridge.tasks.objects import ObjectShape, add_object, slots, with_sizes
 from robotics_bridge.tasks.task import Pose, Task
 
@@ -89,8 +91,7 @@ def build(task: Task, hand: Hand) -> TaskModel:
     high = np.where(limited, first.jnt_range[ids, 1], np.pi)
     given = task.joints.get(hand.name, {})
     for name in given:
-        if name not in joints:
-            raise UsageError(f"Task {task.name!r} sets the joint {name!r}, which hand {hand.name!r} does not have.")
+        check_name(f"joint in task {task.name!r} of hand {hand.name!r}:", name, joints)
     rest = np.array([given.get(name, 0.0) for name in joints])
     stiffness, damping, effort = (np.array([drives[name][column] for name in joints]) for column in range(3))
     return TaskModel(
@@ -116,14 +117,13 @@ def _hand_spec(task: Task, hand: Hand) -> tuple[Any, dict[str, tuple[float, floa
             joint.armature = joint.armature or _ARMATURE
     slides = {}
     for axis, ((low, high), stiffness, damping, effort) in task.carriage.items():
-        # The carriage moves along world axes, while a joint's axis is given in the frame of its body.
-        direction = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}[axis]
+        # The carriage moves along world axes, while a joint's axis is given in the frame of its body: rows of Rᵀ.
         matrix = np.zeros(9)
         mujoco.mju_quat2Mat(matrix, np.array(palm.quat, dtype=float))
         name = f"carriage_{axis}"
         palm.add_joint(
-            name=name, type=mujoco.mjtJoint.mjJNT_SLIDE, axis=matrix.reshape(3, 3).T @ direction, range=(low, high),
-            limited=True, armature=1.0,
+            name=name, type=mujoco.mjtJoint.mjJNT_SLIDE, axis=matrix.reshape(3, 3)["xyz".index(axis)],
+            range=(low, high), limited=True, armature=1.0,
         )  # fmt: skip
         slides[name] = (stiffness, damping, effort)
     if slides:
@@ -183,38 +183,29 @@ def _moved(task: Task, hand: Hand, joints: Sequence[str]) -> tuple[str, ...]:
                 f"{', '.join(hand.fingers)}. Change the task with dataclasses.replace(task, moves=(...))."
             )
     links = {link for name in chosen for link in hand.fingers[name]}
+    others = {link for name in hand.fingers if name not in chosen for link in hand.fingers[name]}
     model = hand.model
+    # Names of each body and of all below it; bodies come after their parents.
+    below = [{model.body(body).name} for body in range(model.nbody)]
+    for body in range(model.nbody - 1, 0, -1):
+        below[model.body_parentid[body]] |= below[body]
     roots = set()
     for index in range(model.njnt):
-        body = int(model.jnt_bodyid[index])
-        below = {model.body(b).name for b in range(model.nbody) if _is_below(model, b, body)}
-        if below & links and not below >= set(hand.fingers):
-            others = {link for name in hand.fingers if name not in chosen for link in hand.fingers[name]}
-            if not below & others:
-                roots.add(model.joint(index).name)
+        moved = below[model.jnt_bodyid[index]]
+        if moved & links and not moved & others and not moved >= set(hand.fingers):
+            roots.add(model.joint(index).name)
     return tuple(name for name in joints if name in roots or name.startswith("carriage_"))
 
 
-def _is_below(model: Any, body: int, ancestor: int) -> bool:
-    while body > 0:
-        if body == ancestor:
-            return True
-        body = int(model.body_parentid[body])
-    return False
-
-
-def _tips(hand: Hand) -> dict[str, tuple[float, float, float]]:
+def _tips(hand: Hand) -> dict[str, Any]:
     layout = hand.layout("low", "tips")
     found = {}
     for tip in hand.tips:
+        found[tip] = (0.0, 0.0, 0.0)
         if tip in _TIPS and hand.spec is not None:
             found[tip] = _TIPS[tip]
         elif tip in layout and layout[tip].active.any():
-            probes = layout[tip]
-            x, y, z = probes.position[probes.active].mean(axis=0).tolist()
-            found[tip] = (x, y, z)
-        else:
-            found[tip] = (0.0, 0.0, 0.0)
+            found[tip] = tuple(layout[tip].position[layout[tip].active].mean(axis=0).tolist())
     return found
 
 
@@ -250,7 +241,7 @@ def _apart(spec: Any, samples: int = 1500, margin: float = 2e-3) -> list[tuple[s
     high = np.where(model.jnt_limited, model.jnt_range[:, 1], np.pi)
     hinges = np.isin(model.jnt_type, (2, 3))
     address = model.jnt_qposadr[hinges]
-    met: set[tuple[int, int]] = set()
+    met = excluded_links(model)
     for sample in range(samples):
         share = rng.random(hinges.sum())
         # Fingers meet most when bent far: half of the poses are at the ends of the ranges.
@@ -259,13 +250,7 @@ def _apart(spec: Any, samples: int = 1500, margin: float = 2e-3) -> list[tuple[s
         mujoco.mj_kinematics(model, data)
         mujoco.mj_comPos(model, data)
         mujoco.mj_collision(model, data)
-        for first, second in model.geom_bodyid[data.contact.geom].tolist():
-            met.add((min(first, second), max(first, second)))
+        met |= {(min(pair), max(pair)) for pair in model.geom_bodyid[data.contact.geom].tolist()}
     bodies = [body for body in range(1, model.nbody) if model.body_geomnum[body]]
-    known = {(min(int(s) >> 16, int(s) & 0xFFFF), max(int(s) >> 16, int(s) & 0xFFFF)) for s in model.exclude_signature}
-    return [
-        (model.body(first).name, model.body(second).name)
-        for place, first in enumerate(bodies)
-        for second in bodies[place + 1 :]
-        if (first, second) not in met and (first, second) not in known
-    ]
+    apart = [pair for pair in combinations(bodies, 2) if pair not in met]
+    return [(model.body(first).name, model.body(second).name) for first, second in apart]

@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass, field
 from typing import Any
 
-from brainbench.core.errors import UsageError, unknown_name
+from brainbench.core.errors import UsageError, check_name
 from brainbench.core.reading.ranges import check_number
 
 SCHEDULES = ("adaptive", "fixed")
@@ -68,8 +68,7 @@ class TeacherSettings:
     """Learning rate of the predicting network."""
 
     def __post_init__(self) -> None:
-        if self.schedule not in SCHEDULES:
-            raise unknown_name("schedule of the learning rate", self.schedule, SCHEDULES)
+        check_name("schedule of the learning rate", self.schedule, SCHEDULES)
         low, high = self.learning_rate_range
         if not _WIDEST[0] <= low <= self.learning_rate <= high <= _WIDEST[1]:
             raise UsageError(
@@ -91,52 +90,30 @@ class TeacherSettings:
             raise UsageError(f"std_range is a range of positive numbers; received {self.std_range!r}.")
 
     def config(self, groups: dict[str, tuple[str, ...]]) -> dict[str, Any]:
-        """Return the configuration of rsl_rl 5 (``PPO.construct_algorithm``).
-
-        Args:
-            groups: observation set → observation groups.
-        """
+        """Return the configuration of rsl_rl 5 (``PPO.construct_algorithm``), given observation set → groups."""
         network = {
-            "class_name": "MLPModel",
-            "hidden_dims": list(self.hidden),
-            "activation": "elu",
-            "obs_normalization": True,
-        }
+            "class_name": "MLPModel", "hidden_dims": list(self.hidden), "activation": "elu", "obs_normalization": True,
+        }  # fmt: skip
         spread = {
-            "class_name": "GaussianDistribution",
-            "init_std": self.initial_std,
-            "std_type": self.std_type,
+            "class_name": "GaussianDistribution", "init_std": self.initial_std, "std_type": self.std_type,
             "std_range": list(self.std_range),
-        }
+        }  # fmt: skip
         algorithm: dict[str, Any] = {
-            "class_name": "PPO",
-            "num_learning_epochs": self.epochs,
-            "num_mini_batches": self.minibatches,
-            "learning_rate": self.learning_rate,
-            "schedule": self.schedule,
-            "gamma": self.discount,
-            "lam": self.gae_lambda,
-            "entropy_coef": self.entropy,
-            "desired_kl": self.desired_kl,
-            "max_grad_norm": self.max_grad_norm,
-            "value_loss_coef": self.value_loss,
-            "use_clipped_value_loss": True,
-            "clip_param": self.clip,
-        }
+            "class_name": "PPO", "num_learning_epochs": self.epochs, "num_mini_batches": self.minibatches,
+            "learning_rate": self.learning_rate, "schedule": self.schedule, "desired_kl": self.desired_kl,
+            "gamma": self.discount, "lam": self.gae_lambda, "entropy_coef": self.entropy, "clip_param": self.clip,
+            "max_grad_norm": self.max_grad_norm, "value_loss_coef": self.value_loss, "use_clipped_value_loss": True,
+        }  # fmt: skip
         if tuple(self.learning_rate_range) != _WIDEST:
             algorithm |= {"class_name": BOUNDED, "learning_rate_range": list(self.learning_rate_range)}
         sets = {name: list(groups[name]) for name in ("actor", "critic")}
         if self.rnd_weight:
             sets["rnd_state"] = list(groups["rnd_state"])
             algorithm["rnd_cfg"] = {
-                "weight": self.rnd_weight,
-                "reward_normalization": True,
-                "state_normalization": True,
-                "learning_rate": self.rnd_learning_rate,
-                "num_outputs": self.rnd_outputs,
-                "predictor_hidden_dims": [-1],
-                "target_hidden_dims": [-1],
-            }
+                "weight": self.rnd_weight, "reward_normalization": True, "state_normalization": True,
+                "learning_rate": self.rnd_learning_rate, "num_outputs": self.rnd_outputs,
+                "predictor_hidden_dims": [-1], "target_hidden_dims": [-1],
+            }  # fmt: skip
         return {
             "num_steps_per_env": self.steps_per_env,
             "obs_groups": sets,

@@ -5,14 +5,17 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from brainbench.core.errors import UsageError, unknown_name
+from brainbench.core.errors import UsageError, check_name
 from brainbench.core.reading.ranges import check_number
 from robotics_bridge.tasks.goals import Goal
 from robotics_bridge.tasks.objects import PRIMITIVES, ObjectShape
 from robotics_bridge.tasks.settings import AuxiliaryDecoder, StudentSettings, TeacherSettings
-from robotics_bridge.tasks.task_state import TaskEnvironment, TaskState
+from robotics_bridge.tasks.task_state import TaskState
+
+if TYPE_CHECKING:
+    from robotics_bridge.envs.state import EnvState
 
 Range = tuple[float, float]
 """Lower and upper bound of a uniform distribution."""
@@ -205,7 +208,7 @@ class Task:
     """Axis of the object whose rotation is counted (its own frame)."""
     turn_window: int = 60
     """Steps over which stagnation is judged."""
-    task_state: Callable[[TaskEnvironment], TaskState] | None = None
+    task_state: Callable[[EnvState], TaskState] | None = None
     """Makes the part of the task that keeps a state of its own (hot_ball's thermometers)."""
     # --- learning ---
     goal_terms: tuple[str, ...] = ()
@@ -245,10 +248,8 @@ class Task:
         for name, (low, high) in self._ranges().items():
             if not (math.isfinite(low) and math.isfinite(high) and low <= high):
                 raise UsageError(f"{name} of task {self.name!r} is a range (low, high); received {(low, high)}.")
-        for names in self.groups.values():
-            for name in names:
-                if name not in GROUPS:
-                    raise unknown_name("observation group", name, GROUPS)
+        for name in (name for names in self.groups.values() for name in names):
+            check_name("observation group", name, GROUPS)
 
     @property
     def step_dt(self) -> float:

@@ -1,8 +1,7 @@
 """Reward terms and conditions that end an episode: small functions of one moment of all environments.
 
 A term takes a :class:`~robotics_bridge.tasks.step_context.StepContext` and its parameters and returns one number per
-environment
-[B]. Weights are per second: the environment multiplies by its weight and by the time of a control step, as
+environment [B]. Weights are per second: the environment multiplies by its weight and by the time of a control step, as
 manager-based environments do. Formulas behind the names of table 4.8 are not published; those here are ours.
 
 On CUDA the environment records terms into a graph: they run once as Python, later only as what they launched. A term
@@ -118,8 +117,7 @@ def spin(m: StepContext, *, local_axis: tuple[float, float, float], low: float, 
 
 def alignment(m: StepContext, local_up: tuple[float, float, float]) -> torch.Tensor:
     """Return the cosine [B] between an axis of the object and the vertical."""
-    # The z component of the rotated axis is the cosine of its tilt: no arc cosine, whose slope is infinite when
-    # upright.
+    # The z component of the rotated axis is the cosine of its tilt.
     return rotate(m.object_quat, constant(local_up, m.object_quat))[:, 2]
 
 

@@ -12,14 +12,15 @@ import numpy as np
 
 from brainbench.core.devices import warp
 from brainbench.core.errors import UsageError
+from brainbench.core.reading.ranges import check_number
 from robotics_bridge.sensors.temperature.grid import TemperatureGrid, link_temperature
 from robotics_bridge.sensors.temperature.materials import ThermalBody, ThermalMaterial
 
 if TYPE_CHECKING:
     import torch
 
+    from robotics_bridge.envs.state import EnvState
     from robotics_bridge.tasks.step_context import StepContext
-    from robotics_bridge.tasks.task_state import TaskEnvironment
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,8 +58,7 @@ class ThermalSettings:
     def __post_init__(self) -> None:
         if not self.hot > self.ambient:
             raise UsageError(f"The target is hotter than the room; received {self.hot} and {self.ambient} °C.")
-        if not 0 < self.margin < 1:
-            raise UsageError(f"The latch's margin lies between 0 and 1; received {self.margin!r}.")
+        check_number("The latch's margin", self.margin, above=0, below=1)
 
     @property
     def material(self) -> ThermalMaterial:
@@ -79,13 +79,10 @@ def progress(temperature: torch.Tensor, thermal: ThermalSettings) -> torch.Tenso
 class Thermometers:
     """Temperature grids on every finger link, which ball is hot, the latch, and the time of latched contact.
 
-    Args:
-        env: the environments; ``env.episode.target`` says which ball is hot.
-        thermal: materials and temperatures.
-        chooses: draw the hot ball anew at every reset; otherwise follow ``env.episode.target``.
+    ``env.episode.target`` says which ball is hot; with ``chooses`` it is drawn anew at every reset.
     """
 
-    def __init__(self, env: TaskEnvironment, thermal: ThermalSettings, *, chooses: bool = True) -> None:
+    def __init__(self, env: EnvState, thermal: ThermalSettings, *, chooses: bool = True) -> None:
         import torch
 
         from robotics_bridge.sensors import SensorSuite
@@ -110,8 +107,7 @@ class Thermometers:
         self.suite = SensorSuite(scene, sensors, num_envs=env.num_envs, device=env.simulation.warp_device)
         self._cells = [self.suite.read(link) for link in links]
         self._heat = link_temperature(self.suite, links[0])
-        numbers = [scene.link_index(name) for name in balls]
-        self._balls = torch.as_tensor(numbers, device=env.device)
+        self._balls = torch.as_tensor([scene.link_index(name) for name in balls], device=env.device)
         self._numbers = torch.arange(len(balls), device=env.device)
         # 0 where a geometry is no tip and no ball, 1 for tips, 2 + k for ball k.
         roles = np.zeros(len(scene.geometries), dtype=np.int32)
@@ -179,16 +175,11 @@ class Thermometers:
 
         from robotics_bridge.tasks.kernels.touching import find_touched
 
-        wp, state = warp(), self._env.simulation.state
+        state, device = self._env.simulation.state, self._env.simulation.warp_device
         self._touch.zero_()
-        wp.launch(
-            find_touched, dim=state.contact_env.shape[0],
-            inputs=[
-                state.contact_count, state.contact_geom, state.contact_env, state.contact_distance, self._roles,
-                self._touch,
-            ],
-            device=self._env.simulation.warp_device,
-        )  # fmt: skip
+        inputs = [state.contact_count, state.contact_geom, state.contact_env, state.contact_distance]
+        inputs += [self._roles, self._touch]
+        warp().launch(find_touched, dim=state.contact_env.shape[0], inputs=inputs, device=device)
         self.age += dt
         self.touching.copy_(self._touched.gather(1, self._env.episode.target.unsqueeze(1))[:, 0] > 0)
         # The latch fires once, at progress 1 − m of the warmest cell, and holds for the episode; S counts from then on

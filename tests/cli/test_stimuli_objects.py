@@ -69,7 +69,7 @@ def test_a_shapenet_folder_is_counted(run, tmp_path):
     [
         (("torsu",), "did you mean 'torus'"),
         (("torus", "--collision", "hul"), "did you mean 'hull'"),
-        (("torus", "--detail", "10"), "between 2000 and 20000"),
+        (("torus", "--detail", "10"), "at least 2,000 and at most 20,000"),
         (("torus", "--export", "x.dae"), "Unknown mesh format '.dae'"),
         (("--export", "x.obj"), "name a family or a mesh file"),
         (("torus", "--method", "cocad"), "did you mean 'coacd'"),

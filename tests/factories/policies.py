@@ -13,7 +13,8 @@ from robotics_bridge import hands
 from robotics_bridge.policies.export import export_policy
 from robotics_bridge.policies.student import TactilePolicy
 from robotics_bridge.policies.training.distill_config import DistillConfig
-from robotics_bridge.policies.training.student_files import build_student, save_student
+from robotics_bridge.policies.training.state_tree import write_tensors
+from robotics_bridge.policies.training.student_files import build_student
 
 
 def contract_of() -> dict[str, Any]:
@@ -63,5 +64,5 @@ def student_folder(folder: Path) -> Path:
         "deployment": contract_of()["deployment"],
     }  # fmt: skip
     write_json(folder / "config.json", described)
-    save_student(folder / "model.safetensors", student)
+    write_tensors(folder / "model.safetensors", student.state_dict())
     return folder

@@ -45,4 +45,4 @@ def test_every_training_seed_has_a_command_that_exists_and_students_stopped_earl
             assert program == "brainbench"
             # All words are parsed before help is shown: an unknown option would be refused.
             assert CliRunner().invoke(app, [*words, "--help"]).exit_code == 0
-            assert CliRunner().invoke(app, [*words, "--no-such-option", "--help"]).exit_code != 0
+    assert CliRunner().invoke(app, [*words, "--no-such-option", "--help"]).exit_code != 0

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import numbers
 from typing import Any
 
 from brainbench.core.errors import UsageError, shown
@@ -19,7 +20,7 @@ def check_number(
     whole: bool = False,
 ) -> None:
     """Raise a :class:`UsageError` unless ``value`` is a finite number within all bounds, and whole if asked for."""
-    kind = isinstance(value, int if whole else (int, float)) and not isinstance(value, bool)
+    kind = issubclass(type(value), numbers.Integral if whole else numbers.Real) and not isinstance(value, bool)
     if kind and -math.inf < value < math.inf and least <= value <= most and above < value < below:
         return
     bounds = {"at least": least, "at most": most, "above": above, "below": below}

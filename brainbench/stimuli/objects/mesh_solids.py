@@ -8,8 +8,9 @@ import os
 from collections.abc import Callable, Iterable
 from dataclasses import replace
 
-from brainbench.core.errors import UsageError, unknown_name
+from brainbench.core.errors import UsageError, check_name
 from brainbench.core.files import content_hash
+from brainbench.core.reading.ranges import check_number
 from brainbench.geometry import DecompositionSettings, Mesh, decompose, deviation, load_mesh, repair
 from brainbench.stimuli.objects.obstacle import ConvexPart
 from brainbench.stimuli.objects.procedural import Shape
@@ -34,19 +35,16 @@ def mesh_solid(
 ) -> Solid:
     """Return a mesh file as a solid, repaired where that needs no guessing (see :func:`brainbench.geometry.repair`).
 
-    Args:
-        path: any format :func:`brainbench.geometry.load_mesh` reads.
-        unit: length unit of the file (``m``, ``mm``, …).
-        diagonal: scale to this bounding-box diagonal [m]; None keeps the size.
-        collision: what whiskers touch, one of :data:`COLLISIONS`.
-        decomposition: how ``decomposition`` cuts; its defaults when None.
+    The file is of any format that :func:`brainbench.geometry.load_mesh` reads, its lengths in ``unit`` (``m``, ``mm``,
+    …); it is scaled to a bounding-box ``diagonal`` [m] where one is given. Whiskers touch its ``collision`` geometry,
+    one of :data:`COLLISIONS`.
 
     Raises:
         UsageError: ``collision`` or the unit is unknown, or ``exact`` is asked of a mesh that is not closed.
         DataError: the file is missing, unreadable or flat, or the decomposition passed its limits.
         MissingDependencyError: the decomposition needs a package that is not installed.
     """
-    _check_collision(collision)
+    check_name("collision geometry", collision, COLLISIONS)
     repaired = repair(load_mesh(path, unit=unit))
     solid = touchable(repaired.mesh, collision, decomposition)
     # Separate bodies are what "pieces" is for.
@@ -72,7 +70,7 @@ def shape_solid(
     """
     if collision is None:
         collision = "exact" if shape.part_points else "hull"
-    _check_collision(collision)
+    check_name("collision geometry", collision, COLLISIONS)
     name = f"{shape.label}-{shape.seed}"
     mesh = Mesh(shape.mesh.vertices, shape.mesh.faces, name)
     if collision != "exact" or not shape.part_points:
@@ -109,8 +107,7 @@ def shape_solids(
     """
     from brainbench.stimuli.objects import procedural
 
-    if members < 1:
-        raise UsageError(f"A family needs at least one member; received {members!r}.")
+    check_number("members of a family", members, least=1, whole=True)
     chosen = procedural.list_families() if families is None else tuple(families)
     for family in chosen:
         procedural.describe_family(family)
@@ -119,11 +116,6 @@ def shape_solids(
         return shape_solid(procedural.make(family, seed, detail=detail), diagonal=diagonal, collision=collision)
 
     return {f"{family}-{seed}": functools.partial(load, family, seed) for family in chosen for seed in range(members)}
-
-
-def _check_collision(collision: str) -> None:
-    if collision not in COLLISIONS:
-        raise unknown_name("collision geometry", collision, COLLISIONS)
 
 
 def touchable(mesh: Mesh, collision: str, settings: DecompositionSettings | None) -> Solid:
@@ -162,6 +154,4 @@ def _exact(mesh: Mesh) -> Solid:
 
 
 def _is_concave(mesh: Mesh, hull: Mesh) -> bool:
-    if not mesh.diagnosis.watertight:
-        return True
-    return mesh.volume < 0.999 * hull.volume
+    return not mesh.diagnosis.watertight or mesh.volume < 0.999 * hull.volume

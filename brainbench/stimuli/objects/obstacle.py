@@ -6,16 +6,16 @@ import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import ClassVar, Self
+from typing import ClassVar, Self, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
-from brainbench.core.errors import UsageError
+from brainbench.core.errors import UsageError, check_name
+from brainbench.core.reading.ranges import check_number
 from brainbench.core.rotations import from_matrices, to_matrices
 
 RigidMotion = Callable[[NDArray[np.float64]], tuple[NDArray[np.float64], NDArray[np.float64]]]
-
 """Times [n] (s) → positions [n, 3] (m, world) and unit quaternions [n, 4] (w, x, y, z), body to world."""
 
 Vector = tuple[float, float, float]
@@ -27,6 +27,15 @@ class _Polyhedron:
 
     vertices: NDArray[np.float64]
     """[m, 3] (m)."""
+
+    def _checked_points(self, kind: str) -> NDArray[np.float64]:
+        """Check the vertices, keep a copy of them that cannot be written, and return it."""
+        points = np.array(self.vertices, dtype=float)
+        if points.ndim != 2 or points.shape[1] != 3 or len(points) < 4 or not np.isfinite(points).all():
+            raise UsageError(f"A {kind} needs at least four finite vertices [m, 3]; received shape {points.shape}.")
+        points.setflags(write=False)
+        object.__setattr__(self, "vertices", points)
+        return points
 
     def bounds(self) -> NDArray[np.float64]:
         """Return axis-aligned bounds [2, 3]: lowest and highest corner."""
@@ -46,17 +55,11 @@ class ConvexPart(_Polyhedron):
     """The convex hull of ``vertices`` [m, 3]: at least four points that do not lie in one plane."""
 
     def __post_init__(self) -> None:
-        points = np.array(self.vertices, dtype=float)
-        if points.ndim != 2 or points.shape[1] != 3 or len(points) < 4 or not np.isfinite(points).all():
-            raise UsageError(
-                f"A convex part needs at least four finite vertices [m, 3]; received an array of shape {points.shape}."
-            )
+        points = self._checked_points("convex part")
         # Singular values of centred points are their extents along the principal axes; the last is the thickness.
         spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
         if spread[2] < 1e-6 * spread[0]:
             raise UsageError("The vertices of a convex part lie in one plane; a part needs volume to be touched.")
-        points.setflags(write=False)
-        object.__setattr__(self, "vertices", points)
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,16 +71,12 @@ class TriangleMesh(_Polyhedron):
     faces: NDArray[np.int32]
 
     def __post_init__(self) -> None:
-        points, faces = np.array(self.vertices, dtype=float), np.array(self.faces, dtype=np.int32)
-        if points.ndim != 2 or points.shape[1:] != (3,) or len(points) < 4 or not np.isfinite(points).all():
-            raise UsageError(f"A triangle mesh needs at least four finite vertices [m, 3]; got shape {points.shape}.")
+        points, faces = self._checked_points("triangle mesh"), np.array(self.faces, dtype=np.int32)
         if faces.ndim != 2 or faces.shape[1:] != (3,) or len(faces) < 4:
             raise UsageError(f"A closed triangle mesh needs at least four faces [k, 3]; got shape {faces.shape}.")
         if faces.min() < 0 or faces.max() >= len(points):
             raise UsageError(f"The faces of a triangle mesh must name its {len(points)} vertices, counted from 0.")
-        points.setflags(write=False)
         faces.setflags(write=False)
-        object.__setattr__(self, "vertices", points)
         object.__setattr__(self, "faces", faces)
 
     @cached_property
@@ -154,6 +153,15 @@ class _Segment(_Primitive):
 
     _points = ("start", "end")
 
+    def _reach(self) -> NDArray[np.float64] | float:
+        """Return how far the body reaches beyond its segment along the axes [3] (m)."""
+        return self.radius
+
+    def bounds(self) -> NDArray[np.float64]:
+        """Return axis-aligned bounds [2, 3]: lowest and highest corner."""
+        ends, reach = np.array([self.start, self.end]), self._reach()
+        return np.stack([ends.min(axis=0) - reach, ends.max(axis=0) + reach])
+
     def __post_init__(self) -> None:
         super().__post_init__()
         if tuple(self.start) == tuple(self.end):
@@ -164,22 +172,14 @@ class _Segment(_Primitive):
 class Capsule(_Segment):
     """All points within ``radius`` of the segment from ``start`` to ``end``."""
 
-    def bounds(self) -> NDArray[np.float64]:
-        """Return axis-aligned bounds [2, 3]: lowest and highest corner."""
-        ends = np.array([self.start, self.end])
-        return np.stack([ends.min(axis=0) - self.radius, ends.max(axis=0) + self.radius])
-
 
 class Cylinder(_Segment):
     """A flat-ended cylinder around the segment from ``start`` to ``end``."""
 
-    def bounds(self) -> NDArray[np.float64]:
-        """Return axis-aligned bounds [2, 3]: lowest and highest corner."""
-        ends = np.array([self.start, self.end])
-        axis = (ends[1] - ends[0]) / np.linalg.norm(ends[1] - ends[0])
+    def _reach(self) -> NDArray[np.float64]:
+        axis = np.subtract(self.end, self.start) / np.linalg.norm(np.subtract(self.end, self.start))
         # A disc with unit normal n reaches r √(1 − nᵢ²) along axis i.
-        reach = self.radius * np.sqrt(np.clip(1 - axis**2, 0, 1))
-        return np.stack([ends.min(axis=0) - reach, ends.max(axis=0) + reach])
+        return self.radius * np.sqrt(np.clip(1 - axis**2, 0, 1))
 
 
 @dataclass(frozen=True)
@@ -240,15 +240,11 @@ class Obstacle:
     def __post_init__(self) -> None:
         object.__setattr__(self, "parts", tuple(self.parts))
         for part in self.parts:
-            if not isinstance(part, Part):
-                raise UsageError(
-                    "An obstacle is made of ConvexPart, Sphere, Capsule, Cylinder and Box; "
-                    f"received {type(part).__name__}."
-                )
+            check_name("part of an obstacle", type(part).__name__, [kind.__name__ for kind in get_args(Part)])
         if not self.parts and self.surface is None:
             raise UsageError("An obstacle needs at least one part or a surface.")
-        if self.friction is not None and not (math.isfinite(self.friction) and self.friction >= 0):
-            raise UsageError(f"friction of an obstacle must be zero or more; received {self.friction!r}.")
+        if self.friction is not None:
+            check_number("friction of an obstacle", self.friction, least=0)
 
     @cached_property
     def bounds(self) -> NDArray[np.float64]:

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from brainbench.core.errors import UsageError
+from brainbench.core.reading.ranges import check_number
 from brainbench.core.rotations import euler_matrix, from_matrices
 from brainbench.stimuli.motion.trajectories import Path, Spin, Still, Translation
-from brainbench.stimuli.objects.obstacle import Obstacle, RigidMotion, Vector
+from brainbench.stimuli.objects.obstacle import Obstacle, Vector
 from brainbench.stimuli.objects.solid import Solid
 
 
@@ -53,16 +52,11 @@ class PlacedObject:
     """Coulomb coefficient of its contacts; None takes each whisker's own."""
 
     def __post_init__(self) -> None:
-        if self.friction is not None and not 0 <= self.friction < math.inf:
-            raise UsageError(f"The friction of an object is a finite number of at least 0; received {self.friction!r}.")
+        if self.friction is not None:
+            check_number("The friction of an object", self.friction, least=0)
 
     def obstacle(self, frame: tuple[ArrayLike, ArrayLike] | None = None) -> Obstacle:
-        """Return what the physics sees.
-
-        Args:
-            frame: rotation [3, 3] and origin [3] (m) of the frame, in the world, in which the
-                obstacle and its motion are expressed; the world itself when None.
-        """
+        """Return what the physics sees in a frame, given by its rotation [3, 3] and origin [3] (m), or in the world."""
         axes, origin = (np.eye(3), np.zeros(3)) if frame is None else (np.asarray(frame[0]), np.asarray(frame[1]))
         rotation = axes.T @ euler_matrix(self.rotation)
         place = axes.T @ (np.asarray(self.position) - origin)
@@ -70,21 +64,10 @@ class PlacedObject:
         shift = np.zeros(3) if isinstance(self.motion, (Spin, Path)) else place
         parts = tuple(part.moved(rotation, shift) for part in self.solid.parts)
         surface = self.solid.surface and self.solid.surface.moved(rotation, shift)
-        return Obstacle(parts=parts, motion=self._motion(axes, place), friction=self.friction, surface=surface)
-
-    def _motion(self, axes: NDArray[np.float64], place: NDArray[np.float64]) -> RigidMotion | None:
-        """Return the motion in the frame ``axes`` [3, 3] of a body whose origin is at ``place`` [3] (m) at t = 0."""
-        motion = self.motion
-        if isinstance(motion, Still):
-            return None
-        return _PlacedMotion(motion, axes, place)
+        motion = None if isinstance(self.motion, Still) else _PlacedMotion(self.motion, axes, place)
+        return Obstacle(parts=parts, motion=motion, friction=self.friction, surface=surface)
 
     def config(self) -> dict[str, Any]:
         """Return plain values that determine the physics."""
-        return {
-            "solid": self.solid.config(),
-            "position": list(self.position),
-            "rotation": list(self.rotation),
-            "motion": self.motion.config(),
-            "friction": self.friction,
-        }
+        place = {"position": list(self.position), "rotation": list(self.rotation)}
+        return {"solid": self.solid.config(), **place, "motion": self.motion.config(), "friction": self.friction}

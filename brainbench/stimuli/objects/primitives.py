@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from brainbench.core.errors import UsageError
+from brainbench.core.reading.ranges import check_number
 from brainbench.geometry import Mesh
 from brainbench.stimuli.objects.obstacle import Box, Capsule, ConvexPart, Cylinder, Sphere, Vector
 from brainbench.stimuli.objects.solid import Solid, to_surface
@@ -26,8 +26,7 @@ def sphere(radius: float) -> Solid:
 
 def box(size: Vector) -> Solid:
     """Return a box about the origin with edge lengths ``size`` [m]."""
-    half = (size[0] / 2, size[1] / 2, size[2] / 2)
-    return Solid("box", (Box((0.0, 0.0, 0.0), half),))
+    return Solid("box", (Box((0.0, 0.0, 0.0), (size[0] / 2, size[1] / 2, size[2] / 2)),))
 
 
 def cylinder(radius: float, height: float) -> Solid:
@@ -45,14 +44,10 @@ def rodgers_solid(diagonal: float = 0.055, *, segments: int = 24) -> Solid:
 
     A cubic Bézier profile of constant offset, extruded along z. Each segment between two points of
     the curve is a parallelogram prism, so the parts are exactly convex, their union is exactly the
-    polygonal solid and the concave face stays concave. The concave face looks towards −y.
-
-    Args:
-        diagonal: bounding-box diagonal [m]; 55 mm in the published simulation.
-        segments: prisms along the curve; 24 leave a sagitta below 0.02 mm at 55 mm.
+    polygonal solid and the concave face stays concave. The concave face looks towards −y. The published simulation has
+    a bounding-box diagonal of 55 mm, at which 24 segments leave a sagitta below 0.02 mm.
     """
-    if segments < 2:
-        raise UsageError(f"The Rodgers solid needs at least 2 segments along its curve; received {segments}.")
+    check_number("segments of the Rodgers solid", segments, least=2, whole=True)
     t = np.linspace(0.0, 1.0, segments + 1)[:, None]
     # Bernstein polynomials of degree 3.
     weights = np.hstack([(1 - t) ** 3, 3 * t * (1 - t) ** 2, 3 * t**2 * (1 - t), t**3])

@@ -45,11 +45,7 @@ class ShapeNetModel:
     path: Path
 
     def solid(self, *, diagonal: float = 0.04, **options: Any) -> Solid:
-        """Load and repair the mesh; ``options`` are those of :func:`brainbench.stimuli.objects.mesh_solids.mesh_solid`.
-
-        Raises:
-            DataError: the mesh cannot be used, for the reason in the message.
-        """
+        """Load and repair the mesh; options and errors are those of :func:`~.mesh_solids.mesh_solid`."""
         # The unit cannot matter: the diagonal is set.
         return replace(mesh_solid(self.path, unit="m", diagonal=diagonal, **options), name=self.name)
 
@@ -65,11 +61,9 @@ class ShapeNet:
     """Names of the id list that the tree does not hold."""
 
     def __iter__(self) -> Iterator[ShapeNetModel]:
-        """Iterate over the models."""
         return iter(self.models)
 
     def __len__(self) -> int:
-        """Count the models."""
         return len(self.models)
 
     @property
@@ -96,10 +90,10 @@ def load_shapenet(
     ids: str | os.PathLike[str] | Iterable[str] | None = None,
     categories: str | os.PathLike[str] | Mapping[str, str] | None = None,
 ) -> ShapeNet:
-    """Find models in a local tree; no mesh is read yet.
+    """Find models in the tree of a folder of synset folders; no mesh is read yet.
 
     Args:
-        root: the folder of the synset folders.
+        root: the folder.
         ids: names ``synset/model`` or a file of them, one a line; every model of the tree when None. Names
             that the tree lacks are listed in :attr:`ShapeNet.missing` and logged.
         categories: class labels by ``synset/model`` (first choice) or by synset, or a file of them (see
@@ -179,8 +173,7 @@ def _checked(names: Iterable[str], where: str) -> tuple[str, ...]:
         synset, slash, model = name.partition("/")
         if not (slash and _is_name(synset) and model) or "/" in model or model in (".", ".."):
             raise UsageError(f"A ShapeNet model is named SYNSET/MODEL, such as 02691156/1a04e3; {where} has {name!r}.")
-    twice = [name for name, count in Counter(checked).items() if count > 1]
-    if twice:
+    if twice := [name for name, count in Counter(checked).items() if count > 1]:
         raise UsageError(f"ShapeNet models occur twice in {where}: {listing(twice, limit=4)}.")
     return checked
 

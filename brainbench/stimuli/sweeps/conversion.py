@@ -90,15 +90,10 @@ class SweepTable:
     def config(self) -> dict[str, Any]:
         """Plain values that determine every byte of the data set."""
         return {
-            "format": SWEEPS_FORMAT,
-            "schema": SWEEPS_SCHEMA,
-            "recipe": self.source,
-            "source": self.source_hash,
-            "whiskers": {"names": list(self.array.names)},
-            "classes": list(self.classes),
-            "shard_size": self.shard_size,
-            "version": __version__,
-        }
+            "format": SWEEPS_FORMAT, "schema": SWEEPS_SCHEMA, "version": __version__, "recipe": self.source,
+            "source": self.source_hash, "whiskers": {"names": list(self.array.names)},
+            "classes": list(self.classes), "shard_size": self.shard_size,
+        }  # fmt: skip
 
     @cached_property
     def config_hash(self) -> str:
@@ -109,31 +104,25 @@ class SweepTable:
     def objects(self) -> dict[str, NamedObject]:
         """The objects by name; only their names are known."""
         names, first = np.unique(self.object, return_index=True)
-        pairs = zip(names.tolist(), self.label[first].tolist(), strict=True)
-        return {
-            name: NamedObject(name, self.classes[label], self.source, partial(_no_solid, name)) for name, label in pairs
-        }
+        labels = [self.classes[label] for label in self.label[first].tolist()]
+        pairs = zip(names.tolist(), labels, strict=True)
+        return {name: NamedObject(name, label, self.source, partial(_no_solid, name)) for name, label in pairs}
 
     @cached_property
     def shards(self) -> tuple[PlannedShard, ...]:
         """The shards, those of training first, in the order of the table."""
-        parts = []
+        shards = []
         for split in SPLITS:
             mine = np.flatnonzero(self.split == split)
-            starts = range(0, len(mine), self.shard_size)
-            parts += [(split, place, mine[first : first + self.shard_size]) for place, first in enumerate(starts)]
-        return tuple(
-            PlannedShard(
-                split=split,
-                place=place,
-                objects=tuple(self.objects[name] for name in np.unique(self.object[index]).tolist()),
-                index=index,
-                frames=len(self.times),
-                config=self.config,
-                config_hash=self.config_hash,
-            )
-            for split, place, index in parts
-        )
+            for place, first in enumerate(range(0, len(mine), self.shard_size)):
+                index = mine[first : first + self.shard_size]
+                objects = tuple(self.objects[name] for name in np.unique(self.object[index]).tolist())
+                shard = PlannedShard(
+                    split=split, place=place, objects=objects, index=index, frames=len(self.times), config=self.config,
+                    config_hash=self.config_hash,
+                )  # fmt: skip
+                shards.append(shard)
+        return tuple(shards)
 
     def content(self, shard: PlannedShard) -> ShardContent:
         """Read the sweeps of a shard; a whisker with missing values is marked as unstable."""

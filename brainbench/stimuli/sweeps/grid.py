@@ -15,7 +15,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from brainbench.core.errors import UsageError, unknown_name
+from brainbench.core.errors import UsageError, check_name
 from brainbench.core.files import content_hash
 from brainbench.core.rotations import euler_matrix
 from brainbench.stimuli.motion.trajectories import Still, Translation
@@ -145,9 +145,8 @@ class SweepGrid:
             raise UsageError(
                 f"heights_per_draw must lie between 1 and the number of listed heights; got {self.heights_per_draw!r}."
             )
-        for kind, value, allowed in (("mover", self.mover, MOVERS), ("placing", self.placing, PLACINGS)):
-            if value not in allowed:
-                raise unknown_name(kind, str(value), allowed)
+        check_name("mover", self.mover, MOVERS)
+        check_name("placing", self.placing, PLACINGS)
         if not isinstance(self.head.motion, Still):
             raise UsageError("The head of a sweep grid stands still at first; choose mover='head' to let it travel.")
 

@@ -61,20 +61,13 @@ def make_manifest(plan: GenerationPlan | SweepTable, folder: str | os.PathLike[s
     about = provenance()
     del about["time"]
     return {
-        "format": SWEEPS_FORMAT,
-        "schema": SWEEPS_SCHEMA,
+        "format": SWEEPS_FORMAT, "schema": SWEEPS_SCHEMA,
         "content_hash": content_hash([[shard["name"], shard["content_hash"]] for shard in shards]),
-        "config_hash": plan.config_hash,
-        "config": plan.config,
-        "provenance": about,
-        "classes": list(plan.classes),
-        "sweeps": plan.sweeps,
-        **totals,
-        **plan.notes,
+        "config_hash": plan.config_hash, "config": plan.config, "provenance": about, "classes": list(plan.classes),
+        "sweeps": plan.sweeps, **totals, **plan.notes,
         "splits": {split: _summary(item for item in shards if item["split"] == split) for split in SPLITS},
-        "shards": shards,
-        "objects": objects,
-    }
+        "shards": shards, "objects": objects,
+    }  # fmt: skip
 
 
 def _read(path: Path, task: PlannedShard, objects: dict[str, dict[str, Any]]) -> dict[str, Any]:

@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 
 from brainbench import __version__
 from brainbench.core.contracts import SWEEPS_FORMAT, SWEEPS_SCHEMA
-from brainbench.core.errors import UsageError, unknown_name
+from brainbench.core.errors import UsageError, check_name
 from brainbench.core.files import content_hash, to_plain
+from brainbench.core.reading.ranges import check_number
 from brainbench.stimuli.engines import DEFAULT_ENGINE, PHYSICS_VERSION, get_engine
 from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.objects.collections import NamedObject
@@ -53,16 +54,13 @@ class GenerationSettings:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "fidelity", self.fidelity.resolved(get_engine(self.backend).twists))
-        if self.split not in ("object", "sweep"):
-            raise unknown_name("split", str(self.split), ("object", "sweep"))
+        check_name("split", self.split, ("object", "sweep"))
         for name in ("limit", "shard_size"):
-            value = getattr(self, name)
-            if value is not None and value < 1:
-                raise UsageError(f"{name} must be at least 1; received {value!r}.")
-        if self.retry < 1:
-            raise UsageError(f"retry divides the time step; it must be at least 1; received {self.retry!r}.")
-        if self.sample is not None and not 0 < self.sample <= 1:
-            raise UsageError(f"sample is a fraction above 0 and at most 1; received {self.sample!r}.")
+            if (value := getattr(self, name)) is not None:
+                check_number(name, value, least=1, whole=True)
+        check_number("retry, which divides the time step,", self.retry, least=1, whole=True)
+        if self.sample is not None:
+            check_number("sample, a fraction,", self.sample, above=0, most=1)
         if self.limit is not None and self.sample is not None:
             raise UsageError("Give limit (the first sweeps of each object) or sample (a random fraction), not both.")
 
@@ -219,20 +217,12 @@ class GenerationPlan:
                 part = slice(first, first + size)
                 used = list(dict.fromkeys(owners[part].tolist()))
                 local = {owner: index for index, owner in enumerate(used)}
-                shards.append(
-                    ShardTask(
-                        split=split,
-                        place=place,
-                        objects=tuple(items[owner] for owner in used),
-                        index=owners[part] * count + within[part],
-                        frames=self.grid.frames.count,
-                        config=self.config,
-                        config_hash=self.config_hash,
-                        grid=self.grid,
-                        whiskers=self.whiskers,
-                        owner=np.array([local[owner] for owner in owners[part].tolist()]),
-                        within=within[part],
-                        settings=self.settings,
-                    )
-                )
+                task = ShardTask(
+                    split=split, place=place, objects=tuple(items[owner] for owner in used),
+                    index=owners[part] * count + within[part], frames=self.grid.frames.count, config=self.config,
+                    config_hash=self.config_hash, grid=self.grid, whiskers=self.whiskers,
+                    owner=np.array([local[owner] for owner in owners[part].tolist()]), within=within[part],
+                    settings=self.settings,
+                )  # fmt: skip
+                shards.append(task)
         return tuple(shards)

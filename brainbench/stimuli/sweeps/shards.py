@@ -91,15 +91,10 @@ def simulate_shard(task: ShardTask, prepared: PreparedShard, workers: int | None
     wrench = np.empty((0, *shape[1:]), dtype=np.float32)
     if len(chosen):
         named = {task.objects[owner].name: solid for owner in place if (solid := prepared.solids[owner])}
-        batch = simulate_sweeps(
-            SweepScenes(task.grid, named, whiskers=task.whiskers),
-            [place[int(task.owner[i])] * count + int(task.within[i]) for i in chosen.tolist()],
-            fidelity=task.settings.fidelity,
-            backend=task.settings.backend,
-            device=task.settings.device,
-            workers=workers,
-            retry=task.settings.retry,
-        )
+        settings = {name: getattr(task.settings, name) for name in ("fidelity", "backend", "device", "retry")}
+        indices = [place[int(task.owner[i])] * count + int(task.within[i]) for i in chosen.tolist()]
+        scenes = SweepScenes(task.grid, named, whiskers=task.whiskers)
+        batch = simulate_sweeps(scenes, indices, workers=workers, **settings)
         if batch.wrench.shape != (len(chosen), *shape[1:]):
             raise UsageError(f"The engine gave wrenches {batch.wrench.shape}; expected {(len(chosen), *shape[1:])}.")
         contact[chosen], status[chosen] = batch.contact, np.where(batch.unstable, UNSTABLE, OK)

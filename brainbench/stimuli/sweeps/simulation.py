@@ -28,12 +28,10 @@ def simulate_sweeps(
     workers: int | None = None,
     retry: int = 1,
 ) -> SweepBatch:
-    """Simulate some sweeps, many at once where the engine can (:attr:`WhiskerEngine.batches`).
+    """Simulate the sweeps of some indices, many at once where the engine can (:attr:`WhiskerEngine.batches`).
 
-    Args:
-        scenes, indices: a grid of sweeps over some objects, and which of them; ordered by object they are fastest.
-        fidelity, workers: as for :meth:`WhiskerEngine.run_sweeps`.
-        backend, device, retry: as for :func:`brainbench.stimuli.engines.get_engine`.
+    Ordered by object they are fastest. Options are those of :meth:`WhiskerEngine.run_sweeps` and
+    :func:`brainbench.stimuli.engines.get_engine`.
 
     Raises:
         UsageError: the backend is unknown or does not run on the device.
@@ -41,11 +39,8 @@ def simulate_sweeps(
     engine = get_engine(backend, device=device, retry=retry)
     if engine.batches and scenes.grid.mover == "object":
         return engine.run_sweeps(scenes, indices, fidelity, workers=workers)
-    parts = [
-        _one_by_one(scenes, indices[first : first + _TOGETHER], fidelity, engine, workers)
-        for first in range(0, len(indices), _TOGETHER)
-    ]
-    return join_batches(parts)
+    parts = [indices[first : first + _TOGETHER] for first in range(0, len(indices), _TOGETHER)]
+    return join_batches([_one_by_one(scenes, part, fidelity, engine, workers) for part in parts])
 
 
 def _one_by_one(

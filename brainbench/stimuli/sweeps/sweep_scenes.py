@@ -97,14 +97,9 @@ def counts(scenes: SweepScenes) -> dict[str, Any]:
     """
     grid, whiskers = scenes.grid, len(scenes.array)
     return {
-        "objects": len(scenes.objects),
-        "sweeps_per_object": grid.count,
-        "scenes": len(scenes),
-        "whiskers": whiskers,
-        "draws": grid.draws,
-        "bytes": len(scenes) * grid.frames.count * whiskers * 6 * 4,
-        "published": grid.published,
-    }
+        "objects": len(scenes.objects), "sweeps_per_object": grid.count, "scenes": len(scenes), "whiskers": whiskers,
+        "draws": grid.draws, "bytes": len(scenes) * grid.frames.count * whiskers * 6 * 4, "published": grid.published,
+    }  # fmt: skip
 
 
 def _thesis_head() -> Head:

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brainbench.core.errors import DataError, UsageError
+from brainbench.core.reading.ranges import check_number
 from brainbench.stimuli.engines import DEFAULT_ENGINE, get_engine
 from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.engines.protocol import Job, Load, StillFollicle, Trace, WhiskerEngine
@@ -121,12 +122,7 @@ class SlipOff:
 
 
 def point_load(
-    whisker: Whisker,
-    force: float,
-    at: float,
-    *,
-    backend: str = DEFAULT_ENGINE,
-    fidelity: Fidelity | str = "balanced",
+    whisker: Whisker, force: float, at: float, *, backend: str = DEFAULT_ENGINE, fidelity: Fidelity | str = "balanced"
 ) -> PointLoad:
     """Load a straight whisker with ``force`` (N, along +y) at arc length ``at`` (m) and wait until it is at rest.
 
@@ -195,10 +191,9 @@ def slip_off(
 ) -> SlipOff:
     """Raise a frictionless round peg at distance ``at`` (m) from the base until the whisker slips off it.
 
-    The peg moves slowly and straight towards +y from touching the undeformed whisker; no gravity. It carries a
-    flange on either side, as a pulley does, which keeps the whisker in the plane of the elastica: bent by more than 90°
-        at
-    the contact, as before most slip-offs at small ``at``, it would swing out sideways.
+    The peg moves slowly and straight towards +y from touching the undeformed whisker; no gravity. It carries a flange
+    on either side, as a pulley does, which keeps the whisker in the plane of the elastica: bent by more than 90° at the
+    contact, as before most slip-offs at small ``at``, it would swing out sideways.
 
     Raises:
         UsageError: the whisker is curved, or ``at`` lies beyond it.
@@ -254,8 +249,7 @@ def ringdown(
         raise UsageError(
             f"A ring-down needs a damping ratio between 0 and 1; this whisker has {whisker.damping_ratio:g}."
         )
-    if not 1 <= modes <= 5:
-        raise UsageError(f"modes of a ring-down must lie between 1 and 5; received {modes!r}.")
+    check_number("modes of a ring-down", modes, least=1, most=5, whole=True)
     fidelity = Fidelity.of(fidelity)
     references_hz = references.natural_frequencies(whisker, modes)
     expected = float(references_hz[0])
@@ -299,9 +293,8 @@ def _ring_mode(
     light = replace(whisker, damping_ratio=ratio * float(expected[0] / expected[mode]))
     interval = step if own_step else period / 100
     times = np.asarray(np.arange(1, math.ceil(12 * period / interval) + 1) * interval, dtype=np.float64)
-    loads = tuple(
-        Load(float(arc), (0.0, float(force), 0.0)) for arc, force in zip(chain.nodes[1:], forces, strict=True)
-    )
+    pairs = zip(chain.nodes[1:].tolist(), forces.tolist(), strict=True)
+    loads = tuple(Load(arc, (0.0, force, 0.0)) for arc, force in pairs)
     trace = run_one(backend, Job(light, StillFollicle(), (), times, loads=loads), fine)
     assert trace.link_positions is not None
     # The mode swings about its static bend under the loads.
@@ -344,8 +337,7 @@ def _pulley(whisker: Whisker, radius: float, motion: RigidMotion) -> Obstacle:
 def _check_peg(whisker: Whisker, peg_radius: float) -> None:
     if whisker.curvature:
         raise UsageError(f"The peg test takes a straight whisker; this one has curvature {whisker.curvature:g} 1/m.")
-    if not peg_radius > 0:
-        raise UsageError(f"peg_radius must be positive (m); received {peg_radius!r}.")
+    check_number("peg_radius (m)", peg_radius, above=0)
 
 
 def _fit_decay(times: NDArray, signal: NDArray, frequency: float, ratio: float) -> tuple[float, float]:

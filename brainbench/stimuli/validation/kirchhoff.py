@@ -22,6 +22,7 @@ from brainbench.core.errors import DataError
 from brainbench.stimuli.whiskers.whisker import Whisker
 
 OfArc = Callable[[float], float]
+Array = NDArray[np.float64]
 _STAGES = 8
 """Steps in which a load grows from nothing: each starts from the equilibrium before."""
 
@@ -49,13 +50,8 @@ class KirchhoffRod:
         s = np.linspace(0, whisker.arc_length, 401)
         # Of the parabola y = A x²: κ₀ = 2A cos³ψ with the tangent's angle ψ.
         curvature = CubicSpline(s, 2 * whisker.curvature * np.cos(whisker.tangent_angle(s)) ** 3)
-        return cls(
-            whisker.arc_length,
-            lambda s: float(curvature(s)),
-            lambda s: float(whisker.bending_stiffness(s)),
-            lambda s: float(whisker.torsional_stiffness(s)),
-            lambda s: float(whisker.radius(s)),
-        )
+        laws = (curvature, whisker.bending_stiffness, whisker.torsional_stiffness, whisker.radius)
+        return cls(whisker.arc_length, *(lambda s, law=law: float(law(s)) for law in laws))
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,9 +129,7 @@ def press_rod(
     return RodEquilibrium(force, moment, float(at[0]), _integrate(rod, force, moment, float(at[0]))[0])
 
 
-def trace_rod(
-    rod: KirchhoffRod, equilibrium: RodEquilibrium, arcs: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+def trace_rod(rod: KirchhoffRod, equilibrium: RodEquilibrium, arcs: Array) -> tuple[Array, Array, Array]:
     """Return points [n, 3] (m), axes of the cross-section [n, 3, 3] (columns) and twist [n] (rad) of an equilibrium.
 
     ``arcs`` [n] (m) increase from 0 to the place of the force at most.
@@ -155,9 +149,7 @@ def _solve(residual: Callable[[NDArray], NDArray], start: NDArray) -> NDArray[np
     return found.x
 
 
-def _integrate(
-    rod: KirchhoffRod, force: NDArray, moment: NDArray, arc: float
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+def _integrate(rod: KirchhoffRod, force: Array, moment: Array, arc: float) -> tuple[Array, Array, Array]:
     """Return point, tangent and moment [3] at ``arc`` of the rod with this moment at its base; NaN beyond its ends."""
     if not 0 < arc <= rod.length:
         nowhere = np.full(3, np.nan)
@@ -166,9 +158,7 @@ def _integrate(
     return points[-1], frames[-1, :, 0], moments[-1]
 
 
-def _paths(
-    rod: KirchhoffRod, force: NDArray, moment: NDArray, arcs: NDArray
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+def _paths(rod: KirchhoffRod, force: Array, moment: Array, arcs: Array) -> tuple[Array, Array, Array]:
     """Return points [n, 3], axes [n, 3, 3] and moments [n, 3] at ``arcs`` [n]."""
     from scipy.integrate import solve_ivp
 
@@ -182,10 +172,8 @@ def _paths(
         at = s * rod.length
         torsion, bending = rod.torsion(at), rod.bending(at)
         # What shooting tries may coil a soft tip up without end.
-        u1, u2, u3 = (
-            max(-most, min(most, value))
-            for value in (local[0] / torsion, local[1] / bending, rod.curvature(at) + local[2] / bending)
-        )
+        rates = (local[0] / torsion, local[1] / bending, rod.curvature(at) + local[2] / bending)
+        u1, u2, u3 = (max(-most, min(most, rate)) for rate in rates)
         t, n, b = turn.T
         change = np.stack([u3 * n - u2 * b, u1 * b - u3 * t, u2 * t - u1 * n], axis=1)
         return np.concatenate([t, (change * rod.length).ravel(), np.cross(pull, t)])

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brainbench.core.errors import UsageError
+from brainbench.core.reading.ranges import check_number
 from brainbench.stimuli.engines import DEFAULT_ENGINE
 from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.engines.protocol import Load
@@ -21,12 +22,7 @@ from brainbench.stimuli.whiskers.whisker import Whisker
 
 
 def load_aside(
-    whisker: Whisker,
-    at: float,
-    force: float,
-    *,
-    backend: str = DEFAULT_ENGINE,
-    fidelity: Fidelity | str = "balanced",
+    whisker: Whisker, at: float, force: float, *, backend: str = DEFAULT_ENGINE, fidelity: Fidelity | str = "balanced"
 ) -> PointLoad:
     """Load a whisker with ``force`` (N) across its plane at arc length ``at`` (m); compare with the Kirchhoff rod.
 
@@ -83,8 +79,7 @@ def push_aside(
 
 def _check(whisker: Whisker, at: float, **others: float) -> None:
     for name, value in {"at": at, **others}.items():
-        if not (math.isfinite(value) and value > 0):
-            raise UsageError(f"{name} of the test must be a positive number in SI units; received {value!r}.")
+        check_number(f"{name} of the test (SI units)", value, above=0)
     if at > whisker.arc_length:
         raise UsageError(f"The arc length {at:g} m lies beyond this whisker of {whisker.arc_length:g} m.")
 

@@ -49,9 +49,7 @@ def point_load_deflection(whisker: Whisker, force: float, at: float) -> float:
 
     δ = F a³/(3 E I_b) · r_b/r(a), exact for a linear taper.
     """
-    _check_at(whisker, at)
-    _check_straight(whisker)
-    stiffness = float(whisker.bending_stiffness(0.0))
+    stiffness = _base_stiffness(whisker, at)
     return force * at**3 / (3 * stiffness) * whisker.base_radius / float(whisker.radius(at))
 
 
@@ -61,9 +59,7 @@ def point_load_slope(whisker: Whisker, force: float, at: float) -> float:
     F Lc²/(E I_b) · (1 − u)²(1 + 2u)/(6u²) with u = r(a)/r_b and Lc = L r_b/(r_b − r_t); its limit
     F a²/(2 E I) for a cylinder.
     """
-    _check_at(whisker, at)
-    _check_straight(whisker)
-    stiffness = float(whisker.bending_stiffness(0.0))
+    stiffness = _base_stiffness(whisker, at)
     u = float(whisker.radius(at)) / whisker.base_radius
     # a = Lc (1 − u), so Lc²(1 − u)² = a²: this form has no 0/0 for a cylinder.
     return force * at**2 / stiffness * (1 + 2 * u) / (6 * u**2)
@@ -100,14 +96,8 @@ def beam_matrices(whisker: Whisker) -> tuple[NDArray[np.float64], NDArray[np.flo
     nodes, weights = np.polynomial.legendre.leggauss(4)
     for node, weight in zip((nodes + 1) / 2, weights / 2, strict=True):
         # Cubic Hermite shape functions of deflection and slope at both ends, and their second derivatives.
-        shape = np.array(
-            [
-                1 - 3 * node**2 + 2 * node**3,
-                length * (node - 2 * node**2 + node**3),
-                3 * node**2 - 2 * node**3,
-                length * (node**3 - node**2),
-            ]
-        )
+        near, far = 1 - 3 * node**2 + 2 * node**3, 3 * node**2 - 2 * node**3
+        shape = np.array([near, length * (node - 2 * node**2 + node**3), far, length * (node**3 - node**2)])
         bend = np.array([-6 + 12 * node, length * (-4 + 6 * node), 6 - 12 * node, length * (6 * node - 2)]) / length**2
         s = (np.arange(_ELEMENTS) + node) * length
         for e, (k, m) in enumerate(zip(whisker.bending_stiffness(s), whisker.linear_density(s), strict=True)):
@@ -291,8 +281,7 @@ class _Branch:
         """Return base angle, contact point (x, y) and base moment: Runge-Kutta steps from contact to base."""
         half = np.linspace(arc, 0.0, 2 * _STEPS + 1)
         flexibility = 1 / np.maximum(self.whisker.bending_stiffness(half), 1e-300)
-        # Curvature of the rest shape.
-        # Of the parabola: y″/(1 + y′²)^(3/2) = 2A cos³ψ with tan ψ = y′.
+        # Curvature of the rest shape, a parabola: y″/(1 + y′²)^(3/2) = 2A cos³ψ with tan ψ = y′.
         rest = 2 * self.curvature * np.cos(self.whisker.tangent_angle(np.abs(half))) ** 3
         step = -arc / _STEPS
         angle, moment, x, y = slope, 0.0, 0.0, 0.0
@@ -323,9 +312,12 @@ def _check_at(whisker: Whisker, at: float) -> None:
         )
 
 
-def _check_straight(whisker: Whisker) -> None:
+def _base_stiffness(whisker: Whisker, at: float) -> float:
+    """Return E I at the base of a straight whisker that is loaded ``at`` (m)."""
+    _check_at(whisker, at)
     if whisker.curvature:
         raise UsageError(
             f"This closed form is for a straight whisker; this one has curvature {whisker.curvature:g} 1/m; "
             "use elastica, which takes any curvature."
         )
+    return float(whisker.bending_stiffness(0.0))

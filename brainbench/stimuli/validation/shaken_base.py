@@ -74,11 +74,8 @@ def _modes(whisker: Whisker) -> tuple[NDArray[np.float64], NDArray[np.float64], 
     turning = np.ravel(np.column_stack([np.linspace(0, whisker.arc_length, nodes), np.ones(nodes)]))
     # Slopes counted in arc lengths make the matrices well conditioned; the base is clamped.
     scale = np.tile([1.0, 1 / whisker.arc_length], nodes)[2:]
-    squares, shapes = eigh(
-        stiffness[2:, 2:] * np.outer(scale, scale),
-        mass[2:, 2:] * np.outer(scale, scale),
-        subset_by_index=[0, _MODES - 1],
-    )
+    scaled = (matrix[2:, 2:] * np.outer(scale, scale) for matrix in (stiffness, mass))
+    squares, shapes = eigh(*scaled, subset_by_index=[0, _MODES - 1])
     shapes = shapes * scale[:, None]
     return squares, shapes.T @ (mass @ across)[2:], shapes.T @ (mass @ turning)[2:], float(across @ mass @ turning)
 
@@ -93,10 +90,8 @@ def shaken_base(
 ) -> ShakenBase:
     """Move the base of a straight whisker by ``displacement`` (m along y; 0 at and before t = 0) and read its moment.
 
-    Args:
-        whisker, backend, fidelity: what is tested.
-        displacement: of times [n] (s); small against the whisker, smooth.
-        times: readings [n] (s), evenly spaced from the first interval on.
+    The displacement, of times [n] (s), is smooth and small against the whisker; the readings at ``times`` [n] (s) are
+    evenly spaced from the first interval on.
 
     Raises:
         UsageError: the whisker is curved, or the readings are not evenly spaced.

@@ -8,7 +8,7 @@ sizes are those of the thesis (section 4.3.4). Letters: B batch, S sub-step, N i
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass, field
 from functools import partial
 from typing import Any
 
@@ -16,7 +16,8 @@ import torch
 from torch import nn
 
 from brainbench.core.contracts import GRID_SHAPE
-from brainbench.core.errors import UsageError, unknown_name
+from brainbench.core.errors import UsageError, check_name, unknown_name
+from brainbench.core.reading.ranges import check_number
 from brainbench.models.architecture import Architecture
 from brainbench.models.cells import GRU
 from brainbench.models.registry import list_models
@@ -33,6 +34,8 @@ AUTO = "auto"
 _HIDDEN, _CHANNELS, _KERNEL = 64, (16, 32), 3
 _COUNTED = 1 << 24
 """Values per channel whose squares are added up at a time."""
+Stepped = tuple[torch.Tensor, torch.Tensor]
+"""What a step gives, and the memory after it."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -68,26 +71,16 @@ class EncoderConfig:
     """Force and moment that are one unit to a network."""
 
     def __post_init__(self) -> None:
-        for name, most in (("slots", 1000), ("features", 8192)):
-            value = getattr(self, name)
-            if type(value) is not int or not 1 <= value <= most:
-                raise UsageError(
-                    f"{name!r} of a tactile encoder is a whole number from 1 to {most}; received {value!r}."
-                )
+        check_number("'slots' of a tactile encoder", self.slots, least=1, most=1000, whole=True)
+        check_number("'features' of a tactile encoder", self.features, least=1, most=8192, whole=True)
 
     @classmethod
     def of(cls, value: Mapping[str, Any] | EncoderConfig) -> EncoderConfig:
-        """Return a configuration from a mapping of its fields.
-
-        Raises:
-            UsageError: a field does not exist.
-        """
+        """Return a configuration from a mapping of its fields; raise UsageError for a field that does not exist."""
         if isinstance(value, EncoderConfig):
             return value
-        known = [item.name for item in fields(cls)]
         for name in value:
-            if name not in known:
-                raise unknown_name("setting of a tactile encoder", name, known)
+            check_name("setting of a tactile encoder", name, cls.__dataclass_fields__)
         return cls(**{**value, "calibration": HandCalibration.of(value.get("calibration"))})
 
     def plain(self) -> dict[str, Any]:
@@ -100,6 +93,10 @@ class EncoderConfig:
         if self.name != AUTO:
             return self.name
         return "rnn" if observation_type(self.observe).per_link else "tactile_convrnn"
+
+    def grid(self) -> TaxelGrid:
+        """Return the map from these readings to the grid of the hand."""
+        return TaxelGrid(self.hand, placement=self.placement, resolution=self.resolution, observe=self.observe)
 
     def build(self) -> TactileEncoder:
         """Return the encoder with new weights (the global random state), or a network's own.
@@ -124,11 +121,7 @@ def perceptron(inputs: int, hidden: Sequence[int], outputs: int) -> nn.Sequentia
 
 
 class TactileEncoder(nn.Module):
-    """Base of all arms.
-
-    Args:
-        config: Which encoder, and what it reads; fixes :attr:`shape` and the state.
-    """
+    """Base of all arms; the configuration fixes :attr:`shape` and the state."""
 
     state_size: int = 0
     """H."""
@@ -143,19 +136,14 @@ class TactileEncoder(nn.Module):
         self.shape: tuple[int, int, int] = (config.slots, sum(counts), kind.channels)
         """(S, N, C)."""
 
-    def forward(self, taxels: torch.Tensor, h_in: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    def forward(self, taxels: torch.Tensor, h_in: torch.Tensor) -> Stepped:
         """Return (embedding [B, F], h_out [B, H])."""
         raise NotImplementedError
 
-    def unroll(
-        self, taxels: torch.Tensor, h_in: torch.Tensor, ended: torch.Tensor | None = None
-    ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return (embeddings [L, B, F], h_out [B, H]) of L steps, with as few and as large products as there can be.
+    def unroll(self, taxels: torch.Tensor, h_in: torch.Tensor, ended: torch.Tensor | None = None) -> Stepped:
+        """Return (embeddings [L, B, F], h_out [B, H]) of readings [L, B, S, N, C], in few and large products.
 
-        Args:
-            taxels: Readings [L, B, S, N, C].
-            h_in: Memory.
-            ended: Where [L, B] the memory is forgotten after a step; None for nowhere.
+        The memory is forgotten after a step where ``ended`` [L, B]; None for nowhere.
         """
         found = []
         for step, reading in enumerate(taxels):
@@ -179,19 +167,15 @@ class TactileEncoder(nn.Module):
 
 
 class RunningScale(nn.Module):
-    """x / rms per channel, the root mean square of all values seen that are not zero; silence stays silence.
-
-    Args:
-        channels: C; the last axis of what is scaled.
-    """
+    """x / rms per channel (last axis), with that of all values seen that are not zero; silence stays silence."""
 
     total: torch.Tensor
     count: torch.Tensor
 
     def __init__(self, channels: int) -> None:
         super().__init__()
-        self.register_buffer("total", torch.zeros(channels, dtype=torch.float64))
-        self.register_buffer("count", torch.zeros(channels, dtype=torch.float64))
+        for name in ("total", "count"):
+            self.register_buffer(name, torch.zeros(channels, dtype=torch.float64))
 
     def update(self, x: torch.Tensor) -> None:
         """Count values [..., C]; those that are not finite are left out."""
@@ -218,9 +202,7 @@ class _Learned(TactileEncoder):
     def observe_scale(self, taxels: torch.Tensor) -> None:
         self.scale.update(taxels)
 
-    def unroll(
-        self, taxels: torch.Tensor, h_in: torch.Tensor, ended: torch.Tensor | None = None
-    ) -> tuple[torch.Tensor, torch.Tensor]:
+    def unroll(self, taxels: torch.Tensor, h_in: torch.Tensor, ended: torch.Tensor | None = None) -> Stepped:
         if self.state_size:
             return super().unroll(taxels, h_in, ended)
         # Without memory all steps are one batch.
@@ -263,54 +245,58 @@ class _Images(_Learned):
 
     index: torch.Tensor
     """Item in every cell of every link's image; N for none."""
+    head: nn.Linear
 
     def __init__(self, config: EncoderConfig, *, canvas: bool = False) -> None:
         super().__init__(config)
         self.canvas = canvas
         slots, items, channels = self.shape
         if self.canvas:
-            grid = TaxelGrid(
-                config.hand, placement=config.placement, resolution=config.resolution, observe=config.observe
-            )
             # Wrenches of sites differ from readings of taxels, so they have a scale of their own.
-            self.grid, self.scale = grid, RunningScale(6)
+            self.grid, self.scale = config.grid(), RunningScale(6)
             self.images, self.rows, self.columns, self.planes = 1, *GRID_SHAPE, 6 * slots
             return
         layout = hands.load(config.hand).layout(config.resolution, config.placement)
-        if observation_type(config.observe).per_link or any(len(probes.shape) != 2 for probes in layout.values()):
+        shapes = [probes.shape for probes in layout.values()]
+        if observation_type(config.observe).per_link or any(len(shape) != 2 for shape in shapes):
             raise UsageError(
                 f"{config.arm!r} needs a grid of taxels on every link, which {config.observe!r} of this layout does "
                 "not give; use 'mlp', 'rnn' or a canvas."
             )
         self.images, self.planes = len(layout), slots * channels
-        self.rows = max(probes.shape[0] for probes in layout.values())
-        self.columns = max(probes.shape[1] for probes in layout.values())
+        self.rows, self.columns = map(max, zip(*shapes, strict=True))
         index = torch.full((self.images, self.rows, self.columns), items, dtype=torch.long)
         first = 0
         for image, probes in enumerate(layout.values()):
-            active = torch.from_numpy(probes.active.copy())
-            cells = torch.full((len(probes),), items, dtype=torch.long)
-            cells[active] = torch.arange(first, first + int(active.sum()))
+            active = torch.from_numpy(probes.active.copy()).view(probes.shape)
             rows, columns = probes.shape
-            index[image, :rows, :columns] = cells.view(rows, columns)
+            index[image, :rows, :columns][active] = torch.arange(first, first + int(active.sum()))
             first += int(active.sum())
         self.register_buffer("index", index.flatten(), persistent=False)
 
     def observe_scale(self, taxels: torch.Tensor) -> None:
-        if self.canvas:
-            self.scale.update(self.grid(taxels.flatten(0, -4)).unflatten(1, (-1, 6)).movedim(2, -1))
-        else:
-            self.scale.update(taxels)
+        self.scale.update(self._sites(taxels.flatten(0, -4)) if self.canvas else taxels)
+
+    def _sites(self, taxels: torch.Tensor) -> torch.Tensor:
+        """Return the wrenches [B, S, 5, 7, 6] of the hand's grid."""
+        return self.grid(taxels).unflatten(1, (-1, 6)).movedim(2, -1)
 
     def pictures(self, taxels: torch.Tensor) -> torch.Tensor:
         """Return images [B·images, planes, rows, columns]."""
         if self.canvas:
-            grid = self.grid(taxels).unflatten(1, (-1, 6))
-            return self.scale(grid.movedim(2, -1)).movedim(-1, 2).flatten(1, 2)
+            return self.scale(self._sites(taxels)).movedim(-1, 2).flatten(1, 2)
         planes = self.scale(taxels).permute(0, 1, 3, 2).flatten(1, 2)
         # Fillers point at one item more than there are, a zero: a single gather lays out all links.
         cells = torch.cat((planes, torch.zeros_like(planes[..., :1])), 2)[..., self.index]
         return cells.unflatten(2, (self.images, self.rows, self.columns)).transpose(1, 2).flatten(0, 1)
+
+    def _head_of(self, channels: int) -> nn.Linear:
+        # A canvas is one picture whose places differ in meaning; a link's grid is read as a whole.
+        return nn.Linear(channels * (self.rows * self.columns if self.canvas else self.images), self.features)
+
+    def answer(self, maps: torch.Tensor, batch: int) -> torch.Tensor:
+        """Return the embedding [batch, F] of maps [batch·images, channels, rows, columns]."""
+        return self.head((maps if self.canvas else maps.mean((2, 3))).reshape(batch, -1))
 
 
 class _Convolution(_Images):
@@ -323,14 +309,10 @@ class _Convolution(_Images):
             nn.Conv2d(self.planes, first, _KERNEL, padding=1), nn.ELU(),
             nn.Conv2d(first, second, _KERNEL, padding=1), nn.ELU(),
         )  # fmt: skip
-        # A canvas is one picture whose places differ in meaning; a link's grid is read as a whole.
-        places = self.rows * self.columns if self.canvas else self.images
-        self.head = nn.Linear(second * places, self.features)
+        self.head = self._head_of(second)
 
     def forward(self, taxels: torch.Tensor, h_in: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        maps = self.net(self.pictures(taxels))
-        values = maps if self.canvas else maps.mean((2, 3))
-        return self.head(values.reshape(taxels.shape[0], -1)), h_in
+        return self.answer(self.net(self.pictures(taxels)), taxels.shape[0]), h_in
 
 
 class _ConvRecurrent(_Images):
@@ -339,8 +321,7 @@ class _ConvRecurrent(_Images):
     def __init__(self, config: EncoderConfig, *, canvas: bool = False) -> None:
         super().__init__(config, canvas=canvas)
         self.cell = GRU(self.planes, _CHANNELS[0], kernel_size=_KERNEL, layer_norm=True)
-        places = self.rows * self.columns if self.canvas else self.images
-        self.head = nn.Linear(_CHANNELS[0] * places, self.features)
+        self.head = self._head_of(_CHANNELS[0])
         self.state_size = self.images * _CHANNELS[0] * self.rows * self.columns
         small = self.rows * self.columns <= MOST_CELLS
         self.products: ConvGRUProducts | None = ConvGRUProducts(self.rows, self.columns, _KERNEL) if small else None
@@ -348,11 +329,9 @@ class _ConvRecurrent(_Images):
     def forward(self, taxels: torch.Tensor, h_in: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         state = h_in.reshape(-1, _CHANNELS[0], self.rows, self.columns)
         y, state = self.cell(self.pictures(taxels), state)
-        return self._answer(y, taxels.shape[0]), state.reshape(h_in.shape)
+        return self.answer(y, taxels.shape[0]), state.reshape(h_in.shape)
 
-    def unroll(
-        self, taxels: torch.Tensor, h_in: torch.Tensor, ended: torch.Tensor | None = None
-    ) -> tuple[torch.Tensor, torch.Tensor]:
+    def unroll(self, taxels: torch.Tensor, h_in: torch.Tensor, ended: torch.Tensor | None = None) -> Stepped:
         # Processors convolve faster than they multiply.
         if self.products is None or not taxels.is_cuda:
             return super().unroll(taxels, h_in, ended)
@@ -360,7 +339,7 @@ class _ConvRecurrent(_Images):
 
     def unroll_as_products(
         self, taxels: torch.Tensor, h_in: torch.Tensor, ended: torch.Tensor | None = None
-    ) -> tuple[torch.Tensor, torch.Tensor]:
+    ) -> Stepped:
         """Return what :meth:`unroll` returns, by matrix products."""
         assert self.products is not None
         steps, batch = taxels.shape[:2]
@@ -368,10 +347,7 @@ class _ConvRecurrent(_Images):
         gone = None if ended is None else ended.repeat_interleave(self.images, 1)
         y, state = self.products(self.cell, pictures, h_in.reshape(pictures.shape[1], -1), gone)
         y = y.flatten(0, 1).unflatten(1, (-1, self.rows, self.columns))
-        return self._answer(y, steps * batch).unflatten(0, (steps, batch)), state.reshape(h_in.shape)
-
-    def _answer(self, y: torch.Tensor, batch: int) -> torch.Tensor:
-        return self.head((y if self.canvas else y.mean((2, 3))).reshape(batch, -1))
+        return self.answer(y, steps * batch).unflatten(0, (steps, batch)), state.reshape(h_in.shape)
 
 
 class _Network(TactileEncoder):
@@ -379,9 +355,8 @@ class _Network(TactileEncoder):
 
     def __init__(self, config: EncoderConfig) -> None:
         super().__init__(config)
-        grid = TaxelGrid(config.hand, placement=config.placement, resolution=config.resolution, observe=config.observe)
         self.front: FrontEnd = FrontEnd(
-            config.arm, grid, time=config.time, learning=config.learning, calibration=config.calibration,
+            config.arm, config.grid(), time=config.time, learning=config.learning, calibration=config.calibration,
             seed=config.seed, pretrained=config.pretrained, options=config.options,
         )  # fmt: skip
         self.state_size = self.front.state_size

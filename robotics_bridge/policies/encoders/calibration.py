@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -11,6 +10,7 @@ import torch
 
 from brainbench.core.contracts import CHANNELS, GRID_SHAPE
 from brainbench.core.errors import DataError, UsageError
+from brainbench.core.reading.ranges import check_number
 from brainbench.models.normaliser import FORCE_SCALE, MOMENT_SCALE
 
 _TOUCHING = 1e-3
@@ -35,17 +35,11 @@ class HandCalibration:
 
     def __post_init__(self) -> None:
         for name in ("force", "moment"):
-            value = getattr(self, name)
-            if isinstance(value, bool) or not isinstance(value, (int, float)) or not 0 < value < math.inf:
-                raise UsageError(f"The {name} of a hand calibration is a positive number; received {value!r}.")
+            check_number(f"The {name} of a hand calibration", getattr(self, name), above=0)
 
     @classmethod
     def fit(cls, grid: torch.Tensor) -> HandCalibration:
-        """Return the calibration at which touched sites have a root mean square of one unit.
-
-        Args:
-            grid: Recorded grids [..., S·6, 5, 7] (N, N·m) of
-            :class:`~robotics_bridge.policies.encoders.taxel_grid.TaxelGrid`.
+        """Return the calibration at which touched sites of recorded grids [..., S·6, 5, 7] have an rms of one unit.
 
         Raises:
             DataError: nothing touches in the recording, or it holds values that are no numbers.

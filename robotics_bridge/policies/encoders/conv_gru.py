@@ -19,13 +19,7 @@ MOST_CELLS = 64
 
 
 class ConvGRUProducts(nn.Module):
-    """Steps of a :class:`~brainbench.models.cells.GRU` with layer norm and an odd square kernel; it has no weights.
-
-    Args:
-        rows: Of a picture.
-        columns: Of a picture.
-        kernel: Edge of the cell's kernel.
-    """
+    """Steps of a :class:`~brainbench.models.cells.GRU` with layer norm and an odd square kernel; it has no weights."""
 
     places: torch.Tensor
     """[kernel², P, P]: whether cell p stands at this place of the kernel around cell q."""
@@ -45,13 +39,9 @@ class ConvGRUProducts(nn.Module):
     def forward(
         self, cell: GRU, x: torch.Tensor, state: torch.Tensor, ended: torch.Tensor | None
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return (y [L, N, C·P], state [N, C·P] single) of some steps.
+        """Return (y [L, N, C·P], state [N, C·P] single) of pictures x [L, N, inputs·P] from a state.
 
-        Args:
-            cell: The cell, whose weights are used.
-            x: Pictures [L, N, inputs·P].
-            state: [N, C·P].
-            ended: Where [L, N] the state is forgotten after a step; None for nowhere.
+        The state is forgotten after a step where ``ended`` [L, N]; None for nowhere.
         """
         gates, candidate = self._gates(cell, ("r", "u")), self._gates(cell, ("c",))
         kind = torch.get_autocast_dtype(x.device.type) if torch.is_autocast_enabled(x.device.type) else x.dtype

@@ -61,10 +61,7 @@ def finger_rows(fingers: Mapping[str, Sequence[str]]) -> dict[str, int]:
 
 @dataclass(frozen=True, eq=False)
 class FingerAxes:
-    """The fingers of a hand in its reference posture, and where their sites begin.
-
-    Made by :func:`finger_axes_of`.
-    """
+    """The fingers of a hand in its reference posture, and where their sites begin (:func:`finger_axes_of`)."""
 
     place: Mapping[str, tuple[NDArray[np.float64], NDArray[np.float64]]]
     """Link → rotation [3, 3] to the palm's axes and origin [3] (m)."""
@@ -90,11 +87,8 @@ class FingerAxes:
             UsageError: the link is neither the palm nor part of a finger.
         """
         rows, lengths = self.locate(link, self.to_palm(link, points))
-        columns = np.array(
-            [np.searchsorted(self.edges[row], length, side="right") for row, length in zip(rows, lengths, strict=True)],
-            dtype=np.int64,
-        )
-        return rows, columns
+        # The number of edges that a length lies beyond.
+        return rows, (self.edges[rows] <= lengths[:, None]).sum(axis=1)
 
     def locate(self, link: str, points: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
         """Return the row [N] of points (palm frame) and their lengths [N] along it from its far end."""
@@ -129,9 +123,8 @@ def finger_axes_of(hand: Hand, reference: Layout) -> FingerAxes:
     rows = finger_rows(hand.fingers)
     chains = {rows[finger]: tuple(chain) for finger, chain in hand.fingers.items()}
     joints = {row: _corners(chain, place, reference) for row, chain in chains.items()}
-    shape = (*GRID_SHAPE, 3)
     edges = np.full((GRID_SHAPE[0], GRID_SHAPE[1] - 1), np.inf)
-    axes = FingerAxes(place, chains, joints, hand.palm, edges, np.zeros(shape))
+    axes = FingerAxes(place, chains, joints, hand.palm, edges, np.zeros((*GRID_SHAPE, 3)))
     _lay_sites(axes, reference)
     return axes
 

@@ -15,7 +15,7 @@ import torch
 from torch import nn
 
 from brainbench.core.contracts import GRID_SHAPE
-from brainbench.core.errors import UsageError, unknown_name
+from brainbench.core.errors import UsageError, check_name
 from brainbench.models.network import EncoderAttenderDecoder
 from brainbench.models.registry import load_model
 from brainbench.models.streaming import StreamingStep
@@ -31,14 +31,11 @@ class FrontEnd(nn.Module):
     """A network of :func:`brainbench.load_model` that reads a hand.
 
     Args:
-        model: The network, or its name; a name without a tag is untrained with the given seed.
+        model: The network, or its name for :func:`brainbench.load_model` with seed, pretrained weights and options.
         grid: The map from taxels to its input.
         time: ``native`` or ``resampled`` (:mod:`~robotics_bridge.policies.encoders.timing`).
         learning: ``frozen`` computes no gradients and never leaves evaluation mode.
         calibration: What a unit of force is to the network; a mapping of its fields will do.
-        seed: Of untrained weights.
-        pretrained: File or folder of weights for a tagged name.
-        options: What the network's builder takes, such as ``{"unroll": "full"}``.
 
     Raises:
         UsageError: a name is unknown, or the network is no causal network of [T, 30, 5, 7].
@@ -60,17 +57,14 @@ class FrontEnd(nn.Module):
         options: Mapping[str, Any] | None = None,
     ) -> None:
         super().__init__()
-        if time not in TIMES:
-            raise unknown_name("time of an encoder", time, TIMES)
-        if learning not in LEARNING:
-            raise unknown_name("way of learning of an encoder", learning, LEARNING)
-        network = (
-            load_model(model, seed=seed, pretrained=pretrained, **(options or {})) if isinstance(model, str) else model
-        )
+        check_name("time of an encoder", time, TIMES)
+        check_name("way of learning of an encoder", learning, LEARNING)
+        network, name = model, type(model).__name__
+        if isinstance(model, str):
+            network, name = load_model(model, seed=seed, pretrained=pretrained, **(options or {})), model
         if not isinstance(network, EncoderAttenderDecoder) or network.spec.input_shape[1:] != GRID_SHAPE:
             raise UsageError(
-                f"A front end needs an encoder-attender-decoder network of steps [30, 5, 7]; received "
-                f"{model if isinstance(model, str) else type(network).__name__!r}."
+                f"A front end needs an encoder-attender-decoder network of steps [30, 5, 7]; received {name!r}."
             )
         if network.spec.max_steps is not None:
             raise UsageError(

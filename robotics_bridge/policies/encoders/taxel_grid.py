@@ -40,15 +40,11 @@ SITES = GRID_SHAPE[0] * GRID_SHAPE[1]
 
 
 class TaxelGrid(nn.Module):
-    """The map of one hand, placement, resolution and observation type.
+    """The map of one hand, with taxels at a placement and resolution (:meth:`~robotics_bridge.hands.Hand.layout`).
 
-    Args:
-        hand: A hand, its name, or the path of its file.
-        placement: Where taxels sit.
-        resolution: How many there are; a name of :meth:`~robotics_bridge.hands.Hand.layout`.
-        observe: What they read. ``force_torque`` and ``proximity`` are wrenches already; the force of ``force`` and
-            the displacement of ``elastomer`` act at their taxel; ``bool`` and ``depth`` push there against the
-            normal; values per link act at the middle of its taxels.
+    Of what they ``observe``, ``force_torque`` and ``proximity`` are wrenches already; the force of ``force`` and the
+    displacement of ``elastomer`` act at their taxel; ``bool`` and ``depth`` push there against the normal; values per
+    link act at the middle of its taxels.
 
     Raises:
         UsageError: a name is unknown, the observation type has no touch, or the hand has more than five fingers.

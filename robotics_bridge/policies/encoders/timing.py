@@ -26,13 +26,8 @@ class Resampler(nn.Module):
     """Turns control steps [B, S, V] into an encoder's steps [B, S, V], with all memory in one array per row.
 
     Row by row, time starts at the reset (a state of zeros); before it nothing touches. Of q control steps p complete a
-    step of the encoder (5 of 9 at 5 ms and 9 ms). A step shows what was felt up to 45 ms · (its number).
-
-    Args:
-        values: V.
-        sub_steps: S.
-        seconds: Of a control sub-step.
-        target: Of an encoder's sub-step.
+    step of the encoder (5 of 9 at 5 ms and 9 ms). A step shows what was felt up to 45 ms · (its number). A control
+    sub-step lasts ``seconds``, an encoder's ``target`` (s).
 
     Raises:
         UsageError: control is slower than the encoder, so one control step would complete several steps.

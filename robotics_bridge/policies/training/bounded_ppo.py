@@ -8,13 +8,7 @@ from rsl_rl.algorithms import PPO
 
 
 class BoundedPPO(PPO):
-    """rsl_rl's PPO, but that the learning rate stays within a range (rsl_rl's own is 1e-5 to 1e-2).
-
-    Args:
-        *parts: as for PPO.
-        learning_rate_range: least and greatest learning rate.
-        **settings: as for PPO.
-    """
+    """rsl_rl's PPO, but that the learning rate stays within a range (rsl_rl's own is 1e-5 to 1e-2)."""
 
     def __init__(self, *parts: Any, learning_rate_range: tuple[float, float], **settings: Any) -> None:
         self._range = learning_rate_range

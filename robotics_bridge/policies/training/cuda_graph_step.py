@@ -16,12 +16,9 @@ Tensors = dict[str, torch.Tensor]
 class ChunkStep:
     """Forward, backward, clipping and a step of the optimiser, on data of always the same shapes.
 
-    Args:
-        loss: Maps the data to the parts of the loss, by name, and the memory after it.
-        parameters: What is learned.
-        optimizer: Of the parameters; capturable where it is recorded.
-        clip: Largest norm of the gradients; None leaves them alone.
-        record: Record and replay, on CUDA. A step that cannot be recorded runs as it is, and says so.
+    ``loss`` maps the data to the parts of the loss, by name, and the memory after it; ``clip`` is the largest norm of
+    the gradients. With ``record``, on CUDA, the step is recorded and replayed; one that cannot be runs as it is, and
+    says so.
     """
 
     def __init__(

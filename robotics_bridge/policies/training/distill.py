@@ -32,7 +32,8 @@ from robotics_bridge.policies.student import TACTILE, TactilePolicy
 from robotics_bridge.policies.training.cuda_graph_step import ChunkStep
 from robotics_bridge.policies.training.distill_config import EARLIER_TWIST, DistillConfig
 from robotics_bridge.policies.training.rollouts import Recorder, Rollout
-from robotics_bridge.policies.training.student_files import CONFIG, MODEL, build_student, save_student
+from robotics_bridge.policies.training.state_tree import write_tensors
+from robotics_bridge.policies.training.student_files import CONFIG, MODEL, build_student
 
 _log = logging.getLogger(__name__)
 
@@ -69,18 +70,17 @@ def distill(
 ) -> DistillResult:
     """Teach a student, or go on with a run that was interrupted.
 
+    The state is saved after ``stop_after`` seconds or ``stop_at`` iterations in all. A loss that is not finite ends the
+    run as ``diverged``; the last saved state stays.
+
     Args:
         config: What is distilled.
         out: The run's folder.
         env: Environment of :func:`robotics_bridge.tasks.make` with the configuration's observation type.
         teacher: Of :func:`robotics_bridge.policies.training.teacher.load_teacher`.
-        stop_after: Save the state and return after so many seconds.
-        stop_at: Save the state and return after so many iterations in all.
+        stop_after, stop_at: When to stop, where that is before the end.
         graphs: On CUDA, record a step of learning and replay it.
         progress: Called with (iterations done, iterations in all, what).
-
-    Returns:
-        How it ended. A loss that is not finite ends it as ``diverged``; the last saved state stays.
 
     Raises:
         UsageError: the folder holds another run, or the environment does not fit.
@@ -128,17 +128,12 @@ class _Run:
         self.groups: list[str] = [*read, TACTILE] if config.tactile is not None else read
         self.student = build_student(config, env.observation_shapes, self.groups, env.num_actions).to(self.device)
         self.decoders = env.task.decoders
-        heads = {
-            head.target: perceptron(
-                self.student.core.features, head.hidden, math.prod(env.observation_shapes[head.target])
-            )
-            for head in self.decoders
-        }
+        sizes, features = env.observation_shapes, self.student.core.features
+        heads = {one.target: perceptron(features, one.hidden, math.prod(sizes[one.target])) for one in self.decoders}
         self.learner = _Learner(self.student, nn.ModuleDict(heads)).to(self.device)
         weights = [weight for weight in self.learner.parameters() if weight.requires_grad]
-        rate = config.learning_rate or 1e-4
         cuda = self.device.type == "cuda"
-        self.optimizer = torch.optim.Adam(weights, lr=rate, fused=cuda, capturable=cuda)
+        self.optimizer = torch.optim.Adam(weights, lr=config.learning_rate or 1e-4, fused=cuda, capturable=cuda)
         tactile = self.student.core.tactile
         self.front = tactile.frozen_part if tactile is not None else None
         self.precision = torch.bfloat16 if config.precision == "bf16" else None
@@ -178,11 +173,10 @@ class _Run:
             if last or late or enough or self.iteration % self.config.save_interval == 0:
                 self._save()
             if late or enough:
-                why = f"{allowed:g} seconds were over." if late else f"{stop_at} iterations were asked for."
-                status, reason = "stopped", why
+                status = "stopped"
+                reason = f"{allowed:g} seconds were over." if late else f"{stop_at} iterations were asked for."
                 break
-        seconds = time.monotonic() - started
-        return DistillResult(status, reason, self.out, self.iteration, self.loss, seconds)
+        return DistillResult(status, reason, self.out, self.iteration, self.loss, time.monotonic() - started)
 
     @torch.no_grad()
     def _act(self, share: float) -> Rollout:
@@ -277,8 +271,6 @@ class _Run:
         if episodes.get("episodes"):
             self.log.write("episode", self.iteration, **{key: float(value) for key, value in episodes.items()})
 
-    # --- files -------------------------------------------------------------------------------------------------
-
     def _claim(self) -> None:
         """Write the run's configuration, or check that the folder holds this run."""
         path = self.out / CONFIG
@@ -312,7 +304,7 @@ class _Run:
                 rollout.save(path)
         plain = {"iteration": self.iteration, "loss": self.loss, "rollouts": numbers}
         save_state(self.out / STATE, self.learner, self.optimizer, plain)
-        save_student(self.out / MODEL, self.student)
+        write_tensors(self.out / MODEL, self.student.state_dict())
         for path in (self.out / "rollouts").glob("*.safetensors"):
             if int(path.stem) not in numbers:
                 path.unlink()
@@ -347,11 +339,7 @@ def describe_run(config: DistillConfig, student: TactilePolicy, env: Any) -> dic
         "groups": [[name, list(shape)] for name, shape in student.shapes.items()],
         "actions": env.num_actions,
         "deployment": {
-            "task": config.task,
-            "hand": config.hand,
-            "observe": config.observe,
-            "placement": config.placement,
-            "resolution": config.resolution,
+            **{name: getattr(config, name) for name in ("task", "hand", "observe", "placement", "resolution")},
             "rate": 1 / env.step_dt,
             "sub_steps": env.decimation,
             "twist": env.task.taxel_twist if config.twist is None else config.twist,

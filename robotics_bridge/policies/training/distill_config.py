@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, fields, replace
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
-from brainbench.core.errors import UsageError, unknown_name
+from brainbench.core.errors import check_name
+from brainbench.core.reading.ranges import check_number
 from robotics_bridge.hands.observations import observation_type
 from robotics_bridge.policies.contract import MOST_TWIST
 from robotics_bridge.policies.encoders.arms import AUTO, EncoderConfig
@@ -24,11 +25,7 @@ MOST = {"learning_rate": 1.0, "clip": 100.0, "max_grad_norm": 1e6}
 
 @dataclass(frozen=True, kw_only=True)
 class DistillConfig:
-    """A student. Settings of None are the task's own (thesis, table 4.4).
-
-    Raises:
-        UsageError: a value is not allowed.
-    """
+    """A student, with the task's own settings for those of None (thesis, table 4.4); UsageError for a bad value."""
 
     task: str
     teacher: str = ""
@@ -90,38 +87,25 @@ class DistillConfig:
     def __post_init__(self) -> None:
         object.__setattr__(self, "hidden", tuple(self.hidden))
         observation_type(self.observe)
-        for name, value, allowed in (
-            ("encoder of flat groups", self.embedder, EMBEDDERS),
-            ("loss", self.loss or "mse", LOSSES),
-            ("precision", self.precision, ("float32", "bf16")),
-        ):
-            if value not in allowed:
-                raise unknown_name(name, value, allowed)
-        if not 0 <= self.teacher_share <= 1:
-            raise UsageError(f"The teacher's share lies between 0 and 1; received {self.teacher_share!r}.")
-        if self.twist is not None and not 0 <= self.twist <= MOST_TWIST:
-            raise UsageError(f"twist lies between 0 and {MOST_TWIST:g} N·m·s; received {self.twist!r}.")
-        for name in ("learning_rate", "clip", "max_grad_norm"):
-            value = getattr(self, name)
-            if value is not None and not (isinstance(value, (int, float)) and 0 < value <= MOST[name]):
-                raise UsageError(f"{name} is a number above 0, at most {MOST[name]:g}; received {value!r}.")
+        check_name("encoder of flat groups", self.embedder, EMBEDDERS)
+        check_name("loss", self.loss or "mse", LOSSES)
+        check_name("precision", self.precision, ("float32", "bf16"))
+        check_number("teacher_share", self.teacher_share, least=0, most=1)
+        if self.twist is not None:
+            check_number("twist (N·m·s)", self.twist, least=0, most=MOST_TWIST)
+        for name, most in MOST.items():
+            if (value := getattr(self, name)) is not None:
+                check_number(name, value, above=0, most=most)
         positive = {"num_envs", "steps_per_env", "save_interval", "iterations", "epochs", "gradient_length"}
         for name in (*sorted(positive), "teacher_iterations", "aggregate", "seed"):
-            value, least = getattr(self, name), int(name in positive)
-            if value is not None and (isinstance(value, bool) or not isinstance(value, int) or value < least):
-                raise UsageError(f"{name} is a whole number of at least {least}; received {value!r}.")
+            if (value := getattr(self, name)) is not None:
+                check_number(name, value, least=int(name in positive), whole=True)
 
     @classmethod
     def of(cls, value: Mapping[str, Any]) -> DistillConfig:
-        """Return a configuration from a mapping of its fields.
-
-        Raises:
-            UsageError: a field does not exist.
-        """
-        known = [item.name for item in fields(cls)]
+        """Return a configuration from a mapping of its fields; raise UsageError for a field that does not exist."""
         for name in value:
-            if name not in known:
-                raise unknown_name("setting of a student", name, known)
+            check_name("setting of a student", name, cls.__dataclass_fields__)
         return cls(**value)
 
     def plain(self) -> dict[str, Any]:
@@ -144,10 +128,8 @@ class DistillConfig:
         """The tactile encoder; None without touch."""
         if observation_type(self.observe).sensor is None:
             return None
-        named = {"name": self.encoder, "hand": self.hand, "observe": self.observe}
-        return EncoderConfig.of(
-            {**self.encoder_settings, **named, "placement": self.placement, "resolution": self.resolution}
-        )
+        shared = {name: getattr(self, name) for name in ("hand", "observe", "placement", "resolution")}
+        return EncoderConfig.of({**self.encoder_settings, "name": self.encoder, **shared})
 
     @property
     def name(self) -> str:

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import torch
-from safetensors.torch import load_file, save_file
+from safetensors.torch import load_file
 
-from brainbench.core.files import atomic_path
+from robotics_bridge.policies.training.state_tree import write_tensors
 
 
 @dataclass
@@ -32,9 +32,7 @@ class Rollout:
 
     def save(self, path: Path) -> None:
         """Write the rollout to a safetensors file."""
-        parts = {**self.parts, "memory": self.memory}
-        with atomic_path(path) as temporary:
-            save_file({name: value.detach().cpu().contiguous() for name, value in parts.items()}, temporary)
+        write_tensors(path, {**self.parts, "memory": self.memory})
 
     @classmethod
     def load(cls, path: Path, device: torch.device) -> Rollout:

@@ -58,17 +58,18 @@ def restore(rest: Any, tensors: Mapping[str, torch.Tensor]) -> Any:
 def save(path: str | os.PathLike[str], tree: Any) -> None:
     """Write a tree to one safetensors file, replaced as a whole."""
     tensors, rest = flatten(tree)
+    write_tensors(path, tensors, tree=json.dumps(rest))
+
+
+def write_tensors(path: str | os.PathLike[str], tensors: Mapping[str, torch.Tensor], **metadata: str) -> None:
+    """Write tensors of any device to one safetensors file, replaced as a whole."""
     ready = {name: value.detach().cpu().contiguous().clone() for name, value in tensors.items()}
     with atomic_path(path) as target:
-        save_file(ready, str(target), metadata={"tree": json.dumps(rest)})
+        save_file(ready, str(target), metadata=metadata or None)
 
 
 def load(path: str | os.PathLike[str], device: str = "cpu") -> Any:
-    """Read a tree.
-
-    Raises:
-        DataError: the file is missing or holds no tree.
-    """
+    """Read a tree; raise DataError if the file is missing or holds none."""
     if not Path(path).is_file():
         raise DataFileNotFoundError(f"There is no file {str(path)!r}.")
     try:

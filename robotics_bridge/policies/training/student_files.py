@@ -8,10 +8,8 @@ from typing import Any
 
 import torch
 from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
 
 from brainbench.core.errors import BrainbenchError, DataError
-from brainbench.core.files import atomic_path
 from brainbench.core.reading.tensors import read_tensors
 from robotics_bridge.policies.contract import JOINTS, MOST_NUMBERS
 from robotics_bridge.policies.encoders.arms import EncoderConfig
@@ -26,16 +24,10 @@ CONFIG, MODEL = "config.json", "model.safetensors"
 def build_student(
     config: DistillConfig, shapes: Mapping[str, tuple[int, ...]], groups: list[str], actions: int
 ) -> TactilePolicy:
-    """Return a student with new weights (the global random state).
-
-    Args:
-        config: What is distilled.
-        shapes: Group → shape per environment.
-        groups: What the student reads.
-        actions: A.
+    """Return a student of ``groups`` with new weights (the global random state).
 
     Raises:
-        UsageError: the shapes do not fit the tactile encoder.
+        UsageError: the shapes of the groups, per environment, do not fit the tactile encoder.
     """
     example: Any = {name: torch.zeros(1, *shapes[name]) for name in groups}
     tactile = config.tactile
@@ -45,19 +37,10 @@ def build_student(
     )  # fmt: skip
 
 
-def save_student(path: Path, student: TactilePolicy) -> None:
-    """Write a student's weights and normalisers."""
-    state = {name: value.detach().cpu().contiguous().clone() for name, value in student.state_dict().items()}
-    with atomic_path(path) as temporary:
-        save_file(state, temporary)
-
-
 def load_student(folder: str | Path, *, device: str = "cpu") -> tuple[TactilePolicy, dict[str, Any]]:
     """Return a distilled student in evaluation mode, and its run's configuration.
 
-    Args:
-        folder: Of a run, or a name of :func:`~robotics_bridge.policies.shipped.list_policies`.
-        device: Of its weights.
+    The folder is that of a run, or a name of :func:`~robotics_bridge.policies.shipped.list_policies`.
 
     Raises:
         UsageError: there is no such folder or name.

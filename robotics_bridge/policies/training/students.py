@@ -13,9 +13,8 @@ from brainbench.core.errors import DataError, UsageError
 from brainbench.core.files import read_json, write_json
 from brainbench.core.progress import Progress
 from robotics_bridge import tasks
-from robotics_bridge.policies.encoders.arms import ARMS
+from robotics_bridge.policies.encoders.arms import ARMS, EncoderConfig
 from robotics_bridge.policies.encoders.calibration import HandCalibration
-from robotics_bridge.policies.encoders.taxel_grid import TaxelGrid
 from robotics_bridge.policies.evaluate import Policy, evaluate
 from robotics_bridge.policies.report import EVALUATION, GRADED
 from robotics_bridge.policies.shipped import list_policies
@@ -59,8 +58,8 @@ def train_student(
         out: The run's folder; a finished and evaluated run is left as it is.
         device: ``cpu``, or ``cuda`` for MuJoCo Warp.
         episodes: Per evaluation seed; 0 evaluates nothing. An evaluation says how many iterations the student had.
-        stop_after: Seconds after which the state is saved and learning stops.
-        stop_at: Iterations after which it does.
+        stop_after: Seconds; this and the next as of :func:`~robotics_bridge.policies.training.distill.distill`.
+        stop_at: Iterations.
         progress: Called with (done, in all, what).
 
     Raises:
@@ -98,14 +97,13 @@ def calibrated(config: DistillConfig, env: Any, teacher: Any, out: Path) -> Dist
     if (out / CONFIG).is_file():
         found = read_json(out / CONFIG).get("distill", {}).get("encoder_settings", {}).get("calibration")
     else:
-        found = asdict(_measure(config, env, teacher))
+        found = asdict(_measure(tactile, env, teacher))
     settings = dict(config.encoder_settings) if found is None else {**config.encoder_settings, "calibration": found}
     return replace(config, encoder_settings=settings)
 
 
-def _measure(config: DistillConfig, env: Any, teacher: Any) -> HandCalibration:
-    grid = TaxelGrid(config.hand, placement=config.placement, resolution=config.resolution, observe=config.observe)
-    grid = grid.to(env.device)
+def _measure(tactile: EncoderConfig, env: Any, teacher: Any) -> HandCalibration:
+    grid = tactile.grid().to(env.device)
     observations, felt = env.reset(), []
     for _ in range(_CALIBRATION_STEPS):
         felt.append(grid(observations["tactile"][:_CALIBRATION_ENVS]).cpu())
@@ -118,11 +116,7 @@ def _measure(config: DistillConfig, env: Any, teacher: Any) -> HandCalibration:
 
 
 def evaluate_student(
-    folder: str | Path,
-    env: Any,
-    episodes: int,
-    iterations: int,
-    progress: Progress | None,
+    folder: str | Path, env: Any, episodes: int, iterations: int, progress: Progress | None
 ) -> tuple[dict[str, Any], ...]:
     """Run whole episodes with a student and write ``evaluation.json``, one entry per seed.
 

@@ -14,7 +14,7 @@ from itertools import product
 from pathlib import Path
 from typing import Any
 
-from brainbench.core.errors import UsageError, shown, unknown_name
+from brainbench.core.errors import UsageError, check_name, shown
 from brainbench.core.reading.regular import readable
 from brainbench.core.reading.texts import read_toml
 from robotics_bridge.hands.layouts import check_names
@@ -42,21 +42,21 @@ class SweepEntry:
     """Further fields of every student, such as ``iterations``."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class StudentSweep:
     """A file of students."""
 
     name: str
     entries: tuple[SweepEntry, ...]
-    types: tuple[str, ...]
+    types: tuple[str, ...] = ()
     """Observation types, each at every placement of an entry."""
-    extra_types: tuple[str, ...]
+    extra_types: tuple[str, ...] = ()
     """Types beyond the published ones."""
-    resolutions: tuple[str, ...]
+    resolutions: tuple[str, ...] = ("med",)
     """Resolutions of the taxels, in the subset ``all`` and in that of one type."""
-    noisy: tuple[bool, ...]
+    noisy: tuple[bool, ...] = (False,)
     """Without noise, with it, or both; in the same subsets."""
-    seeds: tuple[int, ...]
+    seeds: tuple[int, ...] = (0,)
     """Training seeds, every student once with each."""
     pinned_resolution: str
     """The one resolution of the subsets ``types`` and ``encoders``."""
@@ -66,9 +66,9 @@ class StudentSweep:
     """Observation types of the subset ``encoders``."""
     arms: tuple[Mapping[str, Any], ...]
     """Encoder and its settings, for the subset ``encoders``."""
-    variant: str
+    variant: str = "default"
     """Configuration of the tasks."""
-    teacher: str
+    teacher: str = "teachers/{task}-{hand}"
     """Folder of a teacher's run, with ``{task}`` and ``{hand}``."""
 
     def students(self, subset: str = "all") -> list[DistillConfig]:
@@ -78,14 +78,9 @@ class StudentSweep:
             UsageError: there is no such subset.
         """
         every = (*self.types, *self.extra_types)
-        if subset not in (*SUBSETS, *every):
-            raise unknown_name("subset of the sweep", subset, (*SUBSETS, *every))
-        found = [
-            student
-            for entry in self.entries
-            for seed in self.seeds
-            for student in self._of_entry(entry, seed, subset, every)
-        ]
+        check_name("subset of the sweep", subset, (*SUBSETS, *every))
+        each = product(self.entries, self.seeds)
+        found = [student for entry, seed in each for student in self._of_entry(entry, seed, subset, every)]
         names = Counter(student.name for student in found)
         if repeated := [name for name, count in names.items() if count > 1]:
             raise UsageError(f"The sweep {self.name!r} names the student {repeated[0]!r} twice.")
@@ -140,28 +135,21 @@ def read_sweep(path: str | Path = PUBLISHED) -> StudentSweep:
 
 
 def _sweep(path: Path, document: Mapping[str, Any]) -> StudentSweep:
-    _known(document, _KEYS, "key of a sweep")
+    _check_keys(document, _KEYS, "key of a sweep")
     entries = tuple(_entry(item, document.get("settings", {})) for item in document.get("entries", ()))
     if not entries:
         raise UsageError(f"The sweep {str(path)!r} has no entries; each is a table [[entries]] with a task and a hand.")
     pinned, encoders = document.get("pinned", {}), document.get("encoders", {})
-    _known(pinned, {"resolution", "noisy"}, "key of 'pinned'")
-    _known(encoders, {"types", "arms"}, "key of 'encoders'")
+    _check_keys(pinned, {"resolution", "noisy"}, "key of 'pinned'")
+    _check_keys(encoders, {"types", "arms"}, "key of 'encoders'")
+    lists = ("types", "extra_types", "resolutions", "noisy", "seeds")
     sweep = StudentSweep(
-        name=path.stem,
-        entries=entries,
-        types=tuple(document.get("types", ())),
-        extra_types=tuple(document.get("extra_types", ())),
-        resolutions=tuple(document.get("resolutions", ("med",))),
-        noisy=tuple(document.get("noisy", (False,))),
-        seeds=tuple(document.get("seeds", (0,))),
-        pinned_resolution=pinned.get("resolution", "med"),
-        pinned_noisy=bool(pinned.get("noisy", False)),
-        encoder_types=tuple(encoders.get("types", ())),
+        name=path.stem, entries=entries, pinned_resolution=pinned.get("resolution", "med"),
+        pinned_noisy=bool(pinned.get("noisy", False)), encoder_types=tuple(encoders.get("types", ())),
         arms=tuple(encoders.get("arms", ())),
-        variant=document.get("variant", "default"),
-        teacher=document.get("teacher", "teachers/{task}-{hand}"),
-    )
+        **{key: tuple(document[key]) for key in lists if key in document},
+        **{key: document[key] for key in ("variant", "teacher") if key in document},
+    )  # fmt: skip
     for kind in (*sweep.types, *sweep.extra_types, *sweep.encoder_types):
         observation_type(kind)
     for entry in entries:
@@ -176,7 +164,7 @@ def _sweep(path: Path, document: Mapping[str, Any]) -> StudentSweep:
 
 
 def _entry(item: Mapping[str, Any], settings: Mapping[str, Any]) -> SweepEntry:
-    _known(item, _ENTRY, "key of a sweep's entry")
+    _check_keys(item, _ENTRY, "key of a sweep's entry")
     for key in ("task", "hand", "placements"):
         if not item.get(key):
             raise UsageError(f"An entry of a sweep needs {key!r}; received {shown(dict(item))}.")
@@ -186,7 +174,6 @@ def _entry(item: Mapping[str, Any], settings: Mapping[str, Any]) -> SweepEntry:
     return SweepEntry(item["task"], item["hand"], tuple(item["placements"]), own)
 
 
-def _known(mapping: Mapping[str, Any], known: set[str], what: str) -> None:
+def _check_keys(mapping: Mapping[str, Any], known: set[str], what: str) -> None:
     for key in mapping:
-        if key not in known:
-            raise unknown_name(what, key, sorted(known))
+        check_name(what, key, sorted(known))

@@ -12,7 +12,7 @@ import json
 import logging
 import math
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -21,6 +21,7 @@ import torch
 
 from brainbench.core.errors import BrainbenchError, DataError, DataFileNotFoundError, UsageError, missing_dependency
 from brainbench.core.files import file_hash, provenance, read_json, write_json
+from brainbench.core.progress import Progress
 from brainbench.core.reading.tensors import check_finite
 from brainbench.core.writing.locks import lock_folder
 from robotics_bridge.envs.rsl_rl import RslRlEnv
@@ -54,12 +55,7 @@ class TeacherResult:
 
 
 class Trainer:
-    """PPO on one environment batch; :meth:`iterate` is one iteration.
-
-    Args:
-        env: the environments.
-        settings: of the optimisation; those of the task by default.
-        seed: of weights and actions.
+    """PPO on one environment batch, by default with the task's settings; :meth:`iterate` is one iteration.
 
     Raises:
         MissingDependencyError: rsl-rl-lib is not installed.
@@ -76,12 +72,9 @@ class Trainer:
         observations = self.env.get_observations()
         # rsl_rl prints its networks; what a command prints is its own business.
         with contextlib.redirect_stdout(io.StringIO()) as said:
-            self.algorithm = PPO.construct_algorithm(
-                observations,
-                self.env,  # type: ignore[arg-type]
-                json.loads(json.dumps(self.config)),
-                str(env.device),
-            )
+            wrapped: Any = self.env
+            own = json.loads(json.dumps(self.config))
+            self.algorithm = PPO.construct_algorithm(observations, wrapped, own, str(env.device))
         _LOG.info("%s", said.getvalue())
         self.iteration = 0
         self._observations = observations
@@ -91,12 +84,12 @@ class Trainer:
 
     def iterate(self) -> dict[str, float]:
         """Collect steps, learn from them, and return losses, episode means and seconds spent."""
-        env, algorithm = self.env, self.algorithm
+        env, algorithm, steps = self.env, self.algorithm, self.config["num_steps_per_env"]
         start = _now(env.device)
         reward = torch.zeros((), device=env.device)
         curiosity = torch.zeros((), device=env.device)
         with torch.inference_mode():
-            for _ in range(self.config["num_steps_per_env"]):
+            for _ in range(steps):
                 actions = algorithm.act(self._observations)
                 self._observations, rewards, dones, extras = env.step(actions)
                 algorithm.process_env_step(self._observations, rewards, dones, extras)
@@ -107,24 +100,18 @@ class Trainer:
         collected = _now(env.device)
         losses = algorithm.update()
         self.iteration += 1
-        steps = self.config["num_steps_per_env"]
-        row: dict[str, float] = {"iteration": self.iteration, "steps": self.iteration * steps * env.num_envs}
-        row |= {
-            "reward": float(reward) / steps,
-            "collect_s": collected - start,
-            "learn_s": _now(env.device) - collected,
-        }
-        row |= {f"loss/{name}": float(value) for name, value in losses.items()}
-        row |= {
+        row = {
+            "iteration": self.iteration, "steps": self.iteration * steps * env.num_envs,
+            "reward": float(reward) / steps, "collect_s": collected - start, "learn_s": _now(env.device) - collected,
+            **{f"loss/{name}": float(value) for name, value in losses.items()},
             "learning_rate": float(algorithm.learning_rate),
             "std": float(algorithm.get_policy().output_std.detach().mean()),
-        }
+        }  # fmt: skip
         if algorithm.rnd:
             row["curiosity"] = float(curiosity) / steps
         if self._curriculum:
             row["threshold"] = float(env.unwrapped.goals.threshold)
-        row |= {f"episode/{name}": value for name, value in env.unwrapped.statistics().items()}
-        return row
+        return row | {f"episode/{name}": value for name, value in env.unwrapped.statistics().items()}
 
     def policy(self) -> Policy:
         """Return the present actor."""
@@ -132,14 +119,12 @@ class Trainer:
 
     @property
     def _curriculum(self) -> dict[str, torch.Tensor]:
-        return self.env.unwrapped.goals.curriculum()
+        return {f"curriculum_{name}": value for name, value in self.env.unwrapped.goals.curriculum().items()}
 
     def begin_from(self, path: Path, *, std: float | None = None) -> None:
-        """Take up actor and critic of another run, with what they know of their inputs; learning begins anew.
+        """Take up actor and critic of another run (:func:`model_file`); learning begins anew.
 
-        Args:
-            path: as :func:`load_teacher` takes it.
-            std: standard deviation of actions to begin with; None takes that of the other run.
+        Actions begin with the standard deviation ``std``; None takes that of the other run.
 
         Raises:
             DataError: there is no model, or it has other inputs, outputs or layers.
@@ -147,9 +132,8 @@ class Trainer:
         file = model_file(path)
         found, own = state_tree.load(file), self.algorithm.save()
         for name in ("actor", "critic"):
-            theirs, mine = (
-                {k: tuple(v.shape) for k, v in tree.items()} for tree in (found[name], own[f"{name}_state_dict"])
-            )
+            trees = (found[name], own[f"{name}_state_dict"])
+            theirs, mine = ({k: tuple(v.shape) for k, v in tree.items()} for tree in trees)
             if theirs != mine:
                 odd = next(key for key in {**mine, **theirs} if mine.get(key) != theirs.get(key))
                 raise DataError(
@@ -167,7 +151,7 @@ class Trainer:
     def state(self) -> dict[str, Any]:
         """Return all that the next iteration depends on, random numbers included."""
         state = {"algorithm": self.algorithm.save(), "env": self.env.unwrapped.state_dict()}
-        state |= {name: value.clone() for name, value in _named(self._curriculum).items()}
+        state |= {name: value.clone() for name, value in self._curriculum.items()}
         state |= {"iteration": self.iteration, "torch_rng": torch.get_rng_state()}
         if self.env.device.type == "cuda":
             state["cuda_rng"] = torch.cuda.get_rng_state(self.env.device)
@@ -182,7 +166,7 @@ class Trainer:
         """Go on from what :meth:`state` returned."""
         self.env.unwrapped.load_state_dict(state["env"])
         self.algorithm.load(dict(state["algorithm"]), None, strict=True)
-        for name, value in _named(self._curriculum).items():
+        for name, value in self._curriculum.items():
             # A run that was begun without a curriculum begins it now.
             value.copy_(state.get(name, value))
         self.iteration = int(state["iteration"])
@@ -234,16 +218,11 @@ def train(
     options: TeacherRun | None = None,
     *,
     settings: TeacherSettings | None = None,
-    progress: Callable[[int, int, str], None] | None = None,
+    progress: Progress | None = None,
 ) -> TeacherResult:
-    """Train a teacher in a folder, or go on with the run that the folder holds.
+    """Train a teacher in a folder, or go on with the run that the folder holds, in environments as before.
 
-    Args:
-        env: the environments; on resuming, of the same task, hand and number.
-        run: folder.
-        options: how long, and from where.
-        settings: of the optimisation; those of the task by default.
-        progress: called with iteration, total and a word.
+    The settings of the optimisation are those of the task by default.
 
     Raises:
         UsageError: the folder holds a run of other settings.
@@ -255,19 +234,16 @@ def train(
 
 
 def _train(
-    env: Env,
-    run: Path,
-    options: TeacherRun,
-    settings: TeacherSettings,
-    progress: Callable[[int, int, str], None] | None,
+    env: Env, run: Path, options: TeacherRun, settings: TeacherSettings, progress: Progress | None
 ) -> TeacherResult:
     total = options.iterations or settings.iterations
     trainer = Trainer(env, settings, seed=options.seed)
     env.goals.start_curriculum()
     origin = None
     if options.start is not None and not (run / RESUME).is_file():
-        trainer.begin_from(options.start, std=options.start_std)
-        origin = {"file": str(model_file(options.start)), "hash": file_hash(model_file(options.start))}
+        start = model_file(options.start)
+        trainer.begin_from(start, std=options.start_std)
+        origin = {"file": str(start), "hash": file_hash(start)}
     facts = {
         "kind": "teacher", "task": env.task.name, "hand": env.hand.name, "hand_path": str(env.hand.path or ""),
         "num_envs": env.num_envs, "seed": options.seed, "settings": asdict(settings), "rsl_rl": trainer.config,
@@ -347,11 +323,10 @@ def newest(run: Path) -> Path:
     Raises:
         DataFileNotFoundError: the folder holds no model.
     """
-    numbered = [path for path in run.glob("model_*.safetensors") if path.stem.removeprefix("model_").isdecimal()]
-    found = sorted(numbered, key=lambda path: int(path.stem.removeprefix("model_")))
-    if not found:
+    numbers = [path.stem.removeprefix("model_") for path in run.glob("model_*.safetensors")]
+    if not (found := [int(number) for number in numbers if number.isdecimal()]):
         raise DataFileNotFoundError(f"{str(run)!r} holds no trained policy (model_<iteration>.safetensors).")
-    return found[-1]
+    return run / f"model_{max(found)}.safetensors"
 
 
 def model_file(path: Path) -> Path:
@@ -366,12 +341,10 @@ def model_file(path: Path) -> Path:
 
 
 def load_teacher(run: str | Path, env: Env) -> Policy:
-    """Return the trained actor of a run for an environment.
+    """Return the trained actor of a run for environments with the same observation groups and actions.
 
-    Args:
-        run: folder of a run, one of its ``model_<iteration>.safetensors``, or a name of
-            :func:`~robotics_bridge.policies.shipped.list_policies`.
-        env: environments with the same observation groups and actions.
+    The run is a folder, one of its ``model_<iteration>.safetensors``, or a name of
+    :func:`~robotics_bridge.policies.shipped.list_policies`.
 
     Raises:
         UsageError: there is no such file, folder or name.
@@ -393,19 +366,15 @@ def load_teacher(run: str | Path, env: Env) -> Policy:
         with torch.random.fork_rng(devices=[]):
             actor = ActingModel(env.observations, env.task.groups, "actor", env.num_actions, hidden)
         actor.load_state_dict({name: value for name, value in weights.items() if not name.startswith("distribution.")})
+    except BrainbenchError:
+        raise
     except (RuntimeError, TypeError, ValueError, LookupError, AttributeError) as error:
-        if isinstance(error, BrainbenchError):
-            raise
         task, hand = (str(facts.values.get(name))[:80] for name in ("task", "hand"))
         raise DataError(
             f"The policy of {str(path)!r} was trained on {task!r} with hand {hand!r} and does not "
             f"fit this environment ({env.task.name!r}, {env.hand.name!r})."
         ) from error
     return Policy(actor.to(env.device))
-
-
-def _named(curriculum: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
-    return {f"curriculum_{name}": value for name, value in curriculum.items()}
 
 
 def _plain(settings: Mapping[str, Any]) -> dict[str, Any]:

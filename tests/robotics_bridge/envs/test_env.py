@@ -298,7 +298,7 @@ def test_ten_times_the_published_randomisation_is_survived() -> None:
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"num_envs": 0}, "1 to 1,000,000"),
+        ({"num_envs": 0}, "at least 1 and at most 1,000,000"),
         ({"engine": "mujoko"}, "did you mean 'mujoco'"),
         ({"observe": "forces"}, "did you mean 'force'"),
         ({"device": "cuda:0", "engine": "mujoco"}, "CUDA|processor"),

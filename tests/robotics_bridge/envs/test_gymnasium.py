@@ -105,5 +105,5 @@ def test_wrong_requests_are_refused(env: GymVectorEnv) -> None:
         GymEnv(env)
     with pytest.raises(UsageError, match="keep_final=True"):
         GymVectorEnv(tasks.make("in_palm_rotate", threads=1))
-    with pytest.raises(UsageError, match=r"'vision'; .*'proprio'"):
+    with pytest.raises(UsageError, match=r"'vision'.*'proprio'"):
         GymVectorEnv(tasks.make("in_palm_rotate", keep_final=True, threads=1), ("vision",))

@@ -51,7 +51,7 @@ def test_words_reach_rewards_their_parameters_endings_learning_and_the_task() ->
         ("episode.long=3", "'episode' has no parts"),
         ("goal=3", "dataclasses.replace"),
         ("goal.start_threshold=0.05", "wider threshold than 0.1 rad"),
-        ("goal.narrowing=1.5", "between 0 and 1"),
+        ("goal.narrowing=1.5", "above 0 and below 1; received 1.5"),
         ("schedule=adptive", "did you mean 'adaptive'"),
         ("learning_rate_range=1e-2,1e-3", "lies within its range"),
     ],

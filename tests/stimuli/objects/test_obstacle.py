@@ -72,7 +72,7 @@ def test_a_quarter_turn_about_z_takes_x_to_y():
         (lambda: TriangleMesh(np.eye(4, 3), np.array([[0, 1, 2]])), "at least four faces"),
         (lambda: TriangleMesh(np.eye(4, 3), np.full((4, 3), 4)), "must name its 4 vertices"),
         (lambda: Obstacle((Sphere((0, 0, 0), 1.0),), friction=-1.0), r"friction .*received -1"),
-        (lambda: Obstacle(("ball",)), "received str"),  # pyright: ignore[reportArgumentType]
+        (lambda: Obstacle(("ball",)), "part of an obstacle 'str'"),  # pyright: ignore[reportArgumentType]
     ],
 )
 def test_impossible_shapes_are_refused(make, message):

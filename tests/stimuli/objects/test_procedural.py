@@ -168,9 +168,9 @@ def test_detail_changes_the_triangles_and_hardly_the_solid(family):
     ("arguments", "message"),
     [
         (("torsu",), "Unknown shape family 'torsu'; did you mean 'torus'"),
-        (("torus", -1), "zero or more; received -1"),
+        (("torus", -1), "at least 0; received -1"),
         (("torus", 1.5), "whole number"),
-        (("torus", 0, 100), "between 2000 and 20000 triangles; received 100"),
+        (("torus", 0, 100), "triangles.*at least 2,000 and at most 20,000; received 100"),
     ],
 )
 def test_impossible_shapes_are_refused(arguments, message):

@@ -28,11 +28,11 @@ def test_a_batch_holds_what_simulating_its_scenes_gives():
 
 
 def test_neither_batch_nor_order_nor_threads_change_a_number():
-    scenes = small_scenes()
-    together = simulate_sweeps(scenes, range(8), fidelity=FAST, workers=2)
-    backwards = simulate_sweeps(scenes, list(range(7, -1, -1)), fidelity=FAST, workers=1)
+    scenes, indices = small_scenes(), [2, 3, 9]
+    together = simulate_sweeps(scenes, indices, fidelity=FAST, workers=2)
+    backwards = simulate_sweeps(scenes, indices[::-1], fidelity=FAST, workers=1)
     np.testing.assert_array_equal(together.wrench, backwards.wrench[::-1])
-    alone = join_batches([simulate_sweeps(scenes, [index], fidelity=FAST) for index in range(8)])
+    alone = join_batches([simulate_sweeps(scenes, [index], fidelity=FAST) for index in indices])
     np.testing.assert_array_equal(together.wrench, alone.wrench)
     np.testing.assert_array_equal(together.contact, alone.contact)
 

@@ -91,7 +91,15 @@ def test_the_whisker_slips_off_at_the_depth_of_the_elastica(name, share, preset,
     assert result.error == pytest.approx(0, abs=promise)
 
 
-@pytest.mark.parametrize(("at", "offset", "radius"), [(0.3, 0.02, 5e-5), (0.3, 0.02, 2.5e-4), (0.5, 0.2, 1.5e-3)])
+@pytest.mark.parametrize(
+    ("at", "offset", "radius"),
+    [
+        pytest.param(0.3, 0.02, 5e-5, marks=pytest.mark.slow),
+        (0.3, 0.02, 1e-4),
+        (0.3, 0.02, 2.5e-4),
+        (0.5, 0.2, 1.5e-3),
+    ],
+)
 def test_a_peg_of_any_radius_at_a_joint_of_the_chain_meets_a_smooth_taper(at, offset, radius):
     # A staircase of capsules turned this force by up to 15 %.
     result = bench_tests.peg(C2, at * C2.arc_length, offset * C2.arc_length, peg_radius=radius, fidelity="accurate")
@@ -187,7 +195,7 @@ def test_halving_the_time_step_halves_the_error_of_the_ringdown():
         (lambda: bench_tests.point_load(C2, 0.0, 0.01), "other than zero"),
         (lambda: bench_tests.point_load(C2, 1e-6, 0.1), "0 < at"),
         (lambda: bench_tests.ringdown(replace(C2, damping_ratio=1.5)), "between 0 and 1"),
-        (lambda: bench_tests.ringdown(C2, modes=0), r"modes .*1 and 5; received 0"),
+        (lambda: bench_tests.ringdown(C2, modes=0), r"modes .*1 and at most 5; received 0"),
         (lambda: bench_tests.slip_off(replace(C2, curvature=5.0), 0.007), "takes a straight whisker"),
         (lambda: bench_tests.slip_off(C2, 0.1), "0 < at"),
         (lambda: bench_tests.peg(C2, 0.007, 1e-3, backend="mujocco"), "did you mean 'mujoco'"),

@@ -48,16 +48,9 @@ def arch(draw: ShapeSampler, detail: int) -> Body:
     count = 2 * (around(detail) // 4)
     angle = np.linspace(0, np.pi, count + 1)
     curve = np.column_stack([np.cos(angle), np.sin(angle)])
-    outline = np.vstack(
-        [
-            [(outer, -height)],
-            outer * curve,
-            [(-outer, -height), (-span, -height)],
-            span * curve[::-1],
-            [(span, -height)],
-        ]
-    )
-    return prism(outline, depth)
+    feet = [(-outer, -height), (-span, -height)]
+    outline = [*[(outer, -height)], *outer * curve, *feet, *span * curve[::-1], (span, -height)]
+    return prism(np.vstack(outline), depth)
 
 
 def frame(draw: ShapeSampler, detail: int) -> Body:

@@ -119,13 +119,10 @@ def ball(detail: int, warp: Callable[[NDArray[np.float64]], NDArray[np.float64]]
 
 
 def lathe(outer: ArrayLike, facets: int, *, wall: float | None = None, floor: float = 0.0) -> Body:
-    """Turn an outline about the z axis.
+    """Turn an outline [n, 2] of radius and height about the z axis, with a multiple of :data:`WEDGES` facets.
 
-    Args:
-        outer: [n, 2] radius and height, heights increasing; the ends may have radius zero.
-        facets: around the axis, a multiple of :data:`WEDGES`.
-        wall: thickness of the wall of a hollow body, open at the top; solid when None.
-        floor: height above which it is hollow; must be the height of a point of the outline.
+    Heights increase; the ends may have radius zero. With a ``wall`` thickness the body is hollow above the ``floor``,
+    the height of a point of the outline, and open at the top.
     """
     from manifold3d import CrossSection, FillRule
 
@@ -146,23 +143,15 @@ def lathe(outer: ArrayLike, facets: int, *, wall: float | None = None, floor: fl
         for first in range(0, facets, span):
             sector = circle[(first + np.arange(span + 1)) % facets]
             # Of the inner side only the ends count; between them the wedge is filled to the chord.
-            parts.append(
-                np.concatenate(
-                    [r * (sector if k < 2 else sector[[0, -1]]) + [0, 0, z] for k, (r, z) in enumerate(corners)]
-                )
-            )
+            sides = (sector, sector, sector[[0, -1]], sector[[0, -1]])
+            parts.append(np.concatenate([r * s + [0, 0, z] for s, (r, z) in zip(sides, corners, strict=True)]))
     return Body(solid, parts)
 
 
 def tube(path: ArrayLike, radius: ArrayLike, sides: int, *, closed: bool, aspect: float = 1.0) -> Body:
-    """Sweep a circle along a path, without twist.
+    """Sweep a circle of ``sides`` corners and of one radius, or one per point, along a path [n, 3], without twist.
 
-    Args:
-        path: [n, 3] points.
-        radius: one number, or one per point.
-        sides: of the cross-section.
-        closed: whether the last point is followed by the first.
-        aspect: height of the cross-section over its width.
+    On a closed path the last point is followed by the first; ``aspect`` is height over width of the cross-section.
     """
     from manifold3d import Manifold, Mesh64
 
@@ -174,9 +163,8 @@ def tube(path: ArrayLike, radius: ArrayLike, sides: int, *, closed: bool, aspect
     side = np.cross(tangent, normal)
     angle = 2 * np.pi * np.arange(sides) / sides
     radii = np.broadcast_to(np.asarray(radius, dtype=float), count)[:, None, None]
-    rings = line[:, None] + radii * (
-        np.cos(angle)[None, :, None] * normal[:, None] + aspect * np.sin(angle)[None, :, None] * side[:, None]
-    )
+    cosine, sine = np.cos(angle)[None, :, None], np.sin(angle)[None, :, None]
+    rings = line[:, None] + radii * (cosine * normal[:, None] + aspect * sine * side[:, None])
     here = np.arange(count if closed else count - 1)
     ahead = (here + 1) % count
     k = np.arange(sides)
@@ -194,14 +182,10 @@ def tube(path: ArrayLike, radius: ArrayLike, sides: int, *, closed: bool, aspect
 
 
 def prism(outline: ArrayLike, height: float, *, top: float = 1.0, twist: float = 0.0, slices: int = 0) -> Body:
-    """Extrude a polygon [n, 2] (counter-clockwise) upwards from z = −height/2.
+    """Extrude a simple polygon [n, 2] (counter-clockwise) upwards from z = −height/2.
 
-    Args:
-        outline: simple polygon.
-        height: along z.
-        top: size of the upper end relative to the lower, about the origin.
-        twist: turn of the upper end [degrees]; the convex parts are then true within a slice's turn.
-        slices: cuts between the ends, needed for a twist.
+    The upper end has ``top`` times the size of the lower and is turned by ``twist`` [degrees]; that needs ``slices``
+    between the ends, and the convex parts are then true within a slice's turn.
     """
     from manifold3d import CrossSection, triangulate
 
@@ -230,18 +214,15 @@ def convex_cells(points: NDArray[np.float64], triangles: NDArray[np.int64]) -> l
             other = sides.get((end, start))
             if other is None or other == n:
                 continue
-            joined = _join(cells[n], cells[other], start, end)
+            first, second = cells[n], cells[other]
+            i, j = first.index(end), second.index(start)
+            joined = [*first[i:], *first[:i], *second[j + 1 :], *second[:j]][: len(first) + len(second) - 2]
             if _is_convex(points[joined]):
                 cells[n] = joined
                 cells.pop(other)
                 merged = True
                 break
     return cells
-
-
-def _join(first: list[int], second: list[int], start: int, end: int) -> list[int]:
-    i, j = first.index(end), second.index(start)
-    return [*first[i:], *first[:i], *second[j + 1 :], *second[:j]][: len(first) + len(second) - 2]
 
 
 def _is_convex(corners: NDArray[np.float64]) -> bool:

@@ -100,9 +100,8 @@ def twist(draw: ShapeSampler, detail: int) -> Body:
     corners = _polar(np.full(sides, 0.6), angles)
     share = np.arange(8)[:, None] / 8
     # Sides cut into eighths follow the twisted surface instead of folding it along diagonals.
-    outline = np.concatenate(
-        [(1 - share) * a + share * b for a, b in zip(corners, np.roll(corners, -1, 0), strict=True)]
-    )
+    sides = zip(corners, np.roll(corners, -1, 0), strict=True)
+    outline = np.concatenate([(1 - share) * a + share * b for a, b in sides])
     return prism(outline, height, top=top, twist=turn, slices=39)
 
 

@@ -18,7 +18,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from brainbench.core.errors import UsageError, unknown_name
+from brainbench.core.errors import check_name
+from brainbench.core.reading.ranges import check_number
 from brainbench.geometry import Mesh, convex_hull
 from brainbench.stimuli.objects.procedural import assembled, extruded, round, swept, turned
 from brainbench.stimuli.objects.procedural.bodies import Body, ShapeSampler
@@ -71,23 +72,15 @@ def make(family: str, seed: int = 0, *, detail: int = 4_000) -> Shape:
     """Make one member of a family.
 
     The same family, seed and detail give the same shape in every process; the seed alone chooses the
-    proportions, so shapes of different detail approximate the same solid.
-
-    Args:
-        family: see :func:`list_families`.
-        seed: zero or more.
-        detail: about how many triangles, within :data:`DETAIL`.
+    proportions, so shapes of different detail (about so many triangles, within :data:`DETAIL`) approximate the same
+    solid.
 
     Raises:
         UsageError: the family is unknown, or a number lies outside its range.
     """
     build = _family(family)
-    if isinstance(seed, bool) or not isinstance(seed, int) or seed < 0:
-        raise UsageError(f"The seed of a shape is a whole number, zero or more; received {seed!r}.")
-    if not DETAIL[0] <= detail <= DETAIL[1]:
-        raise UsageError(
-            f"The detail of a shape lies between {DETAIL[0]} and {DETAIL[1]} triangles; received {detail!r}."
-        )
+    check_number("The seed of a shape", seed, least=0, whole=True)
+    check_number("The detail of a shape (triangles)", detail, least=DETAIL[0], most=DETAIL[1])
     return _make(family, build, seed, int(detail))
 
 
@@ -135,6 +128,5 @@ def _refined(solid: Manifold, detail: int) -> Manifold:
 
 
 def _family(name: str) -> Callable[[ShapeSampler, int], Body]:
-    if name not in _FAMILIES:
-        raise unknown_name("shape family", name, list_families())
+    check_name("shape family", name, list_families())
     return _FAMILIES[name]

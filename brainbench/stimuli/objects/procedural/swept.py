@@ -48,12 +48,8 @@ def knot(draw: ShapeSampler, detail: int) -> Body:
     sides, steps = _mesh_of(detail)
     t = 2 * np.pi * np.arange(steps) / steps
     away = 1 + swing * np.cos(lobes * t)
-    return tube(
-        np.column_stack([away * np.cos(2 * t), away * np.sin(2 * t), -rise * np.sin(lobes * t)]),
-        radius,
-        sides,
-        closed=True,
-    )
+    path = np.column_stack([away * np.cos(2 * t), away * np.sin(2 * t), -rise * np.sin(lobes * t)])
+    return tube(path, radius, sides, closed=True)
 
 
 def spring(draw: ShapeSampler, detail: int) -> Body:

@@ -32,9 +32,8 @@ def bottle(draw: ShapeSampler, detail: int) -> Body:
     radius, neck, shoulder = draw(radius=(0.22, 0.32), neck=(0.07, 0.11), shoulder=(0.5, 0.68))
     (height,) = draw(height=(1.3, 1.7))
     z = [0, 0.04, shoulder * height, (shoulder + 0.2) * height, 0.94 * height, height]
-    return lathe(
-        _outline(z, [0.9 * radius, radius, radius, neck, neck, 1.2 * neck], 2 * _rings(detail)), around(detail)
-    )
+    line = _outline(z, [0.9 * radius, radius, radius, neck, neck, 1.2 * neck], 2 * _rings(detail))
+    return lathe(line, around(detail))
 
 
 def cup(draw: ShapeSampler, detail: int) -> Body:
