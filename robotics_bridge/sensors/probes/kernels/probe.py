@@ -20,7 +20,7 @@ from robotics_bridge.sensors.kernels.readout import (
 )
 from robotics_bridge.sensors.kernels.series import power as series_power
 from robotics_bridge.sensors.noise.kernels.noise import NoiseParams, episode_draw, gain, radius_noise
-from robotics_bridge.sensors.queries.kernels.distance import FAR, SolidArrays, SolidShape, shape_functions
+from robotics_bridge.sensors.queries.kernels.distance import FAR, WALL, SolidArrays, SolidShape, shape_functions
 from robotics_bridge.sensors.queries.kernels.pairs import PairArrays
 
 wp = warp()
@@ -54,12 +54,17 @@ def deepest_function(kinds: frozenset[int], raycast: bool) -> Any:
             geometry = pairs.geometry[env, at]
             rotation = pairs.rotation[env, at]
             limit = reach
-            if wp.static(raycast):
+            facing = wp.vec3f()
+            if wp.static(WALL in kinds):
+                # A probe without a limit asks for the distance, whichever side is the nearest.
+                if reach <= 0.0:
+                    facing = rotation @ (probes.radius[n] * probes.normal[n])
+            if wp.static(raycast or WALL in kinds):
                 # A query of triangles searches within a limit: from inside, the surface is at most a bounding diameter
                 # away.
                 if reach <= 0.0:
                     limit = 2.0 * solids.bound[row, geometry][3] + probes.radius[n]
-            found = distance(solids, row, geometry, rotation @ x + pairs.offset[env, at], limit)
+            found = distance(solids, row, geometry, rotation @ x + pairs.offset[env, at], facing, limit)
             # The largest penetration of 4.2 is the least signed distance. A strict comparison keeps the first of equals
             # in the order of geometry numbers, so that ties do not depend on the order of contacts.
             if found[3] < best:
@@ -307,9 +312,12 @@ def kinematic_kernel(
                         shape = shape_of(solids, variant, geometry)
                         rotation = pairs.rotation[env, held]
                         offset = pairs.offset[env, held]
-                        if wp.static(raycast):
+                        if wp.static(raycast or WALL in kinds):
                             limit = 2.0 * solids.bound[variant, geometry][3]
-                    found = distance_to(solids.values, shape, rotation @ x + offset, limit + radius)
+                    facing = wp.vec3f()
+                    if wp.static(WALL in kinds):
+                        facing = rotation @ (radius * probes.normal[n])
+                    found = distance_to(solids.values, shape, rotation @ x + offset, facing, limit + radius)
                     if found[3] < best:
                         best = found[3]
                         normal = wp.transpose(rotation) @ wp.vec3f(found[0], found[1], found[2])
