@@ -42,7 +42,7 @@ def register(name: str, config: str = "default") -> Callable[[Maker], Maker]:
 
 
 def register_bounded(name: str, published: Maker) -> None:
-    """Register the default, on which we train: the published task with bounded actions and physical taxels."""
+    """Register the default, on which we train: the published task with bounded actions and holding taxels."""
     register(name)(lambda: replace(published(), action_limit=ACTION_LIMIT, taxel_twist=None))
 
 
