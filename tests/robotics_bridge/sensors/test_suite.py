@@ -242,7 +242,12 @@ def test_a_noisy_taxel_keeps_at_most_130_bytes(name: str) -> None:
     noise = Noise.preset(f"published-{preset}")
     noise = replace(noise, **{knob: 0.0 for knob in ("hysteresis", "radius") if knob not in kind.knobs})
     noise = noise if "gain" in kind.knobs else replace(noise, gain=(1.0, 1.0), dead_probability=0.0)
-    sensor = kind(link="hand", probes=Probes.grid(10, 10, size=(0.02, 0.02), radius=0.003), noise=noise, **options)
+    sensor = kind(
+        link="hand",
+        probes=Probes.grid(10, 10, size=(0.02, 0.02), center=(0, 0, 5e-3), radius=0.003),
+        noise=noise,
+        **options,
+    )
     held = _suite({"taxel": sensor}).state_bytes
     assert (held["sensors"] + held["shared"]) / 100 <= 130
     assert held["rings"] == 0

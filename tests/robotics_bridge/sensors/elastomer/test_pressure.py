@@ -58,7 +58,7 @@ def test_pressures_add_up_to_the_contact_forces_of_the_engine() -> None:
 
 def test_what_has_no_pressure_is_refused() -> None:
     scene = pad_scene(Geometry(name="ball", link="ball", kind="sphere", size=(RADIUS,)))
-    line = Probes(np.zeros((3, 3)), np.tile([0.0, 0, 1], (3, 1)), np.full(3, 1e-3))
+    line = Probes(np.tile([0.0, 0, 0.005], (3, 1)), np.tile([0.0, 0, 1], (3, 1)), np.full(3, 1e-3))
     sensors = {
         "free": ElastomerTaxel(link="hand", probes=line),
         "bit": ContactProbe(link="hand", probes=GRID),

@@ -161,7 +161,9 @@ def test_meshes_that_are_no_solids_are_refused_or_said() -> None:
         scene = pad_scene(Geometry(name="o", link="o", kind="mesh", mesh=mesh))
         with pytest.raises(UsageError, match=f"{mesh.name!r} has no thickness"):
             SensorSuite(
-                scene, {"d": ContactDepthProbe(link="hand", probes=Probes.grid(2, 2, size=(1e-2, 1e-2)))}, num_envs=1
+                scene,
+                {"d": ContactDepthProbe(link="hand", probes=Probes.grid(2, 2, size=(1e-2, 1e-2), center=(0, 0, 5e-3)))},
+                num_envs=1,
             )
     for mesh, word in (
         (Mesh(box.vertices, box.faces[2:], "lidless"), "open edges"),
