@@ -112,7 +112,7 @@ PRELUDES = {
 ELSEWHERE = ("docs/recordings.md", "docs/statistics.md", "docs/datasets.md")
 """Pages whose code other tests here run."""
 
-SLOW = ("docs/tactile.md",)
+SLOW = ("docs/tactile-hands.md",)
 
 
 @pytest.mark.parametrize(

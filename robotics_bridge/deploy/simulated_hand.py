@@ -92,7 +92,7 @@ class SimulatedHand:
         observe: Observation type that its skin gives; reports need ``agg_force`` on the tips.
         placement: Of its taxels.
         resolution: Of its taxels.
-        twist: Torsional friction of force taxels (N·m·s); None is that of their patch.
+        twist: Torsional friction of force taxels (N·m·s); None: they hold what they touch.
     """
 
     def __init__(
@@ -171,7 +171,7 @@ class ShadowTouch:
         joints: Names of the joints in the order of the reports.
         rate: Control steps per second.
         sub_steps: S.
-        twist: Torsional friction of its force taxels (N·m·s); None is that of their patch.
+        twist: Torsional friction of its force taxels (N·m·s); None: they hold what they touch.
     """
 
     def __init__(

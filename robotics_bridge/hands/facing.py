@@ -28,11 +28,7 @@ def palmar_directions(model: Any, palm: str, fingers: Mapping[str, tuple[str, ..
     face as the next one towards the tip does. What slides, and tips of which no joint tells, face the other fingers.
     The palm faces where the finger tips go, along the nearest axis of its frame, or the tips of jaws.
     """
-    data = mujoco.MjData(model)
-    # Jaws stand half open, so that one lies on each side.
-    for joint in np.flatnonzero((model.jnt_type == mujoco.mjtJoint.mjJNT_SLIDE) & (model.jnt_limited != 0)):
-        data.qpos[model.jnt_qposadr[joint]] = model.jnt_range[joint].mean()
-    mujoco.mj_kinematics(model, data)
+    data = half_open(model)
     towards: dict[str, np.ndarray] = {}
     tips = []
     for name, chain in fingers.items():
@@ -54,8 +50,8 @@ def palmar_directions(model: Any, palm: str, fingers: Mapping[str, tuple[str, ..
         mean, body = np.mean(tips, axis=0), model.body(palm).id
         if np.linalg.norm(mean) <= 0.1:
             # Jaws go towards each other: the palm faces what lies between them.
-            ends = [_middle(model, data, model.body(chain[-1]).id) for chain in fingers.values()]
-            mean = np.mean(ends, axis=0) - _middle(model, data, body)
+            ends = [link_middle(model, data, model.body(chain[-1]).id) for chain in fingers.values()]
+            mean = np.mean(ends, axis=0) - link_middle(model, data, body)
         elif list(map(len, fingers.values())) == [1]:
             # A single jaw closes on the palm itself.
             mean = -mean
@@ -67,7 +63,16 @@ def palmar_directions(model: Any, palm: str, fingers: Mapping[str, tuple[str, ..
     return towards
 
 
-def _middle(model: Any, data: Any, body: int) -> NDArray[np.float64]:
+def half_open(model: Any) -> Any:
+    """Return the ``mujoco.MjData`` of a hand at rest, with jaws that slide half open: one lies on each side."""
+    data = mujoco.MjData(model)
+    for joint in np.flatnonzero((model.jnt_type == mujoco.mjtJoint.mjJNT_SLIDE) & (model.jnt_limited != 0)):
+        data.qpos[model.jnt_qposadr[joint]] = model.jnt_range[joint].mean()
+    mujoco.mj_kinematics(model, data)
+    return data
+
+
+def link_middle(model: Any, data: Any, body: int) -> NDArray[np.float64]:
     """Return the middle of a body's solids [3] (world, m), its origin where it has none."""
     own = link_points(model, body)
     local = (own.min(axis=0) + own.max(axis=0)) / 2 if len(own) else np.zeros(3)
@@ -76,11 +81,11 @@ def _middle(model: Any, data: Any, body: int) -> NDArray[np.float64]:
 
 def _opposite(model: Any, data: Any, body: int, others: list[int]) -> NDArray[np.float64] | None:
     """Return the direction [3] (world) from a tip to the others: along its slide, else along an axis of its frame."""
-    away = np.mean([_middle(model, data, other) for other in others], axis=0) - _middle(model, data, body)
+    away = np.mean([link_middle(model, data, other) for other in others], axis=0) - link_middle(model, data, body)
     length = float(np.linalg.norm(away))
     if length < 1e-6:
         return None
-    slide = _joint_of(model, body, mujoco.mjtJoint.mjJNT_SLIDE)
+    slide = joint_of(model, body, mujoco.mjtJoint.mjJNT_SLIDE)
     if slide >= 0:
         axis = data.xmat[model.jnt_bodyid[slide]].reshape(3, 3) @ model.jnt_axis[slide]
         along = float(axis @ away)
@@ -91,7 +96,7 @@ def _opposite(model: Any, data: Any, body: int, others: list[int]) -> NDArray[np
     return np.sign(cosine[face]) * axes[face] if abs(cosine[face]) > _SNAP else away / length
 
 
-def _joint_of(model: Any, body: int, kind: Any) -> int:
+def joint_of(model: Any, body: int, kind: Any) -> int:
     """Return the joint that moves a body, of its own or of what it is fixed to, if it is of a kind; −1 otherwise."""
     body = int(model.body_weldid[body])
     joint = int(model.body_jntadr[body])
@@ -104,7 +109,7 @@ def _flexed(
     """Return where a body goes [3] (world) when its joint flexes; None if that is not known."""
     own = link_points(model, body)
     joint = _flexion(model, body)
-    slides = _joint_of(model, body, mujoco.mjtJoint.mjJNT_SLIDE) >= 0
+    slides = joint_of(model, body, mujoco.mjtJoint.mjJNT_SLIDE) >= 0
     if joint < 0 or slides or not len(own):
         return None
     low, high = (float(value) for value in model.jnt_range[joint])

@@ -21,6 +21,10 @@ PATCH_FORCE_SCALE = 1e4
 TAXELS_IN_CONTACT = 2
 """More taxels than this must touch for a link to count as touching (table 4.6)."""
 
+HOLDING: Mapping[str, Any] = {"total": "engine", "friction": 1.0}
+"""Settings of force taxels whose tangential reading is what holds an object (coefficient of rubber on a solid, 1)."""
+_LAW = ("convention", "total", "friction", "twist")
+
 
 @dataclass(frozen=True)
 class ObservationType:
@@ -72,7 +76,9 @@ def sensors_for(
         layout: Link → probes.
         noisy: With the published imperfections of the type (table 4.12), the release threshold included.
         track: Links that are looked at; empty means everything that may touch.
-        **knobs: Further settings of the sensor class; ``twist`` is left out where there is no force law.
+        **knobs: Further settings of the sensor class, e.g. ``convention="thesis"`` or ``points=500``. Force taxels hold
+            what they touch and add up to the engine's contact forces (:data:`HOLDING`), unless a convention, a total, a
+            friction or a ``twist`` is stated, which means the law; other classes ignore ``twist``.
 
     Raises:
         UsageError: there is no such type, or a knob has a wrong value.
@@ -81,6 +87,8 @@ def sensors_for(
     if kind.sensor is None:
         return {}
     settings: dict[str, Any] = {"track": track, **knobs}
+    if kind.sensor == "KinematicTaxel" and all(knobs.get(name) is None for name in _LAW):
+        settings |= HOLDING
     if kind.sensor != "KinematicTaxel":
         # Only a force law has it; tasks and stored students state theirs for any type.
         settings.pop("twist", None)

@@ -12,25 +12,32 @@ from brainbench.core.devices import mujoco_module
 from brainbench.core.errors import UsageError
 from brainbench.core.reading.ranges import check_number
 from brainbench.core.rotations import to_matrices
-from robotics_bridge.hands.hand import Hand, palmar_directions
+from robotics_bridge.hands.facing import half_open, joint_of, link_middle, palmar_directions
+from robotics_bridge.hands.hand import Hand
 
 mujoco = mujoco_module()
 
 OBJECT = "object"
 """Name of the free body and of its geometry."""
 _STIFFNESS, _DAMPING, _ARMATURE = 2.0, 0.2, 0.01
-"""Servo of a hinge without a drive: N·m/rad, N·m·s/rad, kg·m²."""
+"""Servo of a hinge without a drive: N·m/rad, N·m·s/rad, kg·m² (kg for a slide)."""
+_PUSH, _DRAG = 300.0, 10.0
+"""Servo of a slide without a drive: N/m, N·s/m."""
 
 
 def holding(hand: Hand, **settings: float) -> Any:
-    """Return the ``mujoco.MjModel`` of a hand, palm up, with a ball just above the palm; see :func:`holding_spec`."""
-    return _raised(holding_spec(hand, **settings).compile())
+    """Return the ``mujoco.MjModel`` of a hand, palm up, with a ball just above the palm; see :func:`holding_spec`.
+
+    Jaws that slide start with the ball between them, which is made smaller where it does not fit.
+    """
+    spec, jaws = holding_spec(hand, **settings), jaw_ends(hand)
+    return _between(hand, spec, jaws) if jaws else _raised(spec.compile())
 
 
 def holding_spec(hand: Hand, *, radius: float = 0.03, timestep: float = 0.002, reach: float = 0.6) -> Any:
     """Return the ``mujoco.MjSpec`` behind :func:`holding`: the palm's surface below the ball is at z = 0.
 
-    A hand whose file has no drives (a URDF) gets a weak position servo on every hinge. The ball of 100 g has a
+    A hand whose file has no drives (a URDF) gets a weak position servo on every hinge and slide. The ball of 100 g has a
     ``radius`` [m] and lies between the middle of the palm (``reach`` 0) and the roots of the fingers (1).
 
     Raises:
@@ -42,6 +49,8 @@ def holding_spec(hand: Hand, *, radius: float = 0.03, timestep: float = 0.002, r
     surface = surface + reach * step
     spec = hand.mjspec()
     spec.option.timestep = timestep
+    for number, joint in enumerate(spec.joints):
+        joint.name = joint.name or f"joint{number}"
     if not hand.model.nu:
         _add_servos(spec)
     palm = spec.body(hand.palm)
@@ -69,26 +78,74 @@ def _raised(model: Any) -> Any:
     return model
 
 
+def jaw_ends(hand: Hand) -> dict[int, tuple[float, float]]:
+    """Return joint number → its places (m) with jaws open and closed, of the fingers' joints that slide."""
+    model, facing = hand.model, palmar_directions(hand.model, hand.palm, hand.fingers)
+    data, ends = half_open(model), {}
+    for chain in hand.fingers.values():
+        for link in (link for link in chain if link in facing):
+            joint = joint_of(model, model.body(link).id, mujoco.mjtJoint.mjJNT_SLIDE)
+            if joint >= 0 and model.jnt_limited[joint]:
+                axis = data.xmat[model.jnt_bodyid[joint]].reshape(3, 3) @ model.jnt_axis[joint]
+                inward = float(axis @ (data.body(link).xmat.reshape(3, 3) @ facing[link]))
+                low, high = (float(end) for end in model.jnt_range[joint])
+                ends[joint] = (low, high) if inward > 0 else (high, low)
+    return ends
+
+
+def _between(hand: Hand, spec: Any, jaws: dict[int, tuple[float, float]]) -> Any:
+    """Return the model of a gripper that starts with the ball between its jaws, which all but touch it."""
+    model, data = hand.model, half_open(hand.model)
+    palm, body = data.body(hand.palm), spec.body(hand.palm)
+    middle = np.mean([link_middle(model, data, model.body(tip).id) for tip in hand.tips], axis=0)
+    ball = spec.body(OBJECT)
+    ball.pos = body.pos + to_matrices(body.quat) @ palm.xmat.reshape(3, 3).T @ (middle - palm.xpos)
+    starts = {joint: np.array(model.body_pos[model.jnt_bodyid[joint]]) for joint in jaws}
+    made = None
+    for smaller in range(6):
+        ball.geoms[0].size[0] *= 0.7 if smaller else 1.0
+        for share in np.linspace(0.95, 0.0, 39):
+            for joint, (opened, closed) in jaws.items():
+                # A joint's reference is where the file puts its body: moving both starts the jaw elsewhere on its way.
+                jaw, slide = model.jnt_bodyid[joint], spec.joints[joint]
+                slide.ref = opened + share * (closed - opened)
+                way = to_matrices(model.body_quat[jaw]) @ model.jnt_axis[joint]
+                spec.body(model.body(jaw).name).pos = (
+                    starts[joint] + (slide.ref - model.qpos0[model.jnt_qposadr[joint]]) * way
+                )
+            made = spec.compile()
+            start = mujoco.MjData(made)
+            mujoco.mj_forward(made, start)
+            if not any(made.geom(OBJECT).id in contact.geom for contact in start.contact):
+                return made
+    return made
+
+
 def closing(hand: Hand, share: float) -> NDArray[np.float64]:
-    """Return servo targets [joints] (rad) at which every joint is flexed by a share of its range from 0."""
+    """Return servo targets [joints] (rad, m) at which every joint is flexed, or closed, by a share of its range."""
     model = hand.model
     joints = model.actuator_trnid[:, 0] if model.nu else np.arange(model.njnt)
     low, high = model.jnt_range[joints].T
     # Flexion is the longer side of a joint's range.
     target = np.where(np.abs(high) >= np.abs(low), high, low) * share
     # Joints that spread the fingers stay in their middle.
-    return np.where(np.abs(high + low) < 0.5 * np.ptp(model.jnt_range[joints], axis=1), 0.0, target)
+    target = np.where(np.abs(high + low) < 0.5 * np.ptp(model.jnt_range[joints], axis=1), 0.0, target)
+    for joint, (opened, closed) in jaw_ends(hand).items():
+        target[joints == joint] = opened + share * (closed - opened)
+    return target
 
 
 def _add_servos(spec: Any) -> None:
-    """Give every hinge of a hand without drives, as URDF files are, a weak position servo."""
+    """Give every hinge and slide of a hand without drives, as URDF files are, a weak position servo."""
     for joint in spec.joints:
-        if joint.type == mujoco.mjtJoint.mjJNT_HINGE:
+        slides = joint.type == mujoco.mjtJoint.mjJNT_SLIDE
+        if slides or joint.type == mujoco.mjtJoint.mjJNT_HINGE:
+            stiffness, damping = (_PUSH, _DRAG) if slides else (_STIFFNESS, _DAMPING)
             joint.armature = max(joint.armature, _ARMATURE)
             spec.add_actuator(
                 name=joint.name, target=joint.name, trntype=mujoco.mjtTrn.mjTRN_JOINT,
                 gaintype=mujoco.mjtGain.mjGAIN_FIXED, biastype=mujoco.mjtBias.mjBIAS_AFFINE,
-                gainprm=[_STIFFNESS] + [0.0] * 9, biasprm=[0.0, -_STIFFNESS, -_DAMPING] + [0.0] * 7,
+                gainprm=[stiffness] + [0.0] * 9, biasprm=[0.0, -stiffness, -damping] + [0.0] * 7,
             )  # fmt: skip
 
 

@@ -63,7 +63,7 @@ class PolicyContract:
     """Hash of the file of the network; empty in contracts of earlier versions."""
     more: Mapping[str, Any] = field(default_factory=dict)
     """``task``, ``placement``, ``resolution`` and ``sub_steps``, where they stand in the contract, and ``twist``, the
-    torsional friction of force taxels (N·m·s; None is that of their patch)."""
+    torsional friction of force taxels (N·m·s; None: they hold what they touch)."""
 
     @classmethod
     def read(cls, path: Path) -> PolicyContract:

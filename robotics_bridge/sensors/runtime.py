@@ -17,7 +17,7 @@ from robotics_bridge.physics.state import HandState
 from robotics_bridge.sensors.context import LaunchContext, ReadoutSlice, SuiteContext
 from robotics_bridge.sensors.kernels.readout import CLEAN, FUSED, STAGED, ProbeArrays, ReadoutArrays, append_history
 from robotics_bridge.sensors.noise.stages import DelayLine, NoiseArrays, NoiseStage
-from robotics_bridge.sensors.probes.placement import Probes
+from robotics_bridge.sensors.probes.placement import enclosing_sphere
 from robotics_bridge.sensors.sensor import ProbeSensor, Sensor
 
 wp = warp()
@@ -219,16 +219,6 @@ def probe_rows(slices: Iterable[ReadoutSlice], context: LaunchContext, mode: int
             starts = range(part.start, end, most)
             rows += [(start, min(start + most, end), 1, number) for start in starts]
     return np.array(rows, dtype=np.int32).reshape(-1, 4)
-
-
-def enclosing_sphere(probes: Probes) -> tuple[np.ndarray, float]:
-    """Return centre [3] and radius (m) of a sphere around the sensing spheres of active probes."""
-    position, radius = probes.position[probes.active], probes.radius[probes.active]
-    if not len(position):
-        return np.zeros(3), 1e-6
-    # Not the smallest sphere, but near it and never too small.
-    center = 0.5 * (position.min(axis=0) + position.max(axis=0))
-    return center, float((np.linalg.norm(position - center, axis=1) + radius).max())
 
 
 class History:

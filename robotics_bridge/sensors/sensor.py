@@ -122,8 +122,8 @@ class QuerySensor(ProbeSensor):
     """
 
     query: Literal["sdf", "raycast"] = "sdf"
-    """``sdf``: closed forms, and sampled fields for meshes. ``raycast``: the nearest triangle, for thin or exact
-    meshes; primitives become triangles too."""
+    """``sdf``: closed forms, and for meshes sampled fields, or the nearest triangle where walls are thin for the cells.
+    ``raycast``: the nearest triangle for all; primitives become triangles too."""
     pairs: Literal["contact", "all"] = "contact"
     """``contact``: geometries that the engine reports in contact with the link (published); ``all``: every tracked
     geometry within reach, for engines or links without collision."""

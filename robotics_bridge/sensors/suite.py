@@ -17,6 +17,7 @@ from robotics_bridge.physics.scene import TouchScene
 from robotics_bridge.physics.state import DIVERGED, MOST_ENVS, UNFELT, HandState
 from robotics_bridge.sensors.context import ReadoutSlice, SuiteContext, UpdateClock
 from robotics_bridge.sensors.fidelity import SensorFidelity
+from robotics_bridge.sensors.plausibility import warn_of
 from robotics_bridge.sensors.probes.runtime import DistanceRuntime
 from robotics_bridge.sensors.probes.sensors import SurfaceDistanceProbe
 from robotics_bridge.sensors.queries.kernels.pairs import count_update, reset_clock
@@ -99,6 +100,7 @@ class SensorSuite:
                 )
             scene.link_index(sensor.link)
             groups.setdefault((type(sensor), sensor.group()), {})[name] = sensor
+        warn_of(scene, self.sensors)
         required = QueryRequirements()
         for sensor in self.sensors.values():
             required |= sensor.requirements(scene)

@@ -85,7 +85,7 @@ def default() -> Task:
     then. Rotation weighs more, but only slow turns count, and so does coming nearer to the goal in every direction;
     reaching it pays; the goal begins wide. The block's place is where it lies, 2 cm higher, so that lying still costs
     nothing. Without the approach to the goal, teachers threw the block round and lost it. Actions are bounded. Taxels
-    have the torsional friction of their patch.
+    hold what they touch.
     """
     task = bounded(published())
     rewards = {

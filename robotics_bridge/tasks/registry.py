@@ -38,7 +38,7 @@ def register(name: str, config: str = "default") -> Callable[[Maker], Maker]:
 
 
 def bounded(task: Task) -> Task:
-    """Return a published task with bounded actions and physical taxels, as all have on which we train."""
+    """Return a published task with bounded actions and holding taxels, as all have on which we train."""
     return replace(task, action_limit=ACTION_LIMIT, taxel_twist=None)
 
 

@@ -187,7 +187,8 @@ class Task:
     """``grasps``: start from sampled grasps instead of the placement."""
     solver: Solver = Solver()
     taxel_twist: float | None = None
-    """Torsional friction of the force taxels [N·m·s]; None is that of their patch, the published tasks have 2."""
+    """Torsional friction of the force taxels [N·m·s], by the published law, where it is 2; None: taxels that hold what
+    they touch and add up to the engine's contact forces."""
     # --- control ---
     action_ratio: float = 0.5
     """Part of a joint's range by which an action of 1 moves its target away from rest."""

@@ -179,7 +179,7 @@ def draw_temperature(
         panel.set_title(f"{name} ball, 45 °C: +{seen.max() - bottom:.1f} K", fontsize=10)
         panel.set(xlabel="cell across", xticks=[], yticks=[])
     axes[1].set_ylabel("cell along the finger")
-    bar = figure.colorbar(shown, ax=axes[1:], label="temperature (°C), scale not linear", shrink=0.85)
+    bar = figure.colorbar(shown, ax=axes[1:], label="temperature (°C), colour: rise$^{0.35}$", shrink=0.85)
     bar.set_ticks([bottom, *(bottom + share * (top - bottom) for share in (0.02, 0.1, 0.3, 0.6)), top])
     bar.ax.yaxis.set_major_formatter("{x:.1f}")
     save_figure(figure, path, dpi=110)

@@ -47,6 +47,9 @@ class Grip:
             MujocoEngine(self.model, envs) if device == "cpu" else MujocoWarpEngine(self.model, envs, device=device)
         )
         self._closed = closing(self.hand, 0.72)
+        # What slides has the ball between its jaws at once; fingers close by and by.
+        moved = self.model.actuator_trnid[:, 0]
+        self._slow = self.model.jnt_type[moved] != mujoco().mjtJoint.mjJNT_SLIDE
         self._steps = 0
 
     def run(self, steps: int) -> None:
@@ -54,7 +57,7 @@ class Grip:
         for _ in range(steps):
             self._steps += 1
             if self.model.nu:
-                self.engine.set(ctrl=self._closed * min(self._steps / 200, 1.0))
+                self.engine.set(ctrl=self._closed * np.where(self._slow, min(self._steps / 200, 1.0), 1.0))
             self.engine.step()
 
     def sensors(self, name: str, resolution: str, placement: str, *, noisy: bool = False) -> dict[str, Any]:

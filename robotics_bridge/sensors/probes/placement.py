@@ -90,9 +90,8 @@ class Probes:
         """
         if rows < 1 or columns < 1:
             raise UsageError(f"A grid needs at least one row and one column; received {rows} × {columns}.")
-        n = np.asarray(normal, dtype=float)
-        n = n / np.linalg.norm(n)
-        u = np.asarray(along, dtype=float)
+        n = _direction("normal", normal)
+        u = _direction("along", along)
         u = u - n * (u @ n)
         if np.linalg.norm(u) < 1e-9:
             raise UsageError(f"'along' {tuple(np.asarray(along))} is parallel to the normal; choose another direction.")
@@ -131,13 +130,16 @@ class Probes:
         Raises:
             UsageError: no triangle is left.
         """
+        if isinstance(count, bool) or not isinstance(count, int | np.integer) or count < 1:
+            raise UsageError(f"count is a whole number of probes, at least 1; received {count!r}.")
         corners = mesh.vertices[mesh.faces]
         area, normal = face_areas(corners)
         keep = area > 0
         if facing is not None:
-            direction = np.asarray(facing, dtype=float) / np.linalg.norm(facing)
-            keep &= normal @ direction >= np.cos(np.radians(within))
+            keep &= normal @ _direction("facing", facing) >= np.cos(np.radians(within))
         if box is not None:
+            if np.shape(box) != (2, 3):
+                raise UsageError(f"box holds two corners (x, y, z) in metres; received the shape {np.shape(box)}.")
             low, high = np.asarray(box, dtype=float)
             middle = corners.mean(axis=1)
             keep &= ((middle >= low) & (middle <= high)).all(axis=1)
@@ -149,6 +151,25 @@ class Probes:
     def with_radius(self, radius: ArrayLike) -> Probes:
         """Return the same places with other radii (m); fillers stay fillers."""
         return Probes(self.position, self.normal, np.where(self.active, radius, 0.0), self.shape, self.pitch)
+
+
+def _direction(name: str, value: ArrayLike) -> NDArray[np.float64]:
+    """Return a direction [3] of unit length; UsageError for anything else."""
+    vector = np.asarray(value, dtype=float)
+    length = float(np.linalg.norm(vector))
+    if vector.shape != (3,) or not 0 < length < math.inf:
+        raise UsageError(f"{name!r} is a direction (x, y, z) of some length; received {value!r}.")
+    return vector / length
+
+
+def enclosing_sphere(probes: Probes) -> tuple[NDArray[np.float64], float]:
+    """Return centre [3] and radius (m) of a sphere around the sensing spheres of active probes."""
+    position, radius = probes.position[probes.active], probes.radius[probes.active]
+    if not len(position):
+        return np.zeros(3), 1e-6
+    # Not the smallest sphere, but near it and never too small.
+    center = 0.5 * (position.min(axis=0) + position.max(axis=0))
+    return center, float((np.linalg.norm(position - center, axis=1) + radius).max())
 
 
 def face_areas(corners: NDArray) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

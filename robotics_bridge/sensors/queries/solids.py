@@ -13,7 +13,8 @@ from brainbench.core.errors import UsageError
 from brainbench.geometry import Mesh
 from robotics_bridge.physics.scene import KINDS, Geometry, TouchScene
 from robotics_bridge.sensors.queries.distance_fields import Field, mesh_tree, sample_field
-from robotics_bridge.sensors.queries.kernels.distance import OTHER, SolidArrays
+from robotics_bridge.sensors.queries.kernels.distance import OTHER, WALL, SolidArrays
+from robotics_bridge.sensors.queries.walls import as_solid, wall_thickness
 from robotics_bridge.sensors.sensor import QueryRequirements
 
 _UNBOUNDED = 1.0e6
@@ -96,6 +97,7 @@ class Solids:
         frame = np.zeros((*shape, 7), np.float32)
         frame[..., 6] = 1
         field, mesh = np.full(shape, -1, np.int32), np.zeros(shape, np.uint64)
+        self._sound: dict[str, Mesh] = {}
         self._fields: dict[str, Field] = {}
         self._trees: dict[str, Any] = {}
         for index in range(len(scene.geometries)):
@@ -150,19 +152,33 @@ class Solids:
 
     def _describe(self, geometry: Geometry, field: bool, tree: bool, resolution: int) -> tuple:
         """Return kind, size, bounding sphere, frame, number of the distance field and id of the tree."""
-        number, mesh = -1, 0
-        if field and geometry.mesh is not None:
-            key = geometry.mesh.content_hash
-            if key not in self._fields:
-                self._fields[key] = sample_field(geometry.mesh, resolution, self.device)
-            number = list(self._fields).index(key)
+        number, mesh, kind, size = -1, 0, KINDS.index(geometry.kind), [*geometry.size, 0.0, 0.0, 0.0][:3]
+        if geometry.mesh is not None and (field or tree):
+            surface = self._solid(geometry.mesh)
+            cell = float(np.ptp(surface.bounds, axis=0).max()) / resolution
+            if thickness := wall_thickness(surface, cell, self.device):
+                # Triangles nearer to one another than a hundredth of the wall are one place, in mean edges for Warp.
+                edges = np.diff(surface.vertices[surface.faces[:, [0, 1, 2, 0]]], axis=1)
+                size = [0.01 * thickness / float(np.linalg.norm(edges, axis=2).mean()), thickness, 0.0]
+                kind, field, tree = WALL, False, True
+            if field:
+                key = surface.content_hash
+                if key not in self._fields:
+                    self._fields[key] = sample_field(surface, resolution, self.device)
+                number = list(self._fields).index(key)
         if tree and geometry.kind not in ("plane", "other"):
-            surface = tessellate(geometry)
+            surface = tessellate(geometry) if geometry.mesh is None else self._solid(geometry.mesh)
             key = surface.content_hash
             if key not in self._trees:
                 self._trees[key] = mesh_tree(surface, self.device)
             mesh = self._trees[key].id
-        size, (w, x, y, z) = [*geometry.size, 0.0, 0.0, 0.0][:3], geometry.quaternion
+        w, x, y, z = geometry.quaternion
         # Ours are (w, x, y, z), Warp's (x, y, z, w).
         frame = (*geometry.position, x, y, z, w)
-        return KINDS.index(geometry.kind), size, bounding_sphere(geometry), frame, number, mesh
+        return kind, size, bounding_sphere(geometry), frame, number, mesh
+
+    def _solid(self, mesh: Mesh) -> Mesh:
+        """Return a mesh mended, once for all that share it."""
+        if mesh.content_hash not in self._sound:
+            self._sound[mesh.content_hash] = as_solid(mesh)
+        return self._sound[mesh.content_hash]

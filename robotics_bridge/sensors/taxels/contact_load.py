@@ -12,59 +12,61 @@ from brainbench.core.devices import warp
 from robotics_bridge.physics.state import HandState
 from robotics_bridge.sensors.context import SuiteContext
 from robotics_bridge.sensors.probes.placement import Probes
-from robotics_bridge.sensors.runtime import ProbeRuntime
 from robotics_bridge.sensors.taxels.kernels import contact_load as kernels
+from robotics_bridge.sensors.taxels.runtime import KinematicRuntime
 from robotics_bridge.sensors.taxels.sensors import KinematicTaxel
 
 wp = warp()
 
 
-class ContactLoadRuntime(ProbeRuntime):
+class ContactLoadRuntime(KinematicRuntime):
     """Serves kinematic taxels with ``total="engine"``: contact forces, spread by the depths of the law."""
 
+    summed = True
+
     def __init__(self, sensors: Mapping[str, KinematicTaxel], context: SuiteContext) -> None:
-        # Readings of one taxel depend on others, so no kernel can finish one of them, noise included, by itself.
-        super().__init__(sensors, 6, context, fusable=False)
-        first, configs = next(iter(sensors.values())), list(sensors.values())
-        self._kernel = kernels.press_kernel(self.kinds, first.query == "raycast", self.mode)
+        super().__init__(sensors, context)
+        configs = list(sensors.values())
         links = [context.scene.link_index(sensor.link) for sensor in configs]
         order = [links[:number].count(link) for number, link in enumerate(links)]
         self._most = max(order) + 1
         places = np.full((len(context.scene.links), self._most), -1)
         places[links, order] = np.arange(len(links))
         spans = [(p.start, p.start + p.count, slot) for p, slot in zip(self.slices.values(), self.slots, strict=True)]
-        plan = kernels.SpreadPlan()
+        plan = self.plan
         plan.sensors, plan.link = context.array(places, int), context.array(links, int)
         plan.order, plan.spans = context.array(order, int), context.array(spans, wp.vec3i)
         plan.reach = context.array(np.concatenate([contact_reach(sensor.probes) for sensor in configs]), float)
-        plan.exponent = context.array([sensor.exponent for sensor in configs], float)
-        plan.slip = 1.0 if first.convention == "physical" else -1.0
-        self._plan = plan
-        shape = (context.num_envs, self.count)
-        self._press = press = kernels.PressArrays()
+        plan.slip = 1.0 if configs[0].convention == "physical" else -1.0
+        shape, press = (context.num_envs, self.count), self.press
         press.weight, press.total = context.zeros(shape), context.zeros(shape)
         press.noisy = context.zeros(shape if self.noisy else (1, 1))
         press.normal, press.body = context.zeros(shape, wp.vec3f), context.zeros(shape, int)
-        self.scratch = [press.weight, press.total, press.normal, press.body, *([press.noisy] if self.noisy else [])]
-        self._nodes = self._make_nodes(0)
+        press.sigma = context.zeros(shape if configs[0].sticky else (0, 0), wp.vec3f)
+        self.scratch = [press.weight, press.total, press.normal, press.body, press.sigma]
+        self.scratch += [press.noisy] if self.noisy else []
+        # Stages after this one write into the measured readings, which are then never left alone.
+        self._written = context.array(np.full((context.num_envs, self.rows.shape[0]), self.noisy), wp.uint8)
+        self.nodes = self._make_nodes(0)
 
     def update(self, state: HandState, dt: float) -> None:
         """Read the state."""
         self.begin(state, dt)
         c, room = self.context, state.contact_env.shape[0]
-        if self._nodes.felt.shape[0] != 2 * room:
-            self._nodes = self._make_nodes(room)
-        plan, nodes, press, link_of = self._plan, self._nodes, self._press, c.solids.struct.link
+        if self.nodes.felt.shape[0] != 2 * room:
+            self.nodes = self._make_nodes(room)
+        plan, nodes, press = self.plan, self.nodes, self.press
+        # A processor can look how many contacts there are; on a GPU that would wait for it.
+        found = room if c.device.is_cuda else min(room, int(state.contact_count.numpy()[0]))
         nodes.head.fill_(-1)
-        known = [plan, c.pairs.plan, link_of, self.probes, state.arrays]
-        c.launch(kernels.list_contacts, 2 * room, *known, state.contact_friction, nodes)
+        known = [plan, c.pairs.plan, c.solids.struct.link, self.probes, state.arrays]
+        c.launch(kernels.list_contacts, 2 * found, *known, state.contact_friction, nodes)
         if c.device.is_cuda:
             c.launch(kernels.sort_contacts, nodes.head.shape, nodes)
-        self.launch(
-            self._kernel, self.probes, c.solids.struct, c.pairs.struct, state.arrays, self.io, plan, nodes, press
-        )
-        c.launch(kernels.share_contacts, (2 * room, self._most), *known, press, nodes)
-        self.launch(kernels.spread_contacts, plan, self.probes, press, nodes, int(self.noisy), self.io)
+        self.ask()
+        c.launch(kernels.share_contacts, (2 * found, self._most), *known, press, nodes)
+        inputs = [plan, self.probes, self.rows, press, nodes, int(self.noisy), self._written, self.io]
+        c.launch(kernels.spread_contacts, (c.num_envs, self.rows.shape[0]), *inputs)
         self.finish(dt)
 
     def _make_nodes(self, room: int) -> Any:

@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
 from brainbench.core.devices import warp
 from robotics_bridge.physics.state import HandState
 from robotics_bridge.sensors.context import SuiteContext, fill
-from robotics_bridge.sensors.probes.kernels.probe import KinematicParams, kinematic_kernel
 from robotics_bridge.sensors.queries.surface_points import halve, sample_cloud
 from robotics_bridge.sensors.runtime import ProbeRuntime, probe_rows
+from robotics_bridge.sensors.taxels.kernels.contact_load import ContactNodes, PressArrays, SpreadPlan
+from robotics_bridge.sensors.taxels.kernels.kinematic import KinematicParams, kinematic_kernel
 from robotics_bridge.sensors.taxels.kernels.proximity import CELL, ProximityArrays, ProximityParams, proximity_kernel
+from robotics_bridge.sensors.taxels.kernels.stick import StickArrays
 from robotics_bridge.sensors.taxels.sensors import KinematicTaxel, ProximityTaxel
 
 wp = warp()
@@ -22,23 +24,40 @@ wp = warp()
 class KinematicRuntime(ProbeRuntime):
     """Serves kinematic taxels of one group, each by its own law."""
 
+    summed: ClassVar[bool] = False
+    """True if the kernel leaves readings to others and writes what sums with contact forces need."""
+
     def __init__(self, sensors: Mapping[str, KinematicTaxel], context: SuiteContext) -> None:
         first = next(iter(sensors.values()))
-        super().__init__(sensors, 6, context)
+        # Readings of a taxel whose forces are summed depend on others, so that none can be finished, noise included.
+        super().__init__(sensors, 6, context, fusable=not self.summed)
         self._kernel = kinematic_kernel(
-            self.kinds, first.query == "raycast", first.convention == "physical", self.mode, *self.stores,
-            context.device.is_cuda,
+            self.kinds, first.query == "raycast", first.convention == "physical", first.sticky, self.summed, self.mode,
+            *self.stores, context.device.is_cuda,
         )  # fmt: skip
-        self._laws = context.array([fill(KinematicParams, sensor) for sensor in sensors.values()], KinematicParams)
-        self._rows = context.array(probe_rows(self.slices.values(), context, self.mode), wp.vec4i)
+        laws = [fill(KinematicParams, sensor, friction=sensor.friction or 0.0) for sensor in sensors.values()]
+        self._laws = context.array(laws, KinematicParams)
+        self.rows: Any = context.array(probe_rows(self.slices.values(), context, self.mode), wp.vec4i)
+        """Warp array [R]: rows of taxels that one thread takes in turn."""
+        self.plan, self.nodes, self.press = SpreadPlan(), ContactNodes(), PressArrays()
+        """Warp structures of the sums, empty here."""
+        sticks, shape = StickArrays(), (context.num_envs, self.count) if first.sticky else (1, 1)
+        sticks.anchor, sticks.body = context.zeros(shape, wp.vec3f), context.zeros(shape, int)
+        sticks.stamp = context.array(np.full(shape, -1), int)
+        self._sticks = sticks
+        self.lasting = [sticks.anchor, sticks.body, sticks.stamp] if first.sticky else []
 
     def update(self, state: HandState, dt: float) -> None:
         """Read the state."""
         self.begin(state, dt)
-        c = self.context
-        inputs = [self.probes, self._rows, c.solids.struct, c.pairs.struct, self.io, self._laws]
-        c.launch(self._kernel, (c.num_envs, self._rows.shape[0]), *inputs)
+        self.ask()
         self.finish(dt)
+
+    def ask(self) -> None:
+        """Run the kernel."""
+        c = self.context
+        inputs = [self.probes, self.rows, c.solids.struct, c.pairs.struct, self.io, self._laws, self._sticks]
+        c.launch(self._kernel, (c.num_envs, self.rows.shape[0]), *inputs, self.plan, self.nodes, self.press)
 
 
 class ProximityRuntime(ProbeRuntime):

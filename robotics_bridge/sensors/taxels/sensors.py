@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar, Literal, Self
@@ -55,17 +56,24 @@ class KinematicTaxel(QuerySensor):
     twist: float | None = None
     """k_ω, N·m·s. None is that of a disc of the largest sensing radius R that slips with k_t, k_t R²/2 (1.6e-5 at
     4 mm), and with ``thesis`` :data:`PUBLISHED_TWIST`."""
+    friction: float | None = None
+    """μ: with it friction holds at rest. Each taxel holds the point that it touched first by a spring, up to μ times
+    its normal force, and lets it slide beyond (Coulomb); k_t and k_ω play no part. None: k_t v_t, nothing at rest."""
+    grip: float = 2 / 3
+    """ρ: tangential over normal stiffness of that spring; 2 (1 − ν) / (2 − ν) of a thick skin (Mindlin 1949), here with
+    ν = ½."""
     convention: Convention = "physical"
     total: Literal["law", "engine"] = "law"
     """``law``: each taxel by itself, as published. ``engine``: the taxels of a sensor add up to the forces, friction at
     rest included, of the engine's contacts between its link and what it tracks. Each contact is spread over the taxels
-    that feel that body from that side, by d^α; stiffness, damping, shear and twist play no part. A taxel without such
+    that feel that body from that side, by d^α and, with ``friction``, by their springs; stiffness, damping, shear and
+    twist play no part. A taxel without such
     a contact reads 0, and a contact with no taxel near it is felt by none (``SensorSuite.unfelt``)."""
 
     channels: ClassVar[int] = 6
     units: ClassVar[str] = "N, N m"
     knobs: ClassVar[frozenset[str]] = GRID_KNOBS
-    shared: ClassVar[tuple[str, ...]] = ("query", "convention", "total")
+    shared: ClassVar[tuple[str, ...]] = ("query", "convention", "total", "sticky")
     runtime: ClassVar[str] = "robotics_bridge.sensors.taxels.runtime:KinematicRuntime"
 
     @classmethod
@@ -86,6 +94,18 @@ class KinematicTaxel(QuerySensor):
             object.__setattr__(self, "twist", PUBLISHED_TWIST if published else self.shear * radius**2 / 2)
         if not self.exponent > 0:
             raise UsageError(f"The exponent of a contact law is positive; received {self.exponent!r}.")
+        if not (self.grip > 0 and (self.friction is None or 0 <= self.friction < math.inf)):
+            raise UsageError(
+                f"friction is a coefficient of 0 or more and grip a positive ratio; received {self.friction!r} and "
+                f"{self.grip!r}."
+            )
+        if self.sticky and self.convention == "thesis":
+            raise UsageError("The published law has no friction at rest; leave out friction or convention='thesis'.")
+
+    @property
+    def sticky(self) -> bool:
+        """True if its taxels hold what they touch."""
+        return self.friction is not None
 
 
 @dataclass(frozen=True, kw_only=True)

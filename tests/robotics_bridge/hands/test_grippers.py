@@ -152,3 +152,20 @@ def test_links_without_collision_feel_all_pairs_but_not_contacts(tmp_path: Path)
     inside = 0.006 - 0.005 + float(left.radius.max())
     assert float(suite.read("all").max()) == pytest.approx(inside, abs=1e-6)
     assert math.isfinite(float(suite.read("all").sum()))
+
+
+@pytest.mark.parametrize("span", ["0 .04", "-.04 0", "-.02 .02"])
+def test_the_scene_of_the_demo_holds_a_ball_between_sliding_jaws(tmp_path: Path, span: str) -> None:
+    from brainbench.cli.tactile.scenes import Grip
+
+    (tmp_path / "gripper.xml").write_text(PANDA_LIKE.format(asset="", tip="", range=span))
+    grip = Grip(str(tmp_path / "gripper.xml"))
+    grip.run(400)
+    state, names = grip.engine.state, [g.link for g in grip.engine.scene.geometries]
+    felt = {}
+    for pair, force in zip(state.contact_geom.numpy(), state.contact_force.numpy(), strict=True):
+        for geometry in pair:
+            felt[names[geometry]] = felt.get(names[geometry], 0.0) + float(force)
+    assert min(felt["left"], felt["right"]) > 1.0
+    ball = state.pose_torch[0, grip.engine.scene.link_index("object"), :3]
+    assert abs(float(ball[1])) < 2e-3

@@ -102,9 +102,8 @@ def test_published_sensors_carry_the_published_parameters():
     force = sensors_for("force", layout, convention="thesis")["right_thumb_DP"]
     assert (force.stiffness, force.damping, force.exponent, force.shear, force.twist) == (500, 1, 1.2, 2, 2)
     assert force.convention == "thesis"
-    # k_t R²/2 of a disc of 4 mm.
-    assert sensors_for("force", layout)["right_thumb_DP"].twist == pytest.approx(1.6e-5)
-    assert sensors_for("force", layout, twist=2.0)["right_thumb_DP"].twist == 2
+    holding, law = (sensors_for("force", layout, **knobs)["right_thumb_DP"] for knobs in ({}, {"twist": 2.0}))
+    assert (holding.total, holding.friction, law.total, law.friction, law.twist) == ("engine", 1.0, "law", None, 2)
     assert sensors_for("bool", layout, twist=2.0).keys() == layout.keys()
     assert set(sensors_for("proximity", layout)["right_thumb_DP"].probes.radius) == {0.01}
     assert sensors_for("none", layout) == {}

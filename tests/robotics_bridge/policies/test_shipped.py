@@ -46,7 +46,7 @@ def test_every_student_feels_what_its_task_gives_and_exports(name: str, tmp_path
 
 
 def test_students_keep_the_force_law_that_they_learned_with(tmp_path: Path) -> None:
-    """Those of versions that did not state it had the published 2 N·m·s; the default of new ones is physical."""
+    """Those of versions that did not state it had the published 2 N·m·s; new ones feel what holds the object."""
     from brainbench.cli.policy.options import touch_of
     from brainbench.core.files import write_json
     from robotics_bridge.policies.contract import PolicyContract
@@ -62,9 +62,9 @@ def test_students_keep_the_force_law_that_they_learned_with(tmp_path: Path) -> N
         contract = {"inputs": [["proprio", [29]]], "format": "onnx", "deployment": facts["deployment"]}
         assert PolicyContract.of(Values("c", contract)).more["twist"] == 2.0
     env = tasks.make("in_palm_rotate", num_envs=1, threads=1, **touch)
-    assert {sensor.twist for sensor in env.touch.suite.sensors.values()} == {2.0}
+    assert {(sensor.twist, sensor.total) for sensor in env.touch.suite.sensors.values()} == {(2.0, "law")}
     env = tasks.make("in_palm_rotate", num_envs=1, threads=1, observe="force_torque")
-    assert {sensor.twist for sensor in env.touch.suite.sensors.values()} == {2.0 * 0.004**2 / 2}
+    assert {(sensor.total, sensor.friction) for sensor in env.touch.suite.sensors.values()} == {("engine", 1.0)}
     env = tasks.make("in_palm_rotate", config="published", num_envs=1, threads=1, observe="force_torque")
     assert {sensor.twist for sensor in env.touch.suite.sensors.values()} == {2.0}
 

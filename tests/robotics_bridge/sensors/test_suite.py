@@ -24,7 +24,7 @@ from robotics_bridge.sensors import (
 )
 from robotics_bridge.sensors.elastomer.kernels import dilation
 from robotics_bridge.sensors.probes.kernels import probe as _probe_kernels
-from robotics_bridge.sensors.taxels.kernels import proximity
+from robotics_bridge.sensors.taxels.kernels import kinematic, proximity
 from tests.factories.touch_scenes import PAD, move_all, pad_scene, poses_at, random_pose, state_of
 
 BALL = Geometry(name="ball", link="object", kind="sphere", size=(0.01,))
@@ -61,7 +61,7 @@ def test_readings_have_the_shapes_of_their_layouts_and_share_memory() -> None:
 
 
 def test_sensors_of_one_class_share_a_launch_and_nothing_else_is_compiled() -> None:
-    for factory in (_probe_kernels.kinematic_kernel, proximity.proximity_kernel, dilation.marker_kernel):
+    for factory in (kinematic.kinematic_kernel, proximity.proximity_kernel, dilation.marker_kernel):
         factory.cache_clear()
     _probe_kernels.depth_kernel.cache_clear()
     mesh = Mesh([[0, 0, 0], [0.01, 0, 0], [0, 0.01, 0], [0, 0, 0.01]], [[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]])
@@ -74,7 +74,7 @@ def test_sensors_of_one_class_share_a_launch_and_nothing_else_is_compiled() -> N
     assert suite.solids.field_count == 0
     assert suite.solids.tree_count == 0
     assert _probe_kernels.depth_kernel.cache_info().currsize == 1
-    assert _probe_kernels.kinematic_kernel.cache_info().currsize == 0
+    assert kinematic.kinematic_kernel.cache_info().currsize == 0
     assert proximity.proximity_kernel.cache_info().currsize == 0
     assert dilation.marker_kernel.cache_info().currsize == 0
 
@@ -242,7 +242,12 @@ def test_a_noisy_taxel_keeps_at_most_130_bytes(name: str) -> None:
     noise = Noise.preset(f"published-{preset}")
     noise = replace(noise, **{knob: 0.0 for knob in ("hysteresis", "radius") if knob not in kind.knobs})
     noise = noise if "gain" in kind.knobs else replace(noise, gain=(1.0, 1.0), dead_probability=0.0)
-    sensor = kind(link="hand", probes=Probes.grid(10, 10, size=(0.02, 0.02), radius=0.003), noise=noise, **options)
+    sensor = kind(
+        link="hand",
+        probes=Probes.grid(10, 10, size=(0.02, 0.02), center=(0, 0, 5e-3), radius=0.003),
+        noise=noise,
+        **options,
+    )
     held = _suite({"taxel": sensor}).state_bytes
     assert (held["sensors"] + held["shared"]) / 100 <= 130
     assert held["rings"] == 0

@@ -11,8 +11,8 @@ from brainbench.core.devices import warp
 
 wp = warp()
 
-PLANE, SPHERE, CAPSULE, ELLIPSOID, CYLINDER, BOX, MESH, OTHER = range(8)
-"""Numbers of the kinds, in the order of :data:`robotics_bridge.physics.scene.KINDS`."""
+PLANE, SPHERE, CAPSULE, ELLIPSOID, CYLINDER, BOX, MESH, OTHER, WALL = range(9)
+"""Numbers of the kinds, in the order of :data:`robotics_bridge.physics.scene.KINDS`; then meshes with thin walls."""
 
 FAR = 1.0e6
 """Distance that stands for "out of reach" (m)."""
@@ -25,7 +25,7 @@ class SolidArrays:
     kind: wp.array2d(dtype=wp.int32)
     """[R, G] number of the kind."""
     size: wp.array2d(dtype=wp.vec3f)
-    """[R, G] (m), as in ``Geometry.size``."""
+    """[R, G] (m), as in ``Geometry.size``; of a thin wall the rounding of its edges and its thickness."""
     frame: wp.array2d(dtype=wp.transformf)
     """[R, G] pose in the frame of the link."""
     bound: wp.array2d(dtype=wp.vec4f)
@@ -214,18 +214,68 @@ def field(values: wp.array(dtype=wp.float32), shape: SolidShape, x: wp.vec3f) ->
 
 
 @wp.func
-def triangles(mesh: wp.uint64, x: wp.vec3f, reach: float) -> wp.vec4f:
-    """Find the nearest triangle of a closed mesh."""
-    found = wp.mesh_query_point_sign_normal(mesh, x, reach)
+def triangles(mesh: wp.uint64, x: wp.vec3f, reach: float, rounding: float) -> wp.vec4f:
+    """Find the nearest triangle of a closed mesh; ``rounding`` (in mean edges) joins triangles that are as near."""
+    found = wp.mesh_query_point_sign_normal(mesh, x, reach, rounding)
     if not found.result:
         return wp.vec4f(0.0, 0.0, 1.0, wp.static(FAR))
     away = x - wp.mesh_eval_position(mesh, found.face, found.u, found.v)
     far = wp.length(away)
     normal = wp.mesh_eval_face_normal(mesh, found.face)
+    sign = found.sign
     # Nearer than rounding can tell a direction, the face knows it.
     if far > 1.2e-4 * wp.length(x):
-        normal = away * (found.sign / far)
-    return wp.vec4f(normal[0], normal[1], normal[2], found.sign * far)
+        across = wp.dot(away, normal)
+        # Straight above a face, that face alone decides: normals of both sides cancel in the middle of a wall.
+        if wp.abs(across) > 0.99 * far:
+            sign = wp.sign(across)
+        normal = away * (sign / far)
+    return wp.vec4f(normal[0], normal[1], normal[2], sign * far)
+
+
+@wp.func
+def wall(shape: SolidShape, x: wp.vec3f, facing: wp.vec3f, reach: float) -> wp.vec4f:
+    """Ask a thin wall from the side of the sensor: past its middle, and through it, the side touched stays the same."""
+    found = triangles(shape.mesh, x, reach, shape.size[0])
+    radius = wp.length(facing)
+    slope = wp.dot(wp.vec3f(found[0], found[1], found[2]), facing)
+    if found[3] >= radius or slope <= 0.2 * radius:
+        return found
+    # The nearest side faces away from the sensor, so the point lies past the middle. Going back along the sensor's
+    # normal, the first face that is left, and not entered, is the one that the sensor came through.
+    back = -facing / radius
+    gone = float(0.0)
+    most = (wp.max(found[3], 0.0) + 2.0 * shape.size[1]) * radius / slope
+    for _ in range(2):
+        hit = wp.mesh_query_ray(shape.mesh, x + gone * back, back, most - gone)
+        if hit.result:
+            gone += hit.t
+            normal = wp.mesh_eval_face_normal(shape.mesh, hit.face)
+            across = wp.dot(normal, back)
+            if across > 0.0:
+                return wp.vec4f(normal[0], normal[1], normal[2], -gone * across)
+            gone += 0.01 * shape.size[1]
+    return found
+
+
+@wp.kernel(module="unique", enable_backward=False)
+def measure_walls(
+    mesh: wp.uint64,
+    point: wp.array(dtype=wp.vec3f),
+    normal: wp.array(dtype=wp.vec3f),
+    skip: float,
+    thickness: wp.array(dtype=wp.float32),
+):
+    """Write how thick a mesh is below points of its surface (m), 0 where no opposite wall lies. Thread: a point.
+
+    An opposite wall faces the other way within 25°.
+    """
+    n = wp.tid()
+    inward = -normal[n]
+    hit = wp.mesh_query_ray(mesh, point[n] + skip * inward, inward, wp.static(FAR))
+    thickness[n] = 0.0
+    if hit.result and wp.dot(wp.mesh_eval_face_normal(mesh, hit.face), inward) > 0.9:
+        thickness[n] = hit.t + skip
 
 
 @wp.kernel(module="unique")
@@ -244,16 +294,17 @@ def shape_functions(kinds: frozenset[int], raycast: bool) -> SimpleNamespace:
     """Return the functions that find distances for the kinds a scene has.
 
     ``shape_of(solids, row, geometry)`` reads what is known of a geometry, once for many points;
-    ``distance_to(solids.values, shape, x, reach) -> (normal, distance)`` asks it;
-    ``distance(solids, row, geometry, x, reach)`` does both.
+    ``distance_to(solids.values, shape, x, facing, reach) -> (normal, distance)`` asks it, where ``facing`` is the
+    outward normal of the sensor times its radius, or 0 for a distance that knows no side;
+    ``distance(solids, row, geometry, x, facing, reach)`` does both.
 
     Args:
         kinds: only their code is compiled.
         raycast: ask triangles instead of closed forms and fields; planes stay planes.
     """
     curved = not raycast
-    has_triangles = raycast and bool(kinds - {PLANE})
-    sized = curved and bool(kinds - {PLANE, MESH})
+    has_triangles = raycast and bool(kinds - {PLANE, WALL})
+    sized = WALL in kinds or (curved and bool(kinds - {PLANE, MESH}))
 
     @wp.func
     def shape_of(solids: SolidArrays, row: int, geometry: int) -> SolidShape:
@@ -261,7 +312,7 @@ def shape_functions(kinds: frozenset[int], raycast: bool) -> SimpleNamespace:
         shape.kind = solids.kind[row, geometry]
         if wp.static(sized):
             shape.size = solids.size[row, geometry]
-        if wp.static(has_triangles):
+        if wp.static(has_triangles or WALL in kinds):
             shape.mesh = solids.mesh[row, geometry]
         if wp.static(curved and MESH in kinds):
             number = wp.max(solids.field[row, geometry], 0)
@@ -272,12 +323,17 @@ def shape_functions(kinds: frozenset[int], raycast: bool) -> SimpleNamespace:
         return shape
 
     @wp.func
-    def distance_to(values: wp.array(dtype=wp.float32), shape: SolidShape, x: wp.vec3f, reach: float) -> wp.vec4f:
+    def distance_to(
+        values: wp.array(dtype=wp.float32), shape: SolidShape, x: wp.vec3f, facing: wp.vec3f, reach: float
+    ) -> wp.vec4f:
         if wp.static(PLANE in kinds):
             if shape.kind == wp.static(PLANE):
                 return plane(shape.size, x)
+        if wp.static(WALL in kinds):
+            if shape.kind == wp.static(WALL):
+                return wall(shape, x, facing, reach)
         if wp.static(has_triangles):
-            return triangles(shape.mesh, x, reach)
+            return triangles(shape.mesh, x, reach, 1.0e-3)
         if wp.static(curved and BOX in kinds):
             if shape.kind == wp.static(BOX):
                 return box(shape.size, x)
@@ -299,7 +355,7 @@ def shape_functions(kinds: frozenset[int], raycast: bool) -> SimpleNamespace:
         return wp.vec4f(0.0, 0.0, 1.0, wp.static(FAR))
 
     @wp.func
-    def distance(solids: SolidArrays, row: int, geometry: int, x: wp.vec3f, reach: float) -> wp.vec4f:
-        return distance_to(solids.values, shape_of(solids, row, geometry), x, reach)
+    def distance(solids: SolidArrays, row: int, geometry: int, x: wp.vec3f, facing: wp.vec3f, reach: float) -> wp.vec4f:
+        return distance_to(solids.values, shape_of(solids, row, geometry), x, facing, reach)
 
     return SimpleNamespace(shape_of=shape_of, distance_to=distance_to, distance=distance)

@@ -4,24 +4,18 @@ A contact c pushes with F_c at p_c. A taxel n with weight d_n^α belongs to the 
 depth, on the side that faces it, by inverse distance: r_nc = g_nc / Σ_c g_nc (Shepard 1968). With y_nc = d_n^α r_nc and
 the outward normal m_n of what is touched::
 
-    f_n = Σ_c y_nc (s_c m_n + (F_c − s_c Σ_n y_nc m_n) / Σ_n y_nc),    s_c = normal force / Σ_n y_nc (m_n · n_c)
+    f_n = Σ_c y_nc (s_c q_n + (F_c − s_c Σ_n y_nc q_n) / Σ_n y_nc),    s_c = normal force / Σ_n y_nc (m_n · n_c)
 
-so that Σ_n f_n = Σ_c F_c whatever the weights are. A node is one side of a contact: 2c of the first geometry, 2c + 1 of
+so that Σ_n f_n = Σ_c F_c whatever the weights are. q_n is m_n, and m_n + σ_n for taxels that hold what they touch
+(``stick``). A node is one side of a contact: 2c of the first geometry, 2c + 1 of
 the second. Vectors are in the frame of the sensor link (m, N).
 Letters: B environment, L link, S sensor, C contact, N taxel, K sensor of one link.
 """
 
-from functools import cache
-from typing import Any
-
 from brainbench.core.devices import warp
 from robotics_bridge.physics.kernels.state import StateArrays
-from robotics_bridge.sensors.kernels.readout import CLEAN, ProbeArrays, ReadoutArrays, idle, lost
-from robotics_bridge.sensors.kernels.series import power
-from robotics_bridge.sensors.noise.kernels.noise import episode_draw, radius_noise
-from robotics_bridge.sensors.probes.kernels.probe import deepest_function
-from robotics_bridge.sensors.queries.kernels.distance import SolidArrays
-from robotics_bridge.sensors.queries.kernels.pairs import PairArrays, SlotArrays
+from robotics_bridge.sensors.kernels.readout import ProbeArrays, ReadoutArrays
+from robotics_bridge.sensors.queries.kernels.pairs import SlotArrays
 
 wp = warp()
 
@@ -40,8 +34,6 @@ class SpreadPlan:
     """[S] first taxel, end and slot of the pair lists."""
     reach: wp.array(dtype=wp.float32)
     """[N] a contact this near is felt (m); negative for fillers."""
-    exponent: wp.array(dtype=wp.float32)
-    """[S] α."""
     slip: wp.float32
     """Sign of friction: 1 as it acts on the sensor, −1 as published."""
 
@@ -79,7 +71,9 @@ class PressArrays:
     noisy: wp.array2d(dtype=wp.float32)
     """[B, N] the same with radius noise and gain."""
     normal: wp.array2d(dtype=wp.vec3f)
-    """[B, N] outward normal of what is touched."""
+    """[B, N] outward normal m of what is touched."""
+    sigma: wp.array2d(dtype=wp.vec3f)
+    """[B, N] σ: friction at rest over normal force, where taxels hold what they touch."""
     body: wp.array2d(dtype=wp.int32)
     """[B, N] its link."""
     total: wp.array2d(dtype=wp.float32)
@@ -184,67 +178,12 @@ def nearness(
     return 1.0 / (away * away)
 
 
-@cache
-def press_kernel(kinds: frozenset[int], raycast: bool, mode: int) -> Any:
-    """Return the kernel ``press``: how deep taxels lie in what, and which contacts explain it. Dim [B, N].
-
-    Args:
-        kinds: of the geometries tracked.
-        raycast: ask triangles.
-        mode: of the readout.
-    """
-    deepest = deepest_function(kinds, raycast)
-
-    @wp.kernel(module="unique")
-    def press(
-        probes: ProbeArrays,
-        solids: SolidArrays,
-        pairs: PairArrays,
-        state: StateArrays,
-        io: ReadoutArrays,
-        plan: SpreadPlan,
-        nodes: ContactNodes,
-        out: PressArrays,
-    ):
-        env, n = wp.tid()
-        out.weight[env, n] = 0.0
-        out.total[env, n] = 0.0
-        if wp.static(mode != CLEAN):
-            out.noisy[env, n] = 0.0
-        radius = probes.radius[n]
-        if radius <= 0.0 or (state.status[env] & 1) != 0:
-            return
-        part = probes.part[n]
-        best, normal, place = deepest(probes, solids, pairs, env, n, 0.0)
-        if place < 0:
-            return
-        weight = float(0.0)
-        if best < radius:
-            weight = power(radius - best, plan.exponent[part])
-        noisy = float(0.0)
-        if wp.static(mode != CLEAN):
-            number = env + io.env_offset
-            probe = probes.probe[n]
-            knobs = io.knobs[part]
-            felt = wp.max(radius + radius_noise(knobs, number, probe, io.age[env], io.episode[env]), 0.0) - best
-            fixed = episode_draw(knobs, number, probe, io.episode[env])
-            if felt * fixed[0] > 0.0:
-                noisy = power(felt * fixed[0], plan.exponent[part])
-            out.noisy[env, n] = noisy
-        if weight + noisy <= 0.0:
-            return
-        body = solids.link[pairs.geometry[env, place]]
-        total = float(0.0)
-        node = nodes.head[env, plan.link[part]]
-        while node >= 0:
-            total += nearness(plan, nodes, node, plan.order[part], n, probes.position[n], normal, body)
-            node = nodes.follower[node]
-        out.weight[env, n] = weight
-        out.normal[env, n] = normal
-        out.body[env, n] = body
-        out.total[env, n] = total
-
-    return press
+@wp.func
+def pull(press: PressArrays, env: int, n: int, m: wp.vec3f) -> wp.vec3f:
+    """Return q of a taxel: the way it is pushed and held, per unit of normal force."""
+    if press.sigma.shape[0] == press.normal.shape[0]:
+        return m + press.sigma[env, n]
+    return m
 
 
 @wp.kernel
@@ -281,7 +220,7 @@ def share_contacts(
             y = press.weight[env, n] * near / press.total[env, n]
             whole += y
             straight += y * wp.dot(m, push)
-            field += y * m
+            field += y * pull(press, env, n, m)
     load = nodes.load[node]
     share = wp.vec4f(0.0)
     if whole > 0.0:
@@ -308,33 +247,51 @@ def write_wrench(out: wp.array3d(dtype=wp.float32), env: int, n: int, x: wp.vec3
 def spread_contacts(
     plan: SpreadPlan,
     probes: ProbeArrays,
+    rows: wp.array(dtype=wp.vec4i),
     press: PressArrays,
     nodes: ContactNodes,
     noisy: int,
+    written: wp.array2d(dtype=wp.uint8),
     io: ReadoutArrays,
 ):
-    """Write the readings. Thread: environment and taxel [B, N]."""
-    env, n = wp.tid()
-    if probes.radius[n] <= 0.0:
-        idle(io, 6, env, n)
+    """Write the readings. Thread: environment and row of taxels [B, R].
+
+    ``written`` [B, R] is 1 where a row may hold anything but zeros; most touch nothing, now and before.
+    """
+    env, at_row = wp.tid()
+    span = rows[at_row]
+    part = span[3]
+    k = plan.order[part]
+    head = nodes.head[env, plan.link[part]]
+    diverged = (io.status[env] & 1) != 0
+    full = diverged or head >= 0
+    if not full and written[env, at_row] == wp.uint8(0):
         return
-    if (io.status[env] & 1) != 0:
-        lost(io, 6, env, n)
-        return
-    f = wp.vec3f(0.0)
-    total = press.total[env, n]
-    part = probes.part[n]
-    x = probes.position[n]
-    if total > 0.0:
-        m = press.normal[env, n]
-        k = plan.order[part]
-        node = nodes.head[env, plan.link[part]]
-        while node >= 0:
-            near = nearness(plan, nodes, node, k, n, x, m, press.body[env, n])
-            if near > 0.0:
-                share = nodes.share[node, k]
-                f += near / total * (share[0] * m + wp.vec3f(share[1], share[2], share[3]))
-            node = nodes.follower[node]
-    write_wrench(io.truth, env, n, x, press.weight[env, n] * f)
-    if noisy == 1:
-        write_wrench(io.measured, env, n, x, press.noisy[env, n] * f)
+    written[env, at_row] = wp.uint8(wp.where(full or noisy == 1, 1, 0))
+    n = span[0]
+    while n < span[1]:
+        f = wp.vec3f(0.0)
+        x = probes.position[n]
+        weight = float(0.0)
+        measured = float(0.0)
+        if diverged and probes.radius[n] > 0.0:
+            weight = wp.nan
+            measured = wp.nan
+        elif head >= 0 and not diverged and press.total[env, n] > 0.0:
+            total = press.total[env, n]
+            m = press.normal[env, n]
+            way = pull(press, env, n, m)
+            node = head
+            while node >= 0:
+                near = nearness(plan, nodes, node, k, n, x, m, press.body[env, n])
+                if near > 0.0:
+                    share = nodes.share[node, k]
+                    f += near / total * (share[0] * way + wp.vec3f(share[1], share[2], share[3]))
+                node = nodes.follower[node]
+            weight = press.weight[env, n]
+            if noisy == 1:
+                measured = press.noisy[env, n]
+        write_wrench(io.truth, env, n, x, weight * f)
+        if noisy == 1:
+            write_wrench(io.measured, env, n, x, measured * f)
+        n += span[2]

@@ -58,6 +58,10 @@ def test_fillers_keep_their_places_and_need_no_normal() -> None:
         (lambda: Probes([[0, 0, np.nan]], [[0, 0, 1]], 0.1), "finite"),
         (lambda: Probes.grid(2, 2, size=(1, 1), along=(0, 0, 1)), "parallel to the normal"),
         (lambda: Probes.grid(0, 2, size=(1, 1)), "0 × 2"),
+        (lambda: Probes.grid(2, 2, size=(1, 1), normal=(0, 0, 0)), "'normal' is a direction"),
+        (lambda: Probes.on_mesh(_ball(), -1), "whole number of probes"),
+        (lambda: Probes.on_mesh(_ball(), 5, facing=(0, 0, 0)), "'facing' is a direction"),
+        (lambda: Probes.on_mesh(_ball(), 5, box=(1, 2, 3)), "two corners"),  # type: ignore[arg-type]
         (lambda: Probes.on_mesh(_ball(), 5, box=[[1, 1, 1], [2, 2, 2]]), "No triangle"),
     ],
 )

@@ -1,0 +1,73 @@
+"""Pressure on an elastomer against Hertz (1882), and its sum against the engine's contact forces."""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+import pytest
+
+from brainbench.core.errors import UsageError
+from robotics_bridge.physics import Geometry, MujocoEngine
+from robotics_bridge.sensors import ContactProbe, ElastomerTaxel, Probes, SensorSuite
+from robotics_bridge.sensors.elastomer.pressure import contact_pressure
+from tests.factories.touch_scenes import pad_scene, poses_at, state_of
+
+RADIUS, PITCH, MODULUS, POISSON = 0.01, 1e-4, 2e5, 0.45
+GRID = Probes.grid(41, 45, size=(40 * PITCH, 44 * PITCH), center=(0, 0, 0.005), radius=1e-3)
+
+
+@pytest.mark.parametrize("depth", [3e-5, 1e-4, 2e-4])
+def test_pressure_under_a_ball_is_that_of_hertz(depth: float) -> None:
+    scene = pad_scene(Geometry(name="ball", link="ball", kind="sphere", size=(RADIUS,)))
+    suite = SensorSuite(scene, {"gel": ElastomerTaxel(link="hand", probes=GRID, points=0)}, num_envs=2)
+    poses = poses_at(3, {2: (0.3 * PITCH, -0.2 * PITCH, 0.005 + RADIUS - depth)}, 2)
+    poses[1, 2, 2] += 0.01
+    suite.update(state_of(scene, poses))
+    pressure = contact_pressure(suite, "gel", modulus=MODULUS, poisson=POISSON).numpy()
+    stiff = MODULUS / (1 - POISSON**2)
+    load = 4 / 3 * stiff * np.sqrt(RADIUS) * depth**1.5
+    assert not pressure[1].any()
+    assert pressure[0].sum() * PITCH**2 == pytest.approx(load, rel=0.03)
+    # p0 = 2 E* a / (π R), with a² = R δ, falling off as √(1 − r²/a²).
+    a = np.sqrt(RADIUS * depth)
+    far = np.linalg.norm(np.asarray(GRID.position)[:, :2] - [0.3 * PITCH, -0.2 * PITCH], axis=1).reshape(41, 45)
+    hertz = 2 * stiff * a / (np.pi * RADIUS) * np.sqrt(np.maximum(1 - (far / a) ** 2, 0))
+    inner = far < 0.8 * a
+    np.testing.assert_allclose(pressure[0][inner], hertz[inner], rtol=0.03)
+    assert pressure[0][far > a + PITCH].max() < 0.02 * hertz.max()
+
+
+def test_pressures_add_up_to_the_contact_forces_of_the_engine() -> None:
+    model = mujoco.MjModel.from_xml_string(
+        """<mujoco><option timestep="0.002"/><worldbody>
+        <body name="hand"><geom name="pad" type="box" size="0.02 0.02 0.005"/></body>
+        <body name="a" pos="-.008 .001 .0148"><freejoint/><geom type="sphere" size=".01" mass=".2" condim="6"/></body>
+        <body name="b" pos=".009 0 .0098"><freejoint/><geom type="box" size=".004 .004 .005" mass=".1"/></body>
+        </worldbody></mujoco>"""
+    )
+    engine = MujocoEngine(model, 1)
+    engine.step(300)
+    grid = Probes.grid(40, 40, size=(0.036, 0.036), center=(0, 0, 0.005), radius=1e-3)
+    suite = SensorSuite(engine.scene, {"gel": ElastomerTaxel(link="hand", probes=grid, points=0)}, num_envs=1)
+    suite.update(engine.state)
+    pressure = contact_pressure(suite, "gel", modulus=1e5, state=engine.state)
+    cell = (0.036 / 39) ** 2
+    assert float(pressure.sum()) * cell == pytest.approx(0.3 * 9.81, rel=0.01)
+    assert (pressure >= 0).all()
+
+
+def test_what_has_no_pressure_is_refused() -> None:
+    scene = pad_scene(Geometry(name="ball", link="ball", kind="sphere", size=(RADIUS,)))
+    line = Probes(np.tile([0.0, 0, 0.005], (3, 1)), np.tile([0.0, 0, 1], (3, 1)), np.full(3, 1e-3))
+    sensors = {
+        "free": ElastomerTaxel(link="hand", probes=line),
+        "bit": ContactProbe(link="hand", probes=GRID),
+        "gel": ElastomerTaxel(link="hand", probes=GRID),
+    }
+    suite = SensorSuite(scene, sensors, num_envs=1)
+    with pytest.raises(UsageError, match="grid"):
+        contact_pressure(suite, "free", modulus=1e5)
+    with pytest.raises(UsageError, match="elastomer"):
+        contact_pressure(suite, "bit", modulus=1e5)
+    with pytest.raises(UsageError, match="modulus"):
+        contact_pressure(suite, "gel", modulus=0)
