@@ -17,8 +17,7 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
-from benchmarks.report import table, write_section
-from brainbench.core.files import write_json
+from benchmarks.report import measure_once, table, write_section
 from tests.factories.kill_jobs import JOBS, TIMES
 
 TITLE = "Kills"
@@ -49,15 +48,8 @@ def main() -> None:
     parser.add_argument("--known", action="store_true", help="Measure nothing that does not stand in --out.")
     parser.add_argument("--write", action="store_true", help="Write the section of RESULTS.md.")
     chosen = parser.parse_args()
-    found = []
-    for job in JOBS:
-        path = chosen.out / f"{job.name.replace(',', '').replace(' ', '-')}.json"
-        if chosen.known and not path.is_file():
-            continue
-        if not path.is_file():
-            write_json(path, kill(job.name, chosen.out / "cache"))
-        found.append(json.loads(path.read_text()))
-        print(found[-1], flush=True)
+    names, cache = [job.name for job in JOBS], chosen.out / "cache"
+    found = list(measure_once(chosen.out, names, lambda name: kill(name, cache), known=chosen.known).values())
     rows = [row(item) for item in found]
     total = [str(sum(item[name] for item in found)) for name in ("kills", "resumed", "repeated")]
     faults = [str(sum(len(item[name]) for item in found)) for name in ("different", "left", "failed")]

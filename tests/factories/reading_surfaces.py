@@ -13,7 +13,7 @@ from typing import Any
 import h5py
 import numpy as np
 import torch
-from safetensors.torch import save_file
+from safetensors.torch import load_file, save_file
 
 from brainbench.cli.leaderboard.scoring import parse_seeds, read_batch
 from brainbench.cli.options import numbers as option_numbers
@@ -30,12 +30,15 @@ from brainbench.models.features import read_features, write_features
 from brainbench.models.graph.tnn_import import read_graph
 from brainbench.models.training.checkpoints import load_weights, read_config
 from brainbench.models.training.config import TrainingConfig
+from brainbench.models.training.run_folder import STATE
+from brainbench.models.training.trainer import train
 from brainbench.scoring.recovery.design import parse_trials
 from brainbench.stimuli import WhiskerArray, load_stimuli
 from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.motion.recorded import load_initial_angles, load_trajectory
 from brainbench.stimuli.objects.collections import resolve_objects
 from brainbench.stimuli.objects.primitives import sphere
+from brainbench.stimuli.objects.shapenet import read_categories, read_ids
 from brainbench.stimuli.scenes.scene_files import load_scene
 from brainbench.stimuli.stimulus_set import hash_stimulus_set, write_stimulus_set
 from brainbench.stimuli.sweeps.generation import generate
@@ -54,6 +57,7 @@ from tests.factories.records import make_record
 from tests.factories.robot_surfaces import ROBOTS
 from tests.factories.scene_files import POLE
 from tests.factories.sweep_batches import small_plan
+from tests.factories.training_sweeps import tiny
 
 SCENE = POLE.replace("interval_ms = 1", "interval_ms = 1\naverage = 2\nlowpass_hz = 40")
 BATCH = """
@@ -81,6 +85,9 @@ checkpoint_seconds = 60.0
 optimizer = "sgd"
 augmentation = "none"
 """
+
+
+CLASSES = "name,label\n02691156,plane\n03001627/bb,seat\n"
 
 
 def _node(name: str, source: str | None) -> dict[str, Any]:
@@ -198,6 +205,18 @@ def _load(path: Path) -> Any:
     model = _model()
     load_weights(model, path, what="test")
     return dict(model.state_dict())
+
+
+def _training(folder: Path) -> Path:
+    """Train for one step and return the file of the run's state."""
+    options: dict[str, Any] = {"epochs": 2, "batch_size": 12, "precision": "float32", "optimizer": "adamw"}
+    config = TrainingConfig.published("zhuang-small", "supervised", **options)
+    train(config, tiny(validation=0, test=0), out=folder, device="cpu", stop_after=0.0)
+    return folder / STATE
+
+
+def _go_on(path: Path) -> Any:
+    return load_file(_training(path.parent))
 
 
 @functools.cache
@@ -319,9 +338,15 @@ SURFACES = (
         lambda path: TrainingConfig.published("zhuang-small", **read_mapping(path)),
         _bad_config,
     ),
+    Surface("training state", _training, _go_on, not_finite),
     Surface("batch file", written("batch.toml", BATCH), read_batch, _bad_batch),
     Surface("match, JSON", written_json("match.json", {"a": "b", "c": None}), read_match, not_finite),
     Surface("match, CSV", written("match.csv", "a,b\nc,\n"), read_match, not_finite),
+    Surface(
+        "ShapeNet names", written("ids.txt", "02691156/1a04e3\n03001627/bb # a chair\n"), read_ids, lambda found: False
+    ),
+    Surface("ShapeNet classes, CSV", written("classes.csv", CLASSES), read_categories, lambda found: False),
+    Surface("ShapeNet classes, JSON", written_json("classes.json", {"02691156": "a"}), read_categories, not_finite),
     Surface("manifest", _sweeps("manifest.json"), _read_sweeps, not_finite),
     Surface("shard", _sweeps("train-00000.h5"), _read_sweeps, not_finite),
     Surface(

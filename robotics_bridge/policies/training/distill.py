@@ -152,7 +152,7 @@ class _Run:
         self.kept: list[tuple[int, Rollout]] = []
         self.iteration, self.loss = 0, math.nan
         self._claim()
-        if (out / STATE).is_file():
+        if (out / STATE).exists():
             self._restore()
         self.log = RunLog(out, step=self.iteration)
 
