@@ -65,8 +65,7 @@ NOTE = (
     "anew. The result is compared with an unbroken run's, file by file and to the byte, but for "
     f"{', '.join(f'`{name}`' for name in TIMES)} in JSON files, pages (`.html`) that state the time, and TensorBoard's "
     "files. *Two at once*: two processes on one folder (and cache) finish, or one is refused in a sentence, and the "
-    "result is whole. Board builds, scores, exports and conversions of sweeps were measured at commit 7fcbea9 with the "
-    "merges after it, the others at commit 0226cce."
+    "result is whole. Every second kill of policy training falls after its first checkpoint, which comes late."
 )
 
 

@@ -13,7 +13,7 @@ from typing import Any
 import h5py
 import numpy as np
 import torch
-from safetensors.torch import load_file, save_file
+from safetensors.torch import save_file
 
 from brainbench.cli.leaderboard.scoring import parse_seeds, read_batch
 from brainbench.cli.options import numbers as option_numbers
@@ -21,7 +21,7 @@ from brainbench.core.errors import DataError
 from brainbench.core.files import read_mapping
 from brainbench.core.labels import read_match
 from brainbench.core.records import ResultRecord, record_identity
-from brainbench.datasets import open_recordings, write_recordings
+from brainbench.datasets import export, open_recordings, write_recordings
 from brainbench.datasets.trials.selection import Selection
 from brainbench.datasets.trials.windows import Window
 from brainbench.datasets.whisking.dataset import WhiskingDataset
@@ -30,8 +30,9 @@ from brainbench.models.features import read_features, write_features
 from brainbench.models.graph.tnn_import import read_graph
 from brainbench.models.training.checkpoints import load_weights, read_config
 from brainbench.models.training.config import TrainingConfig
+from brainbench.models.training.processes import Processes
 from brainbench.models.training.run_folder import STATE
-from brainbench.models.training.trainer import train
+from brainbench.models.training.trainer import _Run
 from brainbench.scoring.recovery.design import parse_trials
 from brainbench.stimuli import WhiskerArray, load_stimuli
 from brainbench.stimuli.engines.fidelity import Fidelity
@@ -120,6 +121,11 @@ def _counts(folder: Path) -> Path:
     )
 
 
+def _copy_recordings(path: Path) -> Path:
+    (written,) = export([path], path.with_name("copy.h5"))
+    return written
+
+
 def _stimulus_set(folder: Path) -> Path:
     dataset = make_stimuli(whiskers=5)
     return write_stimulus_set(dataset.assign_attrs(content_hash=hash_stimulus_set(dataset)), folder / "set.h5")
@@ -135,6 +141,10 @@ def _arrays(folder: Path) -> Path:
 def _activations(folder: Path) -> Path:
     layers = {"one": np.arange(8.0).reshape(4, 2), "two": np.ones((4, 3, 2), np.float32)}
     return write_features(folder / "features.h5", list("abcd"), layers)
+
+
+def _infinite(layers: Any) -> bool:
+    return any(np.isinf(layer).any() for layer in layers.values())
 
 
 def _mesh(suffix: str) -> Callable[[Path], Path]:
@@ -207,16 +217,34 @@ def _load(path: Path) -> Any:
     return dict(model.state_dict())
 
 
+def _training_run(folder: Path) -> _Run:
+    options: dict[str, Any] = {"epochs": 1, "batch_size": 12, "precision": "float32", "optimizer": "adamw"}
+    where = Processes(0, 1, torch.device("cpu"))
+    with torch.random.fork_rng():
+        run = _Run(
+            TrainingConfig.published("zhuang-small", "supervised", **options), tiny(), folder, where, None, folder
+        )
+    run.log.close()
+    return run
+
+
 def _training(folder: Path) -> Path:
-    """Train for one step and return the file of the run's state."""
-    options: dict[str, Any] = {"epochs": 2, "batch_size": 12, "precision": "float32", "optimizer": "adamw"}
-    config = TrainingConfig.published("zhuang-small", "supervised", **options)
-    train(config, tiny(validation=0, test=0), out=folder, device="cpu", stop_after=0.0)
+    run = _training_run(folder)
+    for weight in run.learner.parameters():
+        weight.grad = torch.zeros_like(weight)
+    run.optimizer.step()
+    run._save()
     return folder / STATE
 
 
 def _go_on(path: Path) -> Any:
-    return load_file(_training(path.parent))
+    run = _training_run(path.parent)
+    run.optimizer.step()
+    return run
+
+
+def _bad_training(run: _Run) -> bool:
+    return not_finite([run.learner.state_dict(), run.optimizer.state_dict()]) or min(run.at.step, run.at.epoch) < 0
 
 
 @functools.cache
@@ -304,10 +332,16 @@ SURFACES = (
     Surface("recordings, NWB", _nwb, lambda path: open_recordings(path, conditions="trials:texture"), bad_counts),
     Surface("recordings, HDF5", _spikes, lambda path: open_recordings(path, conditions="trials:stimulus"), bad_counts),
     Surface("recordings, counts", _counts, open_recordings, bad_counts),
+    Surface("recordings, copied", _spikes, _copy_recordings, lambda written: not written.is_file()),
     Surface("stimulus set", _stimulus_set, lambda path: load_stimuli(path).input, not_finite),
     Surface("stimulus arrays", _arrays, lambda path: load_stimuli(path).input, not_finite),
     # NaN in activations is a missing value, and the score of such a layer has a status.
-    Surface("activations", _activations, read_features, lambda found: False),
+    Surface(
+        "activations",
+        _activations,
+        read_features,
+        lambda found: any(np.isinf(x).any() for x in found.activations.values()),
+    ),
     Surface(
         "scene",
         written("scene.toml", SCENE),
@@ -338,7 +372,7 @@ SURFACES = (
         lambda path: TrainingConfig.published("zhuang-small", **read_mapping(path)),
         _bad_config,
     ),
-    Surface("training state", _training, _go_on, not_finite),
+    Surface("training state", _training, _go_on, _bad_training),
     Surface("batch file", written("batch.toml", BATCH), read_batch, _bad_batch),
     Surface("match, JSON", written_json("match.json", {"a": "b", "c": None}), read_match, not_finite),
     Surface("match, CSV", written("match.csv", "a,b\nc,\n"), read_match, not_finite),

@@ -182,7 +182,9 @@ def _checked(names: Iterable[str], where: str) -> tuple[str, ...]:
     for name in checked:
         synset, slash, model = name.partition("/")
         if not (slash and _is_name(synset) and model) or "/" in model or model in (".", ".."):
-            raise UsageError(f"A ShapeNet model is named SYNSET/MODEL, such as 02691156/1a04e3; {where} has {name!r}.")
+            raise UsageError(
+                f"A ShapeNet model is named SYNSET/MODEL, such as 02691156/1a04e3; {where} has {shown(name)}."
+            )
     twice = [name for name, count in Counter(checked).items() if count > 1]
     if twice:
         raise UsageError(f"ShapeNet models occur twice in {where}: {listing(twice, limit=4)}.")
