@@ -14,6 +14,7 @@ from brainbench.core.errors import BrainbenchError, DataError
 from brainbench.core.reading.regular import check_file
 from brainbench.core.reading.tensors import check_finite
 from brainbench.models.export import onnx_session, require_onnx
+from robotics_bridge.policies.contract import MOST_NUMBERS
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -82,6 +83,8 @@ class _OnnxRunner:
                 "policy was lost on the way."
             )
         self.names, self.size = tuple(shapes), int(inputs["h_in"][1])
+        if not 0 < self.size <= MOST_NUMBERS:
+            raise DataError(f"{str(path)!r} has a memory of {self.size:,} numbers; 1 to {MOST_NUMBERS:,} are allowed.")
         self.state = np.zeros((1, self.size), np.float32)
 
     def __call__(self, obs: Mapping[str, NDArray[np.float32]], forget: bool = False) -> NDArray[np.float32]:

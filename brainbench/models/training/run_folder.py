@@ -19,7 +19,7 @@ import torch
 from torch import nn
 
 from brainbench.core.errors import DataError, UsageError, install_command, shown
-from brainbench.core.files import atomic_path, read_json, write_json, write_text
+from brainbench.core.files import atomic_path, read_mapping, write_json, write_text
 from brainbench.core.reading.regular import check_file, readable, reason
 from brainbench.core.reading.tensors import check_finite
 
@@ -40,7 +40,7 @@ def claim(folder: Path, identity: Mapping[str, Any], *, write: bool) -> None:
     """
     path = folder / RUN
     if path.is_file():
-        other = read_json(path).get("run", {})
+        other = read_mapping(path).get("run", {})
         differing = [name for name, value in identity.items() if other.get(name) != value]
         if differing:
             told = ", ".join(f"{name} {other.get(name)!r} (now {identity[name]!r})" for name in differing[:4])
@@ -54,7 +54,7 @@ def claim(folder: Path, identity: Mapping[str, Any], *, write: bool) -> None:
 
 def mark(folder: Path, **values: Any) -> None:
     """Add to what the folder says of its run."""
-    write_json(folder / RUN, {**read_json(folder / RUN), **values})
+    write_json(folder / RUN, {**read_mapping(folder / RUN), **values})
 
 
 def save_state(path: Path, learner: nn.Module, optimizer: torch.optim.Optimizer, plain: Mapping[str, Any]) -> None:

@@ -22,7 +22,7 @@ import torch
 from torch import nn
 
 from brainbench.core.errors import DataError, UsageError
-from brainbench.core.files import read_json, write_json
+from brainbench.core.files import read_mapping, write_json
 from brainbench.core.progress import Progress
 from brainbench.core.reading.regular import readable
 from brainbench.core.writing.locks import lock_folder
@@ -194,7 +194,7 @@ class _Run:
         """Return what is told of the network that the run started from, which may have been drawn elsewhere."""
         if not self.where.first:
             return now
-        kept = read_json(self.out / RUN).get("twin")
+        kept = read_mapping(self.out / RUN).get("twin")
         if kept is None:
             if (self.out / STATE).is_file():  # of an earlier version, which kept no hash
                 del now["state"]
@@ -315,7 +315,7 @@ class _Run:
     def _finish(self) -> TrainingResult:
         result = None
         if self.where.first:
-            told = read_json(self.out / RUN)
+            told = read_mapping(self.out / RUN)
             self.controls = _evaluations(told.get("controls") or {})
             done = told.get("evaluation")
             if done is not None:
@@ -358,7 +358,7 @@ class _Run:
             return {}
         probe: dict[str, Any] = {"epochs": self.config.probe_epochs, "seed": self.config.seed}
         key = {**probe, "classes": list(self.data.classes), "data": result.data, "twin": self.twin}
-        if self.controls_file.is_file() and (kept := read_json(self.controls_file)).get("of") == key:
+        if self.controls_file.is_file() and (kept := read_mapping(self.controls_file)).get("of") == key:
             return _evaluations(kept["controls"])
         self.progress(self._steps, self._steps, "probing raw input, random features and the untrained twin")
         device = self.where.device

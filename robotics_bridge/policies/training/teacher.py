@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 
 from brainbench.core.errors import BrainbenchError, DataError, DataFileNotFoundError, UsageError, missing_dependency
-from brainbench.core.files import file_hash, provenance, read_json, write_json
+from brainbench.core.files import file_hash, provenance, read_mapping, write_json
 from brainbench.core.reading.regular import readable
 from brainbench.core.reading.tensors import check_finite
 from brainbench.core.writing.locks import lock_folder
@@ -302,9 +302,10 @@ def _resume(trainer: Trainer, run: Path, facts: dict[str, Any]) -> None:
     if not config.is_file():
         write_json(config, facts | {"provenance": provenance()})
         return
-    known = read_json(config)
-    # Settings that came later than the run had their defaults in it.
-    known["settings"] = asdict(TeacherSettings(**_plain(known["settings"])))
+    known = read_mapping(config)
+    with readable(config, "configuration of a run"):
+        # Settings that came later than the run had their defaults in it.
+        known["settings"] = asdict(TeacherSettings(**_plain(known["settings"])))
     for name in ("task", "hand", "num_envs", "seed", "settings"):
         if json.loads(json.dumps(facts[name])) != json.loads(json.dumps(known.get(name))):
             raise UsageError(

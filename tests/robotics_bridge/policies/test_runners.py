@@ -94,6 +94,19 @@ def test_constants_of_branches_in_other_files_are_not_opened(exported, tmp_path)
         read_policy(tmp_path / "policy.onnx", SHAPES)
 
 
+def test_a_memory_without_bounds_is_refused(tmp_path) -> None:
+    def value(name: str, *shape: int) -> onnx.ValueInfoProto:
+        return onnx.helper.make_tensor_value_info(name, onnx.TensorProto.FLOAT, [1, *shape])
+
+    inputs = [*(value(name, *shape) for name, shape in SHAPES.items()), value("h_in", 1 << 40)]
+    nodes = [onnx.helper.make_node("Identity", [a], [b]) for a, b in (("h_in", "h_out"), ("proprio", "actions"))]
+    graph = onnx.helper.make_graph(nodes, "policy", inputs, [value("actions", 36), value("h_out", 1 << 40)])
+    path = tmp_path / "policy.onnx"
+    onnx.save(onnx.helper.make_model(graph, ir_version=10, opset_imports=[onnx.helper.make_opsetid("", 18)]), path)
+    with pytest.raises(DataError, match="memory of 1,099"):
+        read_policy(path, SHAPES)
+
+
 def test_what_is_no_file_is_not_waited_for(tmp_path) -> None:
     os.mkfifo(tmp_path / "policy.onnx")
     (tmp_path / "policy.pt").symlink_to("/dev/zero")
