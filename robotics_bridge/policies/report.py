@@ -36,42 +36,20 @@ _STOPPED = "stopped after"
 FEWEST_SEEDS = 3
 """Training seeds below which an interval says little about a new student."""
 
-
 _Share = Annotated[float, msgspec.Meta(ge=0, le=1)]
 _Count = Annotated[int, msgspec.Meta(ge=0)]
 _Number = Annotated[float, msgspec.Meta(ge=-1e12, le=1e12)] | None
-_Numbers = list[_Number | bool] | None
-
-
-class _Evaluation(msgspec.Struct):
-    """What is used of an item of :data:`EVALUATION`."""
-
-    seed: _Count
-    success: Annotated[list[_Share | bool], msgspec.Meta(min_length=1)]
-    iterations: _Count | None = None
-    metric: _Numbers = None
-    goals: _Numbers = None
-    turn_rate: _Numbers = None
-    seconds: _Numbers = None
-    returns: _Numbers = None
-    dropped: _Numbers = None
-
-
-class _Agent(msgspec.Struct):
-    """What is used of an item of :data:`AGENTS`."""
-
-    agent: str
-    task: str
-    success_rate: _Share
-    success_interval: tuple[_Share, _Share]
-    goals: _Number = None
-    goals_half_width: _Number = None
-    turn_rate: _Number = None
-    turn_rate_half_width: _Number = None
-    seconds: _Number = None
-    seconds_half_width: _Number = None
-    returns: _Number = None
-    returns_half_width: _Number = None
+_Success = Annotated[list[_Share | bool], msgspec.Meta(min_length=1)]
+_Evaluation = msgspec.defstruct(
+    "_Evaluation",
+    [("seed", _Count), ("success", _Success), ("iterations", _Count | None, None)]
+    + [(name, list[_Number | bool] | None, None) for name in GRADED],
+)
+_Agent = msgspec.defstruct(
+    "_Agent",
+    [("agent", str), ("task", str), ("success_rate", _Share), ("success_interval", tuple[_Share, _Share])]
+    + [(name + end, _Number, None) for name in GRADED for end in ("", "_half_width")],
+)
 
 
 @dataclass(frozen=True)
