@@ -1,8 +1,7 @@
 """Keep measured results, one JSON file a section, and write RESULTS.md from all of them.
 
 ``python -m benchmarks.report`` writes the page anew. A section says its subject, the command that made it, the date,
-the
-machine, and a body in Markdown.
+the machine, and a body in Markdown.
 """
 
 from __future__ import annotations
@@ -11,8 +10,10 @@ import datetime
 import os
 import platform
 import re
+from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 from brainbench.core.errors import UsageError, unknown_name
 from brainbench.core.files import read_json, write_json, write_text
@@ -54,7 +55,35 @@ class Section:
     @property
     def path(self) -> Path:
         """File of the section, named by its title."""
-        return FOLDER / (re.sub(r"[^a-z0-9]+", "-", self.title.lower()).strip("-")[:60].strip("-") + ".json")
+        return FOLDER / file_name(self.title)
+
+
+def file_name(title: str) -> str:
+    """Return the name of the JSON file of a title."""
+    return re.sub(r"[^a-z0-9]+", "-", title.lower()).strip("-")[:60].strip("-") + ".json"
+
+
+def measure_once(
+    folder: Path, names: Iterable[str], measure: Callable[[str], dict[str, Any]], *, known: bool = False
+) -> dict[str, dict[str, Any]]:
+    """Return the measurement of each name, kept as a JSON file; one that stands in the folder is not made again.
+
+    Args:
+        folder: where the files stand.
+        names: what to measure, in order.
+        measure: makes one measurement.
+        known: leave out what does not stand there instead of measuring it.
+    """
+    found: dict[str, dict[str, Any]] = {}
+    for name in names:
+        path = folder / file_name(name)
+        if not path.is_file():
+            if known:
+                continue
+            write_json(path, measure(name))
+        found[name] = read_json(path)
+        print(name, found[name], flush=True)
+    return found
 
 
 def write_section(title: str, command: str, body: str, *, subject: str, where: str = "") -> None:

@@ -17,8 +17,7 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
-from benchmarks.report import table, write_section
-from brainbench.core.files import write_json
+from benchmarks.report import measure_once, table, write_section
 from tests.factories.kill_jobs import JOBS, TIMES
 
 TITLE = "Kills"
@@ -49,15 +48,8 @@ def main() -> None:
     parser.add_argument("--known", action="store_true", help="Measure nothing that does not stand in --out.")
     parser.add_argument("--write", action="store_true", help="Write the section of RESULTS.md.")
     chosen = parser.parse_args()
-    found = []
-    for job in JOBS:
-        path = chosen.out / f"{job.name.replace(',', '').replace(' ', '-')}.json"
-        if chosen.known and not path.is_file():
-            continue
-        if not path.is_file():
-            write_json(path, kill(job.name, chosen.out / "cache"))
-        found.append(json.loads(path.read_text()))
-        print(found[-1], flush=True)
+    names, cache = [job.name for job in JOBS], chosen.out / "cache"
+    found = list(measure_once(chosen.out, names, lambda name: kill(name, cache), known=chosen.known).values())
     rows = [row(item) for item in found]
     total = [str(sum(item[name] for item in found)) for name in ("kills", "resumed", "repeated")]
     faults = [str(sum(len(item[name]) for item in found)) for name in ("different", "left", "failed")]
@@ -73,8 +65,7 @@ NOTE = (
     "anew. The result is compared with an unbroken run's, file by file and to the byte, but for "
     f"{', '.join(f'`{name}`' for name in TIMES)} in JSON files, pages (`.html`) that state the time, and TensorBoard's "
     "files. *Two at once*: two processes on one folder (and cache) finish, or one is refused in a sentence, and the "
-    "result is whole. Board builds, scores, exports and conversions of sweeps were measured at commit 7fcbea9 with the "
-    "merges after it, the others at commit 0226cce."
+    "result is whole. Every second kill of policy training falls after its first checkpoint, which comes late."
 )
 
 

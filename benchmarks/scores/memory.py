@@ -19,8 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.report import table, write_section
-from brainbench.core.files import write_json
+from benchmarks.report import measure_once, table, write_section
 from tests.factories.recordings import LABELS
 
 TITLE = "Memory per job"
@@ -145,16 +144,8 @@ def main() -> None:
             JOBS[chosen.job](Path(folder))
         print(json.dumps({"gigabytes": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e9}))
         return
-    rows = []
-    for place, name in enumerate(JOBS):
-        path = chosen.out / f"{place:02d}.json"
-        if chosen.known and not path.is_file():
-            continue
-        if not path.is_file():
-            write_json(path, measure(name))
-        found = json.loads(path.read_text())
-        rows.append([name, f"{found['gigabytes']:.2f}", f"{found['seconds']:.0f}"])
-        print(rows[-1], flush=True)
+    found = measure_once(chosen.out, JOBS, measure, known=chosen.known)
+    rows = [[name, f"{item['gigabytes']:.2f}", f"{item['seconds']:.0f}"] for name, item in found.items()]
     text = f"{NOTE}\n\n{table(['job', 'largest memory [GB]', 'duration [s]'], rows)}"
     print(text)
     if chosen.write:

@@ -5,20 +5,36 @@ from __future__ import annotations
 from importlib.util import find_spec
 from pathlib import Path
 
+import typer
+
 from brainbench.core.errors import UsageError, missing_dependency, shown, unknown_name
+from brainbench.core.figures.style import check_format
 from brainbench.core.files import check_folder
 
 
-def out_folder(path: Path | None) -> Path | None:
-    """Return the folder of ``--out`` if files can be written into it; else a :class:`UsageError`."""
+def out_folder(option: typer.CallbackParam, path: Path | None) -> Path | None:
+    """Return the folder of an option if files can be written into it; else a :class:`UsageError`."""
     if path is not None:
-        check_folder(path, "--out")
+        check_folder(path, option.opts[0])
     return path
 
 
-def out_file(path: Path | None) -> Path | None:
-    """Return the file of ``--out`` if it can be written; else a :class:`UsageError`."""
-    return None if path is None else _file(path, "--out")
+def out_file(option: typer.CallbackParam, path: Path | None) -> Path | None:
+    """Return the file of an option if it can be written; else a :class:`UsageError`."""
+    return None if path is None else _file(path, option.opts[0])
+
+
+def picture_file(option: typer.CallbackParam, path: Path | None) -> Path | None:
+    """Return the picture of an option if it can be drawn and written; else a :class:`UsageError`."""
+    if path is not None:
+        check_format(path, (".png", ".svg", ".pdf"))
+    return out_file(option, path)
+
+
+def beside(option: typer.CallbackParam, path: Path) -> Path:
+    """Return a file or folder if something of this name can be written; else a :class:`UsageError`."""
+    check_folder(path.parent, option.opts[0])
+    return path
 
 
 def report_file(path: Path | None) -> Path | None:

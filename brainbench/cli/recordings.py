@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from brainbench.cli.destinations import out_folder
+from brainbench.cli.destinations import beside, out_folder
 from brainbench.cli.options import SCORE, option, with_options
 from brainbench.cli.output import JsonOption, emit, progress_bar, table, table_of
 from brainbench.cli.score_text import left_out
@@ -116,7 +116,9 @@ def check(
 @app.command("export")
 def export(
     source: Annotated[str, typer.Argument(help="'demo', an NWB or HDF5 file, a folder, a glob, or LAYOUT:PATH.")],
-    target: Annotated[Path, typer.Argument(help="*.h5 (any number of sessions), *.nwb (one), or a folder of NWB.")],
+    target: Annotated[
+        Path, typer.Argument(callback=beside, help="*.h5 (any number of sessions), *.nwb (one), or a folder of NWB.")
+    ],
     select: Annotated[str | None, option(SCORE, "select")] = None,
     as_json: JsonOption = False,
 ) -> None:

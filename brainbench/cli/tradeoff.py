@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from brainbench.cli.destinations import out_file
+from brainbench.cli.destinations import out_file, picture_file
 from brainbench.cli.options import items, numbers
 from brainbench.cli.output import JsonOption, emit, progress_bar, table_of
 from brainbench.stimuli.engines import DEFAULT_ENGINE
@@ -29,8 +29,10 @@ def whisker(
     solvers: Annotated[
         str, typer.Option(help="dynamic, quasistatic (of the backend rod), or both, comma-separated.")
     ] = "dynamic",
-    csv: Annotated[Path | None, typer.Option(help="Also write the table as CSV.")] = None,
-    plot: Annotated[Path | None, typer.Option(help="Also draw error against cost (.png, .svg, .pdf).")] = None,
+    csv: Annotated[Path | None, typer.Option(callback=out_file, help="Also write the table as CSV.")] = None,
+    plot: Annotated[
+        Path | None, typer.Option(callback=picture_file, help="Also draw error against cost (.png, .svg, .pdf).")
+    ] = None,
     as_json: JsonOption = False,
 ) -> None:
     """Measure error and cost of whisker simulations over links, time step, solver, backend and collision geometry.
@@ -164,7 +166,9 @@ def tactile(
     out: Annotated[Path, typer.Option("--out", "-o", callback=out_file, help="Table (.json).")] = Path(
         "tactile-tradeoff.json"
     ),
-    plot: Annotated[Path | None, typer.Option(help="Also draw error against cost (.png, .svg, .pdf).")] = None,
+    plot: Annotated[
+        Path | None, typer.Option(callback=picture_file, help="Also draw error against cost (.png, .svg, .pdf).")
+    ] = None,
     as_json: JsonOption = False,
 ) -> None:
     """Measure error and cost of tactile queries over backend, resolution, surface points and taxels.

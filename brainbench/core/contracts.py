@@ -13,7 +13,9 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from brainbench.core.errors import DataError
+import numpy as np
+
+from brainbench.core.errors import DataError, listing
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -23,6 +25,9 @@ CHANNELS = ("Fx", "Fy", "Fz", "Mx", "My", "Mz")
 
 GRID_SHAPE = (5, 7)
 """Rows A–E and columns 0–6 of the whisker grid; whisker (row, col) sits at flat index row·7 + col."""
+
+LONGEST_LABEL = 200
+"""Characters of the name of a stimulus or whisker; names become those of files."""
 
 SWEEPS_FORMAT = "brainbench-sweeps"
 """Attribute ``format`` of every shard and manifest of a data set of sweeps (``docs/datasets.md``)."""
@@ -39,7 +44,7 @@ def check_stimulus_set(dataset: xr.Dataset) -> xr.Dataset:
     ``backend``, ``version``, ``content_hash``.
 
     Raises:
-        DataError: something of this is missing.
+        DataError: something of this is missing or out of range.
     """
     _check(
         dataset,
@@ -49,7 +54,22 @@ def check_stimulus_set(dataset: xr.Dataset) -> xr.Dataset:
         attributes=("array", "scene", "fidelity", "seed", "backend", "version", "content_hash"),
     )
     if tuple(str(name) for name in dataset["channel"].values) != CHANNELS:
-        raise DataError(f"The stimulus set has channels {list(dataset['channel'].values)}; expected {list(CHANNELS)}.")
+        found = listing(map(str, dataset["channel"].values))
+        raise DataError(f"The stimulus set has channels {found}; expected {list(CHANNELS)}.")
+    for name in ("stimulus", "whisker"):
+        labels = [str(label) for label in dataset[name].values]
+        if not labels or len(set(labels)) < len(labels) or max(map(len, labels)) > LONGEST_LABEL:
+            raise DataError(
+                f"The coordinate {name!r} of a stimulus set needs at least one name, all different and of at most "
+                f"{LONGEST_LABEL} characters; this one has {listing(labels, limit=3)}."
+            )
+    time = dataset["time"].values
+    if time.dtype.kind not in "fiu" or not (time.size and np.isfinite(time).all() and (np.diff(time) > 0).all()):
+        raise DataError(f"The times of a stimulus set are numbers in seconds that increase; {time.size} others came.")
+    for name, count in zip(("row", "col"), GRID_SHAPE, strict=True):
+        cells = dataset[name].values
+        if cells.dtype.kind not in "iu" or ((cells < 0) | (cells >= count)).any():
+            raise DataError(f"{name!r} of a whisker is a whole number from 0 to {count - 1}; this set has others.")
     return dataset
 
 

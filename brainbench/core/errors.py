@@ -95,7 +95,7 @@ def unknown_name(kind: str, name: object, options: Iterable[str], *, hint: str =
     """
     choices = [str(option) for option in options]
     guess = nearest(name, choices) if isinstance(name, str) and len(name) < 200 else None
-    suggestion = f"; did you mean {guess!r}?" if guess else "."
+    suggestion = f"; did you mean {shown(guess)}?" if guess else "."
     text = f"Unknown {kind} {shown(name)}{suggestion} Allowed: {listing(choices)}."
     return UsageError(f"{text} {hint}".rstrip())
 

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from brainbench.core.errors import DataError, listing
+from brainbench.core.errors import DataError, listing, shown
 from brainbench.core.reading.hdf5 import open_hdf5
 
 if TYPE_CHECKING:
@@ -92,6 +92,10 @@ def _layers(group: h5py.Group, rows: int, path: str) -> dict[str, NDArray[np.flo
         if not np.issubdtype(item.dtype, np.number):
             raise DataError(f"Layer {name!r} of {path!r} has type {item.dtype}; activations must be numbers.")
         values = item.astype(np.float64 if item.dtype == np.float64 else np.float32)[()]
+        if infinite := int(np.isinf(values).sum()):
+            raise DataError(
+                f"Layer {shown(name)} of {shown(path)} has {infinite:,} infinite values; missing ones are NaN."
+            )
         # NaN is a missing value: the layer is scored on the rest, or its score is undefined and says so.
         layers[name.replace("\N{DIVISION SLASH}", "/")] = values[:, None, :] if values.ndim == 2 else values
 

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from brainbench.core.errors import DataError, DataFileNotFoundError, UsageError, listing
+from brainbench.core.errors import DataError, DataFileNotFoundError, UsageError, listing, shown
 from brainbench.core.files import file_hash
 from robotics_bridge import hands
 from robotics_bridge.deploy.controller import Actuation, Controller, Source
@@ -105,7 +105,7 @@ class DeployedPolicy:
                 calibration=calibration, fallback=fallback,
             )  # fmt: skip
         safe = SafetyLimits.of_hand(body, driver.joints, **dict(limits or {}))
-        run = read_policy(self.path, self.groups, format=contract.format, threads=threads, actions=len(contract.moved))
+        run = read_policy(self.path, self.groups, threads=threads, actions=len(contract.moved))
         return Controller(
             run, driver, Actuation.of(contract), safe, groups=tuple(self.groups), rate=contract.rate, sources=sources,
             **settings,
@@ -117,7 +117,8 @@ def read_deployed(path: str | Path) -> DeployedPolicy:
 
     Raises:
         DataFileNotFoundError: the file or its contract is missing.
-        DataError: the contract is of another kind or of another file, or a value is out of range.
+        DataError: the contract is of another kind or of another file, a value is out of range, or the file is a program
+            (TorchScript).
         UsageError: the contract does not say what a hand needs; export the policy from a trained run.
     """
     path = Path(path)
@@ -128,6 +129,11 @@ def read_deployed(path: str | Path) -> DeployedPolicy:
                 f"There is no file {str(file)!r}; brainbench policy export writes a policy and its contract."
             )
     found = PolicyContract.read(contract)
+    if found.format != "onnx":
+        raise DataError(
+            f"{shown(str(path))} is TorchScript, a program that may read and write files; a hand runs ONNX alone: "
+            "export the policy with --format onnx."
+        )
     if found.sha256 and found.sha256 != file_hash(path, length=64):
         raise DataError(f"{str(path)!r} is not the file that its contract describes; export the policy again.")
     return DeployedPolicy(path, found)

@@ -37,8 +37,8 @@ def holding(hand: Hand, **settings: float) -> Any:
 def holding_spec(hand: Hand, *, radius: float = 0.03, timestep: float = 0.002, reach: float = 0.6) -> Any:
     """Return the ``mujoco.MjSpec`` behind :func:`holding`: the palm's surface below the ball is at z = 0.
 
-    A hand whose file has no drives (a URDF) gets a weak position servo on every hinge and slide. The ball of 100 g has a
-    ``radius`` [m] and lies between the middle of the palm (``reach`` 0) and the roots of the fingers (1).
+    A hand whose file has no drives (a URDF) gets a weak position servo on every hinge and slide. The ball of 100 g has
+    a ``radius`` [m] and lies between the middle of the palm (``reach`` 0) and the roots of the fingers (1).
 
     Raises:
         UsageError: the palm's side is unknown, or the radius is not positive.

@@ -30,7 +30,7 @@ SCALE = (-10.0, 10.0)
 JOINTS = 255
 """Most joints; a frame counts them in one byte."""
 MOST_NUMBERS = 10_000_000
-"""Most numbers of a group of observations."""
+"""Most numbers of all observations, and of a policy's memory."""
 REQUIRED = ("action_map", "frozen", "hand", "joints", "rate")
 """What ``deployment`` must say before a hand can run the policy."""
 
@@ -87,6 +87,8 @@ class PolicyContract:
                 "export it from a trained run."
             )
         inputs, joints = found.shapes("inputs", MOST_NUMBERS), given.texts("joints", JOINTS)
+        if (numbers := sum(map(math.prod, inputs.values()))) > MOST_NUMBERS:
+            raise found.error("inputs", f"at most {MOST_NUMBERS:,} numbers", numbers)
         moved, action_map = _action_map(given.part("action_map"))
         still = given.part("frozen")
         frozen = {name: still.number(name, *ANGLE) for name in still.values}

@@ -13,14 +13,16 @@ from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
+import msgspec
 import numpy as np
 
-from brainbench.core.errors import DataError, DataFileNotFoundError
+from brainbench.core.errors import DataError, DataFileNotFoundError, shown
 from brainbench.core.figures.style import COLORS, PALE, panels, save_figure
 from brainbench.core.files import content_hash, provenance, read_json
 from brainbench.core.provenance import Provenance
+from brainbench.core.reading.regular import reason
 from brainbench.core.records import Interval, ModelCard, ResultRecord, Score, SubjectScore
 from brainbench.core.statistics import newcombe_interval, t_interval, wilson_interval
 from robotics_bridge.policies.evaluate import mean_of_episodes
@@ -33,6 +35,21 @@ GRADED = ("metric", "goals", "turn_rate", "seconds", "returns", "dropped")
 _STOPPED = "stopped after"
 FEWEST_SEEDS = 3
 """Training seeds below which an interval says little about a new student."""
+
+_Share = Annotated[float, msgspec.Meta(ge=0, le=1)]
+_Count = Annotated[int, msgspec.Meta(ge=0)]
+_Number = Annotated[float, msgspec.Meta(ge=-1e12, le=1e12)] | None
+_Success = Annotated[list[_Share | bool], msgspec.Meta(min_length=1)]
+_Evaluation = msgspec.defstruct(
+    "_Evaluation",
+    [("seed", _Count), ("success", _Success), ("iterations", _Count | None, None)]
+    + [(name, list[_Number | bool] | None, None) for name in GRADED],
+)
+_Agent = msgspec.defstruct(
+    "_Agent",
+    [("agent", str), ("task", str), ("success_rate", _Share), ("success_interval", tuple[_Share, _Share])]
+    + [(name + end, _Number, None) for name in GRADED for end in ("", "_half_width")],
+)
 
 
 @dataclass(frozen=True)
@@ -147,12 +164,16 @@ def _counted(members: Sequence[_Member], at_least: int) -> tuple[list[_Member], 
 
 
 def _evaluations(path: Path) -> list[dict[str, Any]]:
+    return _listed(path, _Evaluation, "evaluations with 'seed' and 'success'")
+
+
+def _listed(path: Path, kind: type, what: str) -> list[dict[str, Any]]:
+    """Return the items of a list in a file, checked against a structure; fields that it does not name are kept."""
     found = read_json(path)
-    if not isinstance(found, list) or not found:
-        raise DataError(f"{str(path)!r} is no list of evaluations.")
-    for item in found:
-        if not isinstance(item, dict) or not item.get("success") or "seed" not in item:
-            raise DataError(f"{str(path)!r} holds an evaluation without 'seed' or 'success'.")
+    try:
+        msgspec.convert(found, Annotated[list[kind], msgspec.Meta(min_length=1)])
+    except msgspec.ValidationError as error:
+        raise DataError(f"{shown(str(path))} is no list of {what} ({reason(error)}).") from error
     return found
 
 
@@ -261,15 +282,10 @@ def read_agents(folders: Iterable[str | Path]) -> list[dict[str, Any]]:
     Raises:
         DataError: a file is damaged.
     """
-    found, needed = [], {"agent", "task", "success_rate", "success_interval"}
+    found = []
     for root in folders:
         for path in sorted(Path(root).rglob(AGENTS)):
-            summaries = read_json(path)
-            whole = isinstance(summaries, list) and all(isinstance(one, dict) and needed <= {*one} for one in summaries)
-            if not whole:
-                raise DataError(
-                    f"{str(path)!r} is no list of evaluated agents; brainbench policy evaluate --out writes one."
-                )
+            summaries = _listed(path, _Agent, "evaluated agents; brainbench policy evaluate --out writes one")
             found += summaries
     return found
 
@@ -281,10 +297,15 @@ def agent_rows(agents: Sequence[Mapping[str, Any]]) -> list[list[str]]:
         [
             item["task"], "–", Path(item["agent"]).name, *["–"] * 6,
             "{:.3f} [{:.3f}, {:.3f}]".format(item["success_rate"], *item["success_interval"]), "–",
-            *(_pm((item[name], item[f"{name}_half_width"]) if name in item else None) for name in names),
+            *(_mean_of(item, name) for name in names),
         ]
         for item in agents
     ]  # fmt: skip
+
+
+def _mean_of(item: Mapping[str, Any], name: str) -> str:
+    mean, half_width = item.get(name), item.get(f"{name}_half_width")
+    return _pm(None if mean is None else (mean, math.nan if half_width is None else half_width))
 
 
 def concise(table: Sequence[Sequence[str]]) -> tuple[str, list[str], list[list[str]]]:

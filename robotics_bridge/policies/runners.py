@@ -3,22 +3,26 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
 
 from brainbench.core.errors import BrainbenchError, DataError
+from brainbench.core.reading.regular import check_file
 from brainbench.core.reading.tensors import check_finite
 from brainbench.models.export import onnx_session, require_onnx
+from robotics_bridge.policies.contract import MOST_NUMBERS
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 Runner = Callable[[Mapping[str, "NDArray[np.float32]"], bool], "NDArray[np.float32]"]
 """(groups of one row [n…], forget first) → actions [A]."""
+MOST_POLICY = 2 << 30
+"""Bytes of a policy's file, which Protocol Buffers allow."""
 
 
 def read_policy(
@@ -34,8 +38,8 @@ def read_policy(
     Args:
         path: The file.
         shapes: Group → shape, in the order of the contract's ``inputs``.
-        format: ``onnx`` or ``jit``.
-        threads: Of ONNX Runtime; its own choice if None.
+        format: ``onnx``, or ``jit`` (TorchScript), a program that may read and write files: for your own alone.
+        threads: Threads that ONNX Runtime computes with; its own choice if None.
         actions: A; not checked if None.
 
     Raises:
@@ -44,6 +48,7 @@ def read_policy(
     """
     if format == "onnx":
         require_onnx()
+    check_file(path, "policy", most=MOST_POLICY)
     try:
         run: Runner = _JitRunner(path, shapes) if format == "jit" else _OnnxRunner(path, shapes, threads)
         # A step of zeros shows here, and not with a hand in motion, what a file computes.
@@ -65,10 +70,10 @@ class _OnnxRunner:
         import onnx
 
         # Weights in other files are refused: a policy is one file, and it must not make us open others.
-        graph = onnx.load(str(path), load_external_data=False).graph
-        if any(item.external_data for item in graph.initializer):
+        tensors = list(_tensors(onnx.load(str(path), load_external_data=False)))
+        if any(item.external_data for item in tensors):
             raise DataError(f"{str(path)!r} keeps weights in other files; export the policy again.")
-        check_finite({item.name: onnx.numpy_helper.to_array(item) for item in graph.initializer}, str(path))
+        check_finite({item.name: onnx.numpy_helper.to_array(item) for item in tensors}, str(path))
         self.session = onnx_session(path, threads)
         inputs = {item.name: item.shape for item in self.session.get_inputs()}
         if missing := sorted({*shapes, "h_in"} - set(inputs)):
@@ -77,6 +82,8 @@ class _OnnxRunner:
                 "policy was lost on the way."
             )
         self.names, self.size = tuple(shapes), int(inputs["h_in"][1])
+        if not 0 < self.size <= MOST_NUMBERS:
+            raise DataError(f"{str(path)!r} has a memory of {self.size:,} numbers; 1 to {MOST_NUMBERS:,} are allowed.")
         self.state = np.zeros((1, self.size), np.float32)
 
     def __call__(self, obs: Mapping[str, NDArray[np.float32]], forget: bool = False) -> NDArray[np.float32]:
@@ -85,6 +92,17 @@ class _OnnxRunner:
         feed = {name: np.asarray(obs[name], np.float32)[None] for name in self.names}
         actions, self.state = self.session.run(["actions", "h_out"], {**feed, "h_in": self.state})
         return np.asarray(actions)[0]
+
+
+def _tensors(message: Any) -> Iterator[Any]:
+    """Yield all tensors of an ONNX message: weights, constants of nodes, and those of branches and functions."""
+    if message.DESCRIPTOR.name == "TensorProto":
+        yield message
+        return
+    for field, value in message.ListFields():
+        if field.message_type is not None:
+            for item in (value,) if hasattr(value, "DESCRIPTOR") else value:
+                yield from _tensors(item)
 
 
 class _JitRunner:

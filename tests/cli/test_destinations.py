@@ -36,6 +36,40 @@ def test_other_commands_refuse_such_an_out_too(run, tmp_path, command):
     assert (outcome.status, "--out" in outcome.err) == (2, True)
 
 
+@pytest.mark.parametrize(
+    ("command", "option"),
+    [
+        (("tradeoff", "whisker"), "--csv"),
+        (("tradeoff", "tactile"), "--plot"),
+        (("policy", "play", "in_palm_rotate"), "--video"),
+        (("policy", "play", "in_palm_rotate"), "--strip"),
+        (("policy", "report", "none"), "--records"),
+        (("policy", "sweep"), "--out"),
+        (("policy", "export", "none"), "--out"),
+        (("leaderboard", "add", "none"), "--to"),
+        (("leaderboard", "hold-out", "demo"), "--secret"),
+        (("stimuli", "objects", "torus"), "--export"),
+    ],
+)
+def test_every_option_that_names_a_destination_is_checked_first(run, tmp_path, command, option):
+    (tmp_path / "file").write_text("x")
+    outcome = run(*command, option, str(tmp_path / "file" / "a.png"))
+    assert (outcome.status, option in outcome.err) == (2, True)
+
+
+@pytest.mark.parametrize("command", [("stimuli", "convert", "none"), ("recordings", "export", "demo")])
+def test_destinations_without_an_option_are_checked_first(run, tmp_path, command):
+    (tmp_path / "file").write_text("x")
+    outcome = run(*command, str(tmp_path / "file" / "a"))
+    assert (outcome.status, str(tmp_path / "file") in outcome.err) == (2, True)
+
+
+@pytest.mark.parametrize("command", [("tradeoff", "tactile", "--plot"), ("policy", "report", "none", "--picture")])
+def test_a_picture_of_an_unknown_format_is_refused_first(run, tmp_path, command):
+    outcome = run(*command, str(tmp_path / "x.txt2"))
+    assert (outcome.status, "txt2" in outcome.err) == (2, True)
+
+
 def test_a_cache_that_cannot_be_made_is_one_sentence(run, tmp_path, monkeypatch):
     (tmp_path / "file").write_text("x")
     monkeypatch.setenv("BRAINBENCH_CACHE", str(tmp_path / "file" / "cache"))

@@ -2,6 +2,9 @@ import json
 
 import pytest
 
+from brainbench.stimuli.stimulus_set import hash_stimulus_set, write_stimulus_set
+from tests.factories.recordings import make_stimuli
+
 SCENE = """
 description = "A pole before two whiskers"
 [array]
@@ -118,6 +121,15 @@ def test_wrong_requests_end_with_status_two_and_one_line(run, scene, arguments, 
     assert result.status == 2
     assert message in result.err
     assert result.out == ""
+
+
+@pytest.mark.parametrize("scene", ["no JSON", "[]", "[{}]", "[1]", "null", "[" * 5000])
+def test_show_refuses_a_set_whose_scenes_are_no_scenes(run, tmp_path, scene):
+    dataset = make_stimuli(whiskers=2).assign_attrs(scene=scene)
+    file = write_stimulus_set(dataset.assign_attrs(content_hash=hash_stimulus_set(dataset)), tmp_path / "set.h5")
+    result = run("stimuli", "show", str(file))
+    assert (result.status, result.err.count("\n")) == (1, 1)
+    assert "set.h5" in result.err
 
 
 def test_show_tells_where_recorded_whisking_starts(run, tmp_path):

@@ -153,6 +153,26 @@ def test_a_stimulus_set_is_checked_against_the_contract():
         check_stimulus_set(bare)
 
 
+@pytest.mark.parametrize(
+    ("coordinate", "values"),
+    [("stimulus", ["x" * 201]), ("stimulus", [""] * 0), ("time", [0.1, 0.0]), ("time", [0.0, np.nan]), ("row", [-1]),
+     ("row", [5]), ("col", [7]), ("col", [2.0])],
+)  # fmt: skip
+def test_a_stimulus_set_with_impossible_coordinates_is_refused(coordinate, values):
+    good = _make_stimulus_set()
+    (dim,) = good[coordinate].dims
+    odd = good.isel({dim: slice(len(values))}).assign_coords({coordinate: (dim, np.array(values))})
+    with pytest.raises(DataError, match=r"stimulus set|whole number"):
+        check_stimulus_set(odd)
+
+
+def test_names_of_a_stimulus_set_differ():
+    good = _make_stimulus_set()
+    for dim in ("stimulus", "whisker"):
+        with pytest.raises(DataError, match=dim):
+            check_stimulus_set(xr.concat([good, good], dim))
+
+
 def test_recordings_without_duration_are_refused():
     dataset = xr.Dataset({"counts": (("trial", "time", "unit"), np.zeros((1, 1, 1)))})
     with pytest.raises(DataError, match=r"recordings .*'duration'"):

@@ -43,6 +43,8 @@ class KillJob:
     """Loaded before the first run."""
     resumes: bool = False
     """True where finished parts are kept; else all is done again."""
+    part: str = ""
+    """Pattern of the first finished part, where it comes late: every second kill falls after it."""
     apart: tuple[str, ...] = ()
     """Names of files that hold times, which are only there or not."""
 
@@ -92,7 +94,9 @@ def measure(job: KillJob, folder: Path, kills: int) -> Outcome:
     # The first run may compile what later ones find in the machine's own caches.
     _finish(_fork(lambda: job.run(inputs, folder / "first"), folder / "first.log"), folder / "first.log")
     begin = time.monotonic()
-    _finish(_fork(lambda: job.run(inputs, whole), folder / "whole.log"), folder / "whole.log")
+    child = _fork(lambda: job.run(inputs, whole), folder / "whole.log")
+    first = _wait_for_part(whole, job.part) - begin
+    _finish(child, folder / "whole.log")
     outcome = Outcome(job.name, time.monotonic() - begin)
     expected = content(whole, job)
     outcome.different += [f"two unbroken runs: {name}" for name in _differ(content(folder / "first", job), expected)]
@@ -102,7 +106,10 @@ def measure(job: KillJob, folder: Path, kills: int) -> Outcome:
             break
         out, log = folder / str(place), folder / f"{place}.log"
         child = _fork(lambda out=out: job.run(inputs, out), log)
-        time.sleep(draw.uniform(0.0, outcome.seconds))
+        late = bool(job.part) and place % 2 == 1
+        if late:
+            _wait_for_part(out, job.part)
+        time.sleep(draw.uniform(0.0, outcome.seconds - first * late))
         os.kill(child, signal.SIGKILL)
         met = os.WIFSIGNALED(os.waitpid(child, 0)[1])
         outcome.kills += met
@@ -119,6 +126,13 @@ def measure(job: KillJob, folder: Path, kills: int) -> Outcome:
         shutil.rmtree(out, ignore_errors=True)
     _run_together(job, inputs, folder, expected, outcome)
     return outcome
+
+
+def _wait_for_part(out: Path, part: str) -> float:
+    """Wait until a run has finished its first part, and return the time."""
+    while part and not any(out.glob(part)):
+        time.sleep(0.01)
+    return time.monotonic()
 
 
 def _run_together(job: KillJob, inputs: Path, folder: Path, expected: dict[str, Any], outcome: Outcome) -> None:
@@ -210,9 +224,9 @@ def _train_policy(inputs: Path, out: Path) -> None:
     from robotics_bridge.tasks.settings import TeacherSettings
 
     torch.set_num_threads(1)
-    small = TeacherSettings(num_envs=2, steps_per_env=4, iterations=4, epochs=1, minibatches=1, hidden=(8,))
+    small = TeacherSettings(num_envs=2, steps_per_env=4, iterations=12, epochs=1, minibatches=1, hidden=(8,))
     env = tasks.make(tasks.load("in_palm_rotate"), num_envs=2, threads=1, seed=0)
-    train(env, out, TeacherRun(iterations=4, save_every=1), settings=small)
+    train(env, out, TeacherRun(iterations=12, save_every=1), settings=small)
 
 
 def _write_records(inputs: Path) -> None:
@@ -296,7 +310,7 @@ JOBS = (
         "stimulus generation", 12, _generate, modules=("brainbench.stimuli.sweeps.generation", "mujoco"), resumes=True
     ),
     KillJob("train", 12, _train, modules=_TRAINER, resumes=True),
-    KillJob("policy train", 6, _train_policy, modules=_TEACHER, resumes=True),
+    KillJob("policy train", 10, _train_policy, modules=_TEACHER, resumes=True, part="resume.safetensors"),
     KillJob(
         "leaderboard add", 16, lambda inputs, out: _command("leaderboard", "add", inputs / "records", "--to", out),
         _write_records, (*_CLI, "leaderboards"), resumes=True,

@@ -9,14 +9,16 @@ from typing import Any
 import numpy as np
 import torch
 
+from brainbench.core.reading.tensors import read_tensors
 from brainbench.datasets import open_recordings
 from brainbench.datasets.whisking.sweep_files import SweepFile, read_sweep
 from brainbench.datasets.whisking.sweep_tree import open_sweep_tree
 from brainbench.metrics.explain import explain_file
 from brainbench.models.published.files import read_settings, read_weights
-from brainbench.models.published.importing import build_published
+from brainbench.models.published.importing import build_published, import_checkpoint
 from brainbench.models.published.recognition import recognise
 from brainbench.models.registry import load_model
+from brainbench.models.training.checkpoints import WEIGHTS
 from tests.factories.published_files import lightning_state
 from tests.factories.published_recordings import make_zero_filled, write_published
 from tests.factories.published_sweeps import write_sweep
@@ -68,6 +70,11 @@ def _import(path: Path) -> Any:
     ].state_dict()
 
 
+def _import_to_folder(path: Path) -> dict[str, torch.Tensor]:
+    made = import_checkpoint(path, architecture="zhuang-gru-small", out=path.parent / "imported")
+    return read_tensors(made.folder / WEIGHTS)
+
+
 def _bad_sweep(sweep: SweepFile) -> bool:
     """Forces are finite or missing, and stay within what is trusted; conditions and label are numbers."""
     label = 0 if sweep.label is None else sweep.label
@@ -94,5 +101,6 @@ PUBLISHED = (
     ),
     Surface("split halves, npz", _halves, explain_file, _bad_steps),
     Surface("published weights, ckpt", _checkpoint, _import, not_finite),
+    Surface("published weights, imported", _checkpoint, _import_to_folder, not_finite),
     Surface("published settings, YAML", _settings, read_settings, not_finite),
 )

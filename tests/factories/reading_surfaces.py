@@ -21,7 +21,7 @@ from brainbench.core.errors import DataError
 from brainbench.core.files import read_mapping
 from brainbench.core.labels import read_match
 from brainbench.core.records import ResultRecord, record_identity
-from brainbench.datasets import open_recordings, write_recordings
+from brainbench.datasets import export, open_recordings, write_recordings
 from brainbench.datasets.trials.selection import Selection
 from brainbench.datasets.trials.windows import Window
 from brainbench.datasets.whisking.dataset import WhiskingDataset
@@ -30,12 +30,16 @@ from brainbench.models.features import read_features, write_features
 from brainbench.models.graph.tnn_import import read_graph
 from brainbench.models.training.checkpoints import load_weights, read_config
 from brainbench.models.training.config import TrainingConfig
+from brainbench.models.training.processes import Processes
+from brainbench.models.training.run_folder import STATE
+from brainbench.models.training.trainer import _Run
 from brainbench.scoring.recovery.design import parse_trials
 from brainbench.stimuli import WhiskerArray, load_stimuli
 from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.motion.recorded import load_initial_angles, load_trajectory
 from brainbench.stimuli.objects.collections import resolve_objects
 from brainbench.stimuli.objects.primitives import sphere
+from brainbench.stimuli.objects.shapenet import read_categories, read_ids
 from brainbench.stimuli.scenes.scene_files import load_scene
 from brainbench.stimuli.stimulus_set import hash_stimulus_set, write_stimulus_set
 from brainbench.stimuli.sweeps.generation import generate
@@ -54,6 +58,7 @@ from tests.factories.records import make_record
 from tests.factories.robot_surfaces import ROBOTS
 from tests.factories.scene_files import POLE
 from tests.factories.sweep_batches import small_plan
+from tests.factories.training_sweeps import tiny
 
 SCENE = POLE.replace("interval_ms = 1", "interval_ms = 1\naverage = 2\nlowpass_hz = 40")
 BATCH = """
@@ -81,6 +86,9 @@ checkpoint_seconds = 60.0
 optimizer = "sgd"
 augmentation = "none"
 """
+
+
+CLASSES = "name,label\n02691156,plane\n03001627/bb,seat\n"
 
 
 def _node(name: str, source: str | None) -> dict[str, Any]:
@@ -113,6 +121,11 @@ def _counts(folder: Path) -> Path:
     )
 
 
+def _copy_recordings(path: Path) -> Path:
+    (written,) = export([path], path.with_name("copy.h5"))
+    return written
+
+
 def _stimulus_set(folder: Path) -> Path:
     dataset = make_stimuli(whiskers=5)
     return write_stimulus_set(dataset.assign_attrs(content_hash=hash_stimulus_set(dataset)), folder / "set.h5")
@@ -128,6 +141,10 @@ def _arrays(folder: Path) -> Path:
 def _activations(folder: Path) -> Path:
     layers = {"one": np.arange(8.0).reshape(4, 2), "two": np.ones((4, 3, 2), np.float32)}
     return write_features(folder / "features.h5", list("abcd"), layers)
+
+
+def _infinite(layers: Any) -> bool:
+    return any(np.isinf(layer).any() for layer in layers.values())
 
 
 def _mesh(suffix: str) -> Callable[[Path], Path]:
@@ -198,6 +215,36 @@ def _load(path: Path) -> Any:
     model = _model()
     load_weights(model, path, what="test")
     return dict(model.state_dict())
+
+
+def _training_run(folder: Path) -> _Run:
+    options: dict[str, Any] = {"epochs": 1, "batch_size": 12, "precision": "float32", "optimizer": "adamw"}
+    where = Processes(0, 1, torch.device("cpu"))
+    with torch.random.fork_rng():
+        run = _Run(
+            TrainingConfig.published("zhuang-small", "supervised", **options), tiny(), folder, where, None, folder
+        )
+    run.log.close()
+    return run
+
+
+def _training(folder: Path) -> Path:
+    run = _training_run(folder)
+    for weight in run.learner.parameters():
+        weight.grad = torch.zeros_like(weight)
+    run.optimizer.step()
+    run._save()
+    return folder / STATE
+
+
+def _go_on(path: Path) -> Any:
+    run = _training_run(path.parent)
+    run.optimizer.step()
+    return run
+
+
+def _bad_training(run: _Run) -> bool:
+    return not_finite([run.learner.state_dict(), run.optimizer.state_dict()]) or min(run.at.step, run.at.epoch) < 0
 
 
 @functools.cache
@@ -285,10 +332,16 @@ SURFACES = (
     Surface("recordings, NWB", _nwb, lambda path: open_recordings(path, conditions="trials:texture"), bad_counts),
     Surface("recordings, HDF5", _spikes, lambda path: open_recordings(path, conditions="trials:stimulus"), bad_counts),
     Surface("recordings, counts", _counts, open_recordings, bad_counts),
+    Surface("recordings, copied", _spikes, _copy_recordings, lambda written: not written.is_file()),
     Surface("stimulus set", _stimulus_set, lambda path: load_stimuli(path).input, not_finite),
     Surface("stimulus arrays", _arrays, lambda path: load_stimuli(path).input, not_finite),
     # NaN in activations is a missing value, and the score of such a layer has a status.
-    Surface("activations", _activations, read_features, lambda found: False),
+    Surface(
+        "activations",
+        _activations,
+        read_features,
+        lambda found: any(np.isinf(x).any() for x in found.activations.values()),
+    ),
     Surface(
         "scene",
         written("scene.toml", SCENE),
@@ -319,9 +372,15 @@ SURFACES = (
         lambda path: TrainingConfig.published("zhuang-small", **read_mapping(path)),
         _bad_config,
     ),
+    Surface("training state", _training, _go_on, _bad_training),
     Surface("batch file", written("batch.toml", BATCH), read_batch, _bad_batch),
     Surface("match, JSON", written_json("match.json", {"a": "b", "c": None}), read_match, not_finite),
     Surface("match, CSV", written("match.csv", "a,b\nc,\n"), read_match, not_finite),
+    Surface(
+        "ShapeNet names", written("ids.txt", "02691156/1a04e3\n03001627/bb # a chair\n"), read_ids, lambda found: False
+    ),
+    Surface("ShapeNet classes, CSV", written("classes.csv", CLASSES), read_categories, lambda found: False),
+    Surface("ShapeNet classes, JSON", written_json("classes.json", {"02691156": "a"}), read_categories, not_finite),
     Surface("manifest", _sweeps("manifest.json"), _read_sweeps, not_finite),
     Surface("shard", _sweeps("train-00000.h5"), _read_sweeps, not_finite),
     Surface(

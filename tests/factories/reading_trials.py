@@ -51,8 +51,8 @@ class Surface:
 class Outcome:
     """What became of one case.
 
-    ``refused`` in one sentence, or ``wordy`` in more than :data:`LONGEST` characters; ``accepted``; or one of the
-    failures ``traceback``, ``memory``, ``hang`` and ``silent``.
+    ``refused`` in one sentence; ``accepted``; or one of the failures ``wordy`` (more than :data:`LONGEST` characters),
+    ``half-written`` (refused, and something was left behind), ``traceback``, ``memory``, ``hang`` and ``silent``.
     """
 
     kind: str
@@ -68,14 +68,16 @@ def attempt(surface: Surface, good: Path, seed: int) -> Outcome:
         shutil.copytree(good.parent, copy)
         path = copy / good.name
         what = damage(path, seed)
+        before = _entries(copy)
         try:
-            with warnings.catch_warnings(), _bounds():
+            with warnings.catch_warnings(), time_limit(), _memory_limit():
                 warnings.simplefilter("ignore")
                 value = surface.read(path)
                 faulty = surface.faults(value)
         except BrainbenchError as error:
             text = str(error)
-            return Outcome("wordy" if len(text) > LONGEST else "refused", what, text[:LONGEST])
+            kind = "wordy" if len(text) > LONGEST else "half-written" if _entries(copy) > before else "refused"
+            return Outcome(kind, what, text[:LONGEST])
         except HangError:
             return Outcome("hang", what)
         except MemoryError as error:
@@ -88,14 +90,14 @@ def attempt(surface: Surface, good: Path, seed: int) -> Outcome:
 
 
 @contextlib.contextmanager
-def _bounds() -> Iterator[None]:
+def time_limit(work: float = SECONDS, clock: float = 3 * SECONDS) -> Iterator[None]:
+    """Raise :class:`HangError` after so many seconds of work, since a machine may be busy, or by the clock."""
+
     def stop(*_: object) -> None:
         raise HangError
 
-    used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
-    timers = ((signal.SIGPROF, signal.ITIMER_PROF, SECONDS), (signal.SIGALRM, signal.ITIMER_REAL, 3 * SECONDS))
-    limit, handlers = resource.getrlimit(resource.RLIMIT_AS), [signal.signal(kind, stop) for kind, _, _ in timers]
-    resource.setrlimit(resource.RLIMIT_AS, (used + MEMORY + (1 << 28), limit[1]))
+    timers = ((signal.SIGPROF, signal.ITIMER_PROF, work), (signal.SIGALRM, signal.ITIMER_REAL, clock))
+    handlers = [signal.signal(kind, stop) for kind, _, _ in timers]
     for _, timer, seconds in timers:
         signal.setitimer(timer, seconds)
     try:
@@ -104,7 +106,22 @@ def _bounds() -> Iterator[None]:
         for (kind, timer, _), handler in zip(timers, handlers, strict=True):
             signal.setitimer(timer, 0)
             signal.signal(kind, handler)
+
+
+@contextlib.contextmanager
+def _memory_limit() -> Iterator[None]:
+    used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+    limit = resource.getrlimit(resource.RLIMIT_AS)
+    resource.setrlimit(resource.RLIMIT_AS, (used + MEMORY + (1 << 28), limit[1]))
+    try:
+        yield
+    finally:
         resource.setrlimit(resource.RLIMIT_AS, limit)
+
+
+def _entries(folder: Path) -> int:
+    """Count what stands in a folder; a reader of the tests may rename a file, and none may add one."""
+    return sum(1 for _ in folder.rglob("*"))
 
 
 def numbers(value: Any, *, depth: int = 12) -> Iterator[float]:

@@ -8,11 +8,14 @@ from typing import Any
 
 import numpy as np
 
+from brainbench.core.files import write_json
 from robotics_bridge import hands, tasks
 from robotics_bridge.deploy.frames import KEY, read_key
 from robotics_bridge.deploy.simulated_hand import Faults
 from robotics_bridge.hands.layouts import read_probes, write_probes
 from robotics_bridge.policies.contract import PolicyContract
+from robotics_bridge.policies.report import AGENTS, EVALUATION, agent_rows, read_agents, read_results, rows
+from robotics_bridge.policies.training.distill_config import DistillConfig
 from robotics_bridge.policies.training.student_files import load_student
 from robotics_bridge.policies.training.sweep import StudentSweep, read_sweep
 from robotics_bridge.sensors.calibration.log import read_log
@@ -77,6 +80,10 @@ task = "in_palm_rotate"
 hand = "xhand1"
 placements = ["tips", "hand"]
 """
+AGENT = {
+    "agent": "random", "task": "in_palm_rotate", "success_rate": 0.5, "success_interval": [0.4, 0.6], "goals": 1.5,
+    "goals_half_width": 0.2,
+}  # fmt: skip
 _MODEL = (
     "body_pos", "body_quat", "body_mass", "body_inertia", "geom_size", "geom_pos", "geom_friction", "jnt_range",
     "jnt_axis", "dof_damping", "dof_armature", "actuator_gainprm", "actuator_ctrlrange",
@@ -148,6 +155,34 @@ def _bad_sweep(sweep: StudentSweep) -> bool:
     )
 
 
+def _evaluation(folder: Path) -> Path:
+    config = DistillConfig(task="in_palm_rotate")
+    write_json(folder / "config.json", {"distill": config.plain()})
+    found = {"seed": 0, "success": [1.0, 0.0, 1.0], "goals": [2.0, None, 3.5], "iterations": 30}
+    return write_json(folder / EVALUATION, [found, {**found, "seed": 1}])
+
+
+def _read_evaluation(path: Path) -> Any:
+    (result,) = read_results([path.parent])
+    rows([result])
+    return result
+
+
+def _bad_agents(found: Any) -> bool:
+    return not_finite(found) or any(not 0 <= n <= 1 for item in found for n in numbers(item["success_interval"]))
+
+
+def _bad_result(result: Any) -> bool:
+    known = [value for value, _ in result.graded.values()]
+    return not 0 <= result.value <= 1 or not_finite(known) or min(result.learned) < 0
+
+
+def _read_agents(path: Path) -> Any:
+    found = read_agents([path.parent])
+    agent_rows(found)
+    return found
+
+
 def _key(folder: Path) -> Path:
     path = folder / "hand.key"
     path.write_text("0f" * KEY)
@@ -176,5 +211,7 @@ ROBOTS = (
     Surface("student, configuration", _student("config.json"), _load_student, not_finite),
     Surface("student, weights", _student("model.safetensors"), _load_student, not_finite),
     Surface("sweep of students", written("students.toml", STUDENTS), read_sweep, _bad_sweep),
+    Surface("evaluations of a student", _evaluation, _read_evaluation, _bad_result),
+    Surface("evaluated agents", written_json(AGENTS, [AGENT, AGENT]), _read_agents, _bad_agents),
     Surface("key of a hand", _key, read_key, lambda key: len(key) != KEY),
 )

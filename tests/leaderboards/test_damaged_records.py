@@ -7,9 +7,6 @@ import json
 import math
 import os
 import random
-import signal
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +16,7 @@ from brainbench.core.errors import BrainbenchError
 from brainbench.core.records import ResultRecord, Score, record_identity
 from leaderboards import build_leaderboard, read_records, write_record
 from leaderboards.report.paper import write_paper
+from tests.factories.reading_trials import HangError, time_limit
 
 SECONDS = 10
 ODD = (
@@ -69,24 +67,6 @@ def _named(text: bytes) -> str:
         return "x--0123456789abcdef.json"
 
 
-@contextmanager
-def _in_time() -> Iterator[None]:
-    def late(*_: object) -> None:
-        raise AssertionError(f"took longer than {SECONDS} s")
-
-    # Seconds of work, since a test machine may be busy; ten times as many by the clock for what waits.
-    timers = ((signal.SIGPROF, signal.ITIMER_PROF, SECONDS), (signal.SIGALRM, signal.ITIMER_REAL, 10 * SECONDS))
-    before = [signal.signal(kind, late) for kind, _, _ in timers]
-    for _, timer, seconds in timers:
-        signal.setitimer(timer, seconds)
-    try:
-        yield
-    finally:
-        for (kind, timer, _), handler in zip(timers, before, strict=True):
-            signal.setitimer(timer, 0)
-            signal.signal(kind, handler)
-
-
 def _numbers(score: Score) -> list[tuple[str, float]]:
     """The numbers with the ranges that every score has."""
     kinds = {"p": score.p, "p_smallest": score.p_smallest, "-reliability": 1 - score.reliability}
@@ -102,7 +82,7 @@ def outcome(text: bytes, folder: Path, good: ResultRecord) -> str:
     path.write_bytes(text)
     write_record(good, folder)
     try:
-        with _in_time():
+        with time_limit(SECONDS, 10 * SECONDS):
             stored = read_records(folder)
             page = build_leaderboard(stored, folder / "site")
             write_paper(stored, folder / "report.md")
@@ -116,8 +96,10 @@ def outcome(text: bytes, folder: Path, good: ResultRecord) -> str:
             return f"silent: {silent}" if silent or "1e+120" in everything else "shown"
     except BrainbenchError as error:
         return f"the site ended: {error}"
+    except HangError:
+        return "hang"
     except AssertionError as error:
-        return f"hang: {error}"
+        return f"unlisted: {error}"
     except Exception as error:  # noqa: BLE001 - that is what is counted
         return f"traceback: {type(error).__name__}: {str(error)[:80]}"
 
@@ -162,7 +144,7 @@ def test_pipes_devices_and_huge_files_are_problems_and_not_waited_for(make_recor
     (tmp_path / "folder.json").mkdir()
     with (tmp_path / "huge.json").open("wb") as stream:
         stream.truncate(1 << 32)  # sparse
-    with _in_time():
+    with time_limit(SECONDS, 10 * SECONDS):
         stored = read_records(tmp_path)
     assert sorted(item.path.name for item in stored if item.problem) == [
         "folder.json", "huge.json", "pipe.json", "zero.json"

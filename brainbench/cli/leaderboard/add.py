@@ -9,6 +9,7 @@ from typing import Annotated, Any
 
 import typer
 
+from brainbench.cli.destinations import out_folder
 from brainbench.cli.leaderboard.scoring import ScoringJob, full_settings, jobs_of, missing, parse_seeds, read_batch
 from brainbench.cli.options import SCORE, SCORE_FLAGS, SchedulerOption, with_options
 from brainbench.cli.output import JsonOption, emit, progress_bar
@@ -29,9 +30,9 @@ OFFERED = (
 @with_options(SCORE, OFFERED, flags=SCORE_FLAGS, given=True, help="As in brainbench score.")
 def add(
     records: Annotated[list[Path] | None, typer.Argument(help="Record files or folders of them to take in.")] = None,
-    to: Annotated[Path, typer.Option("--to", "-o", help="Folder of the leaderboard's records.")] = Path(
-        "brainbench-results"
-    ),
+    to: Annotated[
+        Path, typer.Option("--to", "-o", callback=out_folder, help="Folder of the leaderboard's records.")
+    ] = Path("brainbench-results"),
     model: Annotated[
         list[str] | None, typer.Option("--model", "-m", help="A model to score, or a pattern such as '*-small'.")
     ] = None,

@@ -32,9 +32,9 @@ def hold_out(
     out: Annotated[Path, typer.Option("--out", "-o", callback=out_folder, help="Folder of what is published.")] = Path(
         "board"
     ),
-    secret: Annotated[Path, typer.Option(help="Folder of what is kept back; never publish it.")] = Path(
-        "held-out-secret"
-    ),
+    secret: Annotated[
+        Path, typer.Option(callback=out_folder, help="Folder of what is kept back; never publish it.")
+    ] = Path("held-out-secret"),
     options: Any = None,
     as_json: JsonOption = False,
 ) -> None:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from brainbench.cli.destinations import out_file
 from brainbench.cli.output import JsonOption, emit
 
 if TYPE_CHECKING:
@@ -17,7 +18,10 @@ if TYPE_CHECKING:
 def export(
     run: Annotated[Path, typer.Argument(help="A shipped student, or a folder of brainbench policy distill.")],
     out: Annotated[
-        Path | None, typer.Option(help="File to write; by default policy.onnx in the folder of the run, or here.")
+        Path | None,
+        typer.Option(
+            callback=out_file, help="File to write; by default policy.onnx in the folder of the run, or here."
+        ),
     ] = None,
     format: Annotated[str, typer.Option(help="onnx or jit.")] = "onnx",
     as_json: JsonOption = False,

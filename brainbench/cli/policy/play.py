@@ -65,8 +65,10 @@ def play(
     task: TaskArgument,
     options: dict[str, Any],
     agent: Annotated[str, typer.Option(help="zero, random, a shipped policy, or a run's folder.")] = "random",
-    video: Annotated[Path | None, typer.Option(help="Write a film here (.mp4 or .gif).")] = None,
-    strip: Annotated[Path | None, typer.Option(help="Write six frames side by side here (.png).")] = None,
+    video: Annotated[Path | None, typer.Option(callback=out_file, help="Write a film here (.mp4 or .gif).")] = None,
+    strip: Annotated[
+        Path | None, typer.Option(callback=out_file, help="Write six frames side by side here (.png).")
+    ] = None,
     seconds: Annotated[float, typer.Option(help="Simulated time.")] = 4.0,
     rate: Annotated[float, typer.Option(help="Frames per simulated second of a film.")] = 20.0,
     width: Annotated[int, typer.Option(help="Of a frame [pixels].")] = 480,

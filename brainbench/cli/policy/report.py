@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from brainbench.cli.destinations import out_folder, picture_file
 from brainbench.cli.output import JsonOption, emit, table, table_of
 
 if TYPE_CHECKING:
@@ -17,9 +18,11 @@ if TYPE_CHECKING:
 
 def report(
     folders: Annotated[list[Path], typer.Argument(help="Folders with evaluated students.")],
-    picture: Annotated[Path | None, typer.Option(help="Draw the comparison into a PNG.")] = None,
+    picture: Annotated[
+        Path | None, typer.Option(callback=picture_file, help="Draw the comparison (.png, .svg, .pdf).")
+    ] = None,
     records: Annotated[
-        Path | None, typer.Option(help="Write records for brainbench leaderboard into a folder.")
+        Path | None, typer.Option(callback=out_folder, help="Write records for brainbench leaderboard into a folder.")
     ] = None,
     at_least: Annotated[
         int, typer.Option(help="Leave out students that learned fewer iterations, and say which.", min=0)

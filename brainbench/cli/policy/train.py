@@ -88,7 +88,9 @@ def distill(
     task: TaskArgument,
     teacher: Annotated[Path, typer.Option(help="A shipped teacher, or a folder of brainbench policy train.")],
     options: dict[str, Any],
-    out: Annotated[Path | None, typer.Option(help="Folder of the run; by default students/<what it is>.")] = None,
+    out: Annotated[
+        Path | None, typer.Option(callback=out_folder, help="Folder of the run; by default students/<what it is>.")
+    ] = None,
     encoder: Annotated[
         str, typer.Option(help="mlp, rnn, tactile_cnn, tactile_convrnn, …, or a model's name; auto as published.")
     ] = "auto",
@@ -144,7 +146,7 @@ def sweep(
     subset: Annotated[str, typer.Option(help="all, types, encoders, or an observation type.")] = "all",
     count: Annotated[bool, typer.Option("--count", help="Print how many students there are, and stop.")] = False,
     names: Annotated[bool, typer.Option("--list", help="Print their names, and stop.")] = False,
-    out: Annotated[Path, typer.Option(help="Folder of the runs.")] = Path("students"),
+    out: Annotated[Path, typer.Option(callback=out_folder, help="Folder of the runs.")] = Path("students"),
     shard: Annotated[str, typer.Option(help="Part of the students, as 0/4.")] = "0/1",
     envs: Annotated[int | None, typer.Option(help="Environments at once, in place of the file's.")] = None,
     iterations: Annotated[int | None, typer.Option(help="In place of the file's.")] = None,

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from brainbench.cli.destinations import beside
 from brainbench.cli.output import JsonOption, emit, facts, progress_bar
 from brainbench.core.errors import DataError, DataFileNotFoundError, UsageError, listing
 from brainbench.core.writing.temporaries import temporary_path
@@ -29,7 +30,10 @@ def convert(
     ],
     out: Annotated[
         Path,
-        typer.Argument(help="Folder of a data set; stimulus set (.h5) for sweeps and runs; run folder for a .h5 file."),
+        typer.Argument(
+            callback=beside,
+            help="Folder of a data set; stimulus set (.h5) for sweeps and runs; run folder for a .h5 file.",
+        ),
     ],
     cleaning: Annotated[
         str | None,

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from brainbench.cli.destinations import out_file
 from brainbench.cli.output import JsonOption, emit, facts, table
 
 if TYPE_CHECKING:
@@ -35,7 +36,7 @@ def objects(
     ids: Annotated[Path | None, typer.Option(help="For a ShapeNet folder: file of synset/model names.")] = None,
     categories: Annotated[Path | None, typer.Option(help="For a ShapeNet folder: CSV or JSON of labels.")] = None,
     export: Annotated[
-        Path | None, typer.Option(help="Write the repaired mesh, in mm (.obj .stl .ply .glb .off).")
+        Path | None, typer.Option(callback=out_file, help="Write the repaired mesh, in mm (.obj .stl .ply .glb .off).")
     ] = None,
     as_json: JsonOption = False,
 ) -> None:

@@ -11,6 +11,7 @@ import typer
 from brainbench.cli.options import SCORE, option
 from brainbench.cli.output import JsonOption, emit, table
 from brainbench.core.errors import UsageError, unknown_name
+from brainbench.core.reading.regular import readable
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -95,11 +96,16 @@ def show(
     if Path(source).suffix in (".h5", ".hdf5", ".nc"):
         from brainbench.stimuli import read_stimulus_set
 
-        data = _of_file(read_stimulus_set(source), stimulus)
+        dataset = read_stimulus_set(source)
+        # Scenes of a set come from whoever wrote it.
+        with readable(source, "description of a stimulus set"):
+            data = _of_file(dataset, stimulus)
+            text = _text(data)
     else:
         recipe = open_recipe(source, whiskers)
         data = _of_recipe(recipe, list(recipe.scenes) if stimulus is None else [choose_scene(recipe, stimulus)])
-    emit(data, _text(data), as_json=as_json)
+        text = _text(data)
+    emit(data, text, as_json=as_json)
 
 
 def _of_recipe(recipe: Recipe, scenes: list[Scene]) -> dict[str, Any]:

@@ -50,12 +50,17 @@ def write_sealed(path: Path, what: str, arrays: Mapping[str, Any], *, compress: 
 
 
 def seal_file(path: Path) -> None:
-    """Write the hash of an HDF5 file of the cache beside it."""
+    """Write the hash of a file of the cache beside it."""
     write_text(path.with_suffix(".sha256"), file_hash(path, length=64))
+
+
+def is_sealed(path: Path) -> bool:
+    """Return whether a file of the cache is there with the bytes that :func:`seal_file` saw."""
+    seal = path.with_suffix(".sha256")
+    return path.is_file() and seal.is_file() and seal.read_bytes()[:64] == file_hash(path, length=64).encode()
 
 
 def trust_sealed(path: Path) -> None:
     """Open an HDF5 file of the cache without looking through it first, if its bytes fit the hash beside it."""
-    seal = path.with_suffix(".sha256")
-    if seal.is_file() and seal.read_bytes()[:64] == file_hash(path, length=64).encode():
+    if is_sealed(path):
         trust_hdf5(path)

@@ -21,7 +21,8 @@ import numpy as np
 from brainbench.core.contracts import CHANNELS
 from brainbench.core.devices import usable_processors
 from brainbench.core.errors import DataError
-from brainbench.core.files import atomic_path, cache_dir, content_hash, file_hash, read_json
+from brainbench.core.files import cache_dir, content_hash, file_hash, read_json
+from brainbench.core.reading.sealed import read_sealed, write_sealed
 from brainbench.datasets.whisking.files import Shard
 from brainbench.datasets.whisking.sweep_files import (
     CELLS,
@@ -216,14 +217,13 @@ def _list(root: Path, stamps: Sequence[tuple[str, int, int]]) -> Listed:
         for first in range(0, len(stamps), _TOGETHER):
             part = stamps[first : first + _TOGETHER]
             kept = cache_dir("sweep-files") / f"{content_hash(str(root), part, _VERSION, length=24)}.npz"
-            if kept.is_file():
-                with np.load(kept, allow_pickle=False) as file:
-                    parts.append(Listed._make(file[name] for name in Listed._fields))
+            known = read_sealed(kept, "list of sweep files")
+            if known is not None:
+                parts.append(Listed(**known))
                 continue
             rows = list(pool.map(functools.partial(_row, root), [path for path, _, _ in part]))
             parts.append(Listed._make(map(np.array, zip(*rows, strict=True))))
-            with atomic_path(kept) as temporary:
-                np.savez(temporary, **parts[-1]._asdict())
+            write_sealed(kept, "list of sweep files", parts[-1]._asdict())
             _LOG.info("%d of %d sweep files are listed", first + len(part), len(stamps))
     return Listed._make(np.concatenate(columns) for columns in zip(*parts, strict=True))
 

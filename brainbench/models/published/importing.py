@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
@@ -11,7 +12,8 @@ from typing import Any, cast
 import torch
 
 from brainbench.core.errors import DataError
-from brainbench.core.files import cache_dir, file_hash, provenance
+from brainbench.core.files import cache_dir, content_hash, provenance
+from brainbench.core.reading.sealed import is_sealed, seal_file
 from brainbench.models.encoders.s4 import S4Encoder
 from brainbench.models.network import EncoderAttenderDecoder
 from brainbench.models.normaliser import PUBLISHED_FORCE_SCALE, Normaliser
@@ -20,7 +22,9 @@ from brainbench.models.published.files import ForeignWeights, read_settings, rea
 from brainbench.models.published.names import published_names, stored_readout
 from brainbench.models.published.recognition import Recognised, recognise
 from brainbench.models.registry import load_model
-from brainbench.models.training.checkpoints import CONFIG, save_checkpoint
+from brainbench.models.training.checkpoints import CONFIG, WEIGHTS, save_checkpoint
+
+_LOG = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -88,9 +92,16 @@ def import_checkpoint(
 
 
 def import_to_cache(path: Path, config: Path | None = None) -> Path:
-    """Import a file into the cache, once for each content, and return its folder."""
-    folder = cache_dir("imported") / file_hash(path)
-    return folder if (folder / CONFIG).is_file() else import_checkpoint(path, config=config, out=folder).folder
+    """Import a file into the cache, once for each content, and return its folder; a damaged one is made again."""
+    folder = cache_dir("imported") / content_hash(path, config)
+    files = [folder / name for name in (WEIGHTS, CONFIG)]
+    if not all(map(is_sealed, files)):
+        if files[0].exists():
+            _LOG.warning("The imported model in the cache, %s, is damaged and is made again", folder)
+        import_checkpoint(path, config=config, out=folder)
+        for file in files:
+            seal_file(file)
+    return folder
 
 
 def build_published(state: Mapping[str, torch.Tensor], found: Recognised) -> tuple[EncoderAttenderDecoder, set[str]]:

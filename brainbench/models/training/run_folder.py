@@ -18,14 +18,16 @@ from typing import Any
 import torch
 from torch import nn
 
-from brainbench.core.errors import DataError, UsageError, install_command
-from brainbench.core.files import atomic_path, read_json, write_json, write_text
-from brainbench.core.reading.regular import check_file, readable
+from brainbench.core.errors import DataError, UsageError, install_command, shown
+from brainbench.core.files import atomic_path, read_mapping, write_json, write_text
+from brainbench.core.reading.regular import check_file, readable, reason
+from brainbench.core.reading.tensors import check_finite
 
 _log = logging.getLogger(__name__)
 
 RUN, STATE, LOG, BEST, FAILED = "run.json", "state.safetensors", "log.jsonl", "best", "failed-batch.safetensors"
 CONTROLS_FILE = "controls.json"
+RESTART = "Delete it to start anew."
 
 
 def claim(folder: Path, identity: Mapping[str, Any], *, write: bool) -> None:
@@ -38,7 +40,7 @@ def claim(folder: Path, identity: Mapping[str, Any], *, write: bool) -> None:
     """
     path = folder / RUN
     if path.is_file():
-        other = read_json(path).get("run", {})
+        other = read_mapping(path).get("run", {})
         differing = [name for name, value in identity.items() if other.get(name) != value]
         if differing:
             told = ", ".join(f"{name} {other.get(name)!r} (now {identity[name]!r})" for name in differing[:4])
@@ -52,7 +54,7 @@ def claim(folder: Path, identity: Mapping[str, Any], *, write: bool) -> None:
 
 def mark(folder: Path, **values: Any) -> None:
     """Add to what the folder says of its run."""
-    write_json(folder / RUN, {**read_json(folder / RUN), **values})
+    write_json(folder / RUN, {**read_mapping(folder / RUN), **values})
 
 
 def save_state(path: Path, learner: nn.Module, optimizer: torch.optim.Optimizer, plain: Mapping[str, Any]) -> None:
@@ -88,26 +90,53 @@ def load_state(path: Path, learner: nn.Module, optimizer: torch.optim.Optimizer)
 
     check_file(path, "training state")
     weights: dict[str, torch.Tensor] = {}
-    with readable(path, "training state", "Delete it to start anew."), safe_open(path, framework="pt") as file:
-        header = json.loads(file.metadata()["state"])
-        tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - not a mapping
+    with readable(path, "training state", RESTART):
+        with safe_open(path, framework="pt") as file:
+            header = json.loads(file.metadata()["state"])
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - not a mapping
+        check_finite(tensors, str(path))
         entries: dict[int, dict[str, Any]] = {int(key): dict(value) for key, value in header["scalars"].items()}
-    for name, value in tensors.items():
-        owner, _, rest = name.partition(".")
-        if owner == "learner":
-            weights[rest] = value
-        elif owner == "optimizer":
-            index, _, key = rest.partition(".")
-            entries.setdefault(int(index), {})[key] = value
-    try:
-        learner.load_state_dict(weights)
-    except RuntimeError as error:
-        raise DataError(f"{str(path)!r} belongs to another network: {error}") from error
-    optimizer.load_state_dict({"state": entries, "param_groups": header["groups"]})
-    torch.set_rng_state(tensors["random.cpu"])
-    if torch.cuda.is_available() and "random.cuda" in tensors:
-        torch.cuda.set_rng_state(tensors["random.cuda"])
-    return header["plain"]
+        for name, value in tensors.items():
+            owner, _, rest = name.partition(".")
+            if owner == "learner":
+                weights[rest] = value
+            elif owner == "optimizer":
+                index, _, key = rest.partition(".")
+                entries.setdefault(int(index), {})[key] = value
+        try:
+            learner.load_state_dict(weights)
+        except RuntimeError as error:
+            raise DataError(f"{shown(str(path))} belongs to another network ({reason(error)}). {RESTART}") from error
+        optimizer.load_state_dict({"state": entries, "param_groups": header["groups"]})
+        for name in {name for kept in optimizer.state.values() for name in kept}:
+            shapes = [
+                (getattr(kept.get(name), "shape", None), weight.shape) for weight, kept in optimizer.state.items()
+            ]
+            # Moments have the shapes of the weights; counts of steps are alike for all.
+            if any(own != shape for own, shape in shapes) and len({own for own, _ in shapes}) > 1:
+                raise DataError(f"{shown(name)} of the optimiser in {shown(str(path))} fits no weights. {RESTART}")
+        torch.set_rng_state(tensors["random.cpu"])
+        if torch.cuda.is_available() and "random.cuda" in tensors:
+            torch.cuda.set_rng_state(tensors["random.cuda"])
+        return header["plain"]
+
+
+def trim_log(path: Path, key: str, last: int) -> None:
+    """Drop the lines of a log that came after the last saved state, and what a kill cut short.
+
+    Args:
+        path: JSON documents, one a line; made if it is missing.
+        key: field that counts, for example ``step``.
+        last: its value in the saved state.
+    """
+    kept = []
+    for line in check_file(path, LOG).read_bytes().splitlines() if path.exists() else ():
+        try:
+            if json.loads(line)[key] <= last:
+                kept.append(line.decode())
+        except (ValueError, LookupError, TypeError, RecursionError):
+            break
+    write_text(path, "".join(f"{line}\n" for line in kept))
 
 
 class RunLog:
@@ -122,15 +151,7 @@ class RunLog:
         if not active:
             return
         path = folder / LOG
-        kept = []
-        if path.exists():
-            for line in path.read_text(encoding="utf-8").splitlines():
-                try:
-                    if json.loads(line)["step"] <= step:
-                        kept.append(line)
-                except (json.JSONDecodeError, KeyError):  # the line that a kill cut short
-                    break
-        write_text(path, "".join(f"{line}\n" for line in kept))
+        trim_log(path, "step", step)
         self._file = path.open("a", encoding="utf-8")
         try:
             from torch.utils.tensorboard import SummaryWriter

@@ -49,13 +49,13 @@ def best_run(out: str | Path) -> tuple[Path, dict[str, float]]:
     Raises:
         DataError: no run of the sweep is finished.
     """
-    from brainbench.core.files import read_json
+    from brainbench.core.files import read_mapping
     from brainbench.models.training.run_folder import RUN, read_log
 
     scores: dict[str, float] = {}
     costs: dict[str, float] = {}
     for path in sorted(Path(out).glob(f"*/{RUN}")):
-        if read_json(path).get("status") != "finished":
+        if read_mapping(path).get("status") != "finished":
             continue
         # Without validation data the losses of the training epochs decide.
         name, lines = path.parent.name, read_log(path.parent, "validation") or read_log(path.parent, "epoch")

@@ -17,12 +17,14 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
+import msgspec
 import torch
 from torch import nn
 
 from brainbench.core.errors import DataError, UsageError
-from brainbench.core.files import read_json, write_json
+from brainbench.core.files import read_mapping, write_json
 from brainbench.core.progress import Progress
+from brainbench.core.reading.regular import readable
 from brainbench.core.writing.locks import lock_folder
 from brainbench.models.activations import evaluating
 from brainbench.models.ops.seeding import seeded
@@ -41,6 +43,7 @@ from brainbench.models.training.run_folder import (
     BEST,
     CONTROLS_FILE,
     FAILED,
+    RESTART,
     RUN,
     STATE,
     RunLog,
@@ -181,7 +184,7 @@ class _Run:
             raise DataError("The data set has no split 'train', so there is nothing to train on.")
         self.batches: Batches = batches
         self.at = _Position()
-        if (out / STATE).is_file():
+        if (out / STATE).exists():  # what is no file is refused there
             self._restore()
         self.log = RunLog(out, step=self.at.step, active=where.first)
         for warning in config_warnings(config, self.model) if where.first else ():
@@ -191,7 +194,7 @@ class _Run:
         """Return what is told of the network that the run started from, which may have been drawn elsewhere."""
         if not self.where.first:
             return now
-        kept = read_json(self.out / RUN).get("twin")
+        kept = read_mapping(self.out / RUN).get("twin")
         if kept is None:
             if (self.out / STATE).is_file():  # of an earlier version, which kept no hash
                 del now["state"]
@@ -312,7 +315,7 @@ class _Run:
     def _finish(self) -> TrainingResult:
         result = None
         if self.where.first:
-            told = read_json(self.out / RUN)
+            told = read_mapping(self.out / RUN)
             self.controls = _evaluations(told.get("controls") or {})
             done = told.get("evaluation")
             if done is not None:
@@ -355,7 +358,7 @@ class _Run:
             return {}
         probe: dict[str, Any] = {"epochs": self.config.probe_epochs, "seed": self.config.seed}
         key = {**probe, "classes": list(self.data.classes), "data": result.data, "twin": self.twin}
-        if self.controls_file.is_file() and (kept := read_json(self.controls_file)).get("of") == key:
+        if self.controls_file.is_file() and (kept := read_mapping(self.controls_file)).get("of") == key:
             return _evaluations(kept["controls"])
         self.progress(self._steps, self._steps, "probing raw input, random features and the untrained twin")
         device = self.where.device
@@ -398,11 +401,12 @@ class _Run:
 
     def _restore(self) -> None:
         plain = load_state(self.out / STATE, self.learner, self.optimizer)
-        state = dict(plain.pop("batches"))
-        if "part" in state:  # every process reads its own part, and the first one's state was saved
-            state["part"] = list(self.where.part)
-        self.batches.load_state_dict(state)
-        self.at = _Position(**plain)
+        with readable(self.out / STATE, "training state", RESTART):
+            state = dict(plain.pop("batches"))
+            if "part" in state:  # every process reads its own part, and the first one's state was saved
+                state["part"] = list(self.where.part)
+            self.batches.load_state_dict(state)
+            self.at = msgspec.convert(plain, _Position)
 
     def _keep_failure(self, views: tuple[torch.Tensor, ...], labels: torch.Tensor, loss: float, norm: float) -> str:
         from safetensors.torch import save_file

@@ -11,9 +11,10 @@ from typing import Any
 import numpy as np
 
 from brainbench.core.errors import UsageError
-from brainbench.core.files import content_hash, read_json, to_plain, write_json
+from brainbench.core.files import content_hash, read_json, read_mapping, to_plain, write_json
 from brainbench.core.jobs import run_jobs
 from brainbench.core.progress import Progress
+from brainbench.core.reading.regular import readable
 from brainbench.metrics.measures.registry import get_metric
 from brainbench.scoring.recovery.boards import RecoveryBoard, make_board
 from brainbench.scoring.recovery.candidates import Candidate
@@ -81,7 +82,8 @@ def recover(
         _begin(folder, {"candidates": [item.identity for item in candidates], "design": to_plain(design)})
         for job in jobs:
             if (folder / job.file).is_file():
-                kept = [RecoveryBoard.of(item) for item in read_json(folder / job.file)]
+                with readable(folder / job.file, "part of a recovery", "Delete it to make it again."):
+                    kept = [RecoveryBoard.of(item) for item in read_json(folder / job.file)]
                 if [item.number for item in kept] == list(job.numbers):
                     found[job] = kept
     missing = [job for job in jobs if job not in found]
@@ -139,7 +141,7 @@ def _begin(folder: Path, config: dict[str, Any]) -> None:
         if any(folder.iterdir()):
             raise UsageError(f"{str(folder)!r} is not empty and holds no recovery; choose a new folder.")
         write_json(path, stated)
-    elif read_json(path).get("hash") != stated["hash"]:
+    elif read_mapping(path).get("hash") != stated["hash"]:
         raise UsageError(
             f"{str(folder)!r} holds a recovery begun with other candidates, stimuli or options; give the same as then, "
             "or choose another folder."

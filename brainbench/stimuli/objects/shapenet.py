@@ -18,7 +18,8 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
-from brainbench.core.errors import DataError, DataFileNotFoundError, UsageError, listing
+from brainbench.core.errors import DataError, DataFileNotFoundError, UsageError, listing, shown
+from brainbench.core.reading.regular import readable
 from brainbench.core.reading.texts import read_json, read_text
 from brainbench.stimuli.objects.mesh_solids import mesh_solid
 from brainbench.stimuli.objects.solid import Solid
@@ -155,10 +156,13 @@ def read_categories(path: str | os.PathLike[str]) -> dict[str, str]:
         if not isinstance(data, dict) or not all(isinstance(label, str) for label in data.values()):
             raise DataError(f"{os.fspath(path)!r} must be one JSON object from names to labels (texts).")
         return data
-    rows = [row for row in csv.reader(read_text(path).splitlines()) if row]
+    with readable(path, "table of categories"):
+        rows = [row for row in csv.reader(read_text(path).splitlines()) if row]
     for number, row in enumerate(rows, start=1):
         if len(row) != 2:
-            raise DataError(f"Row {number} of {os.fspath(path)!r} must be a name and a label; it is {','.join(row)!r}.")
+            raise DataError(
+                f"Row {number} of {os.fspath(path)!r} must be a name and a label; it is {shown(','.join(row))}."
+            )
     return {name.strip(): label.strip() for name, label in rows if _is_name(name.strip().partition("/")[0])}
 
 
@@ -172,7 +176,9 @@ def _checked(names: Iterable[str], where: str) -> tuple[str, ...]:
     for name in checked:
         synset, slash, model = name.partition("/")
         if not (slash and _is_name(synset) and model) or "/" in model or model in (".", ".."):
-            raise UsageError(f"A ShapeNet model is named SYNSET/MODEL, such as 02691156/1a04e3; {where} has {name!r}.")
+            raise UsageError(
+                f"A ShapeNet model is named SYNSET/MODEL, such as 02691156/1a04e3; {where} has {shown(name)}."
+            )
     if twice := [name for name, count in Counter(checked).items() if count > 1]:
         raise UsageError(f"ShapeNet models occur twice in {where}: {listing(twice, limit=4)}.")
     return checked

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from brainbench.core.errors import DataError, UsageError
-from brainbench.core.files import read_json, to_plain, write_json
+from brainbench.core.files import read_mapping, to_plain, write_json
 from brainbench.core.progress import Progress
 from brainbench.core.reading.ranges import check_number
 from brainbench.core.writing.locks import lock_folder
@@ -138,7 +138,7 @@ def _check_config(plan: GenerationPlan | SweepTable, folder: Path) -> None:
             )
         write_json(path, config)
         return
-    found = read_json(path)
+    found = read_mapping(path)
     if found != config and not any(folder.glob("*.h5")):
         # Begun, but nothing was made: a failed first try must not stand in the way.
         write_json(path, config)

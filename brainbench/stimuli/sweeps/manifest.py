@@ -13,6 +13,7 @@ from brainbench.core.contracts import SWEEPS_FORMAT, SWEEPS_SCHEMA
 from brainbench.core.errors import DataError
 from brainbench.core.files import content_hash, provenance
 from brainbench.core.reading.hdf5 import open_hdf5
+from brainbench.core.reading.regular import readable
 from brainbench.stimuli.sweeps.plan import GenerationPlan, PlannedShard
 from brainbench.stimuli.sweeps.shards import COUNTS, UNUSABLE
 from brainbench.stimuli.sweeps.split import SPLITS
@@ -32,16 +33,16 @@ def is_complete(path: Path, task: PlannedShard) -> bool:
     if not path.is_file():
         return False
     try:
-        with h5py.File(path, "r") as file:
+        with readable(path, "shard"), h5py.File(path, "r") as file:
             found = str(file.attrs["config_hash"])
             wrench: Any = file["wrench"]
             end = wrench.id.get_offset() + wrench.size * wrench.dtype.itemsize
-            shape = wrench.shape
-    except (OSError, KeyError):
+            whole = wrench.shape[0] == len(task) and path.stat().st_size >= end
+    except DataError:
         return False
     if found != task.config_hash:
         raise DataError(f"{str(path)!r} belongs to another data set; choose an empty folder, or remove what is there.")
-    return shape[0] == len(task) and path.stat().st_size >= end
+    return whole
 
 
 def make_manifest(plan: GenerationPlan | SweepTable, folder: str | os.PathLike[str]) -> dict[str, Any]:

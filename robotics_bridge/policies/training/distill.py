@@ -23,7 +23,7 @@ import torch
 from torch import nn
 
 from brainbench.core.errors import UsageError
-from brainbench.core.files import provenance, read_json, to_plain, write_json
+from brainbench.core.files import provenance, read_mapping, to_plain, write_json
 from brainbench.core.progress import Progress
 from brainbench.models.training.run_folder import RunLog, load_state, save_state
 from robotics_bridge.policies.encoders.arms import perceptron
@@ -147,7 +147,7 @@ class _Run:
         self.kept: list[tuple[int, Rollout]] = []
         self.iteration, self.loss = 0, math.nan
         self._claim()
-        if (out / STATE).is_file():
+        if (out / STATE).exists():
             self._restore()
         self.log = RunLog(out, step=self.iteration)
 
@@ -276,7 +276,7 @@ class _Run:
         path = self.out / CONFIG
         mine = to_plain(self.config.plain())
         if path.is_file():
-            found = read_json(path).get("distill")
+            found = read_mapping(path).get("distill")
             found = {"twist": EARLIER_TWIST, **found} if isinstance(found, dict) else found
             differing = sorted(key for key in mine if not isinstance(found, dict) or found.get(key) != mine[key])
             if differing:

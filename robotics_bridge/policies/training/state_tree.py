@@ -5,15 +5,15 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any
 
 import torch
-from safetensors import SafetensorError, safe_open
+from safetensors import safe_open
 from safetensors.torch import save_file
 
-from brainbench.core.errors import DataError, DataFileNotFoundError
+from brainbench.core.errors import DataError
 from brainbench.core.files import atomic_path
+from brainbench.core.reading.regular import check_file, readable
 
 _LEAF = "__tensor__"
 
@@ -69,16 +69,17 @@ def write_tensors(path: str | os.PathLike[str], tensors: Mapping[str, torch.Tens
 
 
 def load(path: str | os.PathLike[str], device: str = "cpu") -> Any:
-    """Read a tree; raise DataError if the file is missing or holds none."""
-    if not Path(path).is_file():
-        raise DataFileNotFoundError(f"There is no file {str(path)!r}.")
-    try:
+    """Read a tree.
+
+    Raises:
+        DataError: the file is missing or holds no tree.
+    """
+    check_file(path, "saved state")
+    with readable(path, "saved state"):
         with safe_open(str(path), framework="pt", device=device) as file:
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
             metadata = file.metadata() or {}
         tree = restore(json.loads(metadata["tree"]), tensors)
-    except (SafetensorError, LookupError, ValueError, TypeError, AttributeError, RecursionError, OSError) as error:
-        raise DataError(f"{str(path)!r} is damaged or not one of ours: {str(error)[:80]}.") from error
     if not isinstance(tree, dict):
         raise DataError(f"{str(path)!r} is damaged or not one of ours: it holds no names and values.")
     return tree

@@ -7,9 +7,10 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from safetensors import SafetensorError, safe_open
+from safetensors import safe_open
 
-from brainbench.core.errors import BrainbenchError, DataError
+from brainbench.core.errors import DataError
+from brainbench.core.reading.regular import readable
 from brainbench.core.reading.tensors import read_tensors
 from robotics_bridge.policies.contract import JOINTS, MOST_NUMBERS
 from robotics_bridge.policies.encoders.arms import EncoderConfig
@@ -58,17 +59,11 @@ def load_student(folder: str | Path, *, device: str = "cpu") -> tuple[TactilePol
         given.part("encoder_settings").fields(EncoderConfig)
     shapes, actions = described.shapes("groups", MOST_NUMBERS), described.whole("actions", 1, JOINTS)
     described.part("deployment")
-    try:
+    with readable(folder / MODEL, "student", "It is damaged, or of another student."):
         _require_sizes(folder / MODEL, config, shapes)
         with torch.random.fork_rng(devices=[]):
             student = build_student(config, shapes, list(shapes), actions)
-        weights = read_tensors(folder / MODEL, "file of weights (safetensors)")
-        student.load_state_dict(weights)
-    except BrainbenchError:
-        raise
-    except (SafetensorError, RuntimeError, ValueError, TypeError, LookupError, OSError) as error:
-        first = " ".join(str(error).split())[:120]
-        raise DataError(f"The weights in {str(folder)!r} are damaged or of another student ({first}).") from error
+        student.load_state_dict(read_tensors(folder / MODEL, "file of weights (safetensors)"))
     return student.to(device).eval(), dict(described.values)
 
 

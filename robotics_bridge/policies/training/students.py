@@ -10,7 +10,7 @@ from typing import Any
 import torch
 
 from brainbench.core.errors import DataError, UsageError
-from brainbench.core.files import read_json, write_json
+from brainbench.core.files import read_mapping, write_json
 from brainbench.core.progress import Progress
 from robotics_bridge import tasks
 from robotics_bridge.policies.encoders.arms import ARMS, EncoderConfig
@@ -95,7 +95,7 @@ def calibrated(config: DistillConfig, env: Any, teacher: Any, out: Path) -> Dist
     if tactile is None or tactile.arm in ARMS or "calibration" in config.encoder_settings:
         return config
     if (out / CONFIG).is_file():
-        found = read_json(out / CONFIG).get("distill", {}).get("encoder_settings", {}).get("calibration")
+        found = read_mapping(out / CONFIG).get("distill", {}).get("encoder_settings", {}).get("calibration")
     else:
         found = asdict(_measure(tactile, env, teacher))
     settings = dict(config.encoder_settings) if found is None else {**config.encoder_settings, "calibration": found}

@@ -20,10 +20,12 @@ from typing import TYPE_CHECKING, Any
 import torch
 
 from brainbench.core.errors import BrainbenchError, DataError, DataFileNotFoundError, UsageError, missing_dependency
-from brainbench.core.files import file_hash, provenance, read_json, write_json
+from brainbench.core.files import file_hash, provenance, read_mapping, write_json
 from brainbench.core.progress import Progress
+from brainbench.core.reading.regular import readable
 from brainbench.core.reading.tensors import check_finite
 from brainbench.core.writing.locks import lock_folder
+from brainbench.models.training.run_folder import LOG, RESTART, trim_log
 from robotics_bridge.envs.rsl_rl import RslRlEnv
 from robotics_bridge.policies.acting import ActingModel
 from robotics_bridge.policies.evaluate import Policy
@@ -257,7 +259,7 @@ def _train(
     while trainer.iteration < total and not over:
         row = trainer.iterate()
         rows.append(row)
-        with (run / "log.jsonl").open("a", encoding="utf-8") as file:
+        with (run / LOG).open("a", encoding="utf-8") as file:
             file.write(json.dumps(row) + "\n")
         for name, value in row.items():
             writer.add_scalar(name, value, trainer.iteration)
@@ -276,28 +278,27 @@ def _resume(trainer: Trainer, run: Path, facts: dict[str, Any]) -> None:
     if not config.is_file():
         write_json(config, facts | {"provenance": provenance()})
         return
-    known = read_json(config)
-    # Settings that came later than the run had their defaults in it.
-    known["settings"] = asdict(TeacherSettings(**_plain(known["settings"])))
+    known = read_mapping(config)
+    with readable(config, "configuration of a run"):
+        # Settings that came later than the run had their defaults in it.
+        known["settings"] = asdict(TeacherSettings(**_plain(known["settings"])))
     for name in ("task", "hand", "num_envs", "seed", "settings"):
         if json.loads(json.dumps(facts[name])) != json.loads(json.dumps(known.get(name))):
             raise UsageError(
                 f"The run in {str(run)!r} has {name} = {known.get(name)!r}; this one {facts[name]!r}. "
                 "Choose another folder."
             )
-    if not (run / RESUME).is_file():
+    if not (run / RESUME).exists():
+        trim_log(run / LOG, "iteration", 0)
         return
     state = state_tree.load(run / RESUME)
     if "env" not in state:
         _LOG.warning("The run was saved without its environments: it goes on with new episodes.")
         state["env"] = trainer.env.unwrapped.state_dict()
-    trainer.load(state)
-    log = run / "log.jsonl"
-    if log.is_file():
-        # Iterations after the last checkpoint are done again.
-        lines = [line for line in log.read_text(encoding="utf-8").splitlines() if line.endswith("}")]
-        kept = [line for line in lines if json.loads(line)["iteration"] <= trainer.iteration]
-        log.write_text("".join(f"{line}\n" for line in kept), encoding="utf-8")
+    with readable(run / RESUME, "training state", RESTART):
+        trainer.load(state)
+    # Iterations after the last checkpoint are done again.
+    trim_log(run / LOG, "iteration", trainer.iteration)
 
 
 def _save(trainer: Trainer, run: Path, *, keep_env: bool) -> None:

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from brainbench.core.errors import DataError
+from brainbench.datasets.whisking import sweep_tree
 from brainbench.datasets.whisking.dataset import WhiskingDataset
 from tests.factories.published_sweeps import sweep_data, write_sweep, write_tree
 
@@ -47,6 +48,19 @@ def test_sweeps_are_shuffled_and_batches_go_on_where_a_state_was_saved(tree):
     for (x, y), (again, label) in zip(kept, second, strict=True):
         np.testing.assert_array_equal(x.numpy(), again.numpy())
         assert y.tolist() == label.tolist()
+
+
+def test_a_damaged_list_in_the_cache_is_made_again(tree, monkeypatch, tmp_path, caplog):
+    monkeypatch.setenv("BRAINBENCH_CACHE", str(tmp_path))
+    sweep_tree._open.cache_clear()
+    classes = sweep_tree.open_sweep_tree(tree).classes
+    (kept,) = (tmp_path / "sweep-files").iterdir()
+    whole = kept.read_bytes()
+    kept.write_bytes(whole[: len(whole) // 2])
+    sweep_tree._open.cache_clear()
+    assert sweep_tree.open_sweep_tree(tree).classes == classes
+    assert "made again" in caplog.text
+    assert kept.read_bytes() == whole
 
 
 def test_classes_keep_their_numbers_and_take_names_from_the_shapes(tree):

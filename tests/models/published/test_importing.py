@@ -7,7 +7,7 @@ import torch
 
 from brainbench.core.errors import DataError, UsageError
 from brainbench.models.normaliser import Normaliser
-from brainbench.models.published.importing import import_checkpoint
+from brainbench.models.published.importing import import_checkpoint, import_to_cache
 from brainbench.models.registry import describe_model, load_model
 from tests.factories.published_files import lightning_state
 from tests.factories.training_sweeps import random_sweeps
@@ -101,6 +101,18 @@ def test_a_folder_with_one_such_file_is_a_model(file, original):
     file.rename(file.with_name("first.ckpt"))
     with pytest.raises(UsageError, match=r"'first\.ckpt', 'last\.ckpt'"):
         load_model(name)
+
+
+def test_a_damaged_import_in_the_cache_is_made_again(file, tmp_path, monkeypatch, caplog):
+    monkeypatch.setenv("BRAINBENCH_CACHE", str(tmp_path / "cache"))
+    weights = import_to_cache(file) / "model.safetensors"
+    whole, before = weights.read_bytes(), weights.stat().st_mtime_ns
+    assert import_to_cache(file) == weights.parent
+    assert weights.stat().st_mtime_ns == before
+    weights.write_bytes(whole[:-1] + bytes([whole[-1] ^ 1]))
+    import_to_cache(file)
+    assert "made again" in caplog.text
+    assert weights.read_bytes() == whole
 
 
 @torch.no_grad()

@@ -44,6 +44,7 @@ def test_a_contract_is_read_as_it_was_written(tmp_path) -> None:
         ("format", ["pickle", 1, None, ["onnx"]]),
         ("inputs", [[], {}, "proprio", [["proprio"]], [["proprio", [8]], ["proprio", [8]]], [[1, [8]]]]),
         ("inputs", [[["proprio", shape]] for shape in ([7], [0], [-8], [8.0], [True], [], [1, 1, 1, 8], "8")]),
+        ("inputs", [[["goal", [9_000_000]], ["thermal", [9_000_000]]]]),
         ("inputs", [[["tactile", shape]] for shape in ([5, 2], [5, 3, 3], [5, 2, 1], [5, 2, 10**9])]),
         ("deployment.rate", [NAN, INF, -INF, 0, -40, 1e9, 10**400, "40", True, None, [40]]),
         ("deployment.hand", ["", 1, None, "x" * 5000]),

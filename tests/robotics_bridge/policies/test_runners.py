@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 
 import numpy as np
@@ -15,6 +16,7 @@ from robotics_bridge.deploy.session import read_deployed
 from robotics_bridge.policies.runners import read_policy
 from tests.factories.mutations import mutate_text
 from tests.factories.policies import export_small
+from tests.factories.reading_trials import time_limit
 
 SHAPES = {"proprio": (36,), "goal": (1,), "tactile": (5, 5, 3)}
 
@@ -79,6 +81,43 @@ def test_weights_in_other_files_are_not_opened(exported, tmp_path) -> None:
     onnx.save(model, tmp_path / "policy.onnx", save_as_external_data=True, location="elsewhere", size_threshold=0)
     with pytest.raises(DataError, match="other files"):
         read_policy(tmp_path / "policy.onnx", SHAPES)
+
+
+def test_constants_of_branches_in_other_files_are_not_opened(exported, tmp_path) -> None:
+    model = onnx.load(exported["onnx"])
+    (tmp_path / "elsewhere").write_bytes(bytes(4))
+    value = onnx.TensorProto(name="w", data_type=onnx.TensorProto.FLOAT, dims=[1], data_location=1)
+    value.external_data.add(key="location", value="elsewhere")
+    model.graph.node.append(onnx.helper.make_node("Constant", [], ["unused"], value=value))
+    (tmp_path / "policy.onnx").write_bytes(model.SerializeToString())
+    with pytest.raises(DataError, match="other files"):
+        read_policy(tmp_path / "policy.onnx", SHAPES)
+
+
+def test_a_memory_without_bounds_is_refused(tmp_path) -> None:
+    def value(name: str, *shape: int) -> onnx.ValueInfoProto:
+        return onnx.helper.make_tensor_value_info(name, onnx.TensorProto.FLOAT, [1, *shape])
+
+    inputs = [*(value(name, *shape) for name, shape in SHAPES.items()), value("h_in", 1 << 40)]
+    nodes = [onnx.helper.make_node("Identity", [a], [b]) for a, b in (("h_in", "h_out"), ("proprio", "actions"))]
+    graph = onnx.helper.make_graph(nodes, "policy", inputs, [value("actions", 36), value("h_out", 1 << 40)])
+    path = tmp_path / "policy.onnx"
+    onnx.save(onnx.helper.make_model(graph, ir_version=10, opset_imports=[onnx.helper.make_opsetid("", 18)]), path)
+    with pytest.raises(DataError, match="memory of 1,099"):
+        read_policy(path, SHAPES)
+
+
+def test_what_is_no_file_is_not_waited_for(tmp_path) -> None:
+    os.mkfifo(tmp_path / "policy.onnx")
+    (tmp_path / "policy.pt").symlink_to("/dev/zero")
+    for path, format in ((tmp_path / "policy.onnx", "onnx"), (tmp_path / "policy.pt", "jit")):
+        with time_limit(), pytest.raises(DataError, match="device"):
+            read_policy(path, SHAPES, format=format)
+
+
+def test_a_program_is_not_deployed(exported) -> None:
+    with pytest.raises(DataError, match="TorchScript"):
+        read_deployed(exported["jit"])
 
 
 def test_files_that_fit_another_contract_are_refused(exported, tmp_path) -> None:

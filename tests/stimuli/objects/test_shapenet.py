@@ -90,6 +90,9 @@ def test_a_folder_without_models_says_what_it_should_hold(tree, tmp_path):
     bad.write_text("02691156,air,plane\n")
     with pytest.raises(DataError, match=r"Row 1 .*bad\.csv'.*'02691156,air,plane'"):
         read_categories(bad)
+    bad.write_text('02691156,"' + "x" * 200_000)
+    with pytest.raises(DataError, match=r"bad\.csv"):
+        read_categories(bad)
 
 
 @pytest.mark.shared

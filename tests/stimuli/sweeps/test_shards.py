@@ -131,6 +131,10 @@ def test_a_shard_that_was_cut_off_is_not_whole(tmp_path, kept):
     write_shard(simulate_shard(task, prepare_shard(task)), tmp_path)
     path = tmp_path / task.name
     assert is_complete(path, task)
+    with h5py.File(path, "r+") as file:
+        del file["wrench"]
+        file.create_group("wrench")
+    assert not is_complete(path, task)
     path.write_bytes(path.read_bytes()[:kept])
     assert not is_complete(path, task)
 

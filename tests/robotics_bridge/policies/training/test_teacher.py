@@ -61,6 +61,16 @@ def test_a_run_that_stops_halfway_goes_on_exactly(tmp_path: Path) -> None:
     assert list((tmp_path / "parts").glob("events.out.tfevents*"))
 
 
+def test_a_run_killed_before_its_first_checkpoint_begins_its_log_anew(tmp_path: Path) -> None:
+    train(_env(), tmp_path, settings=SMALL, iterations=1)
+    (tmp_path / RESUME).unlink()
+    with (tmp_path / "log.jsonl").open("a") as log:
+        log.write('{"iteration": 2, "rew')
+    train(_env(), tmp_path, settings=SMALL, iterations=2)
+    lines = (tmp_path / "log.jsonl").read_text().splitlines()
+    assert [json.loads(line)["iteration"] for line in lines] == [1, 2]
+
+
 @pytest.mark.slow
 def test_a_killed_run_goes_on_exactly(tmp_path: Path) -> None:
     text = f"""
@@ -190,7 +200,7 @@ def test_trees_of_tensors_and_numbers_survive_a_file(tmp_path: Path) -> None:
     assert torch.equal(back["b"][2][0], torch.ones(2, 2))
     assert float(back["state"][0]["step"]) == 2.0
     (tmp_path / "broken.safetensors").write_bytes(b"no tensors")
-    with pytest.raises(DataError, match="damaged"):
+    with pytest.raises(DataError, match=r"broken\.safetensors"):
         state_tree.load(tmp_path / "broken.safetensors")
 
 
