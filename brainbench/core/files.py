@@ -19,6 +19,8 @@ from brainbench.core.writing.temporaries import temporary_path
 
 CACHE_VARIABLE = "BRAINBENCH_CACHE"
 """Environment variable that overrides the platform's cache folder."""
+LIBRARIES = ("numpy", "scipy", "xarray", "h5py", "torch", "warp-lang", "mujoco-core")
+"""Distributions on whose version the last digits of a result depend."""
 _UNWRITABLE = (
     errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.ENOTDIR, errno.EEXIST,
     errno.EISDIR, errno.ENAMETOOLONG,
@@ -204,7 +206,7 @@ def provenance(**extra: Any) -> dict[str, Any]:
     from brainbench import __version__
 
     versions: dict[str, str] = {}
-    for package in ("numpy", "scipy", "xarray", "h5py", "torch", "warp-lang", "mujoco-core"):
+    for package in LIBRARIES:
         with contextlib.suppress(metadata.PackageNotFoundError):
             versions[package] = metadata.version(package)
     return {

@@ -18,15 +18,16 @@ from brainbench.core.progress import Progress
 from brainbench.core.reading.hdf5 import open_hdf5
 from brainbench.core.reading.regular import readable
 from brainbench.stimuli.engines import DEFAULT_ENGINE
+from brainbench.stimuli.engines.fidelity import Fidelity
+from brainbench.stimuli.kept_sets import index_path, read_index, write_index
 from brainbench.stimuli.readout import to_grid
-from brainbench.stimuli.scenes.recipes import get_recipe, is_recipe, list_recipes
+from brainbench.stimuli.scenes.recipes import get_recipe, is_packaged, is_recipe, list_recipes
 from brainbench.stimuli.stimulus_set import hash_stimulus_set, read_stimulus_set
 from brainbench.stimuli.whiskers.selection import match_whiskers
 
 if TYPE_CHECKING:
     import xarray as xr
 
-    from brainbench.stimuli.engines.fidelity import Fidelity
     from brainbench.stimuli.engines.protocol import WhiskerEngine
     from brainbench.stimuli.scenes.scene_files import Recipe
 
@@ -84,11 +85,17 @@ def load_stimuli(
         return source if whiskers == "all" else load_stimuli(source.dataset, whiskers=whiskers)  # type: ignore[arg-type]
     if not isinstance(source, (str, os.PathLike)):
         return _from_dataset(check_stimulus_set(source), whiskers, "stimulus set")
+    index = index_path(source, whiskers, Fidelity.of(fidelity), backend) if cache and is_packaged(source) else None
+    if index is not None and (found := _indexed(index)) is not None:
+        return found
     if (recipe := _recipe(source, whiskers)) is not None:
-        from brainbench.stimuli.simulation import simulate
+        from brainbench.stimuli.simulation import ENTRY, simulate
 
         dataset = simulate(recipe.scenes, fidelity=fidelity, backend=backend, progress=progress, cache=cache)
-        return _from_dataset(dataset, "all", recipe.description.strip() or recipe.name)
+        description = recipe.description.strip() or recipe.name
+        if index is not None and ENTRY in dataset.encoding:
+            write_index(index, dataset.encoding[ENTRY], description)
+        return _from_dataset(dataset, "all", description)
     path = Path(source)
     if path.suffix in _HDF5 or path.is_file():
         return _from_hdf5(path, whiskers)
@@ -110,8 +117,19 @@ def prepare_stimuli(
     from brainbench.stimuli.simulation import prepare
 
     with contextlib.suppress(BrainbenchError, OSError):
+        if is_packaged(source) and read_index(index_path(source, whiskers, Fidelity.of(fidelity), DEFAULT_ENGINE)) is not None:
+            return
         if isinstance(source, (str, os.PathLike)) and (recipe := _recipe(source, whiskers)) is not None:
             prepare(recipe.scenes, fidelity=fidelity, progress=progress)
+
+
+def _indexed(index: Path) -> Stimuli | None:
+    """Return the stimuli that an index of the cache leads to; None without them."""
+    from brainbench.stimuli.simulation import read_entry
+
+    found = read_index(index)
+    dataset = None if found is None else read_entry(found[0])
+    return None if found is None or dataset is None else _from_dataset(dataset, "all", found[1])
 
 
 def _recipe(source: str | os.PathLike[str], whiskers: str) -> Recipe | None:

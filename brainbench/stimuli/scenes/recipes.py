@@ -41,6 +41,11 @@ def is_recipe(source: str) -> bool:
     return source in list_recipes() or source.startswith(f"{RECORDED} ")
 
 
+def is_packaged(source: object) -> bool:
+    """Return whether ``source`` names a recipe that depends on nothing but the package."""
+    return isinstance(source, str) and source in _scene_files()
+
+
 def get_recipe(
     name: str,
     *,
