@@ -5,16 +5,16 @@ from __future__ import annotations
 import shlex
 import sys
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from brainbench.cli import destinations
 from brainbench.cli.options import SCORE, SCORE_FLAGS, with_options
 from brainbench.cli.output import JsonOption, emit, progress_bar
-from brainbench.cli.score_text import score_text, walk_text
-from brainbench.core.files import to_plain
-from brainbench.scoring.options import ScoreOptions
+
+if TYPE_CHECKING:
+    from brainbench.scoring.options import ScoreOptions
 
 
 def _complete_model(incomplete: str) -> list[str]:
@@ -49,6 +49,8 @@ def score(
     as_json: JsonOption = False,
 ) -> None:
     """Score a model against neural recordings and write a result record and an HTML report."""
+    from brainbench.cli.score_text import score_text, walk_text
+    from brainbench.core.files import to_plain
     from brainbench.scoring.kept_records import keep, read_kept, record_path
     from leaderboards.site.score_page import write_report
     from leaderboards.store import write_record

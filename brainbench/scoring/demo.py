@@ -36,7 +36,7 @@ def demo_recordings(name: str = "demo", *, progress: Progress | None = None) -> 
     from brainbench.stimuli import load_stimuli
 
     stimuli = load_stimuli(DEMOS[name], progress=progress)
-    if name == "demo-rodgers":
+    if name == "demo-rodgers" and stimuli.dataset is not None:
         return ensure_rodgers_demo(stimuli.dataset, progress=progress)
     weights, design = locate_model(HIDDEN_NETWORK).weights, PopulationDesign()
     told = {"stimuli_hash": stimuli.content_hash, "weights": file_hash(weights) if weights else None}

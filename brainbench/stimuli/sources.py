@@ -117,7 +117,8 @@ def prepare_stimuli(
     from brainbench.stimuli.simulation import prepare
 
     with contextlib.suppress(BrainbenchError, OSError):
-        if is_packaged(source) and read_index(index_path(source, whiskers, Fidelity.of(fidelity), DEFAULT_ENGINE)) is not None:
+        index = index_path(source, whiskers, Fidelity.of(fidelity), DEFAULT_ENGINE)
+        if is_packaged(source) and read_index(index) is not None:
             return
         if isinstance(source, (str, os.PathLike)) and (recipe := _recipe(source, whiskers)) is not None:
             prepare(recipe.scenes, fidelity=fidelity, progress=progress)
