@@ -5,10 +5,9 @@ from __future__ import annotations
 import functools
 import os
 import platform
-from importlib import metadata
 from pathlib import Path
 
-from brainbench.core.files import LIBRARIES, content_hash
+from brainbench.core.files import content_hash, library_versions
 
 
 @functools.cache
@@ -25,5 +24,4 @@ def code_stamp() -> str:
             if not name.endswith(".pyc"):
                 state = os.stat(os.path.join(folder, name))  # noqa: PTH116, PTH118 - twice as fast, on every score
                 found.append((folder, name, state.st_size, state.st_mtime_ns))
-    versions = [metadata.version(library) for library in LIBRARIES]
-    return content_hash(sorted(found), versions, platform.python_version(), platform.machine())
+    return content_hash(sorted(found), library_versions(), platform.python_version(), platform.machine())

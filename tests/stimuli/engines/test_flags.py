@@ -1,4 +1,4 @@
-"""The table of docs/unstable-whiskers.md that says what is flagged and what is not: each of its rows is simulated, or judged."""
+"""The tables of docs/unstable-whiskers.md, what is flagged and what is not: each row is simulated, or judged."""
 
 import re
 from pathlib import Path
