@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import os
+import tomllib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,11 +19,12 @@ from brainbench.core.files import content_hash
 from brainbench.core.progress import Progress
 from brainbench.core.reading.hdf5 import open_hdf5
 from brainbench.core.reading.regular import readable
+from brainbench.core.reading.texts import read_toml
 from brainbench.stimuli.engines import DEFAULT_ENGINE
 from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.kept_sets import index_path, read_index, write_index
 from brainbench.stimuli.readout import to_grid
-from brainbench.stimuli.scenes.recipes import get_recipe, is_packaged, is_recipe, list_recipes
+from brainbench.stimuli.scenes.recipes import get_recipe, is_packaged, is_recipe, list_recipes, recipe_file
 from brainbench.stimuli.stimulus_set import hash_stimulus_set, read_stimulus_set
 from brainbench.stimuli.whiskers.selection import match_whiskers
 
@@ -103,6 +106,16 @@ def load_stimuli(
     raise unknown_name("stimuli", os.fspath(source), list_recipes(), hint=hint)
 
 
+def known_labels(source: object) -> tuple[str, ...] | None:
+    """Return the labels of a packaged recipe or a scene file, before its scenes are built; None for anything else."""
+    with contextlib.suppress(BrainbenchError, OSError, KeyError, TypeError):
+        if is_packaged(source):
+            return tuple(item["label"] for item in tomllib.loads(recipe_file(source).read_text("utf-8"))["scene"])
+        if isinstance(source, (str, os.PathLike)) and Path(source).suffix == ".toml":
+            return tuple(item["label"] for item in read_toml(Path(source), "scene file")["scene"])
+    return None
+
+
 def prepare_stimuli(
     source: object,
     *,
@@ -135,6 +148,8 @@ def _indexed(index: Path) -> Stimuli | None:
 
 def _recipe(source: str | os.PathLike[str], whiskers: str) -> Recipe | None:
     """Return the scenes that a recipe name or the path of a scene file names; None for anything else."""
+    if is_packaged(source):
+        return _packaged(source, whiskers)
     if isinstance(source, str) and is_recipe(source):
         return get_recipe(source, whiskers=whiskers)
     if Path(source).suffix != ".toml":
@@ -142,6 +157,12 @@ def _recipe(source: str | os.PathLike[str], whiskers: str) -> Recipe | None:
     from brainbench.stimuli.scenes.scene_files import load_scene
 
     return load_scene(source, whiskers=whiskers)
+
+
+@functools.lru_cache(maxsize=1)
+def _packaged(name: str, whiskers: str) -> Recipe:
+    """Return a recipe of the package, whose meshes take longest of all; a score asks for it several times."""
+    return get_recipe(name, whiskers=whiskers)
 
 
 def _from_dataset(dataset: xr.Dataset, whiskers: str, description: str) -> Stimuli:
