@@ -6,9 +6,9 @@ import logging
 import re
 from pathlib import Path
 
-from brainbench.core.code_stamp import code_stamp
 from brainbench.core.errors import DataError, UsageError
 from brainbench.core.files import cache_dir, content_hash, read_json, write_text
+from brainbench.core.reading.code_stamp import code_stamp
 from brainbench.core.records import ResultRecord
 from brainbench.scoring.demo import DEMOS
 from brainbench.scoring.options import ScoreOptions

@@ -9,9 +9,9 @@ from __future__ import annotations
 import contextlib
 from pathlib import Path
 
-from brainbench.core.code_stamp import code_stamp
 from brainbench.core.errors import DataError
 from brainbench.core.files import cache_dir, content_hash, read_json, write_json
+from brainbench.core.reading.code_stamp import code_stamp
 
 
 def index_path(*asked: object) -> Path:

@@ -17,7 +17,7 @@ def code_stamp() -> str:
     An entry named by it never outlives an edit. What is slow to make again, such as a simulation, has a version of
     its own instead (:data:`brainbench.stimuli.engines.PHYSICS_VERSION`).
     """
-    root = Path(__file__).parents[1]
+    root = Path(__file__).parents[2]
     found = []
     for folder, _, names in os.walk(root):
         for name in names:
