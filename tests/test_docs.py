@@ -104,7 +104,7 @@ def _commands(page: str) -> list[str]:
 
 PRELUDES = {
     "docs/export.md": "import torch\nstimuli = torch.zeros(2, 22, 30, 5, 7)",
-    "docs/stimuli.md": "from brainbench.stimuli import WhiskerArray, whiskit\n"
+    "docs/whiskit.md": "from brainbench.stimuli import WhiskerArray, whiskit\n"
     "whiskit.save_parameters(WhiskerArray.rat(), 'whisker_param_average_rat/')",
 }
 """What a page takes for granted."""

@@ -6,53 +6,9 @@ Exit status: 0 done; 1 the request was fine but the job failed (unusable data);
 
 from __future__ import annotations
 
-import logging
 import os
 import sys
-from typing import Annotated
-
-import typer
-
-from brainbench import __version__
-from brainbench.cli import (
-    doctor,
-    leaderboard,
-    models,
-    policy,
-    power,
-    recordings,
-    recovery,
-    requirements,
-    score,
-    stimuli,
-    tactile,
-    tradeoff,
-    train,
-)
-from brainbench.core.errors import BrainbenchError
-
-app = typer.Typer(
-    name="brainbench",
-    help="Which artificial networks process touch the way a brain does?",
-    no_args_is_help=True,
-    pretty_exceptions_enable=False,
-    rich_markup_mode="rich",
-    context_settings={"help_option_names": ["-h", "--help"]},
-)
-app.command("score")(score.score)
-app.command("power")(power.power)
-app.command("recovery")(recovery.recovery)
-app.command("train")(train.train)
-app.command("export")(models.export)
-app.command("doctor")(doctor.doctor)
-app.add_typer(models.app, name="models")
-app.add_typer(recordings.app, name="recordings")
-app.add_typer(stimuli.app, name="stimuli")
-app.add_typer(tactile.app, name="tactile")
-app.add_typer(policy.app, name="policy")
-app.add_typer(tradeoff.app, name="tradeoff")
-app.add_typer(leaderboard.app, name="leaderboard")
-requirements.guard(app)
+from typing import Any
 
 INTERRUPTED = 130
 """Exit status after Ctrl-C, as shells count it: 128 and the number of the signal."""
@@ -62,24 +18,14 @@ GO_ON = (
 )
 
 
-def _version(show: bool) -> None:
-    if show:
-        print(__version__)
-        raise typer.Exit
+def __getattr__(name: str) -> Any:
+    """Return the complete command line, ``app``, built when it is first asked for."""
+    if name != "app":
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    from brainbench.cli.application import build
 
-
-@app.callback()
-def _root(
-    verbose: Annotated[bool, typer.Option("--verbose", "-v", help="Log what is done, on stderr.")] = False,
-    version: Annotated[
-        bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version and exit.")
-    ] = False,
-) -> None:
-    logging.basicConfig(
-        stream=sys.stderr,
-        level=logging.INFO if verbose else logging.WARNING,
-        format="%(levelname)s %(name)s: %(message)s",
-    )
+    globals()["app"] = app = build()
+    return app
 
 
 def main() -> None:
@@ -87,16 +33,33 @@ def main() -> None:
     # Idle OpenMP threads would otherwise spin and slow each other down on a busy machine.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     try:
-        app()
-    except BrainbenchError as error:
-        print(f"brainbench: {error}", file=sys.stderr)
-        sys.exit(error.exit_code)
+        _run()
+    except KeyboardInterrupt:
+        _say_interrupted()
+        sys.exit(INTERRUPTED)
     except SystemExit as stop:
         # typer turns Ctrl-C into this status, without a word.
         if stop.code == INTERRUPTED:
-            print(f"\nbrainbench: {GO_ON}", file=sys.stderr)
+            _say_interrupted()
         raise
     except BrokenPipeError:
         # The reader (head, less) has gone; Python would otherwise complain again at shutdown.
         sys.stderr.close()
         sys.exit(0)
+
+
+def _run() -> None:
+    from brainbench.cli.application import build
+    from brainbench.core.errors import BrainbenchError
+
+    # A shell that completes words asks for all of them.
+    completing = "_BRAINBENCH_COMPLETE" in os.environ
+    try:
+        build(None if completing else sys.argv[1:])()
+    except BrainbenchError as error:
+        print(f"brainbench: {error}", file=sys.stderr)
+        sys.exit(error.exit_code)
+
+
+def _say_interrupted() -> None:
+    print(f"\nbrainbench: {GO_ON}", file=sys.stderr)

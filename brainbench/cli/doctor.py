@@ -75,7 +75,10 @@ def _required() -> list[str]:
     """Return the packages that this one cannot do without, as its own metadata states them."""
     from importlib import metadata  # 30 ms that no other command needs
 
-    stated = metadata.requires("brainbench") or []
+    try:
+        stated = metadata.requires("brainbench") or []
+    except metadata.PackageNotFoundError:  # a checkout that runs without being installed
+        return []
     return [line.split(">")[0].split("<")[0] for line in stated if "extra ==" not in line]
 
 

@@ -148,7 +148,8 @@ def import_(
     """Turn weights of the published study into a model that can be scored; nothing in the file is executed."""
     from brainbench.models.published.importing import import_checkpoint
 
-    made = import_checkpoint(file, architecture=architecture, config=config, out=out)
+    with progress_bar("importing the weights"):
+        made = import_checkpoint(file, architecture=architecture, config=config, out=out)
     left = ", ".join(f"{part} ({count} entries)" for part, count in made.not_imported.items())
     shown = {
         "architecture": made.architecture,
@@ -173,9 +174,10 @@ def export(
     from brainbench.models.registry import load_model
     from brainbench.models.training.checkpoints import PREFIXES, find_folder
 
-    loaded = load_model(model, seed=seed)
     name = find_folder(model).resolve().name if model.startswith(PREFIXES) else model
-    made = export_model(loaded, out or Path(f"{name}{SUFFIXES.get(format, '')}"), format=format, name=model)
+    target = out or Path(f"{name}{SUFFIXES.get(format, '')}")
+    with progress_bar("exporting the network"):
+        made = export_model(load_model(model, seed=seed), target, format=format, name=model)
     text = (
         f"{model}: {made.features} features, {made.state_size:,} numbers of state; the file agrees with the network "
         f"to {made.difference:.1e}\n\nfile      {made.path}\ncontract  {made.contract}"

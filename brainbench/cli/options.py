@@ -110,7 +110,9 @@ def with_options(
 
     def decorate(command: Callable[..., None]) -> Callable[..., None]:
         parameters = []
-        for own in inspect.signature(command, eval_str=True).parameters.values():
+        # The dataclass is named in the signature and not imported.
+        unloaded = {kind.partition(":")[2]: Any}
+        for own in inspect.signature(command, locals=unloaded, eval_str=True).parameters.values():
             if own.name != "options":
                 parameters.append(own.replace(kind=inspect.Parameter.KEYWORD_ONLY))
                 continue

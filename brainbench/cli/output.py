@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import math
 import sys
+import threading
 import time as clock
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import TYPE_CHECKING, Annotated, Any
@@ -117,25 +118,30 @@ FIRST_LINE, NEXT_LINE = 2.0, 10.0
 
 
 @contextlib.contextmanager
-def progress_bar() -> Iterator[Progress]:
-    """Yield a progress callback that draws a bar on stderr when that is a terminal, and else writes a line at times."""
+def progress_bar(what: str = "") -> Iterator[Progress]:
+    """Yield a progress callback that draws a bar on stderr when that is a terminal, and else writes a line at times.
+
+    Args:
+        what: What is being done, for a job that does not count its steps.
+    """
     if not sys.stderr.isatty():
-        yield _progress_lines()
+        lines, done = ProgressLines(what), threading.Event()
+        threading.Thread(target=lines.tell_until, args=(done,), daemon=True).start()
+        try:
+            yield lines.update
+        finally:
+            done.set()
         return
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
     from rich.progress import Progress as ProgressBar
 
+    counts = () if what else (MofNCompleteColumn(), TimeRemainingColumn())
     bar = ProgressBar(
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeRemainingColumn(),
-        console=Console(stderr=True),
-        transient=True,
+        TextColumn("{task.description}"), BarColumn(), *counts, console=Console(stderr=True), transient=True
     )
     with bar:
-        tasks: dict[str, Any] = {}
+        tasks: dict[str, Any] = {what: bar.add_task(what, total=None)} if what else {}
 
         def update(done: int, total: int, what: str) -> None:
             if what not in tasks:
@@ -145,15 +151,27 @@ def progress_bar() -> Iterator[Progress]:
         yield update
 
 
-def _progress_lines() -> Progress:
-    start = clock.monotonic()
-    due = start + FIRST_LINE
+class ProgressLines:
+    """Lines on stderr that say what is being done, the first after two seconds."""
 
-    def update(done: int, total: int, what: str) -> None:
-        nonlocal due
-        if (now := clock.monotonic()) < due:
+    def __init__(self, what: str = "") -> None:
+        self._start = clock.monotonic()
+        self._due = self._start + FIRST_LINE
+        self._state = what
+
+    def update(self, done: int, total: int, what: str) -> None:
+        """Take the number of steps done, of all, and what is done."""
+        self._state = f"{what}, {done:,} of {total:,}"
+        self.tell()
+
+    def tell(self) -> None:
+        """Print a line, if it is time for one."""
+        if (now := clock.monotonic()) < self._due or not self._state:
             return
-        due = now + NEXT_LINE
-        print(f"brainbench: {what}, {done:,} of {total:,} ({now - start:.0f} s)", file=sys.stderr, flush=True)
+        self._due = now + NEXT_LINE
+        print(f"brainbench: {self._state} ({now - self._start:.0f} s)", file=sys.stderr, flush=True)
 
-    return update
+    def tell_until(self, done: threading.Event) -> None:
+        """Print lines also while one step lasts long."""
+        while not done.wait(FIRST_LINE):
+            self.tell()

@@ -125,7 +125,9 @@ def export(
     """Write a small copy without raw data: spike times and tables. Scores of the copy are identical."""
     from brainbench.datasets import export as export_files
 
-    files = export_files(_found(source), target, select=select)
+    found = _found(source)
+    with progress_bar("copying the recordings"):
+        files = export_files(found, target, select=select)
     columns = {"file": "{0}", ">": lambda path: f"{path.stat().st_size / 1e6:.2f} MB"}
     emit({"files": files}, table_of("", files, columns), as_json=as_json)
 
@@ -140,7 +142,8 @@ def fetch(
     """Download a public data set with the dandi client; without a network or that client, nothing is tried."""
     from brainbench.datasets import fetch as fetch_files
 
-    folder = fetch_files(name, out, assets=assets)
+    with progress_bar("downloading"):
+        folder = fetch_files(name, out, assets=assets)
     emit({"folder": folder}, str(folder), as_json=as_json)
 
 

@@ -13,12 +13,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from brainbench.cli.destinations import out_folder
-from brainbench.cli.leaderboard.scoring import find_models
 from brainbench.cli.options import SCORE, SchedulerOption, WorkersOption, option, with_options
 from brainbench.cli.output import JsonOption, emit, progress_bar, table_of
 from brainbench.core.errors import UsageError
 from brainbench.core.files import provenance, to_plain, write_json
-from brainbench.scoring.options import ScoreOptions
 
 if TYPE_CHECKING:
     from brainbench.scoring.recovery import Candidate, Recovery, RecoveryDesign
@@ -73,11 +71,13 @@ def recovery(
     scheduler: SchedulerOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Say whether an experiment could tell networks apart: animals are drawn from each, and all are scored on them.
+    """Say whether an experiment could tell networks apart: each network in turn makes the animals.
 
-    Run again with the same --out, an interrupted recovery goes on where it stopped.
+    Animals are drawn from each network, and all networks are scored on them. Run again with the same --out, an
+    interrupted recovery goes on where it stopped.
     """
     from brainbench.datasets.synthetic import PopulationDesign
+    from brainbench.scoring.options import ScoreOptions
     from brainbench.scoring.recovery import RecoveryDesign, find_cheapest, open_candidates, plot_confusion, recover
     from brainbench.scoring.recovery.design import parse_trials
 
@@ -124,6 +124,7 @@ def recovery(
 
 def _find(patterns: Sequence[str] | None) -> list[str]:
     """Return the models that names and patterns mean; the shipped ones without any."""
+    from brainbench.cli.leaderboard.scoring import find_models
     from brainbench.models.training.checkpoints import shipped
 
     if not patterns:

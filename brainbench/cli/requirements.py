@@ -119,9 +119,10 @@ def check_requirements(command: str, values: Mapping[str, Any]) -> None:
 
 
 def guard(app: typer.Typer) -> None:
-    """Let every command check what it needs before it runs."""
+    """Let every command check what it needs before it runs; once, however often its command line is built."""
     for name, command in commands(app):
-        if command.callback is not None and (name in EXTRAS or name in CACHED):
+        if command.callback is not None and (name in EXTRAS or name in CACHED) and not hasattr(command, "guarded"):
+            command.guarded = True
             command.callback = _checked(name, command.callback)
 
 

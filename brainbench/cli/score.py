@@ -5,16 +5,16 @@ from __future__ import annotations
 import shlex
 import sys
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from brainbench.cli import destinations
 from brainbench.cli.options import SCORE, SCORE_FLAGS, with_options
 from brainbench.cli.output import JsonOption, emit, progress_bar
-from brainbench.cli.score_text import score_text, walk_text
-from brainbench.core.files import to_plain
-from brainbench.scoring.options import ScoreOptions
+
+if TYPE_CHECKING:
+    from brainbench.scoring.options import ScoreOptions
 
 
 def _complete_model(incomplete: str) -> list[str]:
@@ -49,21 +49,31 @@ def score(
     as_json: JsonOption = False,
 ) -> None:
     """Score a model against neural recordings and write a result record and an HTML report."""
-    from brainbench.metrics.explain import explain_file
-    from brainbench.scoring.scores import score_record
+    from brainbench.cli.score_text import score_text, walk_text
+    from brainbench.core.files import to_plain
+    from brainbench.scoring.kept_records import keep, read_kept, record_path
     from leaderboards.site.score_page import write_report
     from leaderboards.store import write_record
 
     if options.explain and Path(model).suffix == ".npz":
+        from brainbench.metrics.explain import explain_file
+
         steps = to_plain(explain_file(model))
         emit({"estimator_walk": steps}, walk_text(steps), as_json=as_json)
         return
-    with progress_bar() as progress:
-        record = score_record(model, options, command=_command(), progress=progress)
+    command = _command()
+    kept = record_path(model, options, command)
+    record, note = read_kept(kept), "  (as scored before: nothing has changed since)"
+    if record is None:
+        from brainbench.scoring.scores import score_record
+
+        with progress_bar() as progress:
+            record, note = score_record(model, options, command=command, progress=progress), ""
+        keep(record, kept)
     path = write_record(record, out)
     report = write_report(record, path.with_suffix(".html"))
     data: dict[str, Any] = {"record": record, "record_path": path, "report_path": report}
-    text = f"{score_text(record)}\n\nrecord  {path}\nreport  {report}"
+    text = f"{score_text(record)}\n\nrecord  {path}{note}\nreport  {report}"
     if report_file is not None:
         from leaderboards.report.paper import write_paper
 

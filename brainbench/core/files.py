@@ -19,6 +19,8 @@ from brainbench.core.writing.temporaries import temporary_path
 
 CACHE_VARIABLE = "BRAINBENCH_CACHE"
 """Environment variable that overrides the platform's cache folder."""
+LIBRARIES = ("numpy", "scipy", "xarray", "h5py", "torch", "warp-lang", "mujoco-core")
+"""Distributions on whose version the last digits of a result depend."""
 _UNWRITABLE = (
     errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.ENOTDIR, errno.EEXIST,
     errno.EISDIR, errno.ENAMETOOLONG,
@@ -195,22 +197,28 @@ def _update(digest: Any, value: Any) -> None:
     digest.update(b"\x00")
 
 
+def library_versions() -> dict[str, str]:
+    """Return the versions of the :data:`LIBRARIES` that are installed."""
+    from importlib import metadata
+
+    versions: dict[str, str] = {}
+    for library in LIBRARIES:
+        with contextlib.suppress(metadata.PackageNotFoundError):
+            versions[library] = metadata.version(library)
+    return versions
+
+
 def provenance(**extra: Any) -> dict[str, Any]:
     """Return what a result needs to be made again: versions, machine, time, and what the caller adds."""
     import datetime
     import platform
-    from importlib import metadata
 
     from brainbench import __version__
 
-    versions: dict[str, str] = {}
-    for package in ("numpy", "scipy", "xarray", "h5py", "torch", "warp-lang", "mujoco-core"):
-        with contextlib.suppress(metadata.PackageNotFoundError):
-            versions[package] = metadata.version(package)
     return {
         "version": __version__,
         "python": platform.python_version(),
-        "packages": versions,
+        "packages": library_versions(),
         "machine": f"{platform.system()} {platform.machine()}",
         "time": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
         **extra,

@@ -97,6 +97,7 @@ def open_recordings(
         strict=strict,
     )
     suitable, reader.skipped = suitable_files(paths, strict=strict)
+    reader.lenient = len(suitable) > 1 and not strict
     for path in track(suitable, "reading recordings", progress):
         reader.read(path)
     return reader.dataset(", ".join(map(str, paths)) if len(paths) < 4 else f"{len(paths)} files, {paths[0]} …")
@@ -114,6 +115,8 @@ class _Reader:
     """The layout that the source named; else the one by which the first session was recognised."""
     named: bool
     strict: bool = False
+    lenient: bool = False
+    """Skip sessions without the table of the conditions, because others may have it."""
     options: ReadingOptions | None = None
     """Made for the first session and kept for all others."""
     counted: list[SessionCounts] = field(default_factory=list)
@@ -123,6 +126,8 @@ class _Reader:
     skipped: list[str] = field(default_factory=list)
     """Why each file that holds no recordings is left out."""
     without_units: list[str] = field(default_factory=list)
+    other_tables: dict[str, str] = field(default_factory=dict)
+    """Why each session without the table of the conditions is left out, by one of the tables that it has."""
     other_subjects: set[str] = field(default_factory=set)
 
     def read(self, path: Path) -> None:
@@ -133,6 +138,11 @@ class _Reader:
                     if self.strict:
                         raise DataError(no_units(session))
                     self.without_units.append(no_units(session))
+                    continue
+                table = None if self.conditions is None else self.conditions.table
+                if self.lenient and table is not None and table not in session.tables:
+                    why = f"{session.source} has no table {table!r}; its tables: {listing(session.tables)}"
+                    self.other_tables |= dict.fromkeys(session.tables or ("none",), why)
                     continue
                 self._refuse_twins(session)
                 options = self._options_for(session, found)
@@ -179,6 +189,8 @@ class _Reader:
 
     def dataset(self, source: str) -> xr.Dataset:
         """Join what was counted; see :func:`open_recordings`."""
+        if self.options is None and self.other_tables and self.conditions is not None:
+            raise unknown_name("table", self.conditions.table, self.other_tables)
         if self.options is None:
             more = f" ({len(self.without_units) - 1} more files likewise)" if len(self.without_units) > 1 else ""
             raise DataError(f"{self.without_units[0]}{more}" if self.without_units else "The file holds no session.")
@@ -186,7 +198,7 @@ class _Reader:
             raise unknown_name("subject", self.options.selection.subjects[0], sorted(self.other_subjects))
         name = self.layout.name if self.layout else ""
         name += "" if self.named or not name else " (detected from its columns)"
-        skipped = self.skipped + self.without_units
+        skipped = self.skipped + self.without_units + [*dict.fromkeys(self.other_tables.values())]
         made = join_sessions(self.counted, self.options, source=source, layout=name, notes=self.notes + skipped)
         made.attrs["skipped"] = skipped
         return check_recordings(made)

@@ -33,11 +33,11 @@ def demo_recordings(name: str = "demo", *, progress: Progress | None = None) -> 
     from brainbench.datasets.synthetic.cache import ensure_recordings
     from brainbench.datasets.synthetic.rodgers_demo import ensure_rodgers_demo
     from brainbench.models.registry import locate_model
-    from brainbench.stimuli import get_recipe, load_stimuli, simulate
+    from brainbench.stimuli import load_stimuli
 
-    if name == "demo-rodgers":
-        return ensure_rodgers_demo(simulate(get_recipe(DEMOS[name]).scenes, progress=progress), progress=progress)
     stimuli = load_stimuli(DEMOS[name], progress=progress)
+    if name == "demo-rodgers" and stimuli.dataset is not None:
+        return ensure_rodgers_demo(stimuli.dataset, progress=progress)
     weights, design = locate_model(HIDDEN_NETWORK).weights, PopulationDesign()
     told = {"stimuli_hash": stimuli.content_hash, "weights": file_hash(weights) if weights else None}
 

@@ -21,6 +21,7 @@ from brainbench.scoring.options import ScoreOptions
 
 if TYPE_CHECKING:
     from brainbench.metrics import Metric
+    from brainbench.scoring.model_responses import ResolvedModel
     from brainbench.scoring.neural_responses import NeuralResponses
 
 STAGES = 5
@@ -102,6 +103,7 @@ def score_record(
     stage_done()
     # Recordings name the stimuli that the animals felt; the caller's choice goes first.
     options = replace(options, stimuli=brain.stimuli if options.stimuli is None else options.stimuli)
+    _check_labels(resolved, brain, options)
     network = resolved.respond(options, progress=progress)
     stage_done()
     pairs = brain.pairs(network.labels, options.match)
@@ -146,6 +148,14 @@ def score_record(
     if between is not None:
         between = replace(between, brain_rdm=(), provenance=replace(origin, statistics=between.provenance.statistics))
     return ResultRecord(first, between, {item.name: item for item in others}, network.card, brain.synthetic)
+
+
+def _check_labels(resolved: ResolvedModel, brain: NeuralResponses, options: ScoreOptions) -> None:
+    """Refuse labels that do not match before anything is simulated, where they are known by then."""
+    from brainbench.stimuli.sources import known_labels
+
+    if resolved.labels is None and (shown := known_labels(options.stimuli)) is not None:
+        brain.pairs(shown, options.match)
 
 
 def _compare(

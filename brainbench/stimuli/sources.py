@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import os
+import tomllib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,16 +19,18 @@ from brainbench.core.files import content_hash
 from brainbench.core.progress import Progress
 from brainbench.core.reading.hdf5 import open_hdf5
 from brainbench.core.reading.regular import readable
+from brainbench.core.reading.texts import read_toml
 from brainbench.stimuli.engines import DEFAULT_ENGINE
+from brainbench.stimuli.engines.fidelity import Fidelity
+from brainbench.stimuli.kept_sets import index_path, read_index, write_index
 from brainbench.stimuli.readout import to_grid
-from brainbench.stimuli.scenes.recipes import get_recipe, is_recipe, list_recipes
+from brainbench.stimuli.scenes.recipes import get_recipe, is_packaged, is_recipe, list_recipes, recipe_file
 from brainbench.stimuli.stimulus_set import hash_stimulus_set, read_stimulus_set
 from brainbench.stimuli.whiskers.selection import match_whiskers
 
 if TYPE_CHECKING:
     import xarray as xr
 
-    from brainbench.stimuli.engines.fidelity import Fidelity
     from brainbench.stimuli.engines.protocol import WhiskerEngine
     from brainbench.stimuli.scenes.scene_files import Recipe
 
@@ -84,16 +88,32 @@ def load_stimuli(
         return source if whiskers == "all" else load_stimuli(source.dataset, whiskers=whiskers)  # type: ignore[arg-type]
     if not isinstance(source, (str, os.PathLike)):
         return _from_dataset(check_stimulus_set(source), whiskers, "stimulus set")
+    index = index_path(source, whiskers, Fidelity.of(fidelity), backend) if cache and is_packaged(source) else None
+    if index is not None and (found := _indexed(index)) is not None:
+        return found
     if (recipe := _recipe(source, whiskers)) is not None:
-        from brainbench.stimuli.simulation import simulate
+        from brainbench.stimuli.simulation import ENTRY, simulate
 
         dataset = simulate(recipe.scenes, fidelity=fidelity, backend=backend, progress=progress, cache=cache)
-        return _from_dataset(dataset, "all", recipe.description.strip() or recipe.name)
+        description = recipe.description.strip() or recipe.name
+        if index is not None and ENTRY in dataset.encoding:
+            write_index(index, dataset.encoding[ENTRY], description)
+        return _from_dataset(dataset, "all", description)
     path = Path(source)
     if path.suffix in _HDF5 or path.is_file():
         return _from_hdf5(path, whiskers)
     hint = f"Or a path: a scene file (.toml), or a stimulus-set or array file ({', '.join(_HDF5)})."
     raise unknown_name("stimuli", os.fspath(source), list_recipes(), hint=hint)
+
+
+def known_labels(source: object) -> tuple[str, ...] | None:
+    """Return the labels of a packaged recipe or a scene file, before its scenes are built; None for anything else."""
+    with contextlib.suppress(BrainbenchError, OSError, KeyError, TypeError):
+        if is_packaged(source):
+            return tuple(item["label"] for item in tomllib.loads(recipe_file(source).read_text("utf-8"))["scene"])
+        if isinstance(source, (str, os.PathLike)) and Path(source).suffix == ".toml":
+            return tuple(item["label"] for item in read_toml(Path(source), "scene file")["scene"])
+    return None
 
 
 def prepare_stimuli(
@@ -110,12 +130,26 @@ def prepare_stimuli(
     from brainbench.stimuli.simulation import prepare
 
     with contextlib.suppress(BrainbenchError, OSError):
+        index = index_path(source, whiskers, Fidelity.of(fidelity), DEFAULT_ENGINE)
+        if is_packaged(source) and read_index(index) is not None:
+            return
         if isinstance(source, (str, os.PathLike)) and (recipe := _recipe(source, whiskers)) is not None:
             prepare(recipe.scenes, fidelity=fidelity, progress=progress)
 
 
+def _indexed(index: Path) -> Stimuli | None:
+    """Return the stimuli that an index of the cache leads to; None without them."""
+    from brainbench.stimuli.simulation import read_entry
+
+    found = read_index(index)
+    dataset = None if found is None else read_entry(found[0])
+    return None if found is None or dataset is None else _from_dataset(dataset, "all", found[1])
+
+
 def _recipe(source: str | os.PathLike[str], whiskers: str) -> Recipe | None:
     """Return the scenes that a recipe name or the path of a scene file names; None for anything else."""
+    if is_packaged(source):
+        return _packaged(source, whiskers)
     if isinstance(source, str) and is_recipe(source):
         return get_recipe(source, whiskers=whiskers)
     if Path(source).suffix != ".toml":
@@ -123,6 +157,12 @@ def _recipe(source: str | os.PathLike[str], whiskers: str) -> Recipe | None:
     from brainbench.stimuli.scenes.scene_files import load_scene
 
     return load_scene(source, whiskers=whiskers)
+
+
+@functools.lru_cache(maxsize=1)
+def _packaged(name: str, whiskers: str) -> Recipe:
+    """Return a recipe of the package, whose meshes take longest of all; a score asks for it several times."""
+    return get_recipe(name, whiskers=whiskers)
 
 
 def _from_dataset(dataset: xr.Dataset, whiskers: str, description: str) -> Stimuli:

@@ -1,21 +1,30 @@
 import json
+import os
 import signal
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import pytest
+import typer
 
 import brainbench
+from brainbench.cli import app
+from brainbench.cli.application import COMMANDS as COMMAND_HELP
 
 HEAVY = {"torch", "xarray", "h5py", "mujoco", "scipy", "trimesh", "pandas", "matplotlib", "plotly"}
 COMMANDS = ["score", "models", "recordings", "stimuli", "leaderboard", "doctor"]
 
 
-def _modules_after(statement: str) -> set[str]:
-    code = f"{statement}\nimport sys, json\nprint(json.dumps([name for name in sys.modules if '.' not in name]))"
+def _all_modules_after(statement: str) -> set[str]:
+    code = f"{statement}\nimport sys, json\nprint(json.dumps([*sys.modules]))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     return set(json.loads(done.stdout.splitlines()[-1]))
+
+
+def _modules_after(statement: str) -> set[str]:
+    return {name for name in _all_modules_after(statement) if "." not in name}
 
 
 @pytest.mark.parametrize("statement", ["import brainbench", "import brainbench.cli", "import leaderboards"])
@@ -73,6 +82,30 @@ def test_shell_completion_can_be_shown():
         [sys.executable, "-c", code, "--show-completion", "bash"], capture_output=True, text=True, check=False
     )
     assert "complete" in done.stdout.lower() + done.stderr.lower()
+
+
+def test_the_help_of_all_commands_says_what_each_of_them_says():
+    shown = typer.main.get_command(app).commands  # pyright: ignore[reportAttributeAccessIssue]
+    assert {name: command.help.splitlines()[0] for name, command in shown.items()} == COMMAND_HELP
+
+
+@pytest.mark.parametrize("words", [["score", "--help"], ["stimuli", "render", "--help"], ["--help"], ["-v", "doctor"]])
+def test_no_more_is_imported_than_the_command_that_is_asked_for(words: list[str]):
+    code = f"import sys; from brainbench.cli.application import build; build({words!r})"
+    found = {name.split(".")[2] for name in _all_modules_after(code) if name.startswith("brainbench.cli.")}
+    assert found & set(COMMAND_HELP) == {*words} & set(COMMAND_HELP)
+
+
+def test_ctrl_c_while_the_command_line_itself_is_imported_prints_no_traceback(tmp_path):
+    (tmp_path / "typer.py").write_text("import os, signal\nos.kill(os.getpid(), signal.SIGINT)\n")
+    place = os.pathsep.join([str(tmp_path), str(Path(brainbench.__file__).parents[1])])
+    code = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler); import brainbench.__main__ as m"
+    done = subprocess.run(
+        [sys.executable, "-c", f"{code}; m.main()"],
+        env={**os.environ, "PYTHONPATH": place}, capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert done.returncode == 130
+    assert len(done.stderr.strip().splitlines()) == 1
 
 
 def test_ctrl_c_is_answered_in_one_sentence_that_says_how_to_go_on(tmp_path):

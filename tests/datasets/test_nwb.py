@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from brainbench.core.errors import DataError, UsageError
-from brainbench.datasets import inspect, open_recordings
+from brainbench.datasets import inspect, open_recordings, write_recordings
 from brainbench.datasets.nwb import read_nwb
 from brainbench.datasets.sessions import make_session
 from brainbench.datasets.trials.session_trials import trials_by_subject
@@ -49,6 +49,22 @@ def test_files_without_units_are_skipped_in_a_folder_and_refused_alone(tmp_path)
     assert "b.nwb has no units table" in "".join(dataset.attrs["notes"])
     with pytest.raises(DataError, match=r"b\.nwb .*trials, pokes"):
         open_recordings(alone, conditions="trials:texture")
+
+
+def test_sessions_without_the_table_are_skipped_with_the_reason_and_refused_when_strict(tmp_path):
+    own = {"start_time": [0.0, 1.0, 2.0, 3.0], "stop_time": [0.5, 1.5, 2.5, 3.5], "kind": ["a", "b", "a", "b"]}
+    sessions = {"1": {"trials": own}, "2": {"epochs": own}}
+    for name, tables in sessions.items():
+        write_recordings(tmp_path / f"{name}.h5", make_session("m", name, [np.arange(0.1, 4, 0.1)], tables))
+    dataset = open_recordings(tmp_path, conditions="trials:kind")
+    assert set(dataset["session"].values) == {"1"}
+    (reason,) = dataset.attrs["skipped"]
+    assert "2.h5" in reason
+    assert "epochs" in reason
+    with pytest.raises(UsageError, match="trials"):
+        open_recordings(tmp_path, conditions="trials:kind", strict=True)
+    with pytest.raises(UsageError, match=r"'trails'.*trials"):
+        open_recordings(tmp_path, conditions="trails:kind")
 
 
 def test_a_copy_under_another_session_name_is_recognised(tmp_path):

@@ -128,3 +128,15 @@ def test_an_edited_set_is_noticed(tmp_path, dataset):
         file["wrench"][0, 0, 0, 0] += 1
     with pytest.raises(DataError, match=r"set\.h5' .*hash_stimulus_set"):
         load_stimuli(path)
+
+
+def test_labels_are_known_before_scenes_are_built(tmp_path):
+    from brainbench.stimuli import get_recipe
+    from brainbench.stimuli.sources import known_labels
+
+    path = tmp_path / "scene.toml"
+    path.write_text('[[scene]]\nlabel = "a"\n[[scene]]\nlabel = "b"\n')
+    assert known_labels("rodgers") == get_recipe("rodgers").labels
+    assert known_labels(path) == ("a", "b")
+    path.write_text("[[scene]]\n")
+    assert [known_labels(source) for source in (path, "set.h5", "no-such-recipe", None)] == [None] * 4

@@ -11,7 +11,7 @@ import typer
 
 from brainbench.cli.destinations import out_folder
 from brainbench.cli.options import SCORE, with_options
-from brainbench.cli.output import JsonOption, emit
+from brainbench.cli.output import JsonOption, emit, progress_bar
 from brainbench.core.errors import UsageError
 from brainbench.core.files import content_hash, write_json
 from brainbench.core.records import ResultRecord, Score
@@ -50,7 +50,8 @@ def hold_out(
     if secret.exists():
         raise UsageError(f"The folder {str(secret)!r} exists; name a new one, so that no earlier secret is lost.")
     kind = "animals" if animals else "stimuli"
-    whole = open_neural_responses(recordings, progress=None, **options).dataset
+    with progress_bar() as progress:
+        whole = open_neural_responses(recordings, progress=progress, **options).dataset
     names = list(whole.attrs["vocabulary"]) if stimuli else sorted(set(map(str, whole["subject"].values)))
     held_count = animals or stimuli
     if min(held_count, len(names) - held_count) < FEWEST[kind]:

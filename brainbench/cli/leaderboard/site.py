@@ -9,7 +9,7 @@ from typing import Annotated, Any
 import typer
 
 from brainbench.cli.destinations import out_file, out_folder
-from brainbench.cli.output import JsonOption, emit, table_of
+from brainbench.cli.output import JsonOption, emit, progress_bar, table_of
 from leaderboards.store import StoredRecord, read_records
 
 RECORDS = Path("brainbench-results")
@@ -31,7 +31,8 @@ def build(
     from leaderboards.site.build import build_leaderboard
 
     stored = read_records(records or [RECORDS])
-    page = build_leaderboard(stored, out, title=title)
+    with progress_bar("building the pages"):
+        page = build_leaderboard(stored, out, title=title)
     problems = _problems(stored)
     good = len(stored) - len(problems)
     text = f"{page}  ({good} records, {len(problems)} with problems){_left_out(problems)}"
@@ -59,7 +60,8 @@ def report(
 
     stored = open_build(*(records or [RECORDS]))
     kind = format or (out.suffix.removeprefix(".") if out is not None and out.suffix else "html")
-    files = write_paper(stored, out or Path(f"leaderboard-report.{kind}"), format=kind, title=title)
+    with progress_bar("writing the report"):
+        files = write_paper(stored, out or Path(f"leaderboard-report.{kind}"), format=kind, title=title)
     problems = _problems(stored)
     emit({"files": files, "problems": problems}, "\n".join(map(str, files)) + _left_out(problems), as_json=as_json)
 

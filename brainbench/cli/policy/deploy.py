@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from brainbench.cli.destinations import out_file
-from brainbench.cli.output import JsonOption, emit
+from brainbench.cli.output import JsonOption, emit, progress_bar
 
 if TYPE_CHECKING:
     from robotics_bridge.deploy.session import DeployedPolicy
@@ -33,7 +33,8 @@ def export(
     student, described = load_student(run)
     suffix = SUFFIXES.get(format, "")
     target = out or (run / f"policy{suffix}" if run.exists() else Path(f"{run.name}{suffix}"))
-    found = export_policy(student, target, format=format, deployment=described["deployment"], name=run.name)
+    with progress_bar("exporting the policy"):
+        found = export_policy(student, target, format=format, deployment=described["deployment"], name=run.name)
     text = (
         f"{found.path}: {found.state_size:,} numbers of memory; {STEPS} steps with resets differ by at most "
         f"{found.difference:.1e} of the largest action\n{found.contract}"

@@ -68,14 +68,17 @@ def convert(
         made = _data_set(source, out)
     elif sweeps := [source] if source.suffix == ".npz" else sorted(source.glob("*.npz")):
         _check("sweeps without splits", of_runs | of_sets, out, _SET, _is_set(out))
-        made = _write_set(_sweep_set(sweeps), out)
+        with progress_bar("converting the sweeps"):
+            made = _write_set(_sweep_set(sweeps), out)
     elif source.is_file():
         free = not out.is_file() and not (out.is_dir() and any(out.iterdir()))
         _check("a stimulus set", of_runs, out, "a run, which is a new folder", free)
-        made = _run(source, out, stimulus=stimulus, dialect=dialect or "thesis")
+        with progress_bar("writing the run"):
+            made = _run(source, out, stimulus=stimulus, dialect=dialect or "thesis")
     elif runs := find_runs(source):
         _check("runs", of_sets, out, _SET, _is_set(out))
-        made = _write_set(read_runs(runs, cleaning=cleaning or "mark", rate=rate), out)  # type: ignore[arg-type]
+        with progress_bar("converting the runs"):
+            made = _write_set(read_runs(runs, cleaning=cleaning or "mark", rate=rate), out)  # type: ignore[arg-type]
     else:
         raise DataError(
             f"{str(source)!r} holds nothing to convert: no folders train, validate and test, no sweeps (.npz) and no "

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from brainbench.cli.destinations import out_file
-from brainbench.cli.output import JsonOption, emit, facts, table
+from brainbench.cli.output import JsonOption, emit, facts, progress_bar, table
 
 if TYPE_CHECKING:
     from brainbench.geometry import DecompositionSettings, Mesh
@@ -52,10 +52,11 @@ def objects(
         data, text = _families() if source is None else _folder(source, ids, categories)
         emit(data, text, as_json=as_json)
         return
-    if Path(source).is_file():
-        data, solid = _file(source, unit, diagonal, collision or "hull", settings)
-    else:
-        data, solid = _member(source, seed, detail, diagonal, collision, settings)
+    with progress_bar("preparing the object"):
+        if Path(source).is_file():
+            data, solid = _file(source, unit, diagonal, collision or "hull", settings)
+        else:
+            data, solid = _member(source, seed, detail, diagonal, collision, settings)
     if export is not None and solid.mesh is not None:
         data["export"] = save_mesh(export, solid.mesh, unit="mm")
     emit(data, _text(data), as_json=as_json)

@@ -53,7 +53,11 @@ def demo(
     def shown(item: dict[str, Any]) -> str:
         return ", ".join(f"{key} {value:.3g}" for key, value in item.items() if key != "picture")
 
-    emit(made, table_of("", made.values(), {"picture": "{0[picture]}", "shows": shown}), as_json=as_json)
+    text = table_of("", made.values(), {"picture": "{0[picture]}", "shows": shown})
+    if not made["forces"]["in contact"]:
+        text += f"\n\nNo taxel of {hand} touched the ball: closed, its fingers do not reach it. "
+        text += f"Its probes are listed by: brainbench tactile layouts {hand}"
+    emit(made, text, as_json=as_json)
 
 
 def layouts(

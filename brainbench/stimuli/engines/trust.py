@@ -25,7 +25,7 @@ LARGEST_BEND = 1.5
 """Angle between two links (rad) that no intact whisker reaches; beyond it a simulation counts as unstable."""
 LARGEST_RESIDUAL = 0.05
 """Residual of the contact forces from which a result counts as unstable. Whiskers below it are within a few per cent of
-the converged solution (docs/stimuli.md)."""
+the converged solution (docs/unstable-whiskers.md)."""
 LARGEST_CROWDED_SHARE = 0.02
 """Share of the steps with more contacts than are solved together from which a result counts as unstable."""
 

@@ -8,7 +8,7 @@ import dataclasses
 import math
 from importlib import resources
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeGuard
 
 from brainbench.core.errors import UsageError, unknown_name
 
@@ -39,6 +39,11 @@ def list_recipes() -> tuple[str, ...]:
 def is_recipe(source: str) -> bool:
     """Return whether ``source`` names a recipe, with or without a file behind it (``rodgers-recorded FILE``)."""
     return source in list_recipes() or source.startswith(f"{RECORDED} ")
+
+
+def is_packaged(source: object) -> TypeGuard[str]:
+    """Return whether ``source`` names a recipe that depends on nothing but the package."""
+    return isinstance(source, str) and source in _scene_files()
 
 
 def get_recipe(
@@ -83,7 +88,7 @@ def get_recipe(
                 f"get_recipe({name!r}, objects=[sphere(0.01), …]), or: brainbench stimuli sweep {name} OBJECT …"
             )
         return Recipe(name, describe_grid(name), SweepScenes(GRIDS[name], objects, whiskers=whiskers))
-    path = _file(name)
+    path = recipe_file(name)
     if objects is not None:
         raise UsageError(f"The recipe {name!r} has objects of its own; only {', '.join(GRIDS)} take some.")
     from brainbench.stimuli.scenes.scene_files import load_scene
@@ -105,7 +110,7 @@ def describe_recipe(name: str) -> str:
             "The six stimuli of `rodgers`, met by recorded whisking: rodgers-recorded FILE, a WHISKiT trajectory (base "
             "angular velocities, rad/s at 1 kHz, one line per whisker). Starts 10 degrees behind rest."
         )
-    return str(tomllib.loads(_file(name).read_text(encoding="utf-8")).get("description", ""))
+    return str(tomllib.loads(recipe_file(name).read_text(encoding="utf-8")).get("description", ""))
 
 
 def _rodgers_recorded(file: str, trajectory: Trajectory | None, species: str, whiskers: str) -> Recipe:
@@ -147,7 +152,12 @@ def _scene_files() -> dict[str, Traversable]:
     return {item.name.removesuffix(".toml"): item for item in folder.iterdir() if item.name.endswith(".toml")}
 
 
-def _file(name: str) -> Traversable:
+def recipe_file(name: str) -> Traversable:
+    """Return the scene file of a packaged recipe.
+
+    Raises:
+        UsageError: there is no such recipe.
+    """
     files = _scene_files()
     if name not in files:
         raise unknown_name("stimulus recipe", name, list_recipes())

@@ -1,4 +1,4 @@
-"""The table of docs/stimuli.md that says what is flagged and what is not: each of its rows is simulated, or judged."""
+"""The tables of docs/unstable-whiskers.md, what is flagged and what is not: each row is simulated, or judged."""
 
 import re
 from pathlib import Path
@@ -16,7 +16,7 @@ from tests.factories.whiskers import C2
 
 pytest.importorskip("warp")
 
-PAGE = Path(__file__).parents[3] / "docs" / "stimuli.md"
+PAGE = Path(__file__).parents[3] / "docs" / "unstable-whiskers.md"
 TIMES = np.arange(1, 31) * 1e-3
 
 

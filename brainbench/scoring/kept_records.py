@@ -1,0 +1,61 @@
+"""Records of scores that were made before on this machine, with the same code, network, recordings and options."""
+
+from __future__ import annotations
+
+import logging
+import re
+from pathlib import Path
+
+from brainbench.core.errors import DataError, UsageError
+from brainbench.core.files import cache_dir, content_hash, read_json, write_text
+from brainbench.core.reading.code_stamp import code_stamp
+from brainbench.core.records import ResultRecord
+from brainbench.scoring.demo import DEMOS
+from brainbench.scoring.options import ScoreOptions
+
+_LOG = logging.getLogger(__name__)
+
+
+def record_path(model: str, options: ScoreOptions, command: str) -> Path | None:
+    """Return where the cache keeps the record of a score; None for one that depends on files of the user.
+
+    Args:
+        model: what is scored, as typed.
+        options: how it is scored.
+        command: the command line, which stands in the record.
+    """
+    from brainbench.models.registry import locate_model
+
+    # A path, or FILE.py:NAME, has characters that no name of the package has.
+    if not all(re.fullmatch(r"[\w.+-]+", str(name)) for name in (model, options.metric)):
+        return None
+    if str(options.recordings) not in DEMOS or options.stimuli is not None or options.match is not None:
+        return None
+    try:
+        found = locate_model(model)
+    except UsageError:
+        return None
+    package = Path(__file__).parents[1]
+    ours = found.record.source == package.name and (found.weights is None or package in found.weights.parents)
+    return cache_dir("scores") / f"{content_hash(model, options, command, code_stamp())}.json" if ours else None
+
+
+def read_kept(path: Path | None) -> ResultRecord | None:
+    """Return the record that the cache keeps at ``path``; None without one, or with a damaged one."""
+    if path is None or not path.is_file():
+        return None
+    try:
+        return ResultRecord.from_json(read_json(path))
+    except DataError as error:
+        _LOG.warning("The record in the cache is damaged and is made again (%s).", error)
+        return None
+
+
+def keep(record: ResultRecord, path: Path | None) -> None:
+    """Keep a record in the cache; where nothing can be written, a warning says so and work goes on."""
+    if path is None:
+        return
+    try:
+        write_text(path, record.to_json())
+    except OSError as error:
+        _LOG.warning("The record could not be kept in the cache (%s).", error)
