@@ -1,6 +1,6 @@
 """Synthetic recordings whose truth is known, as arrays, data sets, sessions of spike times, or files.
 
-A ``geometry`` (from a network's features or an RDM) and a ``design`` give ``populations``: expected rates, trials and
+A ``geometry`` (from a network's features) and a ``design`` give ``populations``: expected rates, trials and
 counts. ``animals`` keeps them as arrays with their truth, ``sessions`` writes files (``spikes`` places their spikes),
 ``truth`` what the neurons encode beside them, ``cache`` makes files once per machine. ``rodgers_demo`` puts the same
 neurons into the task and file layout of Rodgers 2022 (``rodgers_task``).

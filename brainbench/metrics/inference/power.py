@@ -9,7 +9,7 @@ models agree by luck. With s shared by all animals and the other terms drawn ane
     measured    √q · t + √(1 − q) · noise          q: reliability of an animal's RDM
     model       (e/√c) · s + √(1 − e²/c) · other   e: the effect, the score that is true, between chance and 1
 
-Each experiment goes through the permutation test of :func:`brainbench.metrics.score_rdms`, with the
+Each experiment goes through the permutation test of a score, with the
 choice among ``layers`` of which one has the effect and the others know nothing. The comparison is the whitened one
 with the mean distance taken away, which has the same permutations as the whitened cosine and a chance of 0.
 """

@@ -49,30 +49,6 @@ class VariancePartition:
     """Reason for an undefined p; empty otherwise."""
 
 
-def nuisance_rdm(values: ArrayLike, labels: ArrayLike) -> Floats:
-    """Return the RDM [P] of a quantity measured in every trial: absolute differences of its stimulus means.
-
-    Args:
-        values: [R] one number per trial (contacts, licks, choice as 0 and 1), NaN where unknown.
-        labels: [R] stimulus of each trial, as in :func:`brainbench.metrics.rdm`.
-
-    Raises:
-        UsageError: not one value and one label per trial.
-        DataError: an infinite value, or a stimulus without any.
-
-    >>> nuisance_rdm([2, 4, 5, 5, 0], ["a", "a", "b", "b", "c"]).tolist()
-    [2.0, 3.0, 5.0]
-    """
-    numbers = np.asarray(values, dtype=np.float64)
-    codes, names = stimulus_codes(labels)
-    if numbers.ndim != 1 or len(numbers) != len(codes):
-        raise UsageError(f"A nuisance has one value per trial [{len(codes)}]; received shape {numbers.shape}.")
-    means = stimulus_means(numbers[:, None], codes, len(names))[:, 0]
-    if not np.isfinite(means).all():
-        raise DataError(f"The nuisance has no value for stimulus {names[int(np.argmin(np.isfinite(means)))]!r}.")
-    return upper(np.abs(means[:, None] - means))
-
-
 def variance_partition(
     model_rdm: ArrayLike, nuisance_rdms: Mapping[str, ArrayLike], brain_rdms: ArrayLike, *, seed: int = 0
 ) -> VariancePartition:

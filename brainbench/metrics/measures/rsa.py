@@ -12,7 +12,6 @@ from numpy.typing import ArrayLike
 
 from brainbench.core.errors import UsageError
 from brainbench.core.records import Score
-from brainbench.metrics.animal_to_animal import score_agreement
 from brainbench.metrics.measures.metric import Metric, usable_features
 from brainbench.metrics.rdms.comparison import check_comparison, compare_all, permuted_comparisons
 from brainbench.metrics.rdms.comparison import compare as compare_rdms
@@ -174,32 +173,6 @@ def score_rdms(
     rdms = check_layers(layer_rdms, stimuli)
     options = {"name": name, "stimuli": stimuli, "estimator": estimator, "seed": seed, "device": device}
     return score_layers(RSA(comparison=compare), rdms, subjects, **options)[0]
-
-
-def score_animals(
-    subjects: Sequence[SubjectRDM],
-    *,
-    stimuli: Sequence[str] | None = None,
-    estimator: str = "default",
-    compare: str = "pearson",
-    seed: int = 0,
-) -> Score:
-    """Score each reliable animal against the mean RDM of the others, both sides corrected for noise.
-
-    Args:
-        subjects: From :func:`subject_rdm`, for the same stimuli in the same order.
-        stimuli: Names of the K stimuli; numbers by default.
-        estimator: See :func:`noise_corrected`.
-        compare: Comparison of RDMs.
-        seed: Seed of the permutations.
-
-    Raises:
-        UsageError: no animals, RDMs that do not fit, unknown estimator or comparison.
-    """
-    check_comparison(compare)
-    if stimuli is None:
-        stimuli = [str(number) for number in range(subjects[0].count if subjects else 0)]
-    return score_agreement(RSA(comparison=compare), subjects, stimuli=stimuli, estimator=estimator, seed=seed)
 
 
 def check_layers(layer_rdms: Mapping[str, ArrayLike], stimuli: Sequence[str]) -> dict[str, Floats]:

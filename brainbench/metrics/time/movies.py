@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 
 from brainbench.core.errors import UsageError
 from brainbench.core.trials import Trials
-from brainbench.metrics.rdms.movies import rdm_movie
+from brainbench.metrics.rdms.dissimilarity import rdm
 from brainbench.metrics.rdms.pairs import Floats
 from brainbench.metrics.reliability.subject_rdm import subject_rdm
 
@@ -106,7 +106,8 @@ def layer_movie(values: ArrayLike, step: float, width: float, *, method: str = "
         UsageError: activations without a time axis, or times that are not positive.
     """
     array = np.asarray(values)
-    return rdm_movie(array if array.ndim == 3 and array.shape[1] == 1 else in_bins(array, step, width), method=method)
+    bins = array if array.ndim == 3 and array.shape[1] == 1 else in_bins(array, step, width)
+    return np.stack([rdm(bins[:, index], method=method) for index in range(bins.shape[1])])
 
 
 def in_bins(values: ArrayLike, step: float, width: float) -> Floats:

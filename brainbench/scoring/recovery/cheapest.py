@@ -35,11 +35,6 @@ class TriedDesign:
     interval: Interval
     """Wilson's interval of ``win_rate``."""
 
-    @property
-    def presentations(self) -> int:
-        """Trials of all animals together: the cost of the experiment."""
-        return self.animals * self.trials * self.stimuli
-
 
 def find_cheapest(
     candidates: Sequence[Candidate],
