@@ -63,8 +63,7 @@ class Animals:
 def gather(metric: Metric, subjects: Sequence[SubjectRDM], stimuli: int, *, estimator: str = "default") -> Animals:
     """Sort subjects by name, correct each for noise as the metric does and decide who is scored.
 
-    Raises:
-        UsageError: no subjects, repeated names, or RDMs of another number of stimuli.
+    Raises UsageError: no subjects, repeated names, or RDMs of another number of stimuli.
     """
     if not subjects:
         raise UsageError("There are no animals to score against; give at least one SubjectRDM.")

@@ -128,8 +128,7 @@ def response_by_lag(
     """Cross-correlate touches and spikes.
 
     Returns:
-        lags [L] (s), response [L] (Hz, all units together), and its size [L] in robust standard
-        deviations over lags.
+        lags [L] (s), response [L] (Hz, all units together), and its size [L] in robust standard deviations over lags.
     """
     from scipy.signal import fftconvolve
 

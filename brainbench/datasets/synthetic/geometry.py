@@ -24,11 +24,9 @@ class ResponseGeometry:
     def from_features(cls, features: ArrayLike, labels: Sequence[str] | None = None) -> ResponseGeometry:
         """Take the correlations between the rows of features [K, F], such as a model's activations.
 
-        The truth is then 1 − Pearson between rows, the model's own correlation-distance RDM.
-
-        Raises:
-            UsageError: the features are not [K, F] with K ≥ 2 and F ≥ 2, or labels do not fit.
-            DataError: a value is not finite or a row is constant and has no direction.
+        The truth is then 1 − Pearson between rows, the model's own correlation-distance RDM. Raises UsageError: the
+        features are not [K, F] with K ≥ 2 and F ≥ 2, or labels do not fit; DataError: a value is not finite or a row is
+        constant and has no direction.
         """
         values = _checked(features, 2)
         # Inner products of centred rows of length one are Pearson correlations (r), so the RDM below is 1 − r.
@@ -42,11 +40,9 @@ class ResponseGeometry:
     def from_activations(cls, features: ArrayLike, labels: Sequence[str] | None = None) -> ResponseGeometry:
         """Take the Euclidean distances between stimuli over features [K, F], each standardised over the stimuli.
 
-        Constant features are left out. Unlike :meth:`from_features`, stimuli may be near to the mean response.
-
-        Raises:
-            UsageError: the features are not [K, F] with K ≥ 2, or labels do not fit.
-            DataError: a value is not finite, or every feature is constant.
+        Constant features are left out. Unlike :meth:`from_features`, stimuli may be near to the mean response. Raises
+        UsageError: the features are not [K, F] with K ≥ 2, or labels do not fit; DataError: a value is not finite, or
+        every feature is constant.
         """
         values = _checked(features, 1)
         spread = values.std(axis=0)

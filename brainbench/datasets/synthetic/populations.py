@@ -2,10 +2,9 @@
 
 Every unit has a mean rate b (log-normal over units) and Gaussian weights w on the axes of a geometry
 (:class:`ResponseGeometry`). Its expected rate for stimulus k is b · max(0, 1 + m (√(1−ι) x_k·w + √ι y_k·w′)): x_k is
-the shared direction of the stimulus, y_k the animal's own random one, m the ``modulation``, ι the ``individual``
-share. Each animal multiplies the axes by its own log-normal ``emphasis``. Squared Euclidean distances over many units
-are then proportional to those between directions; rectification touches less than 0.7 % of the rates at the largest
-modulation.
+the shared direction of the stimulus, y_k the animal's own random one, m the ``modulation``, ι the ``individual`` share.
+Each animal multiplies the axes by its own log-normal ``emphasis``. Squared Euclidean distances over many units are then
+proportional to those between directions; rectification touches less than 0.7 % of the rates at the largest modulation.
 
 Counts are Poisson around that rate, times a gamma gain per unit and trial (``dispersion`` φ: variance =
 mean + φ mean², the negative binomial), times one gain common to all units of a trial (``shared_gain``).
@@ -83,8 +82,7 @@ def draw_sessions(
 ) -> Iterator[DrawnSession]:
     """Draw the sessions of every animal; each is a pure function of geometry, design, seed, animal and session.
 
-    Raises:
-        UsageError: a missing stimulus does not exist.
+    Raises UsageError: a missing stimulus does not exist.
     """
     design = design or PopulationDesign()
     for animal in range(design.animals):

@@ -140,8 +140,7 @@ def ensure_rodgers_demo(
 def wrench_features(stimuli: xr.Dataset) -> NDArray[np.float64]:
     """Return what whisker afferents tell of each stimulus [K, F] until the earliest choice.
 
-    Raises:
-        DataError: a wrench is not finite (an unstable simulation), all are zero, or no tracked whisker is there.
+    Raises DataError: a wrench is not finite (an unstable simulation), all are zero, or no tracked whisker is there.
     """
     names = tuple(str(name) for name in stimuli["whisker"].values)
     wrench = stimuli["wrench"].transpose("stimulus", "time", "whisker", "channel").values.astype(np.float64)

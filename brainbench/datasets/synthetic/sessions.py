@@ -48,8 +48,7 @@ def as_recordings(
 ) -> xr.Dataset:
     """Draw synthetic animals as a recordings data set, ready for ``trials_by_subject`` and ``score``.
 
-    Raises:
-        DataError: the design leaves no trial or one condition only.
+    Raises DataError: the design leaves no trial or one condition only.
     """
     counted, length = [], (design or PopulationDesign()).window
     for drawn in draw_sessions(geometry, design, seed):
@@ -85,10 +84,9 @@ def make_sessions(
 ) -> list[Session]:
     """Draw synthetic animals as sessions of spike times.
 
-    A trial begins 0.5 s before a whisker touches (table ``contacts_by_whisker_C1``); 15 % of the spikes
-    that are counted come about 12 ms after that touch, the others anywhere in the window; between
-    windows units fire at half their mean rate, and never twice within 2 ms (less at rates above
-    250 Hz). The window is ``first-contact..choice``.
+    A trial begins 0.5 s before a whisker touches (table ``contacts_by_whisker_C1``); 15 % of the spikes that are
+    counted come about 12 ms after that touch, the others anywhere in the window; between windows units fire at half
+    their mean rate, and never twice within 2 ms (less at rates above 250 Hz). The window is ``first-contact..choice``.
     """
     return [_session(geometry, drawn) for drawn in draw_sessions(geometry, design, seed)]
 

@@ -72,9 +72,8 @@ class SessionCounts:
 def count_session(session: Session, options: ReadingOptions) -> SessionCounts:
     """Count the trials of one session.
 
-    Raises:
-        UsageError: a table or column does not exist (the nearest is named).
-        DataError: the session's units or tables cannot be used.
+    Raises UsageError: a table or column does not exist (the nearest is named); DataError: the session's units or tables
+    cannot be used.
     """
     if session.units is None or not has_units(session):
         raise DataError(no_units(session))
@@ -150,8 +149,7 @@ def no_units(session: Session) -> str:
 def read_spikes(units: SessionTable, notes: list[str]) -> list[NDArray[np.float64]]:
     """Read the spike times (s, ascending) of every unit.
 
-    Raises:
-        DataError: the ragged index is inconsistent or a time is not finite.
+    Raises DataError: the ragged index is inconsistent or a time is not finite.
     """
     if f"{SPIKES}_index" not in units:
         raise DataError(f"{units.label} has spike_times without spike_times_index; the spikes belong to no unit.")

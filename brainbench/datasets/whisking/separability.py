@@ -113,11 +113,8 @@ def separate(
     """Measure how well classes are told apart by features [n, F], for all choices of ``count`` of them.
 
     ``names`` are those of the labels [n]. Sweeps of the same object (``objects`` [n]) stay on one side of every test.
-
-    Raises:
-        UsageError: there are fewer classes than ``count``.
-        DataError: a class has fewer than two objects.
-        MissingDependencyError: scikit-learn is not installed.
+    Raises UsageError: there are fewer classes than ``count``; DataError: a class has fewer than two objects;
+    MissingDependencyError: scikit-learn is not installed.
     """
     try:
         from sklearn.metrics.pairwise import rbf_kernel

@@ -28,9 +28,7 @@ _SPLITS = 20
 def pattern_dimensions(patterns: ArrayLike) -> float:
     """Return the dimensions of patterns [K, F] without noise, such as a layer's features.
 
-    Raises:
-        UsageError: not [K, F] with at least 3 stimuli.
-        DataError: the patterns do not differ or are not finite.
+    Raises UsageError: not [K, F] with at least 3 stimuli; DataError: the patterns do not differ or are not finite.
     """
     array = np.asarray(patterns, dtype=np.float64)
     if array.ndim != 2 or len(array) < 3:

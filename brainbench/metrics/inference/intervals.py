@@ -19,8 +19,7 @@ BEYOND = 1.1
 def t_interval(values: ArrayLike, level: float = LEVEL) -> Interval | None:
     """Return the t interval of the mean of one value per animal [A]; None for fewer than two or missing ones.
 
-    Raises:
-        UsageError: a level outside (0, 1).
+    Raises UsageError: a level outside (0, 1).
     """
     return statistics.t_interval(values, level, over="animals")
 

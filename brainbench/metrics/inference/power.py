@@ -50,8 +50,7 @@ _CHUNK_ELEMENTS = 1 << 21
 class ExperimentDesign:
     """An experiment, and the truth it is to find.
 
-    Raises:
-        UsageError: a number is out of range, or the effect is larger than what the animals share allows.
+    Raises UsageError: a number is out of range, or the effect is larger than what the animals share allows.
     """
 
     stimuli: int = 6
@@ -148,8 +147,7 @@ def needed(
 ) -> int | None:
     """Return the smallest tried number of stimuli or animals whose power reaches ``target``; None if none does.
 
-    Raises:
-        UsageError: ``vary`` is neither, or a target outside (0, 1).
+    Raises UsageError: ``vary`` is neither, or a target outside (0, 1).
     """
     tried = {"stimuli": STIMULUS_COUNTS, "animals": ANIMAL_COUNTS}
     if vary not in tried:

@@ -1,9 +1,8 @@
 """Procrustes similarity: how well the best rotation carries one set of patterns onto another.
 
-Patterns are centred over stimuli and scaled to unit size; the value is the cosine of the angular
-Procrustes distance of Williams et al. 2021, ‖XᵀY‖∗ (sum of singular values): 1 when a rotation and a
-scale make the patterns equal. It is not corrected for noise and is well above 0 for unrelated patterns
-(the permutation's mean score stands beside it).
+Patterns are centred over stimuli and scaled to unit size; the value is the cosine of the angular Procrustes distance of
+Williams et al. 2021, ‖XᵀY‖∗ (sum of singular values): 1 when a rotation and a scale make the patterns equal. It is not
+corrected for noise and is well above 0 for unrelated patterns (the permutation's mean score stands beside it).
 """
 
 from __future__ import annotations

@@ -176,11 +176,7 @@ def score_rdms(
 
 
 def check_layers(layer_rdms: Mapping[str, ArrayLike], stimuli: Sequence[str]) -> dict[str, Floats]:
-    """Return the layers' RDMs [P] by name.
-
-    Raises:
-        UsageError: no layers, or RDMs of another number of stimuli.
-    """
+    """Return the layers' RDMs [P] by name. Raises UsageError: no layers, or RDMs of another number of stimuli."""
     if not layer_rdms:
         raise UsageError("There are no layers to score; give the RDM of at least one layer.")
     rdms = {str(layer): rdm_stack(values, f"The RDM of layer {layer!r}") for layer, values in layer_rdms.items()}

@@ -30,10 +30,9 @@ _SIGN_LIMIT = 128
 def compare(a: ArrayLike, b: ArrayLike, *, method: str = "pearson") -> Floats:
     """Compare RDMs ``a`` [..., P] with ``b`` [..., P]; leading axes broadcast as in numpy.
 
-    Pairs that are NaN in either RDM are left out of that comparison. A comparison without a value
-    (an RDM constant over the pairs that are left, fewer than 2 pairs) is NaN, except that ``rho-a`` and
-    ``tau-a`` of a constant RDM are 0 by definition and the cosines need only a non-zero RDM. Nothing is
-    clipped: rounding may give 1 + 2e-16.
+    Pairs that are NaN in either RDM are left out of that comparison. A comparison without a value (an RDM constant over
+    the pairs that are left, fewer than 2 pairs) is NaN, except that ``rho-a`` and ``tau-a`` of a constant RDM are 0 by
+    definition and the cosines need only a non-zero RDM. Nothing is clipped: rounding may give 1 + 2e-16.
 
     Args:
         a: RDMs, upper triangles.

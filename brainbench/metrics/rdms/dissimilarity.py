@@ -116,8 +116,7 @@ def rdm(
         device: Torch device to compute on (``"cuda"``, ``"cpu"``); by default where ``responses`` lie.
 
     Returns:
-        Distances [P], float64. A pair that has no distance (constant pattern, non-finite entry, no
-        trials) is NaN.
+        Distances [P], float64. A pair that has no distance (constant pattern, non-finite entry, no trials) is NaN.
 
     Raises:
         UsageError: unknown method or device, shapes that do not fit, folds missing or not wanted.

@@ -50,8 +50,7 @@ class NoiseModel:
     def sides(self, left: Array, right: Array) -> tuple[Array, Array]:
         """Return vectors [N, V] and [M, V] whose inner products are those of ``left`` and ``right`` with C⁻¹ between.
 
-        Raises:
-            DataError: the covariance is singular.
+        Raises DataError: the covariance is singular.
         """
         same = left is right
         left = left / self.scale
@@ -71,11 +70,7 @@ class NoiseModel:
         return join([left, first], -1), join([right, -second], -1) / self.ridge
 
     def precision(self) -> Array:
-        """Return C⁻¹ [U, U].
-
-        Raises:
-            DataError: the covariance is singular.
-        """
+        """Return C⁻¹ [U, U]. Raises DataError: the covariance is singular."""
         eye = library(self.scale).eye(len(self.scale), **_like(self.scale))
         if not self.weight:
             inner = eye / self.ridge
@@ -140,9 +135,8 @@ def noise_precision(
 def estimate_noise(trials: Any, codes: Ints, count: int, method: str, *, device: Any = None) -> NoiseModel:
     """Return the covariance of trials [R, U] about the means of their ``count`` stimuli, on the device.
 
-    Raises:
-        UsageError: unknown method.
-        DataError: as :func:`noise_precision`, but a singular covariance is found only when it is used.
+    Raises UsageError: unknown method; DataError: as :func:`noise_precision`, but a singular covariance is found only
+    when it is used.
     """
     if method not in NOISE_METHODS:
         raise unknown_name("noise covariance method", method, NOISE_METHODS)

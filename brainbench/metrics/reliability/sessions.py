@@ -1,10 +1,9 @@
 """Sessions of an animal that can be split into halves: their trials sorted, what cannot be split left out.
 
-Rules for what cannot be split:
-a session that lacks two trials of some stimulus (four for ``crossnobis``, whose halves need two) is
-left out, of the RDM too, so that the RDM and its reliability describe the same data; a unit with fewer
-recorded trials of some stimulus is left out of its session. What was left out is told in words.
-Without any session left the animal is undefined.
+Rules for what cannot be split: a session that lacks two trials of some stimulus (four for ``crossnobis``, whose halves
+need two) is left out, of the RDM too, so that the RDM and its reliability describe the same data; a unit with fewer
+recorded trials of some stimulus is left out of its session. What was left out is told in words. Without any session
+left the animal is undefined.
 """
 
 from __future__ import annotations
@@ -153,8 +152,7 @@ def usable_sessions(
 def trial_hashes(block: Trials, responses: Floats, codes: Ints) -> Hashes:
     """Return one hash per trial, of its key or of its content.
 
-    Raises:
-        UsageError: keys are not one per trial, or repeat.
+    Raises UsageError: keys are not one per trial, or repeat.
     """
     if block.keys is None:
         return content_hashes(responses, codes)

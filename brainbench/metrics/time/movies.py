@@ -101,9 +101,7 @@ def layer_movie(values: ArrayLike, step: float, width: float, *, method: str = "
     """Return a layer's RDMs [T, P] in bins of ``width`` seconds, from activations [K, T, F] every ``step`` seconds.
 
     A layer without time ([K, 1, F]) gives one RDM, which stands for all times.
-
-    Raises:
-        UsageError: activations without a time axis, or times that are not positive.
+    Raises UsageError: activations without a time axis, or times that are not positive.
     """
     array = np.asarray(values)
     bins = array if array.ndim == 3 and array.shape[1] == 1 else in_bins(array, step, width)
@@ -118,8 +116,7 @@ def in_bins(values: ArrayLike, step: float, width: float) -> Floats:
     >>> in_bins([[[0.0], [1.0], [2.0], [3.0]]], 0.5, 1.0).ravel().tolist()
     [0.5, 2.5]
 
-    Raises:
-        UsageError: activations without a time axis, or times that are not positive.
+    Raises UsageError: activations without a time axis, or times that are not positive.
     """
     array = np.asarray(values)
     if array.ndim != 3 or not (step > 0 and width > 0):

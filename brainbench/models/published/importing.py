@@ -96,8 +96,7 @@ def import_to_cache(path: Path, config: Path | None = None) -> Path:
 def build_published(state: Mapping[str, torch.Tensor], found: Recognised) -> tuple[EncoderAttenderDecoder, set[str]]:
     """Build a recognised network with its weights; return it with the names of the entries that it took.
 
-    Raises:
-        DataError: entries are missing or unexpected, or shapes differ.
+    Raises DataError: entries are missing or unexpected, or shapes differ.
     """
     name = found.architecture
     model = load_model(name, classes=found.classes, decoder=found.decoder or "linear")
@@ -116,8 +115,7 @@ def matched_entries(
 ) -> dict[str, torch.Tensor]:
     """Return the entries of a file that are a network's weights, each with its place in ours.
 
-    Raises:
-        DataError: entries are missing or unexpected, or shapes differ.
+    Raises DataError: entries are missing or unexpected, or shapes differ.
     """
     places, names = model.state_dict(), published_names(model)
     if found.decoder is None:

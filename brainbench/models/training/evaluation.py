@@ -87,8 +87,7 @@ def collapse(predicted: int, classes: int, spread: float) -> str:
 def evaluate(model: nn.Module, batches: Iterable[tuple[Any, Any]], *, device: Any = None) -> Evaluation:
     """Evaluate a network on labelled batches ([B, T, C, H, W] in SI, [B]), in evaluation mode.
 
-    Raises:
-        DataError: there are no batches, or an answer is not [B, classes].
+    Raises DataError: there are no batches, or an answer is not [B, classes].
     """
     encode: Any = getattr(model, "encode", None)
     decoder: Any = getattr(model, "decoder", None)
@@ -156,11 +155,9 @@ def fit_probe(
 
     The network, on ``device``, has ``encode``; its weights stay as they are. ``batches`` are one pass over labelled
     training sweeps, ``epochs`` passes over their features. Features of more than ``memory`` bytes are not held: every
-    pass asks ``batches`` for the sweeps again and shuffles as many as fit, so they should come in a new order.
-
-    Raises:
-        DataError: there are no batches, or the features are not finite.
-        UsageError: there are more features than memory, and ``batches`` can be read but once.
+    pass asks ``batches`` for the sweeps again and shuffles as many as fit, so they should come in a new order. Raises
+    DataError: there are no batches, or the features are not finite; UsageError: there are more features than memory,
+    and ``batches`` can be read but once.
     """
     held, pools, count, moments = None, 0, 0, torch.zeros(())
     for held in _feature_pools(model, batches, device, memory):

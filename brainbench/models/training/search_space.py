@@ -44,10 +44,7 @@ def best_run(out: str | Path) -> tuple[Path, dict[str, float]]:
     """Return the folder of the best finished run of a sweep, and every finished run's score by its name.
 
     Scores are those of the validation data: highest accuracy, or lowest self-supervised loss. The test split has no
-    say.
-
-    Raises:
-        DataError: no run of the sweep is finished.
+    say. Raises DataError: no run of the sweep is finished.
     """
     from brainbench.core.files import read_json
     from brainbench.models.training.run_folder import RUN, read_log

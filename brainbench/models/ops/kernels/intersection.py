@@ -1,8 +1,7 @@
 """The gates of an IntersectionRNN, after its convolution (Collins et al. 2017): a kernel forward, a kernel backward.
 
-With p, m, q, n the four gates' pre-activations, normalised over channels if asked (Ba et al. 2016):
-s' = σ(p + 1) s + (1 − σ(p + 1)) tanh(m) and y = σ(q + 1) x + (1 − σ(q + 1)) relu(n). Letters: R rows (stimulus, then
-place), C channels.
+With p, m, q, n the four gates' pre-activations, normalised over channels if asked (Ba et al. 2016): s' = σ(p + 1) s +
+(1 − σ(p + 1)) tanh(m) and y = σ(q + 1) x + (1 − σ(q + 1)) relu(n). Letters: R rows (stimulus, then place), C channels.
 """
 
 from typing import Any
