@@ -205,17 +205,10 @@ def make_session(
 ) -> Session:
     """Build a session from arrays, to be written with :func:`~brainbench.datasets.write_recordings`.
 
-    Args:
-        subject: name of the animal.
-        session: name of the session, unique within the animal.
-        spikes: spike times (s) of each unit.
-        tables: interval tables, each a mapping of columns with at least ``start_time``.
-        unit_columns: columns of the units table, such as ``id``, ``depth`` (µm), ``layer``.
-        observed: per unit the recorded spans [n, 2] (s), if known.
-        start, synthetic, stimuli: as of :class:`Session`.
-
-    Raises:
-        DataError: columns differ in length or a table has no ``start_time``.
+    ``spikes`` are the times (s) of each unit, ``tables`` mappings of columns with at least ``start_time``,
+    ``unit_columns`` such as ``id``, ``depth`` (µm) and ``layer``, ``observed`` the recorded spans [n, 2] (s) of each
+    unit. The session's name is unique within the animal.
+    Raises DataError: columns differ in length or a table has no ``start_time``.
     """
     data: dict[str, Any] = {"id": np.arange(len(spikes))}
     data |= {name: np.asarray(values) for name, values in (unit_columns or {}).items()}

@@ -34,14 +34,8 @@ def score_agreement(
 ) -> Score:
     """Score each reliable animal against the others together, by a metric.
 
-    The p-value permutes every animal's stimuli independently, (b+1)/(n+1).
-
-    Args:
-        metric: What compares them.
-        subjects: What :meth:`Metric.animal` made of each animal.
-        stimuli: Names of the K stimuli.
-        estimator: One of the metric's.
-        seed: Seed of the permutations.
+    The p-value permutes every animal's stimuli independently, (b+1)/(n+1). ``subjects`` are what :meth:`Metric.animal`
+    made of each animal, ``stimuli`` the names of the K stimuli.
 
     Returns:
         A score without layers; undefined for fewer than two usable animals.

@@ -44,19 +44,10 @@ def score_layers(
 ) -> tuple[Score, PermutationTest | None]:
     """Score the layers of a model against animals; also return the permutation test with all statistics.
 
-    Args:
-        metric: What compares them.
-        layers: What :meth:`Metric.layer` made of each layer, in network order.
-        subjects: What :meth:`Metric.animal` made of each animal.
-        name: Name of the model.
-        stimuli: Names of the K stimuli.
-        estimator: One of the metric's.
-        seed: Seed of random permutations.
-        device: Torch device for the permutations; numpy by default.
-        committed: Layer that was chosen before anything was scored.
-
-    Raises:
-        UsageError: no animals, subjects of other stimuli, or an unknown estimator or layer.
+    ``layers`` are what :meth:`Metric.layer` made of each layer, in network order, ``subjects`` what
+    :meth:`Metric.animal` made of each animal. ``committed`` is a layer that was chosen before anything was scored;
+    without a torch ``device`` numpy computes the permutations.
+    Raises UsageError: no animals, subjects of other stimuli, or an unknown estimator or layer.
     """
     if len(set(map(str, stimuli))) < len(stimuli):
         raise UsageError(f"Stimulus names repeat: {list(stimuli)}.")

@@ -58,17 +58,8 @@ def measure_tradeoff(
 ) -> tuple[MonteCarloPoint, ...]:
     """Measure Monte-Carlo error and time of each number, the others at their defaults.
 
-    Args:
-        animals: Synthetic animals of one geometry, six stimuli.
-        units: Units of each.
-        trials: Trials of each stimulus.
-        splits: Numbers of split halves.
-        permutations: Random orders of the stimuli (for more than seven stimuli).
-        repeats: Seeds per setting, at least 2.
-        progress: Called with (done, total, what).
-
-    Raises:
-        UsageError: fewer than two repeats, or numbers that are not positive.
+    Synthetic animals share one geometry of six stimuli; every setting is repeated with ``repeats`` seeds.
+    Raises UsageError: fewer than two repeats, or numbers that are not positive.
     """
     if repeats < 2 or min(*splits, *permutations, animals, units, trials) < 1:
         raise UsageError("A trade-off needs at least 2 repeats and positive numbers.")

@@ -66,12 +66,9 @@ class NetworkState:
 class EncoderAttenderDecoder(nn.Module):
     """Normaliser → encoder → attender → decoder; [B, T, C, H, W] in SI → [B, classes].
 
-    Args:
-        encoder: Maps [B, T, C, H, W] to [B, T, F].
-        attender: Maps [B, T, F] to [B, T, W]; None passes the features on.
-        decoder: Maps features to outputs, ending in a linear layer; None is the linear decoder to 117 classes.
-        normaliser: None is :meth:`Normaliser.physical`.
-        unroll: How a temporal graph is unrolled; other encoders know one way only.
+    The encoder gives features [B, T, F], which the attender (None: nothing) maps to [B, T, W]. The decoder ends in a
+    linear layer; None is the linear one to 117 classes. None as normaliser is :meth:`Normaliser.physical`. Only a
+    temporal graph can be unrolled otherwise than biologically.
 
     Raises:
         UsageError: the unrolling is unknown, or the encoder is no temporal graph and knows one way only.

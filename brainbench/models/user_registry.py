@@ -92,15 +92,9 @@ def read_user_models() -> dict[str, UserModel]:
 def add_user_model(target: str, name: str, *, taken: Collection[str]) -> UserModel:
     """Store a model of the user's own under a name; nothing is stored unless it can be built.
 
-    Args:
-        target: ``path/to/FILE.py:NAME`` or ``package.module:NAME``.
-        name: Name on the command line: lower-case letters, digits, ``-`` and ``+``.
-        taken: Names of the registry.
-
-    Raises:
-        UsageError: the name is taken or breaks the grammar, or the target gives no module.
-        DataFileNotFoundError: there is no such file or module.
-        DataError: the code fails, or the settings cannot be written.
+    ``target`` is ``path/to/FILE.py:NAME`` or ``package.module:NAME``; ``taken`` are the names of the registry. Raises
+    UsageError: the name is taken or breaks the grammar, or the target gives no module; DataFileNotFoundError: there is
+    no such file or module; DataError: the code fails, or the settings cannot be written.
     """
     from brainbench.models.user_models import load_user_model
 

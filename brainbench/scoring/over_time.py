@@ -38,20 +38,9 @@ def time_course(
     """Return the score over time of a model against recordings in bins.
 
     The window of the recordings begins when the stimuli do. Where the stimuli do not state their duration, they last as
-    long as the window.
-
-    Args:
-        brain: Recordings in bins of one width.
-        network: Activations of the model.
-        metric: How RDMs are made and compared.
-        kept: Labels that are scored, in order.
-        rows: Rows of the activations for these labels.
-        options: Hold the seed of split halves and permutations, and the reliability that units must have.
-        progress: Called with (done, total, what).
-
-    Raises:
-        DataError: the recordings have no bins of time.
-        UsageError: fewer than 3 bins or 4 stimuli.
+    long as the window. Recordings have bins of one width; ``kept`` are the labels that are scored, in order, and
+    ``rows`` those of the activations. The options hold the seed, and the reliability that units must have.
+    Raises DataError: the recordings have no bins of time; UsageError: fewer than 3 bins or 4 stimuli.
     """
     if "time" not in brain.dataset.coords or brain.dataset.sizes["time"] < 3:
         raise DataError(

@@ -56,12 +56,8 @@ def draw_animals(
     """Draw animals whose units mix features linearly, such as the activations of a network.
 
     Every animal and session has its own random stream, so the first animals of a larger design are those of a smaller
-    one.
-
-    Args:
-        features: [K, F], each standardised over stimuli (:meth:`ResponseGeometry.from_activations`); or a geometry.
-        design: size and noise; the defaults of :class:`PopulationDesign` if None.
-        seed: one integer, or several (such as study and simulation).
+    one. Features [K, F] are each standardised over stimuli (:meth:`ResponseGeometry.from_activations`). The seed is one
+    integer, or several (such as study and simulation).
 
     Returns:
         Subject → its sessions: ``responses`` [R, 1, U] Hz, ``labels`` [R], ``keys``.
@@ -119,11 +115,8 @@ def expected_rates(
 ) -> NDArray[np.float64]:
     """Draw units and return their expected rates [K, U], Hz.
 
-    Args:
-        geometry: what all animals share.
-        design: number of units, rates, modulation and individual differences.
-        own: stream of the animal, fresh: all of its sessions draw the same differences from it.
-        random: stream of the session.
+    ``own`` is the random stream of the animal, fresh: all of its sessions draw the same differences from it; ``random``
+    is that of the session.
     """
     stimuli = len(geometry.labels)
     # Log-normal weights of the axes; their mean square is one, so that the depth of tuning does not depend on them.

@@ -66,13 +66,8 @@ def make_rodgers_demo(
 ) -> list[Path]:
     """Write the recordings and their truth into ``folder``.
 
-    Args:
-        folder: created if needed; files of the same names are replaced.
-        stimuli: stimulus set (:func:`brainbench.core.contracts.check_stimulus_set`) with the six labels of the
-            Rodgers experiment and ``contact`` [stimulus, time, whisker] (bool).
-        seed: other seeds give other animals.
-        animals: number of animals; from the fifth on their sessions repeat the first ones' design.
-        progress: called as ``progress(done, total, what)`` after each session.
+    The stimulus set has the six labels of the Rodgers experiment and ``contact`` [stimulus, time, whisker] (bool). From
+    the fifth animal on their sessions repeat the first ones' design. Files of the same names are replaced.
 
     Returns:
         The NWB files. ``truth.json`` beside them holds, over ``labels``, the distances [P] of the geometry that all

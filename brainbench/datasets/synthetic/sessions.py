@@ -106,21 +106,9 @@ def write_files(
     """Write synthetic animals as files, one per session, with ``truth.json`` beside them.
 
     Opened again (layout ``synthetic``) they give the counts of :func:`~brainbench.datasets.synthetic.draw_animals`;
-    ``read_truth`` reads the truth.
-
-    Args:
-        folder: created if needed; files of the same names are replaced.
-        geometry: what the units encode.
-        design: size and noise; the defaults of :class:`PopulationDesign` if None.
-        seed: as in ``draw_animals``.
-        format: ``nwb`` or ``h5``.
-        stimuli: recipe of the stimuli, which the files then name.
-        distance: makes the RDM of each animal's expected rates [K, U] for the truth.
-        progress: called as ``progress(done, total, what)`` after each session.
-        about: what else the truth holds.
-
-    Raises:
-        UsageError: a format other than ``nwb`` and ``h5``.
+    ``read_truth`` reads the truth. Files of the same names are replaced. The format is ``nwb`` or ``h5``, ``stimuli`` a
+    recipe that the files then name. ``distance`` makes the RDM of each animal's expected rates [K, U] for the truth,
+    ``about`` is what else that holds. Raises UsageError: a format other than ``nwb`` and ``h5``.
     """
     writers: dict[str, Callable[[Path, Session], Path]] = {"nwb": write_synthetic_nwb, "h5": write_recordings}
     if format not in writers:

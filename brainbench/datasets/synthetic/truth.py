@@ -59,13 +59,9 @@ def write_with_truth(
 ) -> list[Path]:
     """Write sessions as files ``sub-…_ses-…SUFFIX``, and last their truth.
 
-    Args:
-        folder: created if needed; files of the same names are replaced.
-        sessions: drawn one after the other, all of one subject together.
-        write: writes one of them atomically.
-        suffix: end of the files' names.
-        distance: makes the RDM [P] of expected responses [K, U].
-        about: what else ``truth.json`` holds: ``labels``, and ``shared``, the RDM [P] of the shared geometry.
+    Sessions of one subject come together. ``write`` writes one of them atomically, ``distance`` makes the RDM [P] of
+    expected responses [K, U], and ``about`` is what else the truth holds: ``labels``, and ``shared``, the RDM [P] of
+    the shared geometry.
 
     Returns:
         The files of the sessions.

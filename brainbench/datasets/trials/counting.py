@@ -187,15 +187,10 @@ def count(
 ) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
     """Count spikes in bins from each window's begin.
 
-    A bin is half open, [begin, end). Bins past the end of a short window are NaN with duration 0; the
-    last bin of a window may be shorter than ``bin`` and its duration says so.
-
-    Args:
-        spikes: [U] ascending spike times, s.
-        edges: [R, 2] windows, s.
-        covered: [R, U] whether the unit was recorded.
-        bin: bin width, s; None for one bin.
-        length: length common to all windows, s, if the window has one.
+    A bin is half open, [begin, end). Bins past the end of a short window are NaN with duration 0; the last bin of a
+    window may be shorter than ``bin`` and its duration says so. ``spikes`` [U] are ascending times (s), ``edges`` [R,
+    2] the windows (s), ``covered`` [R, U] says whether a unit was recorded. ``length`` (s) is common to all windows, if
+    they have one; no ``bin`` (s) is one bin.
 
     Returns:
         counts [R, T, U] (float32) and duration [R, T] (s).

@@ -272,9 +272,7 @@ class WhiskingDataset:
     def verify(self, *, again: bool = True, progress: Progress | None = None) -> None:
         """Read every byte of the split and compare hashes.
 
-        Args:
-            again: Also read shards that were found whole before and did not change since.
-            progress: Called with (done, total, what).
+        Shards that were found whole before and did not change since are read only ``again``.
 
         Raises:
             DataError: a shard is not what was generated; the message names it.

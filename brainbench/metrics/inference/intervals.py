@@ -29,14 +29,8 @@ def two_factor_interval(
 ) -> Interval | None:
     """Return the t interval of a mean over animals and stimuli; None for fewer than two of either.
 
-    Args:
-        value: The mean.
-        animals: [A] values of single animals.
-        without_stimulus: [K] the mean without each stimulus in turn.
-        level: Coverage asked for.
-
-    Raises:
-        UsageError: a level outside (0, 1).
+    ``animals`` [A] are the values of single animals, ``without_stimulus`` [K] the mean without each stimulus in turn.
+    Raises UsageError: a level outside (0, 1).
     """
     from scipy.special import stdtrit
 

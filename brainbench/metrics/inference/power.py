@@ -106,16 +106,7 @@ class Power:
 
 
 def power(design: ExperimentDesign, *, simulations: int = SIMULATIONS, seed: int = 0) -> Power:
-    """Simulate experiments of one design.
-
-    Args:
-        design: What is measured and what is true.
-        simulations: Number of experiments; the interval says what it is good for.
-        seed: Seed of the experiments.
-
-    Raises:
-        UsageError: no positive number of simulations.
-    """
+    """Simulate experiments of one design. Raises UsageError: no positive number of simulations."""
     if simulations < 1:
         raise UsageError(f"A power analysis needs at least 1 simulation; received {simulations}.")
     smallest = smallest_p(design.stimuli, RSA.orders)

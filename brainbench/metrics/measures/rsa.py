@@ -150,24 +150,14 @@ def score_rdms(
 ) -> Score:
     """Score a model by the RDMs of its layers against animals.
 
-    ``default``: each reliable animal is compared with the layer that compares best with the *other*
-    reliable animals, the comparison is corrected for the animal's noise, and the score is the mean over
-    animals. The permutation p-value repeats the choice of layer in every permutation. A single animal
-    chooses on one half of its trials and is scored on the other. ``thesis`` and ``thesis-input`` are
-    the published estimators with their maximum over layers, which is optimistic and says so.
-
-    Args:
-        layer_rdms: RDM [P] of each layer, in network order.
-        subjects: From :func:`subject_rdm`, for the same stimuli in the same order.
-        name: Name of the model.
-        stimuli: Names of the K stimuli, in the order of the RDMs.
-        estimator: See :func:`noise_corrected`.
-        compare: Comparison of RDMs, see :func:`brainbench.metrics.compare`.
-        seed: Seed of random permutations (more than 7 stimuli).
-        device: Torch device for the permutations, which pays from some hundred stimuli on; numpy by default.
-
-    Raises:
-        UsageError: no layers or animals, RDMs that do not fit the stimuli, unknown estimator or comparison.
+    ``default``: each reliable animal is compared with the layer that compares best with the *other* reliable animals,
+    the comparison is corrected for the animal's noise, and the score is the mean over animals. The permutation p-value
+    repeats the choice of layer in every permutation. A single animal chooses on one half of its trials and is scored on
+    the other. ``thesis`` and ``thesis-input`` are the published estimators with their maximum over layers, which is
+    optimistic and says so. ``layer_rdms`` are the RDMs [P] of the layers in network order, ``subjects`` come from
+    :func:`subject_rdm`, and both are of the same stimuli in the same order. A torch ``device`` for the permutations
+    pays from some hundred stimuli on.
+    Raises UsageError: no layers or animals, RDMs that do not fit the stimuli, unknown estimator or comparison.
     """
     check_comparison(compare)
     rdms = check_layers(layer_rdms, stimuli)

@@ -86,16 +86,10 @@ def permuted_comparisons(
 ) -> Iterator[Floats]:
     """Yield comparisons [N, L, A] of layers [L, P], with their stimuli in each order of a chunk [N, K], with animals.
 
-    Ranks, means and lengths of an RDM do not feel the order of its stimuli, so what most comparisons multiply
-    is made once and every order only moves it: one gather and one matrix product, on the processor or on a
-    torch device. Kendall's tau, whose vectors are of pairs of pairs, is compared order by order by numpy.
-
-    Args:
-        layers: RDMs whose stimuli are permuted.
-        brain: RDMs [A, P].
-        chunks: Orders of the stimuli.
-        method: Comparison.
-        device: Torch device for the products, None for numpy.
+    Ranks, means and lengths of an RDM do not feel the order of its stimuli, so what most comparisons multiply is made
+    once and every order only moves it: one gather and one matrix product, on the processor or on a torch device.
+    Kendall's tau, whose vectors are of pairs of pairs, is compared order by order by numpy. Animals are RDMs [A, P];
+    without a device numpy computes.
     """
     complete = bool(np.isfinite(layers).all() and np.isfinite(brain).all())
     if not complete or method not in (*_OF_PAIRS, *_OF_MATRICES):

@@ -48,12 +48,8 @@ class SortedTrials(Trials):
     ) -> SortedTrials:
         """Sort trials by stimulus and hash, so that the order in which they came is forgotten.
 
-        Args:
-            responses: [R′, U′].
-            labels: [R] stimulus of the trials that are taken.
-            hashes: [R] theirs.
-            rows: [R] the trials that are taken; all by default.
-            units: index or mask of the units that are taken.
+        ``rows`` [R] are the trials of ``responses`` [R′, U′] that are taken (all by default) and ``units`` an index or
+        mask of its units; ``labels`` and ``hashes`` [R] are those of the trials taken.
         """
         # Sorted by content, sums are formed in one order, so results do not change with the order of trials.
         order = np.lexsort((hashes, labels))

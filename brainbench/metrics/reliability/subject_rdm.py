@@ -118,25 +118,13 @@ def subject_rdm(
     Every stimulus' trials of each session are split into random halves, whose RDMs are compared. With an odd number
     of trials the larger half is drawn too. Random numbers are hashes of (seed, split, trial key).
 
-    An animal whose data cannot be used comes back with ``problem`` (for example ``no trials of
-    'convex-far'``) instead of an error, so the others can still be scored.
-
-    Args:
-        subject: Name of the animal.
-        blocks: Its sessions.
-        n_stimuli: K.
-        stimuli: Names of the stimuli, for messages.
-        method: RDM method: ``correlation``, ``sqeuclidean``, ``mahalanobis``, ``crossnobis`` or ``poisson``.
-        comparison: Comparison of RDMs, see :func:`brainbench.metrics.compare`.
-        splits: Number of random split halves.
-        seed: Seed of the splits.
-        noise: Noise covariance for ``mahalanobis`` and ``crossnobis``: ``diag``, ``none`` or another of
-            :func:`brainbench.metrics.noise_precision`. ``diag``, ``none`` and ``full`` leave crossnobis
-            unbiased; shrinkage leaves a bias of up to .01 per unit (docs/calibration.md).
-
-    Raises:
-        UsageError: unknown method, bad shapes or labels, repeated trial keys, no positive ``splits``.
-        DataError: infinite responses, or negative ones for ``poisson``.
+    An animal whose data cannot be used comes back with ``problem`` (for example ``no trials of 'convex-far'``) instead
+    of an error, so the others can still be scored. ``n_stimuli`` is K; names of the ``stimuli`` are for messages.
+    ``method`` is one of :data:`SUBJECT_METHODS`. ``noise`` is the noise covariance of ``mahalanobis`` and
+    ``crossnobis``: ``none`` or one of :func:`brainbench.metrics.noise_precision`. ``diag``, ``none`` and ``full`` leave
+    crossnobis unbiased; shrinkage leaves a bias of up to .01 per unit (docs/calibration.md). Raises UsageError: unknown
+    method, bad shapes or labels, repeated trial keys, no positive ``splits``; DataError: infinite responses, or
+    negative ones for ``poisson``.
     """
     if method not in SUBJECT_METHODS:
         raise unknown_name("RDM method of an animal", method, SUBJECT_METHODS)

@@ -90,18 +90,10 @@ def score_over_time(
 ) -> TimeCourse:
     """Score the RDMs of a model's layers against animals at each time.
 
-    Args:
-        layers: RDMs [T', P] of each layer in bins of ``width``, from :func:`layer_movie`; bin 0 begins when the
-            animals' first bin does.
-        animals: From :func:`animal_movie`, for the same stimuli and bins.
-        width: Width of a bin, seconds.
-        comparison: Comparison of RDMs, see :func:`brainbench.metrics.compare`.
-        permutations: Random orders of the stimuli above six stimuli.
-        seed: Seed of the orders.
-
-    Raises:
-        UsageError: no layers or animals, fewer than 4 stimuli or 3 bins, RDMs that do not fit one another, or an
-            unknown comparison.
+    ``layers`` are RDMs [T', P] in bins of ``width`` seconds from :func:`layer_movie`, bin 0 beginning when the animals'
+    first bin does; ``animals`` come from :func:`animal_movie`, for the same stimuli and bins. ``permutations`` are
+    drawn above six stimuli. Raises UsageError: no layers or animals, fewer than 4 stimuli or 3 bins, RDMs that do not
+    fit one another, or an unknown comparison.
     """
     check_comparison(comparison)
     movies = _checked(layers, animals, width)

@@ -52,22 +52,11 @@ def animal_movie(
     """Return an animal's RDM and reliability in every bin.
 
     All bins split the same trials into the same halves, so differences between bins are not those of the splits.
-
-    Args:
-        subject: Name of the animal.
-        blocks: Its sessions, whose responses are [R, T, U].
-        n_stimuli: K.
-        stimuli: Names of the stimuli, for messages.
-        method: RDM method of :func:`brainbench.metrics.reliability.subject_rdm.subject_rdm`. The default is the squared
-            Euclidean distance without the share of trial noise, which would look like geometry before any response.
-        comparison: Comparison of RDMs, for the reliability.
-        noise: Noise covariance for ``mahalanobis`` and ``crossnobis``.
-        splits: Random split halves.
-        seed: Seed of the splits.
-
-    Raises:
-        UsageError: responses without a time axis, or sessions of different numbers of bins; else as
-            :func:`brainbench.metrics.reliability.subject_rdm.subject_rdm`.
+    Responses of the sessions are [R, T, U]; other arguments are those of
+    :func:`~brainbench.metrics.reliability.subject_rdm.subject_rdm`. The default method is the squared Euclidean
+    distance without the share of trial noise, which would look like geometry before any response. Raises UsageError:
+    responses without a time axis, or sessions of different numbers of bins; else as
+    :func:`brainbench.metrics.reliability.subject_rdm.subject_rdm`.
     """
     shapes = [np.shape(block.responses) for block in blocks]
     if not shapes or any(len(shape) != 3 for shape in shapes) or len({shape[1] for shape in shapes}) > 1:

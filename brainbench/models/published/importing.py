@@ -50,15 +50,10 @@ def import_checkpoint(
 ) -> ImportedModel:
     """Write a published file of weights as a checkpoint of ours.
 
-    Args:
-        path: A Lightning checkpoint (``.ckpt``), a state dict of PyTorch, or safetensors.
-        architecture: Registry name where names and shapes leave a choice.
-        config: The run's settings, which may decide it too.
-        out: Folder; by default ``ARCHITECTURE-HASH`` where the command runs.
-
-    Raises:
-        DataError: the file cannot be read, or is no network of the study.
-        UsageError: its architecture is ambiguous, or there is none of that name.
+    The file is a Lightning checkpoint (``.ckpt``), a state dict of PyTorch, or safetensors. Where names and shapes
+    leave a choice, the registry name ``architecture`` or the run's settings ``config`` decide it. The default folder is
+    ``ARCHITECTURE-HASH`` where the command runs. Raises DataError: the file cannot be read, or is no network of the
+    study; UsageError: its architecture is ambiguous, or there is none of that name.
     """
     settings = None if config is None else read_settings(config)
     weights = read_weights(path)

@@ -40,18 +40,10 @@ def save_checkpoint(
 ) -> Path:
     """Write a model's folder; each file appears whole or not at all, the weights first, and replaces an earlier one.
 
-    Args:
-        folder: Folder to write.
-        model: The model.
-        architecture: Registry name without a tag.
-        options: Keyword arguments that the architecture was built with.
-        info: What else to keep in the configuration: objective, accuracy, data, seed, …
-        card: Text of the model card.
-        dtype: Precision of the floating-point parameters on disk.
-
-    Raises:
-        UsageError: there is no such precision.
-        DataError: a parameter is not finite, or not in ``dtype``.
+    ``architecture`` is a registry name without a tag, ``options`` are the keywords that it was built with, ``info`` is
+    what else the configuration keeps (objective, accuracy, data, seed, …), ``dtype`` the precision of the
+    floating-point parameters on disk.
+    Raises UsageError: there is no such precision; DataError: a parameter is not finite, or not in ``dtype``.
     """
     import torch
     from safetensors.torch import save_file

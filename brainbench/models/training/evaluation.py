@@ -265,19 +265,10 @@ def baselines(
 ) -> dict[str, Evaluation]:
     """Evaluate what a linear probe reads without any network: from the raw input, and from random features of it.
 
-    The probe is that of :func:`fit_probe`. Both see all steps of a sweep.
-
-    Args:
-        train: Labelled training sweeps ([B, T, S·C, H, W] in SI, [B]), read several times, best in a new order each
-            time.
-        test: Sweeps to evaluate on, read twice.
-        features: Number of random features: as many as the probe of the network beside it sees.
-        classes: Number of classes.
-        epochs: Passes of the probe.
-        seed: Seed of the random features and of the probes.
-        device: Where it is computed; the sweeps are moved there.
-        memory: Bytes of raw sweeps that are held (about three times as many are used); a larger training set is read
-            again in every pass.
+    The probe is that of :func:`fit_probe`. Both see all steps of a sweep. Training and test sweeps ([B, T, S·C, H, W]
+    in SI, [B]) are read several times; those of training best come in a new order each time. ``features`` is the number
+    of random features: as many as the probe of the network beside it sees. Up to ``memory`` bytes of raw sweeps are
+    held (about three times as many are used); a larger training set is read again in every pass.
 
     Returns:
         Evaluations on the test sweeps by the names ``raw-input`` and ``random-features``.

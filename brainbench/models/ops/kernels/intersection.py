@@ -216,12 +216,8 @@ def apply_gates(
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Return (y, state), both [B, C, H, W] with channels innermost.
 
-    Args:
-        fused: [R, 4 C], contiguous.
-        x: [B, C, H, W], the cell's input; its precision is that of y.
-        state: [B, C, H, W].
-        norms: [8, C], contiguous: scales of the four gates, then shifts; None without layer norms.
-        state_type: Precision of the new state.
+    ``fused`` [R, 4 C] and ``norms`` [8, C] (scales of the four gates, then shifts; None without layer norms) are
+    contiguous. y has the precision of ``x`` [B, C, H, W], the new state that of ``state_type``.
     """
     x, state = channels_innermost(x), channels_innermost(state)
     y, after = _empty_maps(x, x.dtype), _empty_maps(x, state_type)

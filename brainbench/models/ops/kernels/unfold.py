@@ -101,12 +101,8 @@ def unfold_into(
 ) -> None:
     """Fill ``out`` [R, taps · ΣC] with windows of inputs [B, C, H, W] whose channels lie side by side.
 
-    Args:
-        out: Contiguous; its precision is what inputs are rounded to.
-        inputs: On one grid; channels innermost in memory.
-        grid: Places (rows, columns) of the result.
-        kernel: Size of the window.
-        pads: Zeros (above, left) of the inputs.
+    ``out`` is contiguous, and its precision is what inputs are rounded to; they lie on one grid, channels innermost in
+    memory. ``grid`` counts places (rows, columns) of the result, ``pads`` zeros (above, left) of the inputs.
     """
     if len(inputs) > SLOTS:
         joined = torch.cat([x.permute(0, 2, 3, 1).to(out.dtype) for x in inputs[SLOTS - 1 :]], 3).permute(0, 3, 1, 2)
