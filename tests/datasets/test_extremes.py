@@ -96,8 +96,8 @@ def test_two_thousand_stimuli_keep_their_order_and_are_proposed(tmp_path):
     assert animal.truth.shape == (1_999_000,)
 
 
-def hundred_thousand(tmp_path):
-    units, trials = 100_000, 12
+def many_units(tmp_path, units):
+    trials = 12
     random = np.random.default_rng(0)
     counts = random.poisson(4.0, units)
     times = random.uniform(0, trials + 2, counts.sum())
@@ -110,18 +110,18 @@ def hundred_thousand(tmp_path):
     return write_recordings(tmp_path / "a.h5", session), counts
 
 
-def test_a_hundred_thousand_units_are_read_and_checked(tmp_path):
-    path, counts = hundred_thousand(tmp_path)
+def test_twenty_thousand_units_are_read_and_checked(tmp_path):
+    path, counts = many_units(tmp_path, 20_000)
     dataset = open_recordings(path, conditions="trials:stimulus", window="start..+0.5")
     silent = int(np.sum(counts == 0))
     assert dataset.attrs["removed"]["units: no spikes"] == silent
-    assert dataset.sizes["unit"] == 100_000 - silent
-    assert f"{silent} of 100000 (2 %) units" in str(check(path))
+    assert dataset.sizes["unit"] == 20_000 - silent
+    assert f"{silent} of 20000 (2 %) units" in str(check(path))
 
 
 @pytest.mark.slow
 def test_a_hundred_thousand_units_need_little_memory(tmp_path):
-    path, _ = hundred_thousand(tmp_path)
+    path, _ = many_units(tmp_path, 100_000)
     tracemalloc.start()
     open_recordings(path, conditions="trials:stimulus", window="start..+0.5")
     peak = tracemalloc.get_traced_memory()[1]
