@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from brainbench.core.errors import UsageError, unknown_name
+from brainbench.core.errors import UsageError, check_name
 from brainbench.core.provenance import Provenance
 from brainbench.core.records import Interval, Score, Status, SubjectScore
 from brainbench.metrics.animals import Animals, ceiling_of, gather, mean_rdm, mean_reliability
@@ -45,8 +45,7 @@ def score_agreement(
     """
     if not subjects:
         raise UsageError("There are no animals to compare; give at least two SubjectRDM.")
-    if estimator not in metric.estimators:
-        raise unknown_name(f"estimator of the metric {metric.name!r}", estimator, metric.estimators)
+    check_name(f"estimator of the metric {metric.name!r}", estimator, metric.estimators)
     count = len(stimuli)
     animals = gather(metric, subjects, count, estimator=estimator)
     compared = animals.scored if count >= metric.fewest and len(animals.scored) > 1 else ()

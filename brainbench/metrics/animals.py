@@ -12,7 +12,7 @@ import numpy as np
 
 from brainbench.core.errors import UsageError
 from brainbench.core.records import Ceiling, Interval, Status
-from brainbench.metrics.inference.intervals import t_interval
+from brainbench.core.statistics import t_interval
 from brainbench.metrics.inference.permutation import canonical_order
 from brainbench.metrics.rdms.pairs import Floats, Ints
 from brainbench.metrics.reliability.ceiling import noise_ceiling
@@ -116,7 +116,7 @@ def mean_reliability(animals: Animals) -> tuple[float, Interval | None]:
     # One animal has no interval over animals; the spread over its splits stands in and says so.
     if len(values) == 1:
         return float(values[0]), animals.subjects[animals.scored[0]].spread
-    return float(values.mean()), t_interval(values)
+    return float(values.mean()), t_interval(values, over="animals")
 
 
 def ceiling_of(animals: Animals, comparison: str) -> Ceiling | None:

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from brainbench.core.errors import UsageError
-from brainbench.core.progress import Progress
+from brainbench.core.progress import Progress, track
 from brainbench.core.trials import Trials
 from brainbench.metrics.inference.permutation import label_orders
 from brainbench.metrics.measures.rsa import RSA
@@ -80,9 +80,7 @@ def measure_tradeoff(
         *(("permutations", n, "p near .05", n == metric.orders, lambda seed, n=n: p(seed, n)) for n in permutations),
     ]
     points = []
-    for index, (quantity, count, of, default, job) in enumerate(jobs):
-        if progress is not None:
-            progress(index, len(jobs), "measuring Monte-Carlo error")
+    for quantity, count, of, default, job in track(jobs, "measuring Monte-Carlo error", progress):
         found, seconds = [], []
         for seed in range(repeats):
             start = time.perf_counter()
@@ -91,8 +89,6 @@ def measure_tradeoff(
         points.append(
             MonteCarloPoint(quantity, count, float(np.std(found, ddof=1)), of, float(np.median(seconds)), default)
         )
-    if progress is not None:
-        progress(len(jobs), len(jobs), "measuring Monte-Carlo error")
     return tuple(points)
 
 

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from brainbench.core.errors import DataError, DataFileNotFoundError, UsageError, unknown_name
+from brainbench.core.errors import DataError, DataFileNotFoundError, UsageError, check_name
 from brainbench.core.files import check_folder, file_hash, read_json, write_json
 from brainbench.models.architecture import check_new_name
 
@@ -120,8 +120,7 @@ def remove_user_model(name: str) -> UserModel:
     Raises UsageError: no model was added under this name.
     """
     known = read_user_models()
-    if name not in known:
-        raise unknown_name("model of your own", name, known)
+    check_name("model of your own", name, known)
     made = known.pop(name)
     _write(known)
     return made

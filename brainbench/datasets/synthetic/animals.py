@@ -13,7 +13,7 @@ from itertools import groupby
 import numpy as np
 from numpy.typing import NDArray
 
-from brainbench.core.errors import UsageError, unknown_name
+from brainbench.core.errors import UsageError, check_name
 from brainbench.core.trials import Trials
 from brainbench.datasets.synthetic.design import MODULATION, PopulationDesign
 from brainbench.datasets.synthetic.geometry import ResponseGeometry
@@ -53,8 +53,7 @@ def simulate(
     to show what they cost. Raises UsageError: an unknown fault, or a missing stimulus that does not exist.
     """
     for name in faults:
-        if name not in FAULTS:
-            raise unknown_name("fault", name, FAULTS)
+        check_name("fault", name, FAULTS)
     animals = []
     for subject, group in groupby(draw_sessions(geometry, design, seed), key=lambda item: item.subject):
         drawn = list(group)

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from brainbench.core.errors import unknown_name
+from brainbench.core.errors import check_name
 from brainbench.core.progress import Progress
 from brainbench.datasets.hdf5 import write_recordings
 from brainbench.datasets.sessions import Session, make_session
@@ -111,8 +111,7 @@ def write_files(
     ``about`` is what else that holds. Raises UsageError: a format other than ``nwb`` and ``h5``.
     """
     writers: dict[str, Callable[[Path, Session], Path]] = {"nwb": write_synthetic_nwb, "h5": write_recordings}
-    if format not in writers:
-        raise unknown_name("format", format, writers)
+    check_name("format", format, writers)
     design = design or PopulationDesign()
 
     def draw() -> Iterator[SyntheticSession]:

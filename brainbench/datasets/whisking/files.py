@@ -60,8 +60,8 @@ class Shard:
             found = hash_arrays({**arrays, "wrench": self.forces()})
         if found != self.content_hash:
             raise DataError(
-                f"The numbers in {str(self.path)!r} do not match the hash in the manifest: it was damaged or edited; "
-                "remove it and give the command that made the data set again."
+                f"The numbers in {str(self.path)!r} do not match the hash in the manifest: it was damaged or edited. "
+                f"{_AGAIN}"
             )
 
     def verify_once(self) -> None:

@@ -8,20 +8,11 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import ArrayLike
 
-from brainbench.core import statistics
 from brainbench.core.records import Interval, Score
 from brainbench.core.statistics import FEWEST_ANIMALS, FEWEST_STIMULI, LEVEL, check_level, two_factor_error
 
 BEYOND = 1.1
 """Scaled score that no interval should lie above: a tenth of the scale more than all that is reliable."""
-
-
-def t_interval(values: ArrayLike, level: float = LEVEL) -> Interval | None:
-    """Return the t interval of the mean of one value per animal [A]; None for fewer than two or missing ones.
-
-    Raises UsageError: a level outside (0, 1).
-    """
-    return statistics.t_interval(values, level, over="animals")
 
 
 def two_factor_interval(

@@ -28,7 +28,11 @@ _CHUNK_ELEMENTS = 1 << 22
 class RSA(Metric):
     """Compare RDMs; corrected by the split-half reliability of each animal's RDM.
 
-    A layer is its RDM [P], NaN in the pairs of a stimulus that it has no value for.
+    A layer is its RDM [P], NaN in the pairs of a stimulus that it has no value for. With the estimator ``default`` each
+    reliable animal is compared with the layer that compares best with the *other* reliable animals, the comparison is
+    corrected for the animal's noise, and the score is the mean over animals; a single animal chooses on one half of its
+    trials and is scored on the other. ``thesis`` and ``thesis-input`` are the published estimators with their maximum
+    over layers, which is optimistic and says so.
     """
 
     name: str = "rsa"
@@ -143,26 +147,19 @@ def score_rdms(
     *,
     name: str,
     stimuli: Sequence[str],
-    estimator: str = "default",
     compare: str = "pearson",
-    seed: int = 0,
-    device: Any = None,
+    **options: Any,
 ) -> Score:
-    """Score a model by the RDMs of its layers against animals.
+    """Score a model by the RDMs [P] of its layers, in network order, against animals of :func:`subject_rdm`.
 
-    ``default``: each reliable animal is compared with the layer that compares best with the *other* reliable animals,
-    the comparison is corrected for the animal's noise, and the score is the mean over animals. The permutation p-value
-    repeats the choice of layer in every permutation. A single animal chooses on one half of its trials and is scored on
-    the other. ``thesis`` and ``thesis-input`` are the published estimators with their maximum over layers, which is
-    optimistic and says so. ``layer_rdms`` are the RDMs [P] of the layers in network order, ``subjects`` come from
-    :func:`subject_rdm`, and both are of the same stimuli in the same order. A torch ``device`` for the permutations
-    pays from some hundred stimuli on.
+    Both are of the same stimuli in the same order. ``options`` are those of
+    :func:`~brainbench.metrics.score.score_layers`; a torch ``device`` pays from some hundred stimuli on.
+
     Raises UsageError: no layers or animals, RDMs that do not fit the stimuli, unknown estimator or comparison.
     """
     check_comparison(compare)
     rdms = check_layers(layer_rdms, stimuli)
-    options = {"name": name, "stimuli": stimuli, "estimator": estimator, "seed": seed, "device": device}
-    return score_layers(RSA(comparison=compare), rdms, subjects, **options)[0]
+    return score_layers(RSA(comparison=compare), rdms, subjects, name=name, stimuli=stimuli, **options)[0]
 
 
 def check_layers(layer_rdms: Mapping[str, ArrayLike], stimuli: Sequence[str]) -> dict[str, Floats]:

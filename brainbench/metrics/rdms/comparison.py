@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from brainbench.core.errors import UsageError, unknown_name
+from brainbench.core.errors import UsageError, check_name
 from brainbench.metrics.arrays import fetch, is_tensor, library, place
 from brainbench.metrics.rdms.pairs import Floats, Ints, permuted_pairs, rdm_stack, square, stimulus_count
 
@@ -118,8 +118,7 @@ def features(rdms: Floats, method: str) -> Floats:
 
 def check_comparison(method: str) -> None:
     """Raise UsageError with the nearest name unless ``method`` is a comparison."""
-    if method not in _FEATURES:
-        raise unknown_name("RDM comparison", method, _FEATURES)
+    check_name("RDM comparison", method, _FEATURES)
 
 
 def pooling(method: str) -> Callable[[Floats], Floats]:

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from brainbench.core.errors import DataError, UsageError, unknown_name
+from brainbench.core.errors import DataError, UsageError, check_name, unknown_name
 from brainbench.metrics.arrays import Array, fetch, find_device, library, place
 from brainbench.metrics.rdms.distances import (
     correlation_distances,
@@ -127,8 +127,7 @@ def rdm(
     >>> rdm([[1, 2], [3, 2], [5, 5]], ["b", "b", "a"], method="sqeuclidean").tolist()
     [9.0]
     """
-    if method not in _METHODS:
-        raise unknown_name("RDM method", method, _METHODS)
+    check_name("RDM method", method, _METHODS)
     if folds is not None and method != "crossnobis":
         raise UsageError(f"folds are for method='crossnobis'; method={method!r} averages all trials; leave them out.")
     if precision is not None and method not in ("mahalanobis", "crossnobis"):

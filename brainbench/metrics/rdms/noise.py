@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from brainbench.core.errors import DataError, UsageError, unknown_name
+from brainbench.core.errors import DataError, UsageError, check_name
 from brainbench.metrics.arrays import Array, cholesky, fetch, find_device, is_tensor, library, place, solve_lower
 from brainbench.metrics.rdms.pairs import Floats, Ints
 from brainbench.metrics.stimulus_labels import response_matrix, stimulus_codes, stimulus_means
@@ -138,8 +138,7 @@ def estimate_noise(trials: Any, codes: Ints, count: int, method: str, *, device:
     Raises UsageError: unknown method; DataError: as :func:`noise_precision`, but a singular covariance is found only
     when it is used.
     """
-    if method not in NOISE_METHODS:
-        raise unknown_name("noise covariance method", method, NOISE_METHODS)
+    check_name("noise covariance method", method, NOISE_METHODS)
     # Residuals are small beside the products of units that follow, so they are always made by numpy.
     trials = np.asarray(fetch(trials), dtype=np.float64)
     # Products between units need both entries of a trial; filling one would invent covariance.

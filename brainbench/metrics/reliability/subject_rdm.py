@@ -18,7 +18,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from brainbench.core.errors import DataError, UsageError, unknown_name
+from brainbench.core.errors import DataError, UsageError, check_name
 from brainbench.core.records import Interval
 from brainbench.core.trials import Trials
 from brainbench.metrics.rdms.comparison import check_comparison, compare
@@ -126,8 +126,7 @@ def subject_rdm(
     method, bad shapes or labels, repeated trial keys, no positive ``splits``; DataError: infinite responses, or
     negative ones for ``poisson``.
     """
-    if method not in SUBJECT_METHODS:
-        raise unknown_name("RDM method of an animal", method, SUBJECT_METHODS)
+    check_name("RDM method of an animal", method, SUBJECT_METHODS)
     check_comparison(comparison)
     if splits < 1 or n_stimuli < 2:
         raise UsageError(f"Split halves need splits ≥ 1 and 2 or more stimuli; received {splits} and {n_stimuli}.")

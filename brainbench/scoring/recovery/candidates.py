@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from brainbench.core.errors import UsageError, listing, unknown_name
 from brainbench.core.files import content_hash
-from brainbench.core.progress import Progress
+from brainbench.core.progress import Progress, track
 from brainbench.datasets.synthetic.geometry import ResponseGeometry, principal_axes
 from brainbench.metrics.measures.metric import Metric
 from brainbench.scoring.options import ScoreOptions
@@ -123,9 +123,7 @@ def open_candidates(
     else:  # activations from files alone, whose labels name the stimuli
         stimuli = next(item.labels for item in resolved if item.labels)
     candidates, origin = [], {}
-    for done, item in enumerate(resolved):
-        if progress is not None:
-            progress(done, len(resolved), "running networks")
+    for item in track(resolved, "running networks", progress):
         found = item.respond(options)
         lacking = [label for label in stimuli if label not in found.labels]
         if lacking:
@@ -133,6 +131,4 @@ def open_candidates(
         rows = [found.labels.index(label) for label in stimuli]
         candidates.append(Candidate.of(item.card.name, stimuli, found.features(rows), found.card.weights))
         origin = dict(found.origin.get("stimuli") or origin)
-    if progress is not None:
-        progress(len(resolved), len(resolved), "running networks")
     return tuple(candidates), origin

@@ -8,7 +8,7 @@ from itertools import product
 from typing import Any
 
 from brainbench.core.errors import UsageError
-from brainbench.core.progress import Progress
+from brainbench.core.progress import Progress, track
 from brainbench.core.records import Interval
 from brainbench.scoring.recovery.candidates import Candidate
 from brainbench.scoring.recovery.design import RecoveryDesign
@@ -59,9 +59,7 @@ def find_cheapest(
     grid = sorted(product(ANIMALS, UNITS, TRIALS, sizes), key=lambda one: (one[0] * one[2] * one[3], one[1], one[0]))
     tried: list[TriedDesign] = []
     failed: list[tuple[int, ...]] = []
-    for done, numbers in enumerate(grid):
-        if progress is not None:
-            progress(done, len(grid), "trying designs")
+    for numbers in track(grid, "trying designs", progress):
         if any(all(mine <= other for mine, other in zip(numbers, one, strict=True)) for one in failed):
             continue
         found = _try(candidates, design, numbers, boards, 0, where)
