@@ -65,6 +65,19 @@ def response_matrix(responses: ArrayLike, rows: str) -> Any:
     return array if array.dtype.kind == "f" else array.astype(np.float64)
 
 
+def labelled_trials(responses: ArrayLike, labels: ArrayLike, count: int | None = None) -> tuple[Any, Ints, Any]:
+    """Return trials [R, U], the codes [R] of their stimuli, and the names of all stimuli; UsageError if they differ."""
+    trials, (codes, names) = response_matrix(responses, "trials"), stimulus_codes(labels, count)
+    check_lengths(trials, codes)
+    return trials, codes, names
+
+
+def check_lengths(trials: Any, codes: Ints) -> None:
+    """Raise UsageError unless there is one label per trial."""
+    if len(codes) != len(trials):
+        raise UsageError(f"There are {len(trials)} trials but {len(codes)} labels; give one label per trial.")
+
+
 def membership(codes: Ints, count: int) -> Floats:
     """Return 1 where a trial is one of a stimulus, else 0 [K, R]."""
     return (codes == np.arange(count)[:, None]).astype(np.float64)
@@ -76,8 +89,7 @@ def stimulus_means(responses: NDArray, codes: Ints, count: int) -> Floats:
     A unit without any value for a stimulus is NaN there.
     Raises UsageError: the number of labels is not the number of trials; DataError: a response is infinite.
     """
-    if len(codes) != len(responses):
-        raise UsageError(f"There are {len(responses)} trials but {len(codes)} labels; give one label per trial.")
+    check_lengths(responses, codes)
     numbers = np.bincount(codes, minlength=count)[:, None].astype(np.float64)
     if (means := _complete_means(responses, codes, numbers)) is not None:
         return means

@@ -11,10 +11,10 @@ from brainbench.core.errors import DataError
 from brainbench.core.trials import Trials
 from brainbench.datasets import check, inspect, open_recordings, write_recordings
 from brainbench.datasets.sessions import SessionTable, make_session
-from brainbench.datasets.synthetic import ResponseGeometry, as_recordings, simulate
+from brainbench.datasets.synthetic import ResponseGeometry, simulate
 from brainbench.datasets.trials.session_trials import pooled, trials_by_subject
 from brainbench.metrics.reliability.subject_rdm import subject_rdm
-from tests.factories.recordings import make_simple_session, quiet_design
+from tests.factories.recordings import as_recordings, make_simple_session, quiet_design
 
 
 def make_geometry(stimuli):

@@ -1,7 +1,4 @@
-"""Synthetic recordings as a data set, as sessions of spike times, and as NWB or HDF5 files.
-
-All three hold the same counts as ``simulate`` with the same seed.
-"""
+"""Synthetic recordings as sessions of spike times, and as NWB or HDF5 files: the counts of ``simulate`` by one seed."""
 
 from __future__ import annotations
 
@@ -22,16 +19,10 @@ from brainbench.datasets.synthetic.geometry import ResponseGeometry
 from brainbench.datasets.synthetic.populations import DrawnSession, PopulationDesign, draw_sessions
 from brainbench.datasets.synthetic.spikes import spike_trains
 from brainbench.datasets.synthetic.truth import SyntheticSession, correlation_rdm, write_synthetic_nwb, write_with_truth
-from brainbench.datasets.trials.conditions import Conditions
-from brainbench.datasets.trials.counting import UNIT_COLUMNS, ReadingOptions, SessionCounts, missing_column
-from brainbench.datasets.trials.joining import join_sessions
-from brainbench.datasets.trials.selection import EVERYTHING, Tally
-from brainbench.datasets.trials.windows import Window
 
 if TYPE_CHECKING:
-    import xarray as xr
+    pass
 
-CONDITIONS = Conditions("trials", ("stimulus",))
 _BEFORE = 0.5
 """From trial start to contact, s."""
 _AFTER = (0.25, 1.25)
@@ -41,42 +32,6 @@ REST = 0.5
 """Rate between windows, as a share of a unit's mean rate."""
 _TOUCH = 0.05
 """Duration of a contact, s."""
-
-
-def as_recordings(
-    geometry: ResponseGeometry, design: PopulationDesign | None = None, *, seed: int | Sequence[int] = 0
-) -> xr.Dataset:
-    """Draw synthetic animals as a recordings data set, ready for ``trials_by_subject`` and ``score``.
-
-    Raises DataError: the design leaves no trial or one condition only.
-    """
-    counted, length = [], (design or PopulationDesign()).window
-    for drawn in draw_sessions(geometry, design, seed):
-        trials, units = drawn.counts.shape
-        labels = tuple(geometry.labels[index] for index in drawn.labels)
-        begin, _ = _times(drawn)
-        counted.append(
-            SessionCounts(
-                subject=drawn.subject,
-                session=drawn.session,
-                source=f"{drawn.subject}-{drawn.session}",
-                values=tuple((label,) for label in labels),
-                labels=labels,
-                trial_ids=tuple(map(str, range(trials))),
-                unit_ids=tuple(map(str, range(units))),
-                edges=np.stack([begin, begin + length], axis=1),
-                counts=drawn.counts[:, None].astype(np.float32),
-                duration=np.full((trials, 1), length),
-                columns={name: missing_column(kind, units) for name, kind in UNIT_COLUMNS.items()},
-                covariates={},
-                tally=Tally(),
-                trials=trials,
-                units=units,
-                synthetic=True,
-            )
-        )
-    options = ReadingOptions(CONDITIONS, geometry.labels, EVERYTHING, Window("choice", offset=-length, length=length))
-    return join_sessions(counted, options, source="synthetic", layout="", notes=[])
 
 
 def make_sessions(
@@ -135,7 +90,7 @@ def write_files(
     )
 
 
-def _times(drawn: DrawnSession) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def trial_times(drawn: DrawnSession) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the contact and the end of every trial [R], s."""
     # A stream of its own, apart from that of the spikes: data set and files have equal times, whatever else is drawn.
     pause = np.round(np.random.default_rng([*drawn.stream, 2]).uniform(*_AFTER, len(drawn.labels)), 4)
@@ -146,7 +101,7 @@ def _times(drawn: DrawnSession) -> tuple[NDArray[np.float64], NDArray[np.float64
 
 def _session(geometry: ResponseGeometry, drawn: DrawnSession) -> Session:
     random = np.random.default_rng([*drawn.stream, 1])
-    begin, stop = _times(drawn)
+    begin, stop = trial_times(drawn)
     choice, end = begin + drawn.window, float(stop[-1])
     # The rate between windows is the same for all stimuli: a reader that mistakes the window loses the geometry.
     spikes = spike_trains(random, drawn.counts, begin, drawn.window, REST * drawn.expected.mean(axis=0), (0.0, end))

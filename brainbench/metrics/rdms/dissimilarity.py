@@ -27,7 +27,7 @@ from brainbench.metrics.rdms.distances import (
 )
 from brainbench.metrics.rdms.noise import NOISE_METHODS, estimate_noise
 from brainbench.metrics.rdms.pairs import Floats, Ints
-from brainbench.metrics.stimulus_labels import response_matrix, stimulus_codes, stimulus_means, tensor_means
+from brainbench.metrics.stimulus_labels import labelled_trials, response_matrix, stimulus_means, tensor_means
 
 POISSON_PRIOR_MEAN = 1.0
 POISSON_PRIOR_WEIGHT = 0.1
@@ -151,11 +151,8 @@ def _prepare(
         matrix, codes = response_matrix(responses, "stimuli"), None
         count = len(matrix)
     else:
-        matrix = response_matrix(responses, "trials")
-        codes, names = stimulus_codes(labels)
+        matrix, codes, names = labelled_trials(responses, labels)
         count = len(names)
-        if len(codes) != len(matrix):
-            raise UsageError(f"There are {len(matrix)} trials but {len(codes)} labels; give one label per trial.")
     if count < 2:
         raise UsageError(f"An RDM compares at least 2 stimuli; received {count}.")
     return _Responses(matrix, count, codes, folds, precision, where)

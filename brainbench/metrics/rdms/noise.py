@@ -14,10 +14,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from brainbench.core.errors import DataError, UsageError, check_name
+from brainbench.core.errors import DataError, check_name
 from brainbench.metrics.arrays import Array, cholesky, fetch, find_device, is_tensor, library, place, solve_lower
 from brainbench.metrics.rdms.pairs import Floats, Ints
-from brainbench.metrics.stimulus_labels import response_matrix, stimulus_codes, stimulus_means
+from brainbench.metrics.stimulus_labels import labelled_trials, stimulus_means
 
 _DUAL_RIDGE = 1e-3
 """Share of the diagonal that must not come from trials for the products by Woodbury to keep their digits."""
@@ -124,10 +124,7 @@ def noise_precision(
         UsageError: unknown method or shapes that do not fit.
         DataError: no more complete trials than stimuli, units without noise, or a singular covariance.
     """
-    trials = response_matrix(responses, "trials")
-    codes, names = stimulus_codes(labels)
-    if len(codes) != len(trials):
-        raise UsageError(f"There are {len(trials)} trials but {len(codes)} labels; give one label per trial.")
+    trials, codes, names = labelled_trials(responses, labels)
     model = estimate_noise(trials, codes, len(names), method, device=find_device(device, responses))
     return fetch(model.precision())
 

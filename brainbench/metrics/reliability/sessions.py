@@ -21,9 +21,8 @@ from brainbench.metrics.rdms.pairs import Floats, Ints
 from brainbench.metrics.reliability.trial_hashes import Hashes, content_hashes, key_hashes
 from brainbench.metrics.stimulus_labels import (
     check_finite,
+    labelled_trials,
     listed,
-    response_matrix,
-    stimulus_codes,
     stimulus_means,
 )
 
@@ -108,10 +107,7 @@ def usable_sessions(
     total = np.zeros(count, dtype=np.int64)
     dropped = 0
     for block in blocks:
-        responses = response_matrix(block.responses, "trials")
-        codes, _ = stimulus_codes(block.labels, count)
-        if len(codes) != len(responses):
-            raise UsageError(f"There are {len(responses)} trials but {len(codes)} labels; give one label per trial.")
+        responses, codes, _ = labelled_trials(block.responses, block.labels, count)
         check_finite(responses)
         present = np.isfinite(responses)
         recorded = present.any(axis=1)

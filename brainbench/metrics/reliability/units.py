@@ -21,7 +21,7 @@ from brainbench.metrics.rdms.pairs import Floats
 from brainbench.metrics.reliability.halves import mean_patterns, split_members
 from brainbench.metrics.reliability.noise_correction import spearman_brown
 from brainbench.metrics.reliability.sessions import SortedTrials, trial_hashes
-from brainbench.metrics.stimulus_labels import response_matrix, stimulus_codes
+from brainbench.metrics.stimulus_labels import labelled_trials
 
 UNIT_GATE = 0.5
 """Smallest reliability of a unit that :func:`reliable_units` keeps (published)."""
@@ -45,8 +45,7 @@ def unit_reliability(
     for block in blocks:
         values = np.asarray(block.responses)
         values = finite_mean(values, axis=1) if values.ndim == 3 else values
-        responses = response_matrix(values, "trials").astype(np.float64)
-        codes, _ = stimulus_codes(block.labels, n_stimuli)
+        responses, codes, _ = labelled_trials(values.astype(np.float64), block.labels, n_stimuli)
         session = SortedTrials.sort(responses, codes, trial_hashes(block, responses, codes))
         total, number = np.zeros(responses.shape[1]), np.zeros(responses.shape[1])
         for start in range(0, splits, _CHUNK):

@@ -13,7 +13,6 @@ from brainbench.datasets.synthetic import (
     FAULTS,
     PopulationDesign,
     ResponseGeometry,
-    as_recordings,
     calibrate,
     make_sessions,
     measure_ceiling,
@@ -25,7 +24,7 @@ from brainbench.datasets.synthetic import (
 from brainbench.datasets.trials.session_trials import trials_by_subject
 from brainbench.metrics import noise_ceiling, rdm
 from brainbench.metrics.reliability.subject_rdm import subject_rdm
-from tests.factories.recordings import quiet_design
+from tests.factories.recordings import as_recordings, quiet_design
 
 SMALL = quiet_design(animals=3, sessions=2, units=12, trials=5)
 

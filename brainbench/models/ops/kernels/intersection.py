@@ -55,24 +55,10 @@ def _at(pointer, rows, c, batch_stride, PLACES: tl.constexpr, PLACE_STRIDE: tl.c
 
 @triton.jit
 def gates_kernel(
-    fused,
-    x,
-    state,
-    norms,
-    y,
-    after,
-    count,
-    x_batch,
-    state_batch,
-    PLACES: tl.constexpr,
-    X_PLACE: tl.constexpr,
-    STATE_PLACE: tl.constexpr,
-    C: tl.constexpr,
-    NORM: tl.constexpr,
-    EPS: tl.constexpr,
-    BLOCK_R: tl.constexpr,
-    BLOCK_C: tl.constexpr,
-):
+    fused, x, state, norms, y, after, count, x_batch, state_batch,
+    PLACES: tl.constexpr, X_PLACE: tl.constexpr, STATE_PLACE: tl.constexpr,
+    C: tl.constexpr, NORM: tl.constexpr, EPS: tl.constexpr, BLOCK_R: tl.constexpr, BLOCK_C: tl.constexpr,
+):  # fmt: skip
     """Write y and s' [R, C]. A program takes ``BLOCK_R`` rows with all their channels."""
     rows = tl.program_id(0) * BLOCK_R + tl.arange(0, BLOCK_R)
     c = tl.arange(0, BLOCK_C)
@@ -117,32 +103,12 @@ def _add(at, gradient, c, C: tl.constexpr):
 
 @triton.jit
 def gates_backward_kernel(
-    fused,
-    x,
-    state,
-    norms,
-    d_y,
-    d_after,
-    d_fused,
-    d_x,
-    d_state,
-    sums,
-    count,
-    x_batch,
-    state_batch,
-    d_y_batch,
-    d_after_batch,
-    PLACES: tl.constexpr,
-    X_PLACE: tl.constexpr,
-    STATE_PLACE: tl.constexpr,
-    D_Y_PLACE: tl.constexpr,
-    D_AFTER_PLACE: tl.constexpr,
-    C: tl.constexpr,
-    NORM: tl.constexpr,
-    EPS: tl.constexpr,
-    BLOCK_R: tl.constexpr,
-    BLOCK_C: tl.constexpr,
-):
+    fused, x, state, norms, d_y, d_after, d_fused, d_x, d_state, sums,
+    count, x_batch, state_batch, d_y_batch, d_after_batch,
+    PLACES: tl.constexpr, X_PLACE: tl.constexpr, STATE_PLACE: tl.constexpr,
+    D_Y_PLACE: tl.constexpr, D_AFTER_PLACE: tl.constexpr,
+    C: tl.constexpr, NORM: tl.constexpr, EPS: tl.constexpr, BLOCK_R: tl.constexpr, BLOCK_C: tl.constexpr,
+):  # fmt: skip
     """Write the gradients of pre-activations [R, 4 C], x and s [R, C]; add those of the norms to this program's sums.
 
     A program takes every num_programs-th block of ``BLOCK_R`` rows, with all their channels.

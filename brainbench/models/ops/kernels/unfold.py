@@ -30,39 +30,12 @@ def _from(
 
 @triton.jit
 def unfold_kernel(
-    x0,
-    x1,
-    x2,
-    x3,
-    out,
-    total,
-    batch0,
-    batch1,
-    batch2,
-    batch3,
-    row0,
-    row1,
-    row2,
-    row3,
-    place0,
-    place1,
-    place2,
-    place3,
-    C0: tl.constexpr,
-    C1: tl.constexpr,
-    C2: tl.constexpr,
-    C3: tl.constexpr,
-    UNIT: tl.constexpr,
-    H: tl.constexpr,
-    W: tl.constexpr,
-    OUT_H: tl.constexpr,
-    OUT_W: tl.constexpr,
-    KERNEL_H: tl.constexpr,
-    KERNEL_W: tl.constexpr,
-    TOP: tl.constexpr,
-    LEFT: tl.constexpr,
-    BLOCK: tl.constexpr,
-):
+    x0, x1, x2, x3, out, total,
+    batch0, batch1, batch2, batch3, row0, row1, row2, row3, place0, place1, place2, place3,
+    C0: tl.constexpr, C1: tl.constexpr, C2: tl.constexpr, C3: tl.constexpr, UNIT: tl.constexpr,
+    H: tl.constexpr, W: tl.constexpr, OUT_H: tl.constexpr, OUT_W: tl.constexpr,
+    KERNEL_H: tl.constexpr, KERNEL_W: tl.constexpr, TOP: tl.constexpr, LEFT: tl.constexpr, BLOCK: tl.constexpr,
+):  # fmt: skip
     """Write the windows of all inputs, whose channels lie side by side in every tap.
 
     A thread's share is ``UNIT`` numbers, and all strides and channels come in units: threads that follow one another
