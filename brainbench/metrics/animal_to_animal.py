@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from brainbench.core.errors import UsageError, check_name
+from brainbench.core.errors import UsageError
 from brainbench.core.provenance import Provenance
 from brainbench.core.records import Interval, Score, Status, SubjectScore
 from brainbench.metrics.animals import Animals, ceiling_of, gather, mean_rdm, mean_reliability
@@ -35,17 +35,11 @@ def score_agreement(
     """Score each reliable animal against the others together, by a metric.
 
     The p-value permutes every animal's stimuli independently, (b+1)/(n+1). ``subjects`` are what :meth:`Metric.animal`
-    made of each animal, ``stimuli`` the names of the K stimuli.
-
-    Returns:
-        A score without layers; undefined for fewer than two usable animals.
-
-    Raises:
-        UsageError: no animals, subjects of other stimuli, or an unknown estimator.
+    made of each animal, ``stimuli`` the names of the K stimuli. Returns a score without layers; undefined for fewer
+    than two usable animals. Raises UsageError: no animals, subjects of other stimuli, or an unknown estimator.
     """
     if not subjects:
         raise UsageError("There are no animals to compare; give at least two SubjectRDM.")
-    check_name(f"estimator of the metric {metric.name!r}", estimator, metric.estimators)
     count = len(stimuli)
     animals = gather(metric, subjects, count, estimator=estimator)
     compared = animals.scored if count >= metric.fewest and len(animals.scored) > 1 else ()

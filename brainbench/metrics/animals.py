@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from brainbench.core.errors import UsageError
+from brainbench.core.errors import UsageError, check_name
 from brainbench.core.records import Ceiling, Interval, Status
 from brainbench.core.statistics import t_interval
 from brainbench.metrics.inference.permutation import canonical_order
@@ -65,6 +65,7 @@ def gather(metric: Metric, subjects: Sequence[SubjectRDM], stimuli: int, *, esti
 
     Raises UsageError: no subjects, repeated names, or RDMs of another number of stimuli.
     """
+    check_name(f"estimator of the metric {metric.name!r}", estimator, metric.estimators)
     if not subjects:
         raise UsageError("There are no animals to score against; give at least one SubjectRDM.")
     ordered = tuple(sorted(subjects, key=lambda subject: subject.subject))

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from brainbench.core.errors import UsageError, check_name, unknown_name
+from brainbench.core.errors import UsageError, unknown_name
 from brainbench.core.provenance import Provenance
 from brainbench.core.records import LayerScore, Score, Status, SubjectScore
 from brainbench.core.statistics import t_interval
@@ -52,7 +52,6 @@ def score_layers(
     """
     if len(set(map(str, stimuli))) < len(stimuli):
         raise UsageError(f"Stimulus names repeat: {list(stimuli)}.")
-    check_name(f"estimator of the metric {metric.name!r}", estimator, metric.estimators)
     if committed is not None and committed not in layers:
         raise unknown_name("layer", committed, layers)
     animals = gather(metric, subjects, len(stimuli), estimator=estimator)

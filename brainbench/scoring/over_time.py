@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from brainbench.core.errors import DataError, UsageError
-from brainbench.core.progress import Progress
+from brainbench.core.progress import Progress, stages
 from brainbench.metrics.measures.registry import get_metric, list_metrics
 from brainbench.metrics.measures.rsa import RSA
 from brainbench.metrics.reliability.units import reliable_units
@@ -52,9 +52,9 @@ def time_course(
     seconds = width * len(begins) if network.seconds is None else network.seconds
     sessions = brain.trials(kept)
     how: dict[str, Any] = {"method": metric.brain_method, "noise": metric.noise, "comparison": metric.comparison}
-    total, animals, layers = len(sessions) + len(network.activations), [], {}
+    stage_done = stages(len(sessions) + len(network.activations), "RDMs over time", progress)
+    animals, layers = [], {}
     for subject, blocks in sessions.items():
-        _tell(progress, len(animals), total)
         note = ""
         if options.units_reliability is not None:
             blocks, note = reliable_units(blocks, len(kept), least=options.units_reliability, seed=options.seed)
@@ -63,13 +63,8 @@ def time_course(
         else:
             nothing = np.full((len(begins), math.comb(len(kept), 2)), np.nan)
             animals.append(AnimalMovie(subject, nothing, nothing[:, 0], (note,) * len(begins)))
+        stage_done()
     for name, values in network.activations.items():
-        _tell(progress, len(animals) + len(layers), total)
         layers[name] = layer_movie(values[rows], seconds / values.shape[1], width, method=metric.model_method)
-    _tell(progress, total, total)
+        stage_done()
     return score_over_time(layers, animals, width=width, comparison=metric.comparison, seed=options.seed)
-
-
-def _tell(progress: Progress | None, done: int, total: int) -> None:
-    if progress is not None:
-        progress(done, total, "RDMs over time")

@@ -73,11 +73,9 @@ def measure_ceiling(
 
     That is the mean Pearson correlation between the true RDM and the RDM measured in one animal (correlation distance
     of mean responses, sessions joined). Animals without an RDM, because they lack a stimulus or did not answer one at
-    all, are left out. ``simulations`` studies are drawn, each of ``design.animals`` animals.
-
-    Returns:
-        The ceiling and its Monte-Carlo standard error; NaN if no animal has all stimuli, an RDM is
-        flat (two stimuli), or there is one animal only for the error.
+    all, are left out. ``simulations`` studies are drawn, each of ``design.animals`` animals. Returns the ceiling and
+    its Monte-Carlo standard error; NaN if no animal has all stimuli, an RDM is flat (two stimuli), or there is one
+    animal only for the error.
     """
     truth, stimuli = geometry.rdm, len(geometry.labels)
     scores: list[float] = []

@@ -67,15 +67,10 @@ def make_rodgers_demo(
     """Write the recordings and their truth into ``folder``.
 
     The stimulus set has the six labels of the Rodgers experiment and ``contact`` [stimulus, time, whisker] (bool). From
-    the fifth animal on their sessions repeat the first ones' design. Files of the same names are replaced.
-
-    Returns:
-        The NWB files. ``truth.json`` beside them holds, over ``labels``, the distances [P] of the geometry that all
-        share (``shared``) and the noiseless correlation-distance RDM of each animal's units.
-
-    Raises:
-        DataError: the stimuli lack a label or ``contact``, or one never touches a tracked whisker.
-        UsageError: fewer than one animal is asked for.
+    the fifth animal on their sessions repeat the first ones' design. Files of the same names are replaced. Returns the
+    NWB files. ``truth.json`` beside them holds, over ``labels``, the distances [P] of the geometry that all share
+    (``shared``) and the noiseless correlation-distance RDM of each animal's units. Raises DataError: the stimuli lack a
+    label or ``contact``, or one never touches a tracked whisker; UsageError: fewer than one animal is asked for.
     """
     if animals < 1:
         raise UsageError(f"The demo needs at least one animal; received {animals}.")

@@ -196,10 +196,7 @@ def draw_contacts(
 ) -> dict[str, NDArray[np.float64]]:
     """Place the simulated contacts in the session and add single-frame (zero-duration) ones.
 
-    ``runs`` are as in :func:`draw_session`.
-
-    Returns:
-        whisker → contacts [n, 2] in the order of time, s.
+    ``runs`` are as in :func:`draw_session`. Returns whisker → contacts [n, 2] in the order of time, s.
     """
     placed = {}
     for whisker, per_stimulus in runs.items():

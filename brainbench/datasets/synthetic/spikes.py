@@ -25,9 +25,7 @@ def spike_trains(
 
     ``counts`` [R, U] are the spikes in windows that do not overlap, with ``begin`` [R] (ascending, s) and ``length`` of
     all or of each [R], s; ``rest`` [U] are the rates outside of them, Hz, and ``span`` the first and last second.
-
-    Returns:
-        spike times of each unit [U], s; 15 % of those in a window come about 12 ms after its begin.
+    Returns spike times of each unit [U], s; 15 % of those in a window come about 12 ms after its begin.
     """
     # The margins keep the refractory time between the spikes of a window and those around it.
     opened = np.concatenate([[span[0]], begin + length]) + _DEAD
@@ -51,10 +49,7 @@ def _place_spikes(
 
     Positions are drawn in the window shortened by all refractory times, sorted, and spread apart by them: exactly
     ``counts`` spikes, at least the refractory time between any two. ``onset`` is the share of the spikes at the latency
-    after the begin of their window.
-
-    Returns:
-        spike times, s, window after window.
+    after the begin of their window. Returns spike times, s, window after window.
     """
     long = np.broadcast_to(np.asarray(length, dtype=np.float64), counts.shape)
     # At high counts the refractory time shrinks, so that it fills at most half of any window.

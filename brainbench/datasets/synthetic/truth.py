@@ -61,10 +61,7 @@ def write_with_truth(
 
     Sessions of one subject come together. ``write`` writes one of them atomically, ``distance`` makes the RDM [P] of
     expected responses [K, U], and ``about`` is what else the truth holds: ``labels``, and ``shared``, the RDM [P] of
-    the shared geometry.
-
-    Returns:
-        The files of the sessions.
+    the shared geometry. Returns the files of the sessions.
     """
     folder = Path(folder)
     expected: dict[str, list[NDArray[np.float64]]] = {}

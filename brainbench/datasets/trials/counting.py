@@ -190,13 +190,8 @@ def count(
     A bin is half open, [begin, end). Bins past the end of a short window are NaN with duration 0; the last bin of a
     window may be shorter than ``bin`` and its duration says so. ``spikes`` [U] are ascending times (s), ``edges`` [R,
     2] the windows (s), ``covered`` [R, U] says whether a unit was recorded. ``length`` (s) is common to all windows, if
-    they have one; no ``bin`` (s) is one bin.
-
-    Returns:
-        counts [R, T, U] (float32) and duration [R, T] (s).
-
-    Raises:
-        UsageError: the bin is not positive, or so narrow that the counts would not fit in memory.
+    they have one; no ``bin`` (s) is one bin. Returns counts [R, T, U] (float32) and duration [R, T] (s).
+    Raises UsageError: the bin is not positive, or so narrow that the counts would not fit in memory.
     """
     span = edges[:, 1] - edges[:, 0]
     if bin is None:

@@ -96,11 +96,8 @@ def usable_sessions(
 ) -> tuple[list[SortedTrials], str | None, tuple[str, ...]]:
     """Check the sessions, leave out what cannot be split and say what.
 
-    Returns:
-        Sessions that can be split; why none can, or None; notes for people.
-
-    Raises:
-        UsageError: trials and labels differ in number, or a label is none of the stimuli.
+    Returns sessions that can be split; why none can, or None; notes for people.
+    Raises UsageError: trials and labels differ in number, or a label is none of the stimuli.
     """
     sessions: list[SortedTrials] = []
     lacking: list[str] = []

@@ -114,10 +114,7 @@ def held_out_course(r: Floats) -> tuple[Floats, Ints]:
     """Return comparisons over time [N, T, A] at the layer and lag that suit the *other* animals best.
 
     A single animal has no others; its own best is taken, and the permutations repeat that. From comparisons [N, L, G,
-    T, A].
-
-    Returns:
-        The comparisons, and the chosen candidates [N, A], counted through layers and lags.
+    T, A]. Returns the comparisons, and the chosen candidates [N, A], counted through layers and lags.
     """
     number, layers, lags, bins, animals = r.shape
     vote = np.nan_to_num(votes(r), nan=_NEVER).reshape(number, layers * lags, animals)

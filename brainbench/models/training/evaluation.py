@@ -268,14 +268,9 @@ def baselines(
     The probe is that of :func:`fit_probe`. Both see all steps of a sweep. Training and test sweeps ([B, T, S·C, H, W]
     in SI, [B]) are read several times; those of training best come in a new order each time. ``features`` is the number
     of random features: as many as the probe of the network beside it sees. Up to ``memory`` bytes of raw sweeps are
-    held (about three times as many are used); a larger training set is read again in every pass.
-
-    Returns:
-        Evaluations on the test sweeps by the names ``raw-input`` and ``random-features``.
-
-    Raises:
-        DataError: there are no batches, or the sweeps are not finite.
-        UsageError: the batches can be read but once.
+    held (about three times as many are used); a larger training set is read again in every pass. Returns evaluations on
+    the test sweeps by the names ``raw-input`` and ``random-features``.
+    Raises DataError: there are no batches, or the sweeps are not finite; UsageError: the batches can be read but once.
     """
     for batches in (train, test):
         _check_repeatable(batches, "sweeps of a baseline")
