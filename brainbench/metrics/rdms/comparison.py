@@ -16,6 +16,8 @@ from brainbench.core.errors import UsageError, check_name
 from brainbench.metrics.arrays import fetch, is_tensor, library, place
 from brainbench.metrics.rdms.pairs import Floats, Ints, permuted_pairs, rdm_stack, square, stimulus_count
 
+Transform = Callable[[Floats], Floats]
+
 _CONSTANT = 64 * np.finfo(np.float64).eps
 """An RDM whose spread is below this share of its size is constant up to rounding."""
 
@@ -113,21 +115,21 @@ def permuted_comparisons(
 
 def features(rdms: Floats, method: str) -> Floats:
     """Return vectors whose inner product is the comparison; NaN where it has no value."""
-    return _FEATURES[method](rdms)
+    return _METHODS[method][0](rdms)
 
 
 def check_comparison(method: str) -> None:
     """Raise UsageError with the nearest name unless ``method`` is a comparison."""
-    check_name("RDM comparison", method, _FEATURES)
+    check_name("RDM comparison", method, _METHODS)
 
 
-def pooling(method: str) -> Callable[[Floats], Floats]:
+def pooling(method: str) -> Transform:
     """Return the transform [..., P] → [..., P] of RDMs before they are averaged to predict one another.
 
     Nili 2014: unit vectors for the cosines, standardised ones for the correlations (the whitened ones
     too, as in rsatoolbox), ranks for the rank correlations (approximate for Kendall's tau).
     """
-    return _POOLING[method]
+    return _METHODS[method][1]
 
 
 def _unit(vectors: Floats, size: Floats | None = None) -> Floats:
@@ -148,10 +150,6 @@ def _ranks(vectors: Floats) -> Floats:
 
 def _pearson(rdms: Floats) -> Floats:
     return _unit(_centred(rdms), rdms)
-
-
-def _spearman(rdms: Floats) -> Floats:
-    return _pearson(_ranks(rdms))
 
 
 def _rho_a(rdms: Floats) -> Floats:
@@ -187,39 +185,20 @@ def _second_moment(rdms: Floats) -> Floats:
     return matrix.reshape(*rdms.shape[:-1], -1)
 
 
-def _whitened_cosine(rdms: Floats) -> Floats:
-    return _unit(_second_moment(rdms))
-
-
-def _whitened_pearson(rdms: Floats) -> Floats:
-    return _unit(_second_moment(_centred(rdms)), rdms)
-
-
-_FEATURES: dict[str, Callable[[Floats], Floats]] = {
-    "pearson": _pearson,
-    "spearman": _spearman,
-    "rho-a": _rho_a,
-    "tau-a": _tau_a,
-    "tau-b": _tau_b,
-    "cosine": _unit,
-    "whitened-cosine": _whitened_cosine,
-    "whitened-pearson": _whitened_pearson,
+_METHODS: dict[str, tuple[Transform, Transform]] = {
+    "pearson": (_pearson, _pearson),
+    "spearman": (lambda rdms: _pearson(_ranks(rdms)), _ranks),
+    "rho-a": (_rho_a, _ranks),
+    "tau-a": (_tau_a, _ranks),
+    "tau-b": (_tau_b, _ranks),
+    "cosine": (_unit, _unit),
+    "whitened-cosine": (lambda rdms: _unit(_second_moment(rdms)), _unit),
+    "whitened-pearson": (lambda rdms: _unit(_second_moment(_centred(rdms)), rdms), _pearson),
 }
+"""Comparison → what makes its vectors, and what RDMs pass through before they are averaged."""
 
-COMPARISONS = tuple(_FEATURES)
+COMPARISONS = tuple(_METHODS)
 """Names that ``method`` of :func:`compare` takes."""
-
-
-_POOLING: dict[str, Callable[[Floats], Floats]] = {
-    "pearson": _pearson,
-    "spearman": _ranks,
-    "rho-a": _ranks,
-    "tau-a": _ranks,
-    "tau-b": _ranks,
-    "cosine": _unit,
-    "whitened-cosine": _unit,
-    "whitened-pearson": _pearson,
-}
 
 
 def _compare_present(left: Floats, right: Floats, method: str) -> Floats:
