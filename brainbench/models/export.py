@@ -21,7 +21,6 @@ SUFFIXES = {"onnx": ".onnx", "torch": ".pt2"}
 """Formats and their suffixes: ONNX, and an exported PyTorch program."""
 INPUTS, OUTPUTS = ("obs", "h_in"), ("features", "h_out")
 OPSET = 18
-"""ONNX operator set."""
 TOLERANCE = 1e-4
 """Largest difference between the file and the network, relative to the largest feature."""
 _STEPS = 8
@@ -33,7 +32,6 @@ class Export:
 
     path: Path
     contract: Path
-    """The JSON contract."""
     format: str
     state_size: int
     """S."""

@@ -49,7 +49,6 @@ class ModelSpec:
     max_steps: int | None
     """Longest sweep; None: any."""
     outputs: int
-    """Number of outputs."""
 
 
 @dataclass(frozen=True)

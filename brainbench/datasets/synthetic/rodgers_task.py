@@ -37,7 +37,6 @@ COLUMNS = {
     "choice_time": "Time of the choice lick, s.",
     "response_window_open_time": "From when licks counted, s.",
 }
-"""Meaning of the columns of the trials."""
 
 
 @dataclass(frozen=True)
@@ -69,7 +68,6 @@ class Behaviour:
     """Trials of a session; arrays of length R (rows), times in s on the session clock."""
 
     columns: Mapping[str, NDArray[Any]]
-    """Columns of the trials table."""
     stimulus: NDArray[np.int64]
     """Index of the stimulus; −1 for ``nothing``."""
     onset: NDArray[np.float64]

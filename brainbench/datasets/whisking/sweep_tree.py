@@ -60,7 +60,6 @@ class Listed(NamedTuple):
     faults: NDArray[np.int64]
     """[file, fault] in the order of :data:`FAULTS`."""
     digest: NDArray[np.str_]
-    """Hash of the file."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -48,9 +48,7 @@ class PairTest:
     """Two models on the same animals and stimuli."""
 
     first: str
-    """Name of one model."""
     second: str
-    """Name of the other model."""
     difference: float
     """The first's value minus the second's, on the common scale."""
     interval: Interval | None

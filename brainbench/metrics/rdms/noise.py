@@ -234,4 +234,3 @@ _METHODS: dict[str, Callable[[Array, int], NoiseModel]] = {
 }
 
 NOISE_METHODS = tuple(_METHODS)
-"""Names of the estimators."""

@@ -161,4 +161,3 @@ _ESTIMATORS: dict[str, Callable[[Floats, Floats, Floats | None, list[float]], tu
 }
 
 ESTIMATORS = tuple(_ESTIMATORS)
-"""Names that ``estimator`` takes."""

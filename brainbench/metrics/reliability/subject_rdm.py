@@ -33,7 +33,6 @@ SPLITS = 1000
 """Random split halves per animal."""
 
 SUBJECT_METHODS = ("correlation", "sqeuclidean", "mahalanobis", "crossnobis", "poisson")
-"""RDM methods of an animal."""
 
 _CHUNK_BYTES = 1 << 24
 _HALVES_BYTES = 1 << 26
@@ -57,14 +56,12 @@ class SubjectRDM:
     method: str = "correlation"
     """Dissimilarity of two stimuli."""
     comparison: str = "pearson"
-    """Comparison of two RDMs."""
     reliability: float = math.nan
     """Spearman-Brown reliability of the mean of ``split_half_r`` (averaged before, not after, the formula)."""
     spread: Interval | None = None
     """Percentiles of single splits' Spearman-Brown values: how much one split would have misled, not a
     confidence interval of the reliability."""
     seed: int = 0
-    """Seed of the splits."""
     problem: str | None = None
     """Reason for having no usable RDM, in words; None otherwise."""
     notes: tuple[str, ...] = ()

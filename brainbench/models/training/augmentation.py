@@ -206,4 +206,3 @@ KINDS: Mapping[str, Callable[[torch.Tensor, SampledAugmentation], torch.Tensor]]
     "thesis": _thesis,
     "image": _image,
 }
-"""Augmentations by name."""

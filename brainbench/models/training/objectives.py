@@ -152,7 +152,6 @@ class Autoencoding(Learner):
 
 
 LEARNERS = {"supervised": Supervised, "simclr": SimCLR, "simsiam": SimSiam, "ae": Autoencoding}
-"""Objectives by name."""
 
 
 def make_learner(objective: str, model: nn.Module) -> Learner:

@@ -31,7 +31,6 @@ BOARDS = 4
 FIRST_BOARD = 1_000_000
 """Number of the first of them, far from those on which rates are measured."""
 EXCHANGES = 1500
-"""Exchanges that are tried."""
 
 
 @dataclass(frozen=True)

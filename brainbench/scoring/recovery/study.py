@@ -21,7 +21,6 @@ from brainbench.scoring.recovery.confusion import Recovery
 from brainbench.scoring.recovery.design import RecoveryDesign
 
 BOARDS = 10
-"""Boards of each candidate."""
 _TOGETHER = 5
 """Boards that one job makes and one file keeps."""
 _CONFIG = "config.json"
