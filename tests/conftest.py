@@ -13,6 +13,8 @@ import pytest
 sys.path.append(str(Path(__file__).parents[1]))
 # Idle OpenMP threads would otherwise spin and slow each other down on a busy machine.
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+# So would OpenBLAS's: on two busy cores the small products of a fit took ten times as long with two threads.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 REFERENCE = Path(os.environ.get("BRAINBENCH_REFERENCE", Path(__file__).parents[2] / "shared" / "reference"))
 

@@ -21,7 +21,7 @@ from brainbench.datasets import open_recordings
 from brainbench.datasets.synthetic import ensure_rodgers_demo, read_truth
 from brainbench.datasets.trials.session_trials import trials_by_subject
 from brainbench.metrics import rdm
-from brainbench.metrics.measures.rsa import score_animals
+from brainbench.metrics.measures.rsa import RSA
 from brainbench.metrics.reliability.subject_rdm import subject_rdm
 from brainbench.stimuli import get_recipe, load_stimuli, simulate
 
@@ -81,7 +81,7 @@ def main() -> None:
         print(line, *(f"{correlate(animal.rdm, values):16.2f}" for values in raw.values()))
     against = ", ".join(f"{name} {correlate(values, truth['shared']):.2f}" for name, values in raw.items())
     print(f"raw input with the shared truth: {against}")
-    print(score_animals(animals, stimuli=labels).summary())
+    print(RSA(comparison="pearson").score_animals(animals, stimuli=labels).summary())
 
 
 if __name__ == "__main__":

@@ -24,7 +24,7 @@ import numpy as np
 from benchmarks.report import table, write_section
 from brainbench.core.trials import Trials
 from brainbench.metrics import compare_models, noise_precision, permutation_test, rdm
-from brainbench.metrics.measures.rsa import score_animals, score_rdms
+from brainbench.metrics.measures.rsa import RSA, score_rdms
 from brainbench.metrics.reliability.subject_rdm import subject_rdm
 
 STIMULI = [f"s{k}" for k in range(6)]
@@ -204,7 +204,7 @@ def score_rows() -> list[list[str]]:
     add("brain side: 11 animals, 1,000 splits", "", brain)
     with Stopwatch() as one:
         score = score_rdms(models["m0"], subjects, name="m0", stimuli=STIMULI)
-        between = score_animals(subjects, stimuli=STIMULI)
+        between = RSA(comparison="pearson").score_animals(subjects, stimuli=STIMULI)
     add("one model: 12 layers, 5,040 orders at most; animal to animal, 499 orders", "", one)
     add("**full score**", "3", brain, one)
     with Stopwatch() as many:

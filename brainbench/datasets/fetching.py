@@ -20,8 +20,7 @@ def fetch(name: str, folder: str | os.PathLike[str] = ".", *, assets: str | None
     Args:
         name: a layout's name, or the six digits of a dandiset.
         folder: where to put it.
-        assets: glob of the files wanted, such as ``"sub-231CR/*"``; by default those that the layout
-            can use, else all.
+        assets: glob of the files wanted, such as ``"sub-231CR/*"``; by default those that the layout can use, else all.
 
     Returns:
         The folder of the data set, ``folder/NUMBER``.

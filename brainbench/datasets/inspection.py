@@ -107,13 +107,13 @@ class SessionSummary:
     session: str
     start: str
     synthetic: bool
-    units: UnitsSummary | None
-    tables: tuple[TableSummary, ...]
-    modules: tuple[tuple[str, tuple[str, ...]], ...]
+    units: UnitsSummary | None = None
+    tables: tuple[TableSummary, ...] = ()
+    modules: tuple[tuple[str, tuple[str, ...]], ...] = ()
     """Processing modules with what they hold."""
-    acquired: tuple[AcquiredSummary, ...]
+    acquired: tuple[AcquiredSummary, ...] = ()
     """Signals in the file; their samples are never read here."""
-    missing: tuple[str, ...]
+    missing: tuple[str, ...] = ()
     """Parts that scoring needs and this session lacks."""
     notes: tuple[str, ...] = ()
 
@@ -266,19 +266,9 @@ def _counted(
     labels = Counter(dataset["stimulus"].values.astype(str).tolist())
     pairs = dict.fromkeys(zip(dataset["subject"].values.tolist(), dataset["session"].values.tolist(), strict=True))
     doubt = (dataset.attrs["label_doubt"],) if "label_doubt" in dataset.attrs else ()
+    synthetic = bool(dataset.attrs["synthetic"])
     sessions = tuple(
-        SessionSummary(
-            str(subject),
-            str(session),
-            "",
-            bool(dataset.attrs["synthetic"]),
-            None,
-            (),
-            (),
-            (),
-            (),
-            () if number else doubt,
-        )
+        SessionSummary(str(subject), str(session), "", synthetic, notes=() if number else doubt)
         for number, (subject, session) in enumerate(pairs)
     )
     vocabulary = tuple(dataset.attrs["vocabulary"])

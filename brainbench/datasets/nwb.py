@@ -34,12 +34,9 @@ def is_nwb(file: h5py.File) -> bool:
 def read_nwb(file: h5py.File, path: Path) -> Session:
     """Describe the session in an open NWB file; columns are read later, while it stays open.
 
-    The subject is ``/general/subject/subject_id``, else the ``sub-`` part of the file name, else the
-    file's stem; the session likewise (``/general/session_id``, ``ses-``, stem). What was guessed is
-    said in ``notes``.
-
-    Raises:
-        DataError: the file is NWB 1.x, whose layout differs.
+    The subject is ``/general/subject/subject_id``, else the ``sub-`` part of the file name, else the file's stem; the
+    session likewise (``/general/session_id``, ``ses-``, stem). What was guessed is said in ``notes``. Raises DataError:
+    the file is NWB 1.x, whose layout differs.
     """
     import h5py
 

@@ -68,13 +68,12 @@ def open_recordings(
     vocabulary, else they are sorted naturally; never by appearance.
 
     Returns:
-        ``counts`` [trial, time, unit] (float32; NaN = not recorded) and ``duration`` [trial, time] (s),
-        with ``stimulus, subject, session, trial_id, window_start, window_stop`` per trial,
-        ``unit_subject, unit_session, unit_id, depth, layer, inhibitory`` per unit, ``time`` (begin of
-        the bin, s from the window's begin), and attributes: vocabulary, conditions, layout, window,
-        bin, selection, removed (rule → trials or units that it removed, each counted once, in the
-        order of the rules), missing (subject → labels without a trial), sessions, notes,
-        skipped (why a file is left out), source, synthetic, content_hash.
+        ``counts`` [trial, time, unit] (float32; NaN = not recorded) and ``duration`` [trial, time] (s), with
+        ``stimulus, subject, session, trial_id, window_start, window_stop`` per trial, ``unit_subject, unit_session,
+        unit_id, depth, layer, inhibitory`` per unit, ``time`` (begin of the bin, s from the window's begin), and
+        attributes: vocabulary, conditions, layout, window, bin, selection, removed (rule → trials or units that it
+        removed, each counted once, in the order of the rules), missing (subject → labels without a trial), sessions,
+        notes, skipped (why a file is left out), source, synthetic, content_hash.
 
     Raises:
         DataFileNotFoundError: the source names nothing.

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from brainbench.core.errors import UsageError, unknown_name
+from brainbench.core.errors import UsageError
 from brainbench.core.provenance import Provenance
 from brainbench.core.records import Interval, Score, Status, SubjectScore
 from brainbench.metrics.animals import Animals, ceiling_of, gather, mean_rdm, mean_reliability
@@ -34,25 +34,12 @@ def score_agreement(
 ) -> Score:
     """Score each reliable animal against the others together, by a metric.
 
-    The p-value permutes every animal's stimuli independently, (b+1)/(n+1).
-
-    Args:
-        metric: What compares them.
-        subjects: What :meth:`Metric.animal` made of each animal.
-        stimuli: Names of the K stimuli.
-        estimator: One of the metric's.
-        seed: Seed of the permutations.
-
-    Returns:
-        A score without layers; undefined for fewer than two usable animals.
-
-    Raises:
-        UsageError: no animals, subjects of other stimuli, or an unknown estimator.
+    The p-value permutes every animal's stimuli independently, (b+1)/(n+1). ``subjects`` are what :meth:`Metric.animal`
+    made of each animal, ``stimuli`` the names of the K stimuli. Returns a score without layers; undefined for fewer
+    than two usable animals. Raises UsageError: no animals, subjects of other stimuli, or an unknown estimator.
     """
     if not subjects:
         raise UsageError("There are no animals to compare; give at least two SubjectRDM.")
-    if estimator not in metric.estimators:
-        raise unknown_name(f"estimator of the metric {metric.name!r}", estimator, metric.estimators)
     count = len(stimuli)
     animals = gather(metric, subjects, count, estimator=estimator)
     compared = animals.scored if count >= metric.fewest and len(animals.scored) > 1 else ()

@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from brainbench.core.errors import UsageError
+from brainbench.core.errors import UsageError, check_name
 from brainbench.core.records import Ceiling, Interval, Status
-from brainbench.metrics.inference.intervals import t_interval
+from brainbench.core.statistics import t_interval
 from brainbench.metrics.inference.permutation import canonical_order
 from brainbench.metrics.rdms.pairs import Floats, Ints
 from brainbench.metrics.reliability.ceiling import noise_ceiling
@@ -63,9 +63,9 @@ class Animals:
 def gather(metric: Metric, subjects: Sequence[SubjectRDM], stimuli: int, *, estimator: str = "default") -> Animals:
     """Sort subjects by name, correct each for noise as the metric does and decide who is scored.
 
-    Raises:
-        UsageError: no subjects, repeated names, or RDMs of another number of stimuli.
+    Raises UsageError: no subjects, repeated names, or RDMs of another number of stimuli.
     """
+    check_name(f"estimator of the metric {metric.name!r}", estimator, metric.estimators)
     if not subjects:
         raise UsageError("There are no animals to score against; give at least one SubjectRDM.")
     ordered = tuple(sorted(subjects, key=lambda subject: subject.subject))
@@ -117,7 +117,7 @@ def mean_reliability(animals: Animals) -> tuple[float, Interval | None]:
     # One animal has no interval over animals; the spread over its splits stands in and says so.
     if len(values) == 1:
         return float(values[0]), animals.subjects[animals.scored[0]].spread
-    return float(values.mean()), t_interval(values)
+    return float(values.mean()), t_interval(values, over="animals")
 
 
 def ceiling_of(animals: Animals, comparison: str) -> Ceiling | None:

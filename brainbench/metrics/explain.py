@@ -82,11 +82,9 @@ def corrected_value(
 ) -> tuple[float, int]:
     """Return one comparison corrected for noise under the switches, and the splits that entered.
 
-    Args:
-        r_xy: Raw comparison [S] or a number.
-        r_yy: Raw split-half comparisons [S] of the brain.
-        switches: Of these, ``drop_splits``, ``median``, ``negative_pairs`` and ``ratio_per_split`` matter here.
-        r_xx: The same for the other side; 1 (a model) by default.
+    ``r_xy`` is the raw comparison [S] or a number, ``r_yy`` are the raw split-half comparisons [S] of the brain and
+    ``r_xx`` those of the other side; 1 (a model) by default. Of the switches ``drop_splits``, ``median``,
+    ``negative_pairs`` and ``ratio_per_split`` matter here.
     """
     halves = np.asarray(r_yy, dtype=np.float64).ravel()
     others = np.ones(len(halves)) if r_xx is None else np.broadcast_to(np.asarray(r_xx, dtype=np.float64), halves.shape)
@@ -112,9 +110,7 @@ def corrected_value(
 def explain_file(path: str | Path) -> tuple[Step, ...]:
     """Walk through the split halves in an ``.npz`` file: arrays ``r_xy``, ``r_yy`` and maybe ``r_xx``.
 
-    Raises:
-        DataFileNotFoundError: there is no such file.
-        DataError: it holds something else.
+    Raises DataFileNotFoundError: there is no such file; DataError: it holds something else.
     """
     arrays = read_npz(path, ".npz file of plain arrays")
     if missing := {"r_xy", "r_yy"} - arrays.keys():
@@ -133,13 +129,7 @@ def explain_file(path: str | Path) -> tuple[Step, ...]:
 def explain_splits(r_xy: ArrayLike, r_yy: ArrayLike, *, r_xx: ArrayLike | None = None) -> tuple[Step, ...]:
     """Walk through stored split halves of one model and one target, from the published bars to the default.
 
-    Args:
-        r_xy: Raw comparison [S] or a number.
-        r_yy: Raw split-half comparisons [S] of the brain.
-        r_xx: The same for the other side; 1 by default.
-
-    Raises:
-        UsageError: no splits.
+    Arguments are those of :func:`corrected_value`. Raises UsageError: no splits.
     """
     halves = np.asarray(r_yy, dtype=np.float64).ravel()
     if not np.isfinite(halves).any():
@@ -178,9 +168,7 @@ def explain_score(layer_rdms: Mapping[str, ArrayLike], subjects: Sequence[Subjec
     """Walk a model's score from the published estimator to the default one, on the same RDMs, by Pearson's r.
 
     The published pool of all animals' units is represented by their mean RDM and halves.
-
-    Raises:
-        UsageError: no layers or animals, no animal with a usable RDM, or RDMs that do not fit.
+    Raises UsageError: no layers or animals, no animal with a usable RDM, or RDMs that do not fit.
     """
     rdms = rdm_stack(list(layer_rdms.values()), "layer_rdms")
     rdms = rdms[~is_flat(rdms)]

@@ -80,8 +80,7 @@ HALVES = LayerRule("halves", "chosen on one half of the only animal's trials, ev
 def choose_on_others(r: Floats) -> Ints:
     """Return the layer [..., A] that compares best with all animals but each.
 
-    Args:
-        r: [..., L, A] raw comparisons, A ≥ 2.
+    From raw comparisons [..., L, A], A ≥ 2.
     """
     # All leave-one-out means from one sum over animals.
     others = (r.sum(axis=-1, keepdims=True) - r) / (r.shape[-1] - 1)

@@ -48,9 +48,7 @@ class Target:
 def make_targets(arrays: Mapping[str, Floats], *, splits: int = SPLITS) -> tuple[Target, ...]:
     """Return the animals and, of several, their pool.
 
-    Args:
-        arrays: Animal → rates [R, K, U], NaN where a unit's session had fewer trials.
-        splits: Random halves.
+    ``arrays`` are rates [R, K, U] by animal, NaN where a unit's session had fewer trials.
     """
     named = dict(arrays) if len(arrays) == 1 else {**arrays, POOL: concatenate(list(arrays.values()))}
     return tuple(_target(name, array, splits) for name, array in named.items())
@@ -105,15 +103,9 @@ def score_published(
 ) -> Score:
     """Score a model as published; the value is a maximum over layers and targets, and so never ``ok``.
 
-    The permutation test takes the same maximum under every order of the stimuli.
-
-    Args:
-        features: Layer → features [K, F], the stimuli in the order of the slots.
-        targets: From :func:`make_targets`.
-        name: Name of the model.
-        stimuli: Names of the K stimuli.
-        estimator: ``thesis``, or ``thesis-input`` (the bar of the raw input: the last target alone, median over all
-            splits).
+    The permutation test takes the same maximum under every order of the stimuli. ``features`` [K, F] of each layer have
+    the stimuli in the order of the slots. ``thesis-input`` is the bar of the raw input: the last target alone, median
+    over all splits.
     """
     targets = targets[-1:] if estimator == "thesis-input" else targets
     rdms = {layer: correlation_distances(np.asarray(values, dtype=float)) for layer, values in features.items()}

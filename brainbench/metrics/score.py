@@ -16,11 +16,12 @@ import numpy as np
 from brainbench.core.errors import UsageError, unknown_name
 from brainbench.core.provenance import Provenance
 from brainbench.core.records import LayerScore, Score, Status, SubjectScore
+from brainbench.core.statistics import t_interval
 from brainbench.metrics.animals import Animals, ceiling_of, gather, mean_rdm, mean_reliability, recorded_rdm
 from brainbench.metrics.arrays import finite_mean
 from brainbench.metrics.comparisons import LayerComparisons
 from brainbench.metrics.evaluation import LayerEvaluation, attainable_value, defined_layers, evaluate
-from brainbench.metrics.inference.intervals import held_to_scale, interval_reasons, t_interval, two_factor_interval
+from brainbench.metrics.inference.intervals import held_to_scale, interval_reasons, two_factor_interval
 from brainbench.metrics.inference.permutation import SMALLEST_STIMULI, PermutationTest, layer_p, smallest_p
 from brainbench.metrics.layers import first_best, most_chosen
 from brainbench.metrics.rdms.pairs import Floats
@@ -44,24 +45,13 @@ def score_layers(
 ) -> tuple[Score, PermutationTest | None]:
     """Score the layers of a model against animals; also return the permutation test with all statistics.
 
-    Args:
-        metric: What compares them.
-        layers: What :meth:`Metric.layer` made of each layer, in network order.
-        subjects: What :meth:`Metric.animal` made of each animal.
-        name: Name of the model.
-        stimuli: Names of the K stimuli.
-        estimator: One of the metric's.
-        seed: Seed of random permutations.
-        device: Torch device for the permutations; numpy by default.
-        committed: Layer that was chosen before anything was scored.
-
-    Raises:
-        UsageError: no animals, subjects of other stimuli, or an unknown estimator or layer.
+    ``layers`` are what :meth:`Metric.layer` made of each layer, in network order, ``subjects`` what
+    :meth:`Metric.animal` made of each animal. ``committed`` is a layer that was chosen before anything was scored;
+    without a torch ``device`` numpy computes the permutations.
+    Raises UsageError: no animals, subjects of other stimuli, or an unknown estimator or layer.
     """
     if len(set(map(str, stimuli))) < len(stimuli):
         raise UsageError(f"Stimulus names repeat: {list(stimuli)}.")
-    if estimator not in metric.estimators:
-        raise unknown_name(f"estimator of the metric {metric.name!r}", estimator, metric.estimators)
     if committed is not None and committed not in layers:
         raise unknown_name("layer", committed, layers)
     animals = gather(metric, subjects, len(stimuli), estimator=estimator)
@@ -183,8 +173,9 @@ def _verdict(
 def _layer_score(label: str, row: int | None, result: LayerEvaluation, status: Status) -> LayerScore:
     if row is None:
         return LayerScore(label, math.nan, math.nan, "undefined")
-    values = result.layer_values[row]
-    return LayerScore(label, float(values.mean()), float(result.layer_r[row].mean()), status, t_interval(values))
+    values, r = result.layer_values[row], result.layer_r[row]
+    interval = t_interval(values, over="animals")
+    return LayerScore(label, float(values.mean()), float(r.mean()), status, interval)
 
 
 def _subjects(

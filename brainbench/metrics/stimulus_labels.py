@@ -23,9 +23,7 @@ def stimulus_codes(labels: ArrayLike, count: int | None = None) -> tuple[Ints, t
 
     Integers are codes already (0 … K−1, and K is ``count`` or the largest plus one); strings are
     coded in sorted order. The order of appearance never matters.
-
-    Raises:
-        UsageError: other types, negative codes, codes at or above ``count``, or strings with a ``count``.
+    Raises UsageError: other types, negative codes, codes at or above ``count``, or strings with a ``count``.
     """
     array = np.asarray(labels)
     if array.ndim != 1:
@@ -53,8 +51,7 @@ def stimulus_codes(labels: ArrayLike, count: int | None = None) -> tuple[Ints, t
 def response_matrix(responses: ArrayLike, rows: str) -> Any:
     """Return responses as a floating array [rows, U], keeping float32 and tensors where they lie.
 
-    Raises:
-        UsageError: not a two-dimensional array of real numbers with at least one unit.
+    Raises UsageError: not a two-dimensional array of real numbers with at least one unit.
     """
     array: Any = responses if is_tensor(responses) else np.asarray(responses)
     real = not array.dtype.is_complex if is_tensor(array) else array.dtype.kind in "fiub"
@@ -68,6 +65,19 @@ def response_matrix(responses: ArrayLike, rows: str) -> Any:
     return array if array.dtype.kind == "f" else array.astype(np.float64)
 
 
+def labelled_trials(responses: ArrayLike, labels: ArrayLike, count: int | None = None) -> tuple[Any, Ints, Any]:
+    """Return trials [R, U], the codes [R] of their stimuli, and the names of all stimuli; UsageError if they differ."""
+    trials, (codes, names) = response_matrix(responses, "trials"), stimulus_codes(labels, count)
+    check_lengths(trials, codes)
+    return trials, codes, names
+
+
+def check_lengths(trials: Any, codes: Ints) -> None:
+    """Raise UsageError unless there is one label per trial."""
+    if len(codes) != len(trials):
+        raise UsageError(f"There are {len(trials)} trials but {len(codes)} labels; give one label per trial.")
+
+
 def membership(codes: Ints, count: int) -> Floats:
     """Return 1 where a trial is one of a stimulus, else 0 [K, R]."""
     return (codes == np.arange(count)[:, None]).astype(np.float64)
@@ -77,13 +87,9 @@ def stimulus_means(responses: NDArray, codes: Ints, count: int) -> Floats:
     """Return the mean response [K, U] over the trials of each stimulus; NaN entries are missing.
 
     A unit without any value for a stimulus is NaN there.
-
-    Raises:
-        UsageError: the number of labels is not the number of trials.
-        DataError: a response is infinite.
+    Raises UsageError: the number of labels is not the number of trials; DataError: a response is infinite.
     """
-    if len(codes) != len(responses):
-        raise UsageError(f"There are {len(responses)} trials but {len(codes)} labels; give one label per trial.")
+    check_lengths(responses, codes)
     numbers = np.bincount(codes, minlength=count)[:, None].astype(np.float64)
     if (means := _complete_means(responses, codes, numbers)) is not None:
         return means
@@ -123,8 +129,7 @@ def _complete_means(responses: NDArray, codes: Ints, numbers: Floats) -> Floats 
 def tensor_means(responses: Any, codes: Ints, count: int, device: Any) -> Array:
     """Return what :func:`stimulus_means` does as a tensor on ``device``, by products with the trials' membership.
 
-    Raises:
-        DataError: a response is infinite.
+    Raises DataError: a response is infinite.
     """
     member = place(membership(codes, count), device)
     xp, found = library(member), []

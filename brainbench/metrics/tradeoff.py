@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from brainbench.core.errors import UsageError
-from brainbench.core.progress import Progress
+from brainbench.core.progress import Progress, track
 from brainbench.core.trials import Trials
 from brainbench.metrics.inference.permutation import label_orders
 from brainbench.metrics.measures.rsa import RSA
@@ -58,17 +58,8 @@ def measure_tradeoff(
 ) -> tuple[MonteCarloPoint, ...]:
     """Measure Monte-Carlo error and time of each number, the others at their defaults.
 
-    Args:
-        animals: Synthetic animals of one geometry, six stimuli.
-        units: Units of each.
-        trials: Trials of each stimulus.
-        splits: Numbers of split halves.
-        permutations: Random orders of the stimuli (for more than seven stimuli).
-        repeats: Seeds per setting, at least 2.
-        progress: Called with (done, total, what).
-
-    Raises:
-        UsageError: fewer than two repeats, or numbers that are not positive.
+    Synthetic animals share one geometry of six stimuli; every setting is repeated with ``repeats`` seeds.
+    Raises UsageError: fewer than two repeats, or numbers that are not positive.
     """
     if repeats < 2 or min(*splits, *permutations, animals, units, trials) < 1:
         raise UsageError("A trade-off needs at least 2 repeats and positive numbers.")
@@ -89,9 +80,7 @@ def measure_tradeoff(
         *(("permutations", n, "p near .05", n == metric.orders, lambda seed, n=n: p(seed, n)) for n in permutations),
     ]
     points = []
-    for index, (quantity, count, of, default, job) in enumerate(jobs):
-        if progress is not None:
-            progress(index, len(jobs), "measuring Monte-Carlo error")
+    for quantity, count, of, default, job in track(jobs, "measuring Monte-Carlo error", progress):
         found, seconds = [], []
         for seed in range(repeats):
             start = time.perf_counter()
@@ -100,8 +89,6 @@ def measure_tradeoff(
         points.append(
             MonteCarloPoint(quantity, count, float(np.std(found, ddof=1)), of, float(np.median(seconds)), default)
         )
-    if progress is not None:
-        progress(len(jobs), len(jobs), "measuring Monte-Carlo error")
     return tuple(points)
 
 

@@ -21,7 +21,6 @@ SUFFIXES = {"onnx": ".onnx", "torch": ".pt2"}
 """Formats and their suffixes: ONNX, and an exported PyTorch program."""
 INPUTS, OUTPUTS = ("obs", "h_in"), ("features", "h_out")
 OPSET = 18
-"""ONNX operator set."""
 TOLERANCE = 1e-4
 """Largest difference between the file and the network, relative to the largest feature."""
 _STEPS = 8
@@ -33,7 +32,6 @@ class Export:
 
     path: Path
     contract: Path
-    """The JSON contract."""
     format: str
     state_size: int
     """S."""
@@ -46,16 +44,10 @@ class Export:
 def export_model(model: nn.Module, path: str | Path, *, format: str = "onnx", name: str = "") -> Export:
     """Export the streaming step of an encoder-attender-decoder network and check the file against the network.
 
-    Args:
-        model: The network; exported in evaluation mode, on the CPU.
-        path: File to write; the suffix of the format is added when there is none.
-        format: ``onnx`` or ``torch``.
-        name: What the contract calls the network.
-
-    Raises:
-        UsageError: there is no such format, or the network cannot be streamed.
-        MissingDependencyError: the packages of the extra ``export`` are missing, for ``onnx``.
-        DataError: the file does not compute what the network does; it is then removed.
+    The network is exported in evaluation mode, on the CPU, as ``onnx`` or ``torch``; the suffix of the format is added
+    to a path without one. ``name`` is what the contract calls the network. Raises UsageError: there is no such format,
+    or the network cannot be streamed; MissingDependencyError: the packages of the extra ``export`` are missing, for
+    ``onnx``; DataError: the file does not compute what the network does; it is then removed.
     """
     import copy
 

@@ -49,7 +49,6 @@ class ModelSpec:
     max_steps: int | None
     """Longest sweep; None: any."""
     outputs: int
-    """Number of outputs."""
 
 
 @dataclass(frozen=True)
@@ -66,12 +65,9 @@ class NetworkState:
 class EncoderAttenderDecoder(nn.Module):
     """Normaliser → encoder → attender → decoder; [B, T, C, H, W] in SI → [B, classes].
 
-    Args:
-        encoder: Maps [B, T, C, H, W] to [B, T, F].
-        attender: Maps [B, T, F] to [B, T, W]; None passes the features on.
-        decoder: Maps features to outputs, ending in a linear layer; None is the linear decoder to 117 classes.
-        normaliser: None is :meth:`Normaliser.physical`.
-        unroll: How a temporal graph is unrolled; other encoders know one way only.
+    The encoder gives features [B, T, F], which the attender (None: nothing) maps to [B, T, W]. The decoder ends in a
+    linear layer; None is the linear one to 117 classes. None as normaliser is :meth:`Normaliser.physical`. Only a
+    temporal graph can be unrolled otherwise than biologically.
 
     Raises:
         UsageError: the unrolling is unknown, or the encoder is no temporal graph and knows one way only.
@@ -136,9 +132,7 @@ class EncoderAttenderDecoder(nn.Module):
         """Return the features [B, T, F] of sweeps in SI, which the decoder or the head of another objective reads.
 
         With ``last`` those of the last step [B, F] alone, which spares what no later step reads.
-
-        Raises:
-            UsageError: as for :meth:`forward`.
+        Raises UsageError: as for :meth:`forward`.
         """
         if self.spec.max_steps is not None and x.ndim == 5 and x.shape[1] > self.spec.max_steps:
             # Said before the encoder has worked for nothing.
@@ -155,8 +149,7 @@ class EncoderAttenderDecoder(nn.Module):
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         """Return the decoder's output at the last step [B, classes].
 
-        Raises:
-            UsageError: ``x`` is not [B, T, C, H, W] as :attr:`spec` says, or too long for the attender.
+        Raises UsageError: ``x`` is not [B, T, C, H, W] as :attr:`spec` says, or too long for the attender.
         """
         return self.decoder(self.encode(x, last=not isinstance(self.decoder, AllStepsDecoder)))
 
@@ -164,9 +157,7 @@ class EncoderAttenderDecoder(nn.Module):
         """Return ``{layer: [B, T, ...]}`` for the layers asked for (all by default), in the order of ``layers``.
 
         The decoder is applied at every step; attender layers are read at the action tokens.
-
-        Raises:
-            UsageError: a layer does not exist, or as for :meth:`forward`.
+        Raises UsageError: a layer does not exist, or as for :meth:`forward`.
         """
         wanted = self.layers if layers is None else tuple(layers)
         for name in wanted:

@@ -20,9 +20,7 @@ PUBLISHED_FORCE_SCALE = 1e-3
 class Normaliser(nn.Module):
     """(x − offset) / scale per channel of [B, T, C, H, W] or [B, C, H, W], in SI; buffers, not parameters.
 
-    Args:
-        scale: One positive number per channel, in the channel's unit.
-        offset: One number per channel; zero by default, so that silence stays silence.
+    Without an offset silence stays silence.
     """
 
     scale: torch.Tensor

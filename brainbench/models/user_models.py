@@ -19,8 +19,7 @@ def load_user_model(target: str, *, seed: int = 0) -> nn.Module:
     can be imported from while it loads. Random weights follow from the seed (CPU generator).
 
     Raises:
-        UsageError: the target is not of this form, has no such name, or does not give a
-            :class:`torch.nn.Module`.
+        UsageError: the target is not of this form, has no such name, or does not give a :class:`torch.nn.Module`.
         DataError: the file or module cannot be imported, or building the model fails.
     """
     with seeded(seed):
@@ -46,8 +45,7 @@ def build_user_model(target: str, **options: Any) -> nn.Module:
 def check_module(made: Any, target: str) -> nn.Module:
     """Return what a user's or another package's code made, which must be a module.
 
-    Raises:
-        UsageError: it is something else.
+    Raises UsageError: it is something else.
     """
     from torch import nn
 

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from brainbench.core.errors import DataError, DataFileNotFoundError, UsageError, unknown_name
+from brainbench.core.errors import DataError, DataFileNotFoundError, UsageError, check_name
 from brainbench.core.files import check_folder, file_hash, read_json, write_json
 from brainbench.models.architecture import check_new_name
 
@@ -47,10 +47,7 @@ class UserModel:
     def build(self, **options: Any) -> nn.Module:
         """Build the model from its code as it is today; a changed file is told in a warning.
 
-        Raises:
-            DataFileNotFoundError: the file is gone.
-            UsageError: the code gives no module.
-            DataError: the code fails.
+        Raises DataFileNotFoundError: the file is gone; UsageError: the code gives no module; DataError: the code fails.
         """
         from brainbench.models.user_models import build_user_model
 
@@ -78,11 +75,7 @@ def settings_file() -> Path:
 
 
 def read_user_models() -> dict[str, UserModel]:
-    """Return the added models by name.
-
-    Raises:
-        DataError: the file of settings is damaged.
-    """
+    """Return the added models by name. Raises DataError: the file of settings is damaged."""
     path = settings_file()
     stored = read_json(path) if path.is_file() else {}
     fields = {"target", "hash"}
@@ -99,15 +92,9 @@ def read_user_models() -> dict[str, UserModel]:
 def add_user_model(target: str, name: str, *, taken: Collection[str]) -> UserModel:
     """Store a model of the user's own under a name; nothing is stored unless it can be built.
 
-    Args:
-        target: ``path/to/FILE.py:NAME`` or ``package.module:NAME``.
-        name: Name on the command line: lower-case letters, digits, ``-`` and ``+``.
-        taken: Names of the registry.
-
-    Raises:
-        UsageError: the name is taken or breaks the grammar, or the target gives no module.
-        DataFileNotFoundError: there is no such file or module.
-        DataError: the code fails, or the settings cannot be written.
+    ``target`` is ``path/to/FILE.py:NAME`` or ``package.module:NAME``; ``taken`` are the names of the registry. Raises
+    UsageError: the name is taken or breaks the grammar, or the target gives no module; DataFileNotFoundError: there is
+    no such file or module; DataError: the code fails, or the settings cannot be written.
     """
     from brainbench.models.user_models import load_user_model
 
@@ -130,12 +117,10 @@ def add_user_model(target: str, name: str, *, taken: Collection[str]) -> UserMod
 def remove_user_model(name: str) -> UserModel:
     """Take a stored name away and return what it stood for; the file with the code stays.
 
-    Raises:
-        UsageError: no model was added under this name.
+    Raises UsageError: no model was added under this name.
     """
     known = read_user_models()
-    if name not in known:
-        raise unknown_name("model of your own", name, known)
+    check_name("model of your own", name, known)
     made = known.pop(name)
     _write(known)
     return made

@@ -77,14 +77,7 @@ def build(
 ) -> EncoderAttenderDecoder:
     """Build the network with new random weights.
 
-    Args:
-        item: One of :func:`architectures`.
-        classes: Number of outputs.
-        decoder: ``linear``, ``mlp`` or ``all-steps``.
-        unroll: ``biological`` or ``full``, for a Zhuang encoder.
-
-    Raises:
-        UsageError: an option does not exist or does not fit.
+    ``unroll`` is for a Zhuang encoder. Raises UsageError: an option does not exist or does not fit.
     """
     from brainbench.models.heads.decoders import make_decoder
     from brainbench.models.network import EncoderAttenderDecoder

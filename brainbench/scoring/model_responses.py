@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from brainbench.core.contracts import CHANNELS
-from brainbench.core.errors import UsageError, unknown_name
+from brainbench.core.errors import UsageError, check_name, unknown_name
 from brainbench.core.files import content_hash, file_hash
 from brainbench.core.progress import Progress
 from brainbench.core.records import Interval, ModelCard
@@ -96,8 +96,7 @@ class ResolvedModel:
         if self.module is None or shown is None:
             found = self.activations or {}
             for layer in options.layers or ():
-                if layer not in found:
-                    raise unknown_name("layer", layer, found)
+                check_name("layer", layer, found)
             activations = {layer: _as_steps(layer, found[layer], len(labels)) for layer in options.layers or found}
         else:
             from brainbench.models.activations import extract
@@ -114,9 +113,7 @@ class ResolvedModel:
 def resolve_model(model: Any, *, seed: int = 0) -> ResolvedModel:
     """Find what ``model`` names, and load it; see :func:`brainbench.scoring.scores.score`.
 
-    Raises:
-        UsageError: nothing has this name, or it is no model.
-        DataError: a file was found but cannot be used.
+    Raises UsageError: nothing has this name, or it is no model; DataError: a file was found but cannot be used.
     """
     if isinstance(model, Mapping):
         return ResolvedModel(ModelCard("features", family=_ELSEWHERE), activations=model)

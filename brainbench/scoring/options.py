@@ -12,7 +12,7 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from brainbench.core.errors import UsageError, shown, unknown_name
+from brainbench.core.errors import UsageError, check_name, shown
 from brainbench.core.reading.ranges import check_number
 
 if TYPE_CHECKING:
@@ -108,10 +108,8 @@ class ScoreOptions:
             check_number("weights_seed", self.weights_seed, least=0, whole=True)
         if self.bin is not None:
             check_number("bin", self.bin, above=0)
-        if self.time not in TIME_RULES:
-            raise unknown_name("time rule", self.time, TIME_RULES)
-        if self.readout not in READOUTS:
-            raise unknown_name("readout", self.readout, READOUTS)
+        check_name("time rule", self.time, TIME_RULES)
+        check_name("readout", self.readout, READOUTS)
         if self.readout == "published" and (self.time != "mean" or self.over_time):
             raise UsageError("The published readout averages time by its own rule; leave out --time and --over-time.")
         if self.units_reliability is not None:
@@ -126,8 +124,7 @@ class ScoreOptions:
         """
         known = [item.name for item in fields(cls)]
         for name in values:
-            if name not in known:
-                raise unknown_name("option of a score", name, known)
+            check_name("option of a score", name, known)
         layers = values.get("layers")
         if layers is not None and not (
             isinstance(layers, (list, tuple)) and all(isinstance(name, str) for name in layers)

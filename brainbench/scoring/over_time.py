@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from brainbench.core.errors import DataError, UsageError
-from brainbench.core.progress import Progress
+from brainbench.core.progress import Progress, stages
 from brainbench.metrics.measures.registry import get_metric, list_metrics
 from brainbench.metrics.measures.rsa import RSA
 from brainbench.metrics.reliability.units import reliable_units
@@ -38,20 +38,9 @@ def time_course(
     """Return the score over time of a model against recordings in bins.
 
     The window of the recordings begins when the stimuli do. Where the stimuli do not state their duration, they last as
-    long as the window.
-
-    Args:
-        brain: Recordings in bins of one width.
-        network: Activations of the model.
-        metric: How RDMs are made and compared.
-        kept: Labels that are scored, in order.
-        rows: Rows of the activations for these labels.
-        options: Hold the seed of split halves and permutations, and the reliability that units must have.
-        progress: Called with (done, total, what).
-
-    Raises:
-        DataError: the recordings have no bins of time.
-        UsageError: fewer than 3 bins or 4 stimuli.
+    long as the window. Recordings have bins of one width; ``kept`` are the labels that are scored, in order, and
+    ``rows`` those of the activations. The options hold the seed, and the reliability that units must have.
+    Raises DataError: the recordings have no bins of time; UsageError: fewer than 3 bins or 4 stimuli.
     """
     if "time" not in brain.dataset.coords or brain.dataset.sizes["time"] < 3:
         raise DataError(
@@ -63,9 +52,9 @@ def time_course(
     seconds = width * len(begins) if network.seconds is None else network.seconds
     sessions = brain.trials(kept)
     how: dict[str, Any] = {"method": metric.brain_method, "noise": metric.noise, "comparison": metric.comparison}
-    total, animals, layers = len(sessions) + len(network.activations), [], {}
+    stage_done = stages(len(sessions) + len(network.activations), "RDMs over time", progress)
+    animals, layers = [], {}
     for subject, blocks in sessions.items():
-        _tell(progress, len(animals), total)
         note = ""
         if options.units_reliability is not None:
             blocks, note = reliable_units(blocks, len(kept), least=options.units_reliability, seed=options.seed)
@@ -74,13 +63,8 @@ def time_course(
         else:
             nothing = np.full((len(begins), math.comb(len(kept), 2)), np.nan)
             animals.append(AnimalMovie(subject, nothing, nothing[:, 0], (note,) * len(begins)))
+        stage_done()
     for name, values in network.activations.items():
-        _tell(progress, len(animals) + len(layers), total)
         layers[name] = layer_movie(values[rows], seconds / values.shape[1], width, method=metric.model_method)
-    _tell(progress, total, total)
+        stage_done()
     return score_over_time(layers, animals, width=width, comparison=metric.comparison, seed=options.seed)
-
-
-def _tell(progress: Progress | None, done: int, total: int) -> None:
-    if progress is not None:
-        progress(done, total, "RDMs over time")

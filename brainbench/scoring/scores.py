@@ -12,7 +12,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
-from brainbench.core.errors import UsageError, unknown_name
+from brainbench.core.errors import UsageError, check_name
 from brainbench.core.files import provenance, to_plain
 from brainbench.core.progress import Progress, stages
 from brainbench.core.provenance import Provenance
@@ -210,8 +210,7 @@ def _metric(options: ScoreOptions) -> Metric:
     if metric.name == "rsa" and (options.explain or options.estimator != "default"):
         # The published estimators were those of correlation distances.
         metric = get_metric("rsa-correlation")
-    if options.estimator not in metric.estimators:
-        raise unknown_name(f"estimator of the metric {metric.name!r}", options.estimator, metric.estimators)
+    check_name(f"estimator of the metric {metric.name!r}", options.estimator, metric.estimators)
     if options.explain and metric.name != "rsa-correlation":
         raise UsageError(f"The published estimator is one of RSA; the metric {metric.name!r} has none to explain.")
     if options.over_time:

@@ -11,10 +11,10 @@ from brainbench.core.errors import DataError
 from brainbench.core.trials import Trials
 from brainbench.datasets import check, inspect, open_recordings, write_recordings
 from brainbench.datasets.sessions import SessionTable, make_session
-from brainbench.datasets.synthetic import ResponseGeometry, as_recordings, simulate
+from brainbench.datasets.synthetic import ResponseGeometry, simulate
 from brainbench.datasets.trials.session_trials import pooled, trials_by_subject
 from brainbench.metrics.reliability.subject_rdm import subject_rdm
-from tests.factories.recordings import make_simple_session, quiet_design
+from tests.factories.recordings import as_recordings, make_simple_session, quiet_design
 
 
 def make_geometry(stimuli):
@@ -83,21 +83,21 @@ def test_two_stimuli_are_read_and_one_pair_cannot_be_compared():
     assert result(dataset, "synthetic01").problem
 
 
-def test_two_thousand_stimuli_keep_their_order_and_are_proposed(tmp_path):
-    names = [f"image-{index}" for index in np.random.default_rng(0).permutation(2000)]
-    path = many(tmp_path, trials=4000, units=4, stimuli=names)
+def test_five_hundred_stimuli_keep_their_order_and_are_proposed(tmp_path):
+    names = [f"image-{index}" for index in np.random.default_rng(0).permutation(500)]
+    path = many(tmp_path, trials=1000, units=4, stimuli=names)
     dataset = open_recordings(path, conditions="trials:stimulus")
-    assert dataset.attrs["vocabulary"] == [f"image-{index}" for index in range(2000)]
+    assert dataset.attrs["vocabulary"] == [f"image-{index}" for index in range(500)]
     (proposal,) = inspect(path).proposals
-    assert (len(proposal.labels), proposal.fewest) == (2000, 2)
-    geometry = make_geometry(2000)
-    assert geometry.rdm.shape == (1_999_000,)
+    assert (len(proposal.labels), proposal.fewest) == (500, 2)
+    geometry = make_geometry(500)
+    assert geometry.rdm.shape == (124_750,)
     (animal,) = simulate(geometry, quiet_design(animals=1, units=10, trials=2))
-    assert animal.truth.shape == (1_999_000,)
+    assert animal.truth.shape == (124_750,)
 
 
-def hundred_thousand(tmp_path):
-    units, trials = 100_000, 12
+def many_units(tmp_path, units):
+    trials = 12
     random = np.random.default_rng(0)
     counts = random.poisson(4.0, units)
     times = random.uniform(0, trials + 2, counts.sum())
@@ -110,18 +110,18 @@ def hundred_thousand(tmp_path):
     return write_recordings(tmp_path / "a.h5", session), counts
 
 
-def test_a_hundred_thousand_units_are_read_and_checked(tmp_path):
-    path, counts = hundred_thousand(tmp_path)
+def test_five_thousand_units_are_read_and_checked(tmp_path):
+    path, counts = many_units(tmp_path, 5_000)
     dataset = open_recordings(path, conditions="trials:stimulus", window="start..+0.5")
     silent = int(np.sum(counts == 0))
     assert dataset.attrs["removed"]["units: no spikes"] == silent
-    assert dataset.sizes["unit"] == 100_000 - silent
-    assert f"{silent} of 100000 (2 %) units" in str(check(path))
+    assert dataset.sizes["unit"] == 5_000 - silent
+    assert f"{silent} of 5000 (2 %) units" in str(check(path))
 
 
 @pytest.mark.slow
 def test_a_hundred_thousand_units_need_little_memory(tmp_path):
-    path, _ = hundred_thousand(tmp_path)
+    path, _ = many_units(tmp_path, 100_000)
     tracemalloc.start()
     open_recordings(path, conditions="trials:stimulus", window="start..+0.5")
     peak = tracemalloc.get_traced_memory()[1]

@@ -1,6 +1,6 @@
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from brainbench.core.errors import DataError, UsageError
@@ -26,6 +26,7 @@ def test_natural_order_reads_numbers_in_text():
     assert sorted(labels, key=natural_key) == ["-1", "9", "10", "a", "b2", "b10"]
 
 
+@settings(max_examples=40, deadline=None)
 @given(st.lists(st.text(), unique=True), st.randoms())
 def test_natural_order_does_not_depend_on_appearance(labels, random):
     shuffled = labels.copy()

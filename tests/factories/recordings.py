@@ -7,6 +7,13 @@ import numpy as np
 from brainbench.core.contracts import CHANNELS
 from brainbench.datasets.sessions import Session, make_session
 from brainbench.datasets.synthetic import PopulationDesign
+from brainbench.datasets.synthetic.populations import draw_sessions
+from brainbench.datasets.synthetic.sessions import trial_times
+from brainbench.datasets.trials.conditions import Conditions
+from brainbench.datasets.trials.counting import UNIT_COLUMNS, ReadingOptions, SessionCounts, missing_column
+from brainbench.datasets.trials.joining import join_sessions
+from brainbench.datasets.trials.selection import EVERYTHING, Tally
+from brainbench.datasets.trials.windows import Window
 
 LABELS = ("convex-close", "convex-medium", "convex-far", "concave-close", "concave-medium", "concave-far")
 
@@ -67,3 +74,39 @@ def quiet_design(**changes):
     """A design without any noise but Poisson's and without individual differences, apart from ``changes``."""
     quiet = {"animals": 11, "units": 40, "trials": 20, "rate": 8.0, "window": 1.0, "modulation": 0.3}
     return PopulationDesign(**{**quiet, "emphasis": 0.0, "dispersion": 0.0, "shared_gain": 0.0, **changes})
+
+
+def as_recordings(geometry, design=None, *, seed=0):
+    """Synthetic animals as a recordings data set, with the counts of files of the same seed."""
+    counted, length = [], (design or PopulationDesign()).window
+    for drawn in draw_sessions(geometry, design, seed):
+        trials, units = drawn.counts.shape
+        labels = tuple(geometry.labels[index] for index in drawn.labels)
+        begin, _ = trial_times(drawn)
+        counted.append(
+            SessionCounts(
+                subject=drawn.subject,
+                session=drawn.session,
+                source=f"{drawn.subject}-{drawn.session}",
+                values=tuple((label,) for label in labels),
+                labels=labels,
+                trial_ids=tuple(map(str, range(trials))),
+                unit_ids=tuple(map(str, range(units))),
+                edges=np.stack([begin, begin + length], axis=1),
+                counts=drawn.counts[:, None].astype(np.float32),
+                duration=np.full((trials, 1), length),
+                columns={name: missing_column(kind, units) for name, kind in UNIT_COLUMNS.items()},
+                covariates={},
+                tally=Tally(),
+                trials=trials,
+                units=units,
+                synthetic=True,
+            )
+        )
+    options = ReadingOptions(
+        Conditions("trials", ("stimulus",)),
+        geometry.labels,
+        EVERYTHING,
+        Window("choice", offset=-length, length=length),
+    )
+    return join_sessions(counted, options, source="synthetic", layout="", notes=[])

@@ -10,11 +10,15 @@ from scipy import stats
 
 from brainbench.core.errors import UsageError
 from brainbench.metrics import compare
-from brainbench.metrics.measures.rsa import score_animals
+from brainbench.metrics.measures.rsa import RSA
 from brainbench.metrics.rdms.pairs import permuted_pairs
 from brainbench.metrics.reliability.noise_correction import spearman_brown
 from brainbench.metrics.reliability.subject_rdm import subject_rdm
 from tests.factories.animals import STIMULI, make_block, make_latent, make_rdm, make_subject
+
+
+def score_animals(animals, stimuli=STIMULI):
+    return RSA(comparison="pearson").score_animals(animals, stimuli=stimuli)
 
 
 def _make_animals(count, seed=0, noise=3.0, latent=None, splits=100):

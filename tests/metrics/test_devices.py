@@ -10,8 +10,7 @@ from brainbench.core.errors import DataError, UsageError
 from brainbench.metrics import compare_models, noise_precision, permutation_test, rdm
 from brainbench.metrics.measures.rsa import score_rdms
 from brainbench.metrics.rdms.comparison import COMPARISONS
-from brainbench.metrics.rdms.dissimilarity import RDM_METHODS, rdm_problem
-from brainbench.metrics.rdms.movies import rdm_movie
+from brainbench.metrics.rdms.dissimilarity import RDM_METHODS
 from brainbench.metrics.rdms.noise import NOISE_METHODS
 from tests.factories.animals import STIMULI, make_rdm, make_subject
 
@@ -122,11 +121,8 @@ def test_scores_are_the_same(device):
 def test_a_tensor_is_computed_where_it_lies_whatever_asks():
     patterns = torch.arange(12, dtype=torch.float32, requires_grad=True).reshape(3, 4) ** 2
     np.testing.assert_allclose(rdm(patterns), rdm(patterns.detach().numpy()), atol=1e-12)
-    assert rdm_problem(patterns) is None
     assert rdm(torch.arange(6).reshape(2, 3), method="sqeuclidean").tolist() == [9.0]
     assert rdm(torch.eye(3).bfloat16(), method="sqeuclidean") == pytest.approx([2 / 3] * 3)
-    movie = np.random.default_rng(8).normal(size=(4, 5, 6))
-    np.testing.assert_allclose(rdm_movie(movie, device="cpu"), rdm_movie(movie), atol=1e-12)
 
 
 def test_memory_that_must_not_be_written_is_read():

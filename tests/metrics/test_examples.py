@@ -17,8 +17,6 @@ import pytest
         "inference.permutation",
         "inference.multiple",
         "inference.equivalence",
-        "measures.procrustes",
-        "measures.nuisance",
         "measures.classifier",
     ],
 )

@@ -13,8 +13,8 @@ from scipy import stats
 
 from brainbench.core.errors import UsageError
 from brainbench.core.records import Score
+from brainbench.core.statistics import t_interval
 from brainbench.metrics import compare, noise_ceiling, noise_corrected, rdm
-from brainbench.metrics.inference.intervals import t_interval
 from brainbench.metrics.measures.rsa import score_rdms
 from brainbench.metrics.rdms.pairs import permuted_pairs
 from brainbench.metrics.reliability.subject_rdm import subject_rdm

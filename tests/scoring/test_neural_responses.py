@@ -5,9 +5,10 @@ from brainbench import score
 from brainbench.core.errors import DataError, UsageError
 from brainbench.datasets import write_recordings
 from brainbench.datasets.sessions import make_session
-from brainbench.datasets.synthetic import PopulationDesign, ResponseGeometry, as_recordings
+from brainbench.datasets.synthetic import PopulationDesign, ResponseGeometry
 from brainbench.models.features import write_features
 from brainbench.scoring.neural_responses import without_time
+from tests.factories.recordings import as_recordings
 
 
 def test_the_time_rule_averages_only_what_was_recorded():

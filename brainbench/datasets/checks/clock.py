@@ -127,9 +127,8 @@ def response_by_lag(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """Cross-correlate touches and spikes.
 
-    Returns:
-        lags [L] (s), response [L] (Hz, all units together), and its size [L] in robust standard
-        deviations over lags.
+    Returns lags [L] (s), response [L] (Hz, all units together), and its size [L] in robust standard deviations over
+    lags.
     """
     from scipy.signal import fftconvolve
 

@@ -23,7 +23,6 @@ class Finding:
     message: str
     """The fault, in numbers."""
     advice: str = ""
-    """The remedy."""
     values: dict[str, Any] = field(default_factory=dict)
     """The measurements behind it, for programs."""
     where: str = ""

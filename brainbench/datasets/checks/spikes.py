@@ -103,11 +103,9 @@ def _duplicates(spikes: Spikes, names: list[str]) -> Iterator[Finding]:
 def coincidences(spikes: Spikes) -> list[tuple[int, int, float]]:
     """Find pairs of units whose spikes coincide more than chance.
 
-    Every spike is compared with the next ones of all units together, so the cost grows with the number
-    of spikes and not with that of pairs.
-
-    Returns:
-        (unit, unit, share of the smaller one's spikes beyond chance) of all pairs above ``SIMILAR``.
+    Every spike is compared with the next ones of all units together, so the cost grows with the number of spikes and
+    not with that of pairs. Returns (unit, unit, share of the smaller one's spikes beyond chance) of all pairs above
+    ``SIMILAR``.
     """
     lengths = np.array([len(times) for times in spikes])
     judged = np.flatnonzero(lengths >= _FEWEST)

@@ -1,6 +1,6 @@
-"""Synthetic recordings whose truth is known, as arrays, data sets, sessions of spike times, or files.
+"""Synthetic recordings whose truth is known, as arrays, sessions of spike times, or files.
 
-A ``geometry`` (from a network's features or an RDM) and a ``design`` give ``populations``: expected rates, trials and
+A ``geometry`` (from a network's features) and a ``design`` give ``populations``: expected rates, trials and
 counts. ``animals`` keeps them as arrays with their truth, ``sessions`` writes files (``spikes`` places their spikes),
 ``truth`` what the neurons encode beside them, ``cache`` makes files once per machine. ``rodgers_demo`` puts the same
 neurons into the task and file layout of Rodgers 2022 (``rodgers_task``).
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from brainbench.datasets.synthetic.geometry import ResponseGeometry
     from brainbench.datasets.synthetic.populations import draw_animals, stimulus_means
     from brainbench.datasets.synthetic.rodgers_demo import ensure_rodgers_demo, make_rodgers_demo
-    from brainbench.datasets.synthetic.sessions import as_recordings, make_sessions, write_files
+    from brainbench.datasets.synthetic.sessions import make_sessions, write_files
     from brainbench.datasets.synthetic.truth import read_truth
 
 __all__ = [
@@ -26,7 +26,6 @@ __all__ = [
     "PopulationDesign",
     "ResponseGeometry",
     "SyntheticAnimal",
-    "as_recordings",
     "calibrate",
     "draw_animals",
     "ensure_rodgers_demo",
@@ -45,7 +44,7 @@ _MODULES = {
     ".design": ("PopulationDesign",),
     ".populations": ("draw_animals", "stimulus_means"),
     ".geometry": ("ResponseGeometry",),
-    ".sessions": ("as_recordings", "make_sessions", "write_files"),
+    ".sessions": ("make_sessions", "write_files"),
     ".truth": ("read_truth",),
 }
 __getattr__, __dir__ = lazy_exports(__name__, {name: module for module, names in _MODULES.items() for name in names})

@@ -13,7 +13,7 @@ from itertools import groupby
 import numpy as np
 from numpy.typing import NDArray
 
-from brainbench.core.errors import UsageError, unknown_name
+from brainbench.core.errors import UsageError, check_name
 from brainbench.core.trials import Trials
 from brainbench.datasets.synthetic.design import MODULATION, PopulationDesign
 from brainbench.datasets.synthetic.geometry import ResponseGeometry
@@ -48,22 +48,12 @@ def simulate(
 ) -> tuple[SyntheticAnimal, ...]:
     """Draw animals that share a geometry.
 
-    Every animal and session has its own random stream, so the first animals of a larger design are
-    those of a smaller one.
-
-    Args:
-        geometry: the shared truth.
-        design: what is recorded; the defaults of :class:`PopulationDesign` if None.
-        seed: one integer, or several (such as study and simulation).
-        faults: ``"zero-fill"``, ``"first-appearance"``: faults of the released analysis, for
-            demonstrations of what they cost; see :data:`FAULTS`.
-
-    Raises:
-        UsageError: an unknown fault, or a missing stimulus that does not exist.
+    Every animal and session has its own random stream, so the first animals of a larger design are those of a smaller
+    one. The seed is one integer, or several (such as study and simulation). ``faults`` names those of :data:`FAULTS`,
+    to show what they cost. Raises UsageError: an unknown fault, or a missing stimulus that does not exist.
     """
     for name in faults:
-        if name not in FAULTS:
-            raise unknown_name("fault", name, FAULTS)
+        check_name("fault", name, FAULTS)
     animals = []
     for subject, group in groupby(draw_sessions(geometry, design, seed), key=lambda item: item.subject):
         drawn = list(group)
@@ -81,19 +71,11 @@ def measure_ceiling(
 ) -> tuple[float, float]:
     """Measure the noise ceiling of a design: what the true geometry itself scores.
 
-    That is the mean Pearson correlation between the true RDM and the RDM measured in one animal
-    (correlation distance of mean responses, sessions joined). Animals without an RDM, because they lack a
-    stimulus or did not answer one at all, are left out.
-
-    Args:
-        geometry: the shared truth.
-        design: what is recorded.
-        simulations: studies drawn, each of ``design.animals`` animals.
-        seed: seed of the first.
-
-    Returns:
-        The ceiling and its Monte-Carlo standard error; NaN if no animal has all stimuli, an RDM is
-        flat (two stimuli), or there is one animal only for the error.
+    That is the mean Pearson correlation between the true RDM and the RDM measured in one animal (correlation distance
+    of mean responses, sessions joined). Animals without an RDM, because they lack a stimulus or did not answer one at
+    all, are left out. ``simulations`` studies are drawn, each of ``design.animals`` animals. Returns the ceiling and
+    its Monte-Carlo standard error; NaN if no animal has all stimuli, an RDM is flat (two stimuli), or there is one
+    animal only for the error.
     """
     truth, stimuli = geometry.rdm, len(geometry.labels)
     scores: list[float] = []
@@ -119,17 +101,9 @@ def calibrate(
 ) -> PopulationDesign:
     """Return the design with the modulation at which it has a given noise ceiling.
 
-    Found by Brent's method with common random numbers: the same animals are drawn at every step.
-
-    Args:
-        geometry: the shared truth.
-        design: all but the modulation.
-        ceiling: wanted value of :func:`measure_ceiling`, between 0 and 1.
-        simulations: studies behind each step; the result is as exact as their Monte-Carlo error.
-        seed: seed of the studies.
-
-    Raises:
-        UsageError: even the largest modulation stays below the ceiling; what is reached is said.
+    Found by Brent's method with common random numbers: the same animals are drawn at every step. ``ceiling`` is the
+    wanted value of :func:`measure_ceiling`; the result is as exact as the Monte-Carlo error of so many ``simulations``.
+    Raises UsageError: even the largest modulation stays below the ceiling; what is reached is said.
     """
 
     from scipy.optimize import root_scalar

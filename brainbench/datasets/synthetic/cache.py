@@ -23,13 +23,10 @@ _log = logging.getLogger(__name__)
 def ensure_recordings(name: str, *key: object, make: Callable[[Path], object]) -> Path:
     """Return the folder of synthetic recordings, making them if this machine has none.
 
-    Two processes may ask at once and either may be killed: every file is written whole, the truth comes last, and
-    a folder without it, or with files missing or of another size or hash, is made again.
-
-    Args:
-        name: begin of the folder's name.
-        key: everything on which the recordings depend.
-        make: writes them, and last their truth, into a folder.
+    Two processes may ask at once and either may be killed: every file is written whole, the truth comes last, and a
+    folder without it, or with files missing or of another size or hash, is made again. The folder's name begins with
+    ``name``; ``key`` is everything on which the recordings depend, and ``make`` writes them into a folder, last their
+    truth.
     """
     target = cache_dir("recordings") / f"{name}-{content_hash(*key)}"
     if not _complete(target):

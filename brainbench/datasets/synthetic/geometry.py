@@ -1,4 +1,4 @@
-"""The geometry that synthetic neurons share: one direction per stimulus, from features or from an RDM."""
+"""The geometry that synthetic neurons share: one direction per stimulus, from features."""
 
 from __future__ import annotations
 
@@ -19,18 +19,14 @@ class ResponseGeometry:
     """[K, D] on their principal axes, D < K or so; the mean of their squared lengths is one."""
     labels: tuple[str, ...]
     """[K] names of the stimuli."""
-    distortion: float = 0.0
-    """Largest difference between the RDM asked for and the one that unit vectors can have."""
 
     @classmethod
     def from_features(cls, features: ArrayLike, labels: Sequence[str] | None = None) -> ResponseGeometry:
         """Take the correlations between the rows of features [K, F], such as a model's activations.
 
-        The truth is then 1 − Pearson between rows, the model's own correlation-distance RDM.
-
-        Raises:
-            UsageError: the features are not [K, F] with K ≥ 2 and F ≥ 2, or labels do not fit.
-            DataError: a value is not finite or a row is constant and has no direction.
+        The truth is then 1 − Pearson between rows, the model's own correlation-distance RDM. Raises UsageError: the
+        features are not [K, F] with K ≥ 2 and F ≥ 2, or labels do not fit; DataError: a value is not finite or a row is
+        constant and has no direction.
         """
         values = _checked(features, 2)
         # Inner products of centred rows of length one are Pearson correlations (r), so the RDM below is 1 − r.
@@ -44,11 +40,9 @@ class ResponseGeometry:
     def from_activations(cls, features: ArrayLike, labels: Sequence[str] | None = None) -> ResponseGeometry:
         """Take the Euclidean distances between stimuli over features [K, F], each standardised over the stimuli.
 
-        Constant features are left out. Unlike :meth:`from_features`, stimuli may be near to the mean response.
-
-        Raises:
-            UsageError: the features are not [K, F] with K ≥ 2, or labels do not fit.
-            DataError: a value is not finite, or every feature is constant.
+        Constant features are left out. Unlike :meth:`from_features`, stimuli may be near to the mean response. Raises
+        UsageError: the features are not [K, F] with K ≥ 2, or labels do not fit; DataError: a value is not finite, or
+        every feature is constant.
         """
         values = _checked(features, 1)
         spread = values.std(axis=0)
@@ -58,38 +52,6 @@ class ResponseGeometry:
         standard = (values[:, varied] - values[:, varied].mean(axis=0)) / spread[varied]
         # Each standardised feature has a mean square of one over stimuli, so /√F makes the mean squared length one.
         return cls(principal_axes(standard / np.sqrt(standard.shape[1])), _labels(labels, len(values)))
-
-    @classmethod
-    def from_rdm(cls, rdm: ArrayLike, labels: Sequence[str] | None = None) -> ResponseGeometry:
-        """Embed a correlation-distance RDM, an upper triangle [P] with values from 0 to 2.
-
-        Distances that no set of unit vectors has are replaced by the nearest ones in the sense of
-        dropped negative eigenvalues; ``distortion`` says by how much.
-
-        Raises:
-            UsageError: the length is no number of pairs, or a distance is outside 0 to 2.
-        """
-        distances = np.asarray(rdm, dtype=np.float64)
-        # P = K (K − 1)/2 solved for K.
-        stimuli = round((1 + np.sqrt(1 + 8 * distances.size)) / 2)
-        if distances.ndim != 1 or stimuli < 2 or stimuli * (stimuli - 1) // 2 != distances.size:
-            raise UsageError(f"An RDM is an upper triangle [K(K-1)/2]; received shape {distances.shape}.")
-        if not (np.isfinite(distances).all() and distances.min() >= 0 and distances.max() <= 2):
-            raise UsageError(
-                f"Correlation distances lie between 0 and 2; received {distances.min():g} to {distances.max():g}. "
-                f"Rescale other distances, or pass features."
-            )
-        pairs = np.triu_indices(stimuli, 1)
-        products = np.eye(stimuli)
-        products[pairs] = products.T[pairs] = 1.0 - distances
-        # Unit vectors with inner products 1 − d, from the eigenvectors of that matrix; negative eigenvalues belong to
-        # no vectors and are dropped, after which lengths are made one again.
-        values, vectors = np.linalg.eigh(products)
-        kept = values > 1e-12 * values[-1]
-        directions = vectors[:, kept] * np.sqrt(values[kept])
-        directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-        made = cls(directions, _labels(labels, stimuli))
-        return cls(directions, made.labels, float(np.abs(made.rdm - distances).max()))
 
     @property
     def rdm(self) -> NDArray[np.float64]:

@@ -2,10 +2,9 @@
 
 Every unit has a mean rate b (log-normal over units) and Gaussian weights w on the axes of a geometry
 (:class:`ResponseGeometry`). Its expected rate for stimulus k is b · max(0, 1 + m (√(1−ι) x_k·w + √ι y_k·w′)): x_k is
-the shared direction of the stimulus, y_k the animal's own random one, m the ``modulation``, ι the ``individual``
-share. Each animal multiplies the axes by its own log-normal ``emphasis``. Squared Euclidean distances over many units
-are then proportional to those between directions; rectification touches less than 0.7 % of the rates at the largest
-modulation.
+the shared direction of the stimulus, y_k the animal's own random one, m the ``modulation``, ι the ``individual`` share.
+Each animal multiplies the axes by its own log-normal ``emphasis``. Squared Euclidean distances over many units are then
+proportional to those between directions; rectification touches less than 0.7 % of the rates at the largest modulation.
 
 Counts are Poisson around that rate, times a gamma gain per unit and trial (``dispersion`` φ: variance =
 mean + φ mean², the negative binomial), times one gain common to all units of a trial (``shared_gain``).
@@ -57,19 +56,10 @@ def draw_animals(
     """Draw animals whose units mix features linearly, such as the activations of a network.
 
     Every animal and session has its own random stream, so the first animals of a larger design are those of a smaller
-    one.
-
-    Args:
-        features: [K, F], each standardised over stimuli (:meth:`ResponseGeometry.from_activations`); or a geometry.
-        design: size and noise; the defaults of :class:`PopulationDesign` if None.
-        seed: one integer, or several (such as study and simulation).
-
-    Returns:
-        Subject → its sessions: ``responses`` [R, 1, U] Hz, ``labels`` [R], ``keys``.
-
-    Raises:
-        UsageError: features are not [K, F], or a missing stimulus does not exist.
-        DataError: a feature is not finite, or all are constant.
+    one. Features [K, F] are each standardised over stimuli (:meth:`ResponseGeometry.from_activations`). The seed is one
+    integer, or several (such as study and simulation). Returns subject → its sessions: ``responses`` [R, 1, U] Hz,
+    ``labels`` [R], ``keys``. Raises UsageError: features are not [K, F], or a missing stimulus does not exist;
+    DataError: a feature is not finite, or all are constant.
     """
     geometry = features if isinstance(features, ResponseGeometry) else ResponseGeometry.from_activations(features)
     animals: dict[str, tuple[Trials, ...]] = {}
@@ -83,8 +73,7 @@ def draw_sessions(
 ) -> Iterator[DrawnSession]:
     """Draw the sessions of every animal; each is a pure function of geometry, design, seed, animal and session.
 
-    Raises:
-        UsageError: a missing stimulus does not exist.
+    Raises UsageError: a missing stimulus does not exist.
     """
     design = design or PopulationDesign()
     for animal in range(design.animals):
@@ -121,11 +110,8 @@ def expected_rates(
 ) -> NDArray[np.float64]:
     """Draw units and return their expected rates [K, U], Hz.
 
-    Args:
-        geometry: what all animals share.
-        design: number of units, rates, modulation and individual differences.
-        own: stream of the animal, fresh: all of its sessions draw the same differences from it.
-        random: stream of the session.
+    ``own`` is the random stream of the animal, fresh: all of its sessions draw the same differences from it; ``random``
+    is that of the session.
     """
     stimuli = len(geometry.labels)
     # Log-normal weights of the axes; their mean square is one, so that the depth of tuning does not depend on them.

@@ -37,7 +37,6 @@ COLUMNS = {
     "choice_time": "Time of the choice lick, s.",
     "response_window_open_time": "From when licks counted, s.",
 }
-"""Meaning of the columns of the trials."""
 
 
 @dataclass(frozen=True)
@@ -69,7 +68,6 @@ class Behaviour:
     """Trials of a session; arrays of length R (rows), times in s on the session clock."""
 
     columns: Mapping[str, NDArray[Any]]
-    """Columns of the trials table."""
     stimulus: NDArray[np.int64]
     """Index of the stimulus; −1 for ``nothing``."""
     onset: NDArray[np.float64]
@@ -89,15 +87,9 @@ def draw_session(
 ) -> Session:
     """Draw one session: neurons answer from the first contact that the files tell to the choice.
 
-    Args:
-        random: source of the draws.
-        plan: what is particular to the session.
-        geometry: stimuli [K], whose labels the trials have.
-        expected: [K, U] expected rates in the window, Hz.
-        runs: whisker → per stimulus the contacts [n, 2] (s after onset).
-
-    Raises:
-        DataError: a stimulus touches none of the whiskers whose contacts are told, or too late for the choice.
+    ``expected`` [K, U] are the rates in the window, Hz; ``runs`` has per whisker and stimulus the contacts [n, 2] (s
+    after onset).
+    Raises DataError: a stimulus touches none of the whiskers whose contacts are told, or too late for the choice.
     """
     behaviour = draw_behaviour(random, plan, geometry.labels)
     first = first_contacts(runs, geometry.labels, plan.lost_whisker)
@@ -202,13 +194,7 @@ def draw_contacts(
 ) -> dict[str, NDArray[np.float64]]:
     """Place the simulated contacts in the session and add single-frame (zero-duration) ones.
 
-    Args:
-        random: source of the draws.
-        behaviour: the trials.
-        runs: whisker → per stimulus the contacts [n, 2] (s after onset).
-
-    Returns:
-        whisker → contacts [n, 2] in the order of time, s.
+    ``runs`` are as in :func:`draw_session`. Returns whisker → contacts [n, 2] in the order of time, s.
     """
     placed = {}
     for whisker, per_stimulus in runs.items():

@@ -1,7 +1,4 @@
-"""Synthetic recordings as a data set, as sessions of spike times, and as NWB or HDF5 files.
-
-All three hold the same counts as ``simulate`` with the same seed.
-"""
+"""Synthetic recordings as sessions of spike times, and as NWB or HDF5 files: the counts of ``simulate`` by one seed."""
 
 from __future__ import annotations
 
@@ -14,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from brainbench.core.errors import unknown_name
+from brainbench.core.errors import check_name
 from brainbench.core.progress import Progress
 from brainbench.datasets.hdf5 import write_recordings
 from brainbench.datasets.sessions import Session, make_session
@@ -22,16 +19,10 @@ from brainbench.datasets.synthetic.geometry import ResponseGeometry
 from brainbench.datasets.synthetic.populations import DrawnSession, PopulationDesign, draw_sessions
 from brainbench.datasets.synthetic.spikes import spike_trains
 from brainbench.datasets.synthetic.truth import SyntheticSession, correlation_rdm, write_synthetic_nwb, write_with_truth
-from brainbench.datasets.trials.conditions import Conditions
-from brainbench.datasets.trials.counting import UNIT_COLUMNS, ReadingOptions, SessionCounts, missing_column
-from brainbench.datasets.trials.joining import join_sessions
-from brainbench.datasets.trials.selection import EVERYTHING, Tally
-from brainbench.datasets.trials.windows import Window
 
 if TYPE_CHECKING:
-    import xarray as xr
+    pass
 
-CONDITIONS = Conditions("trials", ("stimulus",))
 _BEFORE = 0.5
 """From trial start to contact, s."""
 _AFTER = (0.25, 1.25)
@@ -43,52 +34,14 @@ _TOUCH = 0.05
 """Duration of a contact, s."""
 
 
-def as_recordings(
-    geometry: ResponseGeometry, design: PopulationDesign | None = None, *, seed: int | Sequence[int] = 0
-) -> xr.Dataset:
-    """Draw synthetic animals as a recordings data set, ready for ``trials_by_subject`` and ``score``.
-
-    Raises:
-        DataError: the design leaves no trial or one condition only.
-    """
-    counted, length = [], (design or PopulationDesign()).window
-    for drawn in draw_sessions(geometry, design, seed):
-        trials, units = drawn.counts.shape
-        labels = tuple(geometry.labels[index] for index in drawn.labels)
-        begin, _ = _times(drawn)
-        counted.append(
-            SessionCounts(
-                subject=drawn.subject,
-                session=drawn.session,
-                source=f"{drawn.subject}-{drawn.session}",
-                values=tuple((label,) for label in labels),
-                labels=labels,
-                trial_ids=tuple(map(str, range(trials))),
-                unit_ids=tuple(map(str, range(units))),
-                edges=np.stack([begin, begin + length], axis=1),
-                counts=drawn.counts[:, None].astype(np.float32),
-                duration=np.full((trials, 1), length),
-                columns={name: missing_column(kind, units) for name, kind in UNIT_COLUMNS.items()},
-                covariates={},
-                tally=Tally(),
-                trials=trials,
-                units=units,
-                synthetic=True,
-            )
-        )
-    options = ReadingOptions(CONDITIONS, geometry.labels, EVERYTHING, Window("choice", offset=-length, length=length))
-    return join_sessions(counted, options, source="synthetic", layout="", notes=[])
-
-
 def make_sessions(
     geometry: ResponseGeometry, design: PopulationDesign | None = None, *, seed: int | Sequence[int] = 0
 ) -> list[Session]:
     """Draw synthetic animals as sessions of spike times.
 
-    A trial begins 0.5 s before a whisker touches (table ``contacts_by_whisker_C1``); 15 % of the spikes
-    that are counted come about 12 ms after that touch, the others anywhere in the window; between
-    windows units fire at half their mean rate, and never twice within 2 ms (less at rates above
-    250 Hz). The window is ``first-contact..choice``.
+    A trial begins 0.5 s before a whisker touches (table ``contacts_by_whisker_C1``); 15 % of the spikes that are
+    counted come about 12 ms after that touch, the others anywhere in the window; between windows units fire at half
+    their mean rate, and never twice within 2 ms (less at rates above 250 Hz). The window is ``first-contact..choice``.
     """
     return [_session(geometry, drawn) for drawn in draw_sessions(geometry, design, seed)]
 
@@ -108,25 +61,12 @@ def write_files(
     """Write synthetic animals as files, one per session, with ``truth.json`` beside them.
 
     Opened again (layout ``synthetic``) they give the counts of :func:`~brainbench.datasets.synthetic.draw_animals`;
-    ``read_truth`` reads the truth.
-
-    Args:
-        folder: created if needed; files of the same names are replaced.
-        geometry: what the units encode.
-        design: size and noise; the defaults of :class:`PopulationDesign` if None.
-        seed: as in ``draw_animals``.
-        format: ``nwb`` or ``h5``.
-        stimuli: recipe of the stimuli, which the files then name.
-        distance: makes the RDM of each animal's expected rates [K, U] for the truth.
-        progress: called as ``progress(done, total, what)`` after each session.
-        about: what else the truth holds.
-
-    Raises:
-        UsageError: a format other than ``nwb`` and ``h5``.
+    ``read_truth`` reads the truth. Files of the same names are replaced. The format is ``nwb`` or ``h5``, ``stimuli`` a
+    recipe that the files then name. ``distance`` makes the RDM of each animal's expected rates [K, U] for the truth,
+    ``about`` is what else that holds. Raises UsageError: a format other than ``nwb`` and ``h5``.
     """
     writers: dict[str, Callable[[Path, Session], Path]] = {"nwb": write_synthetic_nwb, "h5": write_recordings}
-    if format not in writers:
-        raise unknown_name("format", format, writers)
+    check_name("format", format, writers)
     design = design or PopulationDesign()
 
     def draw() -> Iterator[SyntheticSession]:
@@ -150,7 +90,7 @@ def write_files(
     )
 
 
-def _times(drawn: DrawnSession) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def trial_times(drawn: DrawnSession) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the contact and the end of every trial [R], s."""
     # A stream of its own, apart from that of the spikes: data set and files have equal times, whatever else is drawn.
     pause = np.round(np.random.default_rng([*drawn.stream, 2]).uniform(*_AFTER, len(drawn.labels)), 4)
@@ -161,7 +101,7 @@ def _times(drawn: DrawnSession) -> tuple[NDArray[np.float64], NDArray[np.float64
 
 def _session(geometry: ResponseGeometry, drawn: DrawnSession) -> Session:
     random = np.random.default_rng([*drawn.stream, 1])
-    begin, stop = _times(drawn)
+    begin, stop = trial_times(drawn)
     choice, end = begin + drawn.window, float(stop[-1])
     # The rate between windows is the same for all stimuli: a reader that mistakes the window loses the geometry.
     spikes = spike_trains(random, drawn.counts, begin, drawn.window, REST * drawn.expected.mean(axis=0), (0.0, end))

@@ -23,16 +23,9 @@ def spike_trains(
 ) -> list[NDArray[np.float64]]:
     """Place the spikes of a session: counted ones in the trials' windows, and others at a constant rate between them.
 
-    Args:
-        random: source of the draws.
-        counts: [R, U] spikes in each window.
-        begin: [R] begin of the windows, ascending, s.
-        length: length of all windows, or of each [R], s; they do not overlap.
-        rest: [U] rate outside the windows, Hz.
-        span: first and last second of the recording.
-
-    Returns:
-        spike times of each unit [U], s; 15 % of those in a window come about 12 ms after its begin.
+    ``counts`` [R, U] are the spikes in windows that do not overlap, with ``begin`` [R] (ascending, s) and ``length`` of
+    all or of each [R], s; ``rest`` [U] are the rates outside of them, Hz, and ``span`` the first and last second.
+    Returns spike times of each unit [U], s; 15 % of those in a window come about 12 ms after its begin.
     """
     # The margins keep the refractory time between the spikes of a window and those around it.
     opened = np.concatenate([[span[0]], begin + length]) + _DEAD
@@ -54,18 +47,9 @@ def _place_spikes(
 ) -> NDArray[np.float64]:
     """Place counted spikes [R] in windows, none within the refractory time of another.
 
-    Positions are drawn in the window shortened by all refractory times, sorted, and spread apart by
-    them: exactly ``counts`` spikes, at least the refractory time between any two.
-
-    Args:
-        random: source of the draws.
-        counts: spikes of each window.
-        begin: begin of each window, s.
-        length: length of all windows, or of each [R], s.
-        onset: share of the spikes at the latency after the begin.
-
-    Returns:
-        spike times, s, window after window.
+    Positions are drawn in the window shortened by all refractory times, sorted, and spread apart by them: exactly
+    ``counts`` spikes, at least the refractory time between any two. ``onset`` is the share of the spikes at the latency
+    after the begin of their window. Returns spike times, s, window after window.
     """
     long = np.broadcast_to(np.asarray(length, dtype=np.float64), counts.shape)
     # At high counts the refractory time shrinks, so that it fills at most half of any window.

@@ -59,16 +59,9 @@ def write_with_truth(
 ) -> list[Path]:
     """Write sessions as files ``sub-…_ses-…SUFFIX``, and last their truth.
 
-    Args:
-        folder: created if needed; files of the same names are replaced.
-        sessions: drawn one after the other, all of one subject together.
-        write: writes one of them atomically.
-        suffix: end of the files' names.
-        distance: makes the RDM [P] of expected responses [K, U].
-        about: what else ``truth.json`` holds: ``labels``, and ``shared``, the RDM [P] of the shared geometry.
-
-    Returns:
-        The files of the sessions.
+    Sessions of one subject come together. ``write`` writes one of them atomically, ``distance`` makes the RDM [P] of
+    expected responses [K, U], and ``about`` is what else the truth holds: ``labels``, and ``shared``, the RDM [P] of
+    the shared geometry. Returns the files of the sessions.
     """
     folder = Path(folder)
     expected: dict[str, list[NDArray[np.float64]]] = {}
@@ -93,8 +86,7 @@ def write_with_truth(
 def read_truth(folder: str | os.PathLike[str]) -> dict[str, Any]:
     """Return the truth of synthetic recordings: labels, and RDMs [P] of ``shared`` and ``subjects``.
 
-    Raises:
-        DataError: there is none.
+    Raises DataError: there is none.
     """
     truth = read_json(Path(folder) / TRUTH)
     truth["shared"] = np.array(truth["shared"])

@@ -25,15 +25,8 @@ def join_sessions(
 ) -> xr.Dataset:
     """Join the sessions' trials and units, block by block, in canonical order.
 
-    Args:
-        parts: what was read of each session, in any order.
-        options: how the sessions were read.
-        source: what the user asked for.
-        layout: name of the layout, with how it was chosen, or "".
-        notes: what was noted before.
-
-    Raises:
-        DataError: no trial, no unit or only one condition remains.
+    ``source`` is what the user asked for, ``layout`` the name of the layout with how it was chosen, or "".
+    Raises DataError: no trial, no unit or only one condition remains.
     """
     import xarray as xr
 

@@ -21,7 +21,7 @@ import numpy as np
 from brainbench.core.contracts import CHANNELS, GRID_SHAPE
 from brainbench.core.errors import DataError, UsageError, check_name, listing
 from brainbench.core.files import cache_dir, content_hash
-from brainbench.core.progress import Progress
+from brainbench.core.progress import Progress, track
 from brainbench.core.reading.sealed import read_sealed, write_sealed
 from brainbench.datasets.whisking.files import Buffers, most_open, open_shard, read_manifest
 from brainbench.datasets.whisking.sweep_tree import is_sweep_tree, open_sweep_tree
@@ -272,20 +272,13 @@ class WhiskingDataset:
     def verify(self, *, again: bool = True, progress: Progress | None = None) -> None:
         """Read every byte of the split and compare hashes.
 
-        Args:
-            again: Also read shards that were found whole before and did not change since.
-            progress: Called with (done, total, what).
+        Shards that were found whole before and did not change since are read only ``again``.
 
         Raises:
             DataError: a shard is not what was generated; the message names it.
         """
-        for done, shard in enumerate(self._shards):
-            if progress is not None:
-                progress(done, len(self._shards), "shards verified")
-            if again:
-                shard.verify()
-            else:
-                shard.verify_once()
+        for shard in track(self._shards, "shards verified", progress):
+            (shard.verify if again else shard.verify_once)()
 
     def statistics(self) -> ChannelStatistics:
         """Return mean, spread and largest value of each channel over the sweeps of the split.

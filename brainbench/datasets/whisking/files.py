@@ -60,8 +60,8 @@ class Shard:
             found = hash_arrays({**arrays, "wrench": self.forces()})
         if found != self.content_hash:
             raise DataError(
-                f"The numbers in {str(self.path)!r} do not match the hash in the manifest: it was damaged or edited; "
-                "remove it and give the command that made the data set again."
+                f"The numbers in {str(self.path)!r} do not match the hash in the manifest: it was damaged or edited. "
+                f"{_AGAIN}"
             )
 
     def verify_once(self) -> None:
@@ -75,11 +75,7 @@ class Shard:
 
 
 def read_manifest(folder: Path) -> Mapping[str, Any]:
-    """Read the manifest of a finished data set.
-
-    Raises:
-        DataError: there is none, or it is of a newer layout.
-    """
+    """Read the manifest of a finished data set. Raises DataError: there is none, or it is of a newer layout."""
     path = folder / "manifest.json"
     if not path.is_file():
         if (folder / "config.json").is_file():
@@ -115,8 +111,7 @@ def read_manifest(folder: Path) -> Mapping[str, Any]:
 def open_shard(path: Path, entry: Mapping[str, Any], manifest: Mapping[str, Any]) -> Shard:
     """Read what stands beside the forces of a shard that the manifest names.
 
-    Raises:
-        DataError: the file is missing, damaged, or another one.
+    Raises DataError: the file is missing, damaged, or another one.
     """
     again = "remove it and give the command that made the data set again"
     if not path.is_file():

@@ -68,23 +68,14 @@ def separability(
 ) -> tuple[Separability, ...]:
     """Measure how well classes are told apart by the forces and moments of all whiskers.
 
-    A sweep's features are its forces and moments averaged over steps of five frames, all whiskers side by side,
-    divided by the root mean square of each channel; the machine is an SVC with radial kernel (C = 10, its width from
-    the variance of the features, as scikit-learn's ``gamma='scale'``), tested by five-fold cross-validation over
-    objects. Nothing was tuned. Memory grows with the square of the number of sweeps: 10 MB for 1,600.
-
-    Args:
-        data: the sweeps; ``split='all'`` uses every object.
-        classes: which; the four with the most objects when None, in alphabetical order.
-        counts: how many classes at a time; all choices of so many of ``classes`` are averaged.
-        sweeps_per_class: sweeps drawn of each class, evenly from its objects.
-        seed: of the draw, the folds and the resampling.
-        progress: called as ``progress(done, total, what)``.
-
-    Raises:
-        UsageError: a class is unknown, or there are fewer classes than ``counts`` asks for.
-        DataError: a class has fewer than two objects.
-        MissingDependencyError: scikit-learn is not installed.
+    A sweep's features are its forces and moments averaged over steps of five frames, all whiskers side by side, divided
+    by the root mean square of each channel; the machine is an SVC with radial kernel (C = 10, its width from the
+    variance of the features, as scikit-learn's ``gamma='scale'``), tested by five-fold cross-validation over objects.
+    Nothing was tuned. Memory grows with the square of the number of sweeps: 10 MB for 1,600. ``classes`` are the four
+    with the most objects by default; all choices of each number in ``counts`` of them are averaged.
+    ``sweeps_per_class`` are drawn evenly from the objects of each. Raises UsageError: a class is unknown, or there are
+    fewer classes than ``counts`` asks for; DataError: a class has fewer than two objects; MissingDependencyError:
+    scikit-learn is not installed.
     """
     objects = data.objects
     chosen = _choose_classes(data.classes, data.labels, objects, classes, max(counts))
@@ -113,11 +104,8 @@ def separate(
     """Measure how well classes are told apart by features [n, F], for all choices of ``count`` of them.
 
     ``names`` are those of the labels [n]. Sweeps of the same object (``objects`` [n]) stay on one side of every test.
-
-    Raises:
-        UsageError: there are fewer classes than ``count``.
-        DataError: a class has fewer than two objects.
-        MissingDependencyError: scikit-learn is not installed.
+    Raises UsageError: there are fewer classes than ``count``; DataError: a class has fewer than two objects;
+    MissingDependencyError: scikit-learn is not installed.
     """
     try:
         from sklearn.metrics.pairwise import rbf_kernel

@@ -35,10 +35,6 @@ class EquivalenceTest:
     """Interval of the difference at level 1 − 2α: inside ±margin exactly when the model passes."""
     p: float
     """p of equivalence: the larger of the two one-sided p."""
-    p_lower: float
-    """p of the hypothesis that the model is worse than the animals by the margin or more."""
-    p_upper: float
-    """p of the hypothesis that the model is better than the animals by the margin or more."""
     verdict: str
     """``equivalent``, ``worse``, ``better`` (the interval lies wholly outside the margin) or ``undecided``."""
     status: Status
@@ -83,7 +79,7 @@ def equivalence_test(
     count = len(difference)
     if count < 2 or len(without) < 2:
         reason = f"{count} animals and {len(without)} stimuli have a difference; at least 2 of each are needed"
-        return EquivalenceTest(math.nan, margin, None, math.nan, math.nan, math.nan, "undecided", "undefined", reason)
+        return EquivalenceTest(math.nan, margin, None, math.nan, "undecided", "undefined", reason)
     # Two one-sided t tests (Schuirmann 1987), t = (margin ± mean)/error. Both reject at level α exactly when the
     # interval at level 1 − 2α lies within ±margin.
     mean = float(difference.mean())
@@ -99,7 +95,7 @@ def equivalence_test(
     needed = f"at least {FEWEST_ANIMALS} and {FEWEST_STIMULI} are needed"
     reason = f"{count} animals and {len(without)} stimuli; {needed}" if few else ""
     return EquivalenceTest(
-        mean, margin, interval, max(lower, upper), lower, upper, verdict, "unreliable" if few else "ok", reason, count
+        mean, margin, interval, max(lower, upper), verdict, "unreliable" if few else "ok", reason, count
     )
 
 
@@ -108,8 +104,7 @@ def turing_test(
 ) -> EquivalenceTest:
     """Test a model's score against the animals' consistency with one another, paired by animal and stimulus.
 
-    Raises:
-        UsageError: a margin or an alpha out of range, or scores by different estimators.
+    Raises UsageError: a margin or an alpha out of range, or scores by different estimators.
     """
     if score.estimator != animal_to_animal.estimator:
         raise UsageError(

@@ -8,7 +8,6 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import ArrayLike
 
-from brainbench.core import statistics
 from brainbench.core.records import Interval, Score
 from brainbench.core.statistics import FEWEST_ANIMALS, FEWEST_STIMULI, LEVEL, check_level, two_factor_error
 
@@ -16,28 +15,13 @@ BEYOND = 1.1
 """Scaled score that no interval should lie above: a tenth of the scale more than all that is reliable."""
 
 
-def t_interval(values: ArrayLike, level: float = LEVEL) -> Interval | None:
-    """Return the t interval of the mean of one value per animal [A]; None for fewer than two or missing ones.
-
-    Raises:
-        UsageError: a level outside (0, 1).
-    """
-    return statistics.t_interval(values, level, over="animals")
-
-
 def two_factor_interval(
     value: float, animals: ArrayLike, without_stimulus: ArrayLike, level: float = LEVEL
 ) -> Interval | None:
     """Return the t interval of a mean over animals and stimuli; None for fewer than two of either.
 
-    Args:
-        value: The mean.
-        animals: [A] values of single animals.
-        without_stimulus: [K] the mean without each stimulus in turn.
-        level: Coverage asked for.
-
-    Raises:
-        UsageError: a level outside (0, 1).
+    ``animals`` [A] are the values of single animals, ``without_stimulus`` [K] the mean without each stimulus in turn.
+    Raises UsageError: a level outside (0, 1).
     """
     from scipy.special import stdtrit
 

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from brainbench.core.errors import UsageError, unknown_name
+from brainbench.core.errors import UsageError, check_name
 from brainbench.core.records import Interval, Score
 from brainbench.core.statistics import FEWEST_ANIMALS, FEWEST_STIMULI, two_factor_error
 from brainbench.metrics.inference.intervals import two_factor_interval
@@ -48,9 +48,7 @@ class PairTest:
     """Two models on the same animals and stimuli."""
 
     first: str
-    """Name of one model."""
     second: str
-    """Name of the other model."""
     difference: float
     """The first's value minus the second's, on the common scale."""
     interval: Interval | None
@@ -168,8 +166,7 @@ def adjust(p: ArrayLike, correction: str) -> Floats:
 
 def check_correction(correction: str) -> None:
     """Raise UsageError with the nearest name unless ``correction`` is known."""
-    if correction not in CORRECTIONS:
-        raise unknown_name("correction for multiple tests", correction, CORRECTIONS)
+    check_name("correction for multiple tests", correction, CORRECTIONS)
 
 
 def compare_scores(first: Score, second: Score) -> PairTest:

@@ -197,12 +197,8 @@ def label_orders(
 ) -> Iterator[Ints]:
     """Yield orders of the stimuli [≤ step, K], the given order first: all K! in lexicographic order, or random ones.
 
-    Args:
-        stimuli: K.
-        seed: Seed of random orders.
-        exact: Most stimuli of which all orders are taken; :data:`EXACT_STIMULI` by default.
-        draws: Number of random orders above; :data:`RANDOM_PERMUTATIONS` by default.
-        step: Most orders yielded at once.
+    All orders are taken up to ``exact`` stimuli (:data:`EXACT_STIMULI` by default), ``draws`` random ones above
+    (:data:`RANDOM_PERMUTATIONS`).
     """
     if stimuli <= (EXACT_STIMULI if exact is None else exact):
         orders = itertools.permutations(range(stimuli))

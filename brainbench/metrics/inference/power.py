@@ -9,7 +9,7 @@ models agree by luck. With s shared by all animals and the other terms drawn ane
     measured    √q · t + √(1 − q) · noise          q: reliability of an animal's RDM
     model       (e/√c) · s + √(1 − e²/c) · other   e: the effect, the score that is true, between chance and 1
 
-Each experiment goes through the permutation test of :func:`brainbench.metrics.score_rdms`, with the
+Each experiment goes through the permutation test of a score, with the
 choice among ``layers`` of which one has the effect and the others know nothing. The comparison is the whitened one
 with the mean distance taken away, which has the same permutations as the whitened cosine and a chance of 0.
 """
@@ -50,8 +50,7 @@ _CHUNK_ELEMENTS = 1 << 21
 class ExperimentDesign:
     """An experiment, and the truth it is to find.
 
-    Raises:
-        UsageError: a number is out of range, or the effect is larger than what the animals share allows.
+    Raises UsageError: a number is out of range, or the effect is larger than what the animals share allows.
     """
 
     stimuli: int = 6
@@ -107,16 +106,7 @@ class Power:
 
 
 def power(design: ExperimentDesign, *, simulations: int = SIMULATIONS, seed: int = 0) -> Power:
-    """Simulate experiments of one design.
-
-    Args:
-        design: What is measured and what is true.
-        simulations: Number of experiments; the interval says what it is good for.
-        seed: Seed of the experiments.
-
-    Raises:
-        UsageError: no positive number of simulations.
-    """
+    """Simulate experiments of one design. Raises UsageError: no positive number of simulations."""
     if simulations < 1:
         raise UsageError(f"A power analysis needs at least 1 simulation; received {simulations}.")
     smallest = smallest_p(design.stimuli, RSA.orders)
@@ -148,8 +138,7 @@ def needed(
 ) -> int | None:
     """Return the smallest tried number of stimuli or animals whose power reaches ``target``; None if none does.
 
-    Raises:
-        UsageError: ``vary`` is neither, or a target outside (0, 1).
+    Raises UsageError: ``vary`` is neither, or a target outside (0, 1).
     """
     tried = {"stimuli": STIMULUS_COUNTS, "animals": ANIMAL_COUNTS}
     if vary not in tried:

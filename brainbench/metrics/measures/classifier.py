@@ -92,12 +92,8 @@ def decode(
 class Decoder:
     """Decodes any assignment of classes to the stimuli of the same rows.
 
-    Names of classes do not matter, so each partition of the stimuli is decoded once.
-
-    Args:
-        matrix: Responses, one row each; finite.
-        rows: Stimulus of each row, numbered from 0, each at least once.
-        penalty: As of :func:`decode`.
+    Names of classes do not matter, so each partition of the stimuli is decoded once. ``matrix`` has one row of finite
+    responses each, ``rows`` their stimuli, numbered from 0, each at least once.
     """
 
     def __init__(self, matrix: Floats, rows: Ints, *, penalty: float = 1.0) -> None:

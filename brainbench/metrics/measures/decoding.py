@@ -1,11 +1,10 @@
 """Decoding of what stimuli have in common, for a model and for each animal (table 3.6 of the work this grew from).
 
-Labels such as ``convex-close`` name properties: the parts between hyphens. Each property that at least two
-stimuli per class share is decoded from the patterns of the other stimuli
-(:func:`~brainbench.metrics.measures.classifier.decode`),
-and the value is the mean accuracy over properties. It is a property of the model alone; the animals' own
-accuracy stands beside it as animal to animal. Accuracy without information lies below one over the number
-of classes, so the permutation's mean is the chance level to read.
+Labels such as ``convex-close`` name properties: the parts between hyphens. Each property that at least two stimuli per
+class share is decoded from the patterns of the other stimuli (:func:`~brainbench.metrics.measures.classifier.decode`),
+and the value is the mean accuracy over properties. It is a property of the model alone; the animals' own accuracy
+stands beside it as animal to animal. Accuracy without information lies below one over the number of classes, so the
+permutation's mean is the chance level to read.
 """
 
 from __future__ import annotations

@@ -49,41 +49,14 @@ class VariancePartition:
     """Reason for an undefined p; empty otherwise."""
 
 
-def nuisance_rdm(values: ArrayLike, labels: ArrayLike) -> Floats:
-    """Return the RDM [P] of a quantity measured in every trial: absolute differences of its stimulus means.
-
-    Args:
-        values: [R] one number per trial (contacts, licks, choice as 0 and 1), NaN where unknown.
-        labels: [R] stimulus of each trial, as in :func:`brainbench.metrics.rdm`.
-
-    Raises:
-        UsageError: not one value and one label per trial.
-        DataError: an infinite value, or a stimulus without any.
-
-    >>> nuisance_rdm([2, 4, 5, 5, 0], ["a", "a", "b", "b", "c"]).tolist()
-    [2.0, 3.0, 5.0]
-    """
-    numbers = np.asarray(values, dtype=np.float64)
-    codes, names = stimulus_codes(labels)
-    if numbers.ndim != 1 or len(numbers) != len(codes):
-        raise UsageError(f"A nuisance has one value per trial [{len(codes)}]; received shape {numbers.shape}.")
-    means = stimulus_means(numbers[:, None], codes, len(names))[:, 0]
-    if not np.isfinite(means).all():
-        raise DataError(f"The nuisance has no value for stimulus {names[int(np.argmin(np.isfinite(means)))]!r}.")
-    return upper(np.abs(means[:, None] - means))
-
-
 def variance_partition(
     model_rdm: ArrayLike, nuisance_rdms: Mapping[str, ArrayLike], brain_rdms: ArrayLike, *, seed: int = 0
 ) -> VariancePartition:
     """Partition the variance of animals' RDMs [A, P] between a model's RDM [P] and nuisance RDMs.
 
-    Ordinary least squares per animal, with an intercept; the R² are averaged over animals. The p-value
-    permutes the model's stimuli, as in :func:`permutation_test`, and tests the partial correlation.
-
-    Raises:
-        UsageError: no nuisances, or RDMs of different numbers of stimuli.
-        DataError: missing pairs, or too few pairs for so many nuisances.
+    Ordinary least squares per animal, with an intercept; the R² are averaged over animals. The p-value permutes the
+    model's stimuli, as in :func:`permutation_test`, and tests the partial correlation. Raises UsageError: no nuisances,
+    or RDMs of different numbers of stimuli; DataError: missing pairs, or too few pairs for so many nuisances.
     """
     if not nuisance_rdms:
         raise UsageError("There are no nuisances; give the RDM of at least one, or use permutation_test.")

@@ -1,9 +1,8 @@
 """Procrustes similarity: how well the best rotation carries one set of patterns onto another.
 
-Patterns are centred over stimuli and scaled to unit size; the value is the cosine of the angular
-Procrustes distance of Williams et al. 2021, ‖XᵀY‖∗ (sum of singular values): 1 when a rotation and a
-scale make the patterns equal. It is not corrected for noise and is well above 0 for unrelated patterns
-(the permutation's mean score stands beside it).
+Patterns are centred over stimuli and scaled to unit size; the value is the cosine of the angular Procrustes distance of
+Williams et al. 2021, ‖XᵀY‖∗ (sum of singular values): 1 when a rotation and a scale make the patterns equal. It is not
+corrected for noise and is well above 0 for unrelated patterns (the permutation's mean score stands beside it).
 """
 
 from __future__ import annotations
@@ -12,13 +11,10 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import ArrayLike
 
-from brainbench.core.errors import UsageError
 from brainbench.metrics.measures.patterns import PatternMetric, centred_products
 from brainbench.metrics.rdms.pairs import Floats, Ints
 from brainbench.metrics.reliability.subject_rdm import SubjectRDM
-from brainbench.metrics.stimulus_labels import response_matrix
 
 
 class Procrustes(PatternMetric):
@@ -41,25 +37,6 @@ class Procrustes(PatternMetric):
         left = _unit(model)
         columns = [_similarities(left, _unit(a.patterns)[place[:, :, None], place[:, None, :]]) for a in animals]
         return np.stack(columns, axis=1)
-
-
-def procrustes_distance(a: ArrayLike, b: ArrayLike) -> float:
-    """Return the angular Procrustes distance [rad] of patterns [K, F] and [K, U], a metric in the strict sense.
-
-    Raises:
-        UsageError: not two matrices with the same number of rows.
-
-    >>> import numpy as np
-    >>> patterns, turn = np.array([[0., 0], [1, 0], [0, 2]]), np.array([[0., 1], [-1, 0]])
-    >>> bool(procrustes_distance(patterns, 3 * patterns @ turn + 7) < 1e-7)
-    True
-    """
-    left, right = response_matrix(a, "stimuli"), response_matrix(b, "stimuli")
-    if len(left) != len(right):
-        raise UsageError(f"Patterns of {len(left)} and {len(right)} stimuli cannot be compared.")
-    value = Procrustes().similarity(left.astype(np.float64), right.astype(np.float64))
-    # Rounding may give 1 + 2e-16, which has no angle.
-    return math.acos(min(value, 1.0)) if math.isfinite(value) else math.nan
 
 
 def _unit(patterns: Floats) -> Floats:

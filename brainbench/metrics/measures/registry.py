@@ -1,9 +1,8 @@
 """Protocol and registry of metrics.
 
-A metric prepares each animal once (:meth:`Metric.animal`) and then scores any number of models against
-them. A new one needs a single file: subclass :class:`brainbench.metrics.measures.patterns.PatternMetric`, write
-``similarity`` and name it in ``brainbench score --metric mine.py:MyMetric``, or call
-:func:`register_metric`.
+A metric prepares each animal once (:meth:`Metric.animal`) and then scores any number of models against them. A new one
+needs a single file: subclass :class:`brainbench.metrics.measures.patterns.PatternMetric`, write ``similarity`` and name
+it in ``brainbench score --metric mine.py:MyMetric``, or call :func:`register_metric`.
 """
 
 from __future__ import annotations

@@ -12,7 +12,6 @@ from numpy.typing import ArrayLike
 
 from brainbench.core.errors import UsageError
 from brainbench.core.records import Score
-from brainbench.metrics.animal_to_animal import score_agreement
 from brainbench.metrics.measures.metric import Metric, usable_features
 from brainbench.metrics.rdms.comparison import check_comparison, compare_all, permuted_comparisons
 from brainbench.metrics.rdms.comparison import compare as compare_rdms
@@ -29,7 +28,11 @@ _CHUNK_ELEMENTS = 1 << 22
 class RSA(Metric):
     """Compare RDMs; corrected by the split-half reliability of each animal's RDM.
 
-    A layer is its RDM [P], NaN in the pairs of a stimulus that it has no value for.
+    A layer is its RDM [P], NaN in the pairs of a stimulus that it has no value for. With the estimator ``default`` each
+    reliable animal is compared with the layer that compares best with the *other* reliable animals, the comparison is
+    corrected for the animal's noise, and the score is the mean over animals; a single animal chooses on one half of its
+    trials and is scored on the other. ``thesis`` and ``thesis-input`` are the published estimators with their maximum
+    over layers, which is optimistic and says so.
     """
 
     name: str = "rsa"
@@ -144,70 +147,23 @@ def score_rdms(
     *,
     name: str,
     stimuli: Sequence[str],
-    estimator: str = "default",
     compare: str = "pearson",
-    seed: int = 0,
-    device: Any = None,
+    **options: Any,
 ) -> Score:
-    """Score a model by the RDMs of its layers against animals.
+    """Score a model by the RDMs [P] of its layers, in network order, against animals of :func:`subject_rdm`.
 
-    ``default``: each reliable animal is compared with the layer that compares best with the *other*
-    reliable animals, the comparison is corrected for the animal's noise, and the score is the mean over
-    animals. The permutation p-value repeats the choice of layer in every permutation. A single animal
-    chooses on one half of its trials and is scored on the other. ``thesis`` and ``thesis-input`` are
-    the published estimators with their maximum over layers, which is optimistic and says so.
+    Both are of the same stimuli in the same order. ``options`` are those of
+    :func:`~brainbench.metrics.score.score_layers`; a torch ``device`` pays from some hundred stimuli on.
 
-    Args:
-        layer_rdms: RDM [P] of each layer, in network order.
-        subjects: From :func:`subject_rdm`, for the same stimuli in the same order.
-        name: Name of the model.
-        stimuli: Names of the K stimuli, in the order of the RDMs.
-        estimator: See :func:`noise_corrected`.
-        compare: Comparison of RDMs, see :func:`brainbench.metrics.compare`.
-        seed: Seed of random permutations (more than 7 stimuli).
-        device: Torch device for the permutations, which pays from some hundred stimuli on; numpy by default.
-
-    Raises:
-        UsageError: no layers or animals, RDMs that do not fit the stimuli, unknown estimator or comparison.
+    Raises UsageError: no layers or animals, RDMs that do not fit the stimuli, unknown estimator or comparison.
     """
     check_comparison(compare)
     rdms = check_layers(layer_rdms, stimuli)
-    options = {"name": name, "stimuli": stimuli, "estimator": estimator, "seed": seed, "device": device}
-    return score_layers(RSA(comparison=compare), rdms, subjects, **options)[0]
-
-
-def score_animals(
-    subjects: Sequence[SubjectRDM],
-    *,
-    stimuli: Sequence[str] | None = None,
-    estimator: str = "default",
-    compare: str = "pearson",
-    seed: int = 0,
-) -> Score:
-    """Score each reliable animal against the mean RDM of the others, both sides corrected for noise.
-
-    Args:
-        subjects: From :func:`subject_rdm`, for the same stimuli in the same order.
-        stimuli: Names of the K stimuli; numbers by default.
-        estimator: See :func:`noise_corrected`.
-        compare: Comparison of RDMs.
-        seed: Seed of the permutations.
-
-    Raises:
-        UsageError: no animals, RDMs that do not fit, unknown estimator or comparison.
-    """
-    check_comparison(compare)
-    if stimuli is None:
-        stimuli = [str(number) for number in range(subjects[0].count if subjects else 0)]
-    return score_agreement(RSA(comparison=compare), subjects, stimuli=stimuli, estimator=estimator, seed=seed)
+    return score_layers(RSA(comparison=compare), rdms, subjects, name=name, stimuli=stimuli, **options)[0]
 
 
 def check_layers(layer_rdms: Mapping[str, ArrayLike], stimuli: Sequence[str]) -> dict[str, Floats]:
-    """Return the layers' RDMs [P] by name.
-
-    Raises:
-        UsageError: no layers, or RDMs of another number of stimuli.
-    """
+    """Return the layers' RDMs [P] by name. Raises UsageError: no layers, or RDMs of another number of stimuli."""
     if not layer_rdms:
         raise UsageError("There are no layers to score; give the RDM of at least one layer.")
     rdms = {str(layer): rdm_stack(values, f"The RDM of layer {layer!r}") for layer, values in layer_rdms.items()}

@@ -12,9 +12,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from brainbench.core.errors import UsageError, unknown_name
+from brainbench.core.errors import UsageError, check_name
 from brainbench.metrics.arrays import fetch, is_tensor, library, place
 from brainbench.metrics.rdms.pairs import Floats, Ints, permuted_pairs, rdm_stack, square, stimulus_count
+
+Transform = Callable[[Floats], Floats]
 
 _CONSTANT = 64 * np.finfo(np.float64).eps
 """An RDM whose spread is below this share of its size is constant up to rounding."""
@@ -30,10 +32,9 @@ _SIGN_LIMIT = 128
 def compare(a: ArrayLike, b: ArrayLike, *, method: str = "pearson") -> Floats:
     """Compare RDMs ``a`` [..., P] with ``b`` [..., P]; leading axes broadcast as in numpy.
 
-    Pairs that are NaN in either RDM are left out of that comparison. A comparison without a value
-    (an RDM constant over the pairs that are left, fewer than 2 pairs) is NaN, except that ``rho-a`` and
-    ``tau-a`` of a constant RDM are 0 by definition and the cosines need only a non-zero RDM. Nothing is
-    clipped: rounding may give 1 + 2e-16.
+    Pairs that are NaN in either RDM are left out of that comparison. A comparison without a value (an RDM constant over
+    the pairs that are left, fewer than 2 pairs) is NaN, except that ``rho-a`` and ``tau-a`` of a constant RDM are 0 by
+    definition and the cosines need only a non-zero RDM. Nothing is clipped: rounding may give 1 + 2e-16.
 
     Args:
         a: RDMs, upper triangles.
@@ -87,16 +88,10 @@ def permuted_comparisons(
 ) -> Iterator[Floats]:
     """Yield comparisons [N, L, A] of layers [L, P], with their stimuli in each order of a chunk [N, K], with animals.
 
-    Ranks, means and lengths of an RDM do not feel the order of its stimuli, so what most comparisons multiply
-    is made once and every order only moves it: one gather and one matrix product, on the processor or on a
-    torch device. Kendall's tau, whose vectors are of pairs of pairs, is compared order by order by numpy.
-
-    Args:
-        layers: RDMs whose stimuli are permuted.
-        brain: RDMs [A, P].
-        chunks: Orders of the stimuli.
-        method: Comparison.
-        device: Torch device for the products, None for numpy.
+    Ranks, means and lengths of an RDM do not feel the order of its stimuli, so what most comparisons multiply is made
+    once and every order only moves it: one gather and one matrix product, on the processor or on a torch device.
+    Kendall's tau, whose vectors are of pairs of pairs, is compared order by order by numpy. Animals are RDMs [A, P];
+    without a device numpy computes.
     """
     complete = bool(np.isfinite(layers).all() and np.isfinite(brain).all())
     if not complete or method not in (*_OF_PAIRS, *_OF_MATRICES):
@@ -120,22 +115,21 @@ def permuted_comparisons(
 
 def features(rdms: Floats, method: str) -> Floats:
     """Return vectors whose inner product is the comparison; NaN where it has no value."""
-    return _FEATURES[method](rdms)
+    return _METHODS[method][0](rdms)
 
 
 def check_comparison(method: str) -> None:
     """Raise UsageError with the nearest name unless ``method`` is a comparison."""
-    if method not in _FEATURES:
-        raise unknown_name("RDM comparison", method, _FEATURES)
+    check_name("RDM comparison", method, _METHODS)
 
 
-def pooling(method: str) -> Callable[[Floats], Floats]:
+def pooling(method: str) -> Transform:
     """Return the transform [..., P] → [..., P] of RDMs before they are averaged to predict one another.
 
     Nili 2014: unit vectors for the cosines, standardised ones for the correlations (the whitened ones
     too, as in rsatoolbox), ranks for the rank correlations (approximate for Kendall's tau).
     """
-    return _POOLING[method]
+    return _METHODS[method][1]
 
 
 def _unit(vectors: Floats, size: Floats | None = None) -> Floats:
@@ -156,10 +150,6 @@ def _ranks(vectors: Floats) -> Floats:
 
 def _pearson(rdms: Floats) -> Floats:
     return _unit(_centred(rdms), rdms)
-
-
-def _spearman(rdms: Floats) -> Floats:
-    return _pearson(_ranks(rdms))
 
 
 def _rho_a(rdms: Floats) -> Floats:
@@ -195,39 +185,20 @@ def _second_moment(rdms: Floats) -> Floats:
     return matrix.reshape(*rdms.shape[:-1], -1)
 
 
-def _whitened_cosine(rdms: Floats) -> Floats:
-    return _unit(_second_moment(rdms))
-
-
-def _whitened_pearson(rdms: Floats) -> Floats:
-    return _unit(_second_moment(_centred(rdms)), rdms)
-
-
-_FEATURES: dict[str, Callable[[Floats], Floats]] = {
-    "pearson": _pearson,
-    "spearman": _spearman,
-    "rho-a": _rho_a,
-    "tau-a": _tau_a,
-    "tau-b": _tau_b,
-    "cosine": _unit,
-    "whitened-cosine": _whitened_cosine,
-    "whitened-pearson": _whitened_pearson,
+_METHODS: dict[str, tuple[Transform, Transform]] = {
+    "pearson": (_pearson, _pearson),
+    "spearman": (lambda rdms: _pearson(_ranks(rdms)), _ranks),
+    "rho-a": (_rho_a, _ranks),
+    "tau-a": (_tau_a, _ranks),
+    "tau-b": (_tau_b, _ranks),
+    "cosine": (_unit, _unit),
+    "whitened-cosine": (lambda rdms: _unit(_second_moment(rdms)), _unit),
+    "whitened-pearson": (lambda rdms: _unit(_second_moment(_centred(rdms)), rdms), _pearson),
 }
+"""Comparison → what makes its vectors, and what RDMs pass through before they are averaged."""
 
-COMPARISONS = tuple(_FEATURES)
+COMPARISONS = tuple(_METHODS)
 """Names that ``method`` of :func:`compare` takes."""
-
-
-_POOLING: dict[str, Callable[[Floats], Floats]] = {
-    "pearson": _pearson,
-    "spearman": _ranks,
-    "rho-a": _ranks,
-    "tau-a": _ranks,
-    "tau-b": _ranks,
-    "cosine": _unit,
-    "whitened-cosine": _unit,
-    "whitened-pearson": _pearson,
-}
 
 
 def _compare_present(left: Floats, right: Floats, method: str) -> Floats:

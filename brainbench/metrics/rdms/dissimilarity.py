@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from brainbench.core.errors import DataError, UsageError, unknown_name
+from brainbench.core.errors import DataError, UsageError, check_name, unknown_name
 from brainbench.metrics.arrays import Array, fetch, find_device, library, place
 from brainbench.metrics.rdms.distances import (
     correlation_distances,
@@ -27,7 +27,7 @@ from brainbench.metrics.rdms.distances import (
 )
 from brainbench.metrics.rdms.noise import NOISE_METHODS, estimate_noise
 from brainbench.metrics.rdms.pairs import Floats, Ints
-from brainbench.metrics.stimulus_labels import listed, response_matrix, stimulus_codes, stimulus_means, tensor_means
+from brainbench.metrics.stimulus_labels import labelled_trials, response_matrix, stimulus_means, tensor_means
 
 POISSON_PRIOR_MEAN = 1.0
 POISSON_PRIOR_WEIGHT = 0.1
@@ -116,8 +116,7 @@ def rdm(
         device: Torch device to compute on (``"cuda"``, ``"cpu"``); by default where ``responses`` lie.
 
     Returns:
-        Distances [P], float64. A pair that has no distance (constant pattern, non-finite entry, no
-        trials) is NaN; :func:`rdm_problem` says why.
+        Distances [P], float64. A pair that has no distance (constant pattern, non-finite entry, no trials) is NaN.
 
     Raises:
         UsageError: unknown method or device, shapes that do not fit, folds missing or not wanted.
@@ -128,8 +127,7 @@ def rdm(
     >>> rdm([[1, 2], [3, 2], [5, 5]], ["b", "b", "a"], method="sqeuclidean").tolist()
     [9.0]
     """
-    if method not in _METHODS:
-        raise unknown_name("RDM method", method, _METHODS)
+    check_name("RDM method", method, _METHODS)
     if folds is not None and method != "crossnobis":
         raise UsageError(f"folds are for method='crossnobis'; method={method!r} averages all trials; leave them out.")
     if precision is not None and method not in ("mahalanobis", "crossnobis"):
@@ -139,31 +137,6 @@ def rdm(
     given = _prepare(responses, labels, folds, precision, device)
     with np.errstate(invalid="ignore", over="ignore"):
         return fetch(_METHODS[method](given))
-
-
-def rdm_problem(responses: ArrayLike, labels: ArrayLike | None = None) -> str | None:
-    """Say in words why some pairs of the RDM of ``responses`` have no distance; None if none does.
-
-    Constant patterns matter to correlation distance only.
-    """
-    matrix = fetch(response_matrix(responses, "stimuli" if labels is None else "trials"))
-    if labels is None:
-        patterns, names = matrix, tuple(str(row) for row in range(len(matrix)))
-    else:
-        codes, names = stimulus_codes(labels)
-        patterns = stimulus_means(matrix, codes, len(names))
-        empty = np.asarray(~np.isfinite(patterns).any(axis=1))
-        if empty.any():
-            return f"no trials of stimulus {listed(names, empty)}"
-    broken = np.asarray(~np.isfinite(patterns).all(axis=1))
-    if labels is None and broken.any():
-        return f"activations that are not finite for stimulus {listed(names, broken)}"
-    with np.errstate(invalid="ignore"):
-        spread = np.nanmax(patterns, axis=1) - np.nanmin(patterns, axis=1)
-        constant = np.asarray(spread <= 8 * np.finfo(np.float64).eps * np.nanmax(np.abs(patterns), axis=1))
-    if constant.any():
-        return f"a constant response across units to stimulus {listed(names, constant)}"
-    return None
 
 
 def _prepare(
@@ -178,11 +151,8 @@ def _prepare(
         matrix, codes = response_matrix(responses, "stimuli"), None
         count = len(matrix)
     else:
-        matrix = response_matrix(responses, "trials")
-        codes, names = stimulus_codes(labels)
+        matrix, codes, names = labelled_trials(responses, labels)
         count = len(names)
-        if len(codes) != len(matrix):
-            raise UsageError(f"There are {len(matrix)} trials but {len(codes)} labels; give one label per trial.")
     if count < 2:
         raise UsageError(f"An RDM compares at least 2 stimuli; received {count}.")
     return _Responses(matrix, count, codes, folds, precision, where)

@@ -1,9 +1,8 @@
 """Distances between stimulus patterns, batched over leading axes.
 
-Patterns are [..., K, U]; results are upper triangles [..., P]. Everything is accumulated in float64
-over slices of units, so a large float32 input is never copied whole, and centred first, so a large
-common offset costs no digits. Patterns may be torch tensors, or be moved to a torch ``device`` slice by
-slice; the result is a tensor there.
+Patterns are [..., K, U]; results are upper triangles [..., P]. Everything is accumulated in float64 over slices of
+units, so a large float32 input is never copied whole, and centred first, so a large common offset costs no digits.
+Patterns may be torch tensors, or be moved to a torch ``device`` slice by slice; the result is a tensor there.
 """
 
 from __future__ import annotations

@@ -14,10 +14,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from brainbench.core.errors import DataError, UsageError, unknown_name
+from brainbench.core.errors import DataError, check_name
 from brainbench.metrics.arrays import Array, cholesky, fetch, find_device, is_tensor, library, place, solve_lower
 from brainbench.metrics.rdms.pairs import Floats, Ints
-from brainbench.metrics.stimulus_labels import response_matrix, stimulus_codes, stimulus_means
+from brainbench.metrics.stimulus_labels import labelled_trials, stimulus_means
 
 _DUAL_RIDGE = 1e-3
 """Share of the diagonal that must not come from trials for the products by Woodbury to keep their digits."""
@@ -50,8 +50,7 @@ class NoiseModel:
     def sides(self, left: Array, right: Array) -> tuple[Array, Array]:
         """Return vectors [N, V] and [M, V] whose inner products are those of ``left`` and ``right`` with C⁻¹ between.
 
-        Raises:
-            DataError: the covariance is singular.
+        Raises DataError: the covariance is singular.
         """
         same = left is right
         left = left / self.scale
@@ -71,11 +70,7 @@ class NoiseModel:
         return join([left, first], -1), join([right, -second], -1) / self.ridge
 
     def precision(self) -> Array:
-        """Return C⁻¹ [U, U].
-
-        Raises:
-            DataError: the covariance is singular.
-        """
+        """Return C⁻¹ [U, U]. Raises DataError: the covariance is singular."""
         eye = library(self.scale).eye(len(self.scale), **_like(self.scale))
         if not self.weight:
             inner = eye / self.ridge
@@ -129,10 +124,7 @@ def noise_precision(
         UsageError: unknown method or shapes that do not fit.
         DataError: no more complete trials than stimuli, units without noise, or a singular covariance.
     """
-    trials = response_matrix(responses, "trials")
-    codes, names = stimulus_codes(labels)
-    if len(codes) != len(trials):
-        raise UsageError(f"There are {len(trials)} trials but {len(codes)} labels; give one label per trial.")
+    trials, codes, names = labelled_trials(responses, labels)
     model = estimate_noise(trials, codes, len(names), method, device=find_device(device, responses))
     return fetch(model.precision())
 
@@ -140,12 +132,10 @@ def noise_precision(
 def estimate_noise(trials: Any, codes: Ints, count: int, method: str, *, device: Any = None) -> NoiseModel:
     """Return the covariance of trials [R, U] about the means of their ``count`` stimuli, on the device.
 
-    Raises:
-        UsageError: unknown method.
-        DataError: as :func:`noise_precision`, but a singular covariance is found only when it is used.
+    Raises UsageError: unknown method; DataError: as :func:`noise_precision`, but a singular covariance is found only
+    when it is used.
     """
-    if method not in NOISE_METHODS:
-        raise unknown_name("noise covariance method", method, NOISE_METHODS)
+    check_name("noise covariance method", method, NOISE_METHODS)
     # Residuals are small beside the products of units that follow, so they are always made by numpy.
     trials = np.asarray(fetch(trials), dtype=np.float64)
     # Products between units need both entries of a trial; filling one would invent covariance.
@@ -244,4 +234,3 @@ _METHODS: dict[str, Callable[[Array, int], NoiseModel]] = {
 }
 
 NOISE_METHODS = tuple(_METHODS)
-"""Names of the estimators."""

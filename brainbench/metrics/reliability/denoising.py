@@ -20,9 +20,7 @@ SIMULATIONS = 20
 def denoised(patterns: Floats, noise: Floats) -> Floats:
     """Return patterns [K, U] whose products are those of the given ones without their noise.
 
-    Args:
-        patterns: [K, U] mean responses.
-        noise: [K, U] variance of these means.
+    ``patterns`` [K, U] are mean responses, ``noise`` [K, U] the variance of these means.
     """
     mean = patterns.mean(axis=0)
     centred = patterns - mean

@@ -36,10 +36,7 @@ BY_PRODUCTS = ("correlation", "sqeuclidean", "crossnobis")
 class SplitRDMs:
     """RDMs of an animal's trials and of their halves.
 
-    Args:
-        sessions: Those of the animal.
-        count: K.
-        method: RDM method.
+    ``count`` is K.
     """
 
     def __init__(self, sessions: list[SortedTrials], count: int, method: str) -> None:

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from brainbench.core.errors import UsageError, unknown_name
+from brainbench.core.errors import UsageError, check_name
 from brainbench.core.records import Status
 from brainbench.metrics.arrays import finite_mean
 from brainbench.metrics.rdms.pairs import Floats
@@ -100,8 +100,7 @@ def noise_corrected(
     >>> noise_corrected(0.6, [0.1, 0.2]).reason
     'reliability 0.26 is below 0.5, where no noise correction is trustworthy'
     """
-    if estimator not in _ESTIMATORS:
-        raise unknown_name("estimator", estimator, _ESTIMATORS)
+    check_name("estimator", estimator, _ESTIMATORS)
     comparison = np.asarray(r_xy, dtype=np.float64).ravel()
     halves = np.asarray(split_half_r, dtype=np.float64).ravel()
     others = None if other_split_half_r is None else np.asarray(other_split_half_r, dtype=np.float64).ravel()
@@ -162,4 +161,3 @@ _ESTIMATORS: dict[str, Callable[[Floats, Floats, Floats | None, list[float]], tu
 }
 
 ESTIMATORS = tuple(_ESTIMATORS)
-"""Names that ``estimator`` takes."""

@@ -1,10 +1,9 @@
 """Sessions of an animal that can be split into halves: their trials sorted, what cannot be split left out.
 
-Rules for what cannot be split:
-a session that lacks two trials of some stimulus (four for ``crossnobis``, whose halves need two) is
-left out, of the RDM too, so that the RDM and its reliability describe the same data; a unit with fewer
-recorded trials of some stimulus is left out of its session. What was left out is told in words.
-Without any session left the animal is undefined.
+Rules for what cannot be split: a session that lacks two trials of some stimulus (four for ``crossnobis``, whose halves
+need two) is left out, of the RDM too, so that the RDM and its reliability describe the same data; a unit with fewer
+recorded trials of some stimulus is left out of its session. What was left out is told in words. Without any session
+left the animal is undefined.
 """
 
 from __future__ import annotations
@@ -22,9 +21,8 @@ from brainbench.metrics.rdms.pairs import Floats, Ints
 from brainbench.metrics.reliability.trial_hashes import Hashes, content_hashes, key_hashes
 from brainbench.metrics.stimulus_labels import (
     check_finite,
+    labelled_trials,
     listed,
-    response_matrix,
-    stimulus_codes,
     stimulus_means,
 )
 
@@ -49,12 +47,8 @@ class SortedTrials(Trials):
     ) -> SortedTrials:
         """Sort trials by stimulus and hash, so that the order in which they came is forgotten.
 
-        Args:
-            responses: [R′, U′].
-            labels: [R] stimulus of the trials that are taken.
-            hashes: [R] theirs.
-            rows: [R] the trials that are taken; all by default.
-            units: index or mask of the units that are taken.
+        ``rows`` [R] are the trials of ``responses`` [R′, U′] that are taken (all by default) and ``units`` an index or
+        mask of its units; ``labels`` and ``hashes`` [R] are those of the trials taken.
         """
         # Sorted by content, sums are formed in one order, so results do not change with the order of trials.
         order = np.lexsort((hashes, labels))
@@ -102,21 +96,15 @@ def usable_sessions(
 ) -> tuple[list[SortedTrials], str | None, tuple[str, ...]]:
     """Check the sessions, leave out what cannot be split and say what.
 
-    Returns:
-        Sessions that can be split; why none can, or None; notes for people.
-
-    Raises:
-        UsageError: trials and labels differ in number, or a label is none of the stimuli.
+    Returns sessions that can be split; why none can, or None; notes for people.
+    Raises UsageError: trials and labels differ in number, or a label is none of the stimuli.
     """
     sessions: list[SortedTrials] = []
     lacking: list[str] = []
     total = np.zeros(count, dtype=np.int64)
     dropped = 0
     for block in blocks:
-        responses = response_matrix(block.responses, "trials")
-        codes, _ = stimulus_codes(block.labels, count)
-        if len(codes) != len(responses):
-            raise UsageError(f"There are {len(responses)} trials but {len(codes)} labels; give one label per trial.")
+        responses, codes, _ = labelled_trials(block.responses, block.labels, count)
         check_finite(responses)
         present = np.isfinite(responses)
         recorded = present.any(axis=1)
@@ -153,8 +141,7 @@ def usable_sessions(
 def trial_hashes(block: Trials, responses: Floats, codes: Ints) -> Hashes:
     """Return one hash per trial, of its key or of its content.
 
-    Raises:
-        UsageError: keys are not one per trial, or repeat.
+    Raises UsageError: keys are not one per trial, or repeat.
     """
     if block.keys is None:
         return content_hashes(responses, codes)

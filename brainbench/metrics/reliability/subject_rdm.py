@@ -18,7 +18,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from brainbench.core.errors import DataError, UsageError, unknown_name
+from brainbench.core.errors import DataError, UsageError, check_name
 from brainbench.core.records import Interval
 from brainbench.core.trials import Trials
 from brainbench.metrics.rdms.comparison import check_comparison, compare
@@ -33,7 +33,6 @@ SPLITS = 1000
 """Random split halves per animal."""
 
 SUBJECT_METHODS = ("correlation", "sqeuclidean", "mahalanobis", "crossnobis", "poisson")
-"""RDM methods of an animal."""
 
 _CHUNK_BYTES = 1 << 24
 _HALVES_BYTES = 1 << 26
@@ -57,14 +56,12 @@ class SubjectRDM:
     method: str = "correlation"
     """Dissimilarity of two stimuli."""
     comparison: str = "pearson"
-    """Comparison of two RDMs."""
     reliability: float = math.nan
     """Spearman-Brown reliability of the mean of ``split_half_r`` (averaged before, not after, the formula)."""
     spread: Interval | None = None
     """Percentiles of single splits' Spearman-Brown values: how much one split would have misled, not a
     confidence interval of the reliability."""
     seed: int = 0
-    """Seed of the splits."""
     problem: str | None = None
     """Reason for having no usable RDM, in words; None otherwise."""
     notes: tuple[str, ...] = ()
@@ -118,28 +115,15 @@ def subject_rdm(
     Every stimulus' trials of each session are split into random halves, whose RDMs are compared. With an odd number
     of trials the larger half is drawn too. Random numbers are hashes of (seed, split, trial key).
 
-    An animal whose data cannot be used comes back with ``problem`` (for example ``no trials of
-    'convex-far'``) instead of an error, so the others can still be scored.
-
-    Args:
-        subject: Name of the animal.
-        blocks: Its sessions.
-        n_stimuli: K.
-        stimuli: Names of the stimuli, for messages.
-        method: RDM method: ``correlation``, ``sqeuclidean``, ``mahalanobis``, ``crossnobis`` or ``poisson``.
-        comparison: Comparison of RDMs, see :func:`brainbench.metrics.compare`.
-        splits: Number of random split halves.
-        seed: Seed of the splits.
-        noise: Noise covariance for ``mahalanobis`` and ``crossnobis``: ``diag``, ``none`` or another of
-            :func:`brainbench.metrics.noise_precision`. ``diag``, ``none`` and ``full`` leave crossnobis
-            unbiased; shrinkage leaves a bias of up to .01 per unit (docs/calibration.md).
-
-    Raises:
-        UsageError: unknown method, bad shapes or labels, repeated trial keys, no positive ``splits``.
-        DataError: infinite responses, or negative ones for ``poisson``.
+    An animal whose data cannot be used comes back with ``problem`` (for example ``no trials of 'convex-far'``) instead
+    of an error, so the others can still be scored. ``n_stimuli`` is K; names of the ``stimuli`` are for messages.
+    ``method`` is one of :data:`SUBJECT_METHODS`. ``noise`` is the noise covariance of ``mahalanobis`` and
+    ``crossnobis``: ``none`` or one of :func:`brainbench.metrics.noise_precision`. ``diag``, ``none`` and ``full`` leave
+    crossnobis unbiased; shrinkage leaves a bias of up to .01 per unit (docs/calibration.md). Raises UsageError: unknown
+    method, bad shapes or labels, repeated trial keys, no positive ``splits``; DataError: infinite responses, or
+    negative ones for ``poisson``.
     """
-    if method not in SUBJECT_METHODS:
-        raise unknown_name("RDM method of an animal", method, SUBJECT_METHODS)
+    check_name("RDM method of an animal", method, SUBJECT_METHODS)
     check_comparison(comparison)
     if splits < 1 or n_stimuli < 2:
         raise UsageError(f"Split halves need splits ≥ 1 and 2 or more stimuli; received {splits} and {n_stimuli}.")

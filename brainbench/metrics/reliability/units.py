@@ -21,7 +21,7 @@ from brainbench.metrics.rdms.pairs import Floats
 from brainbench.metrics.reliability.halves import mean_patterns, split_members
 from brainbench.metrics.reliability.noise_correction import spearman_brown
 from brainbench.metrics.reliability.sessions import SortedTrials, trial_hashes
-from brainbench.metrics.stimulus_labels import response_matrix, stimulus_codes
+from brainbench.metrics.stimulus_labels import labelled_trials
 
 UNIT_GATE = 0.5
 """Smallest reliability of a unit that :func:`reliable_units` keeps (published)."""
@@ -35,12 +35,9 @@ def unit_reliability(
 ) -> tuple[Floats, ...]:
     """Return the reliability of every unit's tuning [F], for each session; NaN where it has none.
 
-    Responses are [R, F] or [R, T, F], whose time is averaged.
-    A unit without variation over stimuli, or with fewer than two trials of some stimulus in every split,
-    has no reliability. Values can be negative.
-
-    Raises:
-        UsageError: fewer than 3 stimuli or 1 split, bad shapes or labels.
+    Responses are [R, F] or [R, T, F], whose time is averaged. A unit without variation over stimuli, or with fewer than
+    two trials of some stimulus in every split, has no reliability. Values can be negative. Raises UsageError: fewer
+    than 3 stimuli or 1 split, bad shapes or labels.
     """
     if n_stimuli < 3 or splits < 1:
         raise UsageError(f"A unit's tuning needs at least 3 stimuli and 1 split; received {n_stimuli} and {splits}.")
@@ -48,8 +45,7 @@ def unit_reliability(
     for block in blocks:
         values = np.asarray(block.responses)
         values = finite_mean(values, axis=1) if values.ndim == 3 else values
-        responses = response_matrix(values, "trials").astype(np.float64)
-        codes, _ = stimulus_codes(block.labels, n_stimuli)
+        responses, codes, _ = labelled_trials(values.astype(np.float64), block.labels, n_stimuli)
         session = SortedTrials.sort(responses, codes, trial_hashes(block, responses, codes))
         total, number = np.zeros(responses.shape[1]), np.zeros(responses.shape[1])
         for start in range(0, splits, _CHUNK):
@@ -73,10 +69,7 @@ def reliable_units(
 ) -> tuple[tuple[Trials, ...], str]:
     """Return the sessions with the units whose reliability is at least ``least``, and what was left out in words.
 
-    A session without such a unit is left out.
-
-    Raises:
-        UsageError: as :func:`unit_reliability`.
+    A session without such a unit is left out. Raises UsageError: as :func:`unit_reliability`.
     """
     values = unit_reliability(blocks, n_stimuli, splits=splits, seed=seed)
     kept = []

@@ -1,11 +1,10 @@
 """Whitening of a session's trials by its noise, so that squared distances become Mahalanobis distances.
 
-The noise is estimated from the same trials. Their means do not depend on it, but what crossnobis takes
-away does: the noise of a trial divided by its own estimate is 1 on average, that of a mean divided by
-an independent estimate is E[σ²/σ̂²] > 1. So crossnobis would stay above zero for stimuli that are alike,
-by 5 % of the noise with 40 degrees of freedom. The factor is known for Gaussian noise (ν/(ν − 2) per
-unit, ν/(ν − U − 1) for a full covariance of U units); with shrinkage it is measured by holding out
-a tenth of the residuals in turn.
+The noise is estimated from the same trials. Their means do not depend on it, but what crossnobis takes away does: the
+noise of a trial divided by its own estimate is 1 on average, that of a mean divided by an independent estimate is
+E[σ²/σ̂²] > 1. So crossnobis would stay above zero for stimuli that are alike, by 5 % of the noise with 40 degrees of
+freedom. The factor is known for Gaussian noise (ν/(ν − 2) per unit, ν/(ν − U − 1) for a full covariance of U units);
+with shrinkage it is measured by holding out a tenth of the residuals in turn.
 """
 
 from __future__ import annotations
@@ -43,15 +42,11 @@ def whitened_sessions(
 def whitened(session: SortedTrials, count: int, noise: str) -> tuple[SortedTrials | None, str]:
     """Return the session with noise of unit covariance, and what was left out in words.
 
-    The covariance comes from all trials of the session, about their stimulus' mean. Units that never
-    vary between trials of a stimulus have no noise to divide by and are left out. ``diag`` scales each
-    unit by the trials it was recorded in; the other methods mix units, so they leave out units that
-    were not recorded in every trial.
+    The covariance comes from all trials of the session, about their stimulus' mean. Units that never vary between
+    trials of a stimulus have no noise to divide by and are left out. ``diag`` scales each unit by the trials it was
+    recorded in; the other methods mix units, so they leave out units that were not recorded in every trial.
 
-    ``none`` divides by nothing.
-
-    Raises:
-        UsageError: unknown ``noise`` method.
+    ``none`` divides by nothing. Raises UsageError: unknown ``noise`` method.
     """
     if noise == "none":
         return session, ""

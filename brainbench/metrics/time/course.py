@@ -90,18 +90,10 @@ def score_over_time(
 ) -> TimeCourse:
     """Score the RDMs of a model's layers against animals at each time.
 
-    Args:
-        layers: RDMs [T', P] of each layer in bins of ``width``, from :func:`layer_movie`; bin 0 begins when the
-            animals' first bin does.
-        animals: From :func:`animal_movie`, for the same stimuli and bins.
-        width: Width of a bin, seconds.
-        comparison: Comparison of RDMs, see :func:`brainbench.metrics.compare`.
-        permutations: Random orders of the stimuli above six stimuli.
-        seed: Seed of the orders.
-
-    Raises:
-        UsageError: no layers or animals, fewer than 4 stimuli or 3 bins, RDMs that do not fit one another, or an
-            unknown comparison.
+    ``layers`` are RDMs [T', P] in bins of ``width`` seconds from :func:`layer_movie`, bin 0 beginning when the animals'
+    first bin does; ``animals`` come from :func:`animal_movie`, for the same stimuli and bins. ``permutations`` are
+    drawn above six stimuli. Raises UsageError: no layers or animals, fewer than 4 stimuli or 3 bins, RDMs that do not
+    fit one another, or an unknown comparison.
     """
     check_comparison(comparison)
     movies = _checked(layers, animals, width)
@@ -109,7 +101,8 @@ def score_over_time(
     largest = max(1, math.floor(_FARTHEST * bins))
     joined = LaggedRDMs.join(movies, [item.rdms for item in animals], largest=largest, comparison=comparison)
     reliability = np.stack([item.reliability for item in animals], axis=1)
-    factors = _factors(reliability)
+    # A raw comparison is multiplied by this; NaN where a bin is not reliable.
+    factors = 1 / np.sqrt(np.where(reliability >= RELIABILITY_GATE, reliability, np.nan))
     courses, values, matches, chosen, expected = [], [], [], None, 0.0
     for r in joined.permuted(permutations, seed):
         expected = expected + r.sum(axis=0)
@@ -126,7 +119,8 @@ def score_over_time(
     own = held_out_course(observed)[0][0] * factors
     left_out = [joined.without_stimulus(stimulus) for stimulus in range(joined.stimuli)]
     without_each = [finite_mean(held_out_course(item)[0][0] * factors) for item in left_out]
-    intervals = _intervals(own, np.stack(without_each, axis=-1))
+    every = zip(finite_mean(own), own, np.stack(without_each, axis=-1), strict=True)
+    intervals = [two_factor_interval(float(mean), *item) if np.isfinite(mean) else None for mean, *item in every]
     points = tuple(
         TimePoint(
             time=(index + 0.5) * width,
@@ -183,26 +177,12 @@ def _checked(layers: Mapping[str, ArrayLike], animals: Sequence[AnimalMovie], wi
     return movies
 
 
-def _factors(reliability: Floats) -> Floats:
-    """Return what a raw comparison is multiplied by [T, A]; NaN where a bin is not reliable."""
-    trusted = reliability >= RELIABILITY_GATE
-    return np.where(trusted, 1 / np.sqrt(np.where(trusted, reliability, 1.0)), np.nan)
-
-
 def _largest_p(null: Floats) -> tuple[Floats, float]:
     """Return p of every entry of statistics [N, M], corrected by the largest in each permutation, and of the best."""
     z = standardised(null)
     largest = z.max(axis=1)
     p = np.where(np.isfinite(null[0]), tail_p(largest[:, None], z[0]), np.nan)
     return p, float(tail_p(largest))
-
-
-def _intervals(animals: Floats, left_out: Floats) -> list[Interval | None]:
-    """Return the interval of the mean of values [T, A] whose means without each stimulus are [T, K]."""
-    return [
-        two_factor_interval(float(mean), *item) if np.isfinite(mean) else None
-        for mean, *item in zip(finite_mean(animals), animals, left_out, strict=True)
-    ]
 
 
 def _reasons(animals: Sequence[AnimalMovie], points: tuple[TimePoint, ...], stimuli: int) -> tuple[str, ...]:

@@ -46,11 +46,8 @@ class LaggedRDMs:
     def join(cls, movies: Sequence[Floats], animals: Sequence[Floats], *, largest: int, comparison: str) -> LaggedRDMs:
         """Join movies [T', P] of layers and [T, P] of animals.
 
-        Args:
-            movies: One per layer; of a single RDM for a layer without time, which is compared at lag 0 alone.
-            animals: One per animal, all of T bins.
-            largest: Largest lag tried in both directions, bins.
-            comparison: Comparison of RDMs.
+        A movie of a single RDM is that of a layer without time, which is compared at lag 0 alone. Lags up to
+        ``largest`` bins are tried in both directions.
         """
         bins, lags = len(animals[0]), np.arange(-largest, largest + 1)
         place = np.full((len(movies), len(lags), bins), -1, dtype=np.int64)
@@ -116,13 +113,8 @@ def votes(r: Floats) -> Floats:
 def held_out_course(r: Floats) -> tuple[Floats, Ints]:
     """Return comparisons over time [N, T, A] at the layer and lag that suit the *other* animals best.
 
-    A single animal has no others; its own best is taken, and the permutations repeat that.
-
-    Args:
-        r: [N, L, G, T, A].
-
-    Returns:
-        The comparisons, and the chosen candidates [N, A], counted through layers and lags.
+    A single animal has no others; its own best is taken, and the permutations repeat that. From comparisons [N, L, G,
+    T, A]. Returns the comparisons, and the chosen candidates [N, A], counted through layers and lags.
     """
     number, layers, lags, bins, animals = r.shape
     vote = np.nan_to_num(votes(r), nan=_NEVER).reshape(number, layers * lags, animals)

@@ -56,12 +56,8 @@ def layer_latencies(
 ) -> tuple[LayerLatency, ...]:
     """Return every layer's latency.
 
-    Args:
-        names: Layers.
-        lags: [G] seconds.
-        excess: Comparisons less chance [L, G, T, A].
-        left_out: The same without each stimulus in turn.
-        match: Mean comparison under permutations [N, L, G], the given order first.
+    ``lags`` [G] are seconds, ``excess`` [L, G, T, A] comparisons less chance, ``left_out`` the same without each
+    stimulus in turn, ``match`` [N, L, G] mean comparisons under permutations, the given order first.
     """
     z = standardised(match)
     p = tail_p(z.reshape(len(z), -1).max(axis=1)[:, None], z[0].max(axis=-1))

@@ -8,18 +8,22 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from brainbench.core.errors import UsageError
 from brainbench.core.trials import Trials
-from brainbench.metrics.rdms.movies import rdm_movie
+from brainbench.metrics.rdms.dissimilarity import rdm
 from brainbench.metrics.rdms.pairs import Floats
 from brainbench.metrics.reliability.subject_rdm import subject_rdm
 
 SPLITS = 100
 """Random split halves of an animal in each bin."""
+_METHOD: dict[str, Any] = {
+    "method": "crossnobis", "comparison": "whitened-cosine", "noise": "none", "splits": SPLITS,
+}  # fmt: skip
 _PARTLY = 0.5
 """A last bin of which less than this share lies inside the stimulus is left out."""
 
@@ -37,37 +41,13 @@ class AnimalMovie:
     """[T] reason for having no RDM in a bin; None elsewhere."""
 
 
-def animal_movie(
-    subject: str,
-    blocks: Sequence[Trials],
-    n_stimuli: int,
-    *,
-    stimuli: Sequence[str] | None = None,
-    method: str = "crossnobis",
-    comparison: str = "whitened-cosine",
-    noise: str = "none",
-    splits: int = SPLITS,
-    seed: int = 0,
-) -> AnimalMovie:
-    """Return an animal's RDM and reliability in every bin.
+def animal_movie(subject: str, blocks: Sequence[Trials], n_stimuli: int, **options: Any) -> AnimalMovie:
+    """Return an animal's RDM and reliability in every bin, from responses [R, T, U] of its sessions.
 
     All bins split the same trials into the same halves, so differences between bins are not those of the splits.
-
-    Args:
-        subject: Name of the animal.
-        blocks: Its sessions, whose responses are [R, T, U].
-        n_stimuli: K.
-        stimuli: Names of the stimuli, for messages.
-        method: RDM method of :func:`brainbench.metrics.reliability.subject_rdm.subject_rdm`. The default is the squared
-            Euclidean distance without the share of trial noise, which would look like geometry before any response.
-        comparison: Comparison of RDMs, for the reliability.
-        noise: Noise covariance for ``mahalanobis`` and ``crossnobis``.
-        splits: Random split halves.
-        seed: Seed of the splits.
-
-    Raises:
-        UsageError: responses without a time axis, or sessions of different numbers of bins; else as
-            :func:`brainbench.metrics.reliability.subject_rdm.subject_rdm`.
+    ``options`` are those of :func:`~brainbench.metrics.reliability.subject_rdm.subject_rdm`. The default method is the
+    squared Euclidean distance without the share of trial noise, which would look like geometry before any response.
+    Raises UsageError: responses without a time axis, or sessions of different numbers of bins.
     """
     shapes = [np.shape(block.responses) for block in blocks]
     if not shapes or any(len(shape) != 3 for shape in shapes) or len({shape[1] for shape in shapes}) > 1:
@@ -75,22 +55,11 @@ def animal_movie(
             f"Scores over time need responses [trials, time, units] of equal time in all sessions; {subject!r} has "
             f"shapes {shapes}."
         )
+    how = {**_METHOD, **options}
     found = []
     for bin in range(shapes[0][1]):
         parts = [replace(block, responses=np.asarray(block.responses)[:, bin]) for block in blocks]
-        found.append(
-            subject_rdm(
-                subject,
-                parts,
-                n_stimuli,
-                stimuli=stimuli,
-                method=method,
-                comparison=comparison,
-                noise=noise,
-                splits=splits,
-                seed=seed,
-            )
-        )
+        found.append(subject_rdm(subject, parts, n_stimuli, **how))
     usable = np.array([item.problem is None for item in found])
     rdms = np.where(usable[:, None], np.stack([item.rdm for item in found]), np.nan)
     reliability = np.where(usable, [item.reliability for item in found], np.nan)
@@ -101,12 +70,11 @@ def layer_movie(values: ArrayLike, step: float, width: float, *, method: str = "
     """Return a layer's RDMs [T, P] in bins of ``width`` seconds, from activations [K, T, F] every ``step`` seconds.
 
     A layer without time ([K, 1, F]) gives one RDM, which stands for all times.
-
-    Raises:
-        UsageError: activations without a time axis, or times that are not positive.
+    Raises UsageError: activations without a time axis, or times that are not positive.
     """
     array = np.asarray(values)
-    return rdm_movie(array if array.ndim == 3 and array.shape[1] == 1 else in_bins(array, step, width), method=method)
+    bins = array if array.ndim == 3 and array.shape[1] == 1 else in_bins(array, step, width)
+    return np.stack([rdm(bins[:, index], method=method) for index in range(bins.shape[1])])
 
 
 def in_bins(values: ArrayLike, step: float, width: float) -> Floats:
@@ -117,8 +85,7 @@ def in_bins(values: ArrayLike, step: float, width: float) -> Floats:
     >>> in_bins([[[0.0], [1.0], [2.0], [3.0]]], 0.5, 1.0).ravel().tolist()
     [0.5, 2.5]
 
-    Raises:
-        UsageError: activations without a time axis, or times that are not positive.
+    Raises UsageError: activations without a time axis, or times that are not positive.
     """
     array = np.asarray(values)
     if array.ndim != 3 or not (step > 0 and width > 0):

@@ -7,9 +7,8 @@ pre-activation over channels at every place (Ba et al. 2016). A gate that keeps 
 fixed +1 inside its sigmoid, so that a fresh cell remembers: it passes on 1 − σ(1) = 27 % of what is new,
 and untrained gated networks answer ever more softly with depth. Biases start at zero.
 
-Equations: UGRNN and IntersectionRNN, Collins et al. 2017; GRU, Cho et al. 2014; LSTM, Hochreiter and
-Schmidhuber 1997, Gers et al. 2000. Order and names of the gates follow PyTorchTNN, whose weights
-:meth:`load_tnn_state` reads.
+Equations: UGRNN and IntersectionRNN, Collins et al. 2017; GRU, Cho et al. 2014; LSTM, Hochreiter and Schmidhuber 1997,
+Gers et al. 2000. Order and names of the gates follow PyTorchTNN, whose weights :meth:`load_tnn_state` reads.
 """
 
 from collections.abc import Callable, Mapping

@@ -21,11 +21,8 @@ Pair = int | tuple[int, int]
 class GatedCell(Cell):
     """A cell with one fused convolution for all its gates.
 
-    Args:
-        in_channels: Channels of x.
-        out_channels: Channels of y.
-        kernel_size: One number or (rows, columns) of the gates' convolution.
-        layer_norm: Normalise each gate over channels.
+    ``kernel_size`` (one number, or rows and columns) is that of the gates' convolution; ``layer_norm`` normalises each
+    gate over channels.
     """
 
     gates: ClassVar[tuple[str, ...]] = ()

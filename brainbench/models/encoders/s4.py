@@ -54,8 +54,7 @@ class S4Block(nn.Module):
 class S4Encoder(nn.Module):
     """Features [B, T, F] of a sweep [B, T, C, H, W], causally.
 
-    With ``small`` all widths × 3/16 (F = 96 instead of 512; 0.3 M parameters). ``dropout`` is as for
-    :class:`S4Block`.
+    With ``small`` all widths × 3/16 (F = 96 instead of 512; 0.3 M parameters). ``dropout`` is as for :class:`S4Block`.
     """
 
     layers: tuple[str, ...] = ("embed", "block1", "block2", "block3", "block4", "fc")
@@ -79,8 +78,7 @@ class S4Encoder(nn.Module):
     def forward(self, x: torch.Tensor, *, return_activations: bool | Collection[str] = False) -> Any:
         """Return the features [B, T, F], with activations also ``{layer: [B, T, width]}``.
 
-        Raises:
-            UsageError: ``x`` is not [B, T, C, H, W] as :attr:`input_shape` says.
+        Raises UsageError: ``x`` is not [B, T, C, H, W] as :attr:`input_shape` says.
         """
         check_sweep(x, self.input_shape, "S4")
         layers = zip(self.layers, (self.embed, *self.blocks, self.fc), strict=True)

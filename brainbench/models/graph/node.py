@@ -16,6 +16,9 @@ from brainbench.models.graph.spec import Convolution, Dense, Memory, Node, Opera
 from brainbench.models.ops import dispatch
 from brainbench.models.ops.layers import RECTIFIER_GAIN, Conv2d, Linear, activation
 
+# Bilinear with antialiasing: a smaller grid averages what lies between its places instead of skipping it.
+_RESIZED: dict[str, Any] = {"mode": "bilinear", "align_corners": False, "antialias": True}
+
 
 class NodeModule(nn.Module):
     """Operation, memory, activation and pool of one node."""
@@ -36,7 +39,9 @@ class NodeModule(nn.Module):
 
     def resized(self, inputs: list[torch.Tensor]) -> list[torch.Tensor]:
         """Return the inputs [B, C, H, W] on the node's grid."""
-        return [x if x.shape[2:] == self.grid else _resize(x, self.grid) for x in inputs]
+        return [
+            x if x.shape[2:] == self.grid else functional.interpolate(x, size=self.grid, **_RESIZED) for x in inputs
+        ]
 
     def operate(self, inputs: list[torch.Tensor]) -> torch.Tensor:
         """Join the resized inputs on channels and operate on them; return what the memory sees [B, ...]."""
@@ -104,8 +109,3 @@ def _pool(pool: Pool | None) -> list[nn.Module]:
     else:
         layer = nn.AdaptiveAvgPool2d(pool.size)
     return [layer, nn.Flatten()] if pool.flatten else [layer]
-
-
-def _resize(x: torch.Tensor, grid: Shape) -> torch.Tensor:
-    # Bilinear with antialiasing: a smaller grid averages what lies between its places instead of skipping it.
-    return functional.interpolate(x, size=grid, mode="bilinear", align_corners=False, antialias=True)

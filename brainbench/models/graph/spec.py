@@ -46,7 +46,6 @@ class Convolution(Operation):
     """2-D convolution of the concatenated inputs."""
 
     channels: int
-    """Channels of the output."""
     kernel_size: tuple[int, int] = (2, 2)
     """Rows, columns."""
     stride: tuple[int, int] = (1, 1)
@@ -68,7 +67,6 @@ class Dense(Operation):
     """Linear layer of the flattened, concatenated inputs."""
 
     features: int
-    """Features of the output."""
     bias: float | None = field(default=0.1, kw_only=True)
     """Initial bias; None draws it within 1/√fan_in."""
 
@@ -82,8 +80,7 @@ class Dense(Operation):
 class Memory:
     """A recurrent cell of :mod:`brainbench.models.cells`, channels unchanged.
 
-    Raises:
-        UsageError: there is no such cell.
+    Raises UsageError: there is no such cell.
     """
 
     kind: str = "time-decay"

@@ -146,7 +146,8 @@ class TemporalGraph(nn.Module):
         """Yield the name of each node with weights, PyTorchTNN's name of them, and their layer."""
         for name, node in self.named_nodes():
             if isinstance(node.operation, (Conv2d, Linear)):
-                yield name, f"{_tnn_owner(name, node)}.weight", node.operation
+                kind = "lin" if isinstance(node.operation, Linear) else "conv"
+                yield name, f"{name}._pre_memory.{kind}.weight", node.operation
 
     def _resize_operations(self, resized: Mapping[str, tuple[int, ...]]) -> None:
         for _, key, operation in self._weighted():
@@ -287,7 +288,7 @@ class TemporalGraph(nn.Module):
             x = x.flatten(0, 1).to(memory_format=torch.channels_last).unflatten(0, x.shape[:2])
         output = self.spec.output
         whole, final = (asked, {output}) if last else (asked | {output}, set())
-        if self._norms_batches:
+        if self.training and any(isinstance(m, (nn.BatchNorm1d, nn.BatchNorm2d)) for m in self.modules()):
             kept = self._stepwise(x, unroll, whole | final)
         else:
             steps = needed_steps(self.spec, unroll, x.shape[1], whole=whole, last=final)
@@ -306,10 +307,6 @@ class TemporalGraph(nn.Module):
             for name in names:
                 outputs[name].append(state.outputs[name])
         return {name: (0, torch.stack(values, 1)) for name, values in outputs.items()}
-
-    @property
-    def _norms_batches(self) -> bool:
-        return self.training and any(isinstance(m, (nn.BatchNorm1d, nn.BatchNorm2d)) for m in self.modules())
 
     def activations(self, x: torch.Tensor, layers: Collection[str] | None = None) -> dict[str, torch.Tensor]:
         """Return ``{node: [B, T, ...]}`` of the biological unrolling for the nodes asked for (all by default)."""
@@ -337,7 +334,3 @@ def _tnn_operation(owner: str, operation: nn.Module, after: nn.Module) -> dict[s
     found: dict[str, torch.Tensor] = {f"{owner}.{kind}.{key}": value for key, value in operation.named_parameters()}
     norm = after[0].state_dict(keep_vars=True) if isinstance(after, nn.Sequential) else {}
     return found | {f"{owner}.bn.{key}": value for key, value in norm.items()}
-
-
-def _tnn_owner(name: str, node: NodeModule) -> str:
-    return f"{name}._pre_memory.{'lin' if isinstance(node.operation, Linear) else 'conv'}"

@@ -42,11 +42,7 @@ INITIALISERS = ("kaiming_normal_", "kaiming_uniform_", "orthogonal_", "xavier_no
 
 
 def pair(value: int | tuple[int, int] | list[int], what: str) -> tuple[int, int]:
-    """Return (rows, columns) from one number or two.
-
-    Raises:
-        UsageError: it is neither.
-    """
+    """Return (rows, columns) from one number or two. Raises UsageError: it is neither."""
     values = (value, value) if isinstance(value, int) else tuple(value)
     if len(values) != 2 or not all(isinstance(item, int) and item > 0 for item in values):
         raise UsageError(f"The {what} must be a positive integer or a pair of them; received {value!r}.")
@@ -97,11 +93,9 @@ def draw_silent_biases(part: nn.Module) -> None:
     Before an object arrives a sweep is exactly zero, and so is every activation of a network whose biases are zero.
     There layer norm has its steepest slope, 1/√ε = 316, at every place, step and layer: back through 22 steps of an
     unrolled network the gradient overflows single precision, and four S4 blocks alone make it 1e9. With drawn biases
-    silence has a spread over channels, and the slope is of the order of one.
-
-    Args:
-        part: Changed in place with numbers of PyTorch's global random state; without layer norm it is left alone, as
-            in six saturating cells without norms biases would outweigh what is left of the stimulus.
+    silence has a spread over channels, and the slope is of the order of one. Numbers come from PyTorch's global random
+    state. A part without layer norm is left alone: in six saturating cells without norms biases would outweigh what is
+    left of the stimulus.
     """
     if not any(isinstance(module, nn.LayerNorm) for module in part.modules()):
         return

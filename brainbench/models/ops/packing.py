@@ -20,16 +20,11 @@ PRECISIONS = ("float32", "bf16")
 def packed(model: nn.Module, *, precision: str = "float32") -> nn.Module:
     """Return a copy of a network, in evaluation mode, whose steps for one stimulus are faster.
 
-    Args:
-        model: A network on the CPU; unchanged.
-        precision: ``float32``, equal to the network to rounding, or ``bf16``: weights and what they are multiplied with
-            are rounded to 8 bits of mantissa, memories and everything else stay in single precision.
+    ``float32`` equals the network to rounding; with ``bf16`` weights and what they are multiplied with are rounded to 8
+    bits of mantissa, memories and everything else stay in single precision.
 
     Batches of two and more are computed as before, in single precision. The copy does not notice later changes of its
-    weights: pack again after training.
-
-    Raises:
-        UsageError: there is no such precision, or the network is not on the CPU.
+    weights: pack again after training. Raises UsageError: there is no such precision, or the network is not on the CPU.
     """
     import torch
 

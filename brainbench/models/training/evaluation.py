@@ -87,8 +87,7 @@ def collapse(predicted: int, classes: int, spread: float) -> str:
 def evaluate(model: nn.Module, batches: Iterable[tuple[Any, Any]], *, device: Any = None) -> Evaluation:
     """Evaluate a network on labelled batches ([B, T, C, H, W] in SI, [B]), in evaluation mode.
 
-    Raises:
-        DataError: there are no batches, or an answer is not [B, classes].
+    Raises DataError: there are no batches, or an answer is not [B, classes].
     """
     encode: Any = getattr(model, "encode", None)
     decoder: Any = getattr(model, "decoder", None)
@@ -156,11 +155,9 @@ def fit_probe(
 
     The network, on ``device``, has ``encode``; its weights stay as they are. ``batches`` are one pass over labelled
     training sweeps, ``epochs`` passes over their features. Features of more than ``memory`` bytes are not held: every
-    pass asks ``batches`` for the sweeps again and shuffles as many as fit, so they should come in a new order.
-
-    Raises:
-        DataError: there are no batches, or the features are not finite.
-        UsageError: there are more features than memory, and ``batches`` can be read but once.
+    pass asks ``batches`` for the sweeps again and shuffles as many as fit, so they should come in a new order. Raises
+    DataError: there are no batches, or the features are not finite; UsageError: there are more features than memory,
+    and ``batches`` can be read but once.
     """
     held, pools, count, moments = None, 0, 0, torch.zeros(())
     for held in _feature_pools(model, batches, device, memory):
@@ -268,26 +265,12 @@ def baselines(
 ) -> dict[str, Evaluation]:
     """Evaluate what a linear probe reads without any network: from the raw input, and from random features of it.
 
-    The probe is that of :func:`fit_probe`. Both see all steps of a sweep.
-
-    Args:
-        train: Labelled training sweeps ([B, T, S·C, H, W] in SI, [B]), read several times, best in a new order each
-            time.
-        test: Sweeps to evaluate on, read twice.
-        features: Number of random features: as many as the probe of the network beside it sees.
-        classes: Number of classes.
-        epochs: Passes of the probe.
-        seed: Seed of the random features and of the probes.
-        device: Where it is computed; the sweeps are moved there.
-        memory: Bytes of raw sweeps that are held (about three times as many are used); a larger training set is read
-            again in every pass.
-
-    Returns:
-        Evaluations on the test sweeps by the names ``raw-input`` and ``random-features``.
-
-    Raises:
-        DataError: there are no batches, or the sweeps are not finite.
-        UsageError: the batches can be read but once.
+    The probe is that of :func:`fit_probe`. Both see all steps of a sweep. Training and test sweeps ([B, T, S·C, H, W]
+    in SI, [B]) are read several times; those of training best come in a new order each time. ``features`` is the number
+    of random features: as many as the probe of the network beside it sees. Up to ``memory`` bytes of raw sweeps are
+    held (about three times as many are used); a larger training set is read again in every pass. Returns evaluations on
+    the test sweeps by the names ``raw-input`` and ``random-features``.
+    Raises DataError: there are no batches, or the sweeps are not finite; UsageError: the batches can be read but once.
     """
     for batches in (train, test):
         _check_repeatable(batches, "sweeps of a baseline")

@@ -62,14 +62,11 @@ def copy_state(module: nn.Module, state: dict[str, torch.Tensor]) -> None:
 class Gradients:
     """The loss of a batch, its clipped gradients in the parameters of a module, and their norm.
 
-    Args:
-        module: What is trained; what a pass does to its buffers is undone after the runs that precede a recording.
-        forward: The module as it is computed, compiled or wrapped: maps (views, labels) to the loss.
-        clip: Largest norm; 0 leaves it alone.
-        autocast: Makes the context of the forward pass.
-        record: Record the pass for the shape that comes first, and replay it whenever that shape comes again.
-        average: Of several processes: replaces a vector by its mean over them. Every process then returns the same
-            loss and norm, those of the whole batch.
+    What a pass does to the buffers of ``module`` is undone after the runs that precede a recording. ``forward`` is the
+    module as it is computed, compiled or wrapped: (views, labels) → loss, in a context that ``autocast`` makes.
+    ``clip`` is the largest norm; 0 leaves it alone. With ``record`` the pass is recorded for the shape that comes
+    first, and replayed whenever that shape comes again. ``average`` replaces a vector by its mean over several
+    processes, each of which then returns the loss and norm of the whole batch.
     """
 
     def __init__(

@@ -19,14 +19,9 @@ def sweep_runs(
 ) -> list[tuple[TrainingConfig, Path]]:
     """Return the runs of the search space published for a model and an objective, each with its folder.
 
-    Args:
-        config: What all runs share; optimiser, schedule and learning rate are replaced.
-        out: Folder of the sweep; every run has a folder in it, named by its setting.
-        job: (number of this job from 0, number of jobs): this job's share of the runs.
-        warmup: Search SimSiam's warmed-up schedule.
-
-    Raises:
-        UsageError: the job's number is not below the number of jobs.
+    ``config`` is what all runs share; optimiser, schedule and learning rate are replaced. ``job`` is (number of this
+    job from 0, number of jobs); ``warmup`` searches SimSiam's warmed-up schedule.
+    Raises UsageError: the job's number is not below the number of jobs.
     """
     if not 0 <= job[0] < job[1]:
         raise UsageError(f"A job is (number, count) with 0 ≤ number < count; received {job}.")
@@ -44,10 +39,7 @@ def best_run(out: str | Path) -> tuple[Path, dict[str, float]]:
     """Return the folder of the best finished run of a sweep, and every finished run's score by its name.
 
     Scores are those of the validation data: highest accuracy, or lowest self-supervised loss. The test split has no
-    say.
-
-    Raises:
-        DataError: no run of the sweep is finished.
+    say. Raises DataError: no run of the sweep is finished.
     """
     from brainbench.core.files import read_mapping
     from brainbench.models.training.run_folder import RUN, read_log

@@ -69,9 +69,7 @@ class TrainingResult:
     folder: Path
     """The model's folder, for ``local-dir:``."""
     steps: int
-    """Optimiser steps done."""
     epochs: int
-    """Epochs done."""
     best_epoch: int | None
     """Epoch of the best validation, from 1."""
     evaluation: Evaluation | None
@@ -131,16 +129,13 @@ class _Position:
     """Progress of a run."""
 
     step: int = 0
-    """Optimiser steps done."""
     epoch: int = 0
-    """Epochs done."""
     best: float = math.inf
     """Lowest validation score so far."""
     best_epoch: int | None = None
     total: float = 0.0
     """Sum of the losses of this epoch's steps."""
     count: int = 0
-    """Number of them."""
 
 
 class _Run:

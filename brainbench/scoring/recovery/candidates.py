@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from brainbench.core.errors import UsageError, listing, unknown_name
 from brainbench.core.files import content_hash
-from brainbench.core.progress import Progress
+from brainbench.core.progress import Progress, track
 from brainbench.datasets.synthetic.geometry import ResponseGeometry, principal_axes
 from brainbench.metrics.measures.metric import Metric
 from brainbench.scoring.options import ScoreOptions
@@ -37,11 +37,7 @@ class Candidate:
     def of(
         cls, name: str, stimuli: Sequence[str], layers: Mapping[str, ArrayLike], weights: str | None = None
     ) -> Candidate:
-        """Take the layers that can be compared.
-
-        Raises:
-            UsageError: no layer can, or rows do not fit the stimuli.
-        """
+        """Take the layers that can be compared. Raises UsageError: no layer can, or rows do not fit the stimuli."""
         usable = {}
         for layer, values in layers.items():
             array = np.asarray(values, dtype=np.float64)
@@ -56,11 +52,7 @@ class Candidate:
         return cls(name, tuple(stimuli), usable, weights)
 
     def choose(self, layer: str, random: np.random.Generator) -> str:
-        """Return the layer that ``any``, ``last`` or a name means.
-
-        Raises:
-            UsageError: there is no such layer.
-        """
+        """Return the layer that ``any``, ``last`` or a name means. Raises UsageError: there is no such layer."""
         names = list(self.features)
         if layer in names:
             return layer
@@ -107,8 +99,7 @@ def open_candidates(
 ) -> tuple[tuple[Candidate, ...], dict[str, Any]]:
     """Run the models on the stimuli of ``options`` and return them as candidates, with the provenance of the stimuli.
 
-    Raises:
-        UsageError: fewer than two models, two of one name, or a file of activations without one of the stimuli.
+    Raises UsageError: fewer than two models, two of one name, or a file of activations without one of the stimuli.
     """
     from brainbench.scoring.model_responses import resolve_model
     from brainbench.stimuli import load_stimuli
@@ -132,9 +123,7 @@ def open_candidates(
     else:  # activations from files alone, whose labels name the stimuli
         stimuli = next(item.labels for item in resolved if item.labels)
     candidates, origin = [], {}
-    for done, item in enumerate(resolved):
-        if progress is not None:
-            progress(done, len(resolved), "running networks")
+    for item in track(resolved, "running networks", progress):
         found = item.respond(options)
         lacking = [label for label in stimuli if label not in found.labels]
         if lacking:
@@ -142,6 +131,4 @@ def open_candidates(
         rows = [found.labels.index(label) for label in stimuli]
         candidates.append(Candidate.of(item.card.name, stimuli, found.features(rows), found.card.weights))
         origin = dict(found.origin.get("stimuli") or origin)
-    if progress is not None:
-        progress(len(resolved), len(resolved), "running networks")
     return tuple(candidates), origin

@@ -8,7 +8,7 @@ from itertools import product
 from typing import Any
 
 from brainbench.core.errors import UsageError
-from brainbench.core.progress import Progress
+from brainbench.core.progress import Progress, track
 from brainbench.core.records import Interval
 from brainbench.scoring.recovery.candidates import Candidate
 from brainbench.scoring.recovery.design import RecoveryDesign
@@ -35,11 +35,6 @@ class TriedDesign:
     interval: Interval
     """Wilson's interval of ``win_rate``."""
 
-    @property
-    def presentations(self) -> int:
-        """Trials of all animals together: the cost of the experiment."""
-        return self.animals * self.trials * self.stimuli
-
 
 def find_cheapest(
     candidates: Sequence[Candidate],
@@ -54,18 +49,8 @@ def find_cheapest(
 
     Cost is the number of trials of all animals, then the number of units. A design with no more of anything than one
     that failed clearly (interval below ``wanted``) is not tried. The one returned reaches the rate on boards of other
-    numbers too.
-
-    Args:
-        candidates: At least two.
-        design: Noise, metric and layer; its numbers of animals, units, trials and stimuli are replaced.
-        wanted: Win rate, between 0 and 1.
-        boards: Boards of each candidate and design.
-        progress: Called as ``progress(designs done, designs, what)``.
-        **where: ``workers`` and ``scheduler`` of :func:`recover`.
-
-    Raises:
-        UsageError: a rate outside (0, 1).
+    numbers too. The design's numbers of animals, units, trials and stimuli are replaced; ``where`` are ``workers`` and
+    ``scheduler`` of :func:`recover`. Raises UsageError: a rate outside (0, 1).
     """
     if not 0 < wanted < 1:
         raise UsageError(f"A wanted rate lies between 0 and 1; received {wanted}.")
@@ -74,9 +59,7 @@ def find_cheapest(
     grid = sorted(product(ANIMALS, UNITS, TRIALS, sizes), key=lambda one: (one[0] * one[2] * one[3], one[1], one[0]))
     tried: list[TriedDesign] = []
     failed: list[tuple[int, ...]] = []
-    for done, numbers in enumerate(grid):
-        if progress is not None:
-            progress(done, len(grid), "trying designs")
+    for numbers in track(grid, "trying designs", progress):
         if any(all(mine <= other for mine, other in zip(numbers, one, strict=True)) for one in failed):
             continue
         found = _try(candidates, design, numbers, boards, 0, where)

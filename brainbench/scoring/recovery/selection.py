@@ -31,7 +31,6 @@ BOARDS = 4
 FIRST_BOARD = 1_000_000
 """Number of the first of them, far from those on which rates are measured."""
 EXCHANGES = 1500
-"""Exchanges that are tried."""
 
 
 @dataclass(frozen=True)
@@ -57,16 +56,8 @@ def select_stimuli(
 ) -> StimulusSelection:
     """Pick the stimuli of the pool that separate the candidates best.
 
-    Args:
-        candidates: At least two, for all stimuli of the pool.
-        keep: Number of stimuli.
-        design: What is measured of how many animals; the defaults if None. Its ``stimuli`` do not count.
-        boards: Boards of each candidate on which they are chosen.
-        exchanges: Exchanges that are tried.
-        progress: Called as ``progress(exchanges tried, exchanges, what)``.
-
-    Raises:
-        UsageError: as :func:`recover`; the pool is too small, ``keep`` too few, or the metric does not compare RDMs.
+    Stimuli are chosen on so many ``boards`` of each candidate, whose design's own ``stimuli`` do not count.
+    Raises UsageError: as :func:`recover`; the pool is too small, ``keep`` too few, or the metric does not compare RDMs.
     """
     design = replace(design or RecoveryDesign(), stimuli=None)
     check_candidates(candidates, design, boards)

@@ -22,7 +22,6 @@ from brainbench.scoring.recovery.confusion import Recovery
 from brainbench.scoring.recovery.design import RecoveryDesign
 
 BOARDS = 10
-"""Boards of each candidate."""
 _TOGETHER = 5
 """Boards that one job makes and one file keeps."""
 _CONFIG = "config.json"
@@ -54,21 +53,10 @@ def recover(
     """Draw boards from every candidate and count how often the true one wins.
 
     Neither ``workers`` nor the scheduler changes a number. With a folder, a run that was killed goes on when it is
-    started again.
-
-    Args:
-        candidates: At least two, for the same stimuli.
-        design: What is measured; the defaults if None.
-        boards: Boards of each candidate.
-        first: Number of the first board: boards of other numbers have other animals.
-        folder: Keeps finished boards; None keeps nothing.
-        workers: Processes on this machine; as many as there are usable processors when None.
-        scheduler: Address of a Dask scheduler, whose workers make the boards instead.
-        progress: Called as ``progress(boards done, boards in all, what)``.
-
-    Raises:
-        UsageError: fewer than two candidates, more stimuli asked for than there are, an unknown metric or layer, or
-            the folder holds another recovery.
+    started again. ``first`` is the number of the first board: boards of other numbers have other animals. A folder
+    keeps finished boards; ``scheduler`` is the address of a Dask scheduler, whose workers make the boards instead of
+    processes here. Raises UsageError: fewer than two candidates, more stimuli asked for than there are, an unknown
+    metric or layer, or the folder holds another recovery.
     """
     design = design or RecoveryDesign()
     check_candidates(candidates, design, boards)

@@ -14,7 +14,7 @@ from brainbench.datasets.reading import each_session, open_file
 from brainbench.datasets.sessions import SPIKES, Session, SessionTable, make_session, ragged
 from brainbench.datasets.synthetic import ResponseGeometry, make_sessions, write_files
 from tests.factories.recording_files import HUMAN, detection, write_nwb, write_rodgers
-from tests.factories.recordings import make_simple_session, quiet_design
+from tests.factories.recordings import as_recordings, make_simple_session, quiet_design
 
 GEOMETRY = ResponseGeometry.from_features(np.random.default_rng(0).normal(size=(6, 4)))
 
@@ -355,8 +355,6 @@ def test_a_folder_is_judged_as_a_whole_worst_first(tmp_path):
 
 
 def test_counted_recordings_are_said_to_be_beyond_checking(tmp_path):
-    from brainbench.datasets.synthetic import as_recordings
-
     path = write_recordings(tmp_path / "a.h5", as_recordings(GEOMETRY, quiet_design(animals=2, units=4, trials=3)))
     assert "already counted" in found(path, "file", "note")[1]
 

@@ -13,7 +13,6 @@ from brainbench.datasets.synthetic import (
     FAULTS,
     PopulationDesign,
     ResponseGeometry,
-    as_recordings,
     calibrate,
     make_sessions,
     measure_ceiling,
@@ -25,7 +24,7 @@ from brainbench.datasets.synthetic import (
 from brainbench.datasets.trials.session_trials import trials_by_subject
 from brainbench.metrics import noise_ceiling, rdm
 from brainbench.metrics.reliability.subject_rdm import subject_rdm
-from tests.factories.recordings import quiet_design
+from tests.factories.recordings import as_recordings, quiet_design
 
 SMALL = quiet_design(animals=3, sessions=2, units=12, trials=5)
 
@@ -55,34 +54,12 @@ def test_the_truth_of_features_is_their_correlation_distance(seed, stimuli, feat
     assert geometry.directions.shape[1] <= max(stimuli, 2) or features <= stimuli
 
 
-@settings(max_examples=25, deadline=None)
-@given(seed=st.integers(0, 2**16), stimuli=st.integers(2, 12))
-def test_an_rdm_that_vectors_can_have_is_embedded_exactly(seed, stimuli):
-    wanted = make_geometry(seed, stimuli, 5).rdm
-    geometry = ResponseGeometry.from_rdm(wanted)
-    np.testing.assert_allclose(geometry.rdm, wanted, atol=1e-6)
-    assert geometry.distortion < 1e-6
-
-
-def test_an_impossible_rdm_says_by_how_much_it_was_changed():
-    # Three stimuli cannot all be opposite to one another; the nearest have angles of 120 degrees.
-    geometry = ResponseGeometry.from_rdm([2.0, 2.0, 2.0])
-    np.testing.assert_allclose(geometry.rdm, 1.5)
-    assert geometry.distortion == pytest.approx(0.5)
-
-
 @pytest.mark.parametrize(
     ("make", "error", "message"),
     [
         (lambda: ResponseGeometry.from_features(np.zeros(3)), UsageError, r"at least 2 × 2; received shape \(3,\)"),
         (lambda: ResponseGeometry.from_features([[1, 2], [3, 3]]), DataError, "stimulus 1 are constant"),
         (lambda: ResponseGeometry.from_features([[1, 2], [3, np.nan]]), DataError, "1 feature values are not finite"),
-        (
-            lambda: ResponseGeometry.from_rdm([1.0, 1.0]),
-            UsageError,
-            r"upper triangle \[K\(K-1\)/2\]; received shape \(2,\)",
-        ),
-        (lambda: ResponseGeometry.from_rdm([1.0, 1.0, 9.0]), UsageError, "between 0 and 2; received 1 to 9"),
         (
             lambda: ResponseGeometry.from_features(np.eye(3), ["a", "b", "b"]),
             UsageError,

@@ -7,10 +7,18 @@ import pytest
 
 from brainbench.core.trials import Trials
 from brainbench.metrics import get_metric
+from brainbench.metrics.measures.decoding import LabelDecoding
 from brainbench.metrics.reliability.denoising import denoised
 
 METRICS = ("rsa", "rsa-correlation", "rsa-crossnobis", "rsa-partial", "cka", "procrustes", "ridge", "decoding")
 PLACES, SHAPES = ("close", "far"), ("flat", "round")
+
+
+@pytest.fixture(autouse=True)
+def _few_orders(monkeypatch):
+    """Decoding fits anew in every order; a few tell a status."""
+    monkeypatch.setattr(LabelDecoding, "orders", 39)
+    monkeypatch.setattr(LabelDecoding, "orders_between", 39)
 
 
 def _make(stimuli, noise=2.0, animals=6, trials=14, units=50, dims=6, seed=0):

@@ -10,7 +10,7 @@ import pytest
 from brainbench.core.trials import Trials
 from brainbench.metrics import get_metric
 from brainbench.metrics.measures.classifier import decode
-from brainbench.metrics.measures.decoding import label_properties
+from brainbench.metrics.measures.decoding import LabelDecoding, label_properties
 
 LABELS = [f"{shape}-{place}" for shape in ("concave", "convex") for place in ("close", "far", "medium")]
 
@@ -57,14 +57,15 @@ def test_a_model_with_axes_is_decoded_and_one_without_is_not():
     )
 
 
-def test_animals_are_decoded_each_by_itself():
+def test_animals_are_decoded_each_by_itself(monkeypatch):
     metric = get_metric("decoding")
+    monkeypatch.setattr(LabelDecoding, "orders_between", 59)
     score = metric.score_animals(_make_animals(metric), stimuli=LABELS)
     assert score.value > 0.9
     assert [subject.subject for subject in score.subjects] == ["m0", "m1", "m2", "m3"]
     assert score.interval.low > 0.7
     # Orders are those of each animal by itself, and few of them leave all classes together.
-    assert score.p <= 0.01
+    assert score.p == pytest.approx(1 / 60)
 
 
 def test_labels_without_a_shared_property_are_undefined_in_words():

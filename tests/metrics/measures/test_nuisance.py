@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from brainbench.core.errors import DataError, UsageError
-from brainbench.metrics.measures.nuisance import nuisance_rdm, variance_partition
+from brainbench.metrics.measures.nuisance import variance_partition
 from tests.factories.animals import make_rdm
 
 
@@ -56,11 +56,6 @@ def test_p_values_of_unrelated_models_are_uniform():
     assert np.mean(p) == pytest.approx(0.5, abs=0.07)
 
 
-def test_a_nuisance_has_the_differences_of_its_means():
-    contacts = nuisance_rdm([3, 5, 1, np.nan, 8], [0, 0, 1, 1, 2])
-    assert contacts.tolist() == [3, 4, 7]
-
-
 def test_misuse_is_told_in_a_sentence():
     rng = np.random.default_rng(3)
     model = make_rdm(rng)
@@ -72,10 +67,6 @@ def test_misuse_is_told_in_a_sentence():
         variance_partition(model[:6], {str(i): model[:6] for i in range(4)}, model[:6])
     with pytest.raises(UsageError, match="different numbers of stimuli"):
         variance_partition(model[:10], {"a": model}, model)
-    with pytest.raises(DataError, match="no value for stimulus '1'"):
-        nuisance_rdm([1, np.nan], [0, 1])
-    with pytest.raises(UsageError, match="one value per trial"):
-        nuisance_rdm([1, 2], [0, 1, 2])
     few = variance_partition(model, {"a": model}, make_rdm(rng))
     assert np.isnan(few.p)
     assert "no more than the nuisances explain" in few.reason

@@ -13,7 +13,7 @@ from scipy.spatial.distance import pdist
 
 from brainbench.core.errors import DataError, UsageError
 from brainbench.metrics import noise_precision, rdm
-from brainbench.metrics.rdms.dissimilarity import RDM_METHODS, rdm_problem
+from brainbench.metrics.rdms.dissimilarity import RDM_METHODS
 from brainbench.metrics.rdms.pairs import permuted_pairs, square
 
 METHODS_WITHOUT_FOLDS = [method for method in RDM_METHODS if method != "crossnobis"]
@@ -132,7 +132,6 @@ def test_a_complete_pattern_with_a_broken_activation_is_broken_not_missing(value
     result = square(rdm(patterns, method=method, precision=precision))
     assert np.isnan(result[1, [0, 2, 3]]).all()
     assert np.isfinite(result[np.ix_([0, 2, 3], [0, 2, 3])]).all()
-    assert rdm_problem(patterns) == "activations that are not finite for stimulus '1'"
 
 
 @pytest.mark.parametrize("value", [0.1, 1e8, 0.0])
@@ -141,8 +140,6 @@ def test_a_constant_pattern_has_nan_correlation_distances_and_a_reason(value):
     patterns[2] = value
     assert np.isnan(rdm(patterns)).tolist() == [False, True, True]
     assert np.isfinite(rdm(patterns, method="sqeuclidean")).all()
-    assert rdm_problem(patterns) == "a constant response across units to stimulus '2'"
-    assert rdm_problem(patterns[:2]) is None
 
 
 def test_a_stimulus_without_trials_is_missing_in_its_own_place():
@@ -150,7 +147,6 @@ def test_a_stimulus_without_trials_is_missing_in_its_own_place():
     result = square(rdm(trials, [0, 0, 1, 1, 3, 3]))
     assert result.shape == (4, 4)
     assert np.isnan(result[2, [0, 1, 3]]).all()
-    assert rdm_problem(trials, [0, 0, 1, 1, 3, 3]) == "no trials of stimulus '2'"
 
 
 def test_infinite_activations_give_nan_pairs():
@@ -269,5 +265,4 @@ def test_a_covariance_of_too_few_trials_names_the_way_out():
 def test_a_single_unit_has_distances_but_no_correlations():
     responses = np.array([[1.0], [2.0], [4.0]])
     assert np.isnan(rdm(responses)).all()
-    assert rdm_problem(responses) == "a constant response across units to stimulus '0', '1', '2'"
     np.testing.assert_array_equal(rdm(responses, method="sqeuclidean"), [1.0, 9.0, 4.0])

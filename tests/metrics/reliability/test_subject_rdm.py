@@ -65,10 +65,10 @@ def test_crossnobis_is_zero_on_average_where_stimuli_are_alike(noise):
     rng = np.random.default_rng(1)
     labels = np.repeat(np.arange(6), [4, 5, 6, 7, 8, 9])
     found = []
-    for _ in range(100):
+    for _ in range(40):
         block = Trials(rng.normal(size=(len(labels), 8)) * np.linspace(0.5, 2, 8), labels)
         found.append(subject_rdm("a", [block], 6, method="crossnobis", noise=noise, splits=1).rdm.mean())
-    assert abs(np.mean(found)) < 4 * np.std(found) / np.sqrt(100)
+    assert abs(np.mean(found)) < 4 * np.std(found) / np.sqrt(40)
 
 
 @pytest.mark.slow

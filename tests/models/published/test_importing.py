@@ -20,12 +20,17 @@ def original():
     return model
 
 
+@pytest.fixture(scope="module")
+def state(original):
+    head = {"loss.neck.fc0.weight": torch.zeros(2048, 512), "loss.neck.bn0.bias": torch.zeros(2048)}
+    return lightning_state(original, **head)
+
+
 @pytest.fixture
-def file(tmp_path, original):
+def file(tmp_path, state):
     path = tmp_path / "run" / "val_best.ckpt"
     path.parent.mkdir()
-    head = {"loss.neck.fc0.weight": torch.zeros(2048, 512), "loss.neck.bn0.bias": torch.zeros(2048)}
-    torch.save({"state_dict": lightning_state(original, **head), "epoch": 6, "global_step": 50}, path)
+    torch.save({"state_dict": state, "epoch": 6, "global_step": 50}, path)
     return path
 
 

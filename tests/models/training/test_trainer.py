@@ -251,8 +251,8 @@ from tests.factories.training_sweeps import tiny
 
 torch.set_num_threads(1)
 config = TrainingConfig.published(
-    "zhuang-small+gpt", "supervised", epochs=3, batch_size=8, optimizer="adamw", learning_rate=1e-3,
-    checkpoint_seconds=0.0, augmentation="physical", precision="float32",
+    "s4-small+gpt", "supervised", epochs=3, batch_size=8, optimizer="adamw", learning_rate=1e-3,
+    checkpoint_seconds=0.0, probe_epochs=2, augmentation="physical", precision="float32",
 )
 if __name__ == "__main__":
     train(config, tiny(), out=sys.argv[1], device="cpu")
@@ -289,7 +289,7 @@ def test_a_run_killed_at_any_moment_ends_with_the_weights_of_an_unbroken_one(kil
 @pytest.mark.slow
 def test_two_processes_train_as_one(tmp_path):
     script = tmp_path / "script.py"
-    script.write_text(SCRIPT.replace("zhuang-small+gpt", "zhuang-ugrnn-small"))
+    script.write_text(SCRIPT.replace("s4-small+gpt", "zhuang-ugrnn-small"))
     assert _start(script, tmp_path / "one").wait() == 0
     two = _start(script, tmp_path / "two", "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2")
     assert two.wait() == 0

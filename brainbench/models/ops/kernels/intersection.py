@@ -1,8 +1,7 @@
 """The gates of an IntersectionRNN, after its convolution (Collins et al. 2017): a kernel forward, a kernel backward.
 
-With p, m, q, n the four gates' pre-activations, normalised over channels if asked (Ba et al. 2016):
-s' = σ(p + 1) s + (1 − σ(p + 1)) tanh(m) and y = σ(q + 1) x + (1 − σ(q + 1)) relu(n). Letters: R rows (stimulus, then
-place), C channels.
+With p, m, q, n the four gates' pre-activations, normalised over channels if asked (Ba et al. 2016): s' = σ(p + 1) s +
+(1 − σ(p + 1)) tanh(m) and y = σ(q + 1) x + (1 − σ(q + 1)) relu(n). Letters: R rows (stimulus, then place), C channels.
 """
 
 from typing import Any
@@ -56,24 +55,10 @@ def _at(pointer, rows, c, batch_stride, PLACES: tl.constexpr, PLACE_STRIDE: tl.c
 
 @triton.jit
 def gates_kernel(
-    fused,
-    x,
-    state,
-    norms,
-    y,
-    after,
-    count,
-    x_batch,
-    state_batch,
-    PLACES: tl.constexpr,
-    X_PLACE: tl.constexpr,
-    STATE_PLACE: tl.constexpr,
-    C: tl.constexpr,
-    NORM: tl.constexpr,
-    EPS: tl.constexpr,
-    BLOCK_R: tl.constexpr,
-    BLOCK_C: tl.constexpr,
-):
+    fused, x, state, norms, y, after, count, x_batch, state_batch,
+    PLACES: tl.constexpr, X_PLACE: tl.constexpr, STATE_PLACE: tl.constexpr,
+    C: tl.constexpr, NORM: tl.constexpr, EPS: tl.constexpr, BLOCK_R: tl.constexpr, BLOCK_C: tl.constexpr,
+):  # fmt: skip
     """Write y and s' [R, C]. A program takes ``BLOCK_R`` rows with all their channels."""
     rows = tl.program_id(0) * BLOCK_R + tl.arange(0, BLOCK_R)
     c = tl.arange(0, BLOCK_C)
@@ -118,32 +103,12 @@ def _add(at, gradient, c, C: tl.constexpr):
 
 @triton.jit
 def gates_backward_kernel(
-    fused,
-    x,
-    state,
-    norms,
-    d_y,
-    d_after,
-    d_fused,
-    d_x,
-    d_state,
-    sums,
-    count,
-    x_batch,
-    state_batch,
-    d_y_batch,
-    d_after_batch,
-    PLACES: tl.constexpr,
-    X_PLACE: tl.constexpr,
-    STATE_PLACE: tl.constexpr,
-    D_Y_PLACE: tl.constexpr,
-    D_AFTER_PLACE: tl.constexpr,
-    C: tl.constexpr,
-    NORM: tl.constexpr,
-    EPS: tl.constexpr,
-    BLOCK_R: tl.constexpr,
-    BLOCK_C: tl.constexpr,
-):
+    fused, x, state, norms, d_y, d_after, d_fused, d_x, d_state, sums,
+    count, x_batch, state_batch, d_y_batch, d_after_batch,
+    PLACES: tl.constexpr, X_PLACE: tl.constexpr, STATE_PLACE: tl.constexpr,
+    D_Y_PLACE: tl.constexpr, D_AFTER_PLACE: tl.constexpr,
+    C: tl.constexpr, NORM: tl.constexpr, EPS: tl.constexpr, BLOCK_R: tl.constexpr, BLOCK_C: tl.constexpr,
+):  # fmt: skip
     """Write the gradients of pre-activations [R, 4 C], x and s [R, C]; add those of the norms to this program's sums.
 
     A program takes every num_programs-th block of ``BLOCK_R`` rows, with all their channels.
@@ -217,12 +182,8 @@ def apply_gates(
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Return (y, state), both [B, C, H, W] with channels innermost.
 
-    Args:
-        fused: [R, 4 C], contiguous.
-        x: [B, C, H, W], the cell's input; its precision is that of y.
-        state: [B, C, H, W].
-        norms: [8, C], contiguous: scales of the four gates, then shifts; None without layer norms.
-        state_type: Precision of the new state.
+    ``fused`` [R, 4 C] and ``norms`` [8, C] (scales of the four gates, then shifts; None without layer norms) are
+    contiguous. y has the precision of ``x`` [B, C, H, W], the new state that of ``state_type``.
     """
     x, state = channels_innermost(x), channels_innermost(state)
     y, after = _empty_maps(x, x.dtype), _empty_maps(x, state_type)

@@ -30,39 +30,12 @@ def _from(
 
 @triton.jit
 def unfold_kernel(
-    x0,
-    x1,
-    x2,
-    x3,
-    out,
-    total,
-    batch0,
-    batch1,
-    batch2,
-    batch3,
-    row0,
-    row1,
-    row2,
-    row3,
-    place0,
-    place1,
-    place2,
-    place3,
-    C0: tl.constexpr,
-    C1: tl.constexpr,
-    C2: tl.constexpr,
-    C3: tl.constexpr,
-    UNIT: tl.constexpr,
-    H: tl.constexpr,
-    W: tl.constexpr,
-    OUT_H: tl.constexpr,
-    OUT_W: tl.constexpr,
-    KERNEL_H: tl.constexpr,
-    KERNEL_W: tl.constexpr,
-    TOP: tl.constexpr,
-    LEFT: tl.constexpr,
-    BLOCK: tl.constexpr,
-):
+    x0, x1, x2, x3, out, total,
+    batch0, batch1, batch2, batch3, row0, row1, row2, row3, place0, place1, place2, place3,
+    C0: tl.constexpr, C1: tl.constexpr, C2: tl.constexpr, C3: tl.constexpr, UNIT: tl.constexpr,
+    H: tl.constexpr, W: tl.constexpr, OUT_H: tl.constexpr, OUT_W: tl.constexpr,
+    KERNEL_H: tl.constexpr, KERNEL_W: tl.constexpr, TOP: tl.constexpr, LEFT: tl.constexpr, BLOCK: tl.constexpr,
+):  # fmt: skip
     """Write the windows of all inputs, whose channels lie side by side in every tap.
 
     A thread's share is ``UNIT`` numbers, and all strides and channels come in units: threads that follow one another
@@ -101,12 +74,8 @@ def unfold_into(
 ) -> None:
     """Fill ``out`` [R, taps · ΣC] with windows of inputs [B, C, H, W] whose channels lie side by side.
 
-    Args:
-        out: Contiguous; its precision is what inputs are rounded to.
-        inputs: On one grid; channels innermost in memory.
-        grid: Places (rows, columns) of the result.
-        kernel: Size of the window.
-        pads: Zeros (above, left) of the inputs.
+    ``out`` is contiguous, and its precision is what inputs are rounded to; they lie on one grid, channels innermost in
+    memory. ``grid`` counts places (rows, columns) of the result, ``pads`` zeros (above, left) of the inputs.
     """
     if len(inputs) > SLOTS:
         joined = torch.cat([x.permute(0, 2, 3, 1).to(out.dtype) for x in inputs[SLOTS - 1 :]], 3).permute(0, 3, 1, 2)
