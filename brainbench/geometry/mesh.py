@@ -131,8 +131,9 @@ class Mesh:
     def content_hash(self) -> str:
         """Hash of vertices and faces; the name does not count."""
         from brainbench.core.files import content_hash
+        from brainbench.core.portable import without_last_digits
 
-        return content_hash(self.vertices, self.faces)
+        return content_hash(without_last_digits(self.vertices), self.faces)
 
     def scaled(self, factor: float) -> Mesh:
         """Return the mesh scaled about its origin."""

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from brainbench.core.contracts import check_stimulus_set
 from brainbench.core.errors import BrainbenchError, DataError, UsageError
 from brainbench.core.files import cache_dir, content_hash, to_json
+from brainbench.core.portable import portable
 from brainbench.core.progress import Progress
 from brainbench.core.reading.sealed import seal_file, trust_sealed
 from brainbench.stimuli.engines import DEFAULT_ENGINE, PHYSICS_VERSION, get_engine
@@ -296,7 +297,7 @@ def _warn_unstable(dataset: xr.Dataset) -> None:
 def _config_hash(scenes: Sequence[Scene], fidelity: Fidelity, backend: str) -> str:
     """Hash what was asked for: equal on every machine, whatever its arithmetic."""
     arrays = [scene.mounts for scene in scenes]
-    return content_hash(backend, fidelity, [scene.config() for scene in scenes], arrays)
+    return content_hash(backend, fidelity, portable([scene.config() for scene in scenes]), portable(arrays))
 
 
 def cache_path(

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from brainbench.core.errors import UsageError
 from brainbench.core.files import content_hash, to_plain
+from brainbench.core.portable import portable
 from brainbench.geometry import Mesh
 from brainbench.stimuli.objects.obstacle import ConvexPart, Part, TriangleMesh, bounds_of
 
@@ -70,7 +71,7 @@ class Solid:
             return content_hash(self.origin, round(self.diagonal, 12))
         parts = [{"kind": type(part).__name__, **to_plain(part)} for part in self.parts]
         told = () if self.surface is None or _through_corners(self.surface, self.parts) else (self.surface,)
-        return content_hash(parts, *map(to_plain, told))
+        return content_hash(portable(parts), *map(portable, told))
 
 
 def to_surface(mesh: Mesh) -> TriangleMesh:

@@ -15,6 +15,7 @@ from brainbench import __version__
 from brainbench.core.contracts import SWEEPS_FORMAT, SWEEPS_SCHEMA
 from brainbench.core.errors import UsageError, check_name
 from brainbench.core.files import content_hash, to_plain
+from brainbench.core.portable import portable
 from brainbench.core.reading.ranges import check_number
 from brainbench.stimuli.engines import DEFAULT_ENGINE, PHYSICS_VERSION, get_engine
 from brainbench.stimuli.engines.fidelity import Fidelity
@@ -174,7 +175,7 @@ class GenerationPlan:
     @cached_property
     def config_hash(self) -> str:
         """Hash of :attr:`config`."""
-        return content_hash(self.config)
+        return content_hash(portable(self.config))
 
     @cached_property
     def chosen(self) -> NDArray[np.bool_]:
