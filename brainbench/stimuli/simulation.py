@@ -250,7 +250,7 @@ def _assemble(
         dataset[ORIENTATION] = (("stimulus", "time", "whisker", "row_axis", "col_axis"), orientation)
     if clipped is not None:
         dataset.attrs["clipped"] = _count_clipped(dataset, clipped, frames.clip)
-    dataset.attrs["config_hash"] = _config_hash(scenes, fidelity, backend)
+    dataset.attrs["config_hash"] = config_hash(scenes, fidelity, backend)
     dataset.attrs["content_hash"] = hash_stimulus_set(dataset)
     return check_stimulus_set(dataset)
 
@@ -294,8 +294,8 @@ def _warn_unstable(dataset: xr.Dataset) -> None:
         )
 
 
-def _config_hash(scenes: Sequence[Scene], fidelity: Fidelity, backend: str) -> str:
-    """Hash what was asked for: equal on every machine, whatever its arithmetic."""
+def config_hash(scenes: Sequence[Scene], fidelity: Fidelity, backend: str) -> str:
+    """Return a hash of what was asked for, equal on every machine whatever its arithmetic."""
     arrays = [scene.mounts for scene in scenes]
     return content_hash(backend, fidelity, portable([scene.config() for scene in scenes]), portable(arrays))
 
@@ -311,5 +311,5 @@ def cache_path(
     from importlib import metadata
 
     library = metadata.version(engine.package) if engine.package else ""
-    key = content_hash(_config_hash(scenes, fidelity, engine.name), library, PHYSICS_VERSION, *more, length=24)
+    key = content_hash(config_hash(scenes, fidelity, engine.name), library, PHYSICS_VERSION, *more, length=24)
     return cache_dir(folder) / f"{key}.h5"

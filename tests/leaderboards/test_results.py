@@ -9,6 +9,10 @@ from pathlib import Path
 
 import pytest
 
+from brainbench.stimuli.engines import DEFAULT_ENGINE
+from brainbench.stimuli.engines.fidelity import Fidelity
+from brainbench.stimuli.scenes.recipes import get_recipe
+from brainbench.stimuli.simulation import config_hash
 from leaderboards import rank, read_records
 from leaderboards.audit import remarks
 from tests.factories.records import VALIDATOR
@@ -24,6 +28,12 @@ def stored():
 def test_every_shipped_record_is_intact_and_none_contradicts_another(stored):
     assert [item.problem for item in stored if item.problem] == []
     assert [text for doubts in remarks(stored).values() for text in doubts if text.startswith("conflict")] == []
+
+
+def test_a_score_made_on_this_processor_stands_on_the_shipped_board(stored):
+    made = config_hash(get_recipe("objects").scenes, Fidelity.parse("balanced,twist=false"), DEFAULT_ENGINE)
+    hashes = {item.record.score.provenance.stimuli_hash for item in stored if item.record}
+    assert hashes == {made}
 
 
 def test_shipped_records_fit_the_published_schema(stored):
