@@ -21,7 +21,7 @@ def plot_tradeoff(points: Iterable[dict[str, Any]], path: str | os.PathLike[str]
     figure, (axes,) = panels(1, 2 if hollow else 1, (10.5 if hollow else 6, 4.6))
     for number, group in enumerate(sorted({(point["solver"], point["backend"]) for point in bench})):
         _draw_bench(axes[0], [p for p in bench if (p["solver"], p["backend"]) == group], COLORS[number])
-    _label(axes[0], "bench tests: largest error against exact solutions", "largest relative error")
+    _label(axes[0], "whiskers in contact, against a converged simulation", "relative error that 95 % stay below")
     if hollow:
         _draw_collisions(axes[1], hollow)
     return save_figure(figure, Path(path), dpi=150)
@@ -56,7 +56,7 @@ def _draw_collisions(axes: Any, points: Sequence[dict[str, Any]]) -> None:
         parts = f"convex parts, concavity {geometry.partition('-')[2]}"
         name = {"exact": "exact surface", "hull": "convex hull"}.get(geometry, parts)
         axes.scatter([], [], s=22, marker="s", color=COLORS[number], label=name)
-    _label(axes, "whisking into a hollow, by collision surface", "relative error of the base moment")
+    _label(axes, "hollow objects, by collision surface", "relative error that 95 % stay below")
 
 
 def _label(axes: Any, title: str, error: str) -> None:
