@@ -60,16 +60,16 @@ def whisker(
     setting = {">links": "{0[links]}", ">step ms": lambda point: f"{point['time_step'] * 1e3:g}"}
     cost = {">processor s / whisker-s": lambda point: _known(point["cost"], ".3g")}
     text = table_of(
-        f"{len(points)} settings measured; those that no other beats in cost and error (95 % of whiskers stay below):",
+        f"{len(points)} settings measured; those that no other beats in cost and error (90 % of whiskers stay below):",
         [point.settings | {"error": point.error, "cost": point.cost} for point in best],
         {">error": "{0[error]:.2%}", **cost, **setting, "backend": "{0[backend]}"},
     )
     if still := [point for point in points if point.get("solver") == "quasistatic"]:
-        columns = {">error": lambda point: _known(point["error"], ".2%"), ">pegs": "{0[static_error]:.2%}"}
+        columns = {">error": lambda point: _known(point[tradeoff.ERROR], ".2%"), ">pegs": "{0[static_error]:.2%}"}
         text += "\n\n" + table_of("without inertia (rod, quasistatic):", still, columns | cost | setting)
     if hollow := tradeoff.collision_points(points):
         columns = {
-            ">error": lambda point: _known(point["error"], ".2%"),
+            ">error": lambda point: _known(point[tradeoff.ERROR], ".2%"),
             **cost,
             "collision": "{0[collision]}",
             ">pieces": lambda point: point.get("pieces", ""),
