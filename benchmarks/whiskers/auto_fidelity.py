@@ -2,8 +2,8 @@
 
     python -m benchmarks.whiskers.auto_fidelity --write
 
-Scenes of contact of other seeds than the table's, against the converged simulation of the table and, to know that one's
-own error, a finer one; and what single precision makes of short steps. A promise is kept when 90 % of the whiskers stay below the error that was asked for.
+Scenes of contact of other seeds than the table's, against the converged simulation of the table, which is itself
+compared with a finer one. A promise is kept when 90 % of the whiskers stay below the error that was asked for.
 """
 
 from __future__ import annotations

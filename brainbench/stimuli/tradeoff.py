@@ -81,8 +81,9 @@ class SimulationSetting:
 
 
 REFERENCE = SimulationSetting(Fidelity(links=40, time_step=1e-5, precision="double"), "rod")
-"""The converged simulation, in double precision because single precision loses what such short steps gain: with friction ``rod`` is within some tenths of a per cent of a differential equation that
-no engine shares (``benchmarks/whiskers/friction_reference.py``), ``mujoco`` within some per cent."""
+"""The converged simulation, in double precision: single precision loses more at such short steps than they gain. With
+friction ``rod`` is within some tenths of a per cent of a differential equation that no engine shares
+(``benchmarks/whiskers/friction_reference.py``), ``mujoco`` within some per cent."""
 
 
 def settings(
