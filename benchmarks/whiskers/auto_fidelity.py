@@ -1,0 +1,84 @@
+"""Does ``Fidelity.auto`` keep its promise in scenes that it was not measured in?
+
+    python -m benchmarks.whiskers.auto_fidelity --write
+
+Scenes of contact of other seeds than the table's, against the converged simulation of the table, which is itself
+compared with a finer one. A promise is kept when 90 % of the whiskers stay below the error that was asked for.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+
+import numpy as np
+
+from benchmarks.report import table, write_section
+from brainbench.core.statistics import wilson_interval
+from brainbench.stimuli.engines import get_engine
+from brainbench.stimuli.engines.fidelity import Fidelity
+from brainbench.stimuli.engines.protocol import Job, Trace
+from brainbench.stimuli.tradeoff import REFERENCE, SimulationSetting, run_for_cost
+from brainbench.stimuli.validation.contact_scenes import contact_jobs, difference
+
+ERRORS = (0.4, 0.2, 0.1, 0.07, 0.05)
+FINER = Fidelity(links=60, time_step=5e-6, precision="double"), Fidelity(links=40, time_step=5e-6)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--finer", action="store_true", help="also compare finer settings")
+    parser.add_argument("--write", action="store_true")
+    args = parser.parse_args()
+    jobs = contact_jobs(args.seed)
+    found = get_engine(REFERENCE.backend).run(jobs, REFERENCE.fidelity.resolved(True))
+    kept = [i for i, trace in enumerate(found) if trace.status == "ok" and trace.contact.any()]
+    jobs, references = [jobs[i] for i in kept], [found[i] for i in kept]
+    rows = []
+    for error in ERRORS:
+        fidelity = Fidelity.auto(error=error)
+        errors, cost = compare(SimulationSetting(fidelity), jobs, references)
+        below = np.mean(errors <= error)
+        interval = wilson_interval(float(np.sum(errors <= error)), len(errors), over="whiskers")
+        setting = f"{fidelity.links} links, {fidelity.time_step * 1e3:g} ms, {fidelity.steps_per_period:g} a period"
+        share = f"{below:.1%} [{interval.low:.1%}, {interval.high:.1%}]"
+        rows.append([f"{error:.0%}", setting, share, f"{np.median(errors):.2%}", f"{cost:.3f}"])
+        print(*rows[-1], sep=" | ", flush=True)
+    told = ""
+    if args.finer:
+        told = "\n\nAgainst the same converged simulation (50, 90 and 95 % of the whiskers stay below):\n\n"
+        lines = []
+        for fidelity in FINER:
+            errors, cost = compare(SimulationSetting(fidelity), jobs, references)
+            bounds = [f"{np.quantile(errors, share, method='higher'):.2%}" for share in (0.5, 0.9, 0.95)]
+            lines.append(
+                [
+                    f"{fidelity.links} links, {fidelity.time_step * 1e6:g} µs, {fidelity.precision}",
+                    *bounds,
+                    f"{cost:.2f}",
+                ]
+            )
+        told += table(["setting", "50 %", "90 %", "95 %", "processor s / whisker-s"], lines)
+    body = (
+        f"{len(jobs)} whiskers (seed {args.seed}; {len(found) - len(jobs)} start inside an object or touch nothing): "
+        "mouse and rat, post, ball, edge and hollow, friction 0, .4 and .8, whisking at 5, 10 and 20 Hz. Error: root "
+        "mean square over time of base force or moment, whichever is larger, relative to the converged simulation "
+        "(40 links, 10 µs, double precision).\n\n"
+        + table(["asked for", "`Fidelity.auto`", "whiskers below it", "median error", "processor s / whisker-s"], rows)
+        + told
+    )
+    print(body)
+    if args.write:
+        command = f"python -m benchmarks.whiskers.auto_fidelity{' --finer' if args.finer else ''} --write"
+        write_section("Settings chosen for an error", command, body, subject="whiskers")
+
+
+def compare(setting: SimulationSetting, jobs: Sequence[Job], references: Sequence[Trace]) -> tuple[np.ndarray, float]:
+    """Return the errors [n] of a setting, and its cost in processor s per whisker-second."""
+    traces, cost = run_for_cost(setting, jobs)
+    return np.array([difference(*pair) for pair in zip(traces, references, strict=True)]), cost
+
+
+if __name__ == "__main__":
+    main()
