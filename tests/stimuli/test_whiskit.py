@@ -181,7 +181,7 @@ def test_a_run_that_cannot_be_written_says_why(tmp_path, run):
     with pytest.raises(UsageError, match=r"RC1 .*received \(3, 9, 3\)"):
         save_run(dataset, tmp_path, shapes=[shape[:3] for shape in shapes])
     with pytest.raises(UsageError, match="several animals"):
-        save_run(dataset.isel(whisker=[0, 0]), tmp_path)
+        save_run(dataset.isel(whisker=[0, 0]).assign_coords(whisker=["a:C1", "b:C1"]), tmp_path)
     with pytest.raises(UsageError, match=r"WHISKiT.*need"):
         save_run(dataset.drop_vars("side"), tmp_path)
     both = dataset.isel(stimulus=[0, 0]).assign_coords(stimulus=["a", "b"])

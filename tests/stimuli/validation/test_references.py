@@ -111,6 +111,7 @@ def test_beyond_the_slip_off_offset_there_is_no_equilibrium():
         references.elastica(C2, at, 1.01 * limit)
 
 
+@pytest.mark.slow
 def test_near_the_base_a_whisker_turns_back_over_the_peg_before_it_slips_off():
     at = 0.3 * C2.arc_length
     limit = references.slip_off_offset(C2, at)
@@ -120,6 +121,7 @@ def test_near_the_base_a_whisker_turns_back_over_the_peg_before_it_slips_off():
     assert last.moment == pytest.approx(lever, rel=1e-9)
 
 
+@pytest.mark.slow
 def test_the_slip_off_depth_of_a_round_peg_tends_to_that_of_a_point_on_a_thin_rod():
     thin = replace(C2, base_radius=4.8e-8, tip_radius=8.8e-9)
     at = 0.5 * thin.arc_length
