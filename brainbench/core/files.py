@@ -11,11 +11,14 @@ import os
 from collections.abc import Iterator, Mapping
 from dataclasses import Field, fields, is_dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from brainbench.core.errors import FileWriteError, UsageError, shown
 from brainbench.core.reading.texts import read_json, read_mapping  # noqa: F401 - also imported from here
 from brainbench.core.writing.temporaries import temporary_path
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike, NDArray
 
 CACHE_VARIABLE = "BRAINBENCH_CACHE"
 """Environment variable that overrides the platform's cache folder."""
@@ -146,6 +149,41 @@ def write_text(path: str | os.PathLike[str], text: str) -> Path:
 def write_json(path: str | os.PathLike[str], value: Any) -> Path:
     """Write ``value`` as deterministic JSON, atomically."""
     return write_text(path, to_json(value) + "\n")
+
+
+BITS = 34
+"""Bits of a number that count in a portable hash, about ten digits: the last ones differ between processors."""
+SMALLEST = 1e-12
+"""Numbers below it (SI) are zero: what a rotation by 90° leaves of it is 6e-17 here and 0 there."""
+
+
+def without_last_digits(values: ArrayLike) -> NDArray[Any]:
+    """Return numbers rounded to :data:`BITS` bits, 0 below :data:`SMALLEST`.
+
+    >>> float(without_last_digits(0.1 + 0.2)) == float(without_last_digits(0.3))
+    True
+    """
+    import numpy as np
+
+    numbers = np.asarray(values, dtype=np.float64)
+    # Only exact operations: a power or a logarithm would itself differ in its last digit.
+    mantissa, exponent = np.frexp(np.where(np.abs(numbers) < SMALLEST, 0.0, numbers))
+    return np.ldexp(np.rint(np.ldexp(mantissa, BITS)), exponent - BITS) + 0.0
+
+
+def portable(value: Any) -> Any:
+    """Return plain values as :func:`brainbench.core.files.to_plain` does, floats without their last digits."""
+    return _rounded(to_plain(value))
+
+
+def _rounded(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _rounded(item) for key, item in value.items()}
+    if isinstance(value, list):
+        if value and all(type(item) is float for item in value):
+            return without_last_digits(value).tolist()
+        return [_rounded(item) for item in value]
+    return float(without_last_digits(value)) if type(value) is float else value
 
 
 def content_hash(*values: Any, length: int = 16) -> str:

@@ -130,8 +130,7 @@ class Mesh:
     @cached_property
     def content_hash(self) -> str:
         """Hash of vertices and faces; the name does not count."""
-        from brainbench.core.files import content_hash
-        from brainbench.core.portable import without_last_digits
+        from brainbench.core.files import content_hash, without_last_digits
 
         return content_hash(without_last_digits(self.vertices), self.faces)
 

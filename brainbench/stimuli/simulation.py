@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 
 from brainbench.core.contracts import check_stimulus_set
 from brainbench.core.errors import BrainbenchError, DataError, UsageError
-from brainbench.core.files import cache_dir, content_hash, to_json
-from brainbench.core.portable import portable
+from brainbench.core.files import cache_dir, content_hash, portable, to_json
 from brainbench.core.progress import Progress
 from brainbench.core.reading.sealed import seal_file, trust_sealed
 from brainbench.stimuli.engines import DEFAULT_ENGINE, PHYSICS_VERSION, get_engine

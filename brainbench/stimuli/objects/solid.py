@@ -12,8 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brainbench.core.errors import UsageError
-from brainbench.core.files import content_hash, to_plain
-from brainbench.core.portable import portable
+from brainbench.core.files import content_hash, portable, to_plain
 from brainbench.geometry import Mesh
 from brainbench.stimuli.objects.obstacle import ConvexPart, Part, TriangleMesh, bounds_of
 

@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 from brainbench import __version__
 from brainbench.core.contracts import SWEEPS_FORMAT, SWEEPS_SCHEMA
 from brainbench.core.errors import UsageError, check_name
-from brainbench.core.files import content_hash, to_plain
-from brainbench.core.portable import portable
+from brainbench.core.files import content_hash, portable, to_plain
 from brainbench.core.reading.ranges import check_number
 from brainbench.stimuli.engines import DEFAULT_ENGINE, PHYSICS_VERSION, get_engine
 from brainbench.stimuli.engines.fidelity import Fidelity

@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from brainbench.core.files import content_hash
-from brainbench.core.portable import BITS, portable, without_last_digits
+from brainbench.core.files import BITS, content_hash, portable, without_last_digits
 
 
 @pytest.mark.parametrize("start", [0.1, 0.25, 1.0, 0.029, 123.456, 3e9, 1.7e-5])
