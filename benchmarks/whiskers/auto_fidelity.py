@@ -1,6 +1,7 @@
 """Does ``Fidelity.auto`` keep its promise in scenes that it was not measured in?
 
-    python -m benchmarks.whiskers.auto_fidelity --write
+    python -m benchmarks.whiskers.auto_fidelity --finer --write
+    python -m benchmarks.whiskers.auto_fidelity --engines --write    # the other engines in the same scenes
 
 Scenes of contact of other seeds than the table's, against the converged simulation of the table, which is itself
 compared with a finer one. A promise is kept when 90 % of the whiskers stay below the error that was asked for.
@@ -10,6 +11,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -19,7 +21,7 @@ from brainbench.stimuli.engines import get_engine
 from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.engines.protocol import Job, Trace
 from brainbench.stimuli.tradeoff import REFERENCE, SimulationSetting, run_for_cost
-from brainbench.stimuli.validation.contact_scenes import contact_jobs, difference
+from brainbench.stimuli.validation.contact_scenes import FRICTIONS, contact_jobs, difference
 
 ERRORS = (0.4, 0.2, 0.1, 0.07, 0.05)
 FINER = Fidelity(links=60, time_step=5e-6, precision="double"), Fidelity(links=40, time_step=5e-6)
@@ -30,7 +32,11 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--finer", action="store_true", help="also compare finer settings")
     parser.add_argument("--write", action="store_true")
+    parser.add_argument("--engines", action="store_true", help="compare engines, by friction, in place of settings")
     args = parser.parse_args()
+    if args.engines:
+        engines(args.write)
+        return
     jobs = contact_jobs(args.seed)
     found = get_engine(REFERENCE.backend).run(jobs, REFERENCE.fidelity.resolved(True))
     kept = [i for i, trace in enumerate(found) if trace.status == "ok" and trace.contact.any()]
@@ -72,6 +78,28 @@ def main() -> None:
     if args.write:
         command = f"python -m benchmarks.whiskers.auto_fidelity{' --finer' if args.finer else ''} --write"
         write_section("Settings chosen for an error", command, body, subject="whiskers")
+
+
+def engines(write: bool) -> None:
+    """Compare ``mujoco`` and, in some short scenes, ``bullet`` with ``rod`` in double precision, by friction."""
+    accurate, rows = Fidelity.preset("accurate"), []
+    for friction in FRICTIONS:
+        jobs = [job for job in contact_jobs(0, each=1) if job.obstacles[0].friction == friction]
+        for backend in ("mujoco", "bullet"):
+            some = [job for job in jobs if len(job.times) < 200][:6] if backend == "bullet" else jobs
+            twist = get_engine(backend).twists
+            references = get_engine("rod").run(some, replace(accurate, precision="double", twist=twist))
+            errors, cost = compare(SimulationSetting(accurate, backend), some, references)
+            bounds = [f"{np.quantile(errors, share, method='higher'):.1%}" for share in (0.5, 0.9)]
+            rows.append([f"{friction:g}", backend, str(len(some)), *bounds, f"{cost:.2f}"])
+            print(*rows[-1], sep=" | ", flush=True)
+    body = (
+        "Difference from `rod` (`accurate`, double precision): base force or moment, root mean square, the larger.\n\n"
+    )
+    body += table(["friction", "engine", "whiskers", "median", "90 % below", "processor s / whisker-s"], rows)
+    if write:
+        command = "python -m benchmarks.whiskers.auto_fidelity --engines --write"
+        write_section("Engines in random scenes of contact", command, body, subject="whiskers")
 
 
 def compare(setting: SimulationSetting, jobs: Sequence[Job], references: Sequence[Trace]) -> tuple[np.ndarray, float]:

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 
 from brainbench.core.errors import DataError, DataFileNotFoundError, UsageError, nearest, unknown_name
 from brainbench.core.reading.hdf5 import open_hdf5
+from brainbench.core.reading.regular import check_file
 from brainbench.datasets import hdf5, nwb
 from brainbench.datasets.layouts.registry import detect_layout, get_layout, is_name, list_layouts, load_layout
 from brainbench.datasets.trials.selection import DEFAULT, EVERYTHING, Selection
@@ -172,6 +173,8 @@ def _expand(source: str) -> list[Path]:
             f"The demo recordings are made from simulated stimuli on first use: ask for recordings={source!r} in "
             "brainbench.score, or pass the folder that brainbench.scoring.demo.demo_recordings returns."
         )
+    if path.exists():
+        check_file(path, "file of recordings")
     siblings = [item.name for item in path.parent.iterdir()] if path.parent.is_dir() else []
     guess = nearest(path.name, siblings)
     raise DataFileNotFoundError(f"There is no file {source!r}{f'; did you mean {guess!r}?' if guess else '.'}")
