@@ -94,7 +94,7 @@ def read_entry(path: Path) -> xr.Dataset | None:
     try:
         state = path.stat()
         # A score asks for its stimuli twice, for the demo recordings and for the network.
-        return _read_entry(path, state.st_size, state.st_mtime_ns).copy()
+        return _read_entry(path, state.st_size, state.st_mtime_ns).copy(deep=True)
     except DataError as error:
         _LOG.warning("cached stimuli are damaged and are simulated again: %s", error)
         return None

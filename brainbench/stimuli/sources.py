@@ -88,7 +88,8 @@ def load_stimuli(
         return source if whiskers == "all" else load_stimuli(source.dataset, whiskers=whiskers)  # type: ignore[arg-type]
     if not isinstance(source, (str, os.PathLike)):
         return _from_dataset(check_stimulus_set(source), whiskers, "stimulus set")
-    index = index_path(source, whiskers, Fidelity.of(fidelity), backend) if cache and is_packaged(source) else None
+    kept = cache and isinstance(backend, str) and is_packaged(source)
+    index = index_path(source, whiskers, Fidelity.of(fidelity), backend) if kept else None
     if index is not None and (found := _indexed(index)) is not None:
         return found
     if (recipe := _recipe(source, whiskers)) is not None:

@@ -148,9 +148,9 @@ def measure_tradeoff(
         points = list(table["points"])
     known = {_key(point) for point in points}
     missing = [setting for setting in wanted if _key(_fields(setting)) not in known]
-    scenes = {kind: _References(contact_scenes.OBJECTS if kind is None else ("hollow",)) for kind in (None, "hollow")}
+    all_objects, hollows = _References(contact_scenes.OBJECTS), _References(("hollow",))
     for done, setting in enumerate(missing, start=1):
-        points.append(_measure(setting, scenes["hollow" if setting.collision else None]))
+        points.append(_measure(setting, hollows if setting.collision else all_objects))
         write_json(path, {**head, "points": points})
         if progress is not None:
             progress(done, len(missing), "measuring settings")

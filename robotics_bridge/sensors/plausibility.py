@@ -6,8 +6,8 @@ import warnings
 from collections.abc import Mapping
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
+from brainbench.core.rotations import to_matrices
 from robotics_bridge.physics.scene import TouchScene
 from robotics_bridge.sensors.probes.placement import Probes, enclosing_sphere
 from robotics_bridge.sensors.probes.sensors import SurfaceDistanceProbe
@@ -46,8 +46,7 @@ def _buried(scene: TouchScene, link: str, probes: Probes) -> np.ndarray:
     found = np.zeros(len(probes), bool)
     for geometry in (scene.geometries[g] for g in scene.geometries_of(link)):
         if geometry.kind in _CONVEX:
-            turn = Rotation.from_quat(np.roll(geometry.quaternion, -1))
-            local = turn.inv().apply(np.asarray(probes.position) - geometry.position)
+            local = (np.asarray(probes.position) - geometry.position) @ to_matrices(geometry.quaternion)
             # Depth in a convex solid is the least of h(d) − x · d over directions d, h its support function. Finitely
             # many directions overestimate it, by less than a fiftieth of its size.
             reach = geometry.reach(_DIRECTIONS)

@@ -296,3 +296,10 @@ def test_new_scenes_twist_and_shipped_recipes_state_that_they_do_not():
     asked = simulate(pinned, fidelity="fast,twist=true", cache=False)
     assert asked.attrs["config_hash"] != kept.attrs["config_hash"]
     assert not np.array_equal(asked["wrench"].values, kept["wrench"].values)
+
+
+def test_what_a_caller_does_to_a_stimulus_set_does_not_reach_the_next_one(engine):
+    simulate(SCENE, backend=engine)
+    first = simulate(SCENE, backend=engine)
+    first["wrench"].values[:] = 0
+    assert abs(simulate(SCENE, backend=engine)["wrench"]).sum() > 0

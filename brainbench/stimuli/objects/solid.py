@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brainbench.core.errors import UsageError
-from brainbench.core.files import content_hash, portable, to_plain
+from brainbench.core.files import content_hash, portable
 from brainbench.geometry import Mesh
 from brainbench.stimuli.objects.obstacle import ConvexPart, Part, TriangleMesh, bounds_of
 
@@ -68,9 +68,9 @@ class Solid:
         """Hash of the parts; kept, because every whisker's job asks for it and a hull has a thousand corners."""
         if self.origin is not None:
             return content_hash(self.origin, round(self.diagonal, 12))
-        parts = [{"kind": type(part).__name__, **to_plain(part)} for part in self.parts]
+        parts = [{"kind": type(part).__name__, **portable(part)} for part in self.parts]
         told = () if self.surface is None or _through_corners(self.surface, self.parts) else (self.surface,)
-        return content_hash(portable(parts), *map(portable, told))
+        return content_hash(parts, *map(portable, told))
 
 
 def to_surface(mesh: Mesh) -> TriangleMesh:

@@ -10,6 +10,7 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
+from brainbench.core.rotations import euler_matrix
 from brainbench.stimuli.engines.protocol import Job, Trace, base_rotation
 from brainbench.stimuli.motion.trajectories import ArrayFollicle, Whisking
 from brainbench.stimuli.objects.obstacle import Obstacle
@@ -114,20 +115,20 @@ def _object(
     """Return a solid, its turn in the axes of the contact [3, 3], and which point of it touches [3] (m)."""
     size = scale * random.uniform(1, 2)
     roll = random.uniform(-0.4, 0.4)
+    turn = euler_matrix((0.0, roll, 0.0))
     if kind == "post":
-        return capsule(4e-4 * size, 0.03 * scale), _about_y(roll), np.array([0.0, -4e-4 * size, 0.0])
+        return capsule(4e-4 * size, 0.03 * scale), turn, np.array([0.0, -4e-4 * size, 0.0])
     if kind == "ball":
         return sphere(2e-3 * size), np.eye(3), np.array([0.0, -2e-3 * size, 0.0])
     if kind == "edge":
-        half = math.sqrt(0.5)
-        diagonal = np.array([[half, -half, 0.0], [half, half, 0.0], [0.0, 0.0, 1.0]])
         # The edge at −x, −y looks backwards once the box is turned by 45° about z.
         width = 6e-3 * size
-        return box((width, width, 0.03 * scale)), _about_y(roll) @ diagonal, np.array([-width / 2, -width / 2, 0.0])
+        turn = turn @ euler_matrix((0.0, 0.0, math.pi / 4))
+        return box((width, width, 0.03 * scale)), turn, np.array([-width / 2, -width / 2, 0.0])
     # The trough lies along the whisker: its axis z becomes the contact's −x.
-    trough = np.array([[0.0, 0.0, -1.0], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]])
     factor = 0.36 * size
-    return hollow.scaled(factor), _about_y(roll) @ trough, factor * _floor(random.uniform(0.35, 0.65))
+    turn = euler_matrix((0.0, roll - math.pi / 2, 0.0))
+    return hollow.scaled(factor), turn, factor * _floor(random.uniform(0.35, 0.65))
 
 
 @cache
@@ -141,8 +142,3 @@ def _faces() -> NDArray[np.float64]:
 def _floor(along: float) -> NDArray[np.float64]:
     """Return the point [3] (m) of the hollow face of the Rodgers solid, a fraction of the way along its curve."""
     return _faces()[round(along * (len(_faces()) - 1)), 2:].mean(axis=0)
-
-
-def _about_y(angle: float) -> NDArray[np.float64]:
-    sine, cosine = math.sin(angle), math.cos(angle)
-    return np.array([[cosine, 0.0, sine], [0.0, 1.0, 0.0], [-sine, 0.0, cosine]])
