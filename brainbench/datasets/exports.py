@@ -74,8 +74,9 @@ def export(source: Source, target: str | os.PathLike[str], *, select: Selection 
 def subset(session: Session, selection: Selection = EVERYTHING, table: str = "trials") -> Session:
     """Read a session into memory: spikes, tables and plain columns of the rows that a selection keeps.
 
-    Raises DataError: units or tables are damaged, or no unit is left; UsageError: a rule names a column that is not
-    there.
+    Raises:
+        DataError: units or tables are damaged, or no unit is left.
+        UsageError: a rule names a column that is not there.
     """
     units = session.units
     if units is None:

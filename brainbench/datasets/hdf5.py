@@ -82,7 +82,8 @@ def is_ours(file: h5py.File) -> bool:
 def holds_counts(file: h5py.File, path: Path) -> bool:
     """Return whether an open file has this layout and kind "counts".
 
-    Raises DataError: it has this layout, in a version or kind that this package does not read.
+    Raises:
+        DataError: it has this layout, in a version or kind that this package does not read.
     """
     if not is_ours(file):
         return False
@@ -100,7 +101,8 @@ def holds_counts(file: h5py.File, path: Path) -> bool:
 def read_sessions(file: h5py.File, path: Path) -> list[Session]:
     """Describe the sessions of an open file of kind "spikes"; columns are read later.
 
-    Raises DataError: a group of the layout is missing.
+    Raises:
+        DataError: a group of the layout is missing.
     """
     sessions = []
     for name, group in _need(file, "sessions", path).items():
@@ -126,7 +128,8 @@ def read_sessions(file: h5py.File, path: Path) -> list[Session]:
 def read_counts(file: h5py.File, path: Path) -> xr.Dataset:
     """Load the data set in an open file of kind "counts".
 
-    Raises DataError: a part of the layout is missing or does not fit the others.
+    Raises:
+        DataError: a part of the layout is missing or does not fit the others.
     """
     import xarray as xr
 

@@ -55,7 +55,9 @@ def write_nwb(
 
     That it is synthetic is said in the descriptions and keywords. ``general`` and ``subject`` are further texts under
     ``/general`` and ``/general/subject``; ``columns`` says what columns mean, by name.
-    Raises DataError: ids are no integers or a table has no ``stop_time``, which NWB needs.
+
+    Raises:
+        DataError: ids are no integers or a table has no ``stop_time``, which NWB needs.
     """
     import h5py
 

@@ -60,7 +60,10 @@ def find_files(source: Source) -> list[Path]:
     """Return the recording files a source names, sorted and without repetition.
 
     A folder is searched at every depth for ``.nwb`` and, if it has none, for ``.h5`` and ``.hdf5``; hidden files are
-    skipped. Raises DataFileNotFoundError: a path does not exist, or a folder or glob holds no recording file.
+    skipped.
+
+    Raises:
+        DataFileNotFoundError: a path does not exist, or a folder or glob holds no recording file.
     """
     items = [source] if isinstance(source, (str, os.PathLike)) else source
     return sorted({path for item in items for path in _expand(os.fspath(item))}, key=str)
@@ -69,7 +72,8 @@ def find_files(source: Source) -> list[Path]:
 def resolve_selection(select: Selection | str) -> Selection:
     """Return a selection from itself, a name ("none", "default" or a layout's) or rules in text.
 
-    Raises UsageError: the text is neither a name nor a rule.
+    Raises:
+        UsageError: the text is neither a name nor a rule.
     """
     if isinstance(select, Selection):
         return select
@@ -87,7 +91,8 @@ def resolve_selection(select: Selection | str) -> Selection:
 def open_file(path: Path) -> Iterator[h5py.File]:
     """Open an HDF5 file for reading; failures inside the block name the file too.
 
-    Raises DataError: the file is not HDF5, is truncated or is damaged.
+    Raises:
+        DataError: the file is not HDF5, is truncated or is damaged.
     """
     if path.suffix.lower() == ".npz":
         raise DataError(
@@ -102,7 +107,9 @@ def suitable_files(paths: Sequence[Path], *, strict: bool = False) -> tuple[list
     """Return the files that hold sessions of spike times, and for each other file a sentence that says why not.
 
     One file alone was meant, so it is kept whatever it holds: reading it says what is wrong.
-    Raises DataError: there are several files of which none is suitable, or with ``strict`` not all.
+
+    Raises:
+        DataError: there are several files of which none is suitable, or with ``strict`` not all.
     """
     if len(paths) < 2:
         return list(paths), []
@@ -128,7 +135,9 @@ def each_session(
 
     A session comes as its layout adapts it. Read it while the file is open, inside the block of
     :func:`open_file`, which names the file if reading fails.
-    Raises DataError: the file is neither NWB 2.x nor our layout, or holds responses that are already counted.
+
+    Raises:
+        DataError: the file is neither NWB 2.x nor our layout, or holds responses that are already counted.
     """
     for session in _sessions(file, path):
         found = layout or detect_layout(session)

@@ -52,8 +52,9 @@ class SessionTable:
     def column(self, name: str) -> NDArray[Any]:
         """Read one column [rows]; text comes as ``str``.
 
-        Raises UsageError: there is no such column (the nearest is named); DataError: it is ragged, not one value per
-        row, or of another length than the table.
+        Raises:
+            UsageError: there is no such column (the nearest is named).
+            DataError: it is ragged, not one value per row, or of another length than the table.
         """
         self.require(name)
         if f"{name}_index" in self.data:
@@ -69,7 +70,11 @@ class SessionTable:
         return values
 
     def times(self, name: str) -> NDArray[np.float64]:
-        """Read one numeric column [rows] in seconds. Raises DataError: the column holds text."""
+        """Read one numeric column [rows] in seconds.
+
+        Raises:
+            DataError: the column holds text.
+        """
         values = self.column(name)
         if values.dtype.kind == "U":
             raise DataError(f"Column {name!r} of {self.label} holds text ({values[0]!r}); expected times in seconds.")
@@ -82,7 +87,8 @@ class SessionTable:
     def ends(self, name: str) -> NDArray[np.int64]:
         """Return the checked row ends [rows] of a ragged column.
 
-        Raises DataError: they decrease, are negative or do not end where the values end.
+        Raises:
+            DataError: they decrease, are negative or do not end where the values end.
         """
         total = len(self.data[name])
         ends = np.asarray(self.data[f"{name}_index"][...]).astype(np.int64)
@@ -101,7 +107,11 @@ class SessionTable:
         return replace(self, data={**self.data, **columns})
 
     def require(self, column: str) -> None:
-        """Raise the error for an unknown column, naming the nearest one. Raises UsageError: there is no such column."""
+        """Raise the error for an unknown column, naming the nearest one.
+
+        Raises:
+            UsageError: there is no such column.
+        """
         if column not in self.data:
             raise unknown_name("column", column, self.columns, hint=f"(in {self.label})")
 
@@ -137,7 +147,8 @@ class Series:
     def active_times(self) -> NDArray[np.float64]:
         """Return the times (s, ascending) of the samples of a 0/1 signal that are 1.
 
-        Raises DataError: the samples are not 0 or 1, or timestamps are missing or of another number.
+        Raises:
+            DataError: the samples are not 0 or 1, or timestamps are missing or of another number.
         """
         values = np.asarray(self.data[...]).ravel()
         where = np.flatnonzero(values > 0.5)
@@ -182,7 +193,11 @@ class Session:
     """Recipe of the stimuli that this session's animal felt, where the file names one."""
 
     def table(self, name: str) -> SessionTable:
-        """Return one interval table. Raises UsageError: there is no such table (the nearest is named)."""
+        """Return one interval table.
+
+        Raises:
+            UsageError: there is no such table (the nearest is named).
+        """
         check_name("table", name, self.tables, hint=f"(interval tables of {self.source})")
         return self.tables[name]
 
@@ -208,7 +223,9 @@ def make_session(
     ``spikes`` are the times (s) of each unit, ``tables`` mappings of columns with at least ``start_time``,
     ``unit_columns`` such as ``id``, ``depth`` (µm) and ``layer``, ``observed`` the recorded spans [n, 2] (s) of each
     unit. The session's name is unique within the animal.
-    Raises DataError: columns differ in length or a table has no ``start_time``.
+
+    Raises:
+        DataError: columns differ in length or a table has no ``start_time``.
     """
     data: dict[str, Any] = {"id": np.arange(len(spikes))}
     data |= {name: np.asarray(values) for name, values in (unit_columns or {}).items()}

@@ -48,7 +48,9 @@ def score_layers(
     ``layers`` are what :meth:`Metric.layer` made of each layer, in network order, ``subjects`` what
     :meth:`Metric.animal` made of each animal. ``committed`` is a layer that was chosen before anything was scored;
     without a torch ``device`` numpy computes the permutations.
-    Raises UsageError: no animals, subjects of other stimuli, or an unknown estimator or layer.
+
+    Raises:
+        UsageError: no animals, subjects of other stimuli, or an unknown estimator or layer.
     """
     if len(set(map(str, stimuli))) < len(stimuli):
         raise UsageError(f"Stimulus names repeat: {list(stimuli)}.")

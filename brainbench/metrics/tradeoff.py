@@ -59,7 +59,9 @@ def measure_tradeoff(
     """Measure Monte-Carlo error and time of each number, the others at their defaults.
 
     Synthetic animals share one geometry of six stimuli; every setting is repeated with ``repeats`` seeds.
-    Raises UsageError: fewer than two repeats, or numbers that are not positive.
+
+    Raises:
+        UsageError: fewer than two repeats, or numbers that are not positive.
     """
     if repeats < 2 or min(*splits, *permutations, animals, units, trials) < 1:
         raise UsageError("A trade-off needs at least 2 repeats and positive numbers.")

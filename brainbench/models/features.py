@@ -34,7 +34,8 @@ class Features:
 def write_features(path: str | Path, labels: Sequence[str], activations: Mapping[str, NDArray[np.floating]]) -> Path:
     """Write activations ([K, F] or [K, T, F] per layer) in the layout above, atomically.
 
-    Raises DataError: a layer does not have one row per label.
+    Raises:
+        DataError: a layer does not have one row per label.
     """
     import h5py
 
@@ -55,8 +56,9 @@ def write_features(path: str | Path, labels: Sequence[str], activations: Mapping
 def read_features(path: str | Path) -> Features:
     """Read a file in the layout above.
 
-    Raises DataFileNotFoundError: there is no such file; DataError: it is not HDF5, lacks ``labels`` or ``activations``,
-    or a shape does not fit.
+    Raises:
+        DataFileNotFoundError: there is no such file.
+        DataError: it is not HDF5, lacks ``labels`` or ``activations``, or a shape does not fit.
     """
     import h5py
 

@@ -132,7 +132,9 @@ class EncoderAttenderDecoder(nn.Module):
         """Return the features [B, T, F] of sweeps in SI, which the decoder or the head of another objective reads.
 
         With ``last`` those of the last step [B, F] alone, which spares what no later step reads.
-        Raises UsageError: as for :meth:`forward`.
+
+        Raises:
+            UsageError: as for :meth:`forward`.
         """
         if self.spec.max_steps is not None and x.ndim == 5 and x.shape[1] > self.spec.max_steps:
             # Said before the encoder has worked for nothing.
@@ -149,7 +151,8 @@ class EncoderAttenderDecoder(nn.Module):
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         """Return the decoder's output at the last step [B, classes].
 
-        Raises UsageError: ``x`` is not [B, T, C, H, W] as :attr:`spec` says, or too long for the attender.
+        Raises:
+            UsageError: ``x`` is not [B, T, C, H, W] as :attr:`spec` says, or too long for the attender.
         """
         return self.decoder(self.encode(x, last=not isinstance(self.decoder, AllStepsDecoder)))
 
@@ -157,7 +160,9 @@ class EncoderAttenderDecoder(nn.Module):
         """Return ``{layer: [B, T, ...]}`` for the layers asked for (all by default), in the order of ``layers``.
 
         The decoder is applied at every step; attender layers are read at the action tokens.
-        Raises UsageError: a layer does not exist, or as for :meth:`forward`.
+
+        Raises:
+            UsageError: a layer does not exist, or as for :meth:`forward`.
         """
         wanted = self.layers if layers is None else tuple(layers)
         for name in wanted:

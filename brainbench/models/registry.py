@@ -147,8 +147,9 @@ class LocatedModel:
     def build(self, seed: int = 0, **options: Any) -> nn.Module:
         """Build the model with its weights, in evaluation mode; untrained weights follow from the seed alone.
 
-        Raises UsageError: an option is unknown, or nobody trained weights for this name yet; DataError: the weights are
-        unreadable or do not fit.
+        Raises:
+            UsageError: an option is unknown, or nobody trained weights for this name yet.
+            DataError: the weights are unreadable or do not fit.
         """
         from brainbench.models.ops.seeding import seeded
 

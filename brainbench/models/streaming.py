@@ -31,7 +31,10 @@ class StreamingStep(nn.Module):
     The network is in evaluation mode, and its weights are shared.
 
     A transformer keeps a cache of fixed size. Beyond its last step (``max_steps``) the features are NaN, since an
-    exported file cannot complain in words. Raises UsageError: the network is of another kind.
+    exported file cannot complain in words.
+
+    Raises:
+        UsageError: the network is of another kind.
     """
 
     def __init__(self, model: nn.Module) -> None:

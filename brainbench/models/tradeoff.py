@@ -33,7 +33,11 @@ REPEATS = 5
 
 @dataclass(frozen=True)
 class ModelSetting:
-    """One way to run a network. Raises UsageError: the precision or the unrolling is unknown, or there is no step."""
+    """One way to run a network.
+
+    Raises:
+        UsageError: the precision or the unrolling is unknown, or there is no step.
+    """
 
     precision: str = "float32"
     unroll: Unroll = "biological"
@@ -50,7 +54,8 @@ class ModelSetting:
 class Reduced(nn.Module):
     """A network run in one setting; it can be scored and extracted from like the network itself.
 
-    Raises UsageError: the network is no encoder-attender-decoder, or cannot be unrolled that way.
+    Raises:
+        UsageError: the network is no encoder-attender-decoder, or cannot be unrolled that way.
     """
 
     def __init__(self, name: str, setting: ModelSetting, *, seed: int = 0) -> None:
@@ -111,7 +116,9 @@ def measure(name: str, setting: ModelSetting, sweeps: Any, *, seed: int = 0) -> 
 
     ``error`` is the relative difference of the answers from those of the reference setting on all steps, ``cost`` the
     median time of one sweep at batch 1 (ms); settings, stored size and p99 time stand beside them.
-    Raises UsageError: the setting does not fit the network or the sweeps.
+
+    Raises:
+        UsageError: the setting does not fit the network or the sweeps.
     """
     x = torch.as_tensor(sweeps, dtype=torch.float32)
     if x.ndim != 5 or x.shape[1] < setting.steps:

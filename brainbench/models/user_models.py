@@ -45,7 +45,8 @@ def build_user_model(target: str, **options: Any) -> nn.Module:
 def check_module(made: Any, target: str) -> nn.Module:
     """Return what a user's or another package's code made, which must be a module.
 
-    Raises UsageError: it is something else.
+    Raises:
+        UsageError: it is something else.
     """
     from torch import nn
 

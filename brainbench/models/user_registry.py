@@ -47,7 +47,10 @@ class UserModel:
     def build(self, **options: Any) -> nn.Module:
         """Build the model from its code as it is today; a changed file is told in a warning.
 
-        Raises DataFileNotFoundError: the file is gone; UsageError: the code gives no module; DataError: the code fails.
+        Raises:
+            DataFileNotFoundError: the file is gone.
+            UsageError: the code gives no module.
+            DataError: the code fails.
         """
         from brainbench.models.user_models import build_user_model
 
@@ -75,7 +78,11 @@ def settings_file() -> Path:
 
 
 def read_user_models() -> dict[str, UserModel]:
-    """Return the added models by name. Raises DataError: the file of settings is damaged."""
+    """Return the added models by name.
+
+    Raises:
+        DataError: the file of settings is damaged.
+    """
     path = settings_file()
     stored = read_json(path) if path.is_file() else {}
     fields = {"target", "hash"}
@@ -117,7 +124,8 @@ def add_user_model(target: str, name: str, *, taken: Collection[str]) -> UserMod
 def remove_user_model(name: str) -> UserModel:
     """Take a stored name away and return what it stood for; the file with the code stays.
 
-    Raises UsageError: no model was added under this name.
+    Raises:
+        UsageError: no model was added under this name.
     """
     known = read_user_models()
     check_name("model of your own", name, known)

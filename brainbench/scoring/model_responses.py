@@ -113,7 +113,9 @@ class ResolvedModel:
 def resolve_model(model: Any, *, seed: int = 0) -> ResolvedModel:
     """Find what ``model`` names, and load it; see :func:`brainbench.scoring.scores.score`.
 
-    Raises UsageError: nothing has this name, or it is no model; DataError: a file was found but cannot be used.
+    Raises:
+        UsageError: nothing has this name, or it is no model.
+        DataError: a file was found but cannot be used.
     """
     if isinstance(model, Mapping):
         return ResolvedModel(ModelCard("features", family=_ELSEWHERE), activations=model)

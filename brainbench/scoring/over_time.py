@@ -40,7 +40,10 @@ def time_course(
     The window of the recordings begins when the stimuli do. Where the stimuli do not state their duration, they last as
     long as the window. Recordings have bins of one width; ``kept`` are the labels that are scored, in order, and
     ``rows`` those of the activations. The options hold the seed, and the reliability that units must have.
-    Raises DataError: the recordings have no bins of time; UsageError: fewer than 3 bins or 4 stimuli.
+
+    Raises:
+        DataError: the recordings have no bins of time.
+        UsageError: fewer than 3 bins or 4 stimuli.
     """
     if "time" not in brain.dataset.coords or brain.dataset.sizes["time"] < 3:
         raise DataError(

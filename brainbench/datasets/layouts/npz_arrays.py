@@ -23,7 +23,8 @@ RATES = f"rates [trials, {len(SLOTS)}, units]"
 def read_arrays(path: Path) -> tuple[dict[str, NDArray[np.float64]], bool]:
     """Return rates [trials, 6, units] by animal, as the file holds them, and whether :data:`STRAY` is there.
 
-    Raises DataError: the file is no ``.npz`` of plain arrays, holds something else, or rates that cannot be.
+    Raises:
+        DataError: the file is no ``.npz`` of plain arrays, holds something else, or rates that cannot be.
     """
     arrays = read_npz(path, "file of published recordings (.npz)")
     if {"data", "label"} <= arrays.keys():

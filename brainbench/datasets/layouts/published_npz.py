@@ -111,8 +111,9 @@ def read_published(path: Path) -> Iterator[ZeroFilledSession]:
 def open_published(path: Path, **options: object) -> xr.Dataset:
     """Read the file into the recordings contract; rates stand for counts in bins of one second.
 
-    Raises UsageError: conditions, select, window or bin are given, which need spike times; DataError: as
-    :func:`read_arrays`, or no trial has a stimulus.
+    Raises:
+        UsageError: conditions, select, window or bin are given, which need spike times.
+        DataError: as :func:`read_arrays`, or no trial has a stimulus.
     """
     if given := [name for name, value in options.items() if value is not None]:
         raise UsageError(

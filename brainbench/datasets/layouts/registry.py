@@ -111,7 +111,11 @@ def register_layout(layout: RecordingLayout) -> RecordingLayout:
 
 
 def get_layout(name: str) -> RecordingLayout:
-    """Return a layout by name. Raises UsageError: there is no such layout (the nearest is named)."""
+    """Return a layout by name.
+
+    Raises:
+        UsageError: there is no such layout (the nearest is named).
+    """
     check_name("recording layout", name, _known())
     return _LAYOUTS[name]
 
@@ -130,7 +134,10 @@ def detect_layout(session: Session) -> RecordingLayout | None:
 def load_layout(path: str) -> RecordingLayout:
     """Run a Python file and register the layout that it calls ``LAYOUT`` (or ``RECIPE``).
 
-    Raises DataFileNotFoundError: there is no such file; DataError: it fails; UsageError: it defines no layout.
+    Raises:
+        DataFileNotFoundError: there is no such file.
+        DataError: it fails.
+        UsageError: it defines no layout.
     """
     module = load_module(path)
     found = getattr(module, "LAYOUT", getattr(module, "RECIPE", None))

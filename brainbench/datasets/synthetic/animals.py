@@ -50,7 +50,10 @@ def simulate(
 
     Every animal and session has its own random stream, so the first animals of a larger design are those of a smaller
     one. The seed is one integer, or several (such as study and simulation). ``faults`` names those of :data:`FAULTS`,
-    to show what they cost. Raises UsageError: an unknown fault, or a missing stimulus that does not exist.
+    to show what they cost.
+
+    Raises:
+        UsageError: an unknown fault, or a missing stimulus that does not exist.
     """
     for name in faults:
         check_name("fault", name, FAULTS)
@@ -103,7 +106,9 @@ def calibrate(
 
     Found by Brent's method with common random numbers: the same animals are drawn at every step. ``ceiling`` is the
     wanted value of :func:`measure_ceiling`; the result is as exact as the Monte-Carlo error of so many ``simulations``.
-    Raises UsageError: even the largest modulation stays below the ceiling; what is reached is said.
+
+    Raises:
+        UsageError: even the largest modulation stays below the ceiling; what is reached is said.
     """
 
     from scipy.optimize import root_scalar

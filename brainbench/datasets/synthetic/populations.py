@@ -58,8 +58,11 @@ def draw_animals(
     Every animal and session has its own random stream, so the first animals of a larger design are those of a smaller
     one. Features [K, F] are each standardised over stimuli (:meth:`ResponseGeometry.from_activations`). The seed is one
     integer, or several (such as study and simulation). Returns subject → its sessions: ``responses`` [R, 1, U] Hz,
-    ``labels`` [R], ``keys``. Raises UsageError: features are not [K, F], or a missing stimulus does not exist;
-    DataError: a feature is not finite, or all are constant.
+    ``labels`` [R], ``keys``.
+
+    Raises:
+        UsageError: features are not [K, F], or a missing stimulus does not exist.
+        DataError: a feature is not finite, or all are constant.
     """
     geometry = features if isinstance(features, ResponseGeometry) else ResponseGeometry.from_activations(features)
     animals: dict[str, tuple[Trials, ...]] = {}
@@ -73,7 +76,8 @@ def draw_sessions(
 ) -> Iterator[DrawnSession]:
     """Draw the sessions of every animal; each is a pure function of geometry, design, seed, animal and session.
 
-    Raises UsageError: a missing stimulus does not exist.
+    Raises:
+        UsageError: a missing stimulus does not exist.
     """
     design = design or PopulationDesign()
     for animal in range(design.animals):

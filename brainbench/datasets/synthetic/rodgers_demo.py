@@ -69,8 +69,11 @@ def make_rodgers_demo(
     The stimulus set has the six labels of the Rodgers experiment and ``contact`` [stimulus, time, whisker] (bool). From
     the fifth animal on their sessions repeat the first ones' design. Files of the same names are replaced. Returns the
     NWB files. ``truth.json`` beside them holds, over ``labels``, the distances [P] of the geometry that all share
-    (``shared``) and the noiseless correlation-distance RDM of each animal's units. Raises DataError: the stimuli lack a
-    label or ``contact``, or one never touches a tracked whisker; UsageError: fewer than one animal is asked for.
+    (``shared``) and the noiseless correlation-distance RDM of each animal's units.
+
+    Raises:
+        DataError: the stimuli lack a label or ``contact``, or one never touches a tracked whisker.
+        UsageError: fewer than one animal is asked for.
     """
     if animals < 1:
         raise UsageError(f"The demo needs at least one animal; received {animals}.")
@@ -130,7 +133,8 @@ def ensure_rodgers_demo(
 def wrench_features(stimuli: xr.Dataset) -> NDArray[np.float64]:
     """Return what whisker afferents tell of each stimulus [K, F] until the earliest choice.
 
-    Raises DataError: a wrench is not finite (an unstable simulation), all are zero, or no tracked whisker is there.
+    Raises:
+        DataError: a wrench is not finite (an unstable simulation), all are zero, or no tracked whisker is there.
     """
     names = tuple(str(name) for name in stimuli["whisker"].values)
     wrench = stimuli["wrench"].transpose("stimulus", "time", "whisker", "channel").values.astype(np.float64)

@@ -86,7 +86,8 @@ def write_with_truth(
 def read_truth(folder: str | os.PathLike[str]) -> dict[str, Any]:
     """Return the truth of synthetic recordings: labels, and RDMs [P] of ``shared`` and ``subjects``.
 
-    Raises DataError: there is none.
+    Raises:
+        DataError: there is none.
     """
     truth = read_json(Path(folder) / TRUTH)
     truth["shared"] = np.array(truth["shared"])

@@ -59,7 +59,8 @@ def joined_labels(values: NDArray[np.str_]) -> list[str]:
 def natural_vocabulary(values: Iterable[tuple[str, ...]]) -> tuple[str, ...]:
     """Order the labels of condition values: column by column, numbers numerically, text naturally.
 
-    Raises DataError: two different combinations of values read the same when joined.
+    Raises:
+        DataError: two different combinations of values read the same when joined.
     """
     # Sorted, not in order of appearance: that depends on the session that comes first, and RDMs would not share axes.
     ordered = sorted(set(values), key=lambda row: [natural_key(item) for item in row])

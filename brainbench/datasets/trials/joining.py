@@ -26,7 +26,9 @@ def join_sessions(
     """Join the sessions' trials and units, block by block, in canonical order.
 
     ``source`` is what the user asked for, ``layout`` the name of the layout with how it was chosen, or "".
-    Raises DataError: no trial, no unit or only one condition remains.
+
+    Raises:
+        DataError: no trial, no unit or only one condition remains.
     """
     import xarray as xr
 

@@ -75,7 +75,11 @@ class Shard:
 
 
 def read_manifest(folder: Path) -> Mapping[str, Any]:
-    """Read the manifest of a finished data set. Raises DataError: there is none, or it is of a newer layout."""
+    """Read the manifest of a finished data set.
+
+    Raises:
+        DataError: there is none, or it is of a newer layout.
+    """
     path = folder / "manifest.json"
     if not path.is_file():
         if (folder / "config.json").is_file():
@@ -111,7 +115,8 @@ def read_manifest(folder: Path) -> Mapping[str, Any]:
 def open_shard(path: Path, entry: Mapping[str, Any], manifest: Mapping[str, Any]) -> Shard:
     """Read what stands beside the forces of a shard that the manifest names.
 
-    Raises DataError: the file is missing, damaged, or another one.
+    Raises:
+        DataError: the file is missing, damaged, or another one.
     """
     again = "remove it and give the command that made the data set again"
     if not path.is_file():

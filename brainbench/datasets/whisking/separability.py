@@ -73,9 +73,12 @@ def separability(
     variance of the features, as scikit-learn's ``gamma='scale'``), tested by five-fold cross-validation over objects.
     Nothing was tuned. Memory grows with the square of the number of sweeps: 10 MB for 1,600. ``classes`` are the four
     with the most objects by default; all choices of each number in ``counts`` of them are averaged.
-    ``sweeps_per_class`` are drawn evenly from the objects of each. Raises UsageError: a class is unknown, or there are
-    fewer classes than ``counts`` asks for; DataError: a class has fewer than two objects; MissingDependencyError:
-    scikit-learn is not installed.
+    ``sweeps_per_class`` are drawn evenly from the objects of each.
+
+    Raises:
+        UsageError: a class is unknown, or there are fewer classes than ``counts`` asks for.
+        DataError: a class has fewer than two objects.
+        MissingDependencyError: scikit-learn is not installed.
     """
     objects = data.objects
     chosen = _choose_classes(data.classes, data.labels, objects, classes, max(counts))
@@ -104,8 +107,11 @@ def separate(
     """Measure how well classes are told apart by features [n, F], for all choices of ``count`` of them.
 
     ``names`` are those of the labels [n]. Sweeps of the same object (``objects`` [n]) stay on one side of every test.
-    Raises UsageError: there are fewer classes than ``count``; DataError: a class has fewer than two objects;
-    MissingDependencyError: scikit-learn is not installed.
+
+    Raises:
+        UsageError: there are fewer classes than ``count``.
+        DataError: a class has fewer than two objects.
+        MissingDependencyError: scikit-learn is not installed.
     """
     try:
         from sklearn.metrics.pairwise import rbf_kernel

@@ -104,7 +104,8 @@ def turing_test(
 ) -> EquivalenceTest:
     """Test a model's score against the animals' consistency with one another, paired by animal and stimulus.
 
-    Raises UsageError: a margin or an alpha out of range, or scores by different estimators.
+    Raises:
+        UsageError: a margin or an alpha out of range, or scores by different estimators.
     """
     if score.estimator != animal_to_animal.estimator:
         raise UsageError(

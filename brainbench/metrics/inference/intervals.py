@@ -21,7 +21,9 @@ def two_factor_interval(
     """Return the t interval of a mean over animals and stimuli; None for fewer than two of either.
 
     ``animals`` [A] are the values of single animals, ``without_stimulus`` [K] the mean without each stimulus in turn.
-    Raises UsageError: a level outside (0, 1).
+
+    Raises:
+        UsageError: a level outside (0, 1).
     """
     from scipy.special import stdtrit
 

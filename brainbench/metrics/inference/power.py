@@ -50,7 +50,8 @@ _CHUNK_ELEMENTS = 1 << 21
 class ExperimentDesign:
     """An experiment, and the truth it is to find.
 
-    Raises UsageError: a number is out of range, or the effect is larger than what the animals share allows.
+    Raises:
+        UsageError: a number is out of range, or the effect is larger than what the animals share allows.
     """
 
     stimuli: int = 6
@@ -106,7 +107,11 @@ class Power:
 
 
 def power(design: ExperimentDesign, *, simulations: int = SIMULATIONS, seed: int = 0) -> Power:
-    """Simulate experiments of one design. Raises UsageError: no positive number of simulations."""
+    """Simulate experiments of one design.
+
+    Raises:
+        UsageError: no positive number of simulations.
+    """
     if simulations < 1:
         raise UsageError(f"A power analysis needs at least 1 simulation; received {simulations}.")
     smallest = smallest_p(design.stimuli, RSA.orders)
@@ -138,7 +143,8 @@ def needed(
 ) -> int | None:
     """Return the smallest tried number of stimuli or animals whose power reaches ``target``; None if none does.
 
-    Raises UsageError: ``vary`` is neither, or a target outside (0, 1).
+    Raises:
+        UsageError: ``vary`` is neither, or a target outside (0, 1).
     """
     tried = {"stimuli": STIMULUS_COUNTS, "animals": ANIMAL_COUNTS}
     if vary not in tried:

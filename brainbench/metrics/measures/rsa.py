@@ -155,7 +155,8 @@ def score_rdms(
     Both are of the same stimuli in the same order. ``options`` are those of
     :func:`~brainbench.metrics.score.score_layers`; a torch ``device`` pays from some hundred stimuli on.
 
-    Raises UsageError: no layers or animals, RDMs that do not fit the stimuli, unknown estimator or comparison.
+    Raises:
+        UsageError: no layers or animals, RDMs that do not fit the stimuli, unknown estimator or comparison.
     """
     check_comparison(compare)
     rdms = check_layers(layer_rdms, stimuli)
@@ -163,7 +164,11 @@ def score_rdms(
 
 
 def check_layers(layer_rdms: Mapping[str, ArrayLike], stimuli: Sequence[str]) -> dict[str, Floats]:
-    """Return the layers' RDMs [P] by name. Raises UsageError: no layers, or RDMs of another number of stimuli."""
+    """Return the layers' RDMs [P] by name.
+
+    Raises:
+        UsageError: no layers, or RDMs of another number of stimuli.
+    """
     if not layer_rdms:
         raise UsageError("There are no layers to score; give the RDM of at least one layer.")
     rdms = {str(layer): rdm_stack(values, f"The RDM of layer {layer!r}") for layer, values in layer_rdms.items()}

@@ -50,7 +50,8 @@ class NoiseModel:
     def sides(self, left: Array, right: Array) -> tuple[Array, Array]:
         """Return vectors [N, V] and [M, V] whose inner products are those of ``left`` and ``right`` with C⁻¹ between.
 
-        Raises DataError: the covariance is singular.
+        Raises:
+            DataError: the covariance is singular.
         """
         same = left is right
         left = left / self.scale
@@ -70,7 +71,11 @@ class NoiseModel:
         return join([left, first], -1), join([right, -second], -1) / self.ridge
 
     def precision(self) -> Array:
-        """Return C⁻¹ [U, U]. Raises DataError: the covariance is singular."""
+        """Return C⁻¹ [U, U].
+
+        Raises:
+            DataError: the covariance is singular.
+        """
         eye = library(self.scale).eye(len(self.scale), **_like(self.scale))
         if not self.weight:
             inner = eye / self.ridge
@@ -132,8 +137,9 @@ def noise_precision(
 def estimate_noise(trials: Any, codes: Ints, count: int, method: str, *, device: Any = None) -> NoiseModel:
     """Return the covariance of trials [R, U] about the means of their ``count`` stimuli, on the device.
 
-    Raises UsageError: unknown method; DataError: as :func:`noise_precision`, but a singular covariance is found only
-    when it is used.
+    Raises:
+        UsageError: unknown method.
+        DataError: as :func:`noise_precision`, but a singular covariance is found only when it is used.
     """
     check_name("noise covariance method", method, NOISE_METHODS)
     # Residuals are small beside the products of units that follow, so they are always made by numpy.

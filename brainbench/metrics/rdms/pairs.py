@@ -21,7 +21,11 @@ Ints = NDArray[np.int64]
 
 
 def stimulus_count(pairs: int) -> int:
-    """Return K for P = K(K−1)/2 pairs. Raises UsageError: ``pairs`` is not such a number."""
+    """Return K for P = K(K−1)/2 pairs.
+
+    Raises:
+        UsageError: ``pairs`` is not such a number.
+    """
     # Positive root of K² − K − 2P = 0, in integers, so that rounding accepts no wrong P.
     count = (1 + math.isqrt(1 + 8 * pairs)) // 2
     if pairs < 1 or count * (count - 1) // 2 != pairs:
@@ -76,7 +80,8 @@ def permuted_pairs(orders: Any, count: int | None = None) -> Any:
 def rdm_stack(rdms: ArrayLike | Sequence[ArrayLike], what: str) -> Floats:
     """Return float64 RDM vectors [..., P], checked.
 
-    Raises UsageError: not numbers, no pair axis, or a length that is no K(K−1)/2.
+    Raises:
+        UsageError: not numbers, no pair axis, or a length that is no K(K−1)/2.
     """
     try:
         array = np.asarray(rdms, dtype=np.float64)

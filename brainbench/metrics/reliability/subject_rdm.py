@@ -119,9 +119,11 @@ def subject_rdm(
     of an error, so the others can still be scored. ``n_stimuli`` is K; names of the ``stimuli`` are for messages.
     ``method`` is one of :data:`SUBJECT_METHODS`. ``noise`` is the noise covariance of ``mahalanobis`` and
     ``crossnobis``: ``none`` or one of :func:`brainbench.metrics.noise_precision`. ``diag``, ``none`` and ``full`` leave
-    crossnobis unbiased; shrinkage leaves a bias of up to .01 per unit (docs/calibration.md). Raises UsageError: unknown
-    method, bad shapes or labels, repeated trial keys, no positive ``splits``; DataError: infinite responses, or
-    negative ones for ``poisson``.
+    crossnobis unbiased; shrinkage leaves a bias of up to .01 per unit (docs/calibration.md).
+
+    Raises:
+        UsageError: unknown method, bad shapes or labels, repeated trial keys, no positive ``splits``.
+        DataError: infinite responses, or negative ones for ``poisson``.
     """
     check_name("RDM method of an animal", method, SUBJECT_METHODS)
     check_comparison(comparison)

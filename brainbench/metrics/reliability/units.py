@@ -36,8 +36,10 @@ def unit_reliability(
     """Return the reliability of every unit's tuning [F], for each session; NaN where it has none.
 
     Responses are [R, F] or [R, T, F], whose time is averaged. A unit without variation over stimuli, or with fewer than
-    two trials of some stimulus in every split, has no reliability. Values can be negative. Raises UsageError: fewer
-    than 3 stimuli or 1 split, bad shapes or labels.
+    two trials of some stimulus in every split, has no reliability. Values can be negative.
+
+    Raises:
+        UsageError: fewer than 3 stimuli or 1 split, bad shapes or labels.
     """
     if n_stimuli < 3 or splits < 1:
         raise UsageError(f"A unit's tuning needs at least 3 stimuli and 1 split; received {n_stimuli} and {splits}.")
@@ -69,7 +71,10 @@ def reliable_units(
 ) -> tuple[tuple[Trials, ...], str]:
     """Return the sessions with the units whose reliability is at least ``least``, and what was left out in words.
 
-    A session without such a unit is left out. Raises UsageError: as :func:`unit_reliability`.
+    A session without such a unit is left out.
+
+    Raises:
+        UsageError: as :func:`unit_reliability`.
     """
     values = unit_reliability(blocks, n_stimuli, splits=splits, seed=seed)
     kept = []

@@ -46,7 +46,10 @@ def whitened(session: SortedTrials, count: int, noise: str) -> tuple[SortedTrial
     trials of a stimulus have no noise to divide by and are left out. ``diag`` scales each unit by the trials it was
     recorded in; the other methods mix units, so they leave out units that were not recorded in every trial.
 
-    ``none`` divides by nothing. Raises UsageError: unknown ``noise`` method.
+    ``none`` divides by nothing.
+
+    Raises:
+        UsageError: unknown ``noise`` method.
     """
     if noise == "none":
         return session, ""

@@ -84,7 +84,10 @@ class GPTAttender(nn.Module):
     """Map features [B, T, F] to [B, T, width], causally, for at most ``context // 2`` steps.
 
     ``context`` counts tokens, two per step and one over; ``dropout`` is the share dropped while training. 25,778,688
-    parameters for 512 → 512; 6,532,608 for 512 → 256. Raises UsageError: the width is no multiple of the heads.
+    parameters for 512 → 512; 6,532,608 for 512 → 256.
+
+    Raises:
+        UsageError: the width is no multiple of the heads.
     """
 
     def __init__(
@@ -137,7 +140,8 @@ class GPTAttender(nn.Module):
     def step(self, x: torch.Tensor, state: GPTState) -> tuple[torch.Tensor, GPTState]:
         """Advance by one step of features [B, F]; return the answer [B, width] and the next state.
 
-        Raises UsageError: the context is full.
+        Raises:
+            UsageError: the context is full.
         """
         stream = self.tokens(x[:, None], state.tokens)
         keys, values = [], []
@@ -164,7 +168,8 @@ class GPTAttender(nn.Module):
     def tokens(self, x: torch.Tensor, start: int) -> torch.Tensor:
         """Return what the blocks see of features [B, T, F]: two tokens per step [B, 2 T, width], from ``start`` on.
 
-        Raises UsageError: they exceed the context.
+        Raises:
+            UsageError: they exceed the context.
         """
         batch, steps, features = x.shape
         if start + 2 * steps > self.context:

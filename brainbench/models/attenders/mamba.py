@@ -121,7 +121,10 @@ class MambaAttender(nn.Module):
     """Map features [B, T, F] to [B, T, F], causally and for any number of steps.
 
     The inner width of a block is ``expansion`` times F, with ``states`` per inner channel; the short convolution sees
-    ``convolution`` steps. Raises UsageError: a size is not positive.
+    ``convolution`` steps.
+
+    Raises:
+        UsageError: a size is not positive.
     """
 
     max_steps: int | None = None

@@ -33,7 +33,8 @@ class ChannelNorm(nn.LayerNorm):
 class Cell(nn.Module):
     """Base of all cells: channels of x and y, the state's shape, zero initial states and PyTorchTNN's names.
 
-    Raises UsageError: there is no channel, or the numbers differ in a cell that passes its input on.
+    Raises:
+        UsageError: there is no channel, or the numbers differ in a cell that passes its input on.
     """
 
     state_factor: ClassVar[int] = 1
@@ -70,7 +71,8 @@ class Cell(nn.Module):
     def load_tnn_state(self, state: Mapping[str, Any]) -> None:
         """Load arrays or tensors under PyTorchTNN's parameter names, such as ``conv.weight``.
 
-        Raises DataError: a name is missing or unexpected, or a shape differs.
+        Raises:
+            DataError: a name is missing or unexpected, or a shape differs.
         """
         load_named(self.tnn_parameters(), state, what=type(self).__name__)
 

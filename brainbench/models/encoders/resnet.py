@@ -79,7 +79,8 @@ class ResNet18Encoder(nn.Module):
     def forward(self, x: torch.Tensor, *, return_activations: bool | Collection[str] = False) -> Any:
         """Return the features [B, T, F], with activations also ``{layer: [B, T, ...]}``.
 
-        Raises UsageError: ``x`` is not [B, T, C, H, W] as :attr:`input_shape` says.
+        Raises:
+            UsageError: ``x`` is not [B, T, C, H, W] as :attr:`input_shape` says.
         """
         check_sweep(x, self.input_shape, "The ResNet")
         leading = x.shape[:2]

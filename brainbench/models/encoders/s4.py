@@ -78,7 +78,8 @@ class S4Encoder(nn.Module):
     def forward(self, x: torch.Tensor, *, return_activations: bool | Collection[str] = False) -> Any:
         """Return the features [B, T, F], with activations also ``{layer: [B, T, width]}``.
 
-        Raises UsageError: ``x`` is not [B, T, C, H, W] as :attr:`input_shape` says.
+        Raises:
+            UsageError: ``x`` is not [B, T, C, H, W] as :attr:`input_shape` says.
         """
         check_sweep(x, self.input_shape, "S4")
         layers = zip(self.layers, (self.embed, *self.blocks, self.fc), strict=True)

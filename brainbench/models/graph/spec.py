@@ -80,7 +80,8 @@ class Dense(Operation):
 class Memory:
     """A recurrent cell of :mod:`brainbench.models.cells`, channels unchanged.
 
-    Raises UsageError: there is no such cell.
+    Raises:
+        UsageError: there is no such cell.
     """
 
     kind: str = "time-decay"

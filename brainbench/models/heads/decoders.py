@@ -87,7 +87,8 @@ DECODERS: Mapping[str, Callable[..., nn.Module]] = {
 def make_decoder(name: str, features: int, classes: int = CLASSES) -> nn.Module:
     """Build a decoder of :data:`DECODERS` by name.
 
-    Raises UsageError: there is none of this name, or fewer than two classes.
+    Raises:
+        UsageError: there is none of this name, or fewer than two classes.
     """
     check_name("decoder", name, DECODERS)
     if classes < 2:

@@ -127,7 +127,8 @@ class DeferredWeightGrad:
     def gradient(self, span: tuple[int, int]) -> torch.Tensor | None:
         """Return where the gradient of a result is to be written; None for anywhere.
 
-        Raises RuntimeError: the pass has been taken back before.
+        Raises:
+            RuntimeError: the pass has been taken back before.
         """
         if not self.learns:
             return None

@@ -42,7 +42,11 @@ INITIALISERS = ("kaiming_normal_", "kaiming_uniform_", "orthogonal_", "xavier_no
 
 
 def pair(value: int | tuple[int, int] | list[int], what: str) -> tuple[int, int]:
-    """Return (rows, columns) from one number or two. Raises UsageError: it is neither."""
+    """Return (rows, columns) from one number or two.
+
+    Raises:
+        UsageError: it is neither.
+    """
     values = (value, value) if isinstance(value, int) else tuple(value)
     if len(values) != 2 or not all(isinstance(item, int) and item > 0 for item in values):
         raise UsageError(f"The {what} must be a positive integer or a pair of them; received {value!r}.")

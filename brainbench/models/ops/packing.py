@@ -24,7 +24,10 @@ def packed(model: nn.Module, *, precision: str = "float32") -> nn.Module:
     bits of mantissa, memories and everything else stay in single precision.
 
     Batches of two and more are computed as before, in single precision. The copy does not notice later changes of its
-    weights: pack again after training. Raises UsageError: there is no such precision, or the network is not on the CPU.
+    weights: pack again after training.
+
+    Raises:
+        UsageError: there is no such precision, or the network is not on the CPU.
     """
     import torch
 

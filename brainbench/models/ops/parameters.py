@@ -13,7 +13,8 @@ from brainbench.core.errors import DataError, listing, nearest
 def load_named(targets: Mapping[str, torch.Tensor], state: Mapping[str, Any], *, what: str) -> None:
     """Copy arrays or tensors of ``state`` into ``targets``, which has the same names; all or nothing.
 
-    Raises DataError: names are missing or unexpected, or shapes differ.
+    Raises:
+        DataError: names are missing or unexpected, or shapes differ.
     """
     check_named({name: tuple(value.shape) for name, value in targets.items()}, state, what=what)
     copy_named(targets, state)
@@ -22,7 +23,8 @@ def load_named(targets: Mapping[str, torch.Tensor], state: Mapping[str, Any], *,
 def check_named(shapes: Mapping[str, tuple[int, ...]], state: Mapping[str, Any], *, what: str) -> None:
     """Compare the names and shapes of ``state`` with the expected ones.
 
-    Raises DataError: names are missing or unexpected, or shapes differ; the message names them.
+    Raises:
+        DataError: names are missing or unexpected, or shapes differ; the message names them.
     """
     problems = []
     missing = [name for name in shapes if name not in state]

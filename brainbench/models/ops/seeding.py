@@ -15,7 +15,8 @@ _LARGEST = 2**63 - 1
 def seeded(seed: int) -> Iterator[None]:
     """Run a block with PyTorch's CPU generator at ``seed``; its state is put back afterwards.
 
-    Raises UsageError: the seed is not a whole number from 0 to 2**63 − 1.
+    Raises:
+        UsageError: the seed is not a whole number from 0 to 2**63 − 1.
     """
     if isinstance(seed, bool) or not isinstance(seed, int) or not 0 <= seed <= _LARGEST:
         raise UsageError(f"A seed must be a whole number of 0 or more, below 2**63; received {seed!r}.")

@@ -45,8 +45,9 @@ class Settings:
 def read_weights(path: str | os.PathLike[str]) -> ForeignWeights:
     """Read a file of weights; nothing in it is executed.
 
-    Raises DataFileNotFoundError: there is no such file; DataError: it is no such file, is cut short, needs pickle, or a
-    weight is not finite.
+    Raises:
+        DataFileNotFoundError: there is no such file.
+        DataError: it is no such file, is cut short, needs pickle, or a weight is not finite.
     """
     path, kind = Path(path), "file of weights"
     content: Mapping[str, Any] = (
@@ -68,8 +69,10 @@ def read_weights(path: str | os.PathLike[str]) -> ForeignWeights:
 def read_settings(path: str | os.PathLike[str]) -> Settings:
     """Read a run's settings (``config.yaml``, JSON or TOML), or PyTorchTNN's configuration of its graph (JSON).
 
-    Raises DataFileNotFoundError: there is no such file; DataError: it cannot be read, or says nothing that is known
-    here; MissingDependencyError: it is YAML and no reader is installed.
+    Raises:
+        DataFileNotFoundError: there is no such file.
+        DataError: it cannot be read, or says nothing that is known here.
+        MissingDependencyError: it is YAML and no reader is installed.
     """
     values = read_mapping(path, "file of settings")
     if "nodes" in values:

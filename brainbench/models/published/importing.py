@@ -56,8 +56,11 @@ def import_checkpoint(
 
     The file is a Lightning checkpoint (``.ckpt``), a state dict of PyTorch, or safetensors. Where names and shapes
     leave a choice, the registry name ``architecture`` or the run's settings ``config`` decide it. The default folder is
-    ``ARCHITECTURE-HASH`` where the command runs. Raises DataError: the file cannot be read, or is no network of the
-    study; UsageError: its architecture is ambiguous, or there is none of that name.
+    ``ARCHITECTURE-HASH`` where the command runs.
+
+    Raises:
+        DataError: the file cannot be read, or is no network of the study.
+        UsageError: its architecture is ambiguous, or there is none of that name.
     """
     settings = None if config is None else read_settings(config)
     weights = read_weights(path)
@@ -102,7 +105,8 @@ def import_to_cache(path: Path, config: Path | None = None) -> Path:
 def build_published(state: Mapping[str, torch.Tensor], found: Recognised) -> tuple[EncoderAttenderDecoder, set[str]]:
     """Build a recognised network with its weights; return it with the names of the entries that it took.
 
-    Raises DataError: entries are missing or unexpected, or shapes differ.
+    Raises:
+        DataError: entries are missing or unexpected, or shapes differ.
     """
     name = found.architecture
     model = load_model(name, classes=found.classes, decoder=found.decoder or "linear")
@@ -121,7 +125,8 @@ def matched_entries(
 ) -> dict[str, torch.Tensor]:
     """Return the entries of a file that are a network's weights, each with its place in ours.
 
-    Raises DataError: entries are missing or unexpected, or shapes differ.
+    Raises:
+        DataError: entries are missing or unexpected, or shapes differ.
     """
     places, names = model.state_dict(), published_names(model)
     if found.decoder is None:

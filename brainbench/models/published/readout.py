@@ -34,7 +34,8 @@ Layers = list[tuple[str, Callable[[torch.Tensor], torch.Tensor]]]
 def published_layers(model: nn.Module) -> tuple[str, ...]:
     """Return the names that a network's layers have in the study, from stimulus to output.
 
-    Raises UsageError: the network is of another kind.
+    Raises:
+        UsageError: the network is of another kind.
     """
     if not isinstance(model, EncoderAttenderDecoder):
         raise UsageError(
@@ -56,7 +57,8 @@ def published_layers(model: nn.Module) -> tuple[str, ...]:
 def published_activations(model: nn.Module, x: torch.Tensor, layers: Collection[str] | None = None) -> Named:
     """Return ``{layer: [B, averaged axis, F]}`` of sweeps [B, T, C, H, W] in SI, by the names of the study.
 
-    Raises UsageError: the network is of another kind, a layer does not exist, or the sweeps do not fit.
+    Raises:
+        UsageError: the network is of another kind, a layer does not exist, or the sweeps do not fit.
     """
     names = published_layers(model)
     for name in layers or ():

@@ -35,7 +35,8 @@ _MIRRORED = {"vertical": "z", "horizontal": "y"}
 class Augmentation:
     """Change of every sample at training time.
 
-    Raises UsageError: there is no such kind, or the masked share is not in [0, 1).
+    Raises:
+        UsageError: there is no such kind, or the masked share is not in [0, 1).
     """
 
     kind: str = "none"
@@ -90,7 +91,8 @@ class SampledAugmentation:
 def flip(x: torch.Tensor, direction: str) -> torch.Tensor:
     """Mirror sweeps physically: ``vertical`` (z → −z) or ``horizontal`` (y → −y).
 
-    Raises UsageError: there is no such direction, or ``x`` is not [B, T, S·6, 5, 7].
+    Raises:
+        UsageError: there is no such direction, or ``x`` is not [B, T, S·6, 5, 7].
     """
     check_name("direction of a flip", direction, _MIRRORED)
     if x.ndim != 5 or x.shape[2] % len(CHANNELS) or tuple(x.shape[3:]) != GRID_SHAPE:

@@ -61,7 +61,8 @@ class Data(Protocol):
 class ArrayBatches:
     """Batches of sweeps in memory [N, T, S·C, H, W] in SI with integer labels [N], in an order drawn in every epoch.
 
-    Raises UsageError: sizes do not fit.
+    Raises:
+        UsageError: sizes do not fit.
     """
 
     def __init__(self, sweeps: Any, labels: Any, options: BatchOptions) -> None:
@@ -109,7 +110,8 @@ class ArrayBatches:
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Go on where another iteration over the same sweeps stood.
 
-        Raises UsageError: it had another seed or batch size.
+        Raises:
+            UsageError: it had another seed or batch size.
         """
         seed, size = self.options.seed, self.options.batch_size
         if (state["seed"], state["batch_size"]) != (seed, size):

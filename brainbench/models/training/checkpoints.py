@@ -43,7 +43,10 @@ def save_checkpoint(
     ``architecture`` is a registry name without a tag, ``options`` are the keywords that it was built with, ``info`` is
     what else the configuration keeps (objective, accuracy, data, seed, …), ``dtype`` the precision of the
     floating-point parameters on disk.
-    Raises UsageError: there is no such precision; DataError: a parameter is not finite, or not in ``dtype``.
+
+    Raises:
+        UsageError: there is no such precision.
+        DataError: a parameter is not finite, or not in ``dtype``.
     """
     import torch
     from safetensors.torch import save_file
@@ -75,8 +78,9 @@ def save_checkpoint(
 def read_config(folder: str | os.PathLike[str]) -> dict[str, Any]:
     """Read the configuration of a model's folder.
 
-    Raises DataFileNotFoundError: there is no such folder, or no configuration in it; DataError: the configuration is of
-    another kind, or its weights of a version that is not computed here.
+    Raises:
+        DataFileNotFoundError: there is no such folder, or no configuration in it.
+        DataError: the configuration is of another kind, or its weights of a version that is not computed here.
     """
     from brainbench.core.files import read_mapping
 
@@ -105,7 +109,9 @@ def read_config(folder: str | os.PathLike[str]) -> dict[str, Any]:
 def load_weights(model: nn.Module, path: str | os.PathLike[str], *, what: str) -> None:
     """Load a safetensors file into a model of the same parameters and buffers; all or nothing.
 
-    Raises DataFileNotFoundError: there is no such file; DataError: it cannot be read, or does not fit the model.
+    Raises:
+        DataFileNotFoundError: there is no such file.
+        DataError: it cannot be read, or does not fit the model.
     """
     from brainbench.core.reading.tensors import read_tensors
     from brainbench.models.ops.parameters import load_named
@@ -118,9 +124,12 @@ def find_folder(source: str) -> Path:
     """Return the folder that ``local-dir:PATH`` or ``hf-hub:OWNER/NAME[/FOLDER][@REVISION]`` names.
 
     The hub is asked only for a name with its prefix; what it sends is kept in its own cache. A folder with one foreign
-    checkpoint (:data:`FOREIGN`) instead of ours is imported into our cache. Raises UsageError: the name has another
-    form, or there are several foreign checkpoints; DataFileNotFoundError: there is no such folder or repository;
-    MissingDependencyError: ``huggingface_hub`` is not installed.
+    checkpoint (:data:`FOREIGN`) instead of ours is imported into our cache.
+
+    Raises:
+        UsageError: the name has another form, or there are several foreign checkpoints.
+        DataFileNotFoundError: there is no such folder or repository.
+        MissingDependencyError: ``huggingface_hub`` is not installed.
     """
     if source.startswith(LOCAL):
         folder = Path(source.removeprefix(LOCAL)).expanduser()

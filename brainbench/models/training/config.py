@@ -24,7 +24,8 @@ PLAYED_BACKWARDS = ("physical", "thesis")
 class TrainingConfig:
     """One training run. :meth:`published` fills in the published recipe.
 
-    Raises UsageError: a value is outside its range; the message names what is allowed.
+    Raises:
+        UsageError: a value is outside its range; the message names what is allowed.
     """
 
     model: str
@@ -88,7 +89,8 @@ class TrainingConfig:
     def published(cls, model: str, objective: str = "supervised", **changes: Any) -> TrainingConfig:
         """Return the published recipe of an architecture and an objective, with changes.
 
-        Raises UsageError: there is no such objective or field, or a value is outside its range.
+        Raises:
+            UsageError: there is no such objective or field, or a value is outside its range.
         """
         objective, _, variant = objective.partition("-")
         recipe = recipe_for(model, objective)
@@ -106,7 +108,8 @@ class TrainingConfig:
     def from_mapping(cls, values: Mapping[str, Any]) -> TrainingConfig:
         """Build a configuration from names and values.
 
-        Raises UsageError: a name does not exist, or a value is of another kind or outside its range.
+        Raises:
+            UsageError: a name does not exist, or a value is of another kind or outside its range.
         """
         known = {field.name: str(field.type) for field in fields(cls)}
         for name, value in values.items():

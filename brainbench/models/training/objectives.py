@@ -60,7 +60,9 @@ class Learner(nn.Module):
 
     Self-supervised objectives need a network with ``encode``, ``features`` and ``normaliser``, as
     :class:`~brainbench.models.network.EncoderAttenderDecoder` has them.
-    Raises UsageError: the objective learns from features, and the network names none.
+
+    Raises:
+        UsageError: the objective learns from features, and the network names none.
     """
 
     views: int = 1
@@ -137,7 +139,8 @@ class Autoencoding(Learner):
     def forward(self, views: tuple[torch.Tensor, ...], labels: torch.Tensor) -> torch.Tensor:
         """Return the loss; labels have no part in it.
 
-        Raises UsageError: sweeps are no longer than the encoder's latency.
+        Raises:
+            UsageError: sweeps are no longer than the encoder's latency.
         """
         del labels
         x, latency = views[0], self.model.spec.latency
@@ -157,7 +160,8 @@ LEARNERS = {"supervised": Supervised, "simclr": SimCLR, "simsiam": SimSiam, "ae"
 def make_learner(objective: str, model: nn.Module) -> Learner:
     """Join a network and an objective by name.
 
-    Raises UsageError: there is no such objective, or the network does not offer what it needs.
+    Raises:
+        UsageError: there is no such objective, or the network does not offer what it needs.
     """
     check_name("objective", objective, LEARNERS)
     return LEARNERS[objective](model)

@@ -24,7 +24,10 @@ class LARS(Optimizer):
 
     trust = η ‖w‖ / (‖g + λ w‖), v ← m v + trust (g + λ w), w ← w − lr v, with momentum m, weight decay λ and ``trust``
     η. Biases and norm parameters (tensors of fewer than two axes) are excluded: they take plain momentum steps without
-    decay, as in SimCLR. Raises UsageError: a number is negative.
+    decay, as in SimCLR.
+
+    Raises:
+        UsageError: a number is negative.
     """
 
     def __init__(
@@ -84,7 +87,8 @@ SCHEDULES = ("step", "constant", "cosine")
 def make_optimizer(name: str, parameters: Iterable[nn.Parameter], learning_rate: float) -> Optimizer:
     """Build an optimiser by name over the parameters that want a gradient.
 
-    Raises UsageError: there is no such optimiser, or the rate is not a positive number.
+    Raises:
+        UsageError: there is no such optimiser, or the rate is not a positive number.
     """
     check_name("optimizer", name, OPTIMIZERS)
     if not (math.isfinite(learning_rate) and learning_rate > 0):
@@ -96,7 +100,9 @@ def rate_factor(schedule: str, epoch: float, *, epochs: int, warmup_epochs: int 
     """Return the learning rate after so many epochs of all, relative to the initial one.
 
     For ``cosine`` fractions of an epoch count, and ``warmup_epochs`` of linear rise from 1e-4.
-    Raises UsageError: there is no such schedule.
+
+    Raises:
+        UsageError: there is no such schedule.
     """
     check_name("schedule", schedule, SCHEDULES)
     if schedule == "constant":

@@ -43,7 +43,8 @@ class Processes:
     def prepare(self, module: nn.Module) -> nn.Module:
         """Return the module on its device, with batch norms that pool over processes.
 
-        Raises UsageError: batch norms over several processes without CUDA, where PyTorch has none.
+        Raises:
+            UsageError: batch norms over several processes without CUDA, where PyTorch has none.
         """
         if self.count > 1 and any(isinstance(m, nn.modules.batchnorm._BatchNorm) for m in module.modules()):
             if self.device.type != "cuda":
@@ -83,7 +84,8 @@ class Processes:
 def processes(device: str | None = None) -> Iterator[Processes]:
     """Join the processes that torchrun started, or be the only one; without a device's name CUDA when there is one.
 
-    Raises UsageError: the device does not exist.
+    Raises:
+        UsageError: the device does not exist.
     """
     where = torch_device(device or ("cuda" if torch.cuda.is_available() else "cpu"))
     count, rank = int(os.environ.get("WORLD_SIZE", "1")), int(os.environ.get("RANK", "0"))

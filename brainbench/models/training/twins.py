@@ -41,7 +41,10 @@ def difference(twin: Mapping[str, Any], found: Mapping[str, Any]) -> str:
 def draw_twin(twin: Mapping[str, Any], options: Mapping[str, Any]) -> tuple[nn.Module, str]:
     """Return the twin that a checkpoint's configuration names, and why it is another network after all, or ''.
 
-    ``twin`` and ``options`` are entries of the configuration. Raises UsageError: there is no such model.
+    ``twin`` and ``options`` are entries of the configuration.
+
+    Raises:
+        UsageError: there is no such model.
     """
     model = load_model(twin["name"], seed=twin["seed"], **options)
     return model, difference(twin, describe_twin(twin["name"], twin["seed"], model))

@@ -50,7 +50,10 @@ def find_cheapest(
     Cost is the number of trials of all animals, then the number of units. A design with no more of anything than one
     that failed clearly (interval below ``wanted``) is not tried. The one returned reaches the rate on boards of other
     numbers too. The design's numbers of animals, units, trials and stimuli are replaced; ``where`` are ``workers`` and
-    ``scheduler`` of :func:`recover`. Raises UsageError: a rate outside (0, 1).
+    ``scheduler`` of :func:`recover`.
+
+    Raises:
+        UsageError: a rate outside (0, 1).
     """
     if not 0 < wanted < 1:
         raise UsageError(f"A wanted rate lies between 0 and 1; received {wanted}.")
