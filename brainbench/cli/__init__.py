@@ -30,8 +30,9 @@ def __getattr__(name: str) -> Any:
 
 def main() -> None:
     """Entry point: run a command and turn our own errors into one line and an exit status."""
-    # Idle OpenMP threads would otherwise spin and slow each other down on a busy machine.
+    # Idle threads of OpenMP and of numpy's BLAS would otherwise spin and slow each other down on a busy machine.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+    os.environ.setdefault("OPENBLAS_THREAD_TIMEOUT", "4")
     try:
         _run()
     except KeyboardInterrupt:

@@ -44,10 +44,10 @@ def report_file(path: Path | None) -> Path | None:
         UsageError: there is no such format, or nothing can be written there.
         MissingDependencyError: the format is PDF, and WeasyPrint is not installed.
     """
-    from leaderboards.report.paper import FORMATS
-
     if path is None:
         return None
+    from leaderboards.report.paper import FORMATS
+
     kind = path.suffix.removeprefix(".").lower()
     if not kind:
         allowed = ", ".join(f".{name}" for name in FORMATS)

@@ -82,10 +82,12 @@ class RSA(Metric):
             return np.full((count, len(layers), len(animals)), np.nan)
         rdms, brain = np.stack(layers), np.stack([animal.rdm for animal in animals])
         kept = np.array([np.delete(np.arange(count), stimulus) for stimulus in range(count)])
-        return np.stack(
+        pairs = permuted_pairs(kept, count)
+        step = max(1, _CHUNK_ELEMENTS // (count * count * (len(rdms) + len(brain))))
+        return np.concatenate(
             [
-                compare_all(rdms[:, pairs], brain[:, pairs], method=self.comparison)
-                for pairs in permuted_pairs(kept, count)
+                compare_all(*(side[:, part].swapaxes(0, 1).copy() for side in (rdms, brain)), method=self.comparison)
+                for part in (pairs[start : start + step] for start in range(0, count, step))
             ]
         )
 

@@ -75,12 +75,11 @@ def compare(a: ArrayLike, b: ArrayLike, *, method: str = "pearson") -> Floats:
 
 
 def compare_all(a: Floats, b: Floats, *, method: str = "pearson") -> Floats:
-    """Compare every ``a`` [N, P] with every ``b`` [A, P] by one matrix product: [N, A]."""
-    if a.shape[-1] > _SIGN_LIMIT and method in _BY_SORTING:
-        return compare(a[:, None], b[None], method=method)
-    if not (np.isfinite(a).all() and np.isfinite(b).all()):
-        return compare(a[:, None], b[None], method=method)
-    return features(a, method) @ features(b, method).T
+    """Compare every ``a`` [..., N, P] with every ``b`` [..., A, P] by one matrix product each: [..., N, A]."""
+    sorts = a.shape[-1] > _SIGN_LIMIT and method in _BY_SORTING
+    if sorts or not (np.isfinite(a).all() and np.isfinite(b).all()):
+        return compare(a[..., :, None, :], b[..., None, :, :], method=method)
+    return features(a, method) @ features(b, method).swapaxes(-1, -2)
 
 
 def permuted_comparisons(
@@ -135,7 +134,7 @@ def pooling(method: str) -> Transform:
 def _unit(vectors: Floats, size: Floats | None = None) -> Floats:
     length = np.sqrt(np.einsum("...p,...p->...", vectors, vectors))[..., None]
     floor = 0.0 if size is None else _CONSTANT * np.sqrt(np.einsum("...p,...p->...", size, size))[..., None]
-    return np.divide(vectors, length, out=np.full(vectors.shape, np.nan), where=length > floor)
+    return vectors / np.where(length > floor, length, np.nan)
 
 
 def _centred(vectors: Floats) -> Floats:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -52,11 +53,19 @@ def square(rdm: ArrayLike) -> Floats:
     """Return symmetric matrices [..., K, K] with a zero diagonal from upper triangles [..., P]."""
     vector = np.asarray(rdm, dtype=np.float64)
     count = stimulus_count(vector.shape[-1])
-    rows, cols = np.triu_indices(count, k=1)
-    matrix = np.zeros((*vector.shape[:-1], count, count))
-    matrix[..., rows, cols] = vector
-    matrix[..., cols, rows] = vector
+    matrix = vector.take(_pair_places(count), axis=-1)
+    matrix[..., np.arange(count), np.arange(count)] = 0.0
     return matrix
+
+
+@lru_cache(maxsize=4)
+def _pair_places(count: int) -> Ints:
+    """Return the place [K, K] of the pair {i, j} in an upper triangle; 0 on the diagonal, which has none."""
+    rows, cols = np.triu_indices(count, k=1)
+    table = np.zeros((count, count), dtype=np.int64)
+    table[rows, cols] = table[cols, rows] = np.arange(len(rows))
+    table.flags.writeable = False
+    return table
 
 
 def permuted_pairs(orders: Any, count: int | None = None) -> Any:

@@ -205,21 +205,26 @@ def chunk_size(sessions: list[SortedTrials], count: int, method: str) -> int:
 
 
 def members(random: Hashes) -> Floats:
-    """Return 1 for the trials [S, n] of the first half: the lower half of the random numbers."""
-    count = random.shape[1]
-    order = np.argsort(random, axis=1, kind="stable")
+    """Return 1 for the trials [..., n] of the first half: the lower half of the random numbers."""
+    count = random.shape[-1]
+    order = np.argsort(random, axis=-1, kind="stable")
     # The lowest number's parity is the coin that gives the odd trial to either half.
-    coin = np.take_along_axis(random, order[:, :1], axis=1) & np.uint64(1)
+    coin = np.take_along_axis(random, order[..., :1], axis=-1) & np.uint64(1)
     size = count // 2 + (count % 2) * coin.astype(np.int64)
     member = np.zeros(random.shape)
-    np.put_along_axis(member, order, (np.arange(count) < size).astype(np.float64), axis=1)
+    np.put_along_axis(member, order, (np.arange(count) < size).astype(np.float64), axis=-1)
     return member
 
 
 def split_members(session: SortedTrials, count: int, index: Ints, seed: int) -> Floats:
     """Return 1 for the trials [S, R] in the first half of their stimulus, in the splits ``index`` [S]."""
-    random = draws(session.hashes, index, seed)
-    return np.concatenate([members(random[:, session.group(stimulus)]) for stimulus in range(count)], axis=1)
+    random, found = draws(session.hashes, index, seed), np.empty((len(index), len(session.labels)))
+    sizes = np.bincount(session.labels, minlength=count)[session.labels]
+    # Trials are sorted by stimulus; stimuli with as many trials are drawn in one call.
+    for size in np.unique(sizes):
+        rows = np.flatnonzero(sizes == size)
+        found[:, rows] = members(random[:, rows].reshape(len(index), -1, size)).reshape(len(index), -1)
+    return found
 
 
 def half_rdms(sessions: list[SortedTrials], count: int, method: str, index: Ints, seed: int) -> tuple[Floats, Floats]:
