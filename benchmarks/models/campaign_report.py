@@ -14,9 +14,13 @@ from typing import Any
 from benchmarks.models.campaign import CURVES, DONE, ROOT
 from benchmarks.models.campaign_jobs import campaign
 from benchmarks.report import table, write_section
-from brainbench.core.figures.style import panels, save_figure
+from brainbench.core.figures.style import COLORS, panels, save_figure
 
 PICTURE = ROOT / "docs" / "images" / "training-curves.png"
+PATTERNS = {"": "solid", "gpt": (0, (6, 2)), "mamba": (0, (1, 1.4))}
+"""Line pattern of each attender."""
+OBJECTIVES = {"supervised": "labels", "simclr": "SimCLR", "ae": "autoencoder", "simsiam": "SimSiam"}
+"""Objective → what lines are labelled with, in the order of their colours."""
 
 
 def read(path: Path) -> list[dict[str, Any]]:
@@ -59,34 +63,34 @@ def results_table(lines: list[dict[str, Any]]) -> str:
 
 
 def draw(curves: list[dict[str, Any]], path: Path) -> None:
-    """Draw the validation accuracy of the networks of seed 0 over their epochs."""
-    series: dict[str, list[dict[str, Any]]] = defaultdict(list)
+    """Draw the validation accuracy of the networks of seed 0 over their epochs, one panel for each encoder."""
+    series: dict[str, dict[str, list[tuple[int, float]]]] = defaultdict(lambda: defaultdict(list))
     for line in curves:
         if line["job"].endswith(".seed0") and line.get("validation") is not None:
-            series[line["job"].removesuffix(".seed0")].append(line)
-    titles = {
-        "supervised": "trained on labels",
-        "simclr": "SimCLR",
-        "ae": "autoencoder",
-        "simsiam": "SimSiam",
-    }
-    shown = [objective for objective in titles if any(name.endswith(f".{objective}") for name in series)]
-    figure, axes = panels(1, len(shown), (4.8 * len(shown), 4.4))
-    encoders = sorted({name.partition(".")[0].partition("+")[0] for name in series})
-    for name, lines in sorted(series.items()):
-        model, _, objective = name.partition(".")
-        if objective not in shown:
-            continue
-        # One colour for each encoder; dashed and dotted with an attender.
-        encoder, attender, _ = model.partition("+")
-        style = {"color": f"C{encoders.index(encoder)}", "linestyle": {"": "-", "gpt": "--"}.get(attender, ":")}
-        epochs, accuracy = [line["epoch"] for line in lines], [100 * line["validation"] for line in lines]
-        axes[0, shown.index(objective)].plot(epochs, accuracy, label=model, **style)
-    for axis, objective in zip(axes[0], shown, strict=True):
-        axis.set(title=titles[objective], xlabel="epoch", ylabel="validation accuracy (%)", ylim=(0, 100))
-    handles = {label: line for axis in axes[0] for line, label in zip(*axis.get_legend_handles_labels(), strict=True)}
-    figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=3, fontsize=8.5, frameon=False)
-    save_figure(figure, path, dpi=120)
+            model, _, objective = line["job"].removesuffix(".seed0").partition(".")
+            encoder, _, attender = model.partition("+")
+            series[encoder][f"{objective}+{attender}"].append((line["epoch"], 100 * line["validation"]))
+    columns = 4
+    figure, axes = panels(-(-len(series) // columns), columns, (14, 8.4), sharex=True, sharey=True)
+    for axis, (encoder, lines) in zip(axes.flat, sorted(series.items()), strict=False):
+        ends = []
+        for name, points in lines.items():
+            objective, _, attender = name.partition("+")
+            color = COLORS[list(OBJECTIVES).index(objective)]
+            axis.plot(*zip(*points, strict=True), color=color, linestyle=PATTERNS[attender])
+            ends.append((*points[-1], OBJECTIVES[objective] + f" +{attender}" * bool(attender), color))
+        lowest = 0.0
+        for epoch, accuracy, label, color in sorted(ends, key=lambda end: end[1]):
+            # Labels of lines that end close together are moved apart, upwards.
+            lowest = max(lowest, accuracy)
+            axis.annotate(label, (epoch + 0.6, lowest), color=color, fontsize=8, va="center", annotation_clip=False)
+            lowest += 7
+        axis.set(title=encoder, ylim=(0, 100), xlim=(0, 44), xticks=range(0, 31, 10))
+    for axis in list(axes.flat)[len(series) :]:
+        axis.set_axis_off()
+    figure.supxlabel("epoch", fontsize=9.5)
+    figure.supylabel("validation accuracy (%)", fontsize=9.5)
+    save_figure(figure, path)
 
 
 def main() -> None:

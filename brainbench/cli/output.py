@@ -86,9 +86,7 @@ def table(title: str, columns: list[str], rows: list[list[str]], *, right: tuple
     from rich.table import Table
 
     grid = Table(
-        title=title or None,
         show_header=any(columns),
-        title_justify="left",
         box=None,
         pad_edge=False,
         header_style="bold",
@@ -110,7 +108,8 @@ def table(title: str, columns: list[str], rows: list[list[str]], *, right: tuple
         markup=False,
         emoji=False,
     ).print(grid)
-    return "\n".join(line.rstrip() for line in buffer.getvalue().splitlines())
+    # Rich would fold a title at the width of the table.
+    return "\n".join([*([title] if title else []), *(line.rstrip() for line in buffer.getvalue().splitlines())])
 
 
 FIRST_LINE, NEXT_LINE = 2.0, 10.0

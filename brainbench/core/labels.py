@@ -29,7 +29,9 @@ def join_labels(
     sides = f"recordings: {listing(vocabulary, limit=40)}; stimuli: {listing(labels, limit=40)}"
     for label, partner in explicit.items():
         if label not in vocabulary:
-            raise UsageError(f"The match names {label!r}, which is no label of the recordings ({sides}).")
+            raise UsageError(
+                f"The match names {label!r}, which is no label of the recordings ({sides}). A CSV file has no headings."
+            )
         if partner is not None and partner not in labels:
             raise UsageError(f"The match pairs {label!r} with {partner!r}, which is no stimulus ({sides}).")
     pairs = {label: explicit.get(label, label) for label in vocabulary}
@@ -40,8 +42,8 @@ def join_labels(
         lonely = {"without a stimulus": alone, "without recordings": unused}
         told = "; ".join(f"{what}: {listing(found, limit=40)}" for what, found in lonely.items() if found)
         raise UsageError(
-            f"The labels of recordings and stimuli do not match ({told}). The {sides}. Map them with --match FILE "
-            "(recording label → stimulus label)."
+            f"The labels of recordings and stimuli do not match ({told}; equal on both sides: "
+            f"{len(pairs) - len(alone)}). Pair them with --match FILE (recording label → stimulus label)."
         )
     partners = list(pairs.values())
     for partner in partners:

@@ -7,6 +7,7 @@ import re
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import groupby
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -291,10 +292,12 @@ def _session_lines(session: SessionSummary) -> Iterator[str]:
             yield f"    {column.name} ({column.kind}) {values}{' …' if column.distinct > EXAMPLES else ''}"
     for name, contents in session.modules:
         yield f"  processing/{name}: {', '.join(contents)}"
-    for item in session.acquired:
-        shape = " × ".join(map(str, item.shape))
-        size = f"{item.gigabytes:.3g} GB" if item.gigabytes >= 0.1 else f"{item.gigabytes * 1e3:.3g} MB"
-        yield f"  {item.name} ({item.kind}): {shape} samples, {size}, not read"
+    for (kind, shape), found in groupby(session.acquired, key=lambda item: (item.kind, item.shape)):
+        items = list(found)
+        gigabytes = sum(item.gigabytes for item in items)
+        size = f"{gigabytes:.3g} GB" if gigabytes >= 0.1 else f"{gigabytes * 1e3:.3g} MB"
+        names = items[0].name if len(items) == 1 else f"{items[0].name} … {items[-1].name}, {len(items)} series"
+        yield f"  {names} ({kind}): {' × '.join(map(str, shape))} samples{' each' * (len(items) > 1)}, {size}, not read"
     for item in (*session.missing, *session.notes):
         yield f"  ! {item}"
 

@@ -152,10 +152,21 @@ def score_record(
 
 def _check_labels(resolved: ResolvedModel, brain: NeuralResponses, options: ScoreOptions) -> None:
     """Refuse labels that do not match before anything is simulated, where they are known by then."""
+    from brainbench.scoring.model_responses import DEFAULT_STIMULI
     from brainbench.stimuli.sources import known_labels
 
-    if resolved.labels is None and (shown := known_labels(options.stimuli)) is not None:
+    source = DEFAULT_STIMULI if options.stimuli is None else options.stimuli
+    if resolved.labels is not None or (shown := known_labels(source)) is None:
+        return
+    try:
         brain.pairs(shown, options.match)
+    except UsageError as error:
+        if options.stimuli is not None:
+            raise
+        raise UsageError(
+            f"{error} The recordings do not name their stimuli, so the recipe {source!r} was taken; --stimuli names "
+            "another."
+        ) from error
 
 
 def _compare(

@@ -17,7 +17,7 @@ def test_unmatched_labels_list_both_sides():
     text = str(caught.value)
     assert "without a stimulus: 'face'" in text
     assert "without recordings: 'cube'" in text
-    assert "recordings: 'a', 'face'; stimuli: 'a', 'cube'" in text
+    assert "equal on both sides: 1" in text
     assert "--match" in text
 
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from brainbench.core.errors import DataError, UsageError, shown
+from brainbench.core.errors import DataError, UsageError, shown, unknown_name
 from brainbench.core.reading.ranges import check_number
 from brainbench.datasets.sessions import Session, SessionTable
 
@@ -18,6 +18,9 @@ CONTACTS = re.compile(r"^(?:.*/)?contacts_by_whisker_(?P<whisker>\w+)$")
 _ANCHORS = {"start": "start_time", "stop": "stop_time", "choice": "choice_time"}
 # The name is matched lazily, so that it may hold a hyphen (first-contact) and yet leaves a signed number at the end.
 _EDGE = re.compile(r"^(?P<name>.*?)(?P<offset>[+-]\d*\.?\d+)?$")
+
+_UNITS = {"s": 1.0, "sec": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6}
+_WITH_UNIT = re.compile(r"(?P<number>[+-]\d*\.?\d+) ?(?P<unit>s|sec|ms|us|µs)$", re.IGNORECASE)
 
 
 @dataclass(frozen=True)
@@ -69,6 +72,12 @@ class Window:
             UsageError: the text is not of this form.
         """
         first, dots, last = (part.strip() for part in source.partition(".."))
+        if with_unit := _WITH_UNIT.search(first) or _WITH_UNIT.search(last):
+            seconds = float(with_unit["number"]) * _UNITS[with_unit["unit"].lower()]
+            raise UsageError(
+                f"The window {shown(source)} has a time with a unit, {with_unit[0]!r}; times are seconds without a "
+                f"unit, here {seconds:+g}."
+            )
         begin, end = _EDGE.match(first), _EDGE.match(last)
         if not dots or begin is None or end is None or not begin["name"] or not last:
             raise UsageError(
@@ -141,7 +150,10 @@ WHOLE = Window("start", stop="stop")
 
 
 def _event(table: SessionTable, anchor: str) -> NDArray[np.float64]:
-    return table.times(_ANCHORS.get(anchor, anchor))
+    column = _ANCHORS.get(anchor, anchor)
+    if column not in table:
+        raise unknown_name(f"event of a window in {table.label}", anchor, (*_ANCHORS, FIRST_CONTACT, *table.columns))
+    return table.times(column)
 
 
 def _signed(seconds: float) -> str:

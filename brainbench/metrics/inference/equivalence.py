@@ -78,7 +78,9 @@ def equivalence_test(
     difference, without = difference[np.isfinite(difference)], without[np.isfinite(without)]
     count = len(difference)
     if count < 2 or len(without) < 2:
-        reason = f"{count} animals and {len(without)} stimuli have a difference; at least 2 of each are needed"
+        reason = "fewer than two animals can be compared with one another"
+        if count > 1:
+            reason = f"the difference is known without {len(without)} of the stimuli; at least 2 are needed"
         return EquivalenceTest(math.nan, margin, None, math.nan, "undecided", "undefined", reason)
     # Two one-sided t tests (Schuirmann 1987), t = (margin ± mean)/error. Both reject at level α exactly when the
     # interval at level 1 − 2α lies within ±margin.

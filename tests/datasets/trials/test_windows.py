@@ -35,6 +35,17 @@ def test_unreadable_windows_show_the_form(source):
         Window.parse(source)
 
 
+@pytest.mark.parametrize("source", ["start..+500ms", "start+500 ms..stop", "start..+0.5s"])
+def test_a_time_with_a_unit_is_told_in_seconds(source):
+    with pytest.raises(UsageError, match=re.escape("here +0.5.")):
+        Window.parse(source)
+
+
+def test_an_unknown_event_is_answered_with_the_names_of_events():
+    with pytest.raises(UsageError, match="did you mean 'start'"):
+        edges(Window.parse("strt..+0.5"), make_contacts())
+
+
 def test_a_window_needs_an_end_and_a_positive_length():
     with pytest.raises(UsageError, match=r"'start' .*stop .*length"):
         Window("start")
