@@ -180,7 +180,8 @@ def _moved(task: Task, hand: Hand, joints: Sequence[str]) -> tuple[str, ...]:
         if not chosen:
             raise UsageError(
                 f"Task {task.name!r} moves {', '.join(task.moves)}; the fingers of hand {hand.name!r} are "
-                f"{', '.join(hand.fingers)}. Change the task with dataclasses.replace(task, moves=(...))."
+                f"{', '.join(hand.fingers)}. Register a task with moves={tuple(hand.fingers)} in a file of your own; "
+                "on the command line --task-file names it (docs/tasks.md, 'Another hand, a task of your own')."
             )
     links = {link for name in chosen for link in hand.fingers[name]}
     others = {link for name in hand.fingers if name not in chosen for link in hand.fingers[name]}

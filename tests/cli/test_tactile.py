@@ -6,7 +6,7 @@ import pytest
 
 
 def test_layouts_prints_the_counts_of_the_published_table(run):
-    found = json.loads(run("tactile", "layouts", "sharpa", "--json").out)
+    found = json.loads(run("tactile", "layouts", "--hand", "sharpa", "--json").out)
     assert found["counts"]["med"] == {"hand": 206, "tips": 70, "fingers": 190, "palm": 16}
     assert len(found["joints"]) == 22
     text = run("tactile", "layouts", "--links")
@@ -16,13 +16,13 @@ def test_layouts_prints_the_counts_of_the_published_table(run):
 
 
 def test_layouts_writes_probe_files_and_reads_them_back(run, tmp_path):
-    assert run("tactile", "layouts", "xhand1", "--out", str(tmp_path)).status == 0
-    found = run("tactile", "layouts", "xhand1", "--probes", str(tmp_path / "xhand1_low.json"), "--json")
+    assert run("tactile", "layouts", "--hand", "xhand1", "--out", str(tmp_path)).status == 0
+    found = run("tactile", "layouts", "--hand", "xhand1", "--probes", str(tmp_path / "xhand1_low.json"), "--json")
     assert json.loads(found.out)["counts"]["custom"]["hand"] == 90
 
 
 def test_an_unknown_hand_is_explained(run):
-    found = run("tactile", "layouts", "xhand")
+    found = run("tactile", "layouts", "--hand", "xhand")
     assert found.status == 2
     assert "did you mean 'xhand1'" in found.err
 

@@ -56,12 +56,12 @@ def demo(
     text = table_of("", made.values(), {"picture": "{0[picture]}", "shows": shown})
     if not made["forces"]["in contact"]:
         text += f"\n\nNo taxel of {hand} touched the ball: closed, its fingers do not reach it. "
-        text += f"Its probes are listed by: brainbench tactile layouts {hand}"
+        text += f"Its probes are listed by: brainbench tactile layouts --hand {hand}"
     emit(made, text, as_json=as_json)
 
 
 def layouts(
-    hand: Annotated[str, typer.Argument(help="xhand1, sharpa, or a URDF or MJCF file.")] = "xhand1",
+    hand: HandOption = "xhand1",
     probes: Annotated[Path | None, typer.Option(help="Probe file (published JSON form) to show instead.")] = None,
     links: Annotated[bool, typer.Option("--links", help="Also list every link.")] = False,
     out: Annotated[

@@ -8,7 +8,7 @@ import stat
 from collections.abc import Iterator
 from pathlib import Path
 
-from brainbench.core.errors import BrainbenchError, DataError, DataFileNotFoundError, shown
+from brainbench.core.errors import BrainbenchError, DataError, DataFileNotFoundError, nearest, shown
 
 MOST_TEXT = 64 << 20
 """Bytes of a text file that is parsed; nested lists take about twenty times as much memory."""
@@ -32,7 +32,13 @@ def check_file(path: str | os.PathLike[str], kind: str = "file", *, most: int | 
     try:
         found = Path(path).expanduser().stat()
     except (FileNotFoundError, NotADirectoryError) as error:
-        raise DataFileNotFoundError(f"There is no {kind} {name}.") from error
+        wanted, guess = Path(path).expanduser(), None
+        with contextlib.suppress(OSError):
+            guess = nearest(
+                wanted.name, (item.name for item in wanted.parent.iterdir() if item.suffix == wanted.suffix)
+            )
+        hint = f"; did you mean {shown(str(Path(path).with_name(guess)))}?" if guess else "."
+        raise DataFileNotFoundError(f"There is no {kind} {name}{hint}") from error
     except (OSError, ValueError, RuntimeError) as error:
         raise DataError(f"The {kind} {name} cannot be opened ({reason(error)}).") from error
     if stat.S_ISDIR(found.st_mode):

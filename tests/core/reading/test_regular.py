@@ -37,3 +37,10 @@ def test_long_values_are_cut():
     with pytest.raises(DataError) as found, readable("some-file", "thing"):
         raise ValueError("x" * 10_000)
     assert len(str(found.value)) < 300
+
+
+def test_a_missing_file_is_answered_with_the_nearest_of_its_kind(tmp_path):
+    for name in ("gripper.xml", "griper.txt"):
+        (tmp_path / name).write_text("")
+    with pytest.raises(DataFileNotFoundError, match=r"did you mean '.*gripper\.xml'"):
+        check_file(tmp_path / "griper.xml")
