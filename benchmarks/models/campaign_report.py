@@ -63,12 +63,17 @@ def results_table(lines: list[dict[str, Any]]) -> str:
 
 
 def draw(curves: list[dict[str, Any]], path: Path) -> None:
-    """Draw the validation accuracy of the networks of seed 0 over their epochs, one panel for each encoder."""
+    """Draw the validation accuracy of the networks of seed 0 over their epochs, one panel for each encoder.
+
+    Variants of an objective (augmentation, masking) stand in the table alone.
+    """
     series: dict[str, dict[str, list[tuple[int, float]]]] = defaultdict(lambda: defaultdict(list))
     for line in curves:
         if line["job"].endswith(".seed0") and line.get("validation") is not None:
             model, _, objective = line["job"].removesuffix(".seed0").partition(".")
             encoder, _, attender = model.partition("+")
+            if objective not in OBJECTIVES:
+                continue
             series[encoder][f"{objective}+{attender}"].append((line["epoch"], 100 * line["validation"]))
     columns = 4
     figure, axes = panels(-(-len(series) // columns), columns, (14, 8.4), sharex=True, sharey=True)

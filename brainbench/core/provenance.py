@@ -25,7 +25,8 @@ class Provenance(Mapping[str, Any]):
     command: str = ""
     """Command line that makes the score again."""
     recordings: Mapping[str, Any] = field(default_factory=dict)
-    """``source``, ``content_hash``, ``window``, ``selection``, ``removed`` and ``synthetic`` of the recordings."""
+    """``source``, ``content_hash``, ``window``, ``selection``, ``removed`` and ``synthetic`` of the recordings, and
+    ``config_hash`` of the demo, which names it on every machine."""
     stimuli: Mapping[str, Any] = field(default_factory=dict)
     """``description``, ``content_hash``, ``config_hash`` and ``backend``; empty for features computed elsewhere."""
     pairs: Mapping[str, str] = field(default_factory=dict)
@@ -60,8 +61,11 @@ class Provenance(Mapping[str, Any]):
 
     @property
     def recordings_hash(self) -> str | None:
-        """Content hash of the recordings, if stated."""
-        return _text(self.recordings.get("content_hash")) or None
+        """Hash that names the recordings, if stated.
+
+        Of demo recordings it is that of how they were made, as for stimuli; of all others that of their content.
+        """
+        return _text(self.recordings.get("config_hash")) or _text(self.recordings.get("content_hash")) or None
 
     @property
     def stimuli_name(self) -> str:

@@ -8,11 +8,13 @@ few to tell models apart.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from brainbench.core.files import file_hash
+from brainbench.core.files import content_hash, file_hash, read_json
 from brainbench.core.progress import Progress
 
 DEMOS = {"demo": "objects", "demo-rodgers": "rodgers"}
@@ -38,8 +40,10 @@ def demo_recordings(name: str = "demo", *, progress: Progress | None = None) -> 
     stimuli = load_stimuli(DEMOS[name], progress=progress)
     if name == "demo-rodgers" and stimuli.dataset is not None:
         return ensure_rodgers_demo(stimuli.dataset, progress=progress)
-    weights, design = locate_model(HIDDEN_NETWORK).weights, PopulationDesign()
-    told = {"stimuli_hash": stimuli.content_hash, "weights": file_hash(weights) if weights else None}
+    found, design = locate_model(HIDDEN_NETWORK).weights, PopulationDesign()
+    weights = file_hash(found) if found else None
+    made_of = (stimuli.config_hash, weights, design, HIDDEN_NETWORK, HIDDEN_LAYER, VERSION, _SEED)
+    told = {"stimuli_hash": stimuli.content_hash, "weights": weights, "config_hash": content_hash(name, *made_of)}
 
     def make(folder: Path) -> None:
         from brainbench.datasets.synthetic import ResponseGeometry, write_files
@@ -66,3 +70,15 @@ def demo_recordings(name: str = "demo", *, progress: Progress | None = None) -> 
         )
 
     return ensure_recordings(name, told, design, HIDDEN_NETWORK, HIDDEN_LAYER, VERSION, _SEED, make=make)
+
+
+def demo_identity(folder: Path, attributes: Mapping[str, Any]) -> str:
+    """Return the hash of how demo recordings were made and what was read of them, equal on every machine.
+
+    Their numbers are not: a processor's last digits of the stimuli are in the rates, and so in some spikes.
+    ``attributes`` are those of the opened recordings.
+    """
+    from brainbench.datasets.synthetic.truth import TRUTH
+
+    read = [attributes.get(name) for name in ("conditions", "window", "bin", "selection")]
+    return content_hash(read_json(folder / TRUTH)["config_hash"], *read)

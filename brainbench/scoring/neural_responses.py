@@ -13,7 +13,7 @@ import numpy as np
 from brainbench.core.errors import UsageError, listing
 from brainbench.core.labels import join_labels
 from brainbench.core.progress import Progress
-from brainbench.scoring.demo import DEMOS, HIDDEN_NETWORK, demo_recordings
+from brainbench.scoring.demo import DEMOS, HIDDEN_NETWORK, demo_identity, demo_recordings
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -33,6 +33,8 @@ class NeuralResponses:
     """Short name of where they come from, without private folders."""
     title: str | None = None
     """Title that the user gave."""
+    definition: str = ""
+    """Hash of how demo recordings were made (:func:`brainbench.scoring.demo.demo_identity`); empty for all others."""
 
     @property
     def vocabulary(self) -> tuple[str, ...]:
@@ -55,6 +57,7 @@ class NeuralResponses:
         names = ("content_hash", "window", "selection", "removed", "synthetic")
         # Boards of the demo say whether the network that made it was found.
         truth = {"truth": HIDDEN_NETWORK} if self.source == "demo" and self.synthetic else {}
+        truth |= {"config_hash": self.definition} if self.definition else {}
         truth |= {"title": self.title} if self.title else {}
         truth |= {"skipped": skipped} if (skipped := self.dataset.attrs.get("skipped")) else {}
         return {"source": self.source, **{name: self.dataset.attrs[name] for name in names}, **truth}
@@ -134,7 +137,8 @@ def open_neural_responses(recordings: Any, *, progress: Progress | None, **selec
         return NeuralResponses(check_recordings(recordings), "data set")
     if isinstance(recordings, str) and recordings in DEMOS:
         folder = demo_recordings(recordings, progress=progress)
-        return NeuralResponses(open_recordings(folder, **selection, progress=progress), recordings)
+        dataset = open_recordings(folder, **selection, progress=progress)
+        return NeuralResponses(dataset, recordings, definition=demo_identity(folder, dataset.attrs))
     several = not isinstance(recordings, (str, os.PathLike))
     name = ", ".join(map(_short, recordings if several else [recordings]))
     return NeuralResponses(open_recordings(recordings, **selection, progress=progress), name)

@@ -1,9 +1,12 @@
+from pathlib import Path
+
 import h5py
 import numpy as np
 import pytest
 
 import brainbench
 from brainbench.core.errors import UsageError
+from brainbench.core.provenance import Provenance
 from brainbench.datasets import open_recordings
 from brainbench.datasets.synthetic import read_truth
 from brainbench.datasets.trials.session_trials import trials_by_subject
@@ -11,8 +14,12 @@ from brainbench.metrics import compare, rdm
 from brainbench.models.activations import extract
 from brainbench.models.registry import locate_model
 from brainbench.models.training.checkpoints import shipped
-from brainbench.scoring.demo import DEMOS, HIDDEN_LAYER, HIDDEN_NETWORK, demo_recordings
+from brainbench.scoring.demo import DEMOS, HIDDEN_LAYER, HIDDEN_NETWORK, demo_identity, demo_recordings
+from brainbench.scoring.neural_responses import open_neural_responses
 from brainbench.stimuli import load_stimuli
+from leaderboards import read_records
+
+RESULTS = Path(__file__).parents[2] / "leaderboards" / "results"
 
 
 @pytest.fixture(scope="module")
@@ -115,3 +122,23 @@ def test_they_are_made_once(folder):
     stamp = folder.stat().st_mtime_ns
     assert demo_recordings() == folder
     assert folder.stat().st_mtime_ns == stamp
+
+
+def test_they_have_one_name_on_every_processor_that_of_the_shipped_board(folder):
+    stored = next(item.record for item in read_records(RESULTS) if item.record)
+    here = Provenance(recordings=open_neural_responses("demo", progress=None).origin)
+    assert here.recordings_hash == stored.score.provenance.recordings_hash
+    # Elsewhere a few spikes differ, and so does the hash of their content.
+    there = Provenance(recordings={**here.recordings, "content_hash": "0123456789abcdef"})
+    assert there.recordings_hash == here.recordings_hash
+
+
+@pytest.mark.parametrize(("name", "value"), [("window", "stimulus..choice"), ("bin", 0.01), ("conditions", "outcome")])
+def test_another_reading_of_them_has_another_name(folder, dataset, name, value):
+    assert demo_identity(folder, dataset.attrs) != demo_identity(folder, {**dataset.attrs, name: value})
+
+
+def test_recordings_of_ones_own_are_named_by_their_content(folder):
+    origin = open_neural_responses(folder, progress=None).origin
+    assert "config_hash" not in origin
+    assert Provenance(recordings=origin).recordings_hash == origin["content_hash"]

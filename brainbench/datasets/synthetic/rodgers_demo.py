@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from brainbench.core.contracts import check_stimulus_set
 from brainbench.core.errors import DataError, UsageError, listing
+from brainbench.core.files import content_hash
 from brainbench.core.progress import Progress
 from brainbench.datasets.layouts import rodgers
 from brainbench.datasets.synthetic.cache import ensure_recordings
@@ -113,6 +114,7 @@ def make_rodgers_demo(
         seed=seed,
         stimuli="rodgers",
         stimuli_hash=str(stimuli.attrs["content_hash"]),
+        config_hash=_definition(stimuli, seed, animals),
         labels=geometry.labels,
         shared=geometry.rdm,
     )
@@ -122,12 +124,20 @@ def ensure_rodgers_demo(
     stimuli: xr.Dataset, *, seed: int = 0, animals: int = 4, progress: Progress | None = None
 ) -> Path:
     """Return the folder of the recordings, making them if this machine has none; see :func:`make_rodgers_demo`."""
-    key = str(check_stimulus_set(stimuli).attrs["content_hash"])
+    numbers = str(check_stimulus_set(stimuli).attrs["content_hash"])
 
     def make(folder: Path) -> None:
         make_rodgers_demo(folder, stimuli, seed=seed, animals=animals, progress=progress)
 
-    return ensure_recordings("demo-rodgers", key, seed, animals, VERSION, make=make)
+    return ensure_recordings("demo-rodgers", numbers, _definition(stimuli, seed, animals), make=make)
+
+
+def _definition(stimuli: xr.Dataset, seed: int, animals: int) -> str:
+    """Return the hash of how recordings are made, equal on every machine where that of the stimuli is."""
+    attributes = stimuli.attrs
+    return content_hash(
+        "demo-rodgers", attributes.get("config_hash", attributes["content_hash"]), seed, animals, VERSION
+    )
 
 
 def wrench_features(stimuli: xr.Dataset) -> NDArray[np.float64]:

@@ -110,17 +110,21 @@ def draw_silent_biases(part: nn.Module) -> None:
             bias.uniform_(-bound, bound)
 
 
+def _onednn_orders(dtype: torch.dtype) -> bool:
+    """Return whether oneDNN orders matrices of this type here: private operations, half precision not everywhere."""
+    known = hasattr(torch.ops.mkldnn, "_reorder_linear_weight")
+    return known and (dtype != torch.bfloat16 or torch.ops.mkldnn._is_mkldnn_bf16_supported())
+
+
 class PackedMatrix:
     """A matrix [out, in] laid out for products with few rows on the CPU, in single or half precision."""
 
     def __init__(self, weight: torch.Tensor, bias: torch.Tensor | None, dtype: torch.dtype) -> None:
         self.dtype = dtype
         self.bias = None if bias is None else bias.detach()
-        # The order of oneDNN, where this build of PyTorch has it (a private operation); else the plain one.
-        reorder = getattr(torch.ops.mkldnn, "_reorder_linear_weight", None)
-        self.ordered, self.weight = reorder is not None, weight.to(dtype).contiguous()
-        if reorder is not None:
-            self.weight = reorder(self.weight, None)
+        self.ordered, self.weight = _onednn_orders(dtype), weight.to(dtype).contiguous()
+        if self.ordered:
+            self.weight = torch.ops.mkldnn._reorder_linear_weight(self.weight, None)
 
     def __call__(self, x: torch.Tensor) -> torch.Tensor:
         """Return x [..., in] times the matrix, plus the bias, in the precision of ``x``."""

@@ -17,7 +17,10 @@ def _stream(model, sweep):
 
 @pytest.mark.parametrize("name", ["zhuang-intersection-ln-small", "resnet18-small", "s4-small+gpt"])
 @pytest.mark.parametrize(("precision", "tolerance"), [("float32", 1e-5), ("bf16", 0.05)])
-def test_a_packed_network_streams_as_the_plain_one(name, precision, tolerance):
+@pytest.mark.parametrize("ordered", [None, False], ids=["as-this-processor-can", "plain-order"])
+def test_a_packed_network_streams_as_the_plain_one(name, precision, tolerance, ordered, monkeypatch):
+    if ordered is not None:
+        monkeypatch.setattr("brainbench.models.ops.layers._onednn_orders", lambda dtype: ordered)
     model = load_model(name, classes=5)
     sweep = torch.randn(8, 30, 5, 7, generator=torch.Generator().manual_seed(1)) * model.normaliser.scale
     plain, fast = _stream(model, sweep), _stream(packed(model, precision=precision), sweep)
