@@ -22,7 +22,7 @@ from brainbench.stimuli.engines.rod.launch import WhiskerSolver
 from brainbench.stimuli.engines.rod.limits import NOTHING
 from brainbench.stimuli.engines.rod.packing import PackedJobs, PackedMotions, still_knots
 from brainbench.stimuli.engines.rod.shapes import PackedShapes
-from brainbench.stimuli.engines.rod.sweeps import BLOCK, SweepLauncher
+from brainbench.stimuli.engines.rod.sweeps import BLOCK, SweepLauncher, pack_object
 from brainbench.stimuli.engines.trust import LARGEST_RESIDUAL
 from brainbench.stimuli.objects.collections import resolve_objects
 from brainbench.stimuli.sweeps.sweep_scenes import GRIDS, SweepScenes
@@ -140,7 +140,8 @@ def sweep(
     objects = load_objects(words)
     loaded = time.perf_counter() - started
     scenes = SweepScenes(GRIDS[recipe], objects)
-    launcher = SweepLauncher(scenes, fidelity, device_name, sliced=sliced)
+    packed = {name: pack_object(solid) for name, solid in objects.items()}
+    launcher = SweepLauncher(scenes, fidelity, device_name, sliced=sliced, packed=packed)
     launcher.solver.tuning = tuning or {}
     groups = [(name, scenes.grid.sweeps(name)[: max(1, sweeps // len(objects))]) for name in scenes.objects]
     launcher.launch(groups[:1])

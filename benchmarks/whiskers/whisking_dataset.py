@@ -110,7 +110,9 @@ def write_set(folder: Path, sweeps: int) -> list[list[str]]:
         name: NamedObject(name, "box", "made up", partial(box, (1.0, 1.0, 1.0)))
         for name in (f"box-{index}" for index in range(sweeps // 16))
     }
-    plan = GenerationPlan("thesis-low", GRIDS["thesis-low"], objects, GenerationSettings(Fidelity(), shard_size=2048))
+    plan = GenerationPlan(
+        "thesis-low", GRIDS["thesis-low"], objects, GenerationSettings(Fidelity(), backend="mujoco", shard_size=2048)
+    )
     run, running.run_here = (
         running.run_here,
         lambda tasks, where, workers, done: running.run_pipelined(tasks, where, 1, done),

@@ -113,6 +113,14 @@ def pick_device(name: Any) -> Any:
     return wp.get_device(name)
 
 
+def gpus() -> list[str]:
+    """Return the names of the visible CUDA devices, as ``CUDA_VISIBLE_DEVICES`` takes them; none is a UsageError."""
+    pick_device("cuda")
+    count = warp().get_cuda_device_count()
+    given = os.environ.get("CUDA_VISIBLE_DEVICES")
+    return [str(place) for place in range(count)] if given is None else given.split(",")[:count]
+
+
 def torch_device(name: Any) -> torch.device:
     """Return the torch device called ``cpu``, ``cuda`` or ``cuda:1``; a torch device passes through.
 

@@ -16,6 +16,8 @@ from brainbench.core.errors import DataError, UsageError, missing_dependency
 
 TIMEOUT = 30
 """Seconds that the scheduler of a cluster may take to answer."""
+STOPPING = threading.Event()
+"""Set while threads of this process should end early, because another one failed or the user interrupted."""
 QUEUED = 4
 """Jobs that wait at the scheduler for each thread of the cluster."""
 
@@ -127,7 +129,7 @@ def worker_pool(processes: int, *, threads: int | None = None) -> ProcessPoolExe
     """
     # Not forked: physics engines and their threads do not survive a fork.
     context = multiprocessing.get_context("spawn")
-    return ProcessPoolExecutor(processes, mp_context=context, initializer=_start_worker, initargs=(threads,))
+    return ProcessPoolExecutor(processes, mp_context=context, initializer=start_worker, initargs=(threads,))
 
 
 def stop_pool(pool: ProcessPoolExecutor) -> None:
@@ -147,7 +149,7 @@ def pool_died(kept: str) -> str:
     )
 
 
-def _start_worker(threads: int | None) -> None:
+def start_worker(threads: int | None = None) -> None:
     """Leave interrupts to the parent process, and end when it ends in whatever way."""
     if threads is not None:
         # Read by the libraries of linear algebra when they load, which is after this.

@@ -7,9 +7,9 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar, Literal, Protocol
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -22,6 +22,7 @@ from brainbench.stimuli.objects.obstacle import Obstacle
 from brainbench.stimuli.whiskers.whisker import Whisker
 
 if TYPE_CHECKING:
+    from brainbench.stimuli.objects.solid import Solid
     from brainbench.stimuli.sweeps.sweep_scenes import SweepScenes
 
 Progress = Callable[[int, int], None]
@@ -194,13 +195,28 @@ class WhiskerEngine(ABC):
             UsageError: the engine cannot run these jobs at this fidelity.
         """
 
+    def prepare_sweeps(  # noqa: B027 — as for prepare
+        self, scenes: SweepScenes, fidelity: Fidelity
+    ) -> None:
+        """Do, in a thread, what the first :meth:`run_sweeps` would wait for, such as compiling; no object is loaded."""
+
+    def pack(self, solid: Solid) -> Any:
+        """Return what :meth:`run_sweeps` makes of an object first, so that other processes can; None for nothing."""
+        return None
+
     def run_sweeps(
-        self, scenes: SweepScenes, indices: Sequence[int], fidelity: Fidelity, *, workers: int | None = None
+        self,
+        scenes: SweepScenes,
+        indices: Sequence[int],
+        fidelity: Fidelity,
+        *,
+        workers: int | None = None,
+        packed: Mapping[str, Any] | None = None,
     ) -> SweepBatch:
         """Simulate sweeps whose object moves; of engines that take :attr:`batches` alone.
 
         Results do not depend on which sweeps come together, nor on their order; ordered by object they are fastest.
-        ``workers`` are threads on the CPU, one when None.
+        ``workers`` are threads on the CPU, one when None; ``packed`` is what :meth:`pack` made of objects, by name.
         """
         raise NotImplementedError(f"The engine {self.name!r} takes sweeps as single scenes.")
 

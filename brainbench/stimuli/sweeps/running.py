@@ -2,38 +2,55 @@
 
 from __future__ import annotations
 
+import multiprocessing
+import os
+import threading
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Future, ProcessPoolExecutor, ThreadPoolExecutor, as_completed
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, ThreadPoolExecutor, as_completed, wait
 from concurrent.futures.process import BrokenProcessPool
 from functools import partial
 from itertools import islice
+from multiprocessing import connection
+from multiprocessing.process import BaseProcess
 from pathlib import Path
 
-from brainbench.core.devices import usable_processors
-from brainbench.core.errors import DataError
-from brainbench.core.jobs import pool_died, run_on_cluster, stop_pool, worker_pool
+from brainbench.core.devices import gpus, pick_device, usable_processors
+from brainbench.core.errors import BrainbenchError, DataError
+from brainbench.core.jobs import STOPPING, pool_died, run_on_cluster, start_worker, stop_pool, worker_pool
 from brainbench.stimuli.sweeps.plan import ShardTask
-from brainbench.stimuli.sweeps.shards import PreparedShard, make_shard, prepare_shard, simulate_shard, write_shard
+from brainbench.stimuli.sweeps.shards import (
+    PreparedShard,
+    make_shard,
+    prepare_shard,
+    simulate_shard,
+    warm_up,
+    write_shard,
+)
 
 Done = Callable[[int], None]
 """Called with the number of sweeps of a shard that is written."""
 
+SIDE_BY_SIDE = 16
+"""Most shards that are simulated on one GPU at the same time. Whiskers that are simulated again are few and take many
+steps one after the other, however idle the GPU is, which meanwhile computes those of other shards."""
+WHISKER_BYTES = 10_000, 32
+"""Room on a GPU for a whisker of a sweep, and for each of its frames more: state, contacts and results."""
 WRITERS = 4
-"""Threads that write shards behind a GPU: one hashes about 1 GB/s."""
+"""Shards behind a GPU that may be hashed and written meanwhile: one thread hashes about 1 GB/s."""
 AHEAD = 4
 """Shards at least that are prepared ahead of the simulation; as many as there are processes to do it, if more."""
 
 
 def run_here(tasks: Sequence[ShardTask], folder: Path, workers: int | None, done: Done) -> None:
-    """Make shards on a pool of processes, or one after the other through a GPU; call ``done`` after each.
+    """Make shards on a pool of processes, or on all GPUs that are visible; call ``done`` after each.
 
     A process that died is a :class:`DataError`.
     """
     count = workers or usable_processors()
     try:
         if tasks[0].settings.device != "cpu":
-            run_pipelined(tasks, folder, count, done)
+            run_on_gpus(tasks, folder, count, done)
         elif min(count, len(tasks)) == 1:
             for task in tasks:
                 done(make_shard(task, str(folder), count))
@@ -77,25 +94,97 @@ def _run_pool(tasks: Sequence[ShardTask], folder: Path, workers: int, done: Done
             raise
 
 
-def run_pipelined(tasks: Sequence[ShardTask], folder: Path, workers: int, done: Done) -> None:
-    """Make shards one after the other in this process while others build objects and threads hash and write.
+def run_on_gpus(tasks: Sequence[ShardTask], folder: Path, workers: int, done: Done) -> None:
+    """Make shards on all GPUs that are visible, each of several by a process of its own; call ``done`` after each."""
+    # So that kernels of one thread never queue behind those of another; read when the GPU is first used.
+    os.environ.setdefault("CUDA_DEVICE_MAX_CONNECTIONS", "32")
+    names = gpus()[: len(tasks)]
+    if len(names) == 1:
+        run_pipelined(tasks, folder, workers, done)
+        return
+    context = multiprocessing.get_context("spawn")
+    heard: dict[connection.Connection, BaseProcess] = {}
+    try:
+        for place, name in enumerate(names):
+            mine, theirs = context.Pipe(duplex=False)
+            share = tasks[place :: len(names)], folder, max(1, workers // len(names))
+            heard[mine] = context.Process(target=_run_share, args=(name, theirs, *share))
+            heard[mine].start()
+            # Only the process holds its end now, so that the pipe closes when it ends.
+            theirs.close()
+        while heard:
+            ready = connection.wait(list(heard))
+            for pipe in [pipe for pipe in heard if pipe in ready]:
+                try:
+                    told = pipe.recv()
+                except EOFError:
+                    raise DataError(pool_died("Every finished shard")) from None
+                if isinstance(told, str):
+                    raise DataError(told)
+                if told is None:
+                    heard.pop(pipe).join()
+                else:
+                    done(told)
+    finally:
+        for process in heard.values():
+            process.terminate()
 
-    The objects of as many shards as there are workers and the forces of :data:`WRITERS` + 1 shards are in memory.
+
+def _run_share(gpu: str, pipe: connection.Connection, tasks: Sequence[ShardTask], folder: Path, workers: int) -> None:
+    """Make shards on one GPU; send the sweeps of each, then None, or what went wrong."""
+    start_worker()
+    os.environ["CUDA_VISIBLE_DEVICES"] = gpu
+    try:
+        run_pipelined(tasks, folder, workers, pipe.send)
+        pipe.send(None)
+    except BrainbenchError as error:
+        pipe.send(str(error))
+
+
+def run_pipelined(tasks: Sequence[ShardTask], folder: Path, workers: int, done: Done) -> None:
+    """Make shards in threads of this process, some at the same time, while other processes build objects.
+
+    The objects of as many shards as there are workers and the forces of at most :data:`SIDE_BY_SIDE` + :data:`WRITERS`
+    shards are in memory.
     """
-    with worker_pool(min(workers, len(tasks))) as builders, ThreadPoolExecutor(WRITERS) as writers:
-        writing: deque[Future[int]] = deque()
+    at_once = _shards_at_once(tasks[0])
+    free = threading.Semaphore(at_once)
+    STOPPING.clear()
+
+    def make(task: ShardTask, prepared: PreparedShard) -> int:
+        with free:
+            content = simulate_shard(task, prepared, workers)
+        return write_shard(content, folder)
+
+    most = min(at_once + WRITERS, len(tasks))
+    making: set[Future[int]] = set()
+    with worker_pool(min(workers, len(tasks))) as builders, ThreadPoolExecutor(most) as threads:
         try:
+            # Fails where the first shard will fail, which tells of it.
+            threads.submit(warm_up, tasks[0])
             for task, prepared in _built_ahead(tasks, builders, max(AHEAD, workers)):
-                content = simulate_shard(task, prepared, workers)
-                if len(writing) == WRITERS:
-                    done(writing.popleft().result())
-                writing.append(writers.submit(write_shard, content, folder))
-                del content
-            while writing:
-                done(writing.popleft().result())
+                making.add(threads.submit(make, task, prepared))
+                del prepared
+                if len(making) == most:
+                    ended, making = wait(making, return_when=FIRST_COMPLETED)
+                    for shard in ended:
+                        done(shard.result())
+            for shard in as_completed(making):
+                done(shard.result())
         except BaseException:
             stop_pool(builders)
+            threads.shutdown(wait=False, cancel_futures=True)
+            STOPPING.set()
             raise
+
+
+def _shards_at_once(task: ShardTask) -> int:
+    """Return how many shards like this one are simulated at the same time: as many as the memory of a GPU takes."""
+    if task.settings.device == "cpu":
+        return SIDE_BY_SIDE
+    fixed, each = WHISKER_BYTES
+    needed = len(task) * len(task.config["whiskers"]["names"]) * (fixed + each * task.frames)
+    return max(1, min(SIDE_BY_SIDE, pick_device(task.settings.device).free_memory // needed))
 
 
 def _built_ahead(

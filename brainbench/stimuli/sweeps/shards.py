@@ -17,10 +17,11 @@ from numpy.typing import NDArray
 from brainbench.core.contracts import CHANNELS, SWEEPS_FORMAT, SWEEPS_SCHEMA
 from brainbench.core.errors import DataError, UsageError
 from brainbench.core.files import atomic_path, content_hash, hash_arrays, to_json
+from brainbench.stimuli.engines import get_engine
 from brainbench.stimuli.objects.solid import Solid
 from brainbench.stimuli.sweeps.grid import Sweep
 from brainbench.stimuli.sweeps.plan import PlannedShard, ShardTask
-from brainbench.stimuli.sweeps.simulation import simulate_sweeps
+from brainbench.stimuli.sweeps.simulation import simulate_sweeps, takes_sweeps
 from brainbench.stimuli.sweeps.sweep_scenes import SweepScenes
 from brainbench.stimuli.whiskers.array import WhiskerArray
 
@@ -53,6 +54,8 @@ class PreparedShard:
     """The objects of the shard; None for one that cannot be used."""
     reasons: tuple[str, ...]
     """Reason for which an object cannot be used; empty for the others."""
+    packed: tuple[Any, ...]
+    """What :meth:`WhiskerEngine.pack` made of the objects, empty when the engine takes no sweeps."""
     tables: Mapping[str, NDArray[Any]]
     """The arrays that do not depend on the simulation."""
 
@@ -74,7 +77,18 @@ def prepare_shard(task: ShardTask) -> PreparedShard:
     hashes = ["" if solid is None else _hash_solid(solid) for solid in solids]
     array = WhiskerArray.of(task.grid.species).select(task.whiskers)
     tables = shard_tables(task, array, task.grid.frames.times, hashes)
-    return PreparedShard(solids, reasons, {**tables, **_conditions(task)})
+    engine = get_engine(task.settings.backend, device=task.settings.device)
+    sweeps = takes_sweeps(engine, task.grid)
+    packed = tuple(solid and engine.pack(solid) for solid in solids) if sweeps else ()
+    return PreparedShard(solids, reasons, packed, {**tables, **_conditions(task)})
+
+
+def warm_up(task: ShardTask) -> None:
+    """Do what the first shard would wait for beside its objects, such as loading kernels."""
+    settings, objects = task.settings, {item.name: item.load for item in task.objects}
+    engine = get_engine(settings.backend, device=settings.device)
+    if takes_sweeps(engine, task.grid):
+        engine.prepare_sweeps(SweepScenes(task.grid, objects, whiskers=task.whiskers), settings.fidelity)
 
 
 def simulate_shard(task: ShardTask, prepared: PreparedShard, workers: int | None = None) -> ShardContent:
@@ -94,7 +108,8 @@ def simulate_shard(task: ShardTask, prepared: PreparedShard, workers: int | None
         settings = {name: getattr(task.settings, name) for name in ("fidelity", "backend", "device", "retry")}
         indices = [place[int(task.owner[i])] * count + int(task.within[i]) for i in chosen.tolist()]
         scenes = SweepScenes(task.grid, named, whiskers=task.whiskers)
-        batch = simulate_sweeps(scenes, indices, workers=workers, **settings)
+        packed = {task.objects[owner].name: some for owner, some in enumerate(prepared.packed) if some is not None}
+        batch = simulate_sweeps(scenes, indices, workers=workers, packed=packed, **settings)
         if batch.wrench.shape != (len(chosen), *shape[1:]):
             raise UsageError(f"The engine gave wrenches {batch.wrench.shape}; expected {(len(chosen), *shape[1:])}.")
         contact[chosen], status[chosen] = batch.contact, np.where(batch.unstable, UNSTABLE, OK)

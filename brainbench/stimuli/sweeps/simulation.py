@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -12,6 +13,7 @@ from brainbench.stimuli.engines.protocol import WhiskerEngine
 from brainbench.stimuli.engines.sweep_batch import SweepBatch, describe_unstable, join_batches
 from brainbench.stimuli.explain import Explanation
 from brainbench.stimuli.simulation import simulate_uncached
+from brainbench.stimuli.sweeps.grid import SweepGrid
 from brainbench.stimuli.sweeps.sweep_scenes import SweepScenes
 
 _TOGETHER = 16
@@ -27,6 +29,7 @@ def simulate_sweeps(
     device: str = "cpu",
     workers: int | None = None,
     retry: int = 1,
+    packed: Mapping[str, Any] | None = None,
 ) -> SweepBatch:
     """Simulate the sweeps of some indices, many at once where the engine can (:attr:`WhiskerEngine.batches`).
 
@@ -37,10 +40,15 @@ def simulate_sweeps(
         UsageError: the backend is unknown or does not run on the device.
     """
     engine = get_engine(backend, device=device, retry=retry)
-    if engine.batches and scenes.grid.mover == "object":
-        return engine.run_sweeps(scenes, indices, fidelity, workers=workers)
+    if takes_sweeps(engine, scenes.grid):
+        return engine.run_sweeps(scenes, indices, fidelity, workers=workers, packed=packed)
     parts = [indices[first : first + _TOGETHER] for first in range(0, len(indices), _TOGETHER)]
     return join_batches([_one_by_one(scenes, part, fidelity, engine, workers) for part in parts])
+
+
+def takes_sweeps(engine: WhiskerEngine, grid: SweepGrid) -> bool:
+    """Return whether an engine simulates many sweeps of a grid at once."""
+    return engine.batches and grid.mover == "object"
 
 
 def _one_by_one(

@@ -1,3 +1,4 @@
+import dataclasses
 import json
 import logging
 import os
@@ -6,10 +7,13 @@ from collections import namedtuple
 
 import pytest
 
+from brainbench.core.devices import warp
 from brainbench.core.errors import DataError, UsageError
+from brainbench.stimuli.engines.fidelity import Fidelity, list_presets
 from brainbench.stimuli.sweeps import running
 from brainbench.stimuli.sweeps.generation import generate
-from tests.factories.sweep_batches import files_of, small_plan
+from brainbench.stimuli.sweeps.plan import GenerationSettings
+from tests.factories.sweep_batches import GRID, files_of, small_plan
 
 
 @pytest.fixture(scope="module")
@@ -77,6 +81,79 @@ def test_the_pipeline_behind_a_gpu_writes_the_same_bytes(plan, unbroken, tmp_pat
     assert sum(done) == 32
     expected = {name: data for name, data in files_of(unbroken).items() if name != "manifest.json"}
     assert files_of(tmp_path) == expected
+
+
+def test_a_set_of_sweeps_has_the_hash_that_it_always_had(tmp_path, monkeypatch):
+    # Too far away to be felt: what whiskers feel has last digits that differ between processors.
+    far = dataclasses.replace(GRID, distance=(0.05,), height=(-0.002, 0.0, 0.002))
+    plan = small_plan(("brick:2", "cone:1"), grid=far, backend="rod", shard_size=5, whiskers="C1,C2,C3")
+    manifest = generate(plan, tmp_path / "set", workers=1)
+    assert (manifest["sweeps"], manifest["steps"], manifest["unstable"]) == (18, 0, 0)
+    # Made by commit a79787b0.
+    assert manifest["content_hash"] == "46790092c1343cc7"
+    monkeypatch.setattr(running, "worker_pool", _threads)
+    running.run_pipelined(plan.shards, tmp_path, 1, print)
+    assert all(
+        (tmp_path / "set" / task.name).read_bytes() == (tmp_path / task.name).read_bytes() for task in plan.shards
+    )
+
+
+def test_a_setting_means_the_same_on_a_gpu_as_on_a_processor():
+    for name in list_presets():
+        on_both = [GenerationSettings(Fidelity.preset(name), device=device).fidelity for device in ("cpu", "cuda")]
+        assert on_both[0] == on_both[1] == Fidelity.preset(name).resolved(twist=True)
+
+
+@pytest.mark.skipif(warp().is_cuda_available(), reason="there is a GPU")
+def test_a_gpu_that_is_not_there_is_told(tmp_path):
+    plan = small_plan(("brick:1",), backend="rod", device="cuda")
+    with pytest.raises(UsageError, match="No CUDA device"):
+        generate(plan, tmp_path, workers=1)
+
+
+@pytest.mark.gpu
+def test_shards_at_once_on_a_gpu_are_those_one_after_the_other(tmp_path, monkeypatch):
+    plan = small_plan(("brick:4", "cone:4"), backend="rod", device="cuda", shard_size=4, whiskers="C1,C2,C3")
+    generate(plan, tmp_path / "together", workers=2)
+    monkeypatch.setattr(running, "SIDE_BY_SIDE", 1)
+    generate(plan, tmp_path / "alone", workers=2)
+    assert files_of(tmp_path / "together") == files_of(tmp_path / "alone")
+
+
+def test_several_gpus_share_the_shards_and_write_the_same_bytes(plan, unbroken, tmp_path, monkeypatch):
+    monkeypatch.setattr(running, "gpus", lambda: ["0", "1"])
+    done = []
+    running.run_on_gpus(plan.shards, tmp_path, 2, done.append)
+    assert done == [len(task) for task in plan.shards]
+    expected = {name: data for name, data in files_of(unbroken).items() if name.startswith(("train", "val", "test"))}
+    assert files_of(tmp_path) == expected
+
+
+def test_what_went_wrong_on_one_of_several_gpus_is_told(plan, tmp_path, monkeypatch):
+    monkeypatch.setattr(running, "gpus", lambda: ["0", "1"])
+    (tmp_path / "file").write_text("")
+    with pytest.raises(DataError, match="cannot be written"):
+        running.run_on_gpus(plan.shards, tmp_path / "file", 2, print)
+
+
+def test_a_process_of_a_gpu_that_dies_is_told(plan, tmp_path, monkeypatch):
+    monkeypatch.setattr(running, "gpus", lambda: ["0", "1"])
+    monkeypatch.setattr(running, "_run_share", os._exit)
+    with pytest.raises(DataError, match="ended unexpectedly"):
+        running.run_on_gpus(plan.shards, tmp_path, 2, print)
+
+
+def test_a_shard_that_fails_ends_the_others_and_is_told(plan, tmp_path, monkeypatch):
+    monkeypatch.setattr(running, "worker_pool", _threads)
+    monkeypatch.setattr(running, "write_shard", _refuse)
+    with pytest.raises(DataError, match="disk"):
+        running.run_pipelined(plan.shards, tmp_path, 2, print)
+    assert running.STOPPING.is_set()
+    running.STOPPING.clear()
+
+
+def _refuse(content, folder):
+    raise DataError("the disk is full")
 
 
 def _threads(processes):

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
 from brainbench.core.devices import warp
-from brainbench.stimuli.engines.rod.limits import MESHES
+from brainbench.stimuli.engines.rod.limits import CONTACT_BOUNDS, DISTANCE_BOUNDS, MESHES
+from brainbench.stimuli.engines.rod.streams import turn
 
 
 def load_kernels(
@@ -36,6 +38,10 @@ def load_kernels(
             kernels = build_kernels(real, capacity, needs, cuda=True, hinges=hinges, **options)
         else:
             kernels = build_kernels(real, capacity, sliced=options.get("sliced", False), hinges=hinges)
+    if device.is_cuda and options.get("sliced"):
+        with kernels.loading, turn(device):
+            _load_together(kernels, options["bounds"][0], device)
+        return kernels
     if device.is_cuda and options:  # compiled at their launch, for the blocks that it asks for
         return kernels
     block = 1 if device.is_cpu else None
@@ -47,3 +53,11 @@ def load_kernels(
         module.load(device, block_dim=block)
         tell(False)
     return kernels
+
+
+def _load_together(kernels: Any, block: int, device: Any) -> None:
+    """Compile the kernels of whiskers in slices side by side: one after the other they take three times as long."""
+    blocks = {kernels.run: block, kernels.swap_queues: None, kernels.measure_distances: DISTANCE_BOUNDS[0]}
+    blocks |= {kernel: CONTACT_BOUNDS[0] for kernel, _ in kernels.solve_contacts}
+    with ThreadPoolExecutor(len(blocks)) as pool:
+        list(pool.map(lambda kernel: kernel.module.load(device, block_dim=blocks[kernel]), blocks))

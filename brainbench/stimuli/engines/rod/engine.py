@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from brainbench.core.devices import pick_device, usable_processors
+from brainbench.core.devices import pick_device, usable_processors, warp
 from brainbench.core.progress import Progress as NamedProgress
 from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.engines.job_pool import run_groups
@@ -33,11 +33,12 @@ from brainbench.stimuli.engines.rod.packing import (
     follicle_track,
     still_track,
 )
-from brainbench.stimuli.engines.rod.shapes import PackedShapes, TrackedObstacle
+from brainbench.stimuli.engines.rod.shapes import PackedShapes, PackedSurface, TrackedObstacle
 from brainbench.stimuli.engines.stepping import is_silent, silent_trace
 from brainbench.stimuli.engines.sweep_batch import SweepBatch
 from brainbench.stimuli.engines.trust import check_jobs, run_with_retries, step_travel
 from brainbench.stimuli.engines.units import MILLI
+from brainbench.stimuli.objects.solid import Solid
 from brainbench.stimuli.sweeps.sweep_scenes import SweepScenes
 from brainbench.stimuli.whiskers.chain import Chain
 
@@ -115,13 +116,37 @@ class RodEngine(WhiskerEngine):
         threads = 1 if device.is_cuda else workers or usable_processors()
         return run_groups(slices, run, threads=threads, progress=progress)
 
+    def prepare_sweeps(self, scenes: SweepScenes, fidelity: Fidelity) -> None:
+        """See :meth:`brainbench.stimuli.engines.protocol.WhiskerEngine.prepare_sweeps`."""
+        from brainbench.stimuli.engines.rod.sweeps import SweepLauncher
+
+        device = pick_device(self.device)
+        if not device.is_cuda:  # its kernel takes a second
+            return
+        if device.is_mempool_supported:
+            # Shards come and go; what went back to the system at every wait would have to be asked for anew.
+            warp().set_mempool_release_threshold(device, 0.8)
+        SweepLauncher(scenes, fidelity, self.device).solver.free()
+
+    def pack(self, solid: Solid) -> tuple[float, PackedSurface]:
+        """See :func:`brainbench.stimuli.engines.rod.sweeps.pack_object`."""
+        from brainbench.stimuli.engines.rod.sweeps import pack_object
+
+        return pack_object(solid)
+
     def run_sweeps(
-        self, scenes: SweepScenes, indices: Sequence[int], fidelity: Fidelity, *, workers: int | None = None
+        self,
+        scenes: SweepScenes,
+        indices: Sequence[int],
+        fidelity: Fidelity,
+        *,
+        workers: int | None = None,
+        packed: Mapping[str, Any] | None = None,
     ) -> SweepBatch:
         """See :meth:`brainbench.stimuli.engines.protocol.WhiskerEngine.run_sweeps`."""
         from brainbench.stimuli.engines.rod.sweeps import SweepLauncher
 
-        return SweepLauncher(scenes, fidelity, self.device).run(indices, self.retry, workers or 1)
+        return SweepLauncher(scenes, fidelity, self.device, packed=packed).run(indices, self.retry, workers or 1)
 
 
 @dataclass(frozen=True, eq=False)

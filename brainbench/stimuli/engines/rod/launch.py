@@ -17,6 +17,7 @@ from brainbench.stimuli.engines.rod.limits import FINEST, LIGHT, LONGEST_SPAN
 from brainbench.stimuli.engines.rod.packing import PackedJobs, PackedMotions, capacity_for, pack_chains
 from brainbench.stimuli.engines.rod.scheduling import Slices, allocate, make_problems
 from brainbench.stimuli.engines.rod.shapes import PackedShapes
+from brainbench.stimuli.engines.rod.streams import download, turn
 from brainbench.stimuli.engines.trust import RunFacts, Verdict, force_change, halved, judge, residual, strongest_force
 from brainbench.stimuli.engines.units import MILLI
 from brainbench.stimuli.whiskers.chain import Chain
@@ -50,7 +51,7 @@ class LaunchResult:
     contact_wrench: NDArray[np.floating] | None = None
     """[row, reading, 6] force and moment of all contacts (N, N·m), when shapes were asked for."""
     seconds: dict[str, float] = field(default_factory=dict)
-    """Elapsed time of ``upload`` and ``kernel``."""
+    """Elapsed time of ``upload``, ``kernel`` and ``download``."""
 
     @property
     def steps(self) -> NDArray[np.int32]:
@@ -123,7 +124,8 @@ class WhiskerSolver:
             options["sliced"] = sliced
         self.kernels = load_kernels(device, self.real, self.capacity, needs, hinges=hinges, **options)
         packed = pack_chains(self.capacity, self.chains, self.quasistatic, hinges)
-        self.chain_arrays = to_struct(self.kernels.structs.ChainArrays, packed, device)
+        with turn(device):
+            self.chain_arrays = to_struct(self.kernels.structs.ChainArrays, packed, device)
         self.block = {} if block is None else {"block_dim": block}
         self.steps = np.array([fidelity.step_of(chain) * MILLI for chain in self.chains])
         """[whisker] longest time step (ms)."""
@@ -134,6 +136,11 @@ class WhiskerSolver:
         """Arguments of :class:`Slices`."""
         self.slices = 0
         """Slices of the last launch."""
+
+    def free(self) -> None:
+        """Give back what is on the device; no launch may follow."""
+        with turn(self.device):
+            del self.chain_arrays
 
     def launch(
         self,
@@ -163,18 +170,9 @@ class WhiskerSolver:
             travel, fast_at: [row, column] as in :class:`brainbench.stimuli.engines.trust.RunFacts`; never when None.
             record_shape: also return shapes and contact wrenches; jobs then stand in their rows in order.
         """
-        wp, structs, device, real = warp(), self.kernels.structs, self.device, self.real
+        wp, structs, device = warp(), self.kernels.structs, self.device
         clock = [time.perf_counter()]
         count, frames = len(jobs), len(readings)
-        out = allocate(
-            structs.ResultArrays,
-            device,
-            wrench=(size[0], frames, size[1], 6),
-            points=(frames, self.capacity + 1, count) if record_shape else (1, 1, 1),
-            contact_wrench=(frames, 2, count) if record_shape else (1, 1, 1),
-            **dict.fromkeys((*_NUMBERS, *_COUNTS), count),
-        )
-        out.contact = wp.full((size[0], frames, size[1]), -1.0, dtype=real, device=device)
         options = structs.StepOptions()
         options.quasistatic = int(self.quasistatic)
         weight = LIGHT if self.quasistatic else 1.0
@@ -182,24 +180,38 @@ class WhiskerSolver:
         options.gravity = structs.vec3(*np.divide(gravity, MILLI * weight).tolist())
         options.axes = structs.mat33(*(np.eye(3) if axes is None else axes).ravel().tolist())
         options.shape = int(record_shape)
-        inputs = [
-            self.chain_arrays,
-            to_struct(structs.MotionArrays, motions.arrays(), device),
-            to_struct(structs.ShapeArrays, shapes.arrays(), device),
-            to_struct(structs.JobArrays, jobs.arrays(self.chains, self.steps[jobs.whisker], start, finer), device),
-            options,
-            to_struct(structs.ReadingArrays, _readings(readings - start), device),
-            out,
-            make_problems(self.kernels, self.capacity, count, device),
-        ]
-        wp.synchronize_device(device)
+        given = (
+            (structs.MotionArrays, motions.arrays()),
+            (structs.ShapeArrays, shapes.arrays()),
+            (structs.JobArrays, jobs.arrays(self.chains, self.steps[jobs.whisker], start, finer)),
+            (structs.ReadingArrays, _readings(readings - start)),
+        )
+        shapes_of = dict.fromkeys((*_NUMBERS, *_COUNTS), count) | {
+            "wrench": (size[0], frames, size[1], 6),
+            "points": (frames, self.capacity + 1, count) if record_shape else (1, 1, 1),
+            "contact_wrench": (frames, 2, count) if record_shape else (1, 1, 1),
+        }
+        slices = None
+        with turn(device):
+            out = allocate(structs.ResultArrays, device, **shapes_of)
+            out.contact = wp.full((size[0], frames, size[1]), -1.0, dtype=self.real, device=device)
+            *scene, reading = [to_struct(kind, values, device) for kind, values in given]
+            problems = make_problems(self.kernels, self.capacity, count, device)
+            inputs = [self.chain_arrays, *scene, options, reading, out, problems]
+            if self.sliced:
+                slices = Slices(self.kernels, self.capacity, count, device, urgent=finer > 1, **self.tuning)
         clock.append(time.perf_counter())
-        if self.sliced:
-            slices = Slices(self.kernels, self.capacity, count, device, **self.tuning)
+        if slices is not None:
             self.slices = slices.run(inputs, self.block["block_dim"])
         else:
-            wp.launch(self.kernels.run, count, [*inputs, structs.PausedWhiskers()], device=device, **self.block)
-        wp.synchronize_device(device)
+            with turn(device):
+                wp.launch(self.kernels.run, count, [*inputs, structs.PausedWhiskers()], device=device, **self.block)
+                wp.synchronize_device(device)
+        clock.append(time.perf_counter())
+        found = download({name: getattr(out, name) for name in (*shapes_of, "contact")}, slices and slices.stream)
+        with turn(device):
+            # What a GPU holds of this launch is given back in a turn too.
+            del out, scene, reading, problems, inputs, slices
         clock.append(time.perf_counter())
 
         def table(values: NDArray) -> NDArray:
@@ -207,15 +219,14 @@ class WhiskerSolver:
             whole[jobs.row, jobs.column] = values
             return whole
 
-        counts = {name: table(getattr(out, name).numpy()) for name in _COUNTS}
-        numbers = {name: getattr(out, name).numpy() for name in _NUMBERS}
-        wrench, missed = out.wrench.numpy(), table(residual(numbers["miss"], numbers["load"]))
-        depth = table(numbers["depth"].astype(float)) / MILLI
+        counts = {name: table(found[name]) for name in _COUNTS}
+        wrench, missed = found["wrench"], table(residual(found["miss"], found["load"]))
+        depth = table(found["depth"].astype(float)) / MILLI
         force = np.sqrt(np.einsum("...d,...d", wrench[..., :3], wrench[..., :3]))
         facts = RunFacts(
             counts["status"],
             # Single precision rounds a late time; the reading at it must not pass for one before it.
-            start + table(numbers["failed"].astype(float)) * (1 - 2e-7) / MILLI,
+            start + table(found["failed"].astype(float)) * (1 - 2e-7) / MILLI,
             *_strong(force, table(self.strongest[jobs.whisker]), readings),
             travel=np.zeros(size) if travel is None else travel,
             fast_at=np.full(size, np.inf) if fast_at is None else fast_at,
@@ -225,12 +236,11 @@ class WhiskerSolver:
             depth=depth,
             peak=force.max(axis=1),
         )
-        contact, again = out.contact.numpy(), np.zeros(size, dtype=bool)
-        result = LaunchResult(wrench, contact, counts, depth, missed, judge(facts), again)
-        result.seconds = dict(zip(("upload", "kernel"), np.diff(clock).tolist(), strict=True))
+        result = LaunchResult(wrench, found["contact"], counts, depth, missed, judge(facts), np.zeros(size, dtype=bool))
+        result.seconds = dict(zip(("upload", "kernel", "download"), np.diff(clock).tolist(), strict=True))
         if record_shape:
-            result.points = np.moveaxis(out.points.numpy().astype(float) / MILLI, 2, 0)
-            forces = out.contact_wrench.numpy().astype(float)
+            result.points = np.moveaxis(found["points"].astype(float) / MILLI, 2, 0)
+            forces = found["contact_wrench"].astype(float)
             result.contact_wrench = np.moveaxis(forces, 2, 0).reshape(count, frames, 6)
         return result
 

@@ -5,9 +5,8 @@ The object's surface is uploaded once and scaled, turned and moved inside the ke
 
 from __future__ import annotations
 
-import os
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
 from itertools import groupby
@@ -29,6 +28,7 @@ from brainbench.stimuli.engines.rod.shapes import PackedShapes, PackedSurface
 from brainbench.stimuli.engines.sweep_batch import SweepBatch, describe_unstable, join_batches
 from brainbench.stimuli.engines.trust import run_with_retries
 from brainbench.stimuli.engines.units import MILLI
+from brainbench.stimuli.objects.solid import Solid
 from brainbench.stimuli.sweeps.sweep_scenes import SweepScenes
 
 BLOCK = 64
@@ -54,6 +54,7 @@ class SweepLauncher:
         against: int = MESHES,
         bounds: tuple[int, int] | None = None,
         sliced: bool | None = None,
+        packed: Mapping[str, tuple[float, PackedSurface]] | None = None,
     ) -> None:
         grid = scenes.grid
         if grid.mover != "object":
@@ -69,6 +70,7 @@ class SweepLauncher:
         self.solver = WhiskerSolver(chains, fidelity, self.device, against, block=BLOCK, sliced=sliced, bounds=bounds)
         self._head = grid.head.matrix
         self._origin = np.asarray(grid.head.position)
+        self._packed = packed or {}
         self._objects: dict[str, tuple[float, PackedSurface]] = {}
         angles = base_rotation([mount.angles for mount in mounts])
         turns = from_matrices(angles)
@@ -162,38 +164,28 @@ class SweepLauncher:
         # Thousands of sweeps fill a GPU; small groups let the threads of a processor end together.
         limit = 4096 if self.device.is_cuda else 4
         groups: list[tuple[str, list[Any]]] = []
-        for index in indices:
-            which, within = divmod(index, self.grid.count)
+        count = self.grid.count
+        for which, some in groupby(indices, lambda index: index // count):
             name = self.scenes.objects[which]
-            if not groups or groups[-1][0] != name or len(groups[-1][1]) >= limit:
-                groups.append((name, []))
-            groups[-1][1].append(self.grid.sweeps(name)[within])
+            every = self.grid.sweeps(name)
+            sweeps = [every[index % count] for index in some]
+            groups += [(name, sweeps[first : first + limit]) for first in range(0, len(sweeps), limit)]
         if self.device.is_cuda:
-            return self.trusted(groups, retry)
+            batch = self.trusted(groups, retry)
+            self.solver.free()
+            return batch
         with ThreadPoolExecutor(max_workers=workers) as pool:
             return join_batches(list(pool.map(lambda group: self.trusted([group], retry), groups)))
 
     def _prepare(self, names: Sequence[str]) -> dict[str, tuple[float, PackedSurface]]:
-        """Return the diagonal (m) and the surface (mm) of objects.
+        """Return objects as :func:`pack_object` packs them.
 
         Those of the last launch are kept: whiskers are simulated again, and large objects come in several launches.
         """
         # Launches may run side by side.
-        known, new = self._objects, []
-        for name in dict.fromkeys(names):
-            if name not in known:
-                solid = self.scenes.solid(name)
-                if solid.surface is None:
-                    raise UsageError(
-                        f"The object {solid.name!r} has no exact surface to sweep over; use the backend 'mujoco'."
-                    )
-                new.append((name, solid.diagonal, solid.surface))
-        # Sorting leaves Python's lock alone. On a processor several launches are made side by side as it is.
-        with ThreadPoolExecutor(min(8, os.cpu_count() or 1) if self.device.is_cuda else 1) as pool:
-            ordered = pool.map(lambda item: PackedSurface.of(item[2].vertices * MILLI, item[2].faces), new)
-            made = {name: (diagonal, some) for (name, diagonal, _), some in zip(new, ordered, strict=True)}
-        self._objects = {name: made[name] if name in made else known[name] for name in names}
-        return {**known, **made}
+        known = {**self._objects, **self._packed}
+        self._objects = {name: known.get(name) or pack_object(self.scenes.solid(name)) for name in dict.fromkeys(names)}
+        return {**known, **self._objects}
 
     def _add(
         self, shapes: PackedShapes, motions: PackedMotions, diagonal: float, surface: PackedSurface, sweeps: Sequence
@@ -229,6 +221,13 @@ class SweepLauncher:
         still = np.tile([1.0, 0.0, 0.0, 0.0], (len(sweeps), 1))
         radius, track = surface.radius * scale, motions.add_straight(knots)
         shapes.add_placed(surface, track=track, turn=still, scale=scale, radius=radius, speed=speed)
+
+
+def pack_object(solid: Solid) -> tuple[float, PackedSurface]:
+    """Return the diagonal (m) and the surface (mm) of an object; one without an exact surface is a UsageError."""
+    if solid.surface is None:
+        raise UsageError(f"The object {solid.name!r} has no exact surface to sweep over; use the backend 'mujoco'.")
+    return solid.diagonal, PackedSurface.of(solid.surface.vertices * MILLI, solid.surface.faces)
 
 
 @cache
