@@ -149,7 +149,6 @@ def run_pipelined(tasks: Sequence[ShardTask], folder: Path, workers: int, done: 
     """
     at_once = _shards_at_once(tasks[0])
     free = threading.Semaphore(at_once)
-    STOPPING.clear()
 
     def make(task: ShardTask, prepared: PreparedShard) -> int:
         with free:
@@ -158,24 +157,27 @@ def run_pipelined(tasks: Sequence[ShardTask], folder: Path, workers: int, done: 
 
     most = min(at_once + WRITERS, len(tasks))
     making: set[Future[int]] = set()
-    with worker_pool(min(workers, len(tasks))) as builders, ThreadPoolExecutor(most) as threads:
-        try:
-            # Fails where the first shard will fail, which tells of it.
-            threads.submit(warm_up, tasks[0])
-            for task, prepared in _built_ahead(tasks, builders, max(AHEAD, workers)):
-                making.add(threads.submit(make, task, prepared))
-                del prepared
-                if len(making) == most:
-                    ended, making = wait(making, return_when=FIRST_COMPLETED)
-                    for shard in ended:
-                        done(shard.result())
-            for shard in as_completed(making):
-                done(shard.result())
-        except BaseException:
-            stop_pool(builders)
-            threads.shutdown(wait=False, cancel_futures=True)
-            STOPPING.set()
-            raise
+    try:
+        with worker_pool(min(workers, len(tasks))) as builders, ThreadPoolExecutor(most) as threads:
+            try:
+                # Fails where the first shard will fail, which tells of it.
+                threads.submit(warm_up, tasks[0])
+                for task, prepared in _built_ahead(tasks, builders, max(AHEAD, workers)):
+                    making.add(threads.submit(make, task, prepared))
+                    del prepared
+                    if len(making) == most:
+                        ended, making = wait(making, return_when=FIRST_COMPLETED)
+                        for shard in ended:
+                            done(shard.result())
+                for shard in as_completed(making):
+                    done(shard.result())
+            except BaseException:
+                STOPPING.set()
+                stop_pool(builders)
+                threads.shutdown(wait=False, cancel_futures=True)
+                raise
+    finally:
+        STOPPING.clear()
 
 
 def _shards_at_once(task: ShardTask) -> int:

@@ -146,10 +146,12 @@ def test_a_process_of_a_gpu_that_dies_is_told(plan, tmp_path, monkeypatch):
 def test_a_shard_that_fails_ends_the_others_and_is_told(plan, tmp_path, monkeypatch):
     monkeypatch.setattr(running, "worker_pool", _threads)
     monkeypatch.setattr(running, "write_shard", _refuse)
+    told = []
+    monkeypatch.setattr(running, "stop_pool", lambda pool: told.append(running.STOPPING.is_set()))
     with pytest.raises(DataError, match="disk"):
         running.run_pipelined(plan.shards, tmp_path, 2, print)
-    assert running.STOPPING.is_set()
-    running.STOPPING.clear()
+    assert told == [True]
+    assert not running.STOPPING.is_set()
 
 
 def _refuse(content, folder):

@@ -56,7 +56,7 @@ def load_kernels(
 
 
 def _load_together(kernels: Any, block: int, device: Any) -> None:
-    """Compile the kernels of whiskers in slices side by side: one after the other they take three times as long."""
+    """Load the kernels of whiskers in slices; those that this machine does not have yet compile side by side."""
     blocks = {kernels.run: block, kernels.swap_queues: None, kernels.measure_distances: DISTANCE_BOUNDS[0]}
     blocks |= {kernel: CONTACT_BOUNDS[0] for kernel, _ in kernels.solve_contacts}
     with ThreadPoolExecutor(len(blocks)) as pool:

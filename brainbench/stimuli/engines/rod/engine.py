@@ -146,7 +146,10 @@ class RodEngine(WhiskerEngine):
         """See :meth:`brainbench.stimuli.engines.protocol.WhiskerEngine.run_sweeps`."""
         from brainbench.stimuli.engines.rod.sweeps import SweepLauncher
 
-        return SweepLauncher(scenes, fidelity, self.device, packed=packed).run(indices, self.retry, workers or 1)
+        launcher = SweepLauncher(scenes, fidelity, self.device, packed=packed)
+        batch = launcher.run(indices, self.retry, workers or 1)
+        launcher.solver.free()
+        return batch
 
 
 @dataclass(frozen=True, eq=False)

@@ -171,9 +171,7 @@ class SweepLauncher:
             sweeps = [every[index % count] for index in some]
             groups += [(name, sweeps[first : first + limit]) for first in range(0, len(sweeps), limit)]
         if self.device.is_cuda:
-            batch = self.trusted(groups, retry)
-            self.solver.free()
-            return batch
+            return self.trusted(groups, retry)
         with ThreadPoolExecutor(max_workers=workers) as pool:
             return join_batches(list(pool.map(lambda group: self.trusted([group], retry), groups)))
 
