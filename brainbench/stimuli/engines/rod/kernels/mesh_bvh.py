@@ -10,19 +10,14 @@ from typing import Any
 
 import warp as wp
 
-from brainbench.stimuli.engines.rod.mesh_bvh import LEVELS, WIDE
+from brainbench.stimuli.engines.rod.mesh_bvh import BITS, LEVELS, WIDE
 
 from .algebra import maximum, minimum, vec3
 from .distances import point_triangle, segment_triangle
+from .mesh_bounds import Kept, PerChild1, beyond, bound_boxes, bound_triangles, children, nearest_child, none_left, step
 from .parameters import group_size, real
-from .state import ShapeArrays
+from .state import ShapeArrays, corner
 from .thread_groups import broadcast, group_min, group_min_int, warp_max
-
-children = WIDE // group_size
-Kept: Any = wp.types.matrix((LEVELS, children), real)
-beyond = 1e30
-none_left = 2**31 - 1
-
 
 @wp.struct
 class NearestTriangles:
@@ -47,12 +42,9 @@ class NearestTriangles:
 
 
 @wp.func
-def level_size(count: int, level: int) -> int:
-    """Return the number of boxes of a level, of a surface of ``count`` triangles."""
-    size = (count + wp.static(WIDE - 1)) // wp.static(WIDE)
-    for _ in range(level):
-        size = (size + wp.static(WIDE - 1)) // wp.static(WIDE)
-    return size
+def node_count(count: int, level: int) -> int:
+    """Return the number of nodes of a level, of a surface of ``count`` triangles; level −1 is that of leaves."""
+    return ((count - 1) >> (wp.static(BITS) * (level + 2))) + 1
 
 
 @wp.func
@@ -71,19 +63,18 @@ def nearest_triangles(
     sure = real(0.998)
     first_face = shapes.face[s]
     count = shapes.faces[s]
+    first_leaf = first_face // wp.static(WIDE)
     row = shapes.box[s]
-    size = (count + wp.static(WIDE - 1)) // wp.static(WIDE)
-    # Boxes of all levels stand one behind the other, leaves first; the search begins at the top.
+    # Nodes of all levels stand one behind the other, those of leaves first; the search begins at the top.
     level = int(0)
-    while size > wp.static(WIDE):
-        row = row + size
-        size = (size + wp.static(WIDE - 1)) // wp.static(WIDE)
+    while node_count(count, level) > 1:
+        row = row + node_count(count, level)
         level = level + 1
     top = level
     node = int(0)
     opened = int(-1)
     begun = int(-1)
-    if leaf >= 0 and leaf < level_size(count, 0):
+    if leaf >= 0 and leaf < node_count(count, -1):
         opened = leaf
         begun = leaf
     measure = int(1)
@@ -113,33 +104,23 @@ def nearest_triangles(
     side_kept = Kept()
     end_kept = Kept()
     each = int(wp.static(children)) + wp.min(0, part)
+    side_bound = PerChild1()
+    end_bound = PerChild1()
+    start_bound = PerChild1()
 
     while warp_max(busy) == 1:
         if busy == 1 and opened >= 0:
+            bound_triangles(
+                shapes.corners, first_leaf + opened, part, a, axis, length, sure, side_bound, end_bound, start_bound
+            )
             for k in range(each):
-                place = wp.static(WIDE) * opened + part * wp.static(children) + k
+                rank = part * wp.static(children) + k
+                place = wp.static(WIDE) * opened + rank
                 if place < count:
-                    p = shapes.corner[first_face + place, 0]
-                    q = shapes.corner[first_face + place, 1]
-                    r = shapes.corner[first_face + place, 2]
-                    # No triangle is nearer than this, squared: beside the axis, and along it from the segment and
-                    # from its ends.
-                    tp = wp.dot(p - a, axis)
-                    tq = wp.dot(q - a, axis)
-                    tr = wp.dot(r - a, axis)
-                    beside_p = p - a - axis * tp
-                    beside_q = q - a - axis * tq
-                    beside_r = r - a - axis * tr
-                    # No point of a triangle is less far along ``way`` than its nearest corner: a bound from three
-                    # products.
-                    way = beside_p + beside_q + beside_r
-                    beside = minimum(wp.dot(beside_p, way), minimum(wp.dot(beside_q, way), wp.dot(beside_r, way)))
-                    beside = maximum(beside, zero)
-                    beside = beside * beside / maximum(wp.length_sq(way), real(1e-20))
-                    low = minimum(tp, minimum(tq, tr))
-                    high = maximum(tp, maximum(tq, tr))
-                    apart = maximum(zero, maximum(low - length, -high))
-                    if sure * (beside + apart * apart) < minimum(side_most, got.side):
+                    p = corner(shapes.corners, first_leaf + opened, 0, rank)
+                    q = corner(shapes.corners, first_leaf + opened, 1, rank)
+                    r = corner(shapes.corners, first_leaf + opened, 2, rank)
+                    if side_bound[wp.static(step) * k] < minimum(side_most, got.side):
                         at = segment_triangle(a, b, p, q, r)
                         if at[0] < got.side:
                             got.side = at[0]
@@ -147,8 +128,7 @@ def nearest_triangles(
                             got.v = at[2]
                             got.w = at[3]
                             got.face = place
-                    apart = maximum(zero, maximum(low - length, length - high))
-                    if sure * (beside + apart * apart) < minimum(end_most, got.end):
+                    if end_bound[wp.static(step) * k] < minimum(end_most, got.end):
                         spot = point_triangle(b, p, q, r)
                         square = wp.length_sq(b - p - (q - p) * spot[0] - (r - p) * spot[1])
                         if square < got.end:
@@ -156,8 +136,7 @@ def nearest_triangles(
                             got.end_v = spot[0]
                             got.end_w = spot[1]
                             got.end_face = place
-                    apart = maximum(zero, maximum(low, -high))
-                    if sure * (beside + apart * apart) < minimum(all_of, got.start):
+                    if start_bound[wp.static(step) * k] < minimum(all_of, got.start):
                         spot = point_triangle(a, p, q, r)
                         square = wp.length_sq(a - p - (q - p) * spot[0] - (r - p) * spot[1])
                         if square < got.start:
@@ -173,48 +152,14 @@ def nearest_triangles(
         end_most = minimum(end, maximum(all_of, own_only))
         if busy == 1 and measure == 1:
             # How near the children of the node can be: beside the segment, and from its end.
-            for k in range(each):
-                place = wp.static(WIDE) * node + part * wp.static(children) + k
-                side_kept[level, k] = far
-                end_kept[level, k] = far
-                if place < size:
-                    low3 = shapes.low[row + place]
-                    high3 = shapes.high[row + place]
-                    wide = real(0.5) * (high3 - low3)
-                    centre = low3 + wide
-                    off = centre - middle
-                    gap = vec3(
-                        maximum(wp.abs(off[0]) - wide[0] - reach[0], zero),
-                        maximum(wp.abs(off[1]) - wide[1] - reach[1], zero),
-                        maximum(wp.abs(off[2]) - wide[2] - reach[2], zero),
-                    )
-                    bound = wp.length_sq(gap)
-                    if sure * bound < maximum(side_most, end_most):
-                        # All of the segment lies behind the plane through its point nearest to the centre.
-                        t = minimum(maximum(wp.dot(centre - a, axis), zero), length)
-                        off = centre - a - axis * t
-                        square = wp.length_sq(off)
-                        over = square - wp.abs(off[0]) * wide[0] - wp.abs(off[1]) * wide[1] - wp.abs(off[2]) * wide[2]
-                        if over > zero:
-                            bound = maximum(bound, over * over / square)
-                        side_kept[level, k] = bound
-                        off = centre - b
-                        gap = vec3(
-                            maximum(wp.abs(off[0]) - wide[0], zero),
-                            maximum(wp.abs(off[1]) - wide[1], zero),
-                            maximum(wp.abs(off[2]) - wide[2], zero),
-                        )
-                        end_kept[level, k] = wp.length_sq(gap)
+            bound_boxes(
+                shapes.boxes, row + node, part, a, b, axis, length, middle, reach, sure, side_most, end_most, level,
+                side_kept, end_kept
+            )  # fmt: skip
         measure = 0
         opened = -1
         # The nearest child that may hold something nearer; its rank among eight in the last bits of its bound.
-        code = int(wp.static(none_left))
-        for k in range(each):
-            bound = side_kept[level, k]
-            if sure * bound < side_most or sure * end_kept[level, k] < end_most:
-                rank = part * wp.static(children) + k
-                # The bits of positive floats are ordered like their values, so one minimum gives box and rank.
-                code = wp.min(code, ((wp.cast(wp.float32(bound), wp.int32) >> 3) << 3) + rank)
+        code = nearest_child(side_kept, end_kept, level, part, sure, side_most, end_most)
         code = group_min_int(code)
         if busy == 1:
             if code == wp.static(none_left):
@@ -223,16 +168,15 @@ def nearest_triangles(
                 else:
                     # The tree has no pointers: parent and children of a box follow from its rank.
                     # Nothing left below: back to the parent.
-                    row = row + size
+                    row = row + node_count(count, level)
                     level = level + 1
-                    size = (size + wp.static(WIDE - 1)) // wp.static(WIDE)
                     node = node // wp.static(WIDE)
             else:
                 rank = code % wp.static(WIDE)
                 # Open this child, and never again.
                 if rank // wp.static(children) == part:
-                    side_kept[level, rank % wp.static(children)] = far
-                    end_kept[level, rank % wp.static(children)] = far
+                    side_kept[level, wp.static(step) * (rank % wp.static(children))] = far
+                    end_kept[level, wp.static(step) * (rank % wp.static(children))] = far
                 node = wp.static(WIDE) * node + rank
                 if level == 0:
                     if node != begun:
@@ -241,8 +185,7 @@ def nearest_triangles(
                     node = node // wp.static(WIDE)
                 else:
                     level = level - 1
-                    size = level_size(count, level)
-                    row = row - size
+                    row = row - node_count(count, level)
                     measure = 1
                     got.boxes = got.boxes + 1
 

@@ -1,0 +1,145 @@
+"""Lower bounds of the distance of a link from eight triangles of a leaf, or from the boxes of eight children, at once.
+
+Each thread of a group takes its share of the eight: one on a GPU, all on a processor, which computes them side by side
+in the lanes of its vector unit. The loops are native code without calls or branches, because the processor's compiler
+makes vector code of no loop of Warp. All distances are squared.
+"""
+
+from typing import Any
+
+import warp as wp
+
+from brainbench.stimuli.engines.rod.mesh_bvh import LEVELS, WIDE
+
+from .algebra import vec3
+from .parameters import group_size, real
+from .state import LeafCorners, NodeBoxes
+
+children = WIDE // group_size
+step = 1 if children > 1 else 0
+"""Child k of the node stands at step · k among its thread's own."""
+Kept: Any = wp.types.matrix((LEVELS, children), real)
+PerChild1: Any = wp.types.vector(children, real)
+beyond = 1e30
+none_left = 2**31 - 1
+
+lanes = f"""
+using real = wp::{real.__name__};
+#if defined(__CUDA_ARCH__)
+const auto lower = [](real x, real y) {{ return min(x, y); }};
+const auto upper = [](real x, real y) {{ return max(x, y); }};
+const auto magnitude = [](real x) {{ return abs(x); }};
+#else
+// What the vector unit has an instruction for.
+const auto lower = [](real x, real y) {{ return x < y ? x : y; }};
+const auto upper = [](real x, real y) {{ return x > y ? x : y; }};
+const auto magnitude = [](real x) {{ return __builtin_elementwise_abs(x); }};
+#endif
+const auto dot = [](const real* x, const real* y) {{ return x[0] * y[0] + x[1] * y[1] + x[2] * y[2]; }};
+constexpr int children = {children};
+const real zero = 0, half = real(0.5), tiny = real(1e-20);
+"""
+
+@wp.func_native(lanes + """
+const auto& c = corners.data[leaf].data;
+for (int k = 0; k < children; k++) {
+    const int n = children * part + k;
+    real along[3], beside[3][3], way[3];
+    for (int i = 0; i < 3; i++) {
+        const real x[3] = {c[3 * i][n] - a.c[0], c[3 * i + 1][n] - a.c[1], c[3 * i + 2][n] - a.c[2]};
+        along[i] = dot(x, axis.c);
+        for (int d = 0; d < 3; d++) beside[i][d] = x[d] - axis.c[d] * along[i];
+    }
+    // No point of a triangle is less far along this way than its nearest corner: a bound from three products.
+    for (int d = 0; d < 3; d++) way[d] = beside[0][d] + beside[1][d] + beside[2][d];
+    real near = lower(dot(beside[0], way), lower(dot(beside[1], way), dot(beside[2], way)));
+    near = upper(near, zero);
+    near = near * near / upper(dot(way, way), tiny);
+    // Along the axis, from the segment and from its ends.
+    const real low = lower(along[0], lower(along[1], along[2]));
+    const real high = upper(along[0], upper(along[1], along[2]));
+    const real beyond_both = upper(zero, upper(low - length, -high));
+    const real beyond_end = upper(zero, upper(low - length, length - high));
+    const real beyond_start = upper(zero, upper(low, -high));
+    side.c[k] = sure * (near + beyond_both * beyond_both);
+    end.c[k] = sure * (near + beyond_end * beyond_end);
+    start.c[k] = sure * (near + beyond_start * beyond_start);
+}
+""")
+def bound_triangles(
+    corners: wp.array(dtype=LeafCorners),
+    leaf: int,
+    part: int,
+    a: vec3,
+    axis: vec3,
+    length: real,
+    sure: real,
+    side: wp.ref[PerChild1],
+    end: wp.ref[PerChild1],
+    start: wp.ref[PerChild1],
+):
+    """Find how near the triangles of a leaf can be to the segment from a along the axis, to its end and to its start."""
+    ...
+
+
+@wp.func_native(lanes + """
+const auto& c = boxes.data[node].data;
+for (int k = 0; k < children; k++) {
+    const int n = children * part + k;
+    real wide[3], centre[3], x[3], gap[3], off[3];
+    for (int d = 0; d < 3; d++) {
+        wide[d] = half * (c[3 + d][n] - c[d][n]);
+        centre[d] = c[d][n] + wide[d];
+        gap[d] = upper(magnitude(centre[d] - middle.c[d]) - wide[d] - reach.c[d], zero);
+        x[d] = centre[d] - a.c[d];
+    }
+    real bound = dot(gap, gap);
+    const bool worth = sure * bound < upper(side_most, end_most);
+    // All of the segment lies behind the plane through its point nearest to the centre.
+    const real t = lower(upper(dot(x, axis.c), zero), length);
+    for (int d = 0; d < 3; d++) off[d] = x[d] - axis.c[d] * t;
+    const real square = dot(off, off);
+    const real over = square - magnitude(off[0]) * wide[0] - magnitude(off[1]) * wide[1] - magnitude(off[2]) * wide[2];
+    bound = over > zero ? upper(bound, over * over / square) : bound;
+    for (int d = 0; d < 3; d++) gap[d] = upper(magnitude(centre[d] - b.c[d]) - wide[d], zero);
+    side.data[level][k] = worth ? bound : FAR;
+    end.data[level][k] = worth ? dot(gap, gap) : FAR;
+}
+""".replace("FAR", f"real({beyond})"))
+def bound_boxes(
+    boxes: wp.array(dtype=NodeBoxes),
+    node: int,
+    part: int,
+    a: vec3,
+    b: vec3,
+    axis: vec3,
+    length: real,
+    middle: vec3,
+    reach: vec3,
+    sure: real,
+    side_most: real,
+    end_most: real,
+    level: int,
+    side: wp.ref[Kept],
+    end: wp.ref[Kept],
+):
+    """Find how near the children of a node can be to the segment a–b and to b; ``beyond`` where that is no matter."""
+    ...
+
+
+@wp.func_native(lanes + f"""
+int code = {none_left};
+for (int k = 0; k < children; k++) {{
+    const real bound = side.data[level][k];
+    const bool worth = sure * bound < side_most || sure * end.data[level][k] < end_most;
+    // The bits of positive floats are ordered like their values, so one minimum gives box and rank.
+    const int here = ((wp::cast<int>(wp::float32(bound)) >> 3) << 3) + children * part + k;
+    code = worth && here < code ? here : code;
+}}
+return code;
+""")
+def nearest_child(
+    side: wp.ref[Kept], end: wp.ref[Kept], level: int, part: int, sure: real, side_most: real, end_most: real
+) -> int:
+    """Return the bound of the nearest child that may hold something nearer, with its rank in the last three bits."""
+    ...
