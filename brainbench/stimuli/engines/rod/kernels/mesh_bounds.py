@@ -12,6 +12,7 @@ import warp as wp
 from brainbench.stimuli.engines.rod.mesh_bvh import LEVELS, WIDE
 
 from .algebra import vec3
+from .distances import NUMBERS, TRIANGLES
 from .parameters import group_size, real
 from .state import LeafCorners, NodeBoxes
 
@@ -19,29 +20,45 @@ children = WIDE // group_size
 step = 1 if children > 1 else 0
 """Child k of the node stands at step · k among its thread's own."""
 Kept: Any = wp.types.matrix((LEVELS, children), real)
-PerChild1: Any = wp.types.vector(children, real)
 beyond = 1e30
 none_left = 2**31 - 1
 
+@wp.struct
+class NearestTriangles:
+    """Squared distances from the segment, its end b and its start a, the rank of the triangle of each (−1: none)
+    and the place on it."""
+
+    side: real
+    share: real
+    face: wp.int32
+    v: real
+    w: real
+    end: real
+    end_face: wp.int32
+    end_v: real
+    end_w: real
+    start: real
+    start_face: wp.int32
+    start_v: real
+    start_w: real
+    boxes: wp.int32
+    """Boxes opened."""
+
+
 lanes = f"""
-using real = wp::{real.__name__};
+constexpr int children = {children};
+const real tiny = real(1e-20);
 #if defined(__CUDA_ARCH__)
-const auto lower = [](real x, real y) {{ return min(x, y); }};
-const auto upper = [](real x, real y) {{ return max(x, y); }};
 const auto magnitude = [](real x) {{ return abs(x); }};
 #else
-// What the vector unit has an instruction for.
-const auto lower = [](real x, real y) {{ return x < y ? x : y; }};
-const auto upper = [](real x, real y) {{ return x > y ? x : y; }};
 const auto magnitude = [](real x) {{ return __builtin_elementwise_abs(x); }};
 #endif
-const auto dot = [](const real* x, const real* y) {{ return x[0] * y[0] + x[1] * y[1] + x[2] * y[2]; }};
-constexpr int children = {children};
-const real zero = 0, half = real(0.5), tiny = real(1e-20);
 """
 
-@wp.func_native(lanes + """
+
+@wp.func_native(TRIANGLES + lanes + """
 const auto& c = corners.data[leaf].data;
+real side[children], end[children], start[children];
 for (int k = 0; k < children; k++) {
     const int n = children * part + k;
     real along[3], beside[3][3], way[3];
@@ -61,28 +78,77 @@ for (int k = 0; k < children; k++) {
     const real beyond_both = upper(zero, upper(low - length, -high));
     const real beyond_end = upper(zero, upper(low - length, length - high));
     const real beyond_start = upper(zero, upper(low, -high));
-    side.c[k] = sure * (near + beyond_both * beyond_both);
-    end.c[k] = sure * (near + beyond_end * beyond_end);
-    start.c[k] = sure * (near + beyond_start * beyond_start);
+    side[k] = sure * (near + beyond_both * beyond_both);
+    end[k] = sure * (near + beyond_end * beyond_end);
+    start[k] = sure * (near + beyond_start * beyond_start);
+}
+// Places of the last leaf may be empty.
+const int first = 8 * (leaf - first_leaf) + children * part, held = count - first < children ? count - first : children;
+int any_side = 0, any_end = 0, any_start = 0;
+for (int k = 0; k < held; k++) {
+    any_side |= side[k] < lower(side_most, got.side);
+    any_end |= end[k] < lower(end_most, got.end);
+    any_start |= start[k] < lower(all_of, got.start);
+}
+real square[children], share[children], v[children], w[children];
+if (any_side) {
+    for (int k = 0; k < children; k++) {
+        const int n = children * part + k;
+        const real p[3] = {c[0][n], c[1][n], c[2][n]}, q[3] = {c[3][n], c[4][n], c[5][n]};
+        const real r[3] = {c[6][n], c[7][n], c[8][n]};
+        segment_triangle(a.c, b.c, p, q, r, square[k], share[k], v[k], w[k]);
+    }
+    for (int k = 0; k < held; k++)
+        if (side[k] < lower(side_most, got.side) && square[k] < got.side) {
+            got.side = square[k]; got.share = share[k]; got.v = v[k]; got.w = w[k]; got.face = first + k;
+        }
+}
+if (any_end) {
+    for (int k = 0; k < children; k++) {
+        const int n = children * part + k;
+        const real p[3] = {c[0][n], c[1][n], c[2][n]}, q[3] = {c[3][n], c[4][n], c[5][n]};
+        const real r[3] = {c[6][n], c[7][n], c[8][n]};
+        from_triangle(b.c, p, q, r, square[k], v[k], w[k]);
+    }
+    for (int k = 0; k < held; k++)
+        if (end[k] < lower(end_most, got.end) && square[k] < got.end) {
+            got.end = square[k]; got.end_v = v[k]; got.end_w = w[k]; got.end_face = first + k;
+        }
+}
+if (any_start) {
+    for (int k = 0; k < children; k++) {
+        const int n = children * part + k;
+        const real p[3] = {c[0][n], c[1][n], c[2][n]}, q[3] = {c[3][n], c[4][n], c[5][n]};
+        const real r[3] = {c[6][n], c[7][n], c[8][n]};
+        from_triangle(a.c, p, q, r, square[k], v[k], w[k]);
+    }
+    for (int k = 0; k < held; k++)
+        if (start[k] < lower(all_of, got.start) && square[k] < got.start) {
+            got.start = square[k]; got.start_v = v[k]; got.start_w = w[k]; got.start_face = first + k;
+        }
 }
 """)
-def bound_triangles(
+def measure_triangles(
     corners: wp.array(dtype=LeafCorners),
+    first_leaf: int,
     leaf: int,
+    count: int,
     part: int,
     a: vec3,
+    b: vec3,
     axis: vec3,
     length: real,
     sure: real,
-    side: wp.ref[PerChild1],
-    end: wp.ref[PerChild1],
-    start: wp.ref[PerChild1],
+    side_most: real,
+    end_most: real,
+    all_of: real,
+    got: wp.ref[NearestTriangles],
 ):
-    """Find how near the triangles of a leaf can be to the segment from a along the axis, to its end and to its start."""
+    """Keep what is nearer in a leaf to the segment a–b, to b and to a than what was found before."""
     ...
 
 
-@wp.func_native(lanes + """
+@wp.func_native(NUMBERS + lanes + """
 const auto& c = boxes.data[node].data;
 for (int k = 0; k < children; k++) {
     const int n = children * part + k;
@@ -127,11 +193,11 @@ def bound_boxes(
     ...
 
 
-@wp.func_native(lanes + f"""
+@wp.func_native(NUMBERS + lanes + f"""
 int code = {none_left};
 for (int k = 0; k < children; k++) {{
     const real bound = side.data[level][k];
-    const bool worth = sure * bound < side_most || sure * end.data[level][k] < end_most;
+    const bool worth = (sure * bound < side_most) | (sure * end.data[level][k] < end_most);
     // The bits of positive floats are ordered like their values, so one minimum gives box and rank.
     const int here = ((wp::cast<int>(wp::float32(bound)) >> 3) << 3) + children * part + k;
     code = worth && here < code ? here : code;

@@ -13,33 +13,10 @@ import warp as wp
 from brainbench.stimuli.engines.rod.mesh_bvh import BITS, LEVELS, WIDE
 
 from .algebra import maximum, minimum, vec3
-from .distances import point_triangle, segment_triangle
-from .mesh_bounds import Kept, PerChild1, beyond, bound_boxes, bound_triangles, children, nearest_child, none_left, step
+from .mesh_bounds import Kept, NearestTriangles, beyond, bound_boxes, children, measure_triangles, nearest_child, none_left, step
 from .parameters import group_size, real
-from .state import ShapeArrays, corner
+from .state import ShapeArrays
 from .thread_groups import broadcast, group_min, group_min_int, warp_max
-
-@wp.struct
-class NearestTriangles:
-    """Squared distances from the segment, its end b and its start a, the rank of the triangle of each (−1: none)
-    and the place on it."""
-
-    side: real
-    share: real
-    face: wp.int32
-    v: real
-    w: real
-    end: real
-    end_face: wp.int32
-    end_v: real
-    end_w: real
-    start: real
-    start_face: wp.int32
-    start_v: real
-    start_w: real
-    boxes: wp.int32
-    """Boxes opened."""
-
 
 @wp.func
 def node_count(count: int, level: int) -> int:
@@ -103,47 +80,13 @@ def nearest_triangles(
     own_only = within * within
     side_kept = Kept()
     end_kept = Kept()
-    each = int(wp.static(children)) + wp.min(0, part)
-    side_bound = PerChild1()
-    end_bound = PerChild1()
-    start_bound = PerChild1()
 
     while warp_max(busy) == 1:
         if busy == 1 and opened >= 0:
-            bound_triangles(
-                shapes.corners, first_leaf + opened, part, a, axis, length, sure, side_bound, end_bound, start_bound
-            )
-            for k in range(each):
-                rank = part * wp.static(children) + k
-                place = wp.static(WIDE) * opened + rank
-                if place < count:
-                    p = corner(shapes.corners, first_leaf + opened, 0, rank)
-                    q = corner(shapes.corners, first_leaf + opened, 1, rank)
-                    r = corner(shapes.corners, first_leaf + opened, 2, rank)
-                    if side_bound[wp.static(step) * k] < minimum(side_most, got.side):
-                        at = segment_triangle(a, b, p, q, r)
-                        if at[0] < got.side:
-                            got.side = at[0]
-                            got.share = at[1]
-                            got.v = at[2]
-                            got.w = at[3]
-                            got.face = place
-                    if end_bound[wp.static(step) * k] < minimum(end_most, got.end):
-                        spot = point_triangle(b, p, q, r)
-                        square = wp.length_sq(b - p - (q - p) * spot[0] - (r - p) * spot[1])
-                        if square < got.end:
-                            got.end = square
-                            got.end_v = spot[0]
-                            got.end_w = spot[1]
-                            got.end_face = place
-                    if start_bound[wp.static(step) * k] < minimum(all_of, got.start):
-                        spot = point_triangle(a, p, q, r)
-                        square = wp.length_sq(a - p - (q - p) * spot[0] - (r - p) * spot[1])
-                        if square < got.start:
-                            got.start = square
-                            got.start_v = spot[0]
-                            got.start_w = spot[1]
-                            got.start_face = place
+            measure_triangles(
+                shapes.corners, first_leaf, first_leaf + opened, count, part, a, b, axis, length, sure, side_most,
+                end_most, all_of, got
+            )  # fmt: skip
         # Bounds that all threads of the group share.
         side = group_min(got.side)
         end = group_min(got.end)
