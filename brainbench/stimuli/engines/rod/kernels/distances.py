@@ -119,7 +119,9 @@ const auto cross = [](const real* x, const real* y, real* z) {{
 """
 """Native code: numbers of the solver's precision, and vectors of three."""
 
-SEGMENTS = NUMBERS + f"""
+SEGMENTS = (
+    NUMBERS
+    + f"""
 // Closest points of the segments a + s d1 and p + t d2: Ericson (2005), section 5.1.9.
 const auto segments = [&](const real* a, const real* d1, const real* p, const real* d2, real& s, real& t) INLINE {{
     const real r[3] = {{a[0] - p[0], a[1] - p[1], a[2] - p[2]}};
@@ -135,8 +137,11 @@ const auto segments = [&](const real* a, const real* d1, const real* p, const re
     t = across < zero ? zero : across > one ? one : across;
 }};
 """
+)
 
-TRIANGLES = SEGMENTS + f"""
+TRIANGLES = (
+    SEGMENTS
+    + f"""
 // Barycentric v and w of q and r of the point of a triangle that is closest to x: Ericson (2005), section 5.1.5.
 const auto point_triangle = [&](const real* x, const real* p, const real* q, const real* r, real& v, real& w) INLINE {{
     real pq[3], pr[3], px[3], qx[3], rx[3];
@@ -207,10 +212,13 @@ const auto segment_triangle = [&](const real* a, const real* b, const real* p, c
     square = pierced ? zero : square; s = pierced ? place : s; v = pierced ? inside_v : v; w = pierced ? inside_w : w;
 }};
 """
+)
 """Native code: distances of points and segments from triangles."""
 
 
-@wp.func_native(SEGMENTS + "wp::vec_t<2, real> pair; segments(a.c, d1.c, p.c, d2.c, pair.c[0], pair.c[1]); return pair;")
+@wp.func_native(
+    SEGMENTS + "wp::vec_t<2, real> pair; segments(a.c, d1.c, p.c, d2.c, pair.c[0], pair.c[1]); return pair;"
+)
 def segments(a: vec3, d1: vec3, p: vec3, d2: vec3) -> vec2:
     """Return s and t of the closest points of the segments a + s d1 and p + t d2."""
     ...

@@ -23,6 +23,7 @@ Kept: Any = wp.types.matrix((LEVELS, children), real)
 beyond = 1e30
 none_left = 2**31 - 1
 
+
 @wp.struct
 class NearestTriangles:
     """Squared distances from the segment, its end b and its start a, the rank of the triangle of each (−1: none)
@@ -56,7 +57,10 @@ const auto magnitude = [](real x) {{ return __builtin_elementwise_abs(x); }};
 """
 
 
-@wp.func_native(TRIANGLES + lanes + """
+@wp.func_native(
+    TRIANGLES
+    + lanes
+    + """
 const auto& c = corners.data[leaf].data;
 real side[children], end[children], start[children];
 for (int k = 0; k < children; k++) {
@@ -127,7 +131,8 @@ if (any_start) {
             got.start = square[k]; got.start_v = v[k]; got.start_w = w[k]; got.start_face = first + k;
         }
 }
-""")
+"""
+)
 def measure_triangles(
     corners: wp.array(dtype=LeafCorners),
     first_leaf: int,
@@ -148,7 +153,10 @@ def measure_triangles(
     ...
 
 
-@wp.func_native(NUMBERS + lanes + """
+@wp.func_native(
+    NUMBERS
+    + lanes
+    + """
 const auto& c = boxes.data[node].data;
 for (int k = 0; k < children; k++) {
     const int n = children * part + k;
@@ -171,7 +179,8 @@ for (int k = 0; k < children; k++) {
     side.data[level][k] = worth ? bound : FAR;
     end.data[level][k] = worth ? dot(gap, gap) : FAR;
 }
-""".replace("FAR", f"real({beyond})"))
+""".replace("FAR", f"real({beyond})")
+)
 def bound_boxes(
     boxes: wp.array(dtype=NodeBoxes),
     node: int,
@@ -193,7 +202,10 @@ def bound_boxes(
     ...
 
 
-@wp.func_native(NUMBERS + lanes + f"""
+@wp.func_native(
+    NUMBERS
+    + lanes
+    + f"""
 int code = {none_left};
 for (int k = 0; k < children; k++) {{
     const real bound = side.data[level][k];
@@ -203,7 +215,8 @@ for (int k = 0; k < children; k++) {{
     code = worth && here < code ? here : code;
 }}
 return code;
-""")
+"""
+)
 def nearest_child(
     side: wp.ref[Kept], end: wp.ref[Kept], level: int, part: int, sure: real, side_most: real, end_most: real
 ) -> int:

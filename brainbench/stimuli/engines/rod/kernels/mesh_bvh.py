@@ -6,17 +6,26 @@ leaves, one thread a triangle. It begins at the leaf where the last search of th
 anything else is left to open. All lengths are in units of the surface.
 """
 
-from typing import Any
-
 import warp as wp
 
-from brainbench.stimuli.engines.rod.mesh_bvh import BITS, LEVELS, WIDE
+from brainbench.stimuli.engines.rod.mesh_bvh import BITS, WIDE
 
 from .algebra import maximum, minimum, vec3
-from .mesh_bounds import Kept, NearestTriangles, beyond, bound_boxes, children, measure_triangles, nearest_child, none_left, step
+from .mesh_bounds import (
+    Kept,
+    NearestTriangles,
+    beyond,
+    bound_boxes,
+    children,
+    measure_triangles,
+    nearest_child,
+    none_left,
+    step,
+)
 from .parameters import group_size, real
 from .state import ShapeArrays
 from .thread_groups import broadcast, group_min, group_min_int, warp_max
+
 
 @wp.func
 def node_count(count: int, level: int) -> int:
