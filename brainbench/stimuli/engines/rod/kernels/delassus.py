@@ -190,7 +190,7 @@ constexpr int stride = {own_rows}, lanes = {lanes};
 const int rows = (3 * each + lanes - 1) / lanes * lanes;
 """
 )
-LANES = "for (int k = 0; k < rows; k += lanes) for (int r = k; r < k + lanes; r++)"
+LANES = "for (int k = 0; k < rows; k += lanes) SIDE_BY_SIDE for (int r = k; r < k + lanes; r++)"
 
 
 @wp.func_native(
@@ -236,14 +236,20 @@ def pass_joint(
 @wp.func_native(
     ROWS
     + f"""
-for (int b = 0; b < 3; b++) {{
-    real* column = matrix.c + (3 * contact + b) * stride;
-    const real o1 = rate1.c[b], o2 = rate2.c[b], o3 = rate3.c[b];
+real *g0 = matrix.c + 3 * contact * stride, *g1 = g0 + stride, *g2 = g1 + stride;
+const real *h1 = unit.impulse.data[0], *h2 = unit.impulse.data[1], *h3 = unit.impulse.data[2];
+if (twists)
     {LANES.replace("k = 0", "k = first / lanes * lanes")} {{
-        const real sum = column[r] + unit.impulse.data[0][r] * o1 + unit.impulse.data[1][r] * o2;
-        column[r] = twists ? sum + unit.impulse.data[2][r] * o3 : sum;
+        g0[r] = g0[r] + h1[r] * rate1.c[0] + h2[r] * rate2.c[0] + h3[r] * rate3.c[0];
+        g1[r] = g1[r] + h1[r] * rate1.c[1] + h2[r] * rate2.c[1] + h3[r] * rate3.c[1];
+        g2[r] = g2[r] + h1[r] * rate1.c[2] + h2[r] * rate2.c[2] + h3[r] * rate3.c[2];
     }}
-}}
+else
+    {LANES.replace("k = 0", "k = first / lanes * lanes")} {{
+        g0[r] = g0[r] + h1[r] * rate1.c[0] + h2[r] * rate2.c[0];
+        g1[r] = g1[r] + h1[r] * rate1.c[1] + h2[r] * rate2.c[1];
+        g2[r] = g2[r] + h1[r] * rate1.c[2] + h2[r] * rate2.c[2];
+    }}
 """
 )
 def add_joint(

@@ -104,10 +104,12 @@ using real = wp::{real.__name__};
 // Functions below have no branches and no calls, so that a processor's compiler can take many numbers at once.
 #if defined(__CUDA_ARCH__)
 #define INLINE
+#define SIDE_BY_SIDE
 const auto lower = [](real x, real y) {{ return min(x, y); }};
 const auto upper = [](real x, real y) {{ return max(x, y); }};
 #else
 #define INLINE __attribute__((always_inline))
+#define SIDE_BY_SIDE _Pragma("clang loop vectorize(assume_safety) unroll(disable)")
 const auto lower = [](real x, real y) {{ return x < y ? x : y; }};
 const auto upper = [](real x, real y) {{ return x > y ? x : y; }};
 #endif

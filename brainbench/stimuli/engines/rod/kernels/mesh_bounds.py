@@ -63,7 +63,7 @@ const auto magnitude = [](real x) {{ return __builtin_elementwise_abs(x); }};
     + """
 const auto& c = corners.data[leaf].data;
 real side[children], end[children], start[children];
-for (int k = 0; k < children; k++) {
+SIDE_BY_SIDE for (int k = 0; k < children; k++) {
     const int n = children * part + k;
     real along[3], beside[3][3], way[3];
     for (int i = 0; i < 3; i++) {
@@ -96,7 +96,7 @@ for (int k = 0; k < held; k++) {
 }
 real square[children], share[children], v[children], w[children];
 if (any_side) {
-    for (int k = 0; k < children; k++) {
+    SIDE_BY_SIDE for (int k = 0; k < children; k++) {
         const int n = children * part + k;
         const real p[3] = {c[0][n], c[1][n], c[2][n]}, q[3] = {c[3][n], c[4][n], c[5][n]};
         const real r[3] = {c[6][n], c[7][n], c[8][n]};
@@ -108,7 +108,7 @@ if (any_side) {
         }
 }
 if (any_end) {
-    for (int k = 0; k < children; k++) {
+    SIDE_BY_SIDE for (int k = 0; k < children; k++) {
         const int n = children * part + k;
         const real p[3] = {c[0][n], c[1][n], c[2][n]}, q[3] = {c[3][n], c[4][n], c[5][n]};
         const real r[3] = {c[6][n], c[7][n], c[8][n]};
@@ -120,7 +120,7 @@ if (any_end) {
         }
 }
 if (any_start) {
-    for (int k = 0; k < children; k++) {
+    SIDE_BY_SIDE for (int k = 0; k < children; k++) {
         const int n = children * part + k;
         const real p[3] = {c[0][n], c[1][n], c[2][n]}, q[3] = {c[3][n], c[4][n], c[5][n]};
         const real r[3] = {c[6][n], c[7][n], c[8][n]};
@@ -158,7 +158,7 @@ def measure_triangles(
     + lanes
     + """
 const auto& c = boxes.data[node].data;
-for (int k = 0; k < children; k++) {
+SIDE_BY_SIDE for (int k = 0; k < children; k++) {
     const int n = children * part + k;
     real wide[3], centre[3], x[3], gap[3], off[3];
     for (int d = 0; d < 3; d++) {
@@ -207,12 +207,13 @@ def bound_boxes(
     + lanes
     + f"""
 int code = {none_left};
-for (int k = 0; k < children; k++) {{
+SIDE_BY_SIDE for (int k = 0; k < children; k++) {{
     const real bound = side.data[level][k];
     const bool worth = (sure * bound < side_most) | (sure * end.data[level][k] < end_most);
     // The bits of positive floats are ordered like their values, so one minimum gives box and rank.
-    const int here = ((wp::cast<int>(wp::float32(bound)) >> 3) << 3) + children * part + k;
-    code = worth && here < code ? here : code;
+    const int own = ((wp::cast<int>(wp::float32(bound)) >> 3) << 3) + children * part + k;
+    const int here = worth ? own : {none_left};
+    code = here < code ? here : code;
 }}
 return code;
 """
