@@ -7,7 +7,7 @@ import pytest
 
 from brainbench.core.devices import to_struct
 from brainbench.stimuli.engines.rod.kernels import specialize
-from brainbench.stimuli.engines.rod.mesh_bvh import WIDE, spatial_order, tree_boxes
+from brainbench.stimuli.engines.rod.mesh_bvh import EMPTY, WIDE, spatial_order, tree_boxes
 from brainbench.stimuli.engines.rod.shapes import PackedShapes, PackedSurface
 from brainbench.stimuli.objects.obstacle import TriangleMesh
 from tests.factories.rod_threads import WARP, Memory, thread_warp
@@ -37,18 +37,22 @@ def test_every_aligned_run_of_triangles_is_a_box_that_holds_them():
     corners = surface.vertices[surface.faces]
     order = spatial_order(corners)
     np.testing.assert_array_equal(np.sort(order), np.arange(len(corners)))
-    corners, boxes, run, first = corners[order], tree_boxes(corners[order]), WIDE, 0
+    corners, nodes, run, first = corners[order], tree_boxes(corners[order]), WIDE, 0
+    boxes = nodes.swapaxes(1, 2).reshape(-1, 2, 3)
     while first < len(boxes):
         count = -(-len(corners) // run)
         for rank in range(count):
             inside = corners[rank * run : (rank + 1) * run].reshape(-1, 3)
             np.testing.assert_array_equal(boxes[first + rank], [inside.min(axis=0), inside.max(axis=0)])
-        first, run = first + count, run * WIDE
+        # The last node of a level may lack children.
+        assert (boxes[first + count : first + -(-count // WIDE) * WIDE] == EMPTY).all()
+        first, run = first + -(-count // WIDE) * WIDE, run * WIDE
     assert first == len(boxes)
     # Neighbours in the order are neighbours in space: leaves are far smaller than those of triangles in any order.
     leaves = -(-len(corners) // WIDE)
     extent = np.ptp(boxes[:leaves], axis=1).max(axis=1).mean()
-    mixed = np.ptp(tree_boxes(corners[np.random.default_rng(0).permutation(len(corners))])[:leaves], axis=1)
+    mixed = tree_boxes(corners[np.random.default_rng(0).permutation(len(corners))])
+    mixed = np.ptp(mixed.swapaxes(1, 2).reshape(-1, 2, 3)[:leaves], axis=1)
     assert extent < 0.3 * mixed.max(axis=1).mean()
 
 

@@ -13,7 +13,7 @@ import warp as wp
 from brainbench.stimuli.engines.rod.limits import CLOSED, CREVICE
 
 from .algebra import JointVector, reader, vec3, vec6
-from .distances import NUMBERS
+from .native import NUMBERS
 from .parameters import capacity, group_size, hinges, max_contacts, real
 from .state import ContactProblems, JointRecord, PerLinkJoint, most_candidates
 from .thread_groups import broadcast, group_sum, warp_max

@@ -11,16 +11,18 @@ import warp as wp
 from brainbench.stimuli.engines.rod.mesh_bvh import BITS, WIDE
 
 from .algebra import maximum, minimum, vec3
-from .mesh_bounds import (
+from .mesh_nodes import (
     Kept,
     NearestTriangles,
+    SearchBounds,
+    SearchSegment,
     beyond,
     bound_boxes,
     children,
     measure_triangles,
     nearest_child,
     none_left,
-    step,
+    stride,
 )
 from .parameters import group_size, real
 from .state import ShapeArrays
@@ -43,10 +45,7 @@ def nearest_triangles(
     ``leaf`` is where to begin (−1: anywhere), ``part`` the thread's place in its group, ``live`` whether the group
     has a question or only keeps others company.
     """
-    zero = real(0.0)
     far = real(wp.static(beyond))
-    # Rounding must not hide a triangle.
-    sure = real(0.998)
     first_face = shapes.face[s]
     count = shapes.faces[s]
     first_leaf = first_face // wp.static(WIDE)
@@ -67,11 +66,14 @@ def nearest_triangles(
     busy = live
 
     along = b - a
-    length = wp.length(along)
-    axis = along / maximum(length, real(1e-20))
     half = real(0.5) * along
-    middle = a + half
-    reach = vec3(wp.abs(half[0]), wp.abs(half[1]), wp.abs(half[2]))
+    line = SearchSegment()
+    line.a = a
+    line.b = b
+    line.length = wp.length(along)
+    line.axis = along / maximum(line.length, real(1e-20))
+    line.middle = a + half
+    line.reach = vec3(wp.abs(half[0]), wp.abs(half[1]), wp.abs(half[2]))
 
     # Squared distances of the nearest so far.
     got = NearestTriangles()
@@ -82,37 +84,32 @@ def nearest_triangles(
     got.end_face = -1
     got.start_face = -1
     side = got.side
-    all_of = got.side
-    # Beyond these, squared, nothing is looked at for the sake of the segment and of its end.
-    side_most = got.side
-    end_most = got.side
+    end = got.side
+    bounds = SearchBounds()
+    bounds.side = got.side
+    bounds.end = got.side
+    bounds.start = got.side
     own_only = within * within
     side_kept = Kept()
     end_kept = Kept()
 
     while warp_max(busy) == 1:
         if busy == 1 and opened >= 0:
-            measure_triangles(
-                shapes.corners, first_leaf, first_leaf + opened, count, part, a, b, axis, length, sure, side_most,
-                end_most, all_of, got
-            )  # fmt: skip
-        # Bounds that all threads of the group share.
+            first = wp.static(WIDE) * opened + wp.static(children) * part
+            measure_triangles(shapes.corners, first_leaf + opened, first, count, part, line, bounds, got)
+        # Bounds that all threads of the group share; of a start only one that is nearest of all matters.
         side = group_min(got.side)
         end = group_min(got.end)
         all_of = minimum(minimum(side, end), group_min(got.start))
-        side_most = minimum(side, maximum(all_of, own_only))
-        end_most = minimum(end, maximum(all_of, own_only))
+        bounds.side = minimum(side, maximum(all_of, own_only))
+        bounds.end = minimum(end, maximum(all_of, own_only))
+        bounds.start = all_of
         if busy == 1 and measure == 1:
-            # How near the children of the node can be: beside the segment, and from its end.
-            bound_boxes(
-                shapes.boxes, row + node, part, a, b, axis, length, middle, reach, sure, side_most, end_most, level,
-                side_kept, end_kept
-            )  # fmt: skip
+            bound_boxes(shapes.boxes, row + node, part, line, bounds, level, side_kept, end_kept)
         measure = 0
         opened = -1
         # The nearest child that may hold something nearer; its rank among eight in the last bits of its bound.
-        code = nearest_child(side_kept, end_kept, level, part, sure, side_most, end_most)
-        code = group_min_int(code)
+        code = group_min_int(nearest_child(side_kept, end_kept, level, part, bounds))
         if busy == 1:
             if code == wp.static(none_left):
                 if level == top:
@@ -127,8 +124,8 @@ def nearest_triangles(
                 rank = code % wp.static(WIDE)
                 # Open this child, and never again.
                 if rank // wp.static(children) == part:
-                    side_kept[level, wp.static(step) * (rank % wp.static(children))] = far
-                    end_kept[level, wp.static(step) * (rank % wp.static(children))] = far
+                    side_kept[level, wp.static(stride) * (rank % wp.static(children))] = far
+                    end_kept[level, wp.static(stride) * (rank % wp.static(children))] = far
                 node = wp.static(WIDE) * node + rank
                 if level == 0:
                     if node != begun:
