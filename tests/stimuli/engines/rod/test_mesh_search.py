@@ -210,6 +210,69 @@ def test_a_link_outside_is_never_told_that_it_overlaps_wherever_the_search_begin
     np.testing.assert_allclose(gaps[close, 1], ends[close], atol=1e-9)
 
 
+def _measure_leaves(arrays, starts, stops, threads):
+    """Numbers [thread, segment, 7] that the threads of a group find in the leaf of each segment's rank."""
+    nodes = specialize("mesh_nodes", real=wp.float64, group_size=threads)
+    measure_triangles, NearestTriangles = nodes.measure_triangles, nodes.NearestTriangles
+    SearchSegment, SearchBounds, LeafCorners = nodes.SearchSegment, nodes.SearchBounds, nodes.LeafCorners
+    own = WIDE // threads
+
+    @wp.kernel(enable_backward=False, module="unique")
+    def measure(
+        corners: wp.array(dtype=LeafCorners),
+        count: int,
+        a: wp.array(dtype=wp.vec3d),
+        b: wp.array(dtype=wp.vec3d),
+        out: wp.array3d(dtype=wp.float64),
+    ):
+        part, k = wp.tid()
+        line = SearchSegment()
+        line.a = a[k]
+        line.b = b[k]
+        line.length = wp.length(b[k] - a[k])
+        line.axis = (b[k] - a[k]) / line.length
+        got = NearestTriangles()
+        got.face = -1
+        got.side = wp.float64(1e20)
+        got.end = got.side
+        got.start = got.side
+        bounds = SearchBounds()
+        bounds.side = got.side
+        bounds.end = got.side
+        bounds.start = got.side
+        measure_triangles(corners, k, WIDE * k + own * part, count, part, line, bounds, got)
+        out[part, k, 0] = got.side
+        out[part, k, 1] = got.end
+        out[part, k, 2] = got.start
+        out[part, k, 3] = wp.float64(got.face)
+        out[part, k, 4] = got.share
+        out[part, k, 5] = got.v
+        out[part, k, 6] = got.w
+
+    out = wp.zeros((threads, len(starts), 7), dtype=wp.float64)
+    vectors = (wp.array(x, dtype=wp.vec3d) for x in (starts, stops))
+    corners = wp.array(arrays["corners"], dtype=LeafCorners)
+    wp.launch(measure, out.shape[:2], [corners, int(arrays["faces"][0]), *vectors, out], device="cpu")
+    return out.numpy()
+
+
+def test_triangles_measured_side_by_side_are_those_measured_one_by_one():
+    wp.init()
+    # The last leaf is not full, so that places without a triangle are met.
+    surface = _surface()
+    surface = TriangleMesh(surface.vertices, surface.faces[:-3])
+    arrays = _shapes(surface)
+    assert arrays["faces"][0] % WIDE
+    leaves = len(arrays["corners"])
+    starts, stops = _segments(surface, leaves)
+    together, apart = _measure_leaves(arrays, starts, stops, 1)[0], _measure_leaves(arrays, starts, stops, WIDE)
+    np.testing.assert_array_equal(together[:, :3], apart[..., :3].min(axis=0))
+    # Of triangles that are as near the first counts.
+    first = apart[..., 0].argmin(axis=0)
+    np.testing.assert_array_equal(together[:, 3:], apart[first, np.arange(leaves), 3:])
+    assert len(np.unique(together[:, 3] % WIDE)) == WIDE
+
+
 @pytest.mark.parametrize("lanes", [2, 4, 8])
 def test_threads_that_search_together_find_what_one_finds(lanes):
     surface = _surface()
