@@ -6,6 +6,7 @@ import re
 import shlex
 import subprocess
 import sys
+from itertools import groupby
 from pathlib import Path
 from typing import Any
 
@@ -52,6 +53,11 @@ PAGES = sorted(str(path.relative_to(ROOT)) for path in (ROOT / "docs").glob("*.m
 
 
 FRONT = ("README.md", "CONTRIBUTING.md", "RELEASING.md")
+OTHERS = (
+    ".github/pull_request_template.md", "CHANGELOG.md", "SECURITY.md", "benchmarks/README.md", "benchmarks/RESULTS.md",
+    "leaderboards/policies/README.md", "leaderboards/results/README.md",
+    *sorted(str(path.relative_to(ROOT)) for path in (ROOT / "docs" / "notebooks" / "sources").glob("*.md")),
+)  # fmt: skip
 
 
 def _slugs(page: Path) -> set[str]:
@@ -65,17 +71,27 @@ def _slugs(page: Path) -> set[str]:
     return slugs
 
 
-@pytest.mark.parametrize("page", [*FRONT, *PAGES])
+@pytest.mark.parametrize("page", [*FRONT, *PAGES, *OTHERS])
 def test_links_lead_to_files_and_headings_of_the_repository(page: str):
-    text = re.sub(r"```.*?```", "", (ROOT / page).read_text(encoding="utf-8"), flags=re.DOTALL)
+    text = re.sub(r"```.*?```|`[^`\n]*`", "", (ROOT / page).read_text(encoding="utf-8"), flags=re.DOTALL)
+    # The cells of a notebook stand where the notebook is written.
+    folder = ROOT / "docs" / "notebooks" if "/sources/" in page else (ROOT / page).parent
     for target, anchor in re.findall(r"\]\(([^)#:]*)(?:#([^)]*))?\)", text):
-        path = ((ROOT / page).parent / target) if target else ROOT / page
+        path = (folder / target) if target else ROOT / page
         assert path.exists(), f"{page} links to {target}, which does not exist"
         if anchor and path.suffix == ".md":
             assert anchor in _slugs(path), f"{page} links to {target}#{anchor}; its headings are {sorted(_slugs(path))}"
 
 
-@pytest.mark.parametrize("page", ["README.md", *PAGES])
+@pytest.mark.parametrize("page", [*FRONT, *PAGES])
+def test_a_page_needs_no_renderer_of_its_own(page: str):
+    text = re.sub(r"```.*?```|`[^`\n]*`", "", (ROOT / page).read_text(encoding="utf-8"), flags=re.DOTALL)
+    # Admonitions, tabs, attributes, generated documentation and snippets of mkdocs are plain characters elsewhere.
+    alien = re.findall(r"^(?:!!!|\?\?\?|===|:::).*|\{[:#.][^}]*\}|--8<--|\[\[.*?\]\]", text, flags=re.MULTILINE)
+    assert not alien, f"{page}: only the site renders {alien[0]!r}"
+
+
+@pytest.mark.parametrize("page", [*FRONT, *PAGES, *(page for page in OTHERS if page != "CHANGELOG.md")])
 def test_commands_and_options_of_a_page_exist(page: str):
     import typer
 
@@ -135,6 +151,28 @@ def test_the_code_of_a_page_runs_from_top_to_bottom(
         assert names["record"].score.p < 0.05
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("page", ["docs/score.md", "docs/stimuli.md"])
+def test_what_a_page_prints_is_printed(page: str, tmp_path: Path):
+    text = (ROOT / page).read_text(encoding="utf-8")
+    command, (shown, *_) = (
+        _blocks(page, "bash")[0],
+        re.findall(r"```(?:text)?\n(.*?)```", text.split("prints", 1)[1], re.S),
+    )
+    (tmp_path / "poles.toml").write_text("".join(_blocks(page, "toml")))
+    line = next(
+        line
+        for line in command.splitlines()
+        if line.split()[1:3] in (["score", "zhuang-small"], ["stimuli", "simulate"])
+    )
+    done = subprocess.run(
+        [sys.executable, "-m", *shlex.split(line, comments=True)], cwd=tmp_path, capture_output=True, text=True,
+        env={**os.environ, "PYTHONPATH": str(ROOT)}, check=True,
+    )  # fmt: skip
+    printed = {" ".join(line.split()) for line in done.stdout.splitlines()}
+    assert not {" ".join(line.split()) for line in shown.splitlines()} - printed
+
+
 @pytest.fixture
 def registry(monkeypatch: pytest.MonkeyPatch):
     from brainbench import list_models
@@ -180,8 +218,10 @@ def test_a_notebook_runs_and_gives_what_is_shown(name: str, tmp_path: Path, monk
     made = build.make(name, tmp_path)
     for old, new in zip(shown.cells, made.cells, strict=True):
         if new.cell_type == "code":
+            # A line on stderr cuts what is printed into two outputs.
             kinds = [
-                [output.output_type for output in cell.outputs if output.get("name") != "stderr"] for cell in (old, new)
+                [kind for kind, _ in groupby(out.output_type for out in cell.outputs if out.get("name") != "stderr")]
+                for cell in (old, new)
             ]
             assert kinds[0] == kinds[1]
 

@@ -30,18 +30,21 @@ def __getattr__(name: str) -> Any:
 
 def main() -> None:
     """Entry point: run a command and turn our own errors into one line and an exit status."""
-    # Idle threads of OpenMP and of numpy's BLAS would otherwise spin and slow each other down on a busy machine.
+    # The products of a score are small: threads of numpy's BLAS mostly wait for one another, and spin while they do
+    # (six times the processor time for --metric cka, where other work keeps the processors busy). Torch has its own.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
-    os.environ.setdefault("OPENBLAS_THREAD_TIMEOUT", "4")
     try:
         _run()
     except KeyboardInterrupt:
         _say_interrupted()
+        _leave()
         sys.exit(INTERRUPTED)
     except SystemExit as stop:
         # typer turns Ctrl-C into this status, without a word.
         if stop.code == INTERRUPTED:
             _say_interrupted()
+            _leave()
         raise
     except BrokenPipeError:
         # The reader (head, less) has gone; Python would otherwise complain again at shutdown.
@@ -64,3 +67,15 @@ def _run() -> None:
 
 def _say_interrupted() -> None:
     print(f"\nbrainbench: {GO_ON}", file=sys.stderr)
+
+
+def _leave() -> None:
+    """End at once if a compiler runs in a thread: it cannot be stopped, and Python would wait for it for seconds."""
+    import threading
+
+    from brainbench.core.progress import PREPARATION
+
+    if any(thread.name == PREPARATION for thread in threading.enumerate()):
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(INTERRUPTED)

@@ -35,12 +35,12 @@ def emit(data: Any, text: str, *, as_json: bool) -> None:
     print(to_json(data) if as_json else text)
 
 
-def spanned(value: float, interval: Interval | None, *, most: float = math.inf) -> str:
+def spanned(value: float, interval: Interval | None = None, *, most: float = math.inf) -> str:
     """Return ``value [low, high]`` with as many digits as the interval carries: two of its half-width.
 
     Args:
         value: NaN is shown as a dash.
-        interval: Its interval; three significant digits are shown without one.
+        interval: Its interval; two digits are shown without one.
         most: Largest value that can exist, where the interval is cut.
 
     >>> from brainbench.core.records import Interval
@@ -50,7 +50,7 @@ def spanned(value: float, interval: Interval | None, *, most: float = math.inf) 
     if not math.isfinite(value):
         return "–"
     if interval is None or not math.isfinite(interval.high - interval.low):
-        return f"{value:.3g}"
+        return f"{value:.2f}" if abs(value) >= 0.1 else f"{value:.2g}"
     half = (interval.high - interval.low) / 2
     digits = min(max(1 - math.floor(math.log10(half)), 0), 9) if half > 0 else 3
     return f"{value:.{digits}f} [{interval.low:.{digits}f}, {min(interval.high, most):.{digits}f}]"
@@ -79,7 +79,7 @@ def facts(values: Mapping[str, object], title: str = "") -> str:
 
 
 def table(title: str, columns: list[str], rows: list[list[str]], *, right: tuple[int, ...] = ()) -> str:
-    """Lay out a table as text; ``right`` names the columns set flush right. The first column is never folded."""
+    """Lay out a table as text; ``right`` names the columns set flush right. They and the first are never folded."""
     from io import StringIO
 
     from rich.console import Console
@@ -92,7 +92,8 @@ def table(title: str, columns: list[str], rows: list[list[str]], *, right: tuple
         header_style="bold",
     )
     for index, column in enumerate(columns):
-        grid.add_column(column, justify="right" if index in right else "left", overflow="fold", no_wrap=not index)
+        number = index in right
+        grid.add_column(column, justify="right" if number else "left", overflow="fold", no_wrap=number or not index)
     for row in rows:
         grid.add_row(*row)
     first = max((len(row[0]) for row in rows if row), default=0)
