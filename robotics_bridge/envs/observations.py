@@ -16,7 +16,7 @@ VELOCITY = 0.2
 def observe(state: EnvState) -> dict[str, torch.Tensor]:
     """Return every group that the task or the caller asks for, float32 [B, ...]."""
     task = state.task
-    wanted = {"proprio", *task.auxiliary, *(name for names in task.groups.values() for name in names)}
+    wanted = {"proprio", "command", *task.auxiliary, *(name for names in task.groups.values() for name in names)}
     wanted |= {"tactile"} if state.touch is not None else set()
     wanted |= {"link_pose"} if state.options.link_pose else set()
     return {name: make(state) for name, make in _GROUPS.items() if name in wanted}
@@ -32,6 +32,11 @@ def _joints(state: EnvState, *, noisy: bool) -> torch.Tensor:
         position = position + noise.position * drawn[0]
         velocity = velocity + noise.velocity * drawn[1]
     return torch.cat((position, velocity, state.episode.action), dim=1)
+
+
+def _command(state: EnvState) -> torch.Tensor:
+    parts = {"on": torch.ones(state.num_envs, 1, device=state.device), "orientation": state.goals.quat.clone()}
+    return torch.cat([parts[name] for name in state.task.command], dim=1)
 
 
 def _goal(state: EnvState) -> torch.Tensor:
@@ -67,6 +72,7 @@ _GROUPS: dict[str, Callable[[EnvState], torch.Tensor]] = {
     "proprio": lambda state: _joints(state, noisy=True),
     "tactile": lambda state: state.touch.reading,  # type: ignore[union-attr]
     "link_pose": lambda state: state.link_pose,
+    "command": _command,
     "goal": _goal,
     "priv_proprio": lambda state: torch.cat((_joints(state, noisy=False), state.contacts.tip_force.flatten(1)), dim=1),
     "priv_obj_state": _object,

@@ -14,6 +14,7 @@ from brainbench.cli.output import JsonOption, emit, facts, progress_bar, table_o
 from brainbench.cli.policy.options import (
     ENV,
     TOUCH,
+    ChangeOption,
     ConfigOption,
     DeviceOption,
     EnvsOption,
@@ -74,6 +75,7 @@ def play(
     width: Annotated[int, typer.Option(help="Of a frame [pixels].")] = 480,
     hand: HandOption = "xhand1",
     config: ConfigOption = "default",
+    change: ChangeOption = None,
     task_file: TaskFileOption = None,
     as_json: JsonOption = False,
 ) -> None:
@@ -91,7 +93,9 @@ def play(
         check_paths(video, strip)
         from brainbench.cli.policy import pictures as drawing
     options |= touch_of([agent])
-    env = make_env(task, task_file=task_file, num_envs=1, hand=hand, config=config, threads=1, **options)
+    env = make_env(
+        task, config=config, change=change, task_file=task_file, num_envs=1, hand=hand, threads=1, **options
+    )
     act = agent_of(agent, env, seed=options["seed"])
     steps = max(round(seconds / env.step_dt), 1)
     rewards: list[float] = []
@@ -149,6 +153,7 @@ def evaluate(
     envs: EnvsOption = 32,
     hand: HandOption = "xhand1",
     config: ConfigOption = "default",
+    change: ChangeOption = None,
     task_file: TaskFileOption = None,
     device: DeviceOption = "cpu",
     out: Annotated[
@@ -170,7 +175,9 @@ def evaluate(
         raise UsageError(f"An evaluation needs at least one seed; received {seeds}.")
     check_names(task, agents or [], task_file)
     touch = touch_of(list(agents or []))
-    env = make_env(task, task_file=task_file, num_envs=envs, hand=hand, config=config, device=device, **touch)
+    env = make_env(
+        task, config=config, change=change, task_file=task_file, num_envs=envs, hand=hand, device=device, **touch
+    )
     names = ["zero", "random", *(name for name in agents or [] if name not in ("zero", "random"))]
     found: list[dict[str, Any]] = []
     with progress_bar() as progress:

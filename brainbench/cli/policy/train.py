@@ -12,12 +12,13 @@ from brainbench.cli.destinations import out_folder
 from brainbench.cli.options import part_of, with_options
 from brainbench.cli.output import JsonOption, emit, facts, progress_bar, table
 from brainbench.cli.policy.options import (
+    ChangeOption,
     ConfigOption,
     DeviceOption,
     HandOption,
     TaskArgument,
     TaskFileOption,
-    read_task_file,
+    make_env,
 )
 
 
@@ -38,30 +39,37 @@ def train(
     task_file: TaskFileOption = None,
     steps: Annotated[int | None, typer.Option(help="Control steps per environment and iteration.")] = None,
     curiosity: Annotated[float | None, typer.Option(help="Weight of the RND reward (published: 100).")] = None,
-    initial_std: Annotated[float | None, typer.Option(help="Of the first policy's actions (published: 1).")] = None,
-    change: Annotated[
-        list[str] | None,
-        typer.Option(help="Another number of the task: is_dropped=-300, goal.start_threshold=0.4, entropy=0, …"),
+    observe: Annotated[
+        str | None,
+        typer.Option(help="What the policy reads in place of a teacher's groups: proprio, touch, command, with commas."),
     ] = None,
+    touch: Annotated[str, typer.Option(help="Tactile observation type of touch.")] = "agg_bool",
+    placement: Annotated[str, typer.Option(help="Place of the taxels: hand, fingers, tips or palm.")] = "hand",
+    resolution: Annotated[str, typer.Option(help="Number of taxels: low, med or high.")] = "med",
+    initial_std: Annotated[float | None, typer.Option(help="Of the first policy's actions (published: 1).")] = None,
+    change: ChangeOption = None,
     device: DeviceOption = "cpu",
     as_json: JsonOption = False,
 ) -> None:
     """Train the teacher of a task by PPO, or go on with a run.
 
-    The run's folder holds checkpoints, log.jsonl and TensorBoard events. A killed run goes on from its last
+    With --observe proprio,touch the policy has what a hand has, and memory (recurrent PPO); the folder ``policy`` of its
+    run is a student's, for play, evaluate, export and deploy. The run's folder holds checkpoints, log.jsonl and TensorBoard events. A killed run goes on from its last
     checkpoint exactly as if nothing had happened.
     """
-    from robotics_bridge import tasks
     from robotics_bridge.policies.training import teacher
-    from robotics_bridge.tasks.overrides import apply_overrides
 
     count = envs or (8192 if device != "cpu" else 64)
-    read_task_file(task_file)
-    chosen_task = apply_overrides(tasks.load(task, config), change or ())
-    env = tasks.make(chosen_task, num_envs=count, hand=hand, device=device, seed=options.seed)
+    if observe is not None:
+        options = replace(options, observe=tuple(observe.split(",")))
+    senses = {"observe": touch, "placement": placement, "resolution": resolution} if "touch" in options.observe else {}
+    env = make_env(
+        task, config=config, change=change, task_file=task_file, num_envs=count, hand=hand, device=device,
+        seed=options.seed, **senses,
+    )  # fmt: skip
     given: dict[str, Any] = {"steps_per_env": steps, "rnd_weight": curiosity, "initial_std": initial_std}
     chosen = {name: value for name, value in given.items() if value is not None}
-    settings = replace(chosen_task.teacher, num_envs=count, **chosen)
+    settings = replace(env.task.teacher, num_envs=count, **chosen)
     run = out or Path("runs") / f"{task}-{env.hand.name}-{options.seed}"
     with progress_bar() as progress:
         result = teacher.train(env, run, options, settings=settings, progress=progress)

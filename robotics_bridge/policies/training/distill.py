@@ -34,6 +34,7 @@ from robotics_bridge.policies.training.distill_config import EARLIER_TWIST, Dist
 from robotics_bridge.policies.training.rollouts import Recorder, Rollout
 from robotics_bridge.policies.training.state_tree import write_tensors
 from robotics_bridge.policies.training.student_files import CONFIG, MODEL, build_student
+from robotics_bridge.tasks.task import TASK_VERSION, check_measured
 
 _log = logging.getLogger(__name__)
 
@@ -125,6 +126,8 @@ class _Run:
         self.config, self.out, self.env, self.teacher = config, out, env, teacher
         self.device = torch.device(env.device)
         read = [name for name in env.task.groups["student"] if name != TACTILE]
+        # The published students read the goal; nothing else of the simulation is an input, targets of decoders least.
+        check_measured((name for name in read if name != "goal"), "A student")
         self.groups: list[str] = [*read, TACTILE] if config.tactile is not None else read
         self.student = build_student(config, env.observation_shapes, self.groups, env.num_actions).to(self.device)
         self.decoders = env.task.decoders
@@ -333,6 +336,7 @@ def describe_run(config: DistillConfig, student: TactilePolicy, env: Any) -> dic
     actions = env.action_map
     return {
         "brainbench_student": 1,
+        "task_version": TASK_VERSION,
         "distill": config.plain(),
         "network": student.config,
         # A list: the order counts, and JSON keeps that of lists alone.
@@ -340,6 +344,7 @@ def describe_run(config: DistillConfig, student: TactilePolicy, env: Any) -> dic
         "actions": env.num_actions,
         "deployment": {
             **{name: getattr(config, name) for name in ("task", "hand", "observe", "placement", "resolution")},
+            **({"command": [1.0]} if env.task.command == ("on",) else {}),
             "rate": 1 / env.step_dt,
             "sub_steps": env.decimation,
             "twist": env.task.taxel_twist if config.twist is None else config.twist,

@@ -12,14 +12,21 @@ import json
 import logging
 import math
 import time
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import torch
 
-from brainbench.core.errors import BrainbenchError, DataError, DataFileNotFoundError, UsageError, missing_dependency
+from brainbench.core.errors import (
+    BrainbenchError,
+    DataError,
+    DataFileNotFoundError,
+    UsageError,
+    check_name,
+    missing_dependency,
+)
 from brainbench.core.files import file_hash, provenance, read_mapping, write_json
 from brainbench.core.progress import Progress
 from brainbench.core.reading.regular import readable
@@ -31,14 +38,56 @@ from robotics_bridge.policies.acting import ActingModel
 from robotics_bridge.policies.evaluate import Policy
 from robotics_bridge.policies.schema import Values
 from robotics_bridge.policies.shipped import policy_path
+from robotics_bridge.policies.student import TACTILE
 from robotics_bridge.policies.training import state_tree
+from robotics_bridge.policies.training.distill import describe_run
+from robotics_bridge.policies.training.distill_config import DistillConfig
+from robotics_bridge.policies.training.state_tree import write_tensors
+from robotics_bridge.policies.training.student_files import CONFIG, MODEL
+from robotics_bridge.tasks.contact_model import ContactModel
 from robotics_bridge.tasks.settings import TeacherSettings
+from robotics_bridge.tasks.task import GROUPS, TASK_VERSION, check_measured
 
 if TYPE_CHECKING:
     from robotics_bridge.envs.env import Env
 
 _LOG = logging.getLogger(__name__)
 RESUME = "resume.safetensors"
+POLICY = "policy"
+"""Folder in a run of ``observe`` with the policy as a student's, which plays, is evaluated, exported and deployed."""
+SENSES = {
+    "proprio": "proprio", "touch": TACTILE, "command": "command", "link_pose": "link_pose", "thermal": "thermal"
+}  # fmt: skip
+"""Name of an observation → its group."""
+
+
+def sensed_groups(observe: Iterable[str]) -> tuple[str, ...]:
+    """Return the groups of observations of :data:`SENSES`; UsageError for another, or one that is privileged."""
+    found = []
+    for name in observe:
+        if name in GROUPS and name != TACTILE:
+            check_measured((name,), "A policy without a teacher")
+        check_name("observation", name, SENSES)
+        found.append(SENSES[name])
+    return tuple(found)
+
+
+def sensing_policy(env: Env, settings: TeacherSettings, seed: int, observe: tuple[str, ...]) -> DistillConfig:
+    """Return what a policy that reads some observations is as a student: its touch and network, and its memory.
+
+    Raises:
+        UsageError: the environment has no such observation.
+    """
+    for name in sensed_groups(observe):
+        if name not in env.observation_shapes:
+            given = "make the environment with an observation type" if name == TACTILE else "leave it out"
+            raise UsageError(f"Task {env.task.name!r} gives no {name!r} here: {given}.")
+    touch, o = "touch" in observe, env.options
+    senses = {"observe": o.observe, "placement": o.placement, "resolution": o.resolution, "noisy": o.noisy}
+    return DistillConfig(
+        task=env.task.name, hand=str(env.hand.path or env.hand.name), embedder="lstm", hidden=settings.hidden,
+        num_envs=env.num_envs, seed=seed, **(senses if touch else {"observe": "none"}),
+    )  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -63,14 +112,27 @@ class Trainer:
         MissingDependencyError: rsl-rl-lib is not installed.
     """
 
-    def __init__(self, env: Env, settings: TeacherSettings | None = None, *, seed: int = 0) -> None:
+    def __init__(
+        self, env: Env, settings: TeacherSettings | None = None, *, seed: int = 0, observe: tuple[str, ...] = ()
+    ) -> None:
         try:
             from rsl_rl.algorithms import PPO
         except ImportError as error:
             raise missing_dependency("rsl-rl-lib", extra="policies", purpose="Training policies") from error
         self.env, self.settings = RslRlEnv(env), settings or env.task.teacher
         torch.manual_seed(seed)
-        self.config = self.settings.config({name: tuple(groups) for name, groups in env.task.groups.items()})
+        groups = {name: tuple(groups) for name, groups in env.task.groups.items()}
+        self.sensing = sensing_policy(env, self.settings, seed, observe) if observe else None
+        """What a policy that senses is as a student; None for a teacher."""
+        actor = None
+        if self.sensing is not None:
+            groups["actor"] = sensed_groups(observe)
+            tactile = self.sensing.tactile
+            actor = {
+                "class_name": "robotics_bridge.policies.student:TactilePolicy", "embedder": self.sensing.embedder,
+                "tactile": tactile.plain() if tactile is not None else None,
+            }  # fmt: skip
+        self.config = self.settings.config(groups, actor)
         observations = self.env.get_observations()
         # rsl_rl prints its networks; what a command prints is its own business.
         with contextlib.redirect_stdout(io.StringIO()) as said:
@@ -155,6 +217,8 @@ class Trainer:
         state = {"algorithm": self.algorithm.save(), "env": self.env.unwrapped.state_dict()}
         state |= {name: value.clone() for name, value in self._curriculum.items()}
         state |= {"iteration": self.iteration, "torch_rng": torch.get_rng_state()}
+        if self.sensing is not None:
+            state["memory"] = self.algorithm.get_policy().get_hidden_state()
         if self.env.device.type == "cuda":
             state["cuda_rng"] = torch.cuda.get_rng_state(self.env.device)
         if self.algorithm.rnd:
@@ -172,6 +236,8 @@ class Trainer:
             # A run that was begun without a curriculum begins it now.
             value.copy_(state.get(name, value))
         self.iteration = int(state["iteration"])
+        if state.get("memory") is not None:
+            self.algorithm.get_policy().reset(hidden_state=state["memory"].to(self.env.device))
         if self.algorithm.rnd:
             self.algorithm.rnd.update_counter = int(state["rnd_updates"])
             average = state["rnd_average"]
@@ -206,12 +272,16 @@ class TeacherRun:
     """Another run, one of its models, or a shipped teacher, whose actor and critic a new run begins with."""
     start_std: float | None = None
     """Standard deviation of actions that it begins with, to explore anew; by default that of the other run."""
+    observe: tuple[str, ...] = ()
+    """Observations of :data:`SENSES` that the policy reads, with memory, in place of the privileged ones of a teacher;
+    the critic, which only training needs, keeps its own."""
 
     def __post_init__(self) -> None:
         if self.start_std is not None and (self.start is None or not self.start_std > 0):
             raise UsageError(
                 f"start_std is a positive number and goes with a run to start from; received {self.start_std!r}."
             )
+        sensed_groups(self.observe)
 
 
 def train(
@@ -239,7 +309,7 @@ def _train(
     env: Env, run: Path, options: TeacherRun, settings: TeacherSettings, progress: Progress | None
 ) -> TeacherResult:
     total = options.iterations or settings.iterations
-    trainer = Trainer(env, settings, seed=options.seed)
+    trainer = Trainer(env, settings, seed=options.seed, observe=options.observe)
     env.goals.start_curriculum()
     origin = None
     if options.start is not None and not (run / RESUME).is_file():
@@ -250,7 +320,8 @@ def _train(
         "kind": "teacher", "task": env.task.name, "hand": env.hand.name, "hand_path": str(env.hand.path or ""),
         "num_envs": env.num_envs, "seed": options.seed, "settings": asdict(settings), "rsl_rl": trainer.config,
         "observation_shapes": {name: list(shape) for name, shape in env.observation_shapes.items()},
-        "action_names": list(env.action_names), "start": origin,
+        "action_names": list(env.action_names), "start": origin, "task_version": TASK_VERSION,
+        "contacts": asdict(env.task.contacts), "observe": list(options.observe),
     }  # fmt: skip
     _resume(trainer, run, facts)
     writer = _writer(run)
@@ -282,7 +353,9 @@ def _resume(trainer: Trainer, run: Path, facts: dict[str, Any]) -> None:
     with readable(config, "configuration of a run"):
         # Settings that came later than the run had their defaults in it.
         known["settings"] = asdict(TeacherSettings(**_plain(known["settings"])))
-    for name in ("task", "hand", "num_envs", "seed", "settings"):
+    known.setdefault("observe", [])
+    known.setdefault("contacts", asdict(ContactModel()))
+    for name in ("task", "hand", "num_envs", "seed", "settings", "observe", "contacts"):
         if json.loads(json.dumps(facts[name])) != json.loads(json.dumps(known.get(name))):
             raise UsageError(
                 f"The run in {str(run)!r} has {name} = {known.get(name)!r}; this one {facts[name]!r}. "
@@ -304,6 +377,11 @@ def _resume(trainer: Trainer, run: Path, facts: dict[str, Any]) -> None:
 def _save(trainer: Trainer, run: Path, *, keep_env: bool) -> None:
     models = {name: trainer.algorithm.save()[f"{name}_state_dict"] for name in ("actor", "critic")}
     state_tree.save(run / f"model_{trainer.iteration}.safetensors", models)
+    if trainer.sensing is not None:
+        actor: Any = trainer.algorithm.get_policy()
+        weights = {name: value for name, value in actor.state_dict().items() if not name.startswith("distribution.")}
+        write_tensors(run / POLICY / MODEL, weights)
+        write_json(run / POLICY / CONFIG, describe_run(trainer.sensing, actor, trainer.env.unwrapped))
     state = trainer.state()
     if not keep_env:
         del state["env"]
