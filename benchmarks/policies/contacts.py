@@ -30,7 +30,7 @@ from robotics_bridge.tasks.contact_model import CONTACTS, ContactModel
 FIRM = CONTACTS["firm"]
 MODELS: dict[str, tuple[ContactModel, dict[str, Any]]] = {
     "published": (CONTACTS["published"], {}),
-    "firm (6 ms, drives × 0.1)": (FIRM, {}),
+    "firm (6 ms, drives × 0.08)": (FIRM, {}),
     "6 ms": (replace(FIRM, drive_scale=1.0), {}),
     "published, drives × 0.1": (ContactModel(drive_scale=0.1), {}),
     "firm, discrete integrator": (FIRM, {"integrator": "mjINT_DISCRETE"}),
@@ -132,7 +132,7 @@ def draw(rows: Mapping[str, dict[str, Any]]) -> None:
     """Draw how overlap is distributed, as published and firm."""
     figure, ((axes,),) = panels(1, 1, (7.5, 3.4))
     for color, (label, name) in zip(
-        COLORS, (("as published", "published"), ("firm", "firm (6 ms, drives × 0.1)")), strict=False
+        COLORS, (("as published", "published"), ("firm", "firm (6 ms, drives × 0.08)")), strict=False
     ):
         axes.stairs(rows[name]["histogram"], np.maximum(_BINS, 5e-3), color=color, label=label, linewidth=1.8)
     axes.axvline(1.0, color="#6c757d", linewidth=0.8, linestyle="--")

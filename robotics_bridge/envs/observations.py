@@ -16,7 +16,7 @@ VELOCITY = 0.2
 def observe(state: EnvState) -> dict[str, torch.Tensor]:
     """Return every group that the task or the caller asks for, float32 [B, ...]."""
     task = state.task
-    wanted = {"proprio", "command", *task.auxiliary, *(name for names in task.groups.values() for name in names)}
+    wanted = {"proprio", *task.auxiliary, *(name for names in task.groups.values() for name in names)}
     wanted |= {"tactile"} if state.touch is not None else set()
     wanted |= {"link_pose"} if state.options.link_pose else set()
     return {name: make(state) for name, make in _GROUPS.items() if name in wanted}

@@ -42,7 +42,7 @@ class ContactModel:
 
 CONTACTS = {
     "published": ContactModel(),
-    "firm": ContactModel(time_constant=0.006, substeps=2, drive_scale=0.1),
+    "firm": ContactModel(time_constant=0.006, substeps=2, drive_scale=0.08),
 }
 """Named contact models. Under ``published`` a block lies millimetres inside the fingers that press it with the released
 efforts; ``firm`` keeps 95 % of the contacts below 1 mm and the forces of a finger near 20 N (docs/tasks.md)."""

@@ -89,9 +89,11 @@ def agent_of(name: str, env: Env, *, seed: int = 0) -> Any:
     if name in evaluate.AGENTS:
         return evaluate.agent(name, env, seed=seed)
     if _student(name):
+        from robotics_bridge.policies.fit import check_fit
         from robotics_bridge.policies.training.student_files import load_student
 
-        student, _ = load_student(name, device=str(env.device))
+        student, described = load_student(name, device=str(env.device))
+        check_fit(described, env, name)
         return evaluate.Policy(student)
     from robotics_bridge.policies.training import teacher
 

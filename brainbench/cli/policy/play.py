@@ -32,7 +32,8 @@ from brainbench.cli.policy.options import (
 def list_tasks(as_json: JsonOption = False) -> None:
     """List the tasks with their success, length, observation groups, and the policies that come with the package."""
     from robotics_bridge import tasks
-    from robotics_bridge.policies.shipped import list_policies
+    from brainbench.core.files import read_json
+    from robotics_bridge.policies.shipped import FOLDER, list_policies, unmeasured_inputs
 
     found = []
     for name in tasks.list_tasks():
@@ -48,6 +49,11 @@ def list_tasks(as_json: JsonOption = False) -> None:
                 "student": student,
                 "teacher": list(task.groups["actor"]),
                 "shipped": [*list_policies("teacher", name), *list_policies("student", name)],
+                "unmeasured": {
+                    shipped: found
+                    for shipped in list_policies("student", name)
+                    if (found := unmeasured_inputs(read_json(FOLDER / shipped / "config.json")))
+                },
             }
         )
     columns = {
@@ -56,7 +62,12 @@ def list_tasks(as_json: JsonOption = False) -> None:
         "s": "{0[seconds]:g}",
         "success": "{0[metric]} ≥ {0[success_from]:.3g}",
         "student sees": lambda item: ", ".join(item["student"]),
-        "trained": lambda item: ", ".join(item["shipped"]),
+        "trained": lambda item: ", ".join(
+            f"{name} (reads {', '.join(item['unmeasured'][name])}, which no hand measures)"
+            if name in item["unmeasured"]
+            else name
+            for name in item["shipped"]
+        ),
     }
     emit(found, table_of("", found, columns), as_json=as_json)
 
@@ -135,7 +146,7 @@ def play(
     }  # fmt: skip
     shown: dict[str, object] = {
         "task": told["task"], "hand": told["hand"], "agent": agent, "simulated": f"{told['seconds']:g} s",
-        "goals reached": goals, "turned": f"{turned:.2f} rad about the commanded axis", "dropped": f"{dropped} times",
+        "goals reached": goals, "turned": f"{turned + 0.0:.2f} rad about the commanded axis", "dropped": f"{dropped} times",
         "episodes ended": ended, "reward": f"{sum(rewards):.3g}",
     }  # fmt: skip
     shown |= {"files": ", ".join(map(str, pictures))} if pictures else {}

@@ -24,7 +24,7 @@ from brainbench.cli.policy.options import (
 
 @with_options(
     "robotics_bridge.policies.training.teacher:TeacherRun",
-    ("iterations", "minutes", "start", "start_std", "save_every", "seed"),
+    ("iterations", "minutes", "start", "start_std", "observe", "loggers", "save_every", "seed"),
 )
 def train(
     task: TaskArgument,
@@ -39,10 +39,6 @@ def train(
     task_file: TaskFileOption = None,
     steps: Annotated[int | None, typer.Option(help="Control steps per environment and iteration.")] = None,
     curiosity: Annotated[float | None, typer.Option(help="Weight of the RND reward (published: 100).")] = None,
-    observe: Annotated[
-        str | None,
-        typer.Option(help="What the policy reads in place of a teacher's groups: proprio, touch, command, with commas."),
-    ] = None,
     touch: Annotated[str, typer.Option(help="Tactile observation type of touch.")] = "agg_bool",
     placement: Annotated[str, typer.Option(help="Place of the taxels: hand, fingers, tips or palm.")] = "hand",
     resolution: Annotated[str, typer.Option(help="Number of taxels: low, med or high.")] = "med",
@@ -60,8 +56,6 @@ def train(
     from robotics_bridge.policies.training import teacher
 
     count = envs or (8192 if device != "cpu" else 64)
-    if observe is not None:
-        options = replace(options, observe=tuple(observe.split(",")))
     senses = {"observe": touch, "placement": placement, "resolution": resolution} if "touch" in options.observe else {}
     env = make_env(
         task, config=config, change=change, task_file=task_file, num_envs=count, hand=hand, device=device,

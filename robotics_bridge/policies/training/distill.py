@@ -15,7 +15,7 @@ import logging
 import math
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal
 
@@ -337,6 +337,7 @@ def describe_run(config: DistillConfig, student: TactilePolicy, env: Any) -> dic
     return {
         "brainbench_student": 1,
         "task_version": TASK_VERSION,
+        "contacts": asdict(env.task.contacts),
         "distill": config.plain(),
         "network": student.config,
         # A list: the order counts, and JSON keeps that of lists alone.

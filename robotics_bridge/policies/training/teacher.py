@@ -36,12 +36,14 @@ from brainbench.models.training.run_folder import LOG, RESTART, trim_log
 from robotics_bridge.envs.rsl_rl import RslRlEnv
 from robotics_bridge.policies.acting import ActingModel
 from robotics_bridge.policies.evaluate import Policy
+from robotics_bridge.policies.fit import check_fit
 from robotics_bridge.policies.schema import Values
 from robotics_bridge.policies.shipped import policy_path
 from robotics_bridge.policies.student import TACTILE
 from robotics_bridge.policies.training import state_tree
 from robotics_bridge.policies.training.distill import describe_run
 from robotics_bridge.policies.training.distill_config import DistillConfig
+from robotics_bridge.policies.training.loggers import Loggers, check_loggers
 from robotics_bridge.policies.training.state_tree import write_tensors
 from robotics_bridge.policies.training.student_files import CONFIG, MODEL
 from robotics_bridge.tasks.contact_model import ContactModel
@@ -254,7 +256,8 @@ class TeacherRun:
     """Extent of a training run, and what it begins with.
 
     Raises:
-        UsageError: ``start_std`` is not positive, or there is no run to start from.
+        UsageError: ``start_std`` is not positive, there is no run to start from, or an observation or logger is unknown.
+        MissingDependencyError: the package of a logger is not installed.
     """
 
     iterations: int | None = None
@@ -273,8 +276,10 @@ class TeacherRun:
     start_std: float | None = None
     """Standard deviation of actions that it begins with, to explore anew; by default that of the other run."""
     observe: tuple[str, ...] = ()
-    """Observations of :data:`SENSES` that the policy reads, with memory, in place of the privileged ones of a teacher;
-    the critic, which only training needs, keeps its own."""
+    """What the policy reads, with memory, in place of a teacher's groups: proprio, touch, command, …; the critic, which
+    only training needs, keeps its own."""
+    loggers: tuple[str, ...] = ("tensorboard",)
+    """Loggers beside log.jsonl: tensorboard, csv (log.csv), wandb (offline)."""
 
     def __post_init__(self) -> None:
         if self.start_std is not None and (self.start is None or not self.start_std > 0):
@@ -282,6 +287,7 @@ class TeacherRun:
                 f"start_std is a positive number and goes with a run to start from; received {self.start_std!r}."
             )
         sensed_groups(self.observe)
+        check_loggers(self.loggers)
 
 
 def train(
@@ -324,7 +330,7 @@ def _train(
         "contacts": asdict(env.task.contacts), "observe": list(options.observe),
     }  # fmt: skip
     _resume(trainer, run, facts)
-    writer = _writer(run)
+    writer = Loggers(run, options.loggers, facts)
     began, rows = time.monotonic(), []
     over = False
     while trainer.iteration < total and not over:
@@ -332,13 +338,13 @@ def _train(
         rows.append(row)
         with (run / LOG).open("a", encoding="utf-8") as file:
             file.write(json.dumps(row) + "\n")
-        for name, value in row.items():
-            writer.add_scalar(name, value, trainer.iteration)
+        writer.write(row, trainer.iteration)
         if progress:
             progress(trainer.iteration, total, "training")
         over = options.minutes is not None and time.monotonic() - began > 60 * options.minutes
         if over or trainer.iteration % options.save_every == 0 or trainer.iteration == total:
             _save(trainer, run, keep_env=options.keep_env)
+            writer.save()
     writer.close()
     steps = trainer.iteration * settings.steps_per_env * env.num_envs
     return TeacherResult(run, trainer.iteration, steps, time.monotonic() - began, tuple(rows))
@@ -388,14 +394,6 @@ def _save(trainer: Trainer, run: Path, *, keep_env: bool) -> None:
     state_tree.save(run / RESUME, state)
 
 
-def _writer(run: Path) -> Any:
-    try:
-        from torch.utils.tensorboard import SummaryWriter
-    except ImportError as error:
-        raise missing_dependency("tensorboard", extra="policies", purpose="The log of a training run") from error
-    return SummaryWriter(str(run))
-
-
 def newest(run: Path) -> Path:
     """Return the last ``model_<iteration>.safetensors`` of a run.
 
@@ -432,6 +430,7 @@ def load_teacher(run: str | Path, env: Env) -> Policy:
     path = Path(run)
     file = model_file(path)
     facts = Values.read(file.parent / "config.json")
+    check_fit(facts.values, env, str(run))
     found = _plain(facts.part("settings").fields(TeacherSettings))
     hidden = found.get("hidden", env.task.teacher.hidden)
     weights = state_tree.load(file).get("actor")
