@@ -50,9 +50,9 @@ def list_tasks(as_json: JsonOption = False) -> None:
                 "teacher": list(task.groups["actor"]),
                 "shipped": [*list_policies("teacher", name), *list_policies("student", name)],
                 "unmeasured": {
-                    shipped: found
+                    shipped: read
                     for shipped in list_policies("student", name)
-                    if (found := unmeasured_inputs(read_json(FOLDER / shipped / "config.json")))
+                    if (read := unmeasured_inputs(read_json(FOLDER / shipped / "config.json")))
                 },
             }
         )
