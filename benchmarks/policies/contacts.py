@@ -136,7 +136,9 @@ def draw(rows: Mapping[str, dict[str, Any]]) -> None:
     ):
         axes.stairs(rows[name]["histogram"], np.maximum(_BINS, 5e-3), color=color, label=label, linewidth=1.8)
     axes.axvline(1.0, color="#6c757d", linewidth=0.8, linestyle="--")
-    axes.set(xscale="log", xlabel="overlap of block and hand (mm; up to 0.01 in the first bin)", ylabel="share of contacts")
+    axes.set(
+        xscale="log", xlabel="overlap of block and hand (mm; up to 0.01 in the first bin)", ylabel="share of contacts"
+    )
     axes.legend(frameon=False, fontsize=9)
     save_figure(figure, _PICTURE, dpi=120)
 

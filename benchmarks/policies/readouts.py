@@ -1,6 +1,6 @@
 """Lay out the read-outs of tactile encoders that ``brainbench policy probe --out FILE`` measured.
 
-    brainbench policy probe in_palm_rotate --agent in_palm_rotate.careful --config careful --envs 64 --seconds 8 --out FILE
+    brainbench policy probe in_palm_rotate --agent in_palm_rotate.careful --config careful --seconds 8 --out FILE
     python -m benchmarks.policies.readouts --record FILE [--device "one NVIDIA H100"] [--notes FILE] [--write]
 
 Prints the tables; with ``--write`` keeps them as a section of RESULTS.md, draws ``docs/images/policy-readouts.png``,
@@ -17,7 +17,7 @@ from typing import Any
 from benchmarks.report import table, write_section
 from brainbench.core.figures.style import COLORS, PALE, panels, save_figure
 from brainbench.core.files import read_json, write_json
-from robotics_bridge.policies.readouts import TARGETS
+from robotics_bridge.policies.readouts.rollout import TARGETS
 
 _ROOT = Path(__file__).resolve().parents[2]
 PICTURE = _ROOT / "docs" / "images" / "policy-readouts.png"
@@ -31,7 +31,8 @@ def body(record: Mapping[str, Any]) -> str:
         for one in record["arms"]
     ]
     pairs = [[one["arm"], one["less"], *(_cell(one[name], "+") for name in TARGETS)] for one in record["differences"]]
-    head = f"{record['environments']} environments of {record['task']} for {record['seconds']:g} s under `{record['agent']}`."
+    extent = f"{record['environments']} environments of {record['task']} for {record['seconds']:g} s"
+    head = f"{extent} under `{record['agent']}`."
     return "\n\n".join(
         [head, table(["arm", "features", "draws", *TARGETS], arms), table(["arm", "less", *TARGETS], pairs)]
     )
@@ -74,11 +75,9 @@ def main() -> None:
     if options.write:
         draw(record)
         write_json(RECORDS / f"readouts-{record['task']}.json", record)
-        command = (
-            f"brainbench policy probe {record['task']} --agent {record['agent']} --config careful --envs "
-            f"{record['environments']} --seconds {record['seconds']:g} --out FILE; python -m benchmarks.policies.readouts "
-            "--record FILE --write"
-        )
+        words = [record["task"], "--agent", record["agent"], "--config careful --envs", str(record["environments"])]
+        words += ["--seconds", f"{record['seconds']:g}", "--out FILE; python -m benchmarks.policies.readouts"]
+        command = f"brainbench policy probe {' '.join(words)} --record FILE --write"
         write_section("Read-outs of tactile encoders", command, text, where=options.device, subject="policies")
 
 

@@ -25,8 +25,10 @@ LARGEST_INPUT = 1e6
 """Largest magnitude of a constant in place of an observation."""
 _MEANINGS = {
     "goal": "in training the object's angle to the goal, which changed with every step",
-    "thermal": "temperatures of the skin", "command": "what the hand is told", "link_pose": "poses of the tactile links",
-}  # fmt: skip
+    "thermal": "temperatures of the skin",
+    "command": "what the hand is told",
+    "link_pose": "poses of the tactile links",
+}
 
 
 @dataclass(frozen=True)

@@ -18,8 +18,8 @@ def apply_overrides(task: Task, words: Iterable[str]) -> Task:
     A word is ``name=value``. The name is that of a reward term (its weight), ``term.parameter``, ``ending.parameter``,
     a field of :class:`~robotics_bridge.tasks.settings.TeacherSettings`, or a field of the task, by dots into its parts:
     ``is_dropped=-300``, ``rotation_progress.clip=2``, ``obj_dropped.height=0.44``, ``entropy=0``,
-    ``learning_rate_range=1e-4,1e-3``, ``episode=15``, ``goal.start_threshold=0.4``, ``object_changes.friction=0.8,1``, ``contacts=firm``,
-    ``contacts.time_constant=0.01``.
+    ``learning_rate_range=1e-4,1e-3``, ``episode=15``, ``goal.start_threshold=0.4``, ``object_changes.friction=0.8,1``,
+    ``contacts=firm``, ``contacts.time_constant=0.01``.
 
     Raises:
         UsageError: a word is not of this form, names nothing of the task, or the value is not of its kind.

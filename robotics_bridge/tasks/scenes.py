@@ -114,7 +114,7 @@ def _hand_spec(task: Task, hand: Hand) -> tuple[Any, dict[str, tuple[float, floa
     palm = spec.body(hand.palm)
     palm.pos, palm.quat = task.hand_poses[hand.name] if hand.name in task.hand_poses else palm_up(hand)
     scale = task.contacts.drive_scale
-    drives = {name: tuple(scale * value for value in drive) for name, drive in _drives(hand).items()}
+    drives = {name: (scale * k, scale * d, scale * most) for name, (k, d, most) in _drives(hand).items()}
     while spec.actuators:
         spec.delete(spec.actuators[0])
     for joint in spec.joints:

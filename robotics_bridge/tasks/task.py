@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from brainbench.core.errors import UsageError, check_name
 from brainbench.core.reading.ranges import check_number
-from robotics_bridge.tasks.contact_model import ContactModel
+from robotics_bridge.tasks.contact_model import CONTACTS, ContactModel
 from robotics_bridge.tasks.goals import Goal
 from robotics_bridge.tasks.objects import PRIMITIVES, ObjectShape
 from robotics_bridge.tasks.settings import AuxiliaryDecoder, StudentSettings, TeacherSettings
@@ -187,7 +187,7 @@ class Task:
     starts: str | None = None
     """``grasps``: start from sampled grasps instead of the placement."""
     solver: Solver = Solver()
-    contacts: ContactModel = ContactModel()
+    contacts: ContactModel = CONTACTS["published"]
     """Firmness of contacts; names of :data:`~robotics_bridge.tasks.contact_model.CONTACTS` on the command line."""
     taxel_twist: float | None = None
     """Torsional friction of the force taxels [N·m·s], by the published law, where it is 2; None: taxels that hold what
@@ -287,8 +287,8 @@ from every rest position."""
 TASK_VERSION = 1
 """Raised when a change of the tasks leaves earlier policies in a world that they were not trained in."""
 GROUPS = (
-    "proprio", "tactile", "link_pose", "command", "goal", "priv_proprio", "priv_obj_state", "priv_obj_props", "priv_thermal",
-    "thermal", "aux_obj_size", "aux_goal_dist", "aux_obj_tilt", "aux_rotation_progress",
+    "proprio", "tactile", "link_pose", "command", "goal", "priv_proprio", "priv_obj_state", "priv_obj_props",
+    "priv_thermal", "thermal", "aux_obj_size", "aux_goal_dist", "aux_obj_tilt", "aux_rotation_progress",
 )  # fmt: skip
 """Observation groups (table 4.7 and the decoders' targets)."""
 MEASURED = ("proprio", "tactile", "link_pose", "command", "thermal")

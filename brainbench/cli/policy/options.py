@@ -29,7 +29,12 @@ TOUCH = ("observe", "placement", "resolution", "noisy")
 
 
 def make_env(
-    name: str, *, config: str = "default", change: list[str] | None = None, task_file: Path | None = None, **options: Any
+    name: str,
+    *,
+    config: str = "default",
+    change: list[str] | None = None,
+    task_file: Path | None = None,
+    **options: Any,
 ) -> Env:
     """Return the environment of a command; a task of the user's own is read first, then changed."""
     from robotics_bridge import tasks

@@ -31,8 +31,8 @@ from brainbench.cli.policy.options import (
 
 def list_tasks(as_json: JsonOption = False) -> None:
     """List the tasks with their success, length, observation groups, and the policies that come with the package."""
-    from robotics_bridge import tasks
     from brainbench.core.files import read_json
+    from robotics_bridge import tasks
     from robotics_bridge.policies.shipped import FOLDER, list_policies, unmeasured_inputs
 
     found = []
@@ -104,9 +104,7 @@ def play(
         check_paths(video, strip)
         from brainbench.cli.policy import pictures as drawing
     options |= touch_of([agent])
-    env = make_env(
-        task, config=config, change=change, task_file=task_file, num_envs=1, hand=hand, threads=1, **options
-    )
+    env = make_env(task, config=config, change=change, task_file=task_file, num_envs=1, hand=hand, threads=1, **options)
     act = agent_of(agent, env, seed=options["seed"])
     steps = max(round(seconds / env.step_dt), 1)
     rewards: list[float] = []
@@ -146,8 +144,8 @@ def play(
     }  # fmt: skip
     shown: dict[str, object] = {
         "task": told["task"], "hand": told["hand"], "agent": agent, "simulated": f"{told['seconds']:g} s",
-        "goals reached": goals, "turned": f"{turned + 0.0:.2f} rad about the commanded axis", "dropped": f"{dropped} times",
-        "episodes ended": ended, "reward": f"{sum(rewards):.3g}",
+        "goals reached": goals, "turned": f"{round(turned, 2) + 0:.2f} rad about the commanded axis",
+        "dropped": f"{dropped} times", "episodes ended": ended, "reward": f"{sum(rewards):.3g}",
     }  # fmt: skip
     shown |= {"files": ", ".join(map(str, pictures))} if pictures else {}
     emit(told, f"{env.task.text}\n\n{facts(shown)}", as_json=as_json)

@@ -24,7 +24,7 @@ from brainbench.cli.policy.options import (
 )
 
 
-@with_options("robotics_bridge.policies.readouts:ProbeOptions", ("seconds", "reservoirs", "untrained", "seed"))
+@with_options("robotics_bridge.policies.readouts.probe:ProbeOptions", ("seconds", "reservoirs", "untrained", "seed"))
 def probe(
     task: TaskArgument,
     options: Any,
@@ -49,8 +49,9 @@ def probe(
     from dataclasses import replace
 
     from brainbench.core.files import write_json
-    from robotics_bridge.policies.readouts import TARGETS, differences, plain
-    from robotics_bridge.policies.readouts import probe as run
+    from robotics_bridge.policies.readouts.probe import differences, plain
+    from robotics_bridge.policies.readouts.probe import probe as run
+    from robotics_bridge.policies.readouts.rollout import TARGETS
 
     options = replace(options, arms=tuple(arm or ()))
     check_names(task, [agent], task_file)
@@ -65,7 +66,9 @@ def probe(
     if out is not None:
         write_json(out, told)
     columns: dict[str, Any] = {"arm": "{0[arm]}", ">features": "{0[features]}", ">draws": "{0[draws]}"}
-    columns |= {f">{name}": f"{{0[{name}][r2]:.3f}} [{{0[{name}][low]:.3f}}, {{0[{name}][high]:.3f}}]" for name in TARGETS}
+    columns |= {
+        f">{name}": f"{{0[{name}][r2]:.3f}} [{{0[{name}][low]:.3f}}, {{0[{name}][high]:.3f}}]" for name in TARGETS
+    }
     text = table_of("R² on environments left out, by object quantity", told["arms"], columns)
     if told["differences"]:
         columns = {"arm": "{0[arm]}", "less": "{0[less]}"}

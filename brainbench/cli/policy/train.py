@@ -49,9 +49,9 @@ def train(
 ) -> None:
     """Train the teacher of a task by PPO, or go on with a run.
 
-    With --observe proprio,touch the policy has what a hand has, and memory (recurrent PPO); the folder ``policy`` of its
-    run is a student's, for play, evaluate, export and deploy. The run's folder holds checkpoints, log.jsonl and TensorBoard events. A killed run goes on from its last
-    checkpoint exactly as if nothing had happened.
+    With --observe proprio,touch the policy reads what a hand has, and remembers (recurrent PPO); the folder ``policy``
+    of its run is a student's, for play, evaluate, export and deploy. The run's folder holds checkpoints, log.jsonl and
+    TensorBoard events. A killed run goes on from its last checkpoint exactly as if nothing had happened.
     """
     from robotics_bridge.policies.training import teacher
 

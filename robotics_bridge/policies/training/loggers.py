@@ -49,7 +49,9 @@ class Loggers:
             import wandb
 
             # Offline: nothing leaves the machine until its user runs `wandb sync`.
-            self._wandb = wandb.init(project="brainbench", name=run.name, dir=str(run), mode="offline", config=dict(facts))
+            self._wandb = wandb.init(
+                project="brainbench", name=run.name, dir=str(run), mode="offline", config=dict(facts)
+            )
 
     def write(self, row: Mapping[str, float], iteration: int) -> None:
         """Log the numbers of an iteration."""

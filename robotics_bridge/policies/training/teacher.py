@@ -12,7 +12,7 @@ import json
 import logging
 import math
 import time
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -24,7 +24,6 @@ from brainbench.core.errors import (
     DataError,
     DataFileNotFoundError,
     UsageError,
-    check_name,
     missing_dependency,
 )
 from brainbench.core.files import file_hash, provenance, read_mapping, write_json
@@ -39,57 +38,21 @@ from robotics_bridge.policies.evaluate import Policy
 from robotics_bridge.policies.fit import check_fit
 from robotics_bridge.policies.schema import Values
 from robotics_bridge.policies.shipped import policy_path
-from robotics_bridge.policies.student import TACTILE
 from robotics_bridge.policies.training import state_tree
 from robotics_bridge.policies.training.distill import describe_run
-from robotics_bridge.policies.training.distill_config import DistillConfig
 from robotics_bridge.policies.training.loggers import Loggers, check_loggers
+from robotics_bridge.policies.training.sensing import POLICY, sensed_groups, sensing_policy
 from robotics_bridge.policies.training.state_tree import write_tensors
 from robotics_bridge.policies.training.student_files import CONFIG, MODEL
 from robotics_bridge.tasks.contact_model import ContactModel
 from robotics_bridge.tasks.settings import TeacherSettings
-from robotics_bridge.tasks.task import GROUPS, TASK_VERSION, check_measured
+from robotics_bridge.tasks.task import TASK_VERSION
 
 if TYPE_CHECKING:
     from robotics_bridge.envs.env import Env
 
 _LOG = logging.getLogger(__name__)
 RESUME = "resume.safetensors"
-POLICY = "policy"
-"""Folder in a run of ``observe`` with the policy as a student's, which plays, is evaluated, exported and deployed."""
-SENSES = {
-    "proprio": "proprio", "touch": TACTILE, "command": "command", "link_pose": "link_pose", "thermal": "thermal"
-}  # fmt: skip
-"""Name of an observation → its group."""
-
-
-def sensed_groups(observe: Iterable[str]) -> tuple[str, ...]:
-    """Return the groups of observations of :data:`SENSES`; UsageError for another, or one that is privileged."""
-    found = []
-    for name in observe:
-        if name in GROUPS and name != TACTILE:
-            check_measured((name,), "A policy without a teacher")
-        check_name("observation", name, SENSES)
-        found.append(SENSES[name])
-    return tuple(found)
-
-
-def sensing_policy(env: Env, settings: TeacherSettings, seed: int, observe: tuple[str, ...]) -> DistillConfig:
-    """Return what a policy that reads some observations is as a student: its touch and network, and its memory.
-
-    Raises:
-        UsageError: the environment has no such observation.
-    """
-    for name in sensed_groups(observe):
-        if name not in env.observation_shapes:
-            given = "make the environment with an observation type" if name == TACTILE else "leave it out"
-            raise UsageError(f"Task {env.task.name!r} gives no {name!r} here: {given}.")
-    touch, o = "touch" in observe, env.options
-    senses = {"observe": o.observe, "placement": o.placement, "resolution": o.resolution, "noisy": o.noisy}
-    return DistillConfig(
-        task=env.task.name, hand=str(env.hand.path or env.hand.name), embedder="lstm", hidden=settings.hidden,
-        num_envs=env.num_envs, seed=seed, **(senses if touch else {"observe": "none"}),
-    )  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -256,7 +219,8 @@ class TeacherRun:
     """Extent of a training run, and what it begins with.
 
     Raises:
-        UsageError: ``start_std`` is not positive, there is no run to start from, or an observation or logger is unknown.
+        UsageError: ``start_std`` is not positive, there is no run to start from, or an observation or logger is not
+            known.
         MissingDependencyError: the package of a logger is not installed.
     """
 

@@ -36,4 +36,4 @@ def test_a_command_that_the_contract_states_needs_no_word_of_the_user() -> None:
 def test_the_goal_of_earlier_students_is_named_for_what_it_was() -> None:
     with pytest.raises(UsageError, match="angle to the goal, which changed with every step"):
         _deployed("goal").require({"tactile"})
-    assert list(_deployed("goal").require({"goal", "tactile"}))[0] == "goal"
+    assert next(iter(_deployed("goal").require({"goal", "tactile"}))) == "goal"

@@ -8,11 +8,13 @@ import torch
 
 from brainbench.core.errors import UsageError
 from robotics_bridge import tasks
-from robotics_bridge.policies import readouts
 from robotics_bridge.policies.encoders.calibration import HandCalibration
 from robotics_bridge.policies.encoders.taxel_grid import TaxelGrid
 from robotics_bridge.policies.evaluate import agent
-from robotics_bridge.policies.readouts import ProbeOptions, Readout, Rollout, probe
+from robotics_bridge.policies.readouts import arms
+from robotics_bridge.policies.readouts.probe import ProbeOptions, probe
+from robotics_bridge.policies.readouts.regression import Readout, read_targets
+from robotics_bridge.policies.readouts.rollout import TARGETS, Rollout
 
 
 def _made(seed: int = 0, steps: int = 40, envs: int = 20) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
@@ -22,7 +24,7 @@ def _made(seed: int = 0, steps: int = 40, envs: int = 20) -> tuple[torch.Tensor,
 
 
 def _readout(features: torch.Tensor, proprio: torch.Tensor, wanted: torch.Tensor, valid: torch.Tensor) -> Readout:
-    errors, spread = readouts._read(proprio, features, wanted, valid)
+    errors, spread = read_targets(proprio, features, wanted, valid)
     return Readout("made", features.shape[-1], errors[None], spread)
 
 
@@ -73,7 +75,7 @@ def test_memory_begins_anew_with_an_episode() -> None:
     begun[0] = True
     begun[3, 1] = True
     x = torch.ones(6, 2, 1)
-    found = readouts._traces(x, begun)
+    found = arms.traces(x, begun)
     assert found.shape == (6, 2, 3)
     torch.testing.assert_close(found[:, 0, 1], 1 - 0.5 ** torch.arange(1, 7))
     torch.testing.assert_close(found[3:, 1], found[:3, 0])
@@ -81,9 +83,9 @@ def test_memory_begins_anew_with_an_episode() -> None:
     touch = torch.randn(6, 2, 5, grid.items, 6, generator=torch.Generator().manual_seed(0))
     touch[3:, 1] = touch[:3, 0]
     rollout = Rollout(torch.zeros(6, 2, 3), touch, begun, {}, ~begun)
-    state = readouts._reservoir(rollout, grid, HandCalibration(), units=7, seed=1)
+    state = arms.reservoir(rollout, grid, HandCalibration(), units=7, seed=1)
     torch.testing.assert_close(state[3:, 1], state[:3, 0])
-    assert not torch.equal(state, readouts._reservoir(rollout, grid, HandCalibration(), units=7, seed=2))
+    assert not torch.equal(state, arms.reservoir(rollout, grid, HandCalibration(), units=7, seed=2))
 
 
 def test_bits_say_that_more_than_two_taxels_of_a_link_touch() -> None:
@@ -91,7 +93,7 @@ def test_bits_say_that_more_than_two_taxels_of_a_link_touch() -> None:
     touch[..., :2, 2] = 1.0
     touch[..., 4:, 2] = 1.0
     rollout = Rollout(torch.zeros(1, 1, 1), touch, torch.ones(1, 1, dtype=torch.bool), {}, torch.ones(1, 1))
-    assert readouts._bits(rollout, [4, 3]).flatten().tolist() == [0.0, 1.0]
+    assert arms.bits(rollout, [4, 3]).flatten().tolist() == [0.0, 1.0]
 
 
 def test_a_rollout_in_a_task_is_read_from_every_arm_of_a_probe() -> None:
@@ -102,7 +104,7 @@ def test_a_rollout_in_a_task_is_read_from_every_arm_of_a_probe() -> None:
     found = {one.arm: one for one in probe(env, agent("random", env), options)}
     assert [len(one.errors) for one in found.values()] == [1, 1, 1, 2]
     assert found["none"].features == 0
-    assert all(np.isfinite([one.r2(name) for name in readouts.TARGETS]).all() for one in found.values())
+    assert all(np.isfinite([one.r2(name) for name in TARGETS]).all() for one in found.values())
     with pytest.raises(UsageError, match="observe='force_torque'"):
         probe(tasks.make("in_palm_rotate", num_envs=10, threads=1), agent("zero", env), options)
     with pytest.raises(UsageError, match="at least 10 environments; received 2"):

@@ -13,8 +13,9 @@ from brainbench.core.errors import MissingDependencyError, UsageError
 from robotics_bridge import tasks
 from robotics_bridge.envs import Env
 from robotics_bridge.policies.evaluate import Policy, evaluate
+from robotics_bridge.policies.training.sensing import POLICY
 from robotics_bridge.policies.training.student_files import load_student
-from robotics_bridge.policies.training.teacher import POLICY, TeacherRun, train
+from robotics_bridge.policies.training.teacher import TeacherRun, train
 
 
 def _env(observe: str = "agg_bool") -> Env:
