@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import argparse
 import time
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -23,21 +23,22 @@ from benchmarks.report import measure_once, table, write_section
 from brainbench.core.devices import mujoco_module
 from brainbench.core.figures.style import COLORS, panels, save_figure
 from robotics_bridge import tasks
+from robotics_bridge.envs import Env
 from robotics_bridge.policies.evaluate import evaluate
 from robotics_bridge.policies.training.teacher import load_teacher
 from robotics_bridge.tasks.contact_model import CONTACTS, ContactModel
 
 FIRM = CONTACTS["firm"]
-MODELS: dict[str, tuple[ContactModel, dict[str, Any]]] = {
-    "published": (CONTACTS["published"], {}),
-    "firm (6 ms, drives × 0.08)": (FIRM, {}),
-    "6 ms": (replace(FIRM, drive_scale=1.0), {}),
-    "published, drives × 0.1": (ContactModel(drive_scale=0.1), {}),
-    "firm, discrete integrator": (FIRM, {"integrator": "mjINT_DISCRETE"}),
-    "6 ms, drives × 0.15": (replace(FIRM, drive_scale=0.15), {}),
-    "10 ms": (ContactModel(time_constant=0.01), {}),
+MODELS: dict[str, tuple[ContactModel, str]] = {
+    "published": (CONTACTS["published"], "mjINT_IMPLICITFAST"),
+    "firm (6 ms, drives × 0.08)": (FIRM, "mjINT_IMPLICITFAST"),
+    "6 ms": (replace(FIRM, drive_scale=1.0), "mjINT_IMPLICITFAST"),
+    "published, drives × 0.1": (ContactModel(drive_scale=0.1), "mjINT_IMPLICITFAST"),
+    "firm, discrete integrator": (FIRM, "mjINT_DISCRETE"),
+    "6 ms, drives × 0.15": (replace(FIRM, drive_scale=0.15), "mjINT_IMPLICITFAST"),
+    "10 ms": (ContactModel(time_constant=0.01), "mjINT_IMPLICITFAST"),
 }
-"""Name → contact model, and options of MuJoCo."""
+"""Name → contact model, and integrator of MuJoCo."""
 _BINS = np.concatenate(([0.0], np.geomspace(0.01, 30.0, 60)))
 """Edges of the histogram of overlap [mm]."""
 _PICTURE = Path(__file__).resolve().parents[2] / "docs" / "images" / "policy-contacts.png"
@@ -81,36 +82,47 @@ class Recorder:
         self.force.append(np.linalg.norm(sums, axis=1))
 
 
-def measure(name: str, options: argparse.Namespace) -> dict[str, Any]:
-    """Return overlap [mm], forces [N], success and processor time of one contact model."""
-    contacts, flags = MODELS[name]
-    task = replace(tasks.load("in_palm_rotate", "careful"), contacts=contacts)
-    env = tasks.make(task, num_envs=options.envs, threads=1)
-    mujoco = mujoco_module()
-    for number in range(env.num_envs):
+def make(name: str, envs: int) -> Env:
+    """Return the environments of a contact model."""
+    contacts, integrator = MODELS[name]
+    env = tasks.make(replace(tasks.load("in_palm_rotate", "careful"), contacts=contacts), num_envs=envs, threads=1)
+    for number in range(envs):
         option = env.simulation.engine.model_of(number).opt
-        if "integrator" in flags:
-            option.integrator = getattr(mujoco.mjtIntegrator, flags["integrator"])
-        if "cone" in flags:
-            option.cone = getattr(mujoco.mjtCone, flags["cone"])
+        option.integrator = getattr(mujoco_module().mjtIntegrator, integrator)
+    return env
+
+
+def measure(name: str, options: argparse.Namespace) -> dict[str, Any]:
+    """Return overlap [mm], forces [N] and success of one contact model."""
+    env = make(name, options.envs)
     recorder = Recorder(load_teacher(options.policy, env), env)
     result = evaluate(env, recorder, episodes=options.envs, seed=(0, 1, 2), name=name).summary()
     overlap, force = np.concatenate(recorder.overlap), np.concatenate(recorder.force)
-    begun, steps = time.process_time(), 20
-    still = torch.zeros(env.num_envs, env.num_actions)
-    env.reset()
-    for _ in range(steps):
-        env.step(still)
-    spent = 1e3 * (time.process_time() - begun) / steps / env.num_envs
     return {
         **{key: result[key] for key in ("success_rate", "success_interval", "goals", "dropped", "episodes")},
         "overlap": [*np.percentile(overlap, (50, 95)), overlap.max()],
-        "force": [*np.percentile(force, (50, 95, 99)), force.max()], "contacts": len(overlap), "step_ms": spent,
+        "force": [*np.percentile(force, (50, 95, 99)), force.max()], "contacts": len(overlap),
         "histogram": np.histogram(overlap, _BINS)[0] / len(overlap),
     }  # fmt: skip
 
 
-def lay_out(rows: Mapping[str, dict[str, Any]]) -> str:
+def cost(names: Iterable[str], rounds: int = 7) -> dict[str, float]:
+    """Return milliseconds of processor time a control step of an environment: in turns, least of the rounds."""
+    worlds = {name: make(name, 16) for name in names}
+    best = dict.fromkeys(worlds, np.inf)
+    for _ in range(rounds):
+        for name, env in worlds.items():
+            env.seed(0)
+            env.reset()
+            still = torch.zeros(env.num_envs, env.num_actions)
+            begun = time.process_time()
+            for _ in range(40):
+                env.step(still)
+            best[name] = min(best[name], 1e3 * (time.process_time() - begun) / 40 / env.num_envs)
+    return best
+
+
+def lay_out(rows: Mapping[str, dict[str, Any]], spent: Mapping[str, float]) -> str:
     """Return the table."""
     columns = ["contacts", "overlap: median, 95 %, largest [mm]", "force of a link: median, 95 %, 99 %, largest [N]"]
     columns += ["success", "goals an episode", "dropped", "ms a control step"]
@@ -122,7 +134,7 @@ def lay_out(rows: Mapping[str, dict[str, Any]]) -> str:
                 name, ", ".join(f"{value:.2f}" for value in row["overlap"]),
                 ", ".join(f"{value:.1f}" for value in row["force"]),
                 f"{row['success_rate']:.3f} [{low:.3f}, {high:.3f}]", f"{row['goals']:.2f}", f"{row['dropped']:.2f}",
-                f"{row['step_ms']:.2f}",
+                f"{spent[name]:.2f}",
             ]
         )  # fmt: skip
     return table(columns, cells)
@@ -152,7 +164,7 @@ def main() -> None:
     parser.add_argument("--write", action="store_true")
     options = parser.parse_args()
     rows = measure_once(options.out, MODELS, lambda name: measure(name, options), known=options.write)
-    body = lay_out(rows)
+    body = lay_out(rows, cost(rows))
     print(body)
     if options.write:
         draw(rows)

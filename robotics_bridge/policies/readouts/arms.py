@@ -16,7 +16,7 @@ from robotics_bridge.hands.observations import TAXELS_IN_CONTACT
 from robotics_bridge.policies.encoders.calibration import HandCalibration
 from robotics_bridge.policies.encoders.front_end import FrontEnd
 from robotics_bridge.policies.encoders.taxel_grid import TaxelGrid
-from robotics_bridge.policies.readouts.rollout import Rollout
+from robotics_bridge.policies.readouts.rollout import TouchRollout
 
 NETWORK = "zhuang-intersection-ln-small"
 """Network of the arms ``untrained``, ``simclr`` and ``supervised``."""
@@ -38,24 +38,24 @@ def traces(x: torch.Tensor, begun: torch.Tensor) -> Features:
     return torch.stack(found)
 
 
-def raw(rollout: Rollout) -> Features:
+def raw(rollout: TouchRollout) -> Features:
     """Return force and torque of every taxel, averaged over the sub-steps."""
     return rollout.taxels.mean(2).flatten(2)
 
 
-def force(rollout: Rollout) -> Features:
+def force(rollout: TouchRollout) -> Features:
     """Return the force of every taxel, averaged over the sub-steps."""
     return rollout.taxels[..., :3].mean(2).flatten(2)
 
 
-def bits(rollout: Rollout, links: Sequence[int]) -> Features:
+def bits(rollout: TouchRollout, links: Sequence[int]) -> Features:
     """Return one bit per link and sub-step: more than two taxels touch (table 4.6)."""
     touch = (rollout.taxels != 0).any(-1).float()
     parts = [part.sum(-1) > TAXELS_IN_CONTACT for part in touch.split(list(links), dim=-1)]
     return torch.stack(parts, -1).float().flatten(2)
 
 
-def network(rollout: Rollout, grid: TaxelGrid, calibration: HandCalibration, **options: Any) -> Features:
+def network(rollout: TouchRollout, grid: TaxelGrid, calibration: HandCalibration, **options: Any) -> Features:
     """Return the features of a network that steps through the rollout, its memory forgotten where episodes begin."""
     time = options.pop("time", "native")
     front = FrontEnd(
@@ -68,8 +68,10 @@ def network(rollout: Rollout, grid: TaxelGrid, calibration: HandCalibration, **o
     return torch.stack(found)
 
 
-def reservoir(rollout: Rollout, grid: TaxelGrid, calibration: HandCalibration, *, units: int, seed: int) -> Features:
-    """Return the state of a random recurrent network on the same grid (echo state: leak .5, spectral radius .9)."""
+def reservoir(
+    rollout: TouchRollout, grid: TaxelGrid, calibration: HandCalibration, *, units: int, seed: int
+) -> Features:
+    """Return the state of a random recurrent network on the grid (echo state: leak .5, spectral radius .9)."""
     generator = torch.Generator().manual_seed(seed)
     slots = rollout.taxels.shape[2]
     unit = [calibration.force if name.startswith("F") else calibration.moment for name in CHANNELS] * slots
@@ -92,7 +94,7 @@ def reservoir(rollout: Rollout, grid: TaxelGrid, calibration: HandCalibration, *
 class Subject:
     """What arms are made from."""
 
-    rollout: Rollout
+    rollout: TouchRollout
     grid: TaxelGrid
     calibration: HandCalibration
     links: tuple[int, ...]

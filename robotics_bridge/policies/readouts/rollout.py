@@ -22,7 +22,7 @@ _SETTLING = 10
 
 
 @dataclass(frozen=True, eq=False)
-class Rollout:
+class TouchRollout:
     """What a policy did and felt."""
 
     proprio: torch.Tensor
@@ -38,7 +38,7 @@ class Rollout:
 
 
 @torch.no_grad()
-def collect(env: Env, policy: Acting, seconds: float) -> Rollout:
+def collect(env: Env, policy: Acting, seconds: float) -> TouchRollout:
     """Run a policy and return what it felt, and what is to be read from it.
 
     Raises:
@@ -64,7 +64,7 @@ def collect(env: Env, policy: Acting, seconds: float) -> Rollout:
         age = torch.where(done, 0, age + 1)
     stacked = {name: torch.stack(rows) for name, rows in kept.items()}
     targets = {name: stacked.pop(name) for name in TARGETS}
-    return Rollout(targets=targets, **stacked)
+    return TouchRollout(targets=targets, **stacked)
 
 
 def _centre(env: Env, age: torch.Tensor) -> torch.Tensor:

@@ -14,7 +14,7 @@ from robotics_bridge.policies.evaluate import agent
 from robotics_bridge.policies.readouts import arms
 from robotics_bridge.policies.readouts.probe import ProbeOptions, probe
 from robotics_bridge.policies.readouts.regression import Readout, read_targets
-from robotics_bridge.policies.readouts.rollout import TARGETS, Rollout
+from robotics_bridge.policies.readouts.rollout import TARGETS, TouchRollout
 
 
 def _made(seed: int = 0, steps: int = 40, envs: int = 20) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
@@ -82,7 +82,7 @@ def test_memory_begins_anew_with_an_episode() -> None:
     grid = TaxelGrid("xhand1", placement="tips", resolution="low")
     touch = torch.randn(6, 2, 5, grid.items, 6, generator=torch.Generator().manual_seed(0))
     touch[3:, 1] = touch[:3, 0]
-    rollout = Rollout(torch.zeros(6, 2, 3), touch, begun, {}, ~begun)
+    rollout = TouchRollout(torch.zeros(6, 2, 3), touch, begun, {}, ~begun)
     state = arms.reservoir(rollout, grid, HandCalibration(), units=7, seed=1)
     torch.testing.assert_close(state[3:, 1], state[:3, 0])
     assert not torch.equal(state, arms.reservoir(rollout, grid, HandCalibration(), units=7, seed=2))
@@ -92,7 +92,7 @@ def test_bits_say_that_more_than_two_taxels_of_a_link_touch() -> None:
     touch = torch.zeros(1, 1, 1, 7, 6)
     touch[..., :2, 2] = 1.0
     touch[..., 4:, 2] = 1.0
-    rollout = Rollout(torch.zeros(1, 1, 1), touch, torch.ones(1, 1, dtype=torch.bool), {}, torch.ones(1, 1))
+    rollout = TouchRollout(torch.zeros(1, 1, 1), touch, torch.ones(1, 1, dtype=torch.bool), {}, torch.ones(1, 1))
     assert arms.bits(rollout, [4, 3]).flatten().tolist() == [0.0, 1.0]
 
 
