@@ -348,6 +348,7 @@ def describe_run(config: DistillConfig, student: TactilePolicy, env: Any) -> dic
             **({"command": [1.0]} if env.task.command == ("on",) else {}),
             "rate": 1 / env.step_dt,
             "sub_steps": env.decimation,
+            "action_limit": env.task.action_limit,
             "twist": env.task.taxel_twist if config.twist is None else config.twist,
             "joints": list(env.joint_names),
             "action_map": {key: getattr(actions, key) for key in ("names", "default", "scale", "low", "high")},
