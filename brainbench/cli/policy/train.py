@@ -79,7 +79,7 @@ def train(
 DISTILL = "robotics_bridge.policies.training.distill_config:DistillConfig"
 DISTILL_FLAGS = {"variant": ("--config",), "num_envs": ("--envs",)}
 OFFERED = (
-    "observe", "placement", "resolution", "noisy", "embedder", "hand", "variant", "num_envs", "iterations",
+    "observe", "placement", "resolution", "noisy", "contacts", "embedder", "hand", "variant", "num_envs", "iterations",
     "learning_rate", "epochs", "teacher_share", "teacher_iterations", "aggregate", "precision", "save_interval", "seed",
 )  # fmt: skip
 """Fields of a student's configuration that have a flag of their name."""
@@ -98,6 +98,9 @@ def distill(
     ] = "auto",
     learning: Annotated[str, typer.Option(help="Of a model: frozen or finetuned.")] = "frozen",
     time: Annotated[str, typer.Option(help="Of a model: native or resampled to its own 9 ms.")] = "native",
+    draw: Annotated[
+        int | None, typer.Option(help="Seed of an untrained model or reservoir; by default that of the student.")
+    ] = None,
     pretrained: Annotated[Path | None, typer.Option(help="Weights of a tagged model.")] = None,
     episodes: Annotated[int, typer.Option(help="Of the evaluation, per seed; 0 for none.")] = 100,
     device: DeviceOption = "cpu",
@@ -110,9 +113,9 @@ def distill(
     from robotics_bridge.policies.training.distill_config import DistillConfig
     from robotics_bridge.policies.training.students import train_student
 
-    settings: dict[str, Any] = {}
+    settings: dict[str, Any] = {} if draw is None else {"seed": draw}
     if encoder not in (AUTO, *ARMS):
-        settings = {"learning": learning, "time": time}
+        settings |= {"learning": learning, "time": time}
         if pretrained is not None:
             settings["pretrained"] = str(pretrained)
     config = DistillConfig(task=task, teacher=str(teacher), encoder=encoder, encoder_settings=settings, **options)

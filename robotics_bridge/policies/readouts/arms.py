@@ -15,6 +15,7 @@ from brainbench.core.contracts import CHANNELS
 from robotics_bridge.hands.observations import TAXELS_IN_CONTACT
 from robotics_bridge.policies.encoders.calibration import HandCalibration
 from robotics_bridge.policies.encoders.front_end import FrontEnd
+from robotics_bridge.policies.encoders.reservoir import EchoState
 from robotics_bridge.policies.encoders.taxel_grid import TaxelGrid
 from robotics_bridge.policies.readouts.rollout import TouchRollout
 
@@ -68,24 +69,17 @@ def network(rollout: TouchRollout, grid: TaxelGrid, calibration: HandCalibration
     return torch.stack(found)
 
 
-def reservoir(
-    rollout: TouchRollout, grid: TaxelGrid, calibration: HandCalibration, *, units: int, seed: int
-) -> Features:
+def reservoir(rollout: TouchRollout, grid: TaxelGrid, calibration: HandCalibration, *, seed: int) -> Features:
     """Return the state of a random recurrent network on the grid (echo state: leak .5, spectral radius .9)."""
-    generator = torch.Generator().manual_seed(seed)
     slots = rollout.taxels.shape[2]
     unit = [calibration.force if name.startswith("F") else calibration.moment for name in CHANNELS] * slots
-    felt = grid(rollout.taxels.flatten(0, 1)).cpu() / torch.tensor(unit).view(-1, 1, 1)
-    felt = felt.flatten(1)
-    drive = felt @ torch.randn(felt.shape[1], units, generator=generator)
+    felt = (grid(rollout.taxels.flatten(0, 1)).cpu() / torch.tensor(unit).view(-1, 1, 1)).flatten(1)
+    echo = EchoState(felt.shape[1], seed=seed)
+    drive = felt @ echo.inputs
     drive = (drive / drive.square().mean().sqrt().clamp(min=1e-12)).unflatten(0, rollout.taxels.shape[:2])
-    inner = torch.randn(units, units, generator=generator)
-    inner *= 0.9 / torch.linalg.eigvals(inner).abs().max()
-    offset = 0.1 * torch.randn(units, generator=generator)
-    state, found = drive.new_zeros(drive.shape[1], units), []
+    state, found = drive.new_zeros(drive.shape[1:]), []
     for now, first in zip(drive, rollout.begun.cpu(), strict=True):
-        state = torch.where(first[:, None], 0.0, state)
-        state = 0.5 * state + 0.5 * torch.tanh(now + state @ inner + offset)
+        state = echo(now, torch.where(first[:, None], 0.0, state))
         found.append(state)
     return torch.stack(found)
 
@@ -133,8 +127,7 @@ ARMS: Mapping[str, Callable[[Subject], list[Features]]] = {
     "taxels, memory": _with_traces(lambda one: raw(one.rollout)),
     "grid, memory": _with_traces(grid),
     "reservoir": lambda one: [
-        reservoir(one.rollout, one.grid, one.calibration, units=96, seed=one.seed + draw)
-        for draw in range(one.reservoirs)
+        reservoir(one.rollout, one.grid, one.calibration, seed=one.seed + draw) for draw in range(one.reservoirs)
     ],
     "untrained": lambda one: _networks("native", NETWORK, one, range(one.untrained)),
     "simclr": lambda one: _networks("native", f"{NETWORK}.simclr", one),

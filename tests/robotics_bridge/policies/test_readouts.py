@@ -83,9 +83,9 @@ def test_memory_begins_anew_with_an_episode() -> None:
     touch = torch.randn(6, 2, 5, grid.items, 6, generator=torch.Generator().manual_seed(0))
     touch[3:, 1] = touch[:3, 0]
     rollout = TouchRollout(torch.zeros(6, 2, 3), touch, begun, {}, ~begun)
-    state = arms.reservoir(rollout, grid, HandCalibration(), units=7, seed=1)
+    state = arms.reservoir(rollout, grid, HandCalibration(), seed=1)
     torch.testing.assert_close(state[3:, 1], state[:3, 0])
-    assert not torch.equal(state, arms.reservoir(rollout, grid, HandCalibration(), units=7, seed=2))
+    assert not torch.equal(state, arms.reservoir(rollout, grid, HandCalibration(), seed=2))
 
 
 def test_bits_say_that_more_than_two_taxels_of_a_link_touch() -> None:
