@@ -343,6 +343,7 @@ def command(config: DistillConfig, *, stop_at: int | None = None) -> str:
         words |= {"noisy": "" if config.noisy else None}
         words |= {name: config.encoder_settings.get(name) for name in ("learning", "time", "pretrained")}
         words |= {"draw": config.encoder_settings.get("seed")}
+        words |= {"unroll": config.encoder_settings.get("options", {}).get("unroll")}
     words |= {"contacts": config.contacts, "embedder": config.embedder, "hand": config.hand, "envs": config.num_envs}
     words |= {"seed": config.seed, "precision": config.precision, "iterations": config.iterations}
     words |= {"learning-rate": config.learning_rate, "epochs": config.epochs}

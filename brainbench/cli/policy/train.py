@@ -98,6 +98,9 @@ def distill(
     ] = "auto",
     learning: Annotated[str, typer.Option(help="Of a model: frozen or finetuned.")] = "frozen",
     time: Annotated[str, typer.Option(help="Of a model: native or resampled to its own 9 ms.")] = "native",
+    unroll: Annotated[
+        str | None, typer.Option(help="Of a graph model: full answers at once, biological after a step per layer.")
+    ] = None,
     draw: Annotated[
         int | None, typer.Option(help="Seed of an untrained model or reservoir; by default that of the student.")
     ] = None,
@@ -116,6 +119,7 @@ def distill(
     settings: dict[str, Any] = {} if draw is None else {"seed": draw}
     if encoder not in (AUTO, *ARMS):
         settings |= {"learning": learning, "time": time}
+        settings |= {} if unroll is None else {"options": {"unroll": unroll}}
         if pretrained is not None:
             settings["pretrained"] = str(pretrained)
     config = DistillConfig(task=task, teacher=str(teacher), encoder=encoder, encoder_settings=settings, **options)
