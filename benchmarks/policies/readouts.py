@@ -1,10 +1,10 @@
 """Lay out the read-outs of tactile encoders that ``brainbench policy probe --out FILE`` measured.
 
     brainbench policy probe in_palm_rotate --agent in_palm_rotate.careful --config careful --seconds 8 --out FILE
-    python -m benchmarks.policies.readouts --record FILE [--device "one NVIDIA H100"] [--notes FILE] [--write]
+    python -m benchmarks.policies.readouts --record FILE [FILE …] [--device "one NVIDIA H100"] [--notes FILE] [--write]
 
 Prints the tables; with ``--write`` keeps them as a section of RESULTS.md, draws ``docs/images/policy-readouts.png``,
-and keeps the record as ``benchmarks/policies/records/readouts-<task>.json``.
+and keeps the record as ``benchmarks/policies/records/``.
 """
 
 from __future__ import annotations
@@ -32,7 +32,8 @@ def body(record: Mapping[str, Any]) -> str:
     ]
     pairs = [[one["arm"], one["less"], *(_cell(one[name], "+") for name in TARGETS)] for one in record["differences"]]
     extent = f"{record['environments']} environments of {record['task']} for {record['seconds']:g} s"
-    head = f"{extent} under `{record['agent']}`."
+    changed = "".join(f", {word}" for word in record["change"])
+    head = f"**{extent} under `{record['agent']}`{changed}**"
     return "\n\n".join(
         [head, table(["arm", "features", "draws", *TARGETS], arms), table(["arm", "less", *TARGETS], pairs)]
     )
@@ -60,25 +61,35 @@ def draw(record: Mapping[str, Any]) -> None:
     save_figure(figure, PICTURE, dpi=120)
 
 
+def command(record: Mapping[str, Any]) -> str:
+    """Return the command that measured a record."""
+    words = [record["task"], "--agent", record["agent"], "--config", record["config"]]
+    words += [word for change in record["change"] for word in ("--change", change)]
+    words += ["--envs", str(record["environments"]), "--seconds", f"{record['seconds']:g}"]
+    return f"brainbench policy probe {' '.join(words)} --out FILE"
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--record", type=Path, required=True)
+    parser.add_argument("--record", type=Path, nargs="+", required=True, help="the first one is drawn")
     parser.add_argument("--device", default="", help="what measured it, if not this machine")
     parser.add_argument("--notes", type=Path, help="text that follows the tables")
     parser.add_argument("--write", action="store_true")
     options = parser.parse_args()
-    record = read_json(options.record)
-    text = body(record)
+    records = [read_json(path) for path in options.record]
+    text = "\n\n".join(body(record) for record in records)
     if options.notes:
         text += "\n\n" + options.notes.read_text(encoding="utf-8").strip()
     print(text)
     if options.write:
-        draw(record)
-        write_json(RECORDS / f"readouts-{record['task']}.json", record)
-        words = [record["task"], "--agent", record["agent"], "--config careful --envs", str(record["environments"])]
-        words += ["--seconds", f"{record['seconds']:g}", "--out FILE; python -m benchmarks.policies.readouts"]
-        command = f"brainbench policy probe {' '.join(words)} --record FILE --write"
-        write_section("Read-outs of tactile encoders", command, text, where=options.device, subject="policies")
+        draw(records[0])
+        for record in records:
+            name = "-".join([record["task"], *(word.partition("=")[2] for word in record["change"])])
+            write_json(RECORDS / f"readouts-{name}.json", record)
+        commands = [*map(command, records), "python -m benchmarks.policies.readouts --record FILE … --write"]
+        write_section(
+            "Read-outs of tactile encoders", "; ".join(commands), text, where=options.device, subject="policies"
+        )
 
 
 if __name__ == "__main__":

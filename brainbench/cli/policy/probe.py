@@ -61,7 +61,8 @@ def probe(
     )  # fmt: skip
     with progress_bar() as progress:
         found = run(env, agent_of(agent, env), options, progress)
-    told = {"task": task, "agent": agent, "environments": envs, "seconds": options.seconds}
+    told: dict[str, Any] = {"task": task, "config": config, "change": change or [], "agent": agent}
+    told |= {"environments": envs, "seconds": options.seconds}
     told |= {"arms": [plain(item) for item in found], "differences": differences(found)}
     if out is not None:
         write_json(out, told)

@@ -114,6 +114,10 @@ class _Learner(nn.Module):
 
     def keep(self, tensors: Mapping[str, torch.Tensor]) -> None:
         for name, value in tensors.items():
+            if value.is_floating_point():
+                # Files hold finite numbers alone; a deadline that never comes is as far away at the largest of them.
+                most = torch.finfo(value.dtype).max
+                value = value.clamp(-most, most)
             self.world.register_buffer(name.replace(".", "/"), value)
 
     def kept(self, prefix: str) -> dict[str, torch.Tensor]:
