@@ -69,8 +69,8 @@ class FeatureNorm(nn.Module):
                 self.mean += share * (flat.mean(0) - self.mean)
                 self.square += share * (flat.square().mean(0) - self.square)
         spread = (self.square - self.mean.square()).clamp(min=0).sqrt()
-        # Features of untrained networks are small by orders of magnitude, so what counts as constant is relative: to the
-        # other features, and to the feature's own mean, of which single precision keeps seven digits.
+        # Features of untrained networks are small by orders of magnitude, so what counts as constant is relative: to
+        # the other features, and to the feature's own mean, of which single precision keeps seven digits.
         spread = torch.maximum(spread, 1e-6 * spread.max())
         spread = torch.maximum(spread, 1e-2 * self.mean.abs()).clamp(min=1e-30)
         return ((x.float() - self.mean.float()) / spread.float()).clamp(-_FARTHEST, _FARTHEST)
