@@ -1,6 +1,7 @@
 """Train the published networks at equal length, on every GPU there is, several at a time on each.
 
     python -m benchmarks.models.campaign --work /tmp/campaign --minutes 20 &    # makes the data, trains
+    CUDA_VISIBLE_DEVICES=1 python -m benchmarks.models.campaign … --only 'simsiam|rate'   # some jobs on one of the GPUs
     python -m benchmarks.models.campaign --work /tmp/campaign --pack 0 --out $OUT   # the first 60 MB of what is done
     python -m benchmarks.models.campaign --install FOLDER   # here: results of its tars enter the repository
     python -m benchmarks.models.campaign --score FOLDER     # here: networks and twins are scored
@@ -18,6 +19,7 @@ import dataclasses
 import json
 import logging
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -42,6 +44,8 @@ SOLVER = "c1a690c"
 """Commit with whose solver all sweeps are made, so that sessions train on the same."""
 MEMBERS = 150
 """Objects of each of the 54 families: 16 sweeps each, eight tenths of them to train."""
+MANIFEST = "manifest.json"
+"""File that a finished data set has."""
 TAR_BYTES, TARS = 15 * 2**20, 4
 """Sizes of what comes back in one call."""
 MOST_FAULTS = 12
@@ -56,7 +60,7 @@ def parser() -> argparse.ArgumentParser:
     told.add_argument("--members", type=int, default=MEMBERS, help="objects of each family")
     told.add_argument("--epochs", type=int, help="fewer epochs, for a trial")
     told.add_argument("--data", action="store_true", help="make the data and stop")
-    told.add_argument("--only", help="substring of the names of jobs to do")
+    told.add_argument("--only", help="pattern in the names of jobs to do")
     told.add_argument("--device", help="cpu for a trial; all GPUs if not given")
     told.add_argument("--pack", type=int, help="write the n-th part of the results to --out")
     told.add_argument("--out", type=Path, default=Path("campaign-out"))
@@ -133,7 +137,9 @@ def start(args: argparse.Namespace, gpu: int | None, **changes: Any) -> subproce
         if value is not None and value is not False:
             words += [f"--{name.replace('_', '-')}", *([] if value is True else [str(value)])]
     threads = str(max(1, (os.cpu_count() or 1) // 16))
-    seen = "" if gpu is None else str(gpu)
+    # This process may itself see only some of the GPUs.
+    visible = os.environ.get("CUDA_VISIBLE_DEVICES")
+    seen = "" if gpu is None else visible.split(",")[gpu] if visible else str(gpu)
     return subprocess.Popen(words, env={**os.environ, "OMP_NUM_THREADS": threads, "CUDA_VISIBLE_DEVICES": seen})
 
 
@@ -158,6 +164,8 @@ def make_data(args: argparse.Namespace, gpus: int) -> None:
 
     folder = args.work / "data"
     folder.mkdir(parents=True, exist_ok=True)
+    if (folder / MANIFEST).is_file():
+        return
     wanted = plan(args, gpu=gpus > 0)
     if gpus > 1:
         write_json(folder / CONFIG, to_plain(wanted.config))
@@ -233,7 +241,7 @@ class Worker:
         """Claim the first job that nobody has done or claimed and that there is time for."""
         for job in campaign():
             known = job.name in self.done or job.model in self.done  # baselines are listed by what is read
-            if known or (self.args.only and self.args.only not in job.name):
+            if known or (self.args.only and not re.search(self.args.only, job.name)):
                 continue
             if job.trained and job.seed and self._rate(job) is None:
                 continue
@@ -248,7 +256,9 @@ class Worker:
         return None
 
     def _rate(self, job: Job) -> float | None:
-        """Return the learning rate that seed 0 found; None where it has to be searched."""
+        """Return the learning rate that is given, or that seed 0 found; None where it has to be searched."""
+        if job.rate is not None:
+            return job.rate
         if not (job.trained and job.seed):
             return None
         first = job.name.removesuffix(f"seed{job.seed}") + "seed0"
@@ -350,8 +360,10 @@ def score(args: argparse.Namespace) -> None:
     from leaderboards.store import write_record
 
     os.chdir(args.score / "unpacked" / "jobs")
-    done = [job for job in campaign() if job.objective != "baseline" and Path(job.name, "result.json").is_file()]
-    chosen = [job for job in done if not args.only or args.only in job.name]
+    # Of trainings at a given rate the accuracy alone is asked for.
+    asked = [job for job in campaign() if job.objective != "baseline" and job.rate is None]
+    done = [job for job in asked if Path(job.name, "result.json").is_file()]
+    chosen = [job for job in done if not args.only or re.search(args.only, job.name)]
     folder = DONE.parent / "records"
     known = {_subject(path) for path in folder.glob("*.json")}
     for (recordings, metric), job in product(BOARDS, chosen):

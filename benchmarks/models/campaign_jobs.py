@@ -35,6 +35,9 @@ SHIPPED = (
     "zhuang-intersection-ln-small.supervised", "zhuang-intersection-ln-small.simclr",
 )  # fmt: skip
 """Networks of seed 0 that come with the package, 15 MB in all."""
+HIGHER_RATE = 1e-2
+RATE_CHECKED = ("zhuang", "zhuang-ugrnn", "zhuang-intersection-ln", "resnet18", "resnet18+gpt", "s4+gpt")
+"""Networks trained once more with a rate above the search, since with labels all chose its highest."""
 _MILLISECONDS = {"zhuang": 16, "ugrnn": 24, "intersection": 24, "gru": 30, "lstm": 30, "resnet18": 4, "s4": 8}
 _ATTENDER = {None: 0, "gpt": 13, "mamba": 8}
 """A step of 1,024 sweeps on one H200 takes about the sum of both."""
@@ -51,6 +54,8 @@ class Job:
     augmentation: str = "physical"
     masking: float = 0.0
     epochs: int = EPOCHS
+    rate: float | None = None
+    """Learning rate that is given; None: searched, or as seed 0 found it."""
 
     @property
     def trained(self) -> bool:
@@ -68,6 +73,7 @@ class Job:
         usual = self.augmentation == augmentation_of(self.objective)
         variant = "" if usual else f".{self.augmentation}"
         variant += f".masked{self.masking * 100:.0f}" if self.masking else ""
+        variant += f".rate{self.rate:g}" if self.rate is not None else ""
         return f"{self.model}.{self.objective}{variant}.seed{self.seed}"
 
     @property
@@ -78,7 +84,8 @@ class Job:
         parts = self.architecture
         step = _MILLISECONDS[parts.cell or parts.encoder] + _ATTENDER[parts.attender] + 6 * parts.layer_norm
         step *= {"supervised": 1.0, "ae": 1.1}.get(self.objective, 1.65) * (1 if parts.small else 7)
-        return 0.1 * step * (self.epochs + (SEARCH_EPOCHS * len(RATES) if self.seed == 0 else 0)) + 15.0
+        searched = self.seed == 0 and self.rate is None
+        return 0.1 * step * (self.epochs + SEARCH_EPOCHS * len(RATES) * searched) + 15.0
 
     def shortened(self, epochs: int) -> Job:
         """Return the job with fewer epochs."""
@@ -157,3 +164,5 @@ def _jobs() -> Iterator[Job]:
     for name in FULL_SIZE:
         yield _job(name, "supervised", small=False)
         yield _job(name, "untrained", small=False)
+    for name in RATE_CHECKED:
+        yield dataclasses.replace(_job(name, "supervised"), rate=HIGHER_RATE)

@@ -37,7 +37,7 @@ class NetworkKey(NamedTuple):
     attender: str = "none"
     objective: str = "supervised"
     variant: str = ""
-    """Empty for the usual augmentation without masking, else what differs: ``image``, ``masked``."""
+    """Empty for the usual augmentation without masking, else what differs: ``image``, ``masked``, ``rate 0.01``."""
 
     @property
     def name(self) -> str:
@@ -107,7 +107,10 @@ def join_campaign(trainings: Sequence[Training], records: Sequence[ResultRecord]
     Raises:
         DataError: two trainings are of the same network and seed.
     """
-    runs = [_Identity(item.model, item.objective, item.augmentation, item.masking, item.seed) for item in trainings]
+    runs = [
+        _Identity(item.model, item.objective, item.augmentation, item.masking, item.seed, item.rate)
+        for item in trainings
+    ]
     known = dict(zip(runs, trainings, strict=True))
     boards = rank([_completed(record, known) for record in records])
     boards = tuple(sorted(boards, key=lambda board: (bool(board.lacks), "ridge" in board_name(board))))
@@ -160,12 +163,14 @@ class _Identity(NamedTuple):
     augmentation: str
     masking: float
     seed: int
+    rate: float | None = None
 
     def key(self, usual: Mapping[str, str]) -> NetworkKey:
         if self.objective == "untrained":
             return NetworkKey.of(self.model, self.objective)
         parts = [] if self.augmentation == usual.get(self.objective) else [self.augmentation]
         parts += ["masked"] if self.masking else []
+        parts += [f"rate {self.rate:g}"] if self.rate is not None else []
         return NetworkKey.of(self.model, self.objective, " ".join(parts))
 
 

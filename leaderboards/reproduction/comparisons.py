@@ -15,11 +15,16 @@ _Chosen = tuple[list[Matched], str, float]
 _Choice = Callable[[Measured], _Chosen]
 
 
-def _encoders(one: Callable[[NetworkKey], bool], other: Callable[[NetworkKey], bool], objective: str | None) -> _Choice:
+def _encoders(
+    one: Callable[[NetworkKey], bool],
+    other: Callable[[NetworkKey], bool],
+    objective: str | None,
+    variant: str = "",
+) -> _Choice:
     """Return the choice of comparisons of two kinds of encoders, one comparison for each attender and objective."""
 
     def chosen(measured: Measured) -> _Chosen:
-        found = measured.find(objective=objective)
+        found = measured.find(objective=objective, variant=variant)
         comparisons = []
         for group in sorted({(key.attender, key.objective) for key in found}):
             inside = {key: item for key, item in found.items() if (key.attender, key.objective) == group}
@@ -109,6 +114,7 @@ _without_attender = _swap({"attender": "none"}, attender="gpt", objective="super
 _with_mamba = _swap({"attender": "mamba"}, attender="gpt", objective="supervised")
 _image = _swap({"variant": ""}, -1, objective="simclr", variant="image")
 _masked = _swap({"variant": ""}, objective="simclr", variant="masked")
+_HIGHER_RATE = "rate 0.01"
 
 COMPARISONS: dict[str, _Choice] = {
     "best-accuracy": _best(NetworkKey("zhuang", "gpt"), "supervised"),
@@ -124,6 +130,8 @@ COMPARISONS: dict[str, _Choice] = {
     "masking-accuracy": _masked,
     "raw-accuracy": each(RAW_INPUT, "supervised"),
     "random-accuracy": each(RANDOM_FEATURES, "supervised"),
+    "rate-accuracy": _swap({"variant": ""}, objective="supervised", variant=_HIGHER_RATE),
+    "rate-convrnn-resnet-accuracy": _encoders(_recurrent, _is("resnet18"), "supervised", _HIGHER_RATE),
     "best-fit": _best(NetworkKey(_INTERSECTION, "none", "simclr"), None),
     "saturation": _saturation,
     "raw-fit": each(RAW_INPUT, None),

@@ -39,6 +39,8 @@ class Training:
     masking: float = 0.0
     epochs: int | None = None
     learning_rate: float | None = None
+    rate: float | None = None
+    """Learning rate that was given instead of searched."""
     evaluation: Accuracy | None = None
     """None for a training that diverged or is not finished."""
     twin_evaluation: Accuracy | None = None

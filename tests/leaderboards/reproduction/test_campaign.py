@@ -135,3 +135,12 @@ def test_a_folder_of_weights_is_known_by_its_card_and_gets_the_accuracies_of_its
     lost = join_campaign([replace(line, masking=0.75, status="diverged")], [moved])
     assert lost.boards[0].entries[0].card.top5 is None
     assert not fits(lost, 0).networks
+
+
+def test_a_training_at_a_given_rate_stands_beside_the_one_whose_rate_was_searched():
+    key = NetworkKey("zhuang-gru", "gpt", "supervised")
+    line = draw_campaign(1).networks[key].trainings[0]
+    higher = replace(line, name=f"{line.name}.rate", rate=0.01, evaluation=replace(line.evaluation, top5=0.5))
+    found = accuracies(join_campaign([line, higher], [])).networks
+    assert found[key].seeds == {0: line.evaluation.top5}
+    assert found[key._replace(variant="rate 0.01")].seeds == {0: 0.5}
