@@ -30,6 +30,8 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from robotics_bridge.tasks.contact_model import CONTACTS
+
 if TYPE_CHECKING:
     from robotics_bridge.policies.report import StudentResult
     from robotics_bridge.policies.training.distill_config import DistillConfig
@@ -37,6 +39,7 @@ if TYPE_CHECKING:
 NETWORK = "zhuang-intersection-ln-small"
 ARMS: dict[str, dict[str, Any]] = {
     "none": {"observe": "none"},
+    "none_memory": {"observe": "none", "embedder": "lstm"},
     "ft_hand": {"observe": "force_torque", "placement": "hand"},
     "ft_tips": {"observe": "force_torque", "placement": "tips"},
     "bool_hand": {"observe": "agg_bool", "placement": "hand"},
@@ -44,7 +47,17 @@ ARMS: dict[str, dict[str, Any]] = {
     "ead_simclr": {"observe": "force_torque", "placement": "hand", "encoder": f"{NETWORK}.simclr"},
     "ead_supervised": {"observe": "force_torque", "placement": "hand", "encoder": f"{NETWORK}.supervised"},
     "ead_untrained": {"observe": "force_torque", "placement": "hand", "encoder": NETWORK},
-}
+    "reservoir": {"observe": "force_torque", "placement": "hand", "encoder": "reservoir"},
+    "raw_rnn": {"observe": "force_torque", "placement": "hand", "encoder": "rnn"},
+    "ead_finetuned": {
+        "observe": "force_torque", "placement": "hand", "encoder": f"{NETWORK}.simclr",
+        "encoder_settings": {"learning": "finetuned"},
+    },
+    "ead_scratch": {
+        "observe": "force_torque", "placement": "hand", "encoder": NETWORK,
+        "encoder_settings": {"learning": "finetuned"},
+    },
+}  # fmt: skip
 CONTRASTS = (
     ("ft_hand", "ft_tips"), ("bool_hand", "bool_tips"), ("ft_tips", "bool_tips"), ("ft_hand", "bool_hand"),
     ("ead_simclr", "ead_supervised"), ("ead_simclr", "ead_untrained"), ("ead_supervised", "ead_untrained"),
@@ -74,12 +87,16 @@ def train(options: argparse.Namespace) -> None:
 
     settings = dict(ARMS[options.arm])
     if "encoder" in settings:
-        settings["encoder_settings"] = {"learning": "frozen"}
+        # A draw of a random arm is its seed; networks answer without added latency.
+        own = {"seed": options.draw if options.draw is not None else options.seed}
+        if settings["encoder"].startswith(NETWORK):
+            own |= {"learning": "frozen", "options": {"unroll": "full"}}
+        settings["encoder_settings"] = own | settings.get("encoder_settings", {})
     precision = "bf16" if options.device != "cpu" and settings["observe"] != "none" else "float32"
     config = DistillConfig(
-        task=options.task, variant=options.config, teacher=str(options.teacher), num_envs=options.envs,
-        precision=precision, seed=options.seed, save_interval=1_000_000, learning_rate=options.learning_rate,
-        epochs=options.epochs, teacher_share=options.teacher_share,
+        task=options.task, variant=options.config, contacts=options.contacts, teacher=str(options.teacher),
+        num_envs=options.envs, precision=precision, seed=options.seed, save_interval=1_000_000,
+        learning_rate=options.learning_rate, epochs=options.epochs, teacher_share=options.teacher_share,
         teacher_iterations=options.teacher_iterations, **settings,
     )  # fmt: skip
     began = time.time()
@@ -215,10 +232,14 @@ def arm_of(config: DistillConfig) -> str | None:
     for arm, settings in ARMS.items():
         wanted = {"placement": config.placement, "encoder": learned.get("encoder"), **settings}
         if config.observe == "none" == settings["observe"]:
-            return arm
-        frozen = config.encoder_settings.get("learning") == "frozen"
+            if config.embedder == settings.get("embedder", "mlp"):
+                return arm
+            continue
+        learning = None
+        if str(settings.get("encoder")).startswith(NETWORK):
+            learning = settings.get("encoder_settings", {}).get("learning", "frozen")
         if (config.observe, config.placement) == (settings["observe"], wanted["placement"]) and (
-            frozen == ("encoder" in settings) and learned.get("encoder") == wanted["encoder"]
+            config.encoder_settings.get("learning") == learning and learned.get("encoder") == wanted["encoder"]
         ):
             return arm
     return None
@@ -306,6 +327,8 @@ def main() -> None:
     parser.add_argument("--write", action="store_true")
     parser.add_argument("--task", default="in_palm_rotate")
     parser.add_argument("--config", default="default", help="configuration of the task; that of the teacher")
+    parser.add_argument("--contacts", default="published", choices=list(CONTACTS))
+    parser.add_argument("--draw", type=int, help="seed of untrained networks and reservoirs; by default the student's")
     parser.add_argument("--arms", nargs="+", default=list(ARMS), choices=list(ARMS))
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--gpus", type=int, default=1)

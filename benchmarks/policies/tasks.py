@@ -112,7 +112,7 @@ def front_end(sense: str, env: Env) -> Callable[[torch.Tensor], None] | None:
     from robotics_bridge.policies.encoders.front_end import FrontEnd
     from robotics_bridge.policies.encoders.taxel_grid import TaxelGrid
 
-    assert env.tactile is not None
+    assert env.touch is not None
     module = FrontEnd(ENCODERS[sense], TaxelGrid(env.hand, placement="hand", resolution="med")).to(env.device).eval()
     state = module.init_state(env.num_envs).to(env.device)
 

@@ -27,9 +27,9 @@ PICTURE = Path(__file__).resolve().parents[2] / "docs" / "images" / "policy-teac
 NAMES = {
     "zero": "no movement",
     "random": "random movement",
-    "from the thrower": "continued from a teacher that threw the block",
+    "from the early teacher": "continued from a teacher that threw the block",
     "default": "new weights, reward for coming nearer",
-    "dear drop": "the one above, higher penalty for drops",
+    "drop penalty": "the one above, higher penalty for drops",
     "careful": "the same, also higher reward for goals (shipped)",
 }
 """Agent of the table → what the picture calls it."""

@@ -124,6 +124,9 @@ def with_options(
 
         def run(**values: Any) -> None:
             options = {name: known[name].value(values.pop(name)) for name in chosen}
+            if build:
+                # Defaults that are tuples are not read from the source; the dataclass has them.
+                options = {n: value for n, value in options.items() if not (known[n].several and value is None)}
             if given:
                 options = {name: value for name, value in options.items() if value is not None}
             module, _, wanted = kind.partition(":")

@@ -54,12 +54,15 @@ class Actuation:
     """From actions to targets of the joints A that they move."""
     frozen: Mapping[str, float] = field(default_factory=dict)
     """Joint → position (rad) of those that actions do not move."""
+    action_limit: float | None = None
+    """Largest action that counts and is observed as the last one, as in training (``Task.action_limit``)."""
 
     @classmethod
     def of(cls, contract: PolicyContract) -> Actuation:
         """Return the actuation of a contract."""
         arrays = {name: np.array(values) for name, values in contract.action_map.items()}
-        return cls(contract.joints, ActionMap(contract.moved, **arrays), contract.frozen)
+        limit = contract.more.get("action_limit")
+        return cls(contract.joints, ActionMap(contract.moved, **arrays), contract.frozen, limit)
 
     def targets(self, action: NDArray[np.floating]) -> dict[str, float]:
         """Return joint → target (rad) of an action [A]."""
@@ -211,6 +214,8 @@ class Controller:
             return f"the policy gave actions of shape {action.shape} instead of {self._action.shape}"
         if not np.isfinite(action).all():
             return "the policy gave values that are no numbers"
+        if (limit := self.actuation.action_limit) is not None:
+            action = np.clip(action, -limit, limit)
         self._action = action.astype(np.float32)
         targets = self._limit(self.actuation.targets(action), reading)
         # The last look before anything moves, whatever the parts before it did.

@@ -19,11 +19,16 @@ from robotics_bridge.deploy.safety import SafetyLimits
 from robotics_bridge.deploy.touch import REAL_TYPES, Fallback, PressureCalibration, RealTouch
 from robotics_bridge.policies.contract import PolicyContract
 from robotics_bridge.policies.runners import read_policy
+from robotics_bridge.tasks.task import check_measured
 
 LARGEST_INPUT = 1e6
 """Largest magnitude of a constant in place of an observation."""
-_MEANINGS = {"goal": "in training measured from the object's pose", "thermal": "temperatures of the skin"}
-_PRIVILEGED = "known to the simulation alone"
+_MEANINGS = {
+    "goal": "in training the object's angle to the goal, which changed with every step",
+    "thermal": "temperatures of the skin",
+    "command": "what the hand is told",
+    "link_pose": "poses of the tactile links",
+}
 
 
 @dataclass(frozen=True)
@@ -45,10 +50,12 @@ class DeployedPolicy:
             fingers: Fingers with a sensing tip; None for all of the hand that it was trained on.
         """
         contract = self.contract
+        # What is told to the hand is no measurement; a contract that states it needs no word of the user.
+        told = ("proprio", "tactile", *(("command",) if "command" in contract.more else ()))
         found = {
-            name: f"{list(shape)}, {_MEANINGS.get(name, _PRIVILEGED)}"
+            name: f"{list(shape)}, {_MEANINGS.get(name, 'known to the simulation alone')}"
             for name, shape in self.groups.items()
-            if name not in ("proprio", "tactile")
+            if name not in told
         }
         chains = hands.load(contract.hand).fingers
         tips = {chain[-1] for finger, chain in chains.items() if fingers is None or finger in fingers}
@@ -60,8 +67,11 @@ class DeployedPolicy:
         """Return :meth:`unmeasured`.
 
         Raises:
-            UsageError: one of them is not among the groups that something else gives.
+            UsageError: one of them is not among the groups that something else gives, or is privileged: no constant
+                stands for what only the simulation knows.
         """
+        # A goal may be held constant; the contract of a student of earlier versions has one.
+        check_measured((name for name in self.groups if name != "goal"), "A policy on a hand")
         found = self.unmeasured(fingers)
         if missing := [f"{name} ({what})" for name, what in found.items() if name not in given]:
             raise UsageError(
@@ -97,6 +107,8 @@ class DeployedPolicy:
         """
         contract, body, sources = self.contract, hands.load(self.contract.hand), dict(sources or {})
         self.require({*sources, *(("tactile",) if fallback is not None else ())}, driver.fingers)
+        if "command" in self.groups and "command" in contract.more:
+            sources.setdefault("command", constant("command", contract.more["command"], self.groups["command"]))
         if "tactile" in self.groups:
             slots, items, channels = self.groups["tactile"]
             tips = {chain[-1]: finger for finger, chain in body.fingers.items()}

@@ -68,7 +68,7 @@ def grasps_for(task: Task, hand: Hand, model: TaskModel, *, seed: int = 0) -> di
     settings = SETTINGS.get(hand.name, SETTINGS["xhand1"])
     fields = ("geom_size", "geom_pos", "body_pos", "body_quat", "body_mass")
     numbers = [np.round(getattr(m, name), 6).tolist() for m in model.models for name in fields]
-    key = content_hash(asdict(settings), task.name, seed, *numbers, model.rest.tolist())
+    key = content_hash(asdict(settings), asdict(task.contacts), task.name, seed, *numbers, model.rest.tolist())
     path = cache_dir("grasps") / f"{hand.name}-{key}.npz"
     if (found := read_sealed(path, "grasps")) is not None:
         return found

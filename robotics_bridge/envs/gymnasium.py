@@ -14,6 +14,7 @@ import torch
 from brainbench.core.errors import UsageError, check_name, missing_dependency
 from robotics_bridge import tasks
 from robotics_bridge.envs.env import Env
+from robotics_bridge.tasks.task import ACTION_LIMIT, MEASURED, check_measured
 
 try:
     import gymnasium
@@ -29,27 +30,32 @@ IDS = {
     "brainbench/HotBall-v0": "hot_ball",
 }
 """Registered id → task."""
-REACH = 2.0
+REACH = ACTION_LIMIT
 """Actions of this size reach any target from any rest position, as an action of 1 is half a joint's range."""
 
 
 class GymVectorEnv(VectorEnv):
-    """The environments of a task as numpy arrays; observations are a dictionary of some groups, by default all.
+    """The environments of a task as numpy arrays; observations are a dictionary of groups, by default what a hand has.
+
+    ``privileged`` groups of the simulation are given to who asks for them, such as a teacher.
 
     Raises:
-        UsageError: the environment does not keep final observations, or has no such group.
+        UsageError: the environment does not keep final observations, has no such group, or it is privileged.
     """
 
-    def __init__(self, env: Env, groups: tuple[str, ...] = ()) -> None:
+    def __init__(self, env: Env, groups: tuple[str, ...] = (), *, privileged: bool = False) -> None:
         if not env.options.keep_final:
             raise UsageError("Gymnasium needs the last observations of episodes: tasks.make(..., keep_final=True).")
         for name in groups:
             check_name("observation group of the task", name, env.observation_shapes)
+        if not privileged:
+            check_measured(groups, "Without privileged=True, a policy in gymnasium")
         self.native = env
         """The native environment."""
         self.num_envs = env.num_envs
         self.metadata = {"autoreset_mode": AutoresetMode.SAME_STEP, "render_modes": []}
-        self._groups = groups or tuple(env.observation_shapes)
+        own = (name for name in env.observation_shapes if privileged or name in MEASURED)
+        self._groups = groups or tuple(own)
         shapes, box = env.observation_shapes, gymnasium.spaces.Box
         spaces: Any = {name: box(-np.inf, np.inf, shapes[name], np.float32) for name in self._groups}
         self.single_observation_space = gymnasium.spaces.Dict(spaces)
@@ -126,14 +132,16 @@ class GymEnv(gymnasium.Env):
         return observations, float(reward[0]), bool(terminated[0]), bool(truncated[0]), info
 
 
-def make(task: str, *, groups: tuple[str, ...] = (), **options: Any) -> GymEnv:
+def make(task: str, *, groups: tuple[str, ...] = (), privileged: bool = False, **options: Any) -> GymEnv:
     """Return one environment of a task for gymnasium; options as for :func:`make_vec`."""
-    return GymEnv(make_vec(task, 1, groups=groups, **options))
+    return GymEnv(make_vec(task, 1, groups=groups, privileged=privileged, **options))
 
 
-def make_vec(task: str, num_envs: int = 1, *, groups: tuple[str, ...] = (), **options: Any) -> GymVectorEnv:
+def make_vec(
+    task: str, num_envs: int = 1, *, groups: tuple[str, ...] = (), privileged: bool = False, **options: Any
+) -> GymVectorEnv:
     """Return the environments of a task for gymnasium; options are those of :func:`robotics_bridge.tasks.make`."""
-    return GymVectorEnv(tasks.make(task, num_envs=num_envs, keep_final=True, **options), groups)
+    return GymVectorEnv(tasks.make(task, num_envs=num_envs, keep_final=True, **options), groups, privileged=privileged)
 
 
 def register() -> None:

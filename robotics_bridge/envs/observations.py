@@ -34,6 +34,11 @@ def _joints(state: EnvState, *, noisy: bool) -> torch.Tensor:
     return torch.cat((position, velocity, state.episode.action), dim=1)
 
 
+def _command(state: EnvState) -> torch.Tensor:
+    parts = {"on": torch.ones(state.num_envs, 1, device=state.device), "orientation": state.goals.quat.clone()}
+    return torch.cat([parts[name] for name in state.task.command], dim=1)
+
+
 def _goal(state: EnvState) -> torch.Tensor:
     goals = state.goals
     # Rotation from the object to its goal, g q⁻¹, in world axes.
@@ -67,6 +72,7 @@ _GROUPS: dict[str, Callable[[EnvState], torch.Tensor]] = {
     "proprio": lambda state: _joints(state, noisy=True),
     "tactile": lambda state: state.touch.reading,  # type: ignore[union-attr]
     "link_pose": lambda state: state.link_pose,
+    "command": _command,
     "goal": _goal,
     "priv_proprio": lambda state: torch.cat((_joints(state, noisy=False), state.contacts.tip_force.flatten(1)), dim=1),
     "priv_obj_state": _object,

@@ -30,12 +30,13 @@ class Simulation:
     """
 
     def __init__(
-        self, models: Sequence[Any], num_envs: int, *, device: str, engine: str | None, threads: int | None = None
-    ) -> None:
+        self, models: Sequence[Any], num_envs: int, *, device: str, engine: str | None, threads: int | None = None,
+        substeps: int = 1,
+    ) -> None:  # fmt: skip
         if engine == "mujoco" and device != "cpu":
             raise UsageError("C MuJoCo runs on the processor: use device='cpu', or engine='warp'.")
         self.model = models[0]
-        self.num_envs = num_envs
+        self.num_envs, self._substeps = num_envs, substeps
         free = int(mujoco.mjtJoint.mjJNT_FREE)
         starts = zip(self.model.jnt_bodyid, self.model.jnt_type, self.model.jnt_dofadr, strict=True)
         # A body whose centre of mass is not its origin is not simple: its inertia depends on how it lies.
@@ -74,16 +75,16 @@ class Simulation:
 
     @property
     def timestep(self) -> float:
-        """Duration of a physics step (s)."""
-        return self.engine.timestep
+        """Duration of a step (s)."""
+        return self._substeps * self.engine.timestep
 
     def step(self) -> None:
-        """Advance all environments by one physics step with ``ctrl`` and ``push``."""
+        """Advance all environments by one step, of ``substeps`` physics steps, with ``ctrl`` and ``push``."""
         if self.uses_warp:
-            self.engine.step()
+            self.engine.step(self._substeps)
             return
         self.engine.set(ctrl=self.ctrl.numpy())
-        self.engine.step()
+        self.engine.step(self._substeps)
         self._pull()
 
     def apply_push(self) -> None:

@@ -95,8 +95,9 @@ class EnvState:
         self.task, self.hand, self.options, self.num_envs = task, hand, options, options.num_envs
         self.model: TaskModel = build(task, hand)
         self.simulation = Simulation(
-            self.model.models, options.num_envs, device=options.device, engine=options.engine, threads=options.threads
-        )
+            self.model.models, options.num_envs, device=options.device, engine=options.engine, threads=options.threads,
+            substeps=task.contacts.substeps,
+        )  # fmt: skip
         self.device: torch.device = self.simulation.device
         self.step_dt: float = task.step_dt
         """Duration of a control step (s)."""

@@ -62,8 +62,9 @@ class PolicyContract:
     sha256: str = ""
     """Hash of the file of the network; empty in contracts of earlier versions."""
     more: Mapping[str, Any] = field(default_factory=dict)
-    """``task``, ``placement``, ``resolution`` and ``sub_steps``, where they stand in the contract, and ``twist``, the
-    torsional friction of force taxels (N·m·s; None: they hold what they touch)."""
+    """``task``, ``placement``, ``resolution``, ``sub_steps``, ``command`` (what it is told by default) and
+    ``action_limit``, where they stand in the contract, and ``twist``, the torsional friction of force taxels (N·m·s;
+    None: they hold)."""
 
     @classmethod
     def read(cls, path: Path) -> PolicyContract:
@@ -110,6 +111,10 @@ class PolicyContract:
         more: dict[str, Any] = {name: given.text(name) for name in said if name in given.values}
         if "sub_steps" in given.values:
             more["sub_steps"] = given.whole("sub_steps", 1, 1000)
+        if "command" in given.values and "command" in inputs:
+            more["command"] = given.numbers("command", math.prod(inputs["command"]), -1e6, 1e6)
+        if given.values.get("action_limit") is not None:
+            more["action_limit"] = given.number("action_limit", 1e-6, 1e6)
         # Contracts of earlier versions say nothing of it: they have the published law.
         more["twist"] = PUBLISHED_TWIST
         if "twist" in given.values:

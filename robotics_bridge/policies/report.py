@@ -342,9 +342,12 @@ def command(config: DistillConfig, *, stop_at: int | None = None) -> str:
         words |= {"placement": config.placement, "resolution": config.resolution, "encoder": config.encoder}
         words |= {"noisy": "" if config.noisy else None}
         words |= {name: config.encoder_settings.get(name) for name in ("learning", "time", "pretrained")}
-    words |= {"embedder": config.embedder, "hand": config.hand, "envs": config.num_envs, "seed": config.seed}
-    words |= {"precision": config.precision, "iterations": config.iterations, "learning-rate": config.learning_rate}
-    words |= {"epochs": config.epochs, "stop-at": stop_at if stop_at != config.iterations else None}
+        words |= {"draw": config.encoder_settings.get("seed")}
+        words |= {"unroll": config.encoder_settings.get("options", {}).get("unroll")}
+    words |= {"contacts": config.contacts, "embedder": config.embedder, "hand": config.hand, "envs": config.num_envs}
+    words |= {"seed": config.seed, "precision": config.precision, "iterations": config.iterations}
+    words |= {"learning-rate": config.learning_rate, "epochs": config.epochs}
+    words |= {"stop-at": stop_at if stop_at != config.iterations else None}
     usual = DistillConfig(task=config.task)
     given = {
         name: value

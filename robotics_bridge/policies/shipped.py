@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 from brainbench.core.errors import check_name
 from brainbench.core.files import read_json
+from robotics_bridge.tasks.task import MEASURED
 
 AGENTS = ("zero", "random")
 """Agents that every trained one is held against."""
@@ -19,6 +22,12 @@ def list_policies(kind: str, task: str | None = None) -> list[str]:
     files = sorted(FOLDER.glob("*/config.json"))
     found = [file.parent.name for file in files if ("brainbench_student" in read_json(file)) == (kind == "student")]
     return [name for name in found if task in (None, name.partition(".")[0])]
+
+
+def unmeasured_inputs(described: Mapping[str, Any]) -> tuple[str, ...]:
+    """Return the groups that a student of this ``config.json`` reads and no hand has; none for a teacher."""
+    groups = described.get("groups", ()) if "brainbench_student" in described else ()
+    return tuple(name for name, _ in groups if name not in MEASURED)
 
 
 def policy_path(kind: str, name: str | os.PathLike[str]) -> Path:

@@ -45,6 +45,7 @@ def published() -> Task:
         object_changes=ObjectRandomisation(friction=(0.3, 2.0), mass_offset=(0.0, 0.1), each_reset=False),
         push=Push(x=(-1.0, 1.0), y=(-1.0, 1.0), z=(-1.0, 1.0), interval=(2.0, 4.0)),
         noise=ObservationNoise(position=0.005, velocity=0.01),
+        command=("orientation",),
         goal_terms=("orientation", "difference", "angle"),
         groups={
             "actor": ("goal", "priv_proprio", "priv_obj_state"),

@@ -8,6 +8,7 @@ from dataclasses import fields, is_dataclass, replace
 from typing import Any
 
 from brainbench.core.errors import UsageError, check_name, shown, unknown_name
+from robotics_bridge.tasks.contact_model import CONTACTS, ContactModel
 from robotics_bridge.tasks.task import Ending, Reward, Task
 
 
@@ -17,7 +18,8 @@ def apply_overrides(task: Task, words: Iterable[str]) -> Task:
     A word is ``name=value``. The name is that of a reward term (its weight), ``term.parameter``, ``ending.parameter``,
     a field of :class:`~robotics_bridge.tasks.settings.TeacherSettings`, or a field of the task, by dots into its parts:
     ``is_dropped=-300``, ``rotation_progress.clip=2``, ``obj_dropped.height=0.44``, ``entropy=0``,
-    ``learning_rate_range=1e-4,1e-3``, ``episode=15``, ``goal.start_threshold=0.4``, ``object_changes.friction=0.8,1``.
+    ``learning_rate_range=1e-4,1e-3``, ``episode=15``, ``goal.start_threshold=0.4``, ``object_changes.friction=0.8,1``,
+    ``contacts=firm``, ``contacts.time_constant=0.01``.
 
     Raises:
         UsageError: a word is not of this form, names nothing of the task, or the value is not of its kind.
@@ -60,6 +62,9 @@ def set_field(subject: Any, path: list[str], value: str) -> Any:
         if not is_dataclass(present):
             raise UsageError(f"{first!r} has no parts; received {shown('.'.join(path))}.")
         return replace(subject, **{first: set_field(present, rest, value)})
+    if isinstance(present, ContactModel):
+        check_name("contacts of a task", value, CONTACTS)
+        return replace(subject, **{first: CONTACTS[value]})
     if value == "none" and any(field.name == first and field.default is None for field in fields(subject)):
         return replace(subject, **{first: None})
     return replace(subject, **{first: _read(first, value, present)})

@@ -38,8 +38,13 @@ def register(name: str, config: str = "default") -> Callable[[Maker], Maker]:
 
 
 def bounded(task: Task) -> Task:
-    """Return a published task with bounded actions and holding taxels, as all have on which we train."""
-    return replace(task, action_limit=ACTION_LIMIT, taxel_twist=None)
+    """Return a published task as we train it: bounded actions, taxels that hold, and students with a command.
+
+    A student is told what to do and does not read the goal, which follows from the object's pose.
+    """
+    student = tuple(name for name in task.groups["student"] if name != "goal")
+    groups = {**task.groups, "student": (*student, "command")}
+    return replace(task, action_limit=ACTION_LIMIT, taxel_twist=None, groups=groups)
 
 
 def register_bounded(name: str, published: Maker) -> None:

@@ -15,6 +15,7 @@ from brainbench.core.errors import UsageError, check_name
 from robotics_bridge.hands.hand import Hand
 from robotics_bridge.hands.scenes import palm_surface
 from robotics_bridge.physics.scene import excluded_links
+from robotics_bridge.tasks.contact_model import ContactModel
 from robotics_bridge.tasks.objects import ObjectShape, add_object, slots, with_sizes
 from robotics_bridge.tasks.task import Pose, Task
 
@@ -81,6 +82,8 @@ def build(task: Task, hand: Hand) -> TaskModel:
             add_object(
                 spec, name, shape, kinds, density=task.density, condim=3, friction=(task.friction, 0.005, 0.0001)
             )
+        if task.contacts != ContactModel():
+            _set_contacts(spec, task.contacts)
         models.append(spec.compile())
     first = models[0]
     joints = tuple(drives)
@@ -105,16 +108,18 @@ def _hand_spec(task: Task, hand: Hand) -> tuple[Any, dict[str, tuple[float, floa
     """Return the scene without objects and the drives: joint → stiffness, damping, effort."""
     spec = hand.mjspec()
     option, solver = spec.option, task.solver
-    option.timestep, option.iterations, option.ls_iterations = solver.timestep, solver.iterations, solver.line_search
+    option.timestep = solver.timestep / task.contacts.substeps
+    option.iterations, option.ls_iterations = solver.iterations, solver.line_search
     option.tolerance, option.integrator = solver.tolerance, mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     palm = spec.body(hand.palm)
     palm.pos, palm.quat = task.hand_poses[hand.name] if hand.name in task.hand_poses else palm_up(hand)
-    drives = _drives(hand)
+    scale = task.contacts.drive_scale
+    drives = {name: (scale * k, scale * d, scale * most) for name, (k, d, most) in _drives(hand).items()}
     while spec.actuators:
         spec.delete(spec.actuators[0])
     for joint in spec.joints:
         if joint.name in drives:
-            joint.armature = joint.armature or _ARMATURE
+            joint.armature = scale * (joint.armature or _ARMATURE)
     slides = {}
     for axis, ((low, high), stiffness, damping, effort) in task.carriage.items():
         # The carriage moves along world axes, while a joint's axis is given in the frame of its body: rows of Rᵀ.
@@ -142,6 +147,13 @@ def _hand_spec(task: Task, hand: Hand) -> tuple[Any, dict[str, tuple[float, floa
     if task.furniture is not None:
         task.furniture(spec)
     return spec, drives
+
+
+def _set_contacts(spec: Any, contacts: ContactModel) -> None:
+    for geom in spec.geoms:
+        geom.solref = (contacts.time_constant, contacts.damping_ratio)
+        # MuJoCo's sigmoid of the impedance keeps its default middle and power.
+        geom.solimp = (*contacts.impedance, 0.5, 2.0)
 
 
 def _drives(hand: Hand) -> dict[str, tuple[float, float, float]]:

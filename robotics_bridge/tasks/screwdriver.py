@@ -59,6 +59,7 @@ def published() -> Task:
         name="screwdriver",
         text="spin an upright screwdriver with thumb, index and middle finger",
         objects=SCREWDRIVERS,
+        density=4000.0,
         placement=Placement(height=0.0, quaternion=UPRIGHT),
         hand_poses=POSES,
         joints=REST,

@@ -89,8 +89,11 @@ class TeacherSettings:
         if not 0 < self.std_range[0] <= self.std_range[1] < math.inf:
             raise UsageError(f"std_range is a range of positive numbers; received {self.std_range!r}.")
 
-    def config(self, groups: dict[str, tuple[str, ...]]) -> dict[str, Any]:
-        """Return the configuration of rsl_rl 5 (``PPO.construct_algorithm``), given observation set → groups."""
+    def config(self, groups: dict[str, tuple[str, ...]], actor: dict[str, Any] | None = None) -> dict[str, Any]:
+        """Return the configuration of rsl_rl 5 (``PPO.construct_algorithm``), given observation set → groups.
+
+        ``actor`` names another model class of the actor with its own settings.
+        """
         network = {
             "class_name": "MLPModel", "hidden_dims": list(self.hidden), "activation": "elu", "obs_normalization": True,
         }  # fmt: skip
@@ -117,7 +120,7 @@ class TeacherSettings:
         return {
             "num_steps_per_env": self.steps_per_env,
             "obs_groups": sets,
-            "actor": {**network, "distribution_cfg": spread},
+            "actor": {**network, **(actor or {}), "distribution_cfg": spread},
             "critic": dict(network),
             "algorithm": algorithm,
             "multi_gpu": None,

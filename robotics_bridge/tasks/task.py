@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 from brainbench.core.errors import UsageError, check_name
 from brainbench.core.reading.ranges import check_number
+from robotics_bridge.tasks.contact_model import CONTACTS, ContactModel
 from robotics_bridge.tasks.goals import Goal
 from robotics_bridge.tasks.objects import PRIMITIVES, ObjectShape
 from robotics_bridge.tasks.settings import AuxiliaryDecoder, StudentSettings, TeacherSettings
@@ -186,6 +187,8 @@ class Task:
     starts: str | None = None
     """``grasps``: start from sampled grasps instead of the placement."""
     solver: Solver = Solver()
+    contacts: ContactModel = CONTACTS["published"]
+    """Firmness of contacts; names of :data:`~robotics_bridge.tasks.contact_model.CONTACTS` on the command line."""
     taxel_twist: float | None = None
     """Torsional friction of the force taxels [N·m·s], by the published law, where it is 2; None: taxels that hold what
     they touch and add up to the engine's contact forces."""
@@ -195,8 +198,8 @@ class Task:
     action_limit: float | None = None
     """Largest action, either way, that counts and is observed as the last one; None (published) for none.
 
-    Far beyond what moves a joint it changes no motion, but policies that read their own last action can otherwise run
-    away from themselves.
+    What moves no joint further changes no motion, but policies that read their own last action can otherwise run away
+    from themselves.
     """
     # --- randomness ---
     actuators: ActuatorRandomisation | None = ActuatorRandomisation()
@@ -212,6 +215,8 @@ class Task:
     task_state: Callable[[EnvState], TaskState] | None = None
     """Makes the part of the task that keeps a state of its own (hot_ball's thermometers)."""
     # --- learning ---
+    command: tuple[str, ...] = ("on",)
+    """Contents of the group ``command``, which a hand is told: ``on`` (1: do it), ``orientation`` of the goal."""
     goal_terms: tuple[str, ...] = ()
     """Contents of the group ``goal``: ``orientation``, ``difference``, ``angle``."""
     distances_in: str = "priv_obj_props"
@@ -238,6 +243,12 @@ class Task:
             check_number(f"solver.{name} {of}", getattr(self.solver, name), above=0)
         for name in ("decimation", "iterations", "line_search"):
             check_number(f"solver.{name} {of}", getattr(self.solver, name), least=1, whole=True)
+        least = 2 * self.solver.timestep / self.contacts.substeps
+        if self.contacts.time_constant < least:
+            raise UsageError(
+                f"contacts.time_constant {of} is at least two physics steps ({least:g} s); received "
+                f"{self.contacts.time_constant:g}: take more contacts.substeps."
+            )
         check_number(f"object_changes.friction {of}", self.object_changes.friction[0], least=0)
         check_number(f"object_changes.size {of}", self.object_changes.size[0], above=0)
         for name, reward in self.rewards.items():
@@ -270,10 +281,29 @@ class Task:
         return found
 
 
-ACTION_LIMIT = 100.0
-"""Bound of actions of the tasks on which we train; from about 2 on, a joint's target stays at its limit."""
+ACTION_LIMIT = 2.0
+"""Bound of actions of the tasks on which we train: an action of 1 is half a joint's range, so 2 reaches every target
+from every rest position."""
+TASK_VERSION = 1
+"""Raised when a change of the tasks leaves earlier policies in a world that they were not trained in."""
 GROUPS = (
-    "proprio", "tactile", "link_pose", "goal", "priv_proprio", "priv_obj_state", "priv_obj_props", "priv_thermal",
-    "thermal", "aux_obj_size", "aux_goal_dist", "aux_obj_tilt", "aux_rotation_progress",
+    "proprio", "tactile", "link_pose", "command", "goal", "priv_proprio", "priv_obj_state", "priv_obj_props",
+    "priv_thermal", "thermal", "aux_obj_size", "aux_goal_dist", "aux_obj_tilt", "aux_rotation_progress",
 )  # fmt: skip
 """Observation groups (table 4.7 and the decoders' targets)."""
+MEASURED = ("proprio", "tactile", "link_pose", "command", "thermal")
+"""Groups that a hand measures or is told; the others are known to the simulation alone."""
+
+
+def check_measured(names: Iterable[str], reader: str) -> None:
+    """Check that a policy reads what a hand has; ``reader`` names it in errors.
+
+    Raises:
+        UsageError: a name is unknown, or a group follows from the state of the simulation.
+    """
+    for name in names:
+        check_name("observation group", name, GROUPS)
+        if name not in MEASURED:
+            raise UsageError(
+                f"{reader} cannot read {name!r}, which only the simulation knows; a hand has {', '.join(MEASURED)}."
+            )

@@ -10,6 +10,7 @@ import torch
 
 from robotics_bridge.hands.observations import observation_type
 from robotics_bridge.policies.encoders.arms import EncoderConfig
+from robotics_bridge.tasks.contact_model import ContactModel
 
 
 class TouchWorld:
@@ -29,6 +30,9 @@ class TouchWorld:
         self.task = SimpleNamespace(
             groups={"student": student},
             taxel_twist=None,
+            action_limit=None,
+            command=("on",),
+            contacts=ContactModel(),
             decoders=(SimpleNamespace(target="aux_aim", weight=0.5, scale=2.0, hidden=(16,)),),
             student=SimpleNamespace(
                 iterations=4, learning_rate=1e-3, epochs=2, gradient_length=2, clip=None, max_grad_norm=None, loss="mse"

@@ -17,6 +17,10 @@ ConfigOption = Annotated[str, typer.Option("--config", help="Configuration of th
 TaskFileOption = Annotated[
     Path | None, typer.Option("--task-file", help="Python file that registers a task of your own.")
 ]
+ChangeOption = Annotated[
+    list[str] | None,
+    typer.Option("--change", help="Another number of the task: contacts=firm, is_dropped=-300, entropy=0, …"),
+]
 EnvsOption = Annotated[int, typer.Option("--envs", help="Environments at once.")]
 DeviceOption = Annotated[str, typer.Option(help="cpu, or cuda for MuJoCo Warp.")]
 ENV = "robotics_bridge.envs.options:EnvOptions"
@@ -24,12 +28,20 @@ TOUCH = ("observe", "placement", "resolution", "noisy")
 """Fields of the options of an environment that a student fixes."""
 
 
-def make_env(name: str, *, task_file: Path | None = None, **options: Any) -> Env:
-    """Return the environment of a command; a task of the user's own is read first."""
+def make_env(
+    name: str,
+    *,
+    config: str = "default",
+    change: list[str] | None = None,
+    task_file: Path | None = None,
+    **options: Any,
+) -> Env:
+    """Return the environment of a command; a task of the user's own is read first, then changed."""
     from robotics_bridge import tasks
+    from robotics_bridge.tasks.overrides import apply_overrides
 
     read_task_file(task_file)
-    return tasks.make(name, **options)
+    return tasks.make(apply_overrides(tasks.load(name, config), change or ()), **options)
 
 
 def read_task_file(path: Path | None) -> None:
@@ -82,9 +94,11 @@ def agent_of(name: str, env: Env, *, seed: int = 0) -> Any:
     if name in evaluate.AGENTS:
         return evaluate.agent(name, env, seed=seed)
     if _student(name):
+        from robotics_bridge.policies.fit import check_fit
         from robotics_bridge.policies.training.student_files import load_student
 
-        student, _ = load_student(name, device=str(env.device))
+        student, described = load_student(name, device=str(env.device))
+        check_fit(described, env, name)
         return evaluate.Policy(student)
     from robotics_bridge.policies.training import teacher
 

@@ -14,6 +14,7 @@ from brainbench.cli.output import JsonOption, emit, facts, progress_bar, table_o
 from brainbench.cli.policy.options import (
     ENV,
     TOUCH,
+    ChangeOption,
     ConfigOption,
     DeviceOption,
     EnvsOption,
@@ -30,8 +31,9 @@ from brainbench.cli.policy.options import (
 
 def list_tasks(as_json: JsonOption = False) -> None:
     """List the tasks with their success, length, observation groups, and the policies that come with the package."""
+    from brainbench.core.files import read_json
     from robotics_bridge import tasks
-    from robotics_bridge.policies.shipped import list_policies
+    from robotics_bridge.policies.shipped import FOLDER, list_policies, unmeasured_inputs
 
     found = []
     for name in tasks.list_tasks():
@@ -47,6 +49,11 @@ def list_tasks(as_json: JsonOption = False) -> None:
                 "student": student,
                 "teacher": list(task.groups["actor"]),
                 "shipped": [*list_policies("teacher", name), *list_policies("student", name)],
+                "unmeasured": {
+                    shipped: read
+                    for shipped in list_policies("student", name)
+                    if (read := unmeasured_inputs(read_json(FOLDER / shipped / "config.json")))
+                },
             }
         )
     columns = {
@@ -56,8 +63,9 @@ def list_tasks(as_json: JsonOption = False) -> None:
         "success": "{0[metric]} ≥ {0[success_from]:.3g}",
         "student sees": lambda item: ", ".join(item["student"]),
     }
-    shipped = [(name, row["task"]) for row in found for name in row["shipped"]]
-    trained = table_of("", shipped, {"trained policy": "{0[0]}", "task": "{0[1]}"})
+    shipped = [(name, row["task"], row["unmeasured"].get(name, ())) for row in found for name in row["shipped"]]
+    columns = {"trained policy": "{0[0]}", "task": "{0[1]}", "reads what no hand measures": lambda one: ", ".join(one[2])}
+    trained = table_of("", shipped, columns)
     emit(found, f"{table_of('', found, columns)}\n\n{trained}", as_json=as_json)
 
 
@@ -75,6 +83,7 @@ def play(
     width: Annotated[int, typer.Option(help="Of a frame [pixels].")] = 480,
     hand: HandOption = "xhand1",
     config: ConfigOption = "default",
+    change: ChangeOption = None,
     task_file: TaskFileOption = None,
     as_json: JsonOption = False,
 ) -> None:
@@ -92,7 +101,7 @@ def play(
         check_paths(video, strip)
         from brainbench.cli.policy import pictures as drawing
     options |= touch_of([agent])
-    env = make_env(task, task_file=task_file, num_envs=1, hand=hand, config=config, threads=1, **options)
+    env = make_env(task, config=config, change=change, task_file=task_file, num_envs=1, hand=hand, threads=1, **options)
     act = agent_of(agent, env, seed=options["seed"])
     steps = max(round(seconds / env.step_dt), 1)
     rewards: list[float] = []
@@ -132,8 +141,8 @@ def play(
     }  # fmt: skip
     shown: dict[str, object] = {
         "task": told["task"], "hand": told["hand"], "agent": agent, "simulated": f"{told['seconds']:g} s",
-        "goals reached": goals, "turned": f"{turned:.2f} rad about the commanded axis", "dropped": f"{dropped} times",
-        "episodes ended": ended, "reward": f"{sum(rewards):.3g}",
+        "goals reached": goals, "turned": f"{round(turned, 2) + 0:.2f} rad about the commanded axis",
+        "dropped": f"{dropped} times", "episodes ended": ended, "reward": f"{sum(rewards):.3g}",
     }  # fmt: skip
     shown |= {"files": ", ".join(map(str, pictures))} if pictures else {}
     emit(told, f"{env.task.text}\n\n{facts(shown)}", as_json=as_json)
@@ -150,6 +159,7 @@ def evaluate(
     envs: EnvsOption = 32,
     hand: HandOption = "xhand1",
     config: ConfigOption = "default",
+    change: ChangeOption = None,
     task_file: TaskFileOption = None,
     device: DeviceOption = "cpu",
     out: Annotated[
@@ -171,7 +181,9 @@ def evaluate(
         raise UsageError(f"An evaluation needs at least one seed; received {seeds}.")
     check_names(task, agents or [], task_file)
     touch = touch_of(list(agents or []))
-    env = make_env(task, task_file=task_file, num_envs=envs, hand=hand, config=config, device=device, **touch)
+    env = make_env(
+        task, config=config, change=change, task_file=task_file, num_envs=envs, hand=hand, device=device, **touch
+    )
     names = ["zero", "random", *(name for name in agents or [] if name not in ("zero", "random"))]
     found: list[dict[str, Any]] = []
     with progress_bar() as progress:

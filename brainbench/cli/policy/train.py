@@ -12,18 +12,19 @@ from brainbench.cli.destinations import out_folder
 from brainbench.cli.options import part_of, with_options
 from brainbench.cli.output import JsonOption, emit, facts, progress_bar, table
 from brainbench.cli.policy.options import (
+    ChangeOption,
     ConfigOption,
     DeviceOption,
     HandOption,
     TaskArgument,
     TaskFileOption,
-    read_task_file,
+    make_env,
 )
 
 
 @with_options(
     "robotics_bridge.policies.training.teacher:TeacherRun",
-    ("iterations", "minutes", "start", "start_std", "save_every", "seed"),
+    ("iterations", "minutes", "start", "start_std", "observe", "loggers", "save_every", "seed"),
 )
 def train(
     task: TaskArgument,
@@ -38,30 +39,31 @@ def train(
     task_file: TaskFileOption = None,
     steps: Annotated[int | None, typer.Option(help="Control steps per environment and iteration.")] = None,
     curiosity: Annotated[float | None, typer.Option(help="Weight of the RND reward (published: 100).")] = None,
+    touch: Annotated[str, typer.Option(help="Tactile observation type of touch.")] = "agg_bool",
+    placement: Annotated[str, typer.Option(help="Place of the taxels: hand, fingers, tips or palm.")] = "hand",
+    resolution: Annotated[str, typer.Option(help="Number of taxels: low, med or high.")] = "med",
     initial_std: Annotated[float | None, typer.Option(help="Of the first policy's actions (published: 1).")] = None,
-    change: Annotated[
-        list[str] | None,
-        typer.Option(help="Another number of the task: is_dropped=-300, goal.start_threshold=0.4, entropy=0, …"),
-    ] = None,
+    change: ChangeOption = None,
     device: DeviceOption = "cpu",
     as_json: JsonOption = False,
 ) -> None:
     """Train the teacher of a task by PPO, or go on with a run.
 
-    The run's folder holds checkpoints, log.jsonl and TensorBoard events. A killed run goes on from its last
-    checkpoint exactly as if nothing had happened.
+    With --observe proprio,touch the policy reads what a hand has, and remembers (recurrent PPO); the folder ``policy``
+    of its run is a student's, for play, evaluate, export and deploy. The run's folder holds checkpoints, log.jsonl and
+    TensorBoard events. A killed run goes on from its last checkpoint exactly as if nothing had happened.
     """
-    from robotics_bridge import tasks
     from robotics_bridge.policies.training import teacher
-    from robotics_bridge.tasks.overrides import apply_overrides
 
     count = envs or (8192 if device != "cpu" else 64)
-    read_task_file(task_file)
-    chosen_task = apply_overrides(tasks.load(task, config), change or ())
-    env = tasks.make(chosen_task, num_envs=count, hand=hand, device=device, seed=options.seed)
+    senses = {"observe": touch, "placement": placement, "resolution": resolution} if "touch" in options.observe else {}
+    env = make_env(
+        task, config=config, change=change, task_file=task_file, num_envs=count, hand=hand, device=device,
+        seed=options.seed, **senses,
+    )  # fmt: skip
     given: dict[str, Any] = {"steps_per_env": steps, "rnd_weight": curiosity, "initial_std": initial_std}
     chosen = {name: value for name, value in given.items() if value is not None}
-    settings = replace(chosen_task.teacher, num_envs=count, **chosen)
+    settings = replace(env.task.teacher, num_envs=count, **chosen)
     run = out or Path("runs") / f"{task}-{env.hand.name}-{options.seed}"
     with progress_bar() as progress:
         result = teacher.train(env, run, options, settings=settings, progress=progress)
@@ -77,7 +79,7 @@ def train(
 DISTILL = "robotics_bridge.policies.training.distill_config:DistillConfig"
 DISTILL_FLAGS = {"variant": ("--config",), "num_envs": ("--envs",)}
 OFFERED = (
-    "observe", "placement", "resolution", "noisy", "embedder", "hand", "variant", "num_envs", "iterations",
+    "observe", "placement", "resolution", "noisy", "contacts", "embedder", "hand", "variant", "num_envs", "iterations",
     "learning_rate", "epochs", "teacher_share", "teacher_iterations", "aggregate", "precision", "save_interval", "seed",
 )  # fmt: skip
 """Fields of a student's configuration that have a flag of their name."""
@@ -96,6 +98,12 @@ def distill(
     ] = "auto",
     learning: Annotated[str, typer.Option(help="Of a model: frozen or finetuned.")] = "frozen",
     time: Annotated[str, typer.Option(help="Of a model: native or resampled to its own 9 ms.")] = "native",
+    unroll: Annotated[
+        str | None, typer.Option(help="Of a graph model: full answers at once, biological after a step per layer.")
+    ] = None,
+    draw: Annotated[
+        int | None, typer.Option(help="Seed of an untrained model or reservoir; by default that of the student.")
+    ] = None,
     pretrained: Annotated[Path | None, typer.Option(help="Weights of a tagged model.")] = None,
     episodes: Annotated[int, typer.Option(help="Of the evaluation, per seed; 0 for none.")] = 100,
     device: DeviceOption = "cpu",
@@ -108,9 +116,10 @@ def distill(
     from robotics_bridge.policies.training.distill_config import DistillConfig
     from robotics_bridge.policies.training.students import train_student
 
-    settings: dict[str, Any] = {}
+    settings: dict[str, Any] = {} if draw is None else {"seed": draw}
     if encoder not in (AUTO, *ARMS):
-        settings = {"learning": learning, "time": time}
+        settings |= {"learning": learning, "time": time}
+        settings |= {} if unroll is None else {"options": {"unroll": unroll}}
         if pretrained is not None:
             settings["pretrained"] = str(pretrained)
     config = DistillConfig(task=task, teacher=str(teacher), encoder=encoder, encoder_settings=settings, **options)

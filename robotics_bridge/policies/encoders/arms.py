@@ -26,6 +26,7 @@ from robotics_bridge.hands.observations import observation_type
 from robotics_bridge.policies.encoders.calibration import HandCalibration
 from robotics_bridge.policies.encoders.conv_gru import MOST_CELLS, ConvGRUProducts
 from robotics_bridge.policies.encoders.front_end import FrontEnd, Learning
+from robotics_bridge.policies.encoders.reservoir import UNITS, EchoState, FeatureNorm
 from robotics_bridge.policies.encoders.taxel_grid import TaxelGrid
 from robotics_bridge.policies.encoders.timing import Time
 
@@ -62,7 +63,10 @@ class EncoderConfig:
     learning: Learning = "frozen"
     """Learning of a network: ``frozen`` or ``finetuned``."""
     seed: int = 0
-    """Seed of an untrained network."""
+    """Seed of an untrained network or of a reservoir."""
+    standardise: str = "feature"
+    """Standardisation of a network's features: one by one (``feature``), or across each step (``layer``), which leaves
+    what never changes; earlier students have that."""
     pretrained: str | None = None
     """Weights of a network with a tag."""
     options: Mapping[str, Any] = field(default_factory=dict)
@@ -71,6 +75,7 @@ class EncoderConfig:
     """Force and moment that are one unit to a network."""
 
     def __post_init__(self) -> None:
+        check_name("standardisation of features", self.standardise, ("feature", "layer"))
         check_number("'slots' of a tactile encoder", self.slots, least=1, most=1000, whole=True)
         check_number("'features' of a tactile encoder", self.features, least=1, most=8192, whole=True)
 
@@ -361,7 +366,8 @@ class _Network(TactileEncoder):
         )  # fmt: skip
         self.state_size = self.front.state_size
         # Features of untrained and trained networks differ by orders of magnitude; the head should not care.
-        self.norm = nn.LayerNorm(self.front.features, elementwise_affine=False, eps=1e-12)
+        layer = nn.LayerNorm(self.front.features, elementwise_affine=False, eps=1e-12)
+        self.norm: nn.Module = layer if config.standardise == "layer" else FeatureNorm(self.front.features)
         self.project: nn.Linear = nn.Linear(self.front.features, self.features)
 
     @property
@@ -376,6 +382,30 @@ class _Network(TactileEncoder):
         return self.embed(features), h_out
 
 
+class _Reservoir(TactileEncoder):
+    """A random recurrent network on the hand's grid, and a learned linear map to the embedding: what chance gives."""
+
+    state_size = UNITS
+
+    def __init__(self, config: EncoderConfig) -> None:
+        super().__init__(config)
+        self.grid, self.scale = config.grid(), RunningScale(6)
+        self.echo = EchoState(6 * config.slots * GRID_SHAPE[0] * GRID_SHAPE[1], seed=config.seed)
+        self.norm, self.project = FeatureNorm(UNITS), nn.Linear(UNITS, self.features)
+
+    def observe_scale(self, taxels: torch.Tensor) -> None:
+        self.scale.update(self._sites(taxels.flatten(0, -4)))
+
+    def _sites(self, taxels: torch.Tensor) -> torch.Tensor:
+        return self.grid(taxels).unflatten(1, (-1, 6)).movedim(2, -1)
+
+    def forward(self, taxels: torch.Tensor, h_in: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        felt = self.scale(self._sites(taxels)).flatten(1)
+        # A quarter of the cells or fewer are touched at a time, so the drive is of the order of 1.
+        h_out = self.echo(2.0 * felt.shape[1] ** -0.5 * (felt @ self.echo.inputs), h_in)
+        return self.project(self.norm(h_out)), h_out
+
+
 ARMS: Mapping[str, Callable[[EncoderConfig], TactileEncoder]] = {
     "mlp": _Flat,
     "rnn": _Recurrent,
@@ -383,5 +413,7 @@ ARMS: Mapping[str, Callable[[EncoderConfig], TactileEncoder]] = {
     "tactile_convrnn": _ConvRecurrent,
     "tactile_canvas_cnn": partial(_Convolution, canvas=True),
     "tactile_canvas_convrnn": partial(_ConvRecurrent, canvas=True),
+    "reservoir": _Reservoir,
 }
-"""Encoders that are learned with the policy, by their published names. ``canvas``: on the 5 × 7 grid of the hand."""
+"""Encoders that are learned with the policy, by their published names (``canvas``: on the 5 × 7 grid of the hand), and
+``reservoir``, a random one to hold the others against."""

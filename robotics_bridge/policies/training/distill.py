@@ -15,7 +15,7 @@ import logging
 import math
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal
 
@@ -34,6 +34,7 @@ from robotics_bridge.policies.training.distill_config import EARLIER_TWIST, Dist
 from robotics_bridge.policies.training.rollouts import Recorder, Rollout
 from robotics_bridge.policies.training.state_tree import write_tensors
 from robotics_bridge.policies.training.student_files import CONFIG, MODEL, build_student
+from robotics_bridge.tasks.task import TASK_VERSION, check_measured
 
 _log = logging.getLogger(__name__)
 
@@ -113,6 +114,10 @@ class _Learner(nn.Module):
 
     def keep(self, tensors: Mapping[str, torch.Tensor]) -> None:
         for name, value in tensors.items():
+            if value.is_floating_point():
+                # Files hold finite numbers alone; a deadline that never comes is as far away at the largest of them.
+                most = torch.finfo(value.dtype).max
+                value = value.clamp(-most, most)
             self.world.register_buffer(name.replace(".", "/"), value)
 
     def kept(self, prefix: str) -> dict[str, torch.Tensor]:
@@ -125,6 +130,8 @@ class _Run:
         self.config, self.out, self.env, self.teacher = config, out, env, teacher
         self.device = torch.device(env.device)
         read = [name for name in env.task.groups["student"] if name != TACTILE]
+        # The published students read the goal; nothing else of the simulation is an input, targets of decoders least.
+        check_measured((name for name in read if name != "goal"), "A student")
         self.groups: list[str] = [*read, TACTILE] if config.tactile is not None else read
         self.student = build_student(config, env.observation_shapes, self.groups, env.num_actions).to(self.device)
         self.decoders = env.task.decoders
@@ -277,7 +284,7 @@ class _Run:
         mine = to_plain(self.config.plain())
         if path.is_file():
             found = read_mapping(path).get("distill")
-            found = {"twist": EARLIER_TWIST, **found} if isinstance(found, dict) else found
+            found = {"twist": EARLIER_TWIST, "contacts": "published", **found} if isinstance(found, dict) else found
             differing = sorted(key for key in mine if not isinstance(found, dict) or found.get(key) != mine[key])
             if differing:
                 raise UsageError(
@@ -333,6 +340,8 @@ def describe_run(config: DistillConfig, student: TactilePolicy, env: Any) -> dic
     actions = env.action_map
     return {
         "brainbench_student": 1,
+        "task_version": TASK_VERSION,
+        "contacts": asdict(env.task.contacts),
         "distill": config.plain(),
         "network": student.config,
         # A list: the order counts, and JSON keeps that of lists alone.
@@ -340,8 +349,10 @@ def describe_run(config: DistillConfig, student: TactilePolicy, env: Any) -> dic
         "actions": env.num_actions,
         "deployment": {
             **{name: getattr(config, name) for name in ("task", "hand", "observe", "placement", "resolution")},
+            **({"command": [1.0]} if env.task.command == ("on",) else {}),
             "rate": 1 / env.step_dt,
             "sub_steps": env.decimation,
+            "action_limit": env.task.action_limit,
             "twist": env.task.taxel_twist if config.twist is None else config.twist,
             "joints": list(env.joint_names),
             "action_map": {key: getattr(actions, key) for key in ("names", "default", "scale", "low", "high")},

@@ -13,6 +13,7 @@ from robotics_bridge.policies.contract import MOST_TWIST
 from robotics_bridge.policies.encoders.arms import AUTO, EncoderConfig
 from robotics_bridge.policies.student import EMBEDDERS
 from robotics_bridge.sensors.taxels.sensors import PUBLISHED_TWIST
+from robotics_bridge.tasks.contact_model import CONTACTS
 from robotics_bridge.tasks.settings import StudentSettings
 
 LOSSES = ("mse", "inv_var_mse")
@@ -45,6 +46,8 @@ class DistillConfig:
     twist: float | None = None
     """Torsional friction of the force taxels [N·m·s]; by default the task's own. Runs of versions that did not state
     it had the published 2 (:data:`EARLIER_TWIST`)."""
+    contacts: str = "published"
+    """Contact model of the task: ``published`` or ``firm``."""
     encoder: str = AUTO
     """Tactile encoder: an arm of :data:`~robotics_bridge.policies.encoders.arms.ARMS`, or a network's name."""
     encoder_settings: Mapping[str, Any] = field(default_factory=dict)
@@ -87,6 +90,7 @@ class DistillConfig:
     def __post_init__(self) -> None:
         object.__setattr__(self, "hidden", tuple(self.hidden))
         observation_type(self.observe)
+        check_name("contacts of a task", self.contacts, CONTACTS)
         check_name("encoder of flat groups", self.embedder, EMBEDDERS)
         check_name("loss", self.loss or "mse", LOSSES)
         check_name("precision", self.precision, ("float32", "bf16"))
@@ -129,7 +133,8 @@ class DistillConfig:
         if observation_type(self.observe).sensor is None:
             return None
         shared = {name: getattr(self, name) for name in ("hand", "observe", "placement", "resolution")}
-        return EncoderConfig.of({**self.encoder_settings, "name": self.encoder, **shared})
+        # Another seed is another draw of what is random in the encoder too.
+        return EncoderConfig.of({"seed": self.seed, **self.encoder_settings, "name": self.encoder, **shared})
 
     @property
     def name(self) -> str:
@@ -139,6 +144,7 @@ class DistillConfig:
             learning = f"-{self.tactile.learning}" if "learning" in self.encoder_settings else ""
             arm = self.tactile.arm.replace("/", "-").replace(":", "-")
             parts += [self.placement, self.resolution, "noisy" if self.noisy else "clean", f"{arm}{learning}"]
+        parts += [] if self.contacts == "published" else [self.contacts]
         return "_".join([*parts, f"seed{self.seed}"])
 
     def share(self, iteration: int) -> float:

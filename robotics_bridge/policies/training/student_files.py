@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -55,6 +56,9 @@ def load_student(folder: str | Path, *, device: str = "cpu") -> tuple[TactilePol
         raise DataError(f"The student in {str(folder)!r} has no weights yet; its run was interrupted early.")
     given = described.part("distill")
     config = DistillConfig.of({"twist": EARLIER_TWIST, **given.fields(DistillConfig)})
+    if "task_version" not in described.values:
+        # Students of earlier versions do not state it.
+        config = replace(config, encoder_settings={"standardise": "layer", **config.encoder_settings})
     if config.encoder_settings:
         given.part("encoder_settings").fields(EncoderConfig)
     shapes, actions = described.shapes("groups", MOST_NUMBERS), described.whole("actions", 1, JOINTS)

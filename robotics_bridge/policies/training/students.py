@@ -22,6 +22,7 @@ from robotics_bridge.policies.training.distill import DistillResult, distill
 from robotics_bridge.policies.training.distill_config import DistillConfig
 from robotics_bridge.policies.training.student_files import CONFIG, load_student
 from robotics_bridge.policies.training.teacher import load_teacher
+from robotics_bridge.tasks.contact_model import CONTACTS
 
 _log = logging.getLogger(__name__)
 
@@ -72,9 +73,10 @@ def train_student(
             f"({', '.join(list_policies('teacher'))})."
         )
     out = Path(out)
+    task = replace(tasks.load(config.task, config.variant), contacts=CONTACTS[config.contacts])
     env = tasks.make(
-        config.task, num_envs=config.num_envs, device=device, hand=config.hand, config=config.variant,
-        observe=config.observe, placement=config.placement, resolution=config.resolution, noisy=config.noisy,
+        task, num_envs=config.num_envs, device=device, hand=config.hand, observe=config.observe,
+        placement=config.placement, resolution=config.resolution, noisy=config.noisy,
         seed=config.seed, knobs=config.knobs,
     )  # fmt: skip
     teacher = load_teacher(config.teacher, env)

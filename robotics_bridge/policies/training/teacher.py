@@ -19,7 +19,13 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
-from brainbench.core.errors import BrainbenchError, DataError, DataFileNotFoundError, UsageError, missing_dependency
+from brainbench.core.errors import (
+    BrainbenchError,
+    DataError,
+    DataFileNotFoundError,
+    UsageError,
+    missing_dependency,
+)
 from brainbench.core.files import file_hash, provenance, read_mapping, write_json
 from brainbench.core.progress import Progress
 from brainbench.core.reading.regular import readable
@@ -29,10 +35,18 @@ from brainbench.models.training.run_folder import LOG, RESTART, trim_log
 from robotics_bridge.envs.rsl_rl import RslRlEnv
 from robotics_bridge.policies.acting import ActingModel
 from robotics_bridge.policies.evaluate import Policy
+from robotics_bridge.policies.fit import check_fit
 from robotics_bridge.policies.schema import Values
 from robotics_bridge.policies.shipped import policy_path
 from robotics_bridge.policies.training import state_tree
+from robotics_bridge.policies.training.distill import describe_run
+from robotics_bridge.policies.training.loggers import Loggers, check_loggers
+from robotics_bridge.policies.training.sensing import POLICY, sensed_groups, sensing_policy
+from robotics_bridge.policies.training.state_tree import write_tensors
+from robotics_bridge.policies.training.student_files import CONFIG, MODEL
+from robotics_bridge.tasks.contact_model import ContactModel
 from robotics_bridge.tasks.settings import TeacherSettings
+from robotics_bridge.tasks.task import TASK_VERSION
 
 if TYPE_CHECKING:
     from robotics_bridge.envs.env import Env
@@ -63,14 +77,27 @@ class Trainer:
         MissingDependencyError: rsl-rl-lib is not installed.
     """
 
-    def __init__(self, env: Env, settings: TeacherSettings | None = None, *, seed: int = 0) -> None:
+    def __init__(
+        self, env: Env, settings: TeacherSettings | None = None, *, seed: int = 0, observe: tuple[str, ...] = ()
+    ) -> None:
         try:
             from rsl_rl.algorithms import PPO
         except ImportError as error:
             raise missing_dependency("rsl-rl-lib", extra="policies", purpose="Training policies") from error
         self.env, self.settings = RslRlEnv(env), settings or env.task.teacher
         torch.manual_seed(seed)
-        self.config = self.settings.config({name: tuple(groups) for name, groups in env.task.groups.items()})
+        groups = {name: tuple(groups) for name, groups in env.task.groups.items()}
+        self.sensing = sensing_policy(env, self.settings, seed, observe) if observe else None
+        """What a policy that senses is as a student; None for a teacher."""
+        actor = None
+        if self.sensing is not None:
+            groups["actor"] = sensed_groups(observe)
+            tactile = self.sensing.tactile
+            actor = {
+                "class_name": "robotics_bridge.policies.student:TactilePolicy", "embedder": self.sensing.embedder,
+                "tactile": tactile.plain() if tactile is not None else None,
+            }  # fmt: skip
+        self.config = self.settings.config(groups, actor)
         observations = self.env.get_observations()
         # rsl_rl prints its networks; what a command prints is its own business.
         with contextlib.redirect_stdout(io.StringIO()) as said:
@@ -155,6 +182,8 @@ class Trainer:
         state = {"algorithm": self.algorithm.save(), "env": self.env.unwrapped.state_dict()}
         state |= {name: value.clone() for name, value in self._curriculum.items()}
         state |= {"iteration": self.iteration, "torch_rng": torch.get_rng_state()}
+        if self.sensing is not None:
+            state["memory"] = self.algorithm.get_policy().get_hidden_state()
         if self.env.device.type == "cuda":
             state["cuda_rng"] = torch.cuda.get_rng_state(self.env.device)
         if self.algorithm.rnd:
@@ -172,6 +201,8 @@ class Trainer:
             # A run that was begun without a curriculum begins it now.
             value.copy_(state.get(name, value))
         self.iteration = int(state["iteration"])
+        if state.get("memory") is not None:
+            self.algorithm.get_policy().reset(hidden_state=state["memory"].to(self.env.device))
         if self.algorithm.rnd:
             self.algorithm.rnd.update_counter = int(state["rnd_updates"])
             average = state["rnd_average"]
@@ -188,7 +219,9 @@ class TeacherRun:
     """Extent of a training run, and what it begins with.
 
     Raises:
-        UsageError: ``start_std`` is not positive, or there is no run to start from.
+        UsageError: ``start_std`` is not positive, there is no run to start from, or an observation or logger is not
+            known.
+        MissingDependencyError: the package of a logger is not installed.
     """
 
     iterations: int | None = None
@@ -206,12 +239,19 @@ class TeacherRun:
     """Another run, one of its models, or a shipped teacher, whose actor and critic a new run begins with."""
     start_std: float | None = None
     """Standard deviation of actions that it begins with, to explore anew; by default that of the other run."""
+    observe: tuple[str, ...] = ()
+    """What the policy reads, with memory, in place of a teacher's groups: proprio, touch, command, …; the critic, which
+    only training needs, keeps its own."""
+    loggers: tuple[str, ...] = ("tensorboard",)
+    """Loggers beside log.jsonl: tensorboard, csv (log.csv), wandb (offline)."""
 
     def __post_init__(self) -> None:
         if self.start_std is not None and (self.start is None or not self.start_std > 0):
             raise UsageError(
                 f"start_std is a positive number and goes with a run to start from; received {self.start_std!r}."
             )
+        sensed_groups(self.observe)
+        check_loggers(self.loggers)
 
 
 def train(
@@ -239,7 +279,7 @@ def _train(
     env: Env, run: Path, options: TeacherRun, settings: TeacherSettings, progress: Progress | None
 ) -> TeacherResult:
     total = options.iterations or settings.iterations
-    trainer = Trainer(env, settings, seed=options.seed)
+    trainer = Trainer(env, settings, seed=options.seed, observe=options.observe)
     env.goals.start_curriculum()
     origin = None
     if options.start is not None and not (run / RESUME).is_file():
@@ -250,10 +290,11 @@ def _train(
         "kind": "teacher", "task": env.task.name, "hand": env.hand.name, "hand_path": str(env.hand.path or ""),
         "num_envs": env.num_envs, "seed": options.seed, "settings": asdict(settings), "rsl_rl": trainer.config,
         "observation_shapes": {name: list(shape) for name, shape in env.observation_shapes.items()},
-        "action_names": list(env.action_names), "start": origin,
+        "action_names": list(env.action_names), "start": origin, "task_version": TASK_VERSION,
+        "contacts": asdict(env.task.contacts), "observe": list(options.observe),
     }  # fmt: skip
     _resume(trainer, run, facts)
-    writer = _writer(run)
+    writer = Loggers(run, options.loggers, facts)
     began, rows = time.monotonic(), []
     over = False
     while trainer.iteration < total and not over:
@@ -261,13 +302,13 @@ def _train(
         rows.append(row)
         with (run / LOG).open("a", encoding="utf-8") as file:
             file.write(json.dumps(row) + "\n")
-        for name, value in row.items():
-            writer.add_scalar(name, value, trainer.iteration)
+        writer.write(row, trainer.iteration)
         if progress:
             progress(trainer.iteration, total, "training")
         over = options.minutes is not None and time.monotonic() - began > 60 * options.minutes
         if over or trainer.iteration % options.save_every == 0 or trainer.iteration == total:
             _save(trainer, run, keep_env=options.keep_env)
+            writer.save()
     writer.close()
     steps = trainer.iteration * settings.steps_per_env * env.num_envs
     return TeacherResult(run, trainer.iteration, steps, time.monotonic() - began, tuple(rows))
@@ -282,7 +323,9 @@ def _resume(trainer: Trainer, run: Path, facts: dict[str, Any]) -> None:
     with readable(config, "configuration of a run"):
         # Settings that came later than the run had their defaults in it.
         known["settings"] = asdict(TeacherSettings(**_plain(known["settings"])))
-    for name in ("task", "hand", "num_envs", "seed", "settings"):
+    known.setdefault("observe", [])
+    known.setdefault("contacts", asdict(ContactModel()))
+    for name in ("task", "hand", "num_envs", "seed", "settings", "observe", "contacts"):
         if json.loads(json.dumps(facts[name])) != json.loads(json.dumps(known.get(name))):
             raise UsageError(
                 f"The run in {str(run)!r} has {name} = {known.get(name)!r}; this one {facts[name]!r}. "
@@ -304,18 +347,15 @@ def _resume(trainer: Trainer, run: Path, facts: dict[str, Any]) -> None:
 def _save(trainer: Trainer, run: Path, *, keep_env: bool) -> None:
     models = {name: trainer.algorithm.save()[f"{name}_state_dict"] for name in ("actor", "critic")}
     state_tree.save(run / f"model_{trainer.iteration}.safetensors", models)
+    if trainer.sensing is not None:
+        actor: Any = trainer.algorithm.get_policy()
+        weights = {name: value for name, value in actor.state_dict().items() if not name.startswith("distribution.")}
+        write_tensors(run / POLICY / MODEL, weights)
+        write_json(run / POLICY / CONFIG, describe_run(trainer.sensing, actor, trainer.env.unwrapped))
     state = trainer.state()
     if not keep_env:
         del state["env"]
     state_tree.save(run / RESUME, state)
-
-
-def _writer(run: Path) -> Any:
-    try:
-        from torch.utils.tensorboard import SummaryWriter
-    except ImportError as error:
-        raise missing_dependency("tensorboard", extra="policies", purpose="The log of a training run") from error
-    return SummaryWriter(str(run))
 
 
 def newest(run: Path) -> Path:
@@ -354,6 +394,7 @@ def load_teacher(run: str | Path, env: Env) -> Policy:
     path = Path(run)
     file = model_file(path)
     facts = Values.read(file.parent / "config.json")
+    check_fit(facts.values, env, str(run))
     found = _plain(facts.part("settings").fields(TeacherSettings))
     hidden = found.get("hidden", env.task.teacher.hidden)
     weights = state_tree.load(file).get("actor")

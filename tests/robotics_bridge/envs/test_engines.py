@@ -9,18 +9,21 @@ import torch
 
 from robotics_bridge import tasks
 from robotics_bridge.envs import Env
+from robotics_bridge.tasks.contact_model import CONTACTS
 
 
-def _pair() -> tuple[Env, Env]:
-    task = replace(tasks.load("in_palm_rotate", "published"), push=None)
+def _pair(contacts: str) -> tuple[Env, Env]:
+    task = replace(tasks.load("in_palm_rotate", "published"), push=None, contacts=CONTACTS[contacts])
     options = {"num_envs": 3, "observe": "force_torque", "resolution": "low", "seed": 3}
     one = tasks.make(task, engine="mujoco", threads=1, **options)
     return one, tasks.make(task, engine="warp", **options)
 
 
 @pytest.mark.slow
-def test_both_engines_run_the_same_task_and_contain_a_diverging_environment() -> None:
-    one, two = _pair()
+@pytest.mark.parametrize("contacts", CONTACTS)
+def test_both_engines_run_the_same_task_and_contain_a_diverging_environment(contacts: str) -> None:
+    one, two = _pair(contacts)
+    assert one.simulation.timestep == pytest.approx(two.simulation.timestep)
     for name, value in one.simulation.fields.items():
         # Single against double precision.
         assert torch.allclose(value, two.simulation.fields[name], rtol=1e-5, atol=1e-6), name
@@ -40,8 +43,10 @@ def test_both_engines_run_the_same_task_and_contain_a_diverging_environment() ->
 
 
 @pytest.mark.gpu
-def test_a_gpu_runs_many_environments_without_divergence() -> None:
-    env = tasks.make("in_palm_rotate", num_envs=256, device="cuda", observe="force_torque")
+@pytest.mark.parametrize("contacts", CONTACTS)
+def test_a_gpu_runs_many_environments_without_divergence(contacts: str) -> None:
+    task = replace(tasks.load("in_palm_rotate"), contacts=CONTACTS[contacts])
+    env = tasks.make(task, num_envs=256, device="cuda", observe="force_torque")
     for _ in range(20):
         observations, reward, _, _, info = env.step(torch.randn(256, env.num_actions, device="cuda"))
     assert reward.isfinite().all()

@@ -38,7 +38,8 @@ def test_groups_have_the_sizes_of_table_4_7() -> None:
     env = _make(3)
     joints, actions, tips = 12, 5, 5
     assert env.observation_shapes == {
-        "proprio": (2 * joints + actions,), "goal": (1,), "priv_proprio": (2 * joints + actions + 3 * tips,),
+        "proprio": (2 * joints + actions,), "command": (1,), "goal": (1,),
+        "priv_proprio": (2 * joints + actions + 3 * tips,),
         "priv_obj_state": (3 + 6 + 3 + 3,), "priv_obj_props": (2 + tips,), "aux_obj_size": (3,), "aux_goal_dist": (1,),
     }  # fmt: skip
     assert (env.step_dt, env.max_episode_length) == (0.025, 400)

@@ -18,7 +18,7 @@ from robotics_bridge.envs.gymnasium import IDS, GymEnv, GymVectorEnv
 @pytest.fixture(scope="module")
 def env() -> GymVectorEnv:
     task = replace(tasks.load("in_palm_rotate"), episode=0.1)
-    return GymVectorEnv(tasks.make(task, num_envs=3, keep_final=True, threads=1))
+    return GymVectorEnv(tasks.make(task, num_envs=3, keep_final=True, threads=1), privileged=True)
 
 
 def test_registered_ids_make_every_task_that_needs_no_grasps() -> None:
@@ -107,3 +107,14 @@ def test_wrong_requests_are_refused(env: GymVectorEnv) -> None:
         GymVectorEnv(tasks.make("in_palm_rotate", threads=1))
     with pytest.raises(UsageError, match=r"'vision'.*'proprio'"):
         GymVectorEnv(tasks.make("in_palm_rotate", keep_final=True, threads=1), ("vision",))
+
+
+def test_what_a_hand_has_not_is_given_to_who_asks_for_it_alone() -> None:
+    native = tasks.make("in_palm_rotate", num_envs=2, keep_final=True, threads=1)
+    assert set(GymVectorEnv(native).single_observation_space.spaces) == {"proprio", "command"}
+    for group in ("priv_obj_state", "aux_goal_dist", "goal"):
+        with pytest.raises(UsageError, match=f"'{group}', which only the simulation knows"):
+            GymVectorEnv(native, ("proprio", group))
+    asked = GymVectorEnv(native, ("proprio", "priv_obj_state"), privileged=True)
+    assert set(asked.single_observation_space.spaces) == {"proprio", "priv_obj_state"}
+    assert {"goal", "aux_goal_dist"} < set(GymVectorEnv(native, privileged=True).single_observation_space.spaces)

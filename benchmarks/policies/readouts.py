@@ -1,0 +1,96 @@
+"""Lay out the read-outs of tactile encoders that ``brainbench policy probe --out FILE`` measured.
+
+    brainbench policy probe in_palm_rotate --agent in_palm_rotate.careful --config careful --seconds 8 --out FILE
+    python -m benchmarks.policies.readouts --record FILE [FILE …] [--device "one NVIDIA H100"] [--notes FILE] [--write]
+
+Prints the tables; with ``--write`` keeps them as a section of RESULTS.md, draws ``docs/images/policy-readouts.png``,
+and keeps the record as ``benchmarks/policies/records/``.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from benchmarks.report import table, write_section
+from brainbench.core.figures.style import COLORS, PALE, panels, save_figure
+from brainbench.core.files import read_json, write_json
+from robotics_bridge.policies.readouts.rollout import TARGETS
+
+_ROOT = Path(__file__).resolve().parents[2]
+PICTURE = _ROOT / "docs" / "images" / "policy-readouts.png"
+RECORDS = Path(__file__).with_name("records")
+
+
+def body(record: Mapping[str, Any]) -> str:
+    """Return both tables."""
+    arms = [
+        [one["arm"], str(one["features"]), str(one["draws"]), *(_cell(one[name], "") for name in TARGETS)]
+        for one in record["arms"]
+    ]
+    pairs = [[one["arm"], one["less"], *(_cell(one[name], "+") for name in TARGETS)] for one in record["differences"]]
+    extent = f"{record['environments']} environments of {record['task']} for {record['seconds']:g} s"
+    changed = "".join(f", {word}" for word in record["change"])
+    head = f"**{extent} under `{record['agent']}`{changed}**"
+    return "\n\n".join(
+        [head, table(["arm", "features", "draws", *TARGETS], arms), table(["arm", "less", *TARGETS], pairs)]
+    )
+
+
+def _cell(one: Mapping[str, float], sign: str) -> str:
+    return f"{one['r2']:{sign}.3f} [{one['low']:{sign}.3f}, {one['high']:{sign}.3f}]"
+
+
+def draw(record: Mapping[str, Any]) -> None:
+    """Draw R² with its interval, a panel for each quantity, an arm a row."""
+    arms = record["arms"][::-1]
+    figure, axes = panels(1, len(TARGETS), (11.0, 4.6), sharey=True)
+    for panel, name in zip(axes[0], TARGETS, strict=True):
+        for height, one in enumerate(arms):
+            value = one[name]
+            random = one["arm"].startswith(("reservoir", "untrained"))
+            trained = one["arm"].startswith(("simclr", "supervised"))
+            color = COLORS[0] if trained else COLORS[1] if random else PALE
+            error = [[max(value["r2"] - value["low"], 0)], [max(value["high"] - value["r2"], 0)]]
+            panel.errorbar(value["r2"], height, xerr=error, fmt="o", markersize=4, color=color, capsize=2)
+        panel.axvline(0, color=PALE, linewidth=0.8)
+        panel.set(title=name, xlabel="R² on environments left out")
+    axes[0, 0].set_yticks(range(len(arms)), [one["arm"] for one in arms])
+    save_figure(figure, PICTURE, dpi=120)
+
+
+def command(record: Mapping[str, Any]) -> str:
+    """Return the command that measured a record."""
+    words = [record["task"], "--agent", record["agent"], "--config", record["config"]]
+    words += [word for change in record["change"] for word in ("--change", change)]
+    words += ["--envs", str(record["environments"]), "--seconds", f"{record['seconds']:g}"]
+    return f"brainbench policy probe {' '.join(words)} --out FILE"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--record", type=Path, nargs="+", required=True, help="the first one is drawn")
+    parser.add_argument("--device", default="", help="what measured it, if not this machine")
+    parser.add_argument("--notes", type=Path, help="text that follows the tables")
+    parser.add_argument("--write", action="store_true")
+    options = parser.parse_args()
+    records = [read_json(path) for path in options.record]
+    text = "\n\n".join(body(record) for record in records)
+    if options.notes:
+        text += "\n\n" + options.notes.read_text(encoding="utf-8").strip()
+    print(text)
+    if options.write:
+        draw(records[0])
+        for record in records:
+            name = "-".join([record["task"], *(word.partition("=")[2] for word in record["change"])])
+            write_json(RECORDS / f"readouts-{name}.json", record)
+        commands = [*map(command, records), "python -m benchmarks.policies.readouts --record FILE … --write"]
+        write_section(
+            "Read-outs of tactile encoders", "; ".join(commands), text, where=options.device, subject="policies"
+        )
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,141 @@
+"""Features that a policy could have of what it felt: none, bits, forces, random and trained networks.
+
+Letters: T control step, B environment, S sub-step, N taxel, F feature.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+
+from brainbench.core.contracts import CHANNELS
+from robotics_bridge.hands.observations import TAXELS_IN_CONTACT
+from robotics_bridge.policies.encoders.calibration import HandCalibration
+from robotics_bridge.policies.encoders.front_end import FrontEnd
+from robotics_bridge.policies.encoders.reservoir import EchoState
+from robotics_bridge.policies.encoders.taxel_grid import TaxelGrid
+from robotics_bridge.policies.readouts.rollout import TouchRollout
+
+NETWORK = "zhuang-intersection-ln-small"
+"""Network of the arms ``untrained``, ``simclr`` and ``supervised``."""
+_TRACES = (0.5, 0.9)
+"""Share that traces of the short memory keep in a control step (time constants of 36 and 237 ms at 40 Hz)."""
+
+
+Features = torch.Tensor
+"""[T, B, F]."""
+
+
+def traces(x: torch.Tensor, begun: torch.Tensor) -> Features:
+    """Return values [T, B, F] and leaky averages of their past, which episodes begin without."""
+    state = x.new_zeros(len(_TRACES), *x.shape[1:])
+    keep, found = x.new_tensor(_TRACES)[:, None, None], []
+    for now, first in zip(x, begun, strict=True):
+        state = keep * torch.where(first[:, None], 0.0, state) + (1 - keep) * now
+        found.append(torch.cat((now, *state), -1))
+    return torch.stack(found)
+
+
+def raw(rollout: TouchRollout) -> Features:
+    """Return force and torque of every taxel, averaged over the sub-steps."""
+    return rollout.taxels.mean(2).flatten(2)
+
+
+def force(rollout: TouchRollout) -> Features:
+    """Return the force of every taxel, averaged over the sub-steps."""
+    return rollout.taxels[..., :3].mean(2).flatten(2)
+
+
+def bits(rollout: TouchRollout, links: Sequence[int]) -> Features:
+    """Return one bit per link and sub-step: more than two taxels touch (table 4.6)."""
+    touch = (rollout.taxels != 0).any(-1).float()
+    parts = [part.sum(-1) > TAXELS_IN_CONTACT for part in touch.split(list(links), dim=-1)]
+    return torch.stack(parts, -1).float().flatten(2)
+
+
+def network(rollout: TouchRollout, grid: TaxelGrid, calibration: HandCalibration, **options: Any) -> Features:
+    """Return the features of a network that steps through the rollout, its memory forgotten where episodes begin."""
+    time = options.pop("time", "native")
+    front = FrontEnd(
+        options.pop("model"), grid, time=time, calibration=calibration, options={"unroll": "full"}, **options
+    ).to(rollout.taxels.device)
+    state, found = front.init_state(rollout.taxels.shape[1]), []
+    for reading, first in zip(rollout.taxels, rollout.begun, strict=True):
+        features, state = front(reading, torch.where(first[:, None], 0.0, state))
+        found.append(features)
+    return torch.stack(found)
+
+
+def reservoir(rollout: TouchRollout, grid: TaxelGrid, calibration: HandCalibration, *, seed: int) -> Features:
+    """Return the state of a random recurrent network on the grid (echo state: leak .5, spectral radius .9)."""
+    slots = rollout.taxels.shape[2]
+    unit = [calibration.force if name.startswith("F") else calibration.moment for name in CHANNELS] * slots
+    felt = (grid(rollout.taxels.flatten(0, 1)).cpu() / torch.tensor(unit).view(-1, 1, 1)).flatten(1)
+    echo = EchoState(felt.shape[1], seed=seed)
+    drive = felt @ echo.inputs
+    drive = (drive / drive.square().mean().sqrt().clamp(min=1e-12)).unflatten(0, rollout.taxels.shape[:2])
+    state, found = drive.new_zeros(drive.shape[1:]), []
+    for now, first in zip(drive, rollout.begun.cpu(), strict=True):
+        state = echo(now, torch.where(first[:, None], 0.0, state))
+        found.append(state)
+    return torch.stack(found)
+
+
+@dataclass(frozen=True)
+class Subject:
+    """What arms are made from."""
+
+    rollout: TouchRollout
+    grid: TaxelGrid
+    calibration: HandCalibration
+    links: tuple[int, ...]
+    """Taxels of each link."""
+    reservoirs: int
+    """Random reservoirs that are drawn."""
+    untrained: int
+    """Initial states of the untrained network."""
+    seed: int
+    """Of the first reservoir."""
+
+
+def _networks(time: str, name: str, one: Subject, seeds: Sequence[int] = (0,)) -> list[Features]:
+    made = {"model": name, "time": time}
+    return [network(one.rollout, one.grid, one.calibration, seed=seed, **made) for seed in seeds]
+
+
+def grid(one: Subject) -> Features:
+    """Return the networks' input [T, B, 6·35], averaged over the sub-steps."""
+    felt = one.grid(one.rollout.taxels.mean(2, keepdim=True).flatten(0, 1))
+    return felt.flatten(1).unflatten(0, one.rollout.taxels.shape[:2])
+
+
+def _with_traces(features: Callable[[Subject], Features]) -> Callable[[Subject], list[Features]]:
+    return lambda one: [traces(features(one), one.rollout.begun)]
+
+
+ARMS: Mapping[str, Callable[[Subject], list[Features]]] = {
+    "none": lambda one: [one.rollout.proprio[..., :0]],
+    "none, memory": _with_traces(lambda one: one.rollout.proprio),
+    "bits": lambda one: [bits(one.rollout, one.links)],
+    "bits, memory": _with_traces(lambda one: bits(one.rollout, one.links)),
+    "force": lambda one: [force(one.rollout)],
+    "force, memory": _with_traces(lambda one: force(one.rollout)),
+    "taxels": lambda one: [raw(one.rollout)],
+    "taxels, memory": _with_traces(lambda one: raw(one.rollout)),
+    "grid, memory": _with_traces(grid),
+    "reservoir": lambda one: [
+        reservoir(one.rollout, one.grid, one.calibration, seed=one.seed + draw) for draw in range(one.reservoirs)
+    ],
+    "untrained": lambda one: _networks("native", NETWORK, one, range(one.untrained)),
+    "simclr": lambda one: _networks("native", f"{NETWORK}.simclr", one),
+    "supervised": lambda one: _networks("native", f"{NETWORK}.supervised", one),
+    "untrained, 45 ms": lambda one: _networks("resampled", NETWORK, one, range(one.untrained)),
+    "simclr, 45 ms": lambda one: _networks("resampled", f"{NETWORK}.simclr", one),
+    "supervised, 45 ms": lambda one: _networks("resampled", f"{NETWORK}.supervised", one),
+}
+"""Arm → its features, once for each draw; every arm has the joints beside them. ``none`` feels nothing, ``bits`` has
+one bit per link, ``force`` and ``taxels`` every taxel's force, and force with torque; ``memory`` adds two leaky
+averages. ``grid`` is the input of the networks. ``45 ms``: at the pace of training, else a step per control step."""

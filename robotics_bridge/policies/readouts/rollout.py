@@ -1,0 +1,84 @@
+"""One rollout of a policy, which serves every arm of a probe.
+
+Letters: T control step, B environment, S sub-step, N taxel.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from brainbench.core.errors import UsageError
+from robotics_bridge.envs.env import Env
+from robotics_bridge.policies.evaluate import Acting
+
+TARGETS = ("position", "velocity", "spin", "contact")
+"""Object (m, m/s, rad/s), and the centre of the contact forces on it (m), [3] each, world axes."""
+_SETTLING = 10
+"""Control steps after an episode's start that are left out: the object falls onto the palm."""
+
+
+@dataclass(frozen=True, eq=False)
+class TouchRollout:
+    """What a policy did and felt."""
+
+    proprio: torch.Tensor
+    """[T, B, n]."""
+    taxels: torch.Tensor
+    """[T, B, S, N, 6] (N, N·m)."""
+    begun: torch.Tensor
+    """[T, B] bool: first step of an episode."""
+    targets: Mapping[str, torch.Tensor]
+    """Name → [T, B, 3]; NaN where undefined."""
+    valid: torch.Tensor
+    """[T, B] bool: past the settling of its episode."""
+
+
+@torch.no_grad()
+def collect(env: Env, policy: Acting, seconds: float) -> TouchRollout:
+    """Run a policy and return what it felt, and what is to be read from it.
+
+    Raises:
+        UsageError: the environment has no force and torque on its taxels.
+    """
+    if env.options.observe != "force_torque" or env.touch is None:
+        raise UsageError("A probe reads force and torque: make the environment with observe='force_torque'.")
+    # Episodes begin at different times, so that no step holds only beginnings.
+    observations = env.reset()
+    age = torch.zeros(env.num_envs, dtype=torch.long, device=env.device)
+    kept: dict[str, list[torch.Tensor]] = {}
+    for _ in range(round(seconds / env.step_dt)):
+        velocity, spin = env.state.target_velocity
+        row = {"proprio": observations["proprio"], "taxels": observations["tactile"], "begun": age == 0}
+        row |= {"position": env.state.target_pose[:, :3], "velocity": velocity, "spin": spin}
+        row |= {"contact": _centre(env, age), "valid": age >= _SETTLING}
+        for name, value in row.items():
+            kept.setdefault(name, []).append(value.clone())
+        observations, _, terminated, truncated, _ = env.step(policy(observations))
+        done = terminated | truncated
+        if (forget := getattr(policy, "reset", None)) is not None:
+            forget(done)
+        age = torch.where(done, 0, age + 1)
+    stacked = {name: torch.stack(rows) for name, rows in kept.items()}
+    targets = {name: stacked.pop(name) for name in TARGETS}
+    return TouchRollout(targets=targets, **stacked)
+
+
+def _centre(env: Env, age: torch.Tensor) -> torch.Tensor:
+    """Return the centre [B, 3] of the contact forces on the object in the last physics step, NaN without contact."""
+    state, scene = env.simulation.state, env.simulation.engine.scene
+    count = min(int(state.contact_count.numpy()[0]), state.contact_env.shape[0])
+    names = ("env", "geom", "position", "force")
+    row, geometries, position, force = (getattr(state, f"contact_{name}").numpy()[:count] for name in names)
+    link = scene.link_index(env.state.model.objects[0])
+    mine = (np.asarray(scene.link_of)[geometries] == link).any(axis=1) & (force > 0)
+    sums, total = np.zeros((env.num_envs, 3)), np.zeros(env.num_envs)
+    np.add.at(sums, row[mine], position[mine] * force[mine, None])
+    np.add.at(total, row[mine], force[mine])
+    with np.errstate(invalid="ignore"):
+        centre = torch.as_tensor(sums / np.where(total > 0, total, np.nan)[:, None], dtype=torch.float32)
+    # What an ended episode touched last is no contact of the next one.
+    return torch.where((age == 0)[:, None], torch.nan, centre.to(age.device))

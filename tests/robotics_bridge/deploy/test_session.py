@@ -1,0 +1,114 @@
+"""What a deployed policy may read: what a hand measures or is told, and no other group of the simulation."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from brainbench.core.errors import UsageError
+from robotics_bridge import tasks
+from robotics_bridge.deploy.controller import Clock
+from robotics_bridge.deploy.driver import HandReading, LinkCounters
+from robotics_bridge.deploy.session import DeployedPolicy, read_deployed
+from robotics_bridge.policies.contract import PolicyContract
+from robotics_bridge.policies.evaluate import Policy
+from robotics_bridge.policies.export import export_policy
+from robotics_bridge.policies.schema import Values
+from robotics_bridge.policies.training.distill import describe_run
+from robotics_bridge.policies.training.distill_config import DistillConfig
+from robotics_bridge.policies.training.student_files import build_student
+from robotics_bridge.tasks.task import ObservationNoise
+from tests.factories.policies import contract_of
+
+
+def _deployed(group: str, size: int = 1, **deployment: Any) -> DeployedPolicy:
+    contract = contract_of()
+    contract["inputs"][1] = [group, [size]]
+    contract["deployment"] |= {"hand": "xhand1", **deployment}
+    return DeployedPolicy(Path("policy.onnx"), PolicyContract.of(Values("policy.onnx.json", contract)))
+
+
+@pytest.mark.parametrize("group", ["priv_obj_state", "priv_proprio", "aux_goal_dist", "aux_obj_size"])
+def test_no_constant_stands_for_what_only_the_simulation_knows(group: str) -> None:
+    with pytest.raises(UsageError, match=f"'{group}', which only the simulation knows"):
+        _deployed(group).require({group, "tactile"})
+
+
+def test_a_command_that_the_contract_states_needs_no_word_of_the_user() -> None:
+    assert "command" not in _deployed("command", command=[1.0]).require({"tactile"})
+    with pytest.raises(UsageError, match=r"command \(\[4\], what the hand is told"):
+        _deployed("command", 4).require({"tactile"})
+
+
+def test_the_goal_of_earlier_students_is_named_for_what_it_was() -> None:
+    with pytest.raises(UsageError, match="angle to the goal, which changed with every step"):
+        _deployed("goal").require({"tactile"})
+    assert next(iter(_deployed("goal").require({"goal", "tactile"}))) == "goal"
+
+
+class _OwnClock(Clock):
+    def __init__(self) -> None:
+        self.now = 0.0
+
+    def __call__(self) -> float:
+        return self.now
+
+    def sleep(self, seconds: float) -> None:
+        self.now += seconds
+
+
+class _TaskHand:
+    """A hand that is the task itself: each command is held against what evaluation does in the same state."""
+
+    def __init__(self, env: Any, policy: Policy, clock: Clock) -> None:
+        self.env, self.policy, self.clock, self.counters = env, policy, clock, LinkCounters()
+        self.joints, self.fingers = env.joint_names, tuple(env.hand.fingers)
+        self.number = 0
+        self.pairs: list[tuple[np.ndarray, np.ndarray]] = []
+        self.largest = 0.0
+
+    def read(self) -> HandReading:
+        self.number += 1
+        columns, state = self.env.state.actuators, self.env.simulation
+        position, velocity = state.qpos[0, columns.qpos_columns], state.qvel[0, columns.qvel_columns]
+        pressure = np.zeros((len(self.fingers), 3))
+        now = self.clock()
+        return HandReading(self.number, now, now, position.double().numpy(), velocity.double().numpy(), pressure)
+
+    def send(self, targets: np.ndarray) -> None:
+        self.env.step(self.policy(self.env.observations))
+        self.largest = max(self.largest, float(self.env.state.episode.action.abs().max()))
+        self.pairs.append((np.array(targets), self.env.state.actuators.target[0].numpy().copy()))
+
+    def stop(self) -> None: ...
+
+    def close(self) -> None: ...
+
+
+def test_a_deployed_policy_sees_and_does_what_evaluation_does(tmp_path: Path) -> None:
+    task = replace(tasks.load("in_palm_rotate"), noise=ObservationNoise(position=0.0, velocity=0.0))
+    env = tasks.make(task, num_envs=1, threads=1, seed=2)
+    config = DistillConfig(task="in_palm_rotate", observe="none", embedder="lstm", hidden=(16,), num_envs=1)
+    with torch.random.fork_rng():
+        torch.manual_seed(3)
+        student = build_student(config, env.observation_shapes, ["proprio", "command"], env.num_actions).eval()
+        # Actions beyond the limit: deployed, they must be bounded and remembered as in the task.
+        student.mlp[-1].weight.data *= 200.0  # type: ignore[index]
+    described = describe_run(config, student, env)
+    found = export_policy(student, tmp_path / "policy", deployment=described["deployment"])
+    clock = _OwnClock()
+    hand = _TaskHand(env, Policy(student), clock)
+    limits = {"margin": 1.0, "pressure": 1000.0}
+    controller = read_deployed(found.path).controller(hand, limits=limits, clock=clock)
+    controller.limits = replace(controller.limits, speed=np.full(len(hand.joints), 1e6))
+    report = controller.run(0.5)
+    assert (report.status, report.ticks) == ("finished", 20)
+    sent, wanted = (np.array(part) for part in zip(*hand.pairs, strict=True))
+    assert np.ptp(wanted, axis=0).max() > 0.1
+    assert hand.largest == pytest.approx(task.action_limit)
+    np.testing.assert_allclose(sent, wanted, atol=2e-4)

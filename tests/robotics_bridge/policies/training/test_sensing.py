@@ -1,0 +1,88 @@
+"""Policies that train on what a hand has: recurrent PPO, and a student's folder at its end."""
+
+from __future__ import annotations
+
+import csv
+import json
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+import torch
+
+from brainbench.core.errors import MissingDependencyError, UsageError
+from robotics_bridge import tasks
+from robotics_bridge.envs import Env
+from robotics_bridge.policies.evaluate import Policy, evaluate
+from robotics_bridge.policies.training.loggers import Loggers
+from robotics_bridge.policies.training.sensing import POLICY
+from robotics_bridge.policies.training.student_files import load_student
+from robotics_bridge.policies.training.teacher import TeacherRun, train
+
+
+def _env(observe: str = "agg_bool") -> Env:
+    task = tasks.load("in_palm_rotate")
+    return tasks.make(task, num_envs=4, observe=observe, placement="tips", threads=1)
+
+
+def _run(folder: Path, iterations: int, **options: object) -> dict[str, torch.Tensor]:
+    made = TeacherRun(iterations=iterations, save_every=2, observe=("proprio", "touch", "command"), **options)  # type: ignore[arg-type]
+    train(_env(), folder, made)
+    student, _ = load_student(folder / POLICY)
+    return student.state_dict()
+
+
+def test_a_policy_of_joints_and_touch_learns_goes_on_and_acts_as_a_student(tmp_path: Path) -> None:
+    whole = _run(tmp_path / "whole", 4, loggers=("csv",))
+    _run(tmp_path / "parts", 2)
+    parts = _run(tmp_path / "parts", 4)
+    for name, value in whole.items():
+        torch.testing.assert_close(parts[name], value, rtol=0, atol=0, msg=name)
+    student, described = load_student(tmp_path / "whole" / POLICY)
+    assert [name for name, _ in described["groups"]] == ["proprio", "command", "tactile"]
+    assert described["deployment"]["command"] == [1.0]
+    # Memory: the same observation is answered otherwise after another past.
+    env = _env()
+    policy, first = Policy(student), env.observations
+    one = policy(first)
+    assert not torch.equal(one, policy(first))
+    assert len(evaluate(env, policy, episodes=4, seed=0).success) == 4
+    with (tmp_path / "whole" / "log.csv").open(encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    logged = [json.loads(line) for line in (tmp_path / "whole" / "log.jsonl").read_text().splitlines()]
+    assert [float(row["reward"]) for row in rows] == [row["reward"] for row in logged]
+    assert not list((tmp_path / "whole").glob("events*"))
+
+
+def test_what_a_hand_has_not_is_refused_before_anything_is_trained(tmp_path: Path) -> None:
+    refused = [("tuch", "did you mean 'touch'"), ("goal", "'goal', which only"), ("priv_proprio", "'priv_proprio'")]
+    for name, culprit in refused:
+        with pytest.raises(UsageError, match=culprit):
+            TeacherRun(observe=("proprio", name))
+    with pytest.raises(UsageError, match="gives no 'thermal'"):
+        train(_env(), tmp_path, TeacherRun(observe=("proprio", "thermal"), iterations=1))
+    with pytest.raises(UsageError, match="gives no 'tactile'"):
+        train(_env("none"), tmp_path, TeacherRun(observe=("proprio", "touch"), iterations=1))
+
+
+def test_weights_and_biases_stays_offline(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    said: list[tuple[object, ...]] = []
+    run = SimpleNamespace(
+        log=lambda row, step: said.append((step, row["reward"])), finish=lambda: said.append(("end",))
+    )
+    module = SimpleNamespace(init=lambda **given: said.append((given["mode"], given["config"]["task"])) or run)
+    monkeypatch.setitem(sys.modules, "wandb", module)
+    monkeypatch.setattr("robotics_bridge.policies.training.loggers.find_spec", lambda name: name)
+    loggers = Loggers(tmp_path, ("wandb",), {"task": "t"})
+    loggers.write({"reward": 0.5}, 3)
+    loggers.close()
+    assert said == [("offline", "t"), (3, 0.5), ("end",)]
+
+
+def test_loggers_are_known_and_installed(monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(UsageError, match="did you mean 'tensorboard'"):
+        TeacherRun(loggers=("tensorbord",))
+    monkeypatch.setattr("robotics_bridge.policies.training.loggers.find_spec", lambda name: None)
+    with pytest.raises(MissingDependencyError, match="pip install wandb"):
+        TeacherRun(loggers=("wandb",))
