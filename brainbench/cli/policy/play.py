@@ -64,8 +64,8 @@ def list_tasks(as_json: JsonOption = False) -> None:
         "student sees": lambda item: ", ".join(item["student"]),
     }
     shipped = [(name, row["task"], row["unmeasured"].get(name, ())) for row in found for name in row["shipped"]]
-    columns = {"trained policy": "{0[0]}", "task": "{0[1]}", "reads what no hand measures": lambda one: ", ".join(one[2])}
-    trained = table_of("", shipped, columns)
+    told = {"trained policy": "{0[0]}", "task": "{0[1]}", "reads what no hand measures": lambda row: ", ".join(row[2])}
+    trained = table_of("", shipped, told)
     emit(found, f"{table_of('', found, columns)}\n\n{trained}", as_json=as_json)
 
 
