@@ -25,6 +25,7 @@ from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.engines.job_schedule import plan
 from brainbench.stimuli.engines.protocol import Trace, WhiskerEngine
 from brainbench.stimuli.explain import ATTRIBUTE, SECONDS, explain
+from brainbench.stimuli.kept_sets import find_entry
 from brainbench.stimuli.readout import ORIENTATION, turn
 from brainbench.stimuli.scenes.frames import clip_wrenches
 from brainbench.stimuli.scenes.scene import Scene
@@ -53,7 +54,8 @@ def simulate(
         fidelity: how finely; a preset's name or a :class:`Fidelity`; ``balanced`` when None.
         backend: an engine's name, or any :class:`brainbench.stimuli.engines.protocol.WhiskerEngine` (never cached).
         progress: called as ``progress(done, total, what)`` after each simulated whisker.
-        cache: read and keep results under ``brainbench.core.files.cache_dir("stimuli")``.
+        cache: read what the package ships, and read and keep results under
+            ``brainbench.core.files.cache_dir("stimuli")``.
 
     Returns:
         The data set of :func:`brainbench.core.contracts.check_stimulus_set`: ``wrench`` [stimulus, time, whisker,
@@ -88,16 +90,17 @@ def simulate(
 
 
 def read_entry(path: Path) -> xr.Dataset | None:
-    """Return a stimulus set that the cache keeps; None without one, or with a damaged one."""
-    if not path.exists():
-        return None
-    try:
-        state = path.stat()
-        # A score asks for its stimuli twice, for the demo recordings and for the network.
-        return _read_entry(path, state.st_size, state.st_mtime_ns).copy(deep=True)
-    except DataError as error:
-        _LOG.warning("cached stimuli are damaged and are simulated again: %s", error)
-        return None
+    """Return a stimulus set that the package or the cache keeps; None without one, or with a damaged one."""
+    for file in dict.fromkeys((find_entry(path), path)):
+        if file is None or not file.exists():
+            continue
+        try:
+            state = file.stat()
+            # A score asks for its stimuli twice, for the demo recordings and for the network.
+            return _read_entry(file, state.st_size, state.st_mtime_ns).copy(deep=True)
+        except DataError as error:
+            _LOG.warning("stored stimuli are damaged and are simulated again: %s", error)
+    return None
 
 
 @functools.lru_cache(maxsize=1)
@@ -124,7 +127,7 @@ def prepare(
     chosen = list(scenes)
     engine = get_engine(backend)
     fidelity = _resolved(fidelity, chosen, engine)
-    if not cache_path(chosen, fidelity, engine).exists():
+    if find_entry(cache_path(chosen, fidelity, engine)) is None:
         _begin(engine, chosen, fidelity, progress)
 
 

@@ -22,7 +22,7 @@ from brainbench.core.reading.regular import readable
 from brainbench.core.reading.texts import read_toml
 from brainbench.stimuli.engines import DEFAULT_ENGINE
 from brainbench.stimuli.engines.fidelity import Fidelity
-from brainbench.stimuli.kept_sets import index_path, read_index, write_index
+from brainbench.stimuli.kept_sets import find_kept, index_path, write_index
 from brainbench.stimuli.readout import to_grid
 from brainbench.stimuli.scenes.recipes import get_recipe, is_packaged, is_recipe, list_recipes, recipe_file
 from brainbench.stimuli.stimulus_set import hash_stimulus_set, read_stimulus_set
@@ -89,15 +89,15 @@ def load_stimuli(
     if not isinstance(source, (str, os.PathLike)):
         return _from_dataset(check_stimulus_set(source), whiskers, "stimulus set")
     kept = cache and isinstance(backend, str) and is_packaged(source)
-    index = index_path(source, whiskers, Fidelity.of(fidelity), backend) if kept else None
-    if index is not None and (found := _indexed(index)) is not None:
+    if kept and (found := _kept(source, whiskers, Fidelity.of(fidelity), backend)) is not None:
         return found
     if (recipe := _recipe(source, whiskers)) is not None:
         from brainbench.stimuli.simulation import ENTRY, simulate
 
         dataset = simulate(recipe.scenes, fidelity=fidelity, backend=backend, progress=progress, cache=cache)
         description = recipe.description.strip() or recipe.name
-        if index is not None and ENTRY in dataset.encoding:
+        if kept and ENTRY in dataset.encoding:
+            index = index_path(source, whiskers, Fidelity.of(fidelity), backend)
             write_index(index, dataset.encoding[ENTRY], description)
         return _from_dataset(dataset, "all", description)
     path = Path(source)
@@ -131,18 +131,17 @@ def prepare_stimuli(
     from brainbench.stimuli.simulation import prepare
 
     with contextlib.suppress(BrainbenchError, OSError):
-        index = index_path(source, whiskers, Fidelity.of(fidelity), DEFAULT_ENGINE)
-        if is_packaged(source) and read_index(index) is not None:
+        if is_packaged(source) and find_kept(source, whiskers, Fidelity.of(fidelity), DEFAULT_ENGINE) is not None:
             return
         if isinstance(source, (str, os.PathLike)) and (recipe := _recipe(source, whiskers)) is not None:
             prepare(recipe.scenes, fidelity=fidelity, progress=progress)
 
 
-def _indexed(index: Path) -> Stimuli | None:
-    """Return the stimuli that an index of the cache leads to; None without them."""
+def _kept(source: str, whiskers: str, fidelity: Fidelity, backend: str) -> Stimuli | None:
+    """Return stimuli that the package or the cache keeps; None without them."""
     from brainbench.stimuli.simulation import read_entry
 
-    found = read_index(index)
+    found = find_kept(source, whiskers, fidelity, backend)
     dataset = None if found is None else read_entry(found[0])
     return None if found is None or dataset is None else _from_dataset(dataset, "all", found[1])
 
