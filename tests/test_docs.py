@@ -52,6 +52,11 @@ PAGES = sorted(str(path.relative_to(ROOT)) for path in (ROOT / "docs").glob("*.m
 
 
 FRONT = ("README.md", "CONTRIBUTING.md", "RELEASING.md")
+OTHERS = (
+    ".github/pull_request_template.md", "CHANGELOG.md", "SECURITY.md", "benchmarks/README.md", "benchmarks/RESULTS.md",
+    "leaderboards/policies/README.md", "leaderboards/results/README.md",
+    *sorted(str(path.relative_to(ROOT)) for path in (ROOT / "docs" / "notebooks" / "sources").glob("*.md")),
+)  # fmt: skip
 
 
 def _slugs(page: Path) -> set[str]:
@@ -65,17 +70,27 @@ def _slugs(page: Path) -> set[str]:
     return slugs
 
 
-@pytest.mark.parametrize("page", [*FRONT, *PAGES])
+@pytest.mark.parametrize("page", [*FRONT, *PAGES, *OTHERS])
 def test_links_lead_to_files_and_headings_of_the_repository(page: str):
-    text = re.sub(r"```.*?```", "", (ROOT / page).read_text(encoding="utf-8"), flags=re.DOTALL)
+    text = re.sub(r"```.*?```|`[^`\n]*`", "", (ROOT / page).read_text(encoding="utf-8"), flags=re.DOTALL)
+    # The cells of a notebook stand where the notebook is written.
+    folder = ROOT / "docs" / "notebooks" if "/sources/" in page else (ROOT / page).parent
     for target, anchor in re.findall(r"\]\(([^)#:]*)(?:#([^)]*))?\)", text):
-        path = ((ROOT / page).parent / target) if target else ROOT / page
+        path = (folder / target) if target else ROOT / page
         assert path.exists(), f"{page} links to {target}, which does not exist"
         if anchor and path.suffix == ".md":
             assert anchor in _slugs(path), f"{page} links to {target}#{anchor}; its headings are {sorted(_slugs(path))}"
 
 
-@pytest.mark.parametrize("page", ["README.md", *PAGES])
+@pytest.mark.parametrize("page", [*FRONT, *PAGES])
+def test_a_page_needs_no_renderer_of_its_own(page: str):
+    text = re.sub(r"```.*?```|`[^`\n]*`", "", (ROOT / page).read_text(encoding="utf-8"), flags=re.DOTALL)
+    # Admonitions, tabs, attributes, generated documentation and snippets of mkdocs are plain characters elsewhere.
+    alien = re.findall(r"^(?:!!!|\?\?\?|===|:::).*|\{[:#.][^}]*\}|--8<--|\[\[.*?\]\]", text, flags=re.MULTILINE)
+    assert not alien, f"{page}: only the site renders {alien[0]!r}"
+
+
+@pytest.mark.parametrize("page", [*FRONT, *PAGES, *(page for page in OTHERS if page != "CHANGELOG.md")])
 def test_commands_and_options_of_a_page_exist(page: str):
     import typer
 

@@ -28,7 +28,7 @@ VIEWS = {
     "report-phone": ("REPORT", 390, 844, "light"),
 }
 """View → page, width, height and colours."""
-KEPT = ("table", "dark", "phone", "model", "figures", "report")
+KEPT = ("table", "model", "report")
 """Views whose picture is written; the others are only checked."""
 
 

@@ -30,9 +30,10 @@ def __getattr__(name: str) -> Any:
 
 def main() -> None:
     """Entry point: run a command and turn our own errors into one line and an exit status."""
-    # Idle threads of OpenMP and of numpy's BLAS would otherwise spin and slow each other down on a busy machine.
+    # The products of a score are small: threads of numpy's BLAS mostly wait for one another, and spin while they do
+    # (six times the processor time for --metric cka, where other work keeps the processors busy). Torch has its own.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
-    os.environ.setdefault("OPENBLAS_THREAD_TIMEOUT", "4")
     try:
         _run()
     except KeyboardInterrupt:

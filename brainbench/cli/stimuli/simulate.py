@@ -26,7 +26,7 @@ def simulate(
     explain: Annotated[
         bool, typer.Option("--explain", help="Tell what was simulated, shared and left out, and what that saved.")
     ] = False,
-    cache: Annotated[bool, typer.Option("--cache/--no-cache", help="Read and keep results in the cache.")] = True,
+    cache: Annotated[bool, typer.Option("--cache/--no-cache", help="Read kept results and keep new ones.")] = True,
     as_json: JsonOption = False,
 ) -> None:
     """Simulate a recipe or a scene file and report which whiskers touched what, and how hard."""

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
-from brainbench.core.figures.style import COLORS, panels, save_figure
+from brainbench.core.figures.style import COLORS, panels, plain_log_ticks, save_figure
 from brainbench.stimuli.tradeoff import ERROR, collision_points, front, preset_of
 
 
@@ -37,9 +37,9 @@ def _draw_bench(axes: Any, points: Sequence[dict[str, Any]], colour: str) -> Non
     axes.step([p.cost for p in best], [p.error for p in best], "o-", **line)
     for point in points:
         if name := preset_of(point):
-            place, box = (point["cost"], point[ERROR]), {"facecolor": "white", "alpha": 0.8, "lw": 0, "pad": 0.5}
+            place, box = (point["cost"], point[ERROR]), {"facecolor": "white", "alpha": 0.6, "lw": 0, "pad": 0}
             axes.plot(*place, "o", ms=8, mfc="none", mec=colour)
-            shift = {"xytext": (0, 8), "textcoords": "offset points", "ha": "center"}
+            shift = {"xytext": (6, 5), "textcoords": "offset points", "ha": "left"}
             axes.annotate(name, place, color=colour, fontsize=8.5, bbox=box, **shift)
 
 
@@ -62,5 +62,6 @@ def _draw_collisions(axes: Any, points: Sequence[dict[str, Any]]) -> None:
 def _label(axes: Any, title: str, error: str) -> None:
     axes.set(xscale="log", yscale="log", title=title, ylabel=error)
     axes.set_xlabel("processor time per second of one whisker (s/s)")
+    plain_log_ticks(axes)
     axes.margins(x=0.12, y=0.12)
     axes.legend(frameon=False, fontsize=8.5, loc="upper center", bbox_to_anchor=(0.5, -0.15), ncol=2)

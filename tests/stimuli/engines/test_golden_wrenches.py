@@ -11,7 +11,8 @@ from tests.factories.golden_wrenches import GOLDEN, SETTINGS, current_wrenches
 ADVICE = (
     "The engines give other numbers than before. If that is meant, raise brainbench.stimuli.engines.PHYSICS_VERSION, "
     "so that no cached simulation of the old physics is taken for the new one, and write these numbers again with "
-    "'python -m tests.factories.golden_wrenches'; if not, the change has a fault."
+    "'python -m tests.factories.golden_wrenches', and the package's stimuli with 'python -m "
+    "tests.factories.shipped_stimuli'; if not, the change has a fault."
 )
 KEPT = json.loads(GOLDEN.read_text(encoding="utf-8"))
 
