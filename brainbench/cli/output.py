@@ -40,7 +40,7 @@ def spanned(value: float, interval: Interval | None, *, most: float = math.inf) 
 
     Args:
         value: NaN is shown as a dash.
-        interval: Its interval; three significant digits are shown without one.
+        interval: Its interval; two digits are shown without one.
         most: Largest value that can exist, where the interval is cut.
 
     >>> from brainbench.core.records import Interval
@@ -50,7 +50,7 @@ def spanned(value: float, interval: Interval | None, *, most: float = math.inf) 
     if not math.isfinite(value):
         return "–"
     if interval is None or not math.isfinite(interval.high - interval.low):
-        return f"{value:.3g}"
+        return f"{value:.2f}" if abs(value) >= 0.1 else f"{value:.2g}"
     half = (interval.high - interval.low) / 2
     digits = min(max(1 - math.floor(math.log10(half)), 0), 9) if half > 0 else 3
     return f"{value:.{digits}f} [{interval.low:.{digits}f}, {min(interval.high, most):.{digits}f}]"

@@ -82,7 +82,7 @@ def rdm(
     text += "".join(f"\n{line}" for line in left_out(brain.origin))
     if len(labels) <= _LARGEST_SHOWN:
         for item in animals:
-            text += "\n\n" + _matrix(f"RDM of {item.subject}", labels, item.rdm)
+            text += "\n\n" + _matrix(f"RDM of animal {item.subject}", labels, item.rdm)
     emit(data, text, as_json=as_json)
 
 

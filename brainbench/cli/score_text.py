@@ -88,12 +88,12 @@ def _rows(score: Score) -> Iterator[list[str]]:
     """Yield name, number and explanation of each statistic that exists."""
     yield ["status", score.status, "; ".join(score.reasons)]
     if math.isfinite(score.value):
-        limits = f"chance {_number(score.chance)}, attainable {_number(score.attainable)}"
+        limits = f"chance {spanned(score.chance, None)}, attainable {spanned(score.attainable, None)}"
         yield ["value", spanned(score.value, score.interval), f"{score.metric}; {limits}"]
     if math.isfinite(score.r):
         ceiling = score.ceiling
-        shown = f"noise ceiling {_number(ceiling.lower)} to {_number(ceiling.upper)}" if ceiling else "no noise ceiling"
-        yield ["raw r", _number(score.r), shown]
+        shown = f"noise ceiling {spanned(ceiling.lower, None)} to {spanned(ceiling.upper, None)}" if ceiling else "no noise ceiling"
+        yield ["raw r", spanned(score.r, None), shown]
     if math.isfinite(score.reliability):
         reliability = spanned(score.reliability, score.reliability_interval, most=1.0)
         yield ["reliability", reliability, "of the animals' RDMs: split halves, Spearman-Brown, mean"]
@@ -102,7 +102,7 @@ def _rows(score: Score) -> Iterator[list[str]]:
     if score.layer is not None:
         yield ["layer", score.layer, score.layer_rule]
     if score.best_layer is not None:
-        yield ["best layer", _number(score.best_layer_value), f"{score.best_layer}: optimistic maximum, not a result"]
+        yield ["best layer", spanned(score.best_layer_value, None), f"{score.best_layer}: optimistic maximum, not a result"]
     yield ["estimator", score.estimator, "" if math.isfinite(score.value) else score.metric]
 
 
@@ -194,10 +194,6 @@ def _is_known(point: Mapping[str, Any]) -> bool:
 def _scaled(point: Mapping[str, Any]) -> float:
     """Return the score at one time between chance (0) and all that is reliable (1)."""
     return (point["value"] - point["chance"]) / (1 - point["chance"])
-
-
-def _number(value: float) -> str:
-    return f"{value:.3g}" if math.isfinite(value) else "–"
 
 
 def _p(value: float) -> str:

@@ -86,7 +86,7 @@ def gather(metric: Metric, subjects: Sequence[SubjectRDM], stimuli: int, *, esti
     scored = good if good and estimator == "default" else usable
     # Whoever is not averaged is named, so no animal disappears in silence.
     left_out = [i for i in range(len(ordered)) if i not in scored]
-    reasons = [f"{names[i]} left out: {corrections[i].reason}" for i in left_out]
+    reasons = [f"animal {names[i]} left out: {corrections[i].reason}" for i in left_out]
     reliable = bool(scored) and all(corrections[i].status == "ok" for i in scored)
     if scored and not reliable:
         reasons += [f"{names[i]}: {corrections[i].reason}" for i in scored if corrections[i].status != "ok"]

@@ -144,5 +144,5 @@ def test_an_animal_lacking_a_stimulus_is_named_and_one_animal_has_no_interval():
     whole = subject_rdm("a", [make_block(latent)], 6, stimuli=STIMULI, splits=50)
     score = _score(whole, lacking)
     assert score.interval is None
-    assert "b left out: no trials of 'concave-medium'" in score.reasons
+    assert "animal b left out: no trials of 'concave-medium'" in score.reasons
     assert RSA(comparison="pearson").score_animals([whole, lacking], stimuli=STIMULI).status == "undefined"

@@ -163,7 +163,7 @@ def test_unreliable_animals_do_not_vote_and_are_named():
     assert score.value == pytest.approx(without.value, abs=1e-15)
     assert score.p == without.p
     assert score.status == "ok"
-    assert "z left out: reliability 0.30 is below 0.5, where no noise correction is trustworthy" in score.reasons
+    assert "animal z left out: reliability 0.30 is below 0.5, where no noise correction is trustworthy" in score.reasons
     last = score.subjects[-1]
     assert (last.subject, last.status) == ("z", "unreliable")
     assert math.isfinite(last.value)
@@ -183,11 +183,11 @@ def test_animals_without_a_stimulus_are_left_out_in_words():
     lacking = subject_rdm("a0", [make_block(latent, gap=(2,))], 6, stimuli=STIMULI)
     score = _score(_make_layers(latent), [lacking, *_make_animals(latent, 3)])
     assert score.status == "ok"
-    assert "a0 left out: no trials of 'convex-far'" in score.reasons
+    assert "animal a0 left out: no trials of 'convex-far'" in score.reasons
     assert score.subjects[0].status == "undefined"
     alone = _score(_make_layers(latent), [lacking])
     assert alone.status == "undefined"
-    assert alone.reasons == ("no animal can be used", "a0 left out: no trials of 'convex-far'")
+    assert alone.reasons == ("no animal can be used", "animal a0 left out: no trials of 'convex-far'")
     assert math.isnan(alone.value)
     assert alone.p_smallest == pytest.approx(1 / 720)
 

@@ -130,7 +130,7 @@ def _check_file(
             yield Finding("note", "file", message, where=path.name)
             return
         for session, found in each_session(file, path, layout):
-            names.append(f"{session.subject} / {session.session}")
+            names.append(session.subject + f" / {session.session}" * (session.session != session.subject))
             for finding in check_session(session, found, conditions):
                 yield replace(finding, where=names[-1])
 
@@ -139,12 +139,13 @@ def check_session(
     session: Session, layout: RecordingLayout | None = None, conditions: Conditions | None = None
 ) -> Iterator[Finding]:
     """Yield the findings about one session, which must still be open."""
+    if not has_units(session) or session.units is None:
+        # Nothing else matters of a file that scores skip.
+        yield Finding("error", "units", no_units(session))
+        return
     conditions = conditions or (layout.conditions if layout else None)
     yield from check_tables(session)
     yield from check_labels(session, layout, conditions)
-    if not has_units(session) or session.units is None:
-        yield Finding("error", "units", no_units(session))
-        return
     notes: list[str] = []
     try:
         spikes = read_spikes(session.units, notes)

@@ -195,7 +195,7 @@ def test_what_cannot_be_scored_is_undefined_or_unreliable_in_words():
     assert (flat.status, flat.reasons[0]) == ("undefined", "activations of every layer are constant or not finite")
     lacking = metric.animal("z", [make_block(latent, gap=(2,))], 6, stimuli=STIMULI)
     found = _score(metric, {"a": latent, "b": np.ones((6, 4))}, [*animals, lacking])
-    assert "z left out: no trials of 'convex-far'" in found.reasons
+    assert "animal z left out: no trials of 'convex-far'" in found.reasons
     assert [layer.status for layer in found.layers] == ["ok", "undefined"]
     alone = _score(metric, {"a": latent}, [lacking])
     assert alone.reasons[0] == "no animal can be used"
