@@ -82,7 +82,10 @@ EXTRAS: dict[str, tuple[Requirement, ...]] = {
     ),
     "tradeoff whisker": (_PLOT,),
     "tradeoff tactile": (_PLOT,),
-    "tactile demo": (Requirement(("matplotlib",), "report", "Drawing pictures"),),
+    "tactile demo": (
+        Requirement(("matplotlib",), "report", "Drawing pictures"),
+        Requirement(("skfem",), "tactile", "The sound of a struck ball"),
+    ),
 }  # fmt: skip
 
 CACHED = (
@@ -110,10 +113,15 @@ def check_requirements(command: str, values: Mapping[str, Any]) -> None:
         MissingDependencyError: a package of an extra is not installed.
         FileWriteError: the cache cannot be made or written.
     """
-    for item in EXTRAS.get(command, ()):
-        for module in item.packages if item.when(values) else ():
-            if find_spec(module) is None:
-                raise missing_dependency(DISTRIBUTIONS.get(module, module), extra=item.extra, purpose=item.purpose)
+    lacking = {
+        DISTRIBUTIONS.get(module, module): item
+        for item in EXTRAS.get(command, ())
+        for module in (item.packages if item.when(values) else ())
+        if find_spec(module) is None
+    }
+    if lacking:
+        extras = ",".join(dict.fromkeys(item.extra for item in lacking.values()))
+        raise missing_dependency(*lacking, extra=extras, purpose=next(iter(lacking.values())).purpose)
     if command in CACHED:
         check_cache()
 

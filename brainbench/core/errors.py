@@ -115,9 +115,11 @@ def install_command(extra: str) -> str:
     return f"pip install -c constraints.txt '.[{extra}]'"
 
 
-def missing_dependency(package: str, *, extra: str, purpose: str) -> MissingDependencyError:
-    """Build the error for an optional package, naming the extra that installs it."""
+def missing_dependency(*packages: str, extra: str, purpose: str) -> MissingDependencyError:
+    """Build the error for optional packages, naming the extra, or extras with commas between, that installs them."""
+    names = ", ".join(map(repr, packages))
+    words = ("packages", "are", "them") if len(packages) > 1 else ("package", "is", "it")
     return MissingDependencyError(
-        f"{purpose} needs the package {package!r}, which is not installed; "
-        f"install it, in the checkout of brainbench, with: {install_command(extra)}"
+        f"{purpose} needs the {words[0]} {names}, which {words[1]} not installed; "
+        f"install {words[2]}, in the checkout of brainbench, with: {install_command(extra)}"
     )

@@ -52,12 +52,13 @@ def list_tasks(as_json: JsonOption = False) -> None:
     columns = {
         "task": "{0[task]}",
         "what to do": "{0[text]}",
-        "s": "{0[seconds]:g}",
+        ">episode, s": "{0[seconds]:g}",
         "success": "{0[metric]} ≥ {0[success_from]:.3g}",
         "student sees": lambda item: ", ".join(item["student"]),
-        "trained": lambda item: ", ".join(item["shipped"]),
     }
-    emit(found, table_of("", found, columns), as_json=as_json)
+    shipped = [(name, row["task"]) for row in found for name in row["shipped"]]
+    trained = table_of("", shipped, {"trained policy": "{0[0]}", "task": "{0[1]}"})
+    emit(found, f"{table_of('', found, columns)}\n\n{trained}", as_json=as_json)
 
 
 @with_options(ENV, (*TOUCH, "device", "seed"), build=False)
