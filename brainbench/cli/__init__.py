@@ -38,11 +38,13 @@ def main() -> None:
         _run()
     except KeyboardInterrupt:
         _say_interrupted()
+        _leave()
         sys.exit(INTERRUPTED)
     except SystemExit as stop:
         # typer turns Ctrl-C into this status, without a word.
         if stop.code == INTERRUPTED:
             _say_interrupted()
+            _leave()
         raise
     except BrokenPipeError:
         # The reader (head, less) has gone; Python would otherwise complain again at shutdown.
@@ -65,3 +67,15 @@ def _run() -> None:
 
 def _say_interrupted() -> None:
     print(f"\nbrainbench: {GO_ON}", file=sys.stderr)
+
+
+def _leave() -> None:
+    """End at once if a compiler runs in a thread: it cannot be stopped, and Python would wait for it for seconds."""
+    import threading
+
+    from brainbench.core.progress import PREPARATION
+
+    if any(thread.name == PREPARATION for thread in threading.enumerate()):
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(INTERRUPTED)

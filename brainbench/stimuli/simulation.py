@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from brainbench.core.contracts import check_stimulus_set
 from brainbench.core.errors import BrainbenchError, DataError, UsageError
 from brainbench.core.files import cache_dir, content_hash, portable, to_json
-from brainbench.core.progress import Progress
+from brainbench.core.progress import PREPARATION, Progress
 from brainbench.core.reading.sealed import seal_file, trust_sealed
 from brainbench.stimuli.engines import DEFAULT_ENGINE, PHYSICS_VERSION, get_engine
 from brainbench.stimuli.engines.fidelity import Fidelity
@@ -143,11 +143,11 @@ def _begin(
     lengths = {mount.whisker.arc_length for scene in scenes for mount in scene.mounts}
 
     def work() -> None:
-        # What is wrong here is wrong again in the simulation, which says so.
-        with contextlib.suppress(BrainbenchError):
+        # What is wrong here is wrong again in the simulation, which says so; a pool is refused once Python ends (Ctrl-C).
+        with contextlib.suppress(BrainbenchError, RuntimeError):
             engine.prepare(lengths, fidelity, progress=progress)
 
-    thread = threading.Thread(target=work, name="brainbench-prepare")
+    thread = threading.Thread(target=work, name=PREPARATION)
     thread.start()
     return thread
 
