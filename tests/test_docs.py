@@ -6,6 +6,7 @@ import re
 import shlex
 import subprocess
 import sys
+from itertools import groupby
 from pathlib import Path
 from typing import Any
 
@@ -150,6 +151,28 @@ def test_the_code_of_a_page_runs_from_top_to_bottom(
         assert names["record"].score.p < 0.05
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("page", ["docs/score.md", "docs/stimuli.md"])
+def test_what_a_page_prints_is_printed(page: str, tmp_path: Path):
+    text = (ROOT / page).read_text(encoding="utf-8")
+    command, (shown, *_) = (
+        _blocks(page, "bash")[0],
+        re.findall(r"```(?:text)?\n(.*?)```", text.split("prints", 1)[1], re.S),
+    )
+    (tmp_path / "poles.toml").write_text("".join(_blocks(page, "toml")))
+    line = next(
+        line
+        for line in command.splitlines()
+        if line.split()[1:3] in (["score", "zhuang-small"], ["stimuli", "simulate"])
+    )
+    done = subprocess.run(
+        [sys.executable, "-m", *shlex.split(line, comments=True)], cwd=tmp_path, capture_output=True, text=True,
+        env={**os.environ, "PYTHONPATH": str(ROOT)}, check=True,
+    )  # fmt: skip
+    printed = {" ".join(line.split()) for line in done.stdout.splitlines()}
+    assert not {" ".join(line.split()) for line in shown.splitlines()} - printed
+
+
 @pytest.fixture
 def registry(monkeypatch: pytest.MonkeyPatch):
     from brainbench import list_models
@@ -195,8 +218,10 @@ def test_a_notebook_runs_and_gives_what_is_shown(name: str, tmp_path: Path, monk
     made = build.make(name, tmp_path)
     for old, new in zip(shown.cells, made.cells, strict=True):
         if new.cell_type == "code":
+            # A line on stderr cuts what is printed into two outputs.
             kinds = [
-                [output.output_type for output in cell.outputs if output.get("name") != "stderr"] for cell in (old, new)
+                [kind for kind, _ in groupby(out.output_type for out in cell.outputs if out.get("name") != "stderr")]
+                for cell in (old, new)
             ]
             assert kinds[0] == kinds[1]
 

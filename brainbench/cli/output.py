@@ -35,7 +35,7 @@ def emit(data: Any, text: str, *, as_json: bool) -> None:
     print(to_json(data) if as_json else text)
 
 
-def spanned(value: float, interval: Interval | None, *, most: float = math.inf) -> str:
+def spanned(value: float, interval: Interval | None = None, *, most: float = math.inf) -> str:
     """Return ``value [low, high]`` with as many digits as the interval carries: two of its half-width.
 
     Args:

@@ -88,12 +88,12 @@ def _rows(score: Score) -> Iterator[list[str]]:
     """Yield name, number and explanation of each statistic that exists."""
     yield ["status", score.status, "; ".join(score.reasons)]
     if math.isfinite(score.value):
-        limits = f"chance {spanned(score.chance, None)}, attainable {spanned(score.attainable, None)}"
+        limits = f"chance {spanned(score.chance)}, attainable {spanned(score.attainable)}"
         yield ["value", spanned(score.value, score.interval), f"{score.metric}; {limits}"]
     if math.isfinite(score.r):
         ceiling = score.ceiling
-        shown = f"noise ceiling {spanned(ceiling.lower, None)} to {spanned(ceiling.upper, None)}" if ceiling else "no noise ceiling"
-        yield ["raw r", spanned(score.r, None), shown]
+        shown = f"noise ceiling {spanned(ceiling.lower)} to {spanned(ceiling.upper)}" if ceiling else "no noise ceiling"
+        yield ["raw r", spanned(score.r), shown]
     if math.isfinite(score.reliability):
         reliability = spanned(score.reliability, score.reliability_interval, most=1.0)
         yield ["reliability", reliability, "of the animals' RDMs: split halves, Spearman-Brown, mean"]
@@ -102,7 +102,7 @@ def _rows(score: Score) -> Iterator[list[str]]:
     if score.layer is not None:
         yield ["layer", score.layer, score.layer_rule]
     if score.best_layer is not None:
-        yield ["best layer", spanned(score.best_layer_value, None), f"{score.best_layer}: optimistic maximum, not a result"]
+        yield ["best layer", spanned(score.best_layer_value), f"{score.best_layer}: optimistic maximum, not a result"]
     yield ["estimator", score.estimator, "" if math.isfinite(score.value) else score.metric]
 
 

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from brainbench.core.errors import DataError
+from brainbench.core.errors import BrainbenchError, DataError
 from brainbench.core.files import to_json
 from brainbench.core.progress import Progress, track
 from brainbench.datasets import hdf5
@@ -24,6 +24,7 @@ from brainbench.datasets.reading import each_session, find_files, open_file, sui
 from brainbench.datasets.sessions import SPIKES, Session, SessionTable, as_labels, natural_key
 from brainbench.datasets.trials.conditions import natural_vocabulary
 from brainbench.datasets.trials.counting import has_units, no_units, read_spikes, recorded_span
+from brainbench.datasets.trials.selection import Tally
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -305,12 +306,15 @@ def _session_lines(session: SessionSummary) -> Iterator[str]:
 def propose(session: Session, layout: RecordingLayout | None = None) -> list[Proposal]:
     """Rank the columns that could label trials: 3–60 values (more if named like a stimulus), twice each or more.
 
-    The conditions of the session's layout come first. Stimulus-like names come before others and before
-    behavioural ones; then text before integers before the rest, the table ``trials`` before others, and
-    balanced columns before unbalanced. Columns with too few trials of a label for the default metric come last.
+    The conditions of the session's layout come first; of its trials only those count that it selects. Stimulus-like
+    names come before others and before behavioural ones; then text before integers before the rest, the table
+    ``trials`` before others, and balanced columns before unbalanced. Columns with too few trials of a label for the
+    default metric come last.
     """
     ranked: list[tuple[tuple[float, ...], Proposal]] = []
     for name, table in session.tables.items():
+        ours = layout if layout is not None and name == layout.conditions.table else None
+        kept = slice(None) if ours is None else _selected(table, ours)
         for column in summarise_columns(table):
             # A column named like a stimulus may have thousands of values; others would be mere numbers.
             most = np.inf if _STIMULUS.search(column.name) else _MOST_VALUES
@@ -319,16 +323,28 @@ def propose(session: Session, layout: RecordingLayout | None = None) -> list[Pro
                 and column.fewest >= 2
                 and not column.name.endswith(("_time", "_times"))
             ):
-                labels = as_labels(table.column(column.name)).tolist()
-                ranked.append((_rank(name, column, len(table)), _proposal(f"{name}:{column.name}", labels)))
+                labels = as_labels(table.column(column.name))[kept].tolist()
+                order = None if ours is None else ours.orders.get(column.name)
+                found = _proposal(f"{name}:{column.name}", [one for one in labels if order is None or one in order])
+                if len(found.labels) >= FEWEST_LABELS and found.fewest >= 2:
+                    ranked.append((_rank(name, column, len(table)), found))
     if layout is not None:
         table = session.table(layout.conditions.table)
         if all(name in table for name in layout.conditions.columns):
-            values = [tuple(row) for row in layout.conditions.values(table).tolist() if all(row)]
+            rows = layout.conditions.values(table)[_selected(table, layout)].tolist()
+            values = [tuple(row) for row in rows if all(row)]
             declared = layout.vocabulary(layout.conditions) or natural_vocabulary(values)
             labels = ["-".join(row) for row in values]
             ranked.append(((-1.0,), _proposal(str(layout.conditions), labels, declared)))
     return [proposal for _, proposal in sorted(ranked, key=lambda item: item[0])]
+
+
+def _selected(table: SessionTable, layout: RecordingLayout) -> NDArray[np.bool_]:
+    """Return which rows of the table of trials a layout selects; all where its rules do not fit the table."""
+    try:
+        return Tally().select(table, layout.selection.trials, "trials")
+    except BrainbenchError:
+        return np.ones(len(table), dtype=bool)
 
 
 def _proposal(conditions: str, labels: list[str], vocabulary: tuple[str, ...] | None = None) -> Proposal:

@@ -143,7 +143,7 @@ def _begin(
     lengths = {mount.whisker.arc_length for scene in scenes for mount in scene.mounts}
 
     def work() -> None:
-        # What is wrong here is wrong again in the simulation, which says so; a pool is refused once Python ends (Ctrl-C).
+        # What is wrong here is wrong again in the simulation, which says so; Python refuses a pool when it ends.
         with contextlib.suppress(BrainbenchError, RuntimeError):
             engine.prepare(lengths, fidelity, progress=progress)
 

@@ -6,7 +6,7 @@ import pytest
 
 from brainbench.core.errors import DataError
 from brainbench.datasets import inspect, open_recordings, write_recordings
-from tests.factories.recording_files import write_nwb
+from tests.factories.recording_files import detection, write_nwb, write_rodgers
 from tests.factories.recordings import make_simple_session
 
 
@@ -69,6 +69,15 @@ def test_problems_are_reported_not_raised(tmp_path):
     missing = " ".join(inspect(path).sessions[0].missing)
     assert "1 spike times" in missing
     assert "3 to 60 values" in missing
+
+
+def test_proposals_count_only_the_trials_that_the_layout_selects(tmp_path):
+    report = inspect(write_rodgers(tmp_path / "a.h5", **detection()))
+    # 'nothing' is no stimulus of this layout, so two labels of three remain in the column 'stimulus'.
+    assert report.proposals[0].conditions == "trials:stimulus,servo_position"
+    assert "trials:stimulus" not in [item.conditions for item in report.proposals]
+    recordings = open_recordings(tmp_path / "a.h5")
+    assert report.proposals[0].fewest == min(np.unique(recordings["stimulus"], return_counts=True)[1])
 
 
 def test_a_folder_is_inspected_as_a_whole(tmp_path):
