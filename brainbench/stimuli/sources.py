@@ -88,17 +88,18 @@ def load_stimuli(
         return source if whiskers == "all" else load_stimuli(source.dataset, whiskers=whiskers)  # type: ignore[arg-type]
     if not isinstance(source, (str, os.PathLike)):
         return _from_dataset(check_stimulus_set(source), whiskers, "stimulus set")
-    kept = cache and isinstance(backend, str) and is_packaged(source)
-    if kept and (found := _kept(source, whiskers, Fidelity.of(fidelity), backend)) is not None:
-        return found
+    asked = None
+    if cache and isinstance(backend, str) and is_packaged(source):
+        asked = (source, whiskers, Fidelity.of(fidelity), backend)
+        if (found := _kept(*asked)) is not None:
+            return found
     if (recipe := _recipe(source, whiskers)) is not None:
         from brainbench.stimuli.simulation import ENTRY, simulate
 
         dataset = simulate(recipe.scenes, fidelity=fidelity, backend=backend, progress=progress, cache=cache)
         description = recipe.description.strip() or recipe.name
-        if kept and ENTRY in dataset.encoding:
-            index = index_path(source, whiskers, Fidelity.of(fidelity), backend)
-            write_index(index, dataset.encoding[ENTRY], description)
+        if asked is not None and ENTRY in dataset.encoding:
+            write_index(index_path(*asked), dataset.encoding[ENTRY], description)
         return _from_dataset(dataset, "all", description)
     path = Path(source)
     if path.suffix in _HDF5 or path.is_file():
