@@ -79,7 +79,7 @@ def facts(values: Mapping[str, object], title: str = "") -> str:
 
 
 def table(title: str, columns: list[str], rows: list[list[str]], *, right: tuple[int, ...] = ()) -> str:
-    """Lay out a table as text; ``right`` names the columns set flush right. The first column is never folded."""
+    """Lay out a table as text; ``right`` names the columns set flush right. They and the first are never folded."""
     from io import StringIO
 
     from rich.console import Console
@@ -92,7 +92,8 @@ def table(title: str, columns: list[str], rows: list[list[str]], *, right: tuple
         header_style="bold",
     )
     for index, column in enumerate(columns):
-        grid.add_column(column, justify="right" if index in right else "left", overflow="fold", no_wrap=not index)
+        number = index in right
+        grid.add_column(column, justify="right" if number else "left", overflow="fold", no_wrap=number or not index)
     for row in rows:
         grid.add_row(*row)
     first = max((len(row[0]) for row in rows if row), default=0)

@@ -27,7 +27,7 @@ from brainbench.models.network import SUB_STEP_SECONDS, SUB_STEPS
 from robotics_bridge import hands
 from robotics_bridge.exploration.procedures import PROCEDURES, Pose, Procedure, find_procedure
 from robotics_bridge.hands.observations import observe, sensors_for
-from robotics_bridge.hands.scenes import OBJECT, closing, holding_spec
+from robotics_bridge.hands.scenes import OBJECT, closing, holding_spec, replace_drives
 from robotics_bridge.physics import Geometry, MujocoEngine
 from robotics_bridge.physics.variants import compile_variants
 from robotics_bridge.policies.encoders.calibration import HandCalibration
@@ -220,6 +220,10 @@ class _World:
     def __init__(self, hand: str, objects: Sequence[Explored], span: float) -> None:
         self.hand, self.span = hands.load(hand), span
         spec = holding_spec(self.hand, timestep=SUB_STEP_SECONDS / _STEPS)
+        servos = {drive.name for drive in spec.actuators if drive.biasprm[1] < 0}
+        # A file may drive its joints by motors, by tendons, or some of them alone.
+        if not {*self.hand.joints} <= servos:
+            replace_drives(spec)
         kinds = list(dict.fromkeys(objects))
         models = compile_variants(spec, OBJECT, [item.shape() for item in kinds], density=_DENSE)
         self.engine = MujocoEngine(
@@ -229,7 +233,7 @@ class _World:
         joint = model.body(OBJECT).jntadr[0]
         self._at, self._speed = int(model.jnt_qposadr[joint]), int(model.jnt_dofadr[joint])
         self._place = model.body(OBJECT).pos.copy()
-        self._drives = [model.actuator(name).id for name in self.hand.joints] if self.hand.model.nu else slice(None)
+        self._drives = [model.actuator(name).id for name in self.hand.joints] if all(self.hand.joints) else slice(None)
         self._closed = closing(self.hand, 1.0)
         self._bottoms = {id(item): self._bottom(item) for item in kinds}
 

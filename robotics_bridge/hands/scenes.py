@@ -52,7 +52,7 @@ def holding_spec(hand: Hand, *, radius: float = 0.03, timestep: float = 0.002, r
     for number, joint in enumerate(spec.joints):
         joint.name = joint.name or f"joint{number}"
     if not hand.model.nu:
-        _add_servos(spec)
+        replace_drives(spec)
     palm = spec.body(hand.palm)
     turn = _onto_z(up)
     palm.quat, palm.pos = turn, -to_matrices(turn) @ surface
@@ -135,8 +135,10 @@ def closing(hand: Hand, share: float) -> NDArray[np.float64]:
     return target
 
 
-def _add_servos(spec: Any) -> None:
-    """Give every hinge and slide of a hand without drives, as URDF files are, a weak position servo."""
+def replace_drives(spec: Any) -> None:
+    """Give every hinge and slide of a hand a weak position servo of its name, in place of the drives of its file."""
+    while spec.actuators:
+        spec.delete(spec.actuators[0])
     for joint in spec.joints:
         slides = joint.type == mujoco.mjtJoint.mjJNT_SLIDE
         if slides or joint.type == mujoco.mjtJoint.mjJNT_HINGE:

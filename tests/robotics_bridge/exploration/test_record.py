@@ -80,3 +80,25 @@ def test_requests_that_make_no_sense_are_refused() -> None:
         record_exploration([_box(), _box()], ["enclosure"])
     with pytest.raises(UsageError, match=r"'nothing' .*mesh"):
         Explored("nothing")
+
+
+GRIPPER = """<mujoco model="jaws"><worldbody><body name="base"><geom type="box" size=".05 .03 .015"/>
+  <body name="left" pos="-.03 0 .05"><joint name="slide_left" type="slide" axis="1 0 0" range="0 .028"/>
+    <geom type="box" size=".005 .012 .035" mass=".05"/></body>
+  <body name="right" pos=".03 0 .05"><joint name="slide_right" type="slide" axis="-1 0 0" range="0 .028"/>
+    <geom type="box" size=".005 .012 .035" mass=".05"/></body></body></worldbody>
+<equality><joint joint1="slide_left" joint2="slide_right"/></equality>
+<actuator>{}</actuator></mujoco>"""
+
+
+@pytest.mark.parametrize(
+    "drive",
+    ['<position name="grip" joint="slide_left" kp="200"/>', '<motor name="slide_left" joint="slide_left"/>'],
+    ids=["one servo for two jaws", "motor"],
+)
+def test_a_gripper_explores_whatever_drives_its_file_has(tmp_path, drive: str) -> None:
+    path = tmp_path / "jaws.xml"
+    path.write_text(GRIPPER.format(drive))
+    found = record_exploration([_box()], ["static_pressure"], hand=str(path), resolution="low", frames=20)
+    assert np.isfinite(found.wrench).all()
+    assert np.abs(found.wrench[..., :3]).max() > 0.1
