@@ -79,7 +79,10 @@ def facts(values: Mapping[str, object], title: str = "") -> str:
 
 
 def table(title: str, columns: list[str], rows: list[list[str]], *, right: tuple[int, ...] = ()) -> str:
-    """Lay out a table as text; ``right`` names the columns set flush right. They and the first are never folded."""
+    """Lay out a table as text; ``right`` names the columns set flush right.
+
+    The first column is never folded; where no terminal sets the width, those flush right are not either.
+    """
     from io import StringIO
 
     from rich.console import Console
@@ -91,14 +94,18 @@ def table(title: str, columns: list[str], rows: list[list[str]], *, right: tuple
         pad_edge=False,
         header_style="bold",
     )
+    terminal = sys.stdout.isatty()
+    lengths = [max(map(len, column)) for column in zip(columns, *rows, strict=True)]
+    whole = {0, *(() if terminal else right)}
     for index, column in enumerate(columns):
-        number = index in right
-        grid.add_column(column, justify="right" if number else "left", overflow="fold", no_wrap=number or not index)
+        justify = "right" if index in right else "left"
+        grid.add_column(column, justify=justify, overflow="fold", no_wrap=index in whole)
     for row in rows:
         grid.add_row(*row)
-    first = max((len(row[0]) for row in rows if row), default=0)
-    needed = first + 80 if first > 40 else 0
-    terminal = sys.stdout.isatty()
+    needed = lengths[0] + 80 if lengths[0] > 40 else 0
+    if not terminal:
+        shares = (length if index in whole else min(length, 24) for index, length in enumerate(lengths))
+        needed = max(needed, sum(shares) + 2 * len(lengths))
     buffer = StringIO()
     Console(
         file=buffer,

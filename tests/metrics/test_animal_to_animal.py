@@ -99,7 +99,7 @@ def test_unreliable_animals_are_left_out_and_named():
     noisy = make_subject("z", make_rdm(np.random.default_rng(0)), reliability=0.2)
     score, without = score_animals([*animals, noisy]), score_animals(animals)
     assert score.value == pytest.approx(without.value, abs=1e-15)
-    assert any(reason.startswith("z left out: reliability 0.20") for reason in score.reasons)
+    assert any(reason.startswith("animal z left out: reliability 0.20") for reason in score.reasons)
 
 
 def test_unreliable_animals_alone_are_scored_as_unreliable():
