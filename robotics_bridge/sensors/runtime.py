@@ -169,6 +169,8 @@ class ProbeRuntime(Runtime):
         for name, dtype in (("position", wp.vec3f), ("normal", wp.vec3f), ("radius", float)):
             columns = [getattr(sensor.probes, name) for sensor in sensors.values()]
             setattr(p, name, context.array(np.concatenate(columns), dtype))
+        packed = [np.column_stack([s.probes.position, s.probes.radius]) for s in sensors.values()]
+        p.packed = context.array(np.concatenate(packed), wp.vec4f)
         counts = [part.count for part in self.slices.values()]
         p.slot, p.part, p.probe = context.array(np.repeat(self.slots, counts), int), self.part, self.probe
         self.probes = p

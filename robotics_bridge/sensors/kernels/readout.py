@@ -7,6 +7,7 @@ from functools import cache
 from types import SimpleNamespace
 
 from brainbench.core.devices import warp
+from robotics_bridge.sensors.kernels.wide import load_planes, store_planes
 from robotics_bridge.sensors.noise.kernels.noise import (
     NoiseParams,
     apply_drawn,
@@ -31,6 +32,8 @@ class ProbeArrays:
     """[N] unit, out of the sensing surface."""
     radius: wp.array(dtype=wp.float32)
     """[N] sensing radius (m); 0 for fillers."""
+    packed: wp.array(dtype=wp.vec4f)
+    """[N] position and radius once more, for kernels that read them in one access."""
     slot: wp.array(dtype=wp.int32)
     """[N] slot of the pair lists."""
     part: wp.array(dtype=wp.int32)
@@ -145,21 +148,14 @@ def readout_functions(mode: int, hysteresis: bool, walk: bool, channels: int = 6
             io.measured[channel, env, n] = signal
 
     @wp.func
-    def recall(memory: wp.array3d(dtype=wp.float32), env: int, n: int, age: int) -> wp.spatial_vectorf:
-        kept = wp.spatial_vectorf()
-        if age > 0:
-            for channel in range(wp.static(channels)):
-                kept[channel] = memory[channel, env, n]
-        return kept
-
-    @wp.func
     def recall_six(io: ReadoutArrays, env: int, n: int, age: int):
         lag = wp.spatial_vectorf()
         drift = wp.spatial_vectorf()
-        if wp.static(hysteresis):
-            lag = recall(io.hysteresis, env, n, age)
-        if wp.static(walk):
-            drift = recall(io.walk, env, n, age)
+        if age > 0:
+            if wp.static(hysteresis):
+                lag = load_planes(io.hysteresis, env, n, wp.static(channels))
+            if wp.static(walk):
+                drift = load_planes(io.walk, env, n, wp.static(channels))
         return lag, drift
 
     @wp.func
@@ -177,10 +173,9 @@ def readout_functions(mode: int, hysteresis: bool, walk: bool, channels: int = 6
         truth: wp.spatial_vectorf,
         signal: wp.spatial_vectorf,
     ):
-        for channel in range(wp.static(channels)):
-            io.truth[channel, env, n] = truth[channel]
-            if wp.static(mode == STAGED):
-                io.measured[channel, env, n] = signal[channel]
+        store_planes(io.truth, env, n, wp.static(channels), truth)
+        if wp.static(mode == STAGED):
+            store_planes(io.measured, env, n, wp.static(channels), signal)
         if wp.static(mode == FUSED):
             fading = float(0.0)
             if wp.static(hysteresis):

@@ -108,6 +108,7 @@ class PairTable:
             "link": [s["link"] for s in slots],
             "watched": np.where(np.isin(links, [s["link"] for s in slots if s["contact"]]), links, -1),
             "contact": [int(s["contact"]) for s in slots],
+            "felt": [s["link"] if s["contact"] else -1 for s in slots],
             "first": first,
             "room": self._rooms,
             "members": [m for s in slots for m in s["members"]],

@@ -13,7 +13,7 @@ from brainbench.core.devices import to_struct
 from robotics_bridge.physics.scene import Geometry, TouchScene
 from robotics_bridge.sensors.probes.placement import cover_evenly, face_areas
 from robotics_bridge.sensors.queries.solids import tessellate
-from robotics_bridge.sensors.taxels.kernels.proximity import BLOCK, CloudArrays
+from robotics_bridge.sensors.taxels.kernels.proximity import BLOCK, CellArrays, CloudArrays
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,6 +26,10 @@ class Cloud:
     """Most points that any environment has."""
     counts: NDArray[np.int64]
     """Points [R] per variant row."""
+    shapes: list[NDArray[np.float32]]
+    """Points of each geometry that differs from the others, in their order in ``struct``."""
+    shape: NDArray[np.int32]
+    """Number [R, G] of a geometry among them, −1 for none."""
 
 
 def surface_points(geometry: Geometry, count: int) -> NDArray[np.float64]:
@@ -40,9 +44,10 @@ def sample_cloud(scene: TouchScene, geometries: Sequence[int], points: int, rows
 
     Planes are left out: they have no end.
     """
-    sampled: dict[tuple[int, int], tuple[int, NDArray]] = {}
+    sampled: dict[tuple[int, int], tuple[int, int, NDArray]] = {}
     counts, totals = np.zeros(rows, np.int64), np.zeros(rows, np.int64)
-    first, blocks = (np.zeros((rows, max(len(scene.geometries), 1)), np.int32) for _ in range(2))
+    first, blocks, number = (np.zeros((rows, max(len(scene.geometries), 1)), np.int32) for _ in range(3))
+    number[:] = -1
     start = 0
     for row in range(rows):
         shapes = {g: scene.geometry_in(row, g) for g in geometries}
@@ -54,37 +59,77 @@ def sample_cloud(scene: TouchScene, geometries: Sequence[int], points: int, rows
             share = max(1, round(points * areas[g] / whole))
             key = (id(shape), share)
             if key not in sampled:
-                sampled[key] = (start, _in_blocks(surface_points(shape, share)))
-                start += len(sampled[key][1]) // BLOCK
-            first[row, g], placed = sampled[key]
+                sampled[key] = (start, len(sampled), _in_blocks(surface_points(shape, share)))
+                start += len(sampled[key][2]) // BLOCK
+            first[row, g], number[row, g], placed = sampled[key]
             blocks[row, g] = len(placed) // BLOCK
             counts[row] += share
             totals[row] += len(placed)
-    clouds = [placed for _start, placed in sampled.values()] or [np.zeros((0, 3), np.float32)]
+    clouds = [placed for _start, _number, placed in sampled.values()] or [np.zeros((0, 3), np.float32)]
     arrays = {
         "point": np.concatenate(clouds),
         "sphere": np.concatenate([_spheres(placed) for placed in clouds]),
         "first": first,
         "blocks": blocks,
     }
-    return Cloud(to_struct(CloudArrays, arrays, device), int(totals.max()), counts)
+    return Cloud(to_struct(CloudArrays, arrays, device), int(totals.max()), counts, clouds, number)
+
+
+def list_by_cells(cloud: Cloud, reach: float, device: Any) -> Any:
+    """Return the Warp structure ``CellArrays`` that lists the points within ``reach`` (m) of every cell of a grid."""
+    starts, entries, origins, inverses, sizes, firsts = [], [], [], [], [], []
+    first = point = entry = 0
+    for placed in cloud.shapes:
+        points = placed[np.isfinite(placed[:, 0])].astype(np.float64)
+        low, high = (points.min(axis=0), points.max(axis=0)) if len(points) else (np.zeros(3), np.zeros(3))
+        # Rounding of a position must not lose a point at the rim.
+        far = reach * (1 + 1e-5) + 1e-6 * (float(np.abs([low, high]).max()) + reach)
+        low, high = low - far, high + far
+        # About eight cells for a point, and no more than three of them along each axis for its reach.
+        edge = max(far, float((np.prod(high - low) / (8 * max(len(points), 1))) ** (1 / 3)))
+        counts = np.maximum(np.ceil((high - low) / edge).astype(int), 1)
+        cells, numbers = _within(points, far, low, edge, counts)
+        starts.append(entry + np.searchsorted(cells, np.arange(int(np.prod(counts)) + 1)))
+        entries.append(point + numbers)
+        origins.append(low)
+        inverses.append(1 / edge)
+        sizes.append(counts)
+        firsts.append(first)
+        first, point, entry = first + len(starts[-1]), point + len(placed), entry + len(numbers)
+    arrays = {
+        "shape": cloud.shape,
+        "origin": np.array(origins),
+        "inverse": np.array(inverses),
+        "counts": np.array(sizes),
+        "first": np.array(firsts),
+        "start": np.concatenate(starts),
+        "entry": np.concatenate(entries),
+    }
+    return to_struct(CellArrays, arrays, device)
+
+
+def _within(
+    points: NDArray, far: float, origin: NDArray, edge: float, counts: NDArray[np.int64]
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return pairs of a cell and a point that lies no further than ``far`` from it, sorted by cell, then point."""
+    at = np.floor((points - origin) / edge).astype(np.int64)
+    cells, numbers = [], []
+    for step in np.ndindex(3, 3, 3):
+        cell = at + np.array(step) - 1
+        low = origin + cell * edge
+        away = np.maximum(np.maximum(low - points, points - low - edge), 0.0)
+        kept = ((away**2).sum(axis=1) <= far**2) & (cell >= 0).all(axis=1) & (cell < counts).all(axis=1)
+        cells.append(np.ravel_multi_index(cell[kept].T, counts))
+        numbers.append(np.nonzero(kept)[0])
+    found, owners = np.concatenate(cells), np.concatenate(numbers)
+    order = np.lexsort((owners, found))
+    return found[order], owners[order]
 
 
 def surface_area(geometry: Geometry) -> float:
     """Return the surface area of a geometry [m²]."""
     mesh = tessellate(geometry)
     return float(face_areas(mesh.vertices[mesh.faces])[0].sum())
-
-
-def halve(points: NDArray, order: NDArray[np.int64], most: int) -> list[NDArray[np.int64]]:
-    """Cut points [P, 3], of which ``order`` are taken, across their longest side until no part has over ``most``."""
-    if len(order) <= most:
-        return [order]
-    chosen = points[order]
-    axis = int(np.ptp(chosen, axis=0).argmax())
-    ranked = order[np.argsort(chosen[:, axis], kind="stable")]
-    middle = len(order) // 2
-    return halve(points, ranked[:middle], most) + halve(points, ranked[middle:], most)
 
 
 def _in_blocks(points: NDArray) -> NDArray[np.float32]:

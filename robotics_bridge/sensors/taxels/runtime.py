@@ -10,11 +10,11 @@ import numpy as np
 from brainbench.core.devices import warp
 from robotics_bridge.physics.state import HandState
 from robotics_bridge.sensors.context import SuiteContext, fill
-from robotics_bridge.sensors.queries.surface_points import halve, sample_cloud
+from robotics_bridge.sensors.queries.surface_points import list_by_cells, sample_cloud
 from robotics_bridge.sensors.runtime import ProbeRuntime, probe_rows
 from robotics_bridge.sensors.taxels.kernels.contact_load import ContactNodes, PressArrays, SpreadPlan
 from robotics_bridge.sensors.taxels.kernels.kinematic import KinematicParams, kinematic_kernel
-from robotics_bridge.sensors.taxels.kernels.proximity import CELL, ProximityArrays, ProximityParams, proximity_kernel
+from robotics_bridge.sensors.taxels.kernels.proximity import ProximityArrays, ProximityParams, proximity_kernel
 from robotics_bridge.sensors.taxels.kernels.stick import StickArrays
 from robotics_bridge.sensors.taxels.sensors import KinematicTaxel, ProximityTaxel
 
@@ -57,7 +57,7 @@ class KinematicRuntime(ProbeRuntime):
         """Run the kernel."""
         c = self.context
         inputs = [self.probes, self.rows, c.solids.struct, c.pairs.struct, self.io, self._laws, self._sticks]
-        c.launch(self._kernel, (c.num_envs, self.rows.shape[0]), *inputs, self.plan, self.nodes, self.press)
+        c.launch(self._kernel, c.num_envs * self.rows.shape[0], *inputs, self.plan, self.nodes, self.press)
 
 
 class ProximityRuntime(ProbeRuntime):
@@ -73,45 +73,18 @@ class ProximityRuntime(ProbeRuntime):
         for row, sensor in zip(densities, sensors.values(), strict=True):
             # ρ_b of 4.14, by variant: a body with more points does not push harder.
             row[:] = sensor.density / np.maximum(self.cloud.counts, 1)
-        # A processor walks through all probes of an environment anyway, so it may list their points in between.
-        self.gathered = not context.device.is_cuda
-        self._options = (first.convention == "physical", self.mode, *self.stores)
-        own, room = ProximityArrays(), self.cloud.total + len(tracked) + 1
+        options = first.convention == "physical", self.mode, *self.stores
+        self._kernel, own = proximity_kernel(*options), ProximityArrays()
         own.laws, own.densities = context.array(laws, ProximityParams), context.array(densities, float)
         own.links = context.array([context.scene.link_index(sensor.link) for sensor in sensors.values()], int)
-        own.near = context.zeros((context.num_envs, room) if self.gathered else (1, 1), int)
-        if self.gathered:
-            own.members, own.cells, own.around = self._cluster(list(sensors.values()))
-            self.scratch = [own.near]
         self._own = own
+        reach = max(float(s.probes.radius.max(initial=0.0)) + s.noise.radius for s in sensors.values())
+        self._cells = list_by_cells(self.cloud, reach, context.device)
 
     def update(self, state: HandState, dt: float) -> None:
         """Read the state."""
         self.begin(state, dt)
-        kernel, c = proximity_kernel(*self._options, self.gathered), self.context
-        dim = c.num_envs if self.gathered else (c.num_envs, self.count)
-        inputs = [self.probes, c.pairs.struct, self.cloud.struct, self.io, self._own, state.arrays]
-        c.launch(kernel, dim, *inputs)
+        c = self.context
+        inputs = [self.probes, c.pairs.struct, self.cloud.struct, self._cells, self.io, self._own, state.arrays]
+        self.launch(self._kernel, *inputs)
         self.finish(dt)
-
-    def _cluster(self, sensors: list[ProximityTaxel]) -> tuple[Any, Any, Any]:
-        """Return the probes [N] by cell, cells (first, end, slot) [C, 3], and spheres [C, 4] around their reach."""
-        context, members, cells, around = self.context, [], [], []
-        for sensor, part, slot in zip(sensors, self.slices.values(), self.slots, strict=True):
-            position, radius = sensor.probes.position, sensor.probes.radius + sensor.noise.radius
-            first = part.start
-            for chosen in halve(position, np.arange(part.count), CELL):
-                # Sphere around the sensing spheres of a cell, radius noise included: its list holds every point that a
-                # member may feel.
-                middle = 0.5 * (position[chosen].min(axis=0) + position[chosen].max(axis=0))
-                far = (np.linalg.norm(position[chosen] - middle, axis=1) + radius[chosen]).max()
-                # Rounding must not lose a point at the rim.
-                around.append((*middle, far * (1 + 1e-5) + 1e-7))
-                cells.append((first, first + len(chosen), slot))
-                members.append(part.start + chosen)
-                first += len(chosen)
-        return (
-            context.array(np.concatenate(members), int),
-            context.array(cells, wp.vec3i),
-            context.array(around, wp.vec4f),
-        )

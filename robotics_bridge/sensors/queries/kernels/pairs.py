@@ -10,6 +10,7 @@ from typing import Any
 
 from brainbench.core.devices import warp
 from robotics_bridge.physics.kernels.state import StateArrays, link_fails, status_of
+from robotics_bridge.sensors.kernels.wide import entry, load_contacts, load_owners
 from robotics_bridge.sensors.queries.kernels.distance import PLANE, SolidArrays
 
 wp = warp()
@@ -28,6 +29,8 @@ class SlotArrays:
     """[G] link of a geometry whose contacts matter, else −1."""
     contact: wp.array(dtype=wp.int32)
     """[S] 1: only geometries in contact are listed."""
+    felt: wp.array(dtype=wp.int32)
+    """[S] link whose contacts matter, −1 where none do."""
     first: wp.array(dtype=wp.int32)
     """[S + 1] first place of the list."""
     room: wp.array(dtype=wp.int32)
@@ -84,7 +87,7 @@ def reset_clock(mask: wp.array(dtype=wp.bool), age: wp.array(dtype=wp.int32), ep
 def mark(slots: SlotArrays, env: int, link: int, other: int, words: int, bits: wp.array2d(dtype=wp.int32)):
     """Note in the bits of every slot of a link that it touches a geometry."""
     for slot in range(slots.link.shape[0]):
-        if slots.contact[slot] == 1 and slots.link[slot] == link:
+        if entry(slots.felt, slot) == link:
             place = slots.place[slot, other]
             if place >= 0:
                 # One bit per geometry: a set of any size costs one atomic operation, and its order does not depend on
@@ -132,27 +135,38 @@ def start_kernel(contacts: bool, apart: bool) -> Any:
             diverged[tid] = flags & 1
             state.status[tid] = flags
         if wp.static(contacts):
-            # All is asked for before anything is looked at; neighbouring threads read neighbouring contacts.
+            # All is asked for before anything is looked at: two neighbouring contacts by each access of memory, and
+            # neighbouring threads read neighbouring ones.
             threads = (room + wp.static(CONTACTS - 1)) // wp.static(CONTACTS)
             if tid < threads:
+                found = wp.min(count, room)
                 one = wp.vec4i(-1)
                 two = wp.vec4i(-1)
                 envs = wp.vec4i(0)
-                for k in range(wp.static(CONTACTS)):
-                    at = tid + k * threads
-                    if at < room:
+                for half in range(2):
+                    at = 2 * (tid + half * threads)
+                    if at + 1 < found:
+                        both = load_contacts(state.contact_geom, at)
+                        owners = load_owners(state.contact_env, at)
+                        one[2 * half] = both[0]
+                        two[2 * half] = both[1]
+                        one[2 * half + 1] = both[2]
+                        two[2 * half + 1] = both[3]
+                        envs[2 * half] = owners[0]
+                        envs[2 * half + 1] = owners[1]
+                    elif at < found:
                         pair = state.contact_geom[at]
-                        one[k] = pair[0]
-                        two[k] = pair[1]
-                        envs[k] = state.contact_env[at]
+                        one[2 * half] = pair[0]
+                        two[2 * half] = pair[1]
+                        envs[2 * half] = state.contact_env[at]
                 first = wp.vec4i(-1)
                 second = wp.vec4i(-1)
                 # Two bits for each contact: whose contact with what is to be marked.
                 todo = int(0)
                 for k in range(wp.static(CONTACTS)):
-                    if tid + k * threads < count and one[k] >= 0 and two[k] >= 0:
-                        first[k] = slots.watched[one[k]]
-                        second[k] = slots.watched[two[k]]
+                    if one[k] >= 0 and two[k] >= 0:
+                        first[k] = entry(slots.watched, one[k])
+                        second[k] = entry(slots.watched, two[k])
                         if first[k] >= 0:
                             todo = todo | (1 << (2 * k))
                         if second[k] >= 0:

@@ -16,8 +16,6 @@ wp = warp()
 
 BLOCK = 32
 """Points of a block."""
-CELL = 16
-"""Neighbouring probes that ask for the points around them together."""
 
 
 @wp.struct
@@ -32,6 +30,26 @@ class CloudArrays:
     """[R, G] first block of a geometry."""
     blocks: wp.array2d(dtype=wp.int32)
     """[R, G] number of its blocks."""
+
+
+@wp.struct
+class CellArrays:
+    """Points within reach of every cell of a grid, so that a taxel looks at those around it alone."""
+
+    shape: wp.array2d(dtype=wp.int32)
+    """[R, G] number of the grid of a geometry, −1 for none."""
+    origin: wp.array(dtype=wp.vec3f)
+    """[H] corner of a grid in the geometry's frame (m)."""
+    inverse: wp.array(dtype=wp.float32)
+    """[H] 1 / edge of its cells (1/m)."""
+    counts: wp.array(dtype=wp.vec3i)
+    """[H] cells along each axis."""
+    first: wp.array(dtype=wp.int32)
+    """[H] first cell in ``start``."""
+    start: wp.array(dtype=wp.int32)
+    """First entry of every cell; that of the next is its end."""
+    entry: wp.array(dtype=wp.int32)
+    """Numbers of points, rising within a cell."""
 
 
 @wp.struct
@@ -52,27 +70,17 @@ class ProximityArrays:
     """[S, R] weight of a point."""
     links: wp.array(dtype=wp.int32)
     """[S]."""
-    near: wp.array2d(dtype=wp.int32)
-    """[B, …] points near a cell by pair, each list ended by −1; only where points are gathered."""
-    members: wp.array(dtype=wp.int32)
-    """[N] taxels, cell by cell."""
-    cells: wp.array(dtype=wp.vec3i)
-    """First and last member of a cell, and its slot."""
-    around: wp.array(dtype=wp.vec4f)
-    """Sphere around all that a cell senses (m)."""
 
 
 @cache
-def proximity_kernel(physical: bool, mode: int, hysteresis: bool, walk: bool, gathered: bool = False) -> Any:
-    """Return the kernel of ProximityTaxel. Dim [B, N], or [B] if ``gathered``.
+def proximity_kernel(physical: bool, mode: int, hysteresis: bool, walk: bool) -> Any:
+    """Return the kernel of ProximityTaxel. Dim [B, N].
 
     Args:
         physical: convention of the forces.
         mode: of the readout.
         hysteresis: whether it is stored.
         walk: whether it is stored.
-        gathered: a thread serves all probes of an environment, and lists the points around each cell of neighbouring
-            probes before these look at them. The terms of a sum, and their order, are the same.
     """
     readout = readout_functions(mode, hysteresis, walk)
     emit_six, recall_six = readout.emit_six, readout.recall_six
@@ -108,25 +116,24 @@ def proximity_kernel(physical: bool, mode: int, hysteresis: bool, walk: bool, ga
             return wp.vec2f(wp.max(radius - far, 0.0), 0.0)
         return wp.vec2f(wp.max(radius - far, 0.0), wp.max(noisy - far, 0.0))
 
-    @wp.func
-    def feel(
+    @wp.kernel(module="unique", grid_stride=False)
+    def proximity(
         probes: ProbeArrays,
         pairs: PairArrays,
         cloud: CloudArrays,
+        cells: CellArrays,
         io: ReadoutArrays,
         own: ProximityArrays,
         state: StateArrays,
-        env: int,
-        n: int,
     ):
-        """Read one probe."""
+        env, n = wp.tid()
         radius = probes.radius[n]
         if radius <= 0.0:
             idle(io, 6, env, n)
         elif (io.status[env] & 1) != 0:
             lost(io, 6, env, n)
         else:
-            row = env % cloud.first.shape[0]
+            row = env % cells.shape.shape[0]
             slot = probes.slot[n]
             part = probes.part[n]
             probe = probes.probe[n]
@@ -145,7 +152,6 @@ def proximity_kernel(physical: bool, mode: int, hysteresis: bool, walk: bool, ga
             moment_noisy = wp.vec3f(0.0)
             slip = wp.vec3f(0.0)
             slip_noisy = wp.vec3f(0.0)
-            cursor = int(0)
             for k in range(pairs.count[env, slot]):
                 at = pairs.first[slot] + k
                 geometry = pairs.geometry[env, at]
@@ -156,42 +162,28 @@ def proximity_kernel(physical: bool, mode: int, hysteresis: bool, walk: bool, ga
                 own_mass = wp.vec2f(0.0)
                 lever = wp.vec3f(0.0)
                 lever_noisy = wp.vec3f(0.0)
-                if wp.static(gathered):
-                    # The list was filled in the order of the pairs, each part closed by −1, so one cursor walks through
-                    # all of it.
-                    index = own.near[env, cursor]
-                    cursor += 1
-                    while index >= 0:
-                        away = cloud.point[index] - here
-                        square = wp.dot(away, away)
-                        if square < reach * reach:
-                            overlaps = overlap(wp.sqrt(square), radius, noisy)
-                            # P of 4.11, and Σ P (p − x) as the lever from which torque and slip follow.
-                            own_mass += overlaps
-                            lever += overlaps[0] * away
-                            if wp.static(mode != CLEAN):
-                                lever_noisy += overlaps[1] * away
-                        index = own.near[env, cursor]
-                        cursor += 1
-                else:
-                    first = cloud.first[row, geometry]
-                    for block in range(cloud.blocks[row, geometry]):
-                        sphere = cloud.sphere[first + block]
-                        gap = here - wp.vec3f(sphere[0], sphere[1], sphere[2])
-                        # Two spheres that do not meet hold no point in reach: the block of points is skipped as a
-                        # whole.
-                        limit = reach + sphere[3]
-                        if wp.dot(gap, gap) < limit * limit:
-                            for i in range(wp.static(BLOCK)):
-                                away = cloud.point[(first + block) * wp.static(BLOCK) + i] - here
-                                square = wp.dot(away, away)
-                                # A comparison with NaN, which fills the last block, is false.
-                                if square < reach * reach:
-                                    overlaps = overlap(wp.sqrt(square), radius, noisy)
-                                    own_mass += overlaps
-                                    lever += overlaps[0] * away
-                                    if wp.static(mode != CLEAN):
-                                        lever_noisy += overlaps[1] * away
+                number = cells.shape[row, geometry]
+                if number >= 0:
+                    counts = cells.counts[number]
+                    u = cells.inverse[number] * (here - cells.origin[number])
+                    # Beyond the grid nothing is within reach.
+                    if (
+                        wp.min(u) >= 0.0
+                        and u[0] < float(counts[0])
+                        and u[1] < float(counts[1])
+                        and u[2] < float(counts[2])
+                    ):
+                        cell = cells.first[number] + (int(u[0]) * counts[1] + int(u[1])) * counts[2] + int(u[2])
+                        for entry in range(cells.start[cell], cells.start[cell + 1]):
+                            away = cloud.point[cells.entry[entry]] - here
+                            square = wp.dot(away, away)
+                            if square < reach * reach:
+                                # P of 4.11, and Σ P (p − x) as the lever from which torque and slip follow.
+                                overlaps = overlap(wp.sqrt(square), radius, noisy)
+                                own_mass += overlaps
+                                lever += overlaps[0] * away
+                                if wp.static(mode != CLEAN):
+                                    lever_noisy += overlaps[1] * away
                 if own_mass[0] > 0.0 or own_mass[1] > 0.0:
                     link = own.links[part]
                     twist = state.velocity[env, link]
@@ -223,54 +215,4 @@ def proximity_kernel(physical: bool, mode: int, hysteresis: bool, walk: bool, ga
             lag, drift = recall_six(io, env, n, age)
             emit_six(io, io.knobs[part], env, n, probe, age, episode, fixed, lag, drift, truth, signal)
 
-    @wp.kernel(module="unique")
-    def proximity(
-        probes: ProbeArrays,
-        pairs: PairArrays,
-        cloud: CloudArrays,
-        io: ReadoutArrays,
-        own: ProximityArrays,
-        state: StateArrays,
-    ):
-        env, n = wp.tid()
-        feel(probes, pairs, cloud, io, own, state, env, n)
-
-    @wp.kernel(module="unique")
-    def proximity_gathered(
-        probes: ProbeArrays,
-        pairs: PairArrays,
-        cloud: CloudArrays,
-        io: ReadoutArrays,
-        own: ProximityArrays,
-        state: StateArrays,
-    ):
-        env = wp.tid()
-        row = env % cloud.first.shape[0]
-        for c in range(own.cells.shape[0]):
-            cell = own.cells[c]
-            bound = own.around[c]
-            middle = wp.vec3f(bound[0], bound[1], bound[2])
-            found = int(0)
-            for k in range(pairs.count[env, cell[2]]):
-                at = pairs.first[cell[2]] + k
-                geometry = pairs.geometry[env, at]
-                here = pairs.rotation[env, at] @ middle + pairs.offset[env, at]
-                first = cloud.first[row, geometry]
-                # Same order of blocks and points as without gathering, since sums in single precision depend on it.
-                for block in range(cloud.blocks[row, geometry]):
-                    sphere = cloud.sphere[first + block]
-                    gap = here - wp.vec3f(sphere[0], sphere[1], sphere[2])
-                    limit = bound[3] + sphere[3]
-                    if wp.dot(gap, gap) < limit * limit:
-                        for i in range(wp.static(BLOCK)):
-                            index = (first + block) * wp.static(BLOCK) + i
-                            away = cloud.point[index] - here
-                            if wp.dot(away, away) < bound[3] * bound[3]:
-                                own.near[env, found] = index
-                                found += 1
-                own.near[env, found] = -1
-                found += 1
-            for m in range(cell[0], cell[1]):
-                feel(probes, pairs, cloud, io, own, state, env, own.members[m])
-
-    return proximity_gathered if gathered else proximity
+    return proximity

@@ -17,6 +17,7 @@ from robotics_bridge.sensors.audio.microphone import Microphone
 from robotics_bridge.sensors.audio.modes import ElasticSolid, find_modes
 from robotics_bridge.sensors.audio.sensors import ActuationAudio, ContactAudio, joint_drive
 from robotics_bridge.sensors.suite import SensorSuite
+from tests.factories.sensor_episode import require_processor
 
 MODES = Modes((500.0, 1730.0, 4100.0), (8.0, 15.0, 40.0), (1.0, -0.7, 0.4))
 DT, K = 0.005, 160
@@ -305,6 +306,7 @@ def test_balls_on_wood_metal_and_glass_are_told_apart_by_a_linear_classifier_at_
 
 @pytest.mark.gpu
 def test_cpu_and_cuda_agree():
+    require_processor()
     heard = {}
     for device in ("cpu", "cuda"):
         sensors = {

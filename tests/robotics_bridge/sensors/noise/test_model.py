@@ -13,6 +13,7 @@ from brainbench.core.errors import DataError, UsageError
 from robotics_bridge.sensors.context import LaunchContext, ReadoutSlice, UpdateClock
 from robotics_bridge.sensors.noise.model import PRESETS, TAXEL_KNOBS, Noise, stream_seed
 from robotics_bridge.sensors.noise.stages import DelayLine, NoiseArrays, NoiseStage, gaussian_weights, simulate
+from tests.factories.sensor_episode import require_processor
 
 
 def _constant(value: float = 0.0, steps: int = 50, envs: int = 40, probes: int = 30, channels: int = 2) -> np.ndarray:
@@ -386,6 +387,7 @@ def test_noise_in_the_sensors_kernel_and_in_stages_measures_alike():
 
 @pytest.mark.gpu
 def test_cpu_and_cuda_measure_the_same_bits():
+    require_processor()
     x = np.random.default_rng(1).normal(size=(20, 64, 12, 6)).astype(np.float32)
     cpu, cuda = (simulate(_FULL, x, dt=0.01, layout=(3, 4), device=device) for device in ("cpu", "cuda"))
     assert np.array_equal(cpu, cuda)

@@ -7,7 +7,7 @@ import pytest
 
 from robotics_bridge.physics import Geometry
 from robotics_bridge.sensors import Noise, Probes, ProximityTaxel, SensorSuite
-from robotics_bridge.sensors.queries.surface_points import surface_points
+from robotics_bridge.sensors.queries.surface_points import list_by_cells, surface_points
 from tests.factories.touch_scenes import pad_scene, poses_at, random_pose, rotation_of, state_of
 
 GRID = Probes.grid(4, 4, size=(0.02, 0.02), center=(0, 0, 0.005), radius=0.008)
@@ -100,7 +100,7 @@ def test_points_cover_a_surface_evenly() -> None:
     assert quarters.max() / quarters.min() < 1.1
 
 
-def test_points_gathered_by_cells_are_summed_as_each_probe_would_find_them() -> None:
+def test_cells_hold_every_point_within_reach_in_order() -> None:
     noise = Noise(radius=1e-3, gain=(0.5, 1.5))
     free = Probes(np.random.default_rng(0).normal(0, 0.01, (75, 3)), [[0, 0, 1.0]] * 75, [0.0, *np.full(74, 0.006)])
     sensors = {
@@ -109,7 +109,9 @@ def test_points_gathered_by_cells_are_summed_as_each_probe_would_find_them() -> 
     }
     scene = pad_scene(*OBJECTS)
     suites = [SensorSuite(scene, sensors, num_envs=3) for _ in range(2)]
-    suites[1].runtimes[0].gathered = False  # type: ignore[attr-defined]
+    # With a reach of 10 m every cell lists all points.
+    runtime = suites[1].runtimes[0]
+    runtime._cells = list_by_cells(runtime.cloud, 10.0, "cpu")  # type: ignore[attr-defined]
     poses = poses_at(len(scene.links), {}, 3)
     poses[:, 2, :3] = (0.002, 0.001, 0.011)
     poses[:, 3, :3] = (-0.006, 0.002, 0.012)

@@ -21,6 +21,7 @@ from robotics_bridge.sensors.suite import SensorSuite
 from robotics_bridge.sensors.temperature.grid import TemperatureGrid, link_temperature, lost_contacts
 from robotics_bridge.sensors.temperature.materials import MATERIALS, ThermalBody, ThermalMaterial, material
 from robotics_bridge.sensors.temperature.runtime import diffusion
+from tests.factories.sensor_episode import require_processor
 
 PLAIN = ThermalMaterial(2.0, 1000.0, 1000.0, 0.8)
 
@@ -407,6 +408,7 @@ def test_a_hundred_thousand_cells_keep_their_heat():
 
 @pytest.mark.gpu
 def test_cpu_and_cuda_agree():
+    require_processor()
     read = {}
     for device in ("cpu", "cuda"):
         geometries = (
