@@ -1,63 +1,104 @@
 """What friction at rest costs kinematic taxels: one update of a hand that holds a ball, beside the plain law.
 
-python -m benchmarks.tactile.friction_cost --write
+    python -m benchmarks.tactile.friction_cost --write
+    python -m benchmarks.tactile.friction_cost --device cuda --write
+
+A machine whose Warp has no processor compiler takes the state along: ``--write-input FILE`` here, ``--input FILE``
+there. ``--from FILE`` lays out what ``--out FILE`` kept elsewhere.
 """
 
 from __future__ import annotations
 
 import argparse
-import time
+import json
+from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from benchmarks.report import table, write_section
+from benchmarks.tactile.scene import read_input, restore, snapshot
+from benchmarks.tactile.throughput import measure
 from brainbench.cli.tactile.scenes import Grip
+from brainbench.core.devices import pick_device
+from robotics_bridge import hands
+from robotics_bridge.hands.scenes import holding
+from robotics_bridge.physics import TouchScene
 from robotics_bridge.sensors import KinematicTaxel, SensorSuite
 
+HAND = "xhand1"
 SETTINGS: dict[str, dict[str, Any]] = {
     "law": {},
     "law, springs": {"friction": 1.0},
     "engine totals": {"total": "engine"},
     "engine totals, springs (default of the tasks)": {"total": "engine", "friction": 1.0},
 }
-CASES = (("high", 256), ("low", 16))
-ROUNDS, UPDATES = 40, 5
+CASES = {"cpu": (("high", 256), ("low", 16)), "cuda": (("high", 4096), ("low", 4096), ("low", 256))}
+ROUNDS = {"cpu": 15, "cuda": 5}
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--write", action="store_true")
+    parser.add_argument("--device", choices=list(CASES), default="cpu")
+    parser.add_argument("--write", action="store_true", help="put the table into RESULTS.md")
+    parser.add_argument("--write-input", type=Path)
+    parser.add_argument("--input", type=Path)
+    parser.add_argument("--from", type=Path, dest="records")
+    parser.add_argument("--out", type=Path)
     args = parser.parse_args()
-    rows = [row for density, envs in CASES for row in measure(density, envs)]
-    body = "xhand1 holds a ball; processor time of an update, least of 40 rounds of five, settings in turn.\n\n"
-    body += table(["taxels × environments", "forces", "µs", "× law"], rows)
+    if args.write_input:
+        np.savez_compressed(args.write_input, allow_pickle=False, **settled())
+        return
+    if args.records:
+        found = json.loads(args.records.read_text("utf-8"))
+    else:
+        state = read_input(args.input) if args.input else settled()
+        where = pick_device(args.device)
+        rows = [row for density, envs in CASES[args.device] for row in cost(state, density, envs, args.device)]
+        found = {"device": where.name if where.is_cuda else "", "rows": rows, "rounds": ROUNDS[args.device]}
+    if args.out:
+        args.out.write_text(json.dumps(found), "utf-8")
+    time = "time on the device" if found["device"] else "processor time"
+    body = f"{HAND} holds a ball; {time} of an update, least of {found['rounds']} rounds, settings in turn.\n\n"
+    body += table(["taxels × environments", "forces", "µs", "× law"], found["rows"])
     print(body)
     if args.write:
-        command = "python -m benchmarks.tactile.friction_cost --write"
-        write_section("What friction at rest costs", command, body, subject="tactile")
+        title, flag = ("What friction at rest costs", "") if not found["device"] else (
+            f"What friction at rest costs ({found['device']})", "--device cuda "
+        )  # fmt: skip
+        where = f"one {found['device']}" if found["device"] else ""
+        command = f"python -m benchmarks.tactile.friction_cost {flag}--write"
+        write_section(title, command, body, where=where, subject="tactile")
 
 
-def measure(density: str, envs: int) -> list[list[str]]:
-    """Return one row of the table for each setting."""
-    grip = Grip("xhand1", envs=envs)
+def settled() -> dict[str, np.ndarray]:
+    """Return the state of one hand that has closed around the ball."""
+    grip = Grip(HAND)
     grip.run(260)
-    layout = grip.hand.layout(density, "hand")
-    state, step = grip.engine.state, grip.engine.timestep
+    return snapshot(grip.engine.state)
+
+
+def cost(state: dict[str, np.ndarray], density: str, envs: int, device: str) -> list[list[str]]:
+    """Return one row of the table for each setting."""
+    hand = hands.load(HAND)
+    scene, layout = TouchScene.from_mujoco(holding(hand, radius=0.028, reach=0.9)), hand.layout(density, "hand")
+    everywhere = restore(state, envs, device)
     suites = [
         SensorSuite(
-            grip.engine.scene,
+            scene,
             {link: KinematicTaxel(link=link, probes=p, track=("object",), **knobs) for link, p in layout.items()},
             num_envs=envs,
+            device=device,
         )
         for knobs in SETTINGS.values()
     ]
     least = [float("inf")] * len(suites)
-    for _ in range(ROUNDS):
+    for _ in range(ROUNDS[device]):
         for number, suite in enumerate(suites):
-            before = time.process_time()
-            for _ in range(UPDATES):
-                suite.update(state, step)
-            least[number] = min(least[number], (time.process_time() - before) / UPDATES)
-    subject = f"{sum(len(probes) for probes in layout.values())} × {envs}"
+            # The time step stays the same, so that a graph is replayed.
+            update = lambda suite=suite: suite.update(everywhere, 0.002)  # noqa: E731
+            least[number] = min(least[number], measure(update, device, groups=1))
+    subject = f"{sum(len(probes) for probes in layout.values())} × {envs:,}"
     return [
         [subject, name, f"{value * 1e6:.0f}", f"{value / least[0]:.2f}"]
         for name, value in zip(SETTINGS, least, strict=True)

@@ -40,7 +40,7 @@ FULL = Noise.preset("published-force")
 CLASSES = ("kinematic", "depth", "contact", "distance", "proximity", "elastomer", "temperature", "audio")
 CELLS = {"temperature": 8, "audio": 160}
 """Numbers of a reading of the sensors that are no taxels."""
-CONTACT = ("geom", "distance", "position", "normal", "force")
+CONTACT = ("geom", "distance", "position", "normal", "force", "friction")
 State = Mapping[str, np.ndarray]
 
 

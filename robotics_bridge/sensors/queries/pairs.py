@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike
 
 from brainbench.core.devices import to_struct, warp
 from robotics_bridge.physics.state import HandState
+from robotics_bridge.sensors.context import Launcher
 from robotics_bridge.sensors.queries.kernels.pairs import CONTACTS, PairArrays, SlotArrays, pair_kernel, start_kernel
 from robotics_bridge.sensors.queries.solids import Solids
 
@@ -37,7 +38,7 @@ class PairTable:
 
     def __init__(self, solids: Solids, num_envs: int, device: Any, listed: int | None = None) -> None:
         self._solids, self._num_envs, self._device, self._listed = solids, num_envs, device, listed
-        self._slots: list[dict[str, Any]] = []
+        self._launch, self._slots = Launcher(device), list[dict[str, Any]]()
         self.struct: Any = None
         """The Warp structure ``PairArrays``; None before :meth:`freeze`."""
         self.plan: Any = None
@@ -134,7 +135,7 @@ class PairTable:
         contacts, room = self.contacts_needed, state.contact_env.shape[0]
         inputs = [self.plan, state.arrays, self._words, self._bits, age, self.diverged]
         dim = max(self._num_envs, -(-room // CONTACTS)) if contacts else self._num_envs
-        warp().launch(start_kernel(contacts, self._apart), dim=dim, inputs=inputs, device=self._device)
+        self._launch(start_kernel(contacts, self._apart), dim, *inputs)
 
     def update(self, state: HandState) -> None:
         """List what every slot meets now; contacts were marked by :meth:`start`."""
@@ -143,4 +144,4 @@ class PairTable:
         inputs = [self.plan, self._solids.struct, state.arrays, self._words, self._bits, self.struct]
         inputs += [self.crowded, self.diverged]
         dim = self._num_envs * (len(self._slots) + self._apart * state.num_links)
-        warp().launch(pair_kernel(self._apart), dim=dim, inputs=inputs, device=self._device)
+        self._launch(pair_kernel(self._apart), dim, *inputs)

@@ -32,6 +32,12 @@ class SpreadPlan:
     """[S] place k of a sensor on its link."""
     spans: wp.array(dtype=wp.vec3i)
     """[S] first taxel, end and slot of the pair lists."""
+    groups: wp.array(dtype=wp.vec2i)
+    """First and end of groups of neighbouring taxels, sensor by sensor: on a processor the rows of a thread."""
+    group_first: wp.array(dtype=wp.int32)
+    """[S + 1] first group of a sensor."""
+    grouped: wp.int32
+    """1 where groups are rows."""
     reach: wp.array(dtype=wp.float32)
     """[N] a contact this near is felt (m); negative for fillers."""
     slip: wp.float32
@@ -78,6 +84,8 @@ class PressArrays:
     """[B, N] its link."""
     total: wp.array2d(dtype=wp.float32)
     """[B, N] Σ_c g_nc; 0 where no contact explains the touch."""
+    touched: wp.array2d(dtype=wp.int32)
+    """[B, R] taxels of a row with such a sum, where the link has contacts."""
 
 
 @wp.kernel
@@ -166,24 +174,17 @@ def sort_contacts(nodes: ContactNodes):
 
 
 @wp.func
-def nearness(
-    plan: SpreadPlan, nodes: ContactNodes, node: int, k: int, n: int, x: wp.vec3f, normal: wp.vec3f, body: int
-) -> float:
-    """Return g_nc, or 0 where the contact is not one of the taxel's: another body, or the other side of the link."""
-    if ((nodes.felt[node] >> k) & 1) == 0 or nodes.other[node] != body:
+def nearness(alone: bool, point: wp.vec3f, push: wp.vec3f, x: wp.vec3f, normal: wp.vec3f, reach: float) -> float:
+    """Return g_nc of a contact and a taxel at ``x``; 0 where they lie on different sides of the link.
+
+    Only ratios of it matter: of a contact that is ``alone`` on its link it is 1.
+    """
+    if wp.dot(normal, push) <= 0.0:
         return 0.0
-    if wp.dot(normal, nodes.normal[node]) <= 0.0:
-        return 0.0
-    away = wp.length_sq(x - nodes.point[node]) / (plan.reach[n] * plan.reach[n]) + 0.01
+    if alone:
+        return 1.0
+    away = wp.length_sq(x - point) / (reach * reach) + 0.01
     return 1.0 / (away * away)
-
-
-@wp.func
-def pull(press: PressArrays, env: int, n: int, m: wp.vec3f) -> wp.vec3f:
-    """Return q of a taxel: the way it is pushed and held, per unit of normal force."""
-    if press.sigma.shape[0] == press.normal.shape[0]:
-        return m + press.sigma[env, n]
-    return m
 
 
 @wp.kernel
@@ -207,20 +208,32 @@ def share_contacts(
     if ((nodes.felt[node] >> k) & 1) == 0:
         return
     env = state.contact_env[c]
-    sensor = plan.sensors[link_of[state.contact_geom[c][node % 2]], k]
-    span = plan.spans[sensor]
+    link = link_of[state.contact_geom[c][node % 2]]
+    sensor = plan.sensors[link, k]
+    alone = nodes.follower[nodes.head[env, link]] < 0
     push = nodes.normal[node]
+    point = nodes.point[node]
+    other = nodes.other[node]
     whole = float(0.0)
     straight = float(0.0)
     field = wp.vec3f(0.0)
-    for n in range(span[0], span[1]):
-        if press.weight[env, n] > 0.0 and press.total[env, n] > 0.0:
-            m = press.normal[env, n]
-            near = nearness(plan, nodes, node, k, n, probes.position[n], m, press.body[env, n])
-            y = press.weight[env, n] * near / press.total[env, n]
-            whole += y
-            straight += y * wp.dot(m, push)
-            field += y * pull(press, env, n, m)
+    held = press.sigma.shape[0] == press.normal.shape[0]
+    for group in range(plan.group_first[sensor], plan.group_first[sensor + 1]):
+        # Most rows touch nothing.
+        if plan.grouped == 0 or press.touched[env, group] > 0:
+            ends = plan.groups[group]
+            for n in range(ends[0], ends[1]):
+                weight = press.weight[env, n]
+                total = press.total[env, n]
+                if weight > 0.0 and total > 0.0 and press.body[env, n] == other:
+                    m = press.normal[env, n]
+                    y = weight * nearness(alone, point, push, probes.position[n], m, plan.reach[n]) / total
+                    whole += y
+                    straight += y * wp.dot(m, push)
+                    way = m
+                    if held:
+                        way = m + press.sigma[env, n]
+                    field += y * way
     load = nodes.load[node]
     share = wp.vec4f(0.0)
     if whole > 0.0:
@@ -264,10 +277,14 @@ def spread_contacts(
     k = plan.order[part]
     head = nodes.head[env, plan.link[part]]
     diverged = (io.status[env] & 1) != 0
-    full = diverged or head >= 0
+    full = diverged or (head >= 0 and press.touched[env, at_row] > 0)
     if not full and written[env, at_row] == wp.uint8(0):
         return
     written[env, at_row] = wp.uint8(wp.where(full or noisy == 1, 1, 0))
+    held = press.sigma.shape[0] == press.normal.shape[0]
+    alone = bool(False)
+    if full and not diverged:
+        alone = nodes.follower[head] < 0
     n = span[0]
     while n < span[1]:
         f = wp.vec3f(0.0)
@@ -277,16 +294,20 @@ def spread_contacts(
         if diverged and probes.radius[n] > 0.0:
             weight = wp.nan
             measured = wp.nan
-        elif head >= 0 and not diverged and press.total[env, n] > 0.0:
+        elif full and not diverged and press.total[env, n] > 0.0:
             total = press.total[env, n]
             m = press.normal[env, n]
-            way = pull(press, env, n, m)
+            way = m
+            if held:
+                way = m + press.sigma[env, n]
+            body = press.body[env, n]
             node = head
             while node >= 0:
-                near = nearness(plan, nodes, node, k, n, x, m, press.body[env, n])
-                if near > 0.0:
-                    share = nodes.share[node, k]
-                    f += near / total * (share[0] * way + wp.vec3f(share[1], share[2], share[3]))
+                if ((nodes.felt[node] >> k) & 1) == 1 and nodes.other[node] == body:
+                    near = nearness(alone, nodes.point[node], nodes.normal[node], x, m, plan.reach[n])
+                    if near > 0.0:
+                        share = nodes.share[node, k]
+                        f += near / total * (share[0] * way + wp.vec3f(share[1], share[2], share[3]))
                 node = nodes.follower[node]
             weight = press.weight[env, n]
             if noisy == 1:

@@ -149,13 +149,18 @@ def kinematic_kernel(
         tid = wp.uint32(wp.tid())
         count_rows = wp.uint32(rows.shape[0])
         env = int(tid // count_rows)
-        span = rows[int(tid % count_rows)]
+        at_row = int(tid % count_rows)
+        span = rows[at_row]
         part = span[3]
         head = int(-1)
+        order = int(0)
+        alone = bool(False)
         if wp.static(summed):
+            order = plan.order[part]
             head = nodes.head[env, plan.link[part]]
             if head < 0 or (io.status[env] & 1) != 0:
                 return
+            alone = nodes.follower[head] < 0
         slot = probes.slot[span[0]]
         variant = int(0)
         if solids.kind.shape[0] > 1:
@@ -186,6 +191,7 @@ def kinematic_kernel(
         rotation = wp.mat33f()
         offset = wp.vec3f()
         limit = float(0.0)
+        touched = int(0)
         while n < span[1]:
             packed = load_four(probes.packed, n)
             radius = packed[3]
@@ -243,13 +249,18 @@ def kinematic_kernel(
                         body = solids.link[pairs.geometry[env, place]]
                         node = head
                         while node >= 0:
-                            total += nearness(plan, nodes, node, plan.order[part], n, x, normal, body)
+                            if ((nodes.felt[node] >> order) & 1) == 1 and nodes.other[node] == body:
+                                total += nearness(
+                                    alone, nodes.point[node], nodes.normal[node], x, normal, plan.reach[n]
+                                )
                             node = nodes.follower[node]
                         press.normal[env, n] = normal
                         press.body[env, n] = body
                         if wp.static(sticky):
                             press.sigma[env, n] = sigma
                     press.total[env, n] = total
+                    if total > 0.0:
+                        touched += 1
                 else:
                     truth = wp.spatial_vectorf()
                     signal = wp.spatial_vectorf()
@@ -271,5 +282,7 @@ def kinematic_kernel(
             else:
                 idle(io, 6, env, n)
             n += span[2]
+        if wp.static(summed):
+            press.touched[env, at_row] = touched
 
     return kinematic
