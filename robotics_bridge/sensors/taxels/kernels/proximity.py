@@ -8,7 +8,15 @@ from typing import Any
 
 from brainbench.core.devices import warp
 from robotics_bridge.physics.kernels.state import StateArrays
-from robotics_bridge.sensors.kernels.readout import CLEAN, ProbeArrays, ReadoutArrays, idle, lost, readout_functions
+from robotics_bridge.sensors.kernels.readout import (
+    CLEAN,
+    FUSED,
+    ProbeArrays,
+    ReadoutArrays,
+    idle,
+    lost,
+    readout_functions,
+)
 from robotics_bridge.sensors.noise.kernels.noise import episode_draw, radius_noise
 from robotics_bridge.sensors.queries.kernels.pairs import PairArrays
 
@@ -116,7 +124,7 @@ def proximity_kernel(physical: bool, mode: int, hysteresis: bool, walk: bool) ->
             return wp.vec2f(wp.max(radius - far, 0.0), 0.0)
         return wp.vec2f(wp.max(radius - far, 0.0), wp.max(noisy - far, 0.0))
 
-    @wp.kernel(module="unique", grid_stride=False)
+    @wp.kernel(module="unique", grid_stride=False, launch_bounds=(256, 2 if mode == FUSED else 3))
     def proximity(
         probes: ProbeArrays,
         pairs: PairArrays,
