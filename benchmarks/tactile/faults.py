@@ -139,11 +139,11 @@ def heat() -> str:
 
 
 def held() -> str:
-    """Tangential over normal force on taxels whose ball was pushed 4 mm aside and now rests (μ = .8)."""
-    scene = scene_of(ball())
+    """Tangential over normal force of taxels over which a plate slid by 4 mm and now rests (μ = .8)."""
+    scene = scene_of(Geometry(name="o", link="o", kind="box", size=(0.04, 0.04, 0.005)))
     suite = SensorSuite(scene, {"s": KinematicTaxel(link="hand", probes=TOP, friction=0.8)}, num_envs=1)
     for x in (0.0, 4e-3, 4e-3):
-        state = state_of(scene, [(x, 0, 0.0145)])
+        state = state_of(scene, [(x, 0, 0.0095)])
         state.set_contacts([0], [(0, 1)])
         suite.update(state, 0.01)
     force = suite.read("s")[0].numpy().reshape(-1, 6).sum(0)

@@ -15,6 +15,8 @@ from robotics_bridge.sensors.sensor import ProbeSensor, Sensor
 
 LARGEST = 3.0
 """Radius (m) around the probes of one sensor, or around a touched mesh, above which numbers look like millimetres."""
+WIDEST = 0.3
+"""Sensing radius (m) of a taxel above which it does."""
 _CONVEX = ("sphere", "capsule", "ellipsoid", "cylinder", "box")
 
 
@@ -24,9 +26,14 @@ def warn_of(scene: TouchScene, sensors: Mapping[str, Sensor]) -> None:
     sizes = [(f"the probes of {name!r}", enclosing_sphere(sensor.probes)[1]) for name, sensor in probing.items()]
     tracked = {g for sensor in probing.values() for g in sensor.tracked(scene)}
     sizes += [(f"the mesh {mesh.name!r}", mesh.diagonal / 2) for g in tracked if (mesh := scene.geometries[g].mesh)]
-    what, size = max(sizes, key=lambda pair: pair[1], default=("", 0.0))
-    if size > LARGEST:
-        _warn(f"{what[:1].upper()}{what[1:]}: {2 * size:g} m across. Lengths are in metres; scale millimetres by 1e-3.")
+    found = [(what, f"{2 * size:g} m across") for what, size in sizes if size > LARGEST]
+    for name, sensor in probing.items():
+        widest = float(sensor.probes.radius.max(initial=0.0))
+        if widest > WIDEST and not isinstance(sensor, SurfaceDistanceProbe):
+            found.append((f"the sensing radius of {name!r}", f"{widest:g} m"))
+    if found:
+        what, size = found[0]
+        _warn(f"{what[:1].upper()}{what[1:]}: {size}. Lengths are in metres; scale millimetres by 1e-3.")
     for name, sensor in probing.items():
         buried = int(_buried(scene, sensor.link, sensor.probes).sum())
         # Some may lie where parts of a link overlap; distances are read from anywhere.

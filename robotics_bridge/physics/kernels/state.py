@@ -37,6 +37,12 @@ class StateArrays:
 
 
 @wp.func
+def in_scene(pair: wp.vec2i, geometries: int) -> bool:
+    """Return whether both numbers of a contact are those of geometries; a state made by hand may hold others."""
+    return wp.min(pair) >= 0 and wp.max(pair) < geometries
+
+
+@wp.func
 def link_fails(state: StateArrays, env: int, link: int) -> bool:
     """Return whether a pose or a velocity holds a number that is not finite."""
     at = state.pose[env, link]

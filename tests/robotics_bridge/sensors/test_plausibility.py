@@ -25,6 +25,8 @@ def _suite(shape: Geometry, probes: Probes) -> SensorSuite:
 def test_lengths_in_millimetres_are_said() -> None:
     with pytest.warns(RuntimeWarning, match="'tip'.*metres"):
         _suite(BALL, Probes.grid(3, 3, size=(10, 10), center=(0, 0, 5), radius=4))
+    with pytest.warns(RuntimeWarning, match="radius of 'tip': 2 m"):
+        _suite(BALL, Probes.grid(3, 3, size=(0.01, 0.01), center=(0, 0, 0.005), radius=2))
     cup = trimesh.creation.icosphere(2, 40)
     with pytest.warns(RuntimeWarning, match="'cup'.*metres"):
         _suite(Geometry(name="o", link="o", kind="mesh", mesh=Mesh(cup.vertices, cup.faces, "cup")), ON_TOP)

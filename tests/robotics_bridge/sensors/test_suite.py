@@ -10,8 +10,9 @@ import torch
 
 from brainbench.core.errors import UsageError
 from brainbench.geometry import Mesh
-from robotics_bridge.physics import Geometry, TouchScene
+from robotics_bridge.physics import Geometry, HandState, TouchScene
 from robotics_bridge.sensors import (
+    ContactAudio,
     ContactDepthProbe,
     ContactProbe,
     ElastomerTaxel,
@@ -21,7 +22,9 @@ from robotics_bridge.sensors import (
     ProximityTaxel,
     SensorSuite,
     SurfaceDistanceProbe,
+    TemperatureGrid,
 )
+from robotics_bridge.sensors.audio.materials import Modes
 from robotics_bridge.sensors.elastomer.kernels import dilation
 from robotics_bridge.sensors.probes.kernels import probe as _probe_kernels
 from robotics_bridge.sensors.taxels.kernels import kinematic, proximity
@@ -284,3 +287,29 @@ def test_states_and_names_that_do_not_fit_are_refused() -> None:
         suite.read_nearest("depth")
     with pytest.raises(UsageError, match="are 0 to 1"):
         suite.reset([2])
+
+
+def test_contacts_of_geometries_that_the_scene_lacks_are_passed_over() -> None:
+    scene = pad_scene(Geometry(name="ball", link="ball", kind="sphere", size=(0.01,)))
+    grid = Probes.grid(3, 3, size=(0.01, 0.01), center=(0, 0, 0.005), radius=0.002)
+    sensors = {
+        "law": KinematicTaxel(link="hand", probes=grid),
+        "sum": KinematicTaxel(link="hand", probes=grid, total="engine"),
+        "heat": TemperatureGrid(link="hand"),
+        "sound": ContactAudio(link="hand", modes=Modes((500.0,), (5.0,), (1.0,)), samples=100),
+    }
+    read = []
+    for extra in ([], [(0, 7_000_000), (-3, 1), (7_000_000, 0)]):
+        suite, state = SensorSuite(scene, sensors, num_envs=1), HandState.empty(1, 3, 4)
+        state.set_pose(poses_at(3, {2: (0, 0, 0.0145)}))
+        pairs = [(0, 1), *extra]
+        ones = np.ones(len(pairs))
+        places = np.tile([0, 0, 0.005], (len(pairs), 1))
+        normals = np.tile([0, 0, 1.0], (len(pairs), 1))
+        for force in (0.0, 5.0, 5.0):
+            state.set_contacts(0 * ones, pairs, force=force * ones, position=places, normal=normals)
+            suite.update(state)
+        read.append({name: suite.read(name).numpy().copy() for name in sensors})
+    for name in sensors:
+        assert np.abs(read[0][name]).max() > 0, name
+        np.testing.assert_array_equal(read[0][name], read[1][name], err_msg=name)

@@ -4,7 +4,7 @@ Letters: B environment, S source or sensor, K sample of a block, M mode, J joint
 """
 
 from brainbench.core.devices import warp
-from robotics_bridge.physics.kernels.state import StateArrays
+from robotics_bridge.physics.kernels.state import StateArrays, in_scene
 from robotics_bridge.sensors.kernels.readout import ReadoutArrays
 from robotics_bridge.sensors.noise.kernels.noise import normals, philox
 
@@ -65,8 +65,11 @@ def gather_contacts(state: StateArrays, own: ContactSoundArrays):
     if c >= wp.min(state.contact_count[0], state.contact_env.shape[0]):
         return
     env = state.contact_env[c]
-    a = own.link_of[state.contact_geom[c][0]]
-    b = own.link_of[state.contact_geom[c][1]]
+    pair = state.contact_geom[c]
+    if not in_scene(pair, own.link_of.shape[0]):
+        return
+    a = own.link_of[pair[0]]
+    b = own.link_of[pair[1]]
     f = state.contact_force[c]
     if not (f > float(0.0)) or not wp.isfinite(f):
         return

@@ -9,7 +9,7 @@ from functools import cache
 from typing import Any
 
 from brainbench.core.devices import warp
-from robotics_bridge.physics.kernels.state import StateArrays, link_fails, status_of
+from robotics_bridge.physics.kernels.state import StateArrays, in_scene, link_fails, status_of
 from robotics_bridge.sensors.kernels.wide import entry, load_contacts, load_owners
 from robotics_bridge.sensors.queries.kernels.distance import PLANE, SolidArrays
 
@@ -164,7 +164,7 @@ def start_kernel(contacts: bool, apart: bool) -> Any:
                 # Two bits for each contact: whose contact with what is to be marked.
                 todo = int(0)
                 for k in range(wp.static(CONTACTS)):
-                    if one[k] >= 0 and two[k] >= 0:
+                    if in_scene(wp.vec2i(one[k], two[k]), slots.watched.shape[0]):
                         first[k] = entry(slots.watched, one[k])
                         second[k] = entry(slots.watched, two[k])
                         if first[k] >= 0:

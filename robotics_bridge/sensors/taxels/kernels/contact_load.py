@@ -13,7 +13,7 @@ Letters: B environment, L link, S sensor, C contact, N taxel, K sensor of one li
 """
 
 from brainbench.core.devices import warp
-from robotics_bridge.physics.kernels.state import StateArrays
+from robotics_bridge.physics.kernels.state import StateArrays, in_scene
 from robotics_bridge.sensors.kernels.readout import ProbeArrays, ReadoutArrays
 from robotics_bridge.sensors.queries.kernels.pairs import SlotArrays
 
@@ -105,7 +105,7 @@ def list_contacts(
         return
     nodes.felt[node] = 0
     pair = state.contact_geom[c]
-    if pair[0] < 0 or pair[1] < 0:
+    if not in_scene(pair, link_of.shape[0]):
         return
     env = state.contact_env[c]
     # The normal leads from the first to the second, which it pushes away.

@@ -4,7 +4,7 @@ Letters: B environment, S sensor, N cell of all sensors, L link, M contacts kept
 """
 
 from brainbench.core.devices import warp
-from robotics_bridge.physics.kernels.state import StateArrays
+from robotics_bridge.physics.kernels.state import StateArrays, in_scene
 from robotics_bridge.sensors.kernels.readout import ReadoutArrays
 
 wp = warp()
@@ -107,6 +107,8 @@ def collect_contacts(state: StateArrays, heat: HeatArrays):
         return
     env = state.contact_env[c]
     pair = state.contact_geom[c]
+    if not in_scene(pair, heat.link_of.shape[0]):
+        return
     a = heat.link_of[pair[0]]
     b = heat.link_of[pair[1]]
     for s in range(heat.sensors.shape[0]):
