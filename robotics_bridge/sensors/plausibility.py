@@ -16,7 +16,7 @@ from robotics_bridge.sensors.sensor import ProbeSensor, Sensor
 LARGEST = 3.0
 """Radius (m) around the probes of one sensor, or around a touched mesh, above which numbers look like millimetres."""
 WIDEST = 0.3
-"""Sensing radius (m) of a taxel above which it does."""
+"""Sensing radius (m) of a taxel above which it does, if it also exceeds the patch of its sensor."""
 _CONVEX = ("sphere", "capsule", "ellipsoid", "cylinder", "box")
 
 
@@ -29,7 +29,8 @@ def warn_of(scene: TouchScene, sensors: Mapping[str, Sensor]) -> None:
     found = [(what, f"{2 * size:g} m across") for what, size in sizes if size > LARGEST]
     for name, sensor in probing.items():
         widest = float(sensor.probes.radius.max(initial=0.0))
-        if widest > WIDEST and not isinstance(sensor, SurfaceDistanceProbe):
+        patch = float(np.ptp(np.reshape(sensor.probes.position, (-1, 3)), axis=0).max())
+        if widest > max(WIDEST, patch) and not isinstance(sensor, SurfaceDistanceProbe):
             found.append((f"the sensing radius of {name!r}", f"{widest:g} m"))
     if found:
         what, size = found[0]
