@@ -50,8 +50,8 @@ def _sensors(rows: Rows) -> tuple[str, str]:
     if any(row.get("roofline_ratio") is not None for row in rows):
         note += (
             " Roofline: .018 ms clean and .085 ms with noise per 100 taxels and 16,384 environments on an H200;"
-            " the goals 1.5 (primitive) and 3 (mesh 5k) are multiples of it. Own bytes: the 24 (noisy: 144) bytes of a"
-            " taxel that any such update moves, at the bandwidth of the memory."
+            " the goals 1.5 (primitive) and 2.5 (mesh 5k) are multiples of it. Own bytes: the 24 (noisy: 144) bytes of"
+            " a taxel that any such update moves, at the bandwidth of the memory."
         )
     return f"Tactile sensors alone, {rows[0]['envs']:,} environments", f"{note}\n\n{table(columns, cells)}"
 

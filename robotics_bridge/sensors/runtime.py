@@ -189,8 +189,8 @@ class ProbeRuntime(Runtime):
 
 _SHARED = 32
 """Probes that one thread of a processor takes in turn."""
-_SHARED_CUDA = {CLEAN: (8, 3072), FUSED: (4, 6144), STAGED: (8, 3072)}
-"""The same on a GPU by mode: at most, and probes of a multiprocessor for each of them (measured on an H200)."""
+_SHARED_CUDA = {CLEAN: (8, 6144), FUSED: (4, 6144), STAGED: (8, 3072)}
+"""The same on a GPU by mode: at most, and probes of a multiprocessor for each of them (measured on an H100)."""
 
 
 def probe_rows(slices: Iterable[ReadoutSlice], context: LaunchContext, mode: int) -> np.ndarray:

@@ -80,7 +80,9 @@ def triangle_distance(mesh: Mesh, points: NDArray[np.float64]) -> tuple[NDArray[
     corners = mesh.vertices[mesh.faces]
     # All triangles by brute force in double precision: an own reference that shares no code with the kernels.
     sign = np.where(winding_number(mesh, points) > 0.5, -1.0, 1.0)
-    every = (x - closest_point(corners, np.tile(x, (len(corners), 1))) for x in points)
+    # In millimetres: trimesh 5.2 takes parts of triangles of that size in metres for edges.
+    grown = 1e3 * corners
+    every = (x - 1e-3 * closest_point(grown, np.tile(1e3 * x, (len(grown), 1))) for x in points)
     away = np.array([vectors[np.linalg.norm(vectors, axis=1).argmin()] for vectors in every])
     length = np.linalg.norm(away, axis=1)
     return sign * length, (sign / np.maximum(length, 1e-15))[:, None] * away

@@ -40,6 +40,21 @@ def load_contacts(pairs: wp.array(dtype=wp.vec2i), n: int) -> wp.vec4i:
     ...
 
 
+@wp.func_native(
+    """
+#if defined(__CUDA_ARCH__)
+    const int2 found = *reinterpret_cast<const int2*>(&index(owners, n));
+    return wp::vec_t<2, int>(found.x, found.y);
+#else
+    return wp::vec_t<2, int>(index(owners, n), index(owners, n + 1));
+#endif
+"""
+)
+def load_owners(owners: wp.array(dtype=wp.int32), n: int) -> wp.vec2i:
+    """Return the numbers n and n + 1; n is even."""
+    ...
+
+
 @wp.func_native("return values.data[n];")
 def entry(values: wp.array(dtype=wp.int32), n: int) -> int:
     """Return one number."""
@@ -70,13 +85,9 @@ def load_planes(planes: wp.array3d(dtype=wp.float32), row: int, n: int, count: i
     """
     float* at = planes.data + size_t(row) * planes.shape[2] + n;
     const size_t step = size_t(planes.shape[1]) * planes.shape[2];
-#if defined(__CUDA_ARCH__)
-    for (int k = 0; k < 6; ++k) if (k < count) __stcs(at + k * step, value[k]);
-#else
     for (int k = 0; k < 6; ++k) if (k < count) at[k * step] = value[k];
-#endif
 """
 )
 def store_planes(planes: wp.array3d(dtype=wp.float32), row: int, n: int, count: int, value: wp.spatial_vectorf):
-    """Write one place of the first planes, at most six. What an update reads shall not leave a GPU's cache for it."""
+    """Write one place of the first planes, at most six."""
     ...

@@ -37,19 +37,15 @@ class ContactLoadRuntime(KinematicRuntime):
         plan.sensors, plan.link = context.array(places, int), context.array(links, int)
         plan.order, plan.spans = context.array(order, int), context.array(spans, wp.vec3i)
         plan.reach = context.array(np.concatenate([contact_reach(sensor.probes) for sensor in configs]), float)
-        plan.grouped = int(not context.device.is_cuda)
-        rows, ends = self.rows.numpy(), np.array(spans)[:, :2]
-        plan.groups = context.array(rows[:, :2] if plan.grouped else ends, wp.vec2i)
-        owners = rows[:, 3] if plan.grouped else np.arange(len(spans))
-        plan.group_first = context.array(np.searchsorted(owners, np.arange(len(spans) + 1)), int)
+        plan.row_first = context.array(np.searchsorted(self.rows.numpy()[:, 3], np.arange(len(spans) + 1)), int)
         plan.slip = 1.0 if configs[0].convention == "physical" else -1.0
         shape, press = (context.num_envs, self.count), self.press
         press.weight, press.total = context.zeros(shape), context.zeros(shape)
-        press.touched = context.zeros((context.num_envs, self.rows.shape[0]), int)
+        press.part = context.zeros((context.num_envs, self.rows.shape[0]), wp.spatial_vectorf)
         press.noisy = context.zeros(shape if self.noisy else (1, 1))
         press.normal, press.body = context.zeros(shape, wp.vec3f), context.zeros(shape, int)
         press.sigma = context.zeros(shape if configs[0].sticky else (0, 0), wp.vec3f)
-        self.scratch = [press.weight, press.total, press.normal, press.body, press.sigma]
+        self.scratch = [press.weight, press.total, press.normal, press.body, press.sigma, press.part]
         self.scratch += [press.noisy] if self.noisy else []
         # Stages after this one write into the measured readings, which are then never left alone.
         self._written = context.array(np.full((context.num_envs, self.rows.shape[0]), self.noisy), wp.uint8)

@@ -70,3 +70,6 @@ def test_distances_to_triangles_in_double_precision_are_exact_for_a_cube() -> No
     np.testing.assert_allclose(distance, exact, atol=1e-12)
     np.testing.assert_allclose(np.linalg.norm(normal, axis=1), 1)
     np.testing.assert_array_equal(winding_number(mesh, points) > 0.5, distance < 0)
+    # The same cube in tenths of millimetres.
+    small = Mesh(1e-4 * box.vertices, box.faces)
+    np.testing.assert_allclose(triangle_distance(small, 1e-4 * points)[0], 1e-4 * exact, atol=1e-15)

@@ -10,7 +10,7 @@ from typing import Any
 
 from brainbench.core.devices import warp
 from robotics_bridge.physics.kernels.state import StateArrays, in_scene, link_fails, status_of
-from robotics_bridge.sensors.kernels.wide import entry, load_contacts
+from robotics_bridge.sensors.kernels.wide import entry, load_contacts, load_owners
 from robotics_bridge.sensors.queries.kernels.distance import PLANE, SolidArrays
 
 wp = warp()
@@ -142,18 +142,23 @@ def start_kernel(contacts: bool, apart: bool) -> Any:
                 found = wp.min(count, room)
                 one = wp.vec4i(-1)
                 two = wp.vec4i(-1)
+                envs = wp.vec4i(0)
                 for half in range(2):
                     at = 2 * (tid + half * threads)
                     if at + 1 < found:
                         both = load_contacts(state.contact_geom, at)
+                        owners = load_owners(state.contact_env, at)
                         one[2 * half] = both[0]
                         two[2 * half] = both[1]
                         one[2 * half + 1] = both[2]
                         two[2 * half + 1] = both[3]
+                        envs[2 * half] = owners[0]
+                        envs[2 * half + 1] = owners[1]
                     elif at < found:
                         pair = state.contact_geom[at]
                         one[2 * half] = pair[0]
                         two[2 * half] = pair[1]
+                        envs[2 * half] = state.contact_env[at]
                 first = wp.vec4i(-1)
                 second = wp.vec4i(-1)
                 # Two bits for each contact: whose contact with what is to be marked.
@@ -168,21 +173,21 @@ def start_kernel(contacts: bool, apart: bool) -> Any:
                             todo = todo | (2 << (2 * k))
                 # Few are: the threads of a warp take theirs together, whichever of the contacts they are.
                 while todo != 0:
-                    at = int(0)
+                    env = int(0)
                     link = int(-1)
                     other = int(0)
                     lowest = todo & (-todo)
                     todo = todo - lowest
                     for k in range(wp.static(CONTACTS)):
                         if lowest == (1 << (2 * k)):
-                            at = 2 * (tid + (k // 2) * threads) + k % 2
+                            env = envs[k]
                             link = first[k]
                             other = two[k]
                         if lowest == (2 << (2 * k)):
-                            at = 2 * (tid + (k // 2) * threads) + k % 2
+                            env = envs[k]
                             link = second[k]
                             other = one[k]
-                    mark(slots, entry(state.contact_env, at), link, other, words, bits)
+                    mark(slots, env, link, other, words, bits)
 
     return start
 

@@ -32,12 +32,8 @@ class SpreadPlan:
     """[S] place k of a sensor on its link."""
     spans: wp.array(dtype=wp.vec3i)
     """[S] first taxel, end and slot of the pair lists."""
-    groups: wp.array(dtype=wp.vec2i)
-    """First and end of groups of neighbouring taxels, sensor by sensor: on a processor the rows of a thread."""
-    group_first: wp.array(dtype=wp.int32)
-    """[S + 1] first group of a sensor."""
-    grouped: wp.int32
-    """1 where groups are rows."""
+    row_first: wp.array(dtype=wp.int32)
+    """[S + 1] first row of a sensor."""
     reach: wp.array(dtype=wp.float32)
     """[N] a contact this near is felt (m); negative for fillers."""
     slip: wp.float32
@@ -84,8 +80,9 @@ class PressArrays:
     """[B, N] its link."""
     total: wp.array2d(dtype=wp.float32)
     """[B, N] Σ_c g_nc; 0 where no contact explains the touch."""
-    touched: wp.array2d(dtype=wp.int32)
-    """[B, R] taxels of a row with such a sum, where the link has contacts."""
+    part: wp.array2d(dtype=wp.spatial_vectorf)
+    """[B, R] of a row: number of taxels with a touch that a contact explains and, where the link has one contact alone,
+    Σ y, Σ y (m · n) and Σ y q."""
 
 
 @wp.kernel
@@ -218,22 +215,27 @@ def share_contacts(
     straight = float(0.0)
     field = wp.vec3f(0.0)
     held = press.sigma.shape[0] == press.normal.shape[0]
-    for group in range(plan.group_first[sensor], plan.group_first[sensor + 1]):
-        # Most rows touch nothing.
-        if plan.grouped == 0 or press.touched[env, group] > 0:
-            ends = plan.groups[group]
-            for n in range(ends[0], ends[1]):
-                weight = press.weight[env, n]
-                total = press.total[env, n]
-                if weight > 0.0 and total > 0.0 and press.body[env, n] == other:
-                    m = press.normal[env, n]
-                    y = weight * nearness(alone, point, push, probes.position[n], m, plan.reach[n]) / total
-                    whole += y
-                    straight += y * wp.dot(m, push)
-                    way = m
-                    if held:
-                        way = m + press.sigma[env, n]
-                    field += y * way
+    if alone:
+        # Every touch is that of this contact: its taxels were added up row by row.
+        for row in range(plan.row_first[sensor], plan.row_first[sensor + 1]):
+            part = press.part[env, row]
+            whole += part[1]
+            straight += part[2]
+            field += wp.vec3f(part[3], part[4], part[5])
+    else:
+        span = plan.spans[sensor]
+        for n in range(span[0], span[1]):
+            weight = press.weight[env, n]
+            total = press.total[env, n]
+            if weight > 0.0 and total > 0.0 and press.body[env, n] == other:
+                m = press.normal[env, n]
+                y = weight * nearness(alone, point, push, probes.position[n], m, plan.reach[n]) / total
+                whole += y
+                straight += y * wp.dot(m, push)
+                way = m
+                if held:
+                    way = m + press.sigma[env, n]
+                field += y * way
     load = nodes.load[node]
     share = wp.vec4f(0.0)
     if whole > 0.0:
@@ -277,14 +279,16 @@ def spread_contacts(
     k = plan.order[part]
     head = nodes.head[env, plan.link[part]]
     diverged = (io.status[env] & 1) != 0
-    full = diverged or (head >= 0 and press.touched[env, at_row] > 0)
+    full = diverged or (head >= 0 and press.part[env, at_row][0] > 0.0)
     if not full and written[env, at_row] == wp.uint8(0):
         return
     written[env, at_row] = wp.uint8(wp.where(full or noisy == 1, 1, 0))
     held = press.sigma.shape[0] == press.normal.shape[0]
     alone = bool(False)
+    share = wp.vec4f(0.0)
     if full and not diverged:
         alone = nodes.follower[head] < 0
+        share = nodes.share[head, k]
     n = span[0]
     while n < span[1]:
         f = wp.vec3f(0.0)
@@ -300,15 +304,18 @@ def spread_contacts(
             way = m
             if held:
                 way = m + press.sigma[env, n]
-            body = press.body[env, n]
-            node = head
-            while node >= 0:
-                if ((nodes.felt[node] >> k) & 1) == 1 and nodes.other[node] == body:
-                    near = nearness(alone, nodes.point[node], nodes.normal[node], x, m, plan.reach[n])
-                    if near > 0.0:
-                        share = nodes.share[node, k]
-                        f += near / total * (share[0] * way + wp.vec3f(share[1], share[2], share[3]))
-                node = nodes.follower[node]
+            if alone:
+                f = share[0] * way + wp.vec3f(share[1], share[2], share[3])
+            else:
+                body = press.body[env, n]
+                node = head
+                while node >= 0:
+                    if ((nodes.felt[node] >> k) & 1) == 1 and nodes.other[node] == body:
+                        near = nearness(alone, nodes.point[node], nodes.normal[node], x, m, plan.reach[n])
+                        if near > 0.0:
+                            one = nodes.share[node, k]
+                            f += near / total * (one[0] * way + wp.vec3f(one[1], one[2], one[3]))
+                    node = nodes.follower[node]
             weight = press.weight[env, n]
             if noisy == 1:
                 measured = press.noisy[env, n]

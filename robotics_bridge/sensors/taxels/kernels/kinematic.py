@@ -155,12 +155,14 @@ def kinematic_kernel(
         head = int(-1)
         order = int(0)
         alone = bool(False)
+        push = wp.vec3f()
         if wp.static(summed):
             order = plan.order[part]
             head = nodes.head[env, plan.link[part]]
             if head < 0 or (io.status[env] & 1) != 0:
                 return
             alone = nodes.follower[head] < 0
+            push = nodes.normal[head]
         slot = probes.slot[span[0]]
         variant = int(0)
         if solids.kind.shape[0] > 1:
@@ -191,7 +193,10 @@ def kinematic_kernel(
         rotation = wp.mat33f()
         offset = wp.vec3f()
         limit = float(0.0)
-        touched = int(0)
+        touched = float(0.0)
+        whole = float(0.0)
+        straight = float(0.0)
+        field = wp.vec3f()
         while n < span[1]:
             packed = load_four(probes.packed, n)
             radius = packed[3]
@@ -260,7 +265,12 @@ def kinematic_kernel(
                             press.sigma[env, n] = sigma
                     press.total[env, n] = total
                     if total > 0.0:
-                        touched += 1
+                        # With one contact on the link y is the weight alone (taxels.kernels.contact_load).
+                        touched += 1.0
+                        if alone:
+                            whole += weight
+                            straight += weight * wp.dot(normal, push)
+                            field += weight * (normal + sigma)
                 else:
                     truth = wp.spatial_vectorf()
                     signal = wp.spatial_vectorf()
@@ -283,6 +293,6 @@ def kinematic_kernel(
                 idle(io, 6, env, n)
             n += span[2]
         if wp.static(summed):
-            press.touched[env, at_row] = touched
+            press.part[env, at_row] = wp.spatial_vectorf(touched, whole, straight, field[0], field[1], field[2])
 
     return kinematic
