@@ -12,6 +12,7 @@ from typing import Any
 import warp as wp
 
 from brainbench.stimuli.engines.rod.limits import LISTED, SPARE, contacts_for
+from brainbench.stimuli.engines.rod.mesh_bvh import WIDE
 
 from .algebra import JointInverse, JointVector, mat33, reader, vec3, vec4
 from .motion import Instant, MotionArrays  # noqa: F401 — launches take all arrays from here
@@ -32,12 +33,30 @@ PerCandidate3: Any = wp.types.matrix((most_candidates, 3), real)
 PerCandidateInt: Any = wp.types.vector(most_candidates, wp.int32)
 PerListed1: Any = wp.types.vector(LISTED, real)
 PerListedInt: Any = wp.types.vector(LISTED, wp.int32)
+LeafCorners: Any = wp.types.matrix((9, WIDE), real)
+NodeBoxes: Any = wp.types.matrix((6, WIDE), real)
 
 row = reader(
     (PerLink1, real), (PerLinkJoint, JointVector), (PerLinkInverse, JointInverse), (PerLink3, vec3),
     (PerLinkInt, wp.int32), (PerNode3, vec3), (PerCandidate1, real), (PerCandidate3, vec3), (PerCandidateInt, wp.int32),
     (PerListed1, real), (PerListedInt, wp.int32),
 )  # fmt: skip
+
+
+@wp.func_native("return corners.data[leaf].data[row][rank];")
+def leaf_number(corners: wp.array(dtype=LeafCorners), leaf: int, row: int, rank: int) -> real:
+    """Return a coordinate of a triangle of a leaf, without a copy of the whole."""
+    ...
+
+
+@wp.func
+def corner(corners: wp.array(dtype=LeafCorners), leaf: int, which: int, rank: int) -> vec3:
+    """Return a corner of a triangle of a leaf."""
+    return vec3(
+        leaf_number(corners, leaf, 3 * which, rank),
+        leaf_number(corners, leaf, 3 * which + 1, rank),
+        leaf_number(corners, leaf, 3 * which + 2, rank),
+    )
 
 
 @wp.struct
@@ -124,13 +143,11 @@ class ShapeArrays:
     faces: wp.array(dtype=wp.int32)
     """[shape] number of its triangles."""
     box: wp.array(dtype=wp.int32)
-    """[shape] first of its boxes below."""
-    low: wp.array(dtype=vec3)
-    """[box] lowest corner; boxes as in ``brainbench.stimuli.engines.rod.mesh_bvh``."""
-    high: wp.array(dtype=vec3)
-    """[box] highest corner."""
-    corner: wp.array2d(dtype=vec3)
-    """[triangle, 3]"""
+    """[shape] first of its nodes below."""
+    boxes: wp.array(dtype=NodeBoxes)
+    """[node] boxes of its children, as in ``brainbench.stimuli.engines.rod.mesh_bvh``."""
+    corners: wp.array(dtype=LeafCorners)
+    """[leaf] of its triangles; each surface begins with a leaf of its own."""
     outward: wp.array2d(dtype=vec3)
     """[triangle, 7] angle-weighted normals: face, three corners, edges opposite to them."""
 
