@@ -101,7 +101,8 @@ def test_a_tapered_link_meets_a_turned_primitive_where_its_gap_is_least(kind, sc
 def test_segments_and_points_are_as_far_from_triangles_as_trimesh_says():
     import trimesh
 
-    kernels, native = in_double("distances"), in_double("native").TRIANGLES
+    kernels = in_double("distances")
+    native = kernels.TRIANGLES
     vec2, vec3, vec4 = kernels.vec2, kernels.vec3, kernels.vec4
 
     @wp.func_native(

@@ -13,7 +13,7 @@ import warp as wp
 from brainbench.stimuli.engines.rod.limits import CLOSED, CREVICE
 
 from .algebra import JointVector, reader, vec3, vec6
-from .native import NUMBERS
+from .distances import NUMBERS
 from .parameters import capacity, group_size, hinges, max_contacts, real
 from .state import ContactProblems, JointRecord, PerLinkJoint, most_candidates
 from .thread_groups import broadcast, group_sum, warp_max
@@ -193,6 +193,16 @@ const int rows = (3 * each + lanes - 1) / lanes * lanes;
 LANES = "for (int k = 0; k < rows; k += lanes) SIDE_BY_SIDE for (int r = k; r < k + lanes; r++)"
 
 
+TWIST = """
+    if (twists) {
+        const real u3 = dot(j.axis3.c, w) + dot(j.moment3.c, v);
+        for (int d = 0; d < 3; d++) { w[d] = w[d] - j.gain3_w.c[d] * u3; v[d] = v[d] - j.gain3_v.c[d] * u3; }
+        unit.joint_rate.data[2][r] = u3;
+        unit.impulse.data[2][r] = step * j.inverse_inertia.c[3] * u3;
+    }
+"""
+
+
 @wp.func_native(
     ROWS
     + f"""
@@ -201,7 +211,7 @@ const real i11 = j.inverse_inertia.c[0], i12 = j.inverse_inertia.c[1], i22 = j.i
 {LANES} {{
     real w[3], v[3];
     for (int d = 0; d < 3; d++) {{ w[d] = unit.w.data[d][r]; v[d] = unit.v.data[d][r]; }}
-    TWIST
+    {TWIST if hinges == 3 else ""}
     const real u1 = dot(j.axis1.c, w) + dot(j.moment1.c, v), u2 = dot(j.axis2.c, w) + dot(j.moment2.c, v);
     for (int d = 0; d < 3; d++) {{
         unit.w.data[d][r] = w[d] - j.gain1_w.c[d] * u1 - j.gain2_w.c[d] * u2;
@@ -212,19 +222,7 @@ const real i11 = j.inverse_inertia.c[0], i12 = j.inverse_inertia.c[1], i22 = j.i
     unit.impulse.data[0][r] = step * (i11 * u1 + i12 * u2);
     unit.impulse.data[1][r] = step * (i12 * u1 + i22 * u2);
 }}
-""".replace(
-        "TWIST",
-        """
-    if (twists) {
-        const real u3 = dot(j.axis3.c, w) + dot(j.moment3.c, v);
-        for (int d = 0; d < 3; d++) { w[d] = w[d] - j.gain3_w.c[d] * u3; v[d] = v[d] - j.gain3_v.c[d] * u3; }
-        unit.joint_rate.data[2][r] = u3;
-        unit.impulse.data[2][r] = step * j.inverse_inertia.c[3] * u3;
-    }
 """
-        if hinges == 3
-        else "",
-    )
 )
 def pass_joint(
     joints: wp.array(dtype=JointRecord), joint: int, twists: int, step: real, each: int, unit: wp.ref[UnitForces]
@@ -321,7 +319,9 @@ def build_delassus(
         twists = int(0)
         if wp.static(hinges == 3):
             twists = i % 2
-        pass_joint(problems.joint, first_joint + i, twists, solver.step, each, unit)
+        # A thread of a GPU follows the longest whisker of its warp, beyond the end of its own.
+        if wp.static(group_size == 1) or (thread < solver.contacts and row(own.link, 0) >= i):
+            pass_joint(problems.joint, first_joint + i, twists, solver.step, each, unit)
         # Both contacts share this joint: its part of G. One thread alone computes the lower half.
         for e in range(count):
             if wp.static(group_size > 1) or row(own.link, e) >= i:

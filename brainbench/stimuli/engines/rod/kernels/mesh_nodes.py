@@ -1,6 +1,6 @@
 """What a search for the nearest triangles does at a leaf and at a node: eight triangles, or eight boxes, at once.
 
-Each thread of a group takes its share of the eight: one on a GPU, all on a processor (``native``). All distances are
+Each thread of a group takes its share of the eight: one on a GPU, all on a processor (``distances``). All distances are
 squared, and in units of the surface.
 """
 
@@ -11,7 +11,7 @@ import warp as wp
 from brainbench.stimuli.engines.rod.mesh_bvh import LEVELS, WIDE
 
 from .algebra import vec3
-from .native import NUMBERS, TRIANGLES
+from .distances import NUMBERS, TRIANGLES
 from .parameters import group_size, real
 from .state import LeafCorners, NodeBoxes
 
