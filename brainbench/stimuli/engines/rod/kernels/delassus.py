@@ -153,6 +153,8 @@ def select_contacts(problems: ContactProblems, solver: wp.ref[SolverState], own:
             if wp.static(group_size == 1) or solver.contacts == solver.thread:
                 add_contact(problems, solver, own, wp.static(stride) * solver.contacts, slot)
             solver.contacts = solver.contacts + 1
+    if wp.static(group_size == 1):
+        solver.own_count = solver.contacts
     # Threads of a warp walk the same links and contacts.
     # No force enters behind the last link with a contact, so the passes below begin there.
     top = int(-1)
