@@ -10,11 +10,13 @@ import re
 import sys
 import threading
 from contextlib import contextmanager
+from functools import partial
 from types import FunctionType, ModuleType, SimpleNamespace
 
 import numpy as np
 
 from brainbench.stimuli.engines.rod.kernels import specialize
+from tests.factories.rod_native import NATIVES
 
 WARP = 32
 
@@ -127,8 +129,10 @@ def _language() -> ModuleType:
         # Native code reads memory, or is where the processor's minimum and maximum are other than Warp's.
         if "extract(memory, index)" in code:
             return lambda _function: lambda memory, index: memory[index]
-        found = re.search(r"#else\nreturn a ([<>]) b \? a : b;", code)
-        return lambda _function: min if found[1] == "<" else max
+        if found := re.search(r"#else\nreturn a ([<>]) b \? a : b;", code):
+            return lambda _function: min if found[1] == "<" else max
+        children = re.search(r"constexpr int children = (\d+);", code)
+        return lambda function: partial(NATIVES.get(function.__name__, function), int(children[1]) if children else 0)
 
     def zeroed(kind):
         def begin(self):

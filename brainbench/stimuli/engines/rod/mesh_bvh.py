@@ -10,8 +10,11 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-WIDE = 8
+BITS = 3
+WIDE = 1 << BITS
 """Children of a node, and triangles of a leaf."""
+EMPTY = 1e30
+"""Coordinate of children that a node lacks: further away than any search goes."""
 LEVELS = 7
 """Levels of boxes that a search keeps track of: enough for 16 million triangles."""
 
@@ -44,9 +47,10 @@ def spatial_order(corners: NDArray[np.float64]) -> NDArray[np.intp]:
 
 
 def tree_boxes(corners: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return boxes [box, 2, 3] (lowest, highest corner) of ordered triangles: of leaves, then of parents, and so on.
+    """Return the nodes [node, 6, 8] above ordered triangles: boxes (lowest, highest corner) of eight children each.
 
-    The last level has no more than eight boxes; a level that follows ``n`` boxes has ⌈n / 8⌉.
+    Children of the first nodes are leaves, of the next ones these nodes, and so on; the last node is the top. A level
+    above ``n`` boxes has ⌈n / 8⌉ nodes.
     """
     low, high = corners.min(axis=1), corners.max(axis=1)
     levels = []
@@ -54,5 +58,11 @@ def tree_boxes(corners: NDArray[np.float64]) -> NDArray[np.float64]:
         begins = np.arange(0, len(low), WIDE)
         # Parents from the boxes of their children, level by level.
         low, high = np.minimum.reduceat(low, begins), np.maximum.reduceat(high, begins)
-        levels.append(np.stack([low, high], axis=1))
+        levels.append(in_eights(np.concatenate([low, high], axis=1)))
     return np.concatenate(levels)
+
+
+def in_eights(rows: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return rows [row, number] as runs of eight [run, number, 8]: a processor reads a number of all eight at once."""
+    missing = np.full((-len(rows) % WIDE, rows.shape[1]), EMPTY)
+    return np.concatenate([rows, missing]).reshape(-1, WIDE, rows.shape[1]).swapaxes(1, 2)

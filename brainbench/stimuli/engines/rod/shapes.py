@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from brainbench.core import rotations
 from brainbench.geometry.mesh import hull_faces
 from brainbench.stimuli.engines.rod import limits
-from brainbench.stimuli.engines.rod.mesh_bvh import spatial_order, tree_boxes
+from brainbench.stimuli.engines.rod.mesh_bvh import WIDE, in_eights, spatial_order, tree_boxes
 from brainbench.stimuli.engines.rod.packing import PackedMotions, Track
 from brainbench.stimuli.engines.units import MILLI
 from brainbench.stimuli.objects.obstacle import Box, Capsule, ConvexPart, Cylinder, Obstacle, Sphere, TriangleMesh
@@ -28,12 +28,13 @@ SLIVER_ROUNDS = 32
 class PackedSurface:
     """A triangle surface as the kernels take it: triangles in the order of their search tree."""
 
+    triangles: int
     corners: NDArray[np.float64]
-    """[triangle, 3, 3]"""
+    """[leaf, 9, 8] of the eight triangles of each leaf; the last may lack some."""
     outward: NDArray[np.float64]
-    """[triangle, 7, 3] as :func:`pseudo_normals` returns it."""
+    """[triangle, 7, 3] as :func:`pseudo_normals` returns it; up to the last place of the last leaf."""
     boxes: NDArray[np.float64]
-    """[box, 2, 3] as :func:`brainbench.stimuli.engines.rod.mesh_bvh.tree_boxes` returns it."""
+    """[node, 6, 8] as :func:`brainbench.stimuli.engines.rod.mesh_bvh.tree_boxes` returns it."""
     outline: NDArray[np.float64]
     """[corner, 2] of the convex hull of its shadow along z: how far it reaches when it is turned about z."""
     radius: float
@@ -55,7 +56,10 @@ class PackedSurface:
         corners = corners[wide]
         outline = vertices[ConvexHull(vertices[:, :2]).vertices, :2]
         radius = float(np.linalg.norm(vertices, axis=1).max())
-        return cls(corners, pseudo_normals(vertices, faces)[wide], tree_boxes(corners), outline, radius)
+        outward = pseudo_normals(vertices, faces)[wide]
+        outward = np.concatenate([outward, np.zeros((-len(outward) % WIDE, 7, 3))])
+        leaves = in_eights(corners.reshape(-1, 9))
+        return cls(len(corners), leaves, outward, tree_boxes(corners), outline, radius)
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,8 +80,8 @@ class PackedShapes:
     """Columns of the kernel's ``ShapeArrays``, some shapes at a time, [shape, …]."""
     first: list[int] = field(default_factory=lambda: [0])
     surfaces: list[PackedSurface] = field(default_factory=list)
-    triangles: int = 0
-    boxes: int = 0
+    leaves: int = 0
+    nodes: int = 0
     _known: dict[int, dict[str, Any]] = field(default_factory=dict)
 
     def add_scene(self, bodies: Sequence[TrackedObstacle], motions: PackedMotions) -> int:
@@ -156,10 +160,10 @@ class PackedShapes:
 
     def add_mesh(self, surface: PackedSurface) -> dict[str, int]:
         """Append a surface; return where its triangles and boxes are."""
-        place = {"face": self.triangles, "faces": len(surface.corners), "box": self.boxes}
+        place = {"face": self.leaves * WIDE, "faces": surface.triangles, "box": self.nodes}
         self.surfaces.append(surface)
-        self.triangles += len(surface.corners)
-        self.boxes += len(surface.boxes)
+        self.leaves += len(surface.corners)
+        self.nodes += len(surface.boxes)
         return place
 
     @property
@@ -174,15 +178,13 @@ class PackedShapes:
             some = [np.asarray(columns[name], dtype=dtype).reshape(-1, *shape) for columns in self.columns]
             return np.concatenate(some or [np.zeros((0, *shape), dtype=dtype)])
 
-        boxes = np.concatenate([one.boxes for one in self.surfaces] or [np.zeros((1, 2, 3))])
         return {
             "first": np.array(self.first, dtype=np.int32),
             **{name: column(name, np.int32) for name in ("kind", "track", "face", "faces", "box")},
             **{name: column(name, float) for name in ("scale", "radius", "speed", "friction")},
             **{name: column(name, float, (width,)) for name, width in (("size", 3), ("place", 3), ("turn", 4))},
-            "low": boxes[:, 0],
-            "high": boxes[:, 1],
-            "corner": np.concatenate([one.corners for one in self.surfaces] or [np.zeros((1, 3, 3))]),
+            "boxes": np.concatenate([one.boxes for one in self.surfaces] or [np.zeros((1, 6, WIDE))]),
+            "corners": np.concatenate([one.corners for one in self.surfaces] or [np.zeros((1, 9, WIDE))]),
             "outward": np.concatenate([one.outward for one in self.surfaces] or [np.zeros((1, 7, 3))]),
         }
 

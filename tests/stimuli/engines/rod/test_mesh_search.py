@@ -7,7 +7,7 @@ import pytest
 
 from brainbench.core.devices import to_struct
 from brainbench.stimuli.engines.rod.kernels import specialize
-from brainbench.stimuli.engines.rod.mesh_bvh import WIDE, spatial_order, tree_boxes
+from brainbench.stimuli.engines.rod.mesh_bvh import EMPTY, WIDE, spatial_order, tree_boxes
 from brainbench.stimuli.engines.rod.shapes import PackedShapes, PackedSurface
 from brainbench.stimuli.objects.obstacle import TriangleMesh
 from tests.factories.rod_threads import WARP, Memory, thread_warp
@@ -37,18 +37,22 @@ def test_every_aligned_run_of_triangles_is_a_box_that_holds_them():
     corners = surface.vertices[surface.faces]
     order = spatial_order(corners)
     np.testing.assert_array_equal(np.sort(order), np.arange(len(corners)))
-    corners, boxes, run, first = corners[order], tree_boxes(corners[order]), WIDE, 0
+    corners, nodes, run, first = corners[order], tree_boxes(corners[order]), WIDE, 0
+    boxes = nodes.swapaxes(1, 2).reshape(-1, 2, 3)
     while first < len(boxes):
         count = -(-len(corners) // run)
         for rank in range(count):
             inside = corners[rank * run : (rank + 1) * run].reshape(-1, 3)
             np.testing.assert_array_equal(boxes[first + rank], [inside.min(axis=0), inside.max(axis=0)])
-        first, run = first + count, run * WIDE
+        # The last node of a level may lack children.
+        assert (boxes[first + count : first + -(-count // WIDE) * WIDE] == EMPTY).all()
+        first, run = first + -(-count // WIDE) * WIDE, run * WIDE
     assert first == len(boxes)
     # Neighbours in the order are neighbours in space: leaves are far smaller than those of triangles in any order.
     leaves = -(-len(corners) // WIDE)
     extent = np.ptp(boxes[:leaves], axis=1).max(axis=1).mean()
-    mixed = np.ptp(tree_boxes(corners[np.random.default_rng(0).permutation(len(corners))])[:leaves], axis=1)
+    mixed = tree_boxes(corners[np.random.default_rng(0).permutation(len(corners))])
+    mixed = np.ptp(mixed.swapaxes(1, 2).reshape(-1, 2, 3)[:leaves], axis=1)
     assert extent < 0.3 * mixed.max(axis=1).mean()
 
 
@@ -204,6 +208,69 @@ def test_a_link_outside_is_never_told_that_it_overlaps_wherever_the_search_begin
     close = ends < margin
     assert close.any()
     np.testing.assert_allclose(gaps[close, 1], ends[close], atol=1e-9)
+
+
+def _measure_leaves(arrays, starts, stops, threads):
+    """Numbers [thread, segment, 7] that the threads of a group find in the leaf of each segment's rank."""
+    nodes = specialize("mesh_bvh", real=wp.float64, group_size=threads)
+    measure_triangles, NearestTriangles = nodes.measure_triangles, nodes.NearestTriangles
+    SearchSegment, SearchBounds, LeafCorners = nodes.SearchSegment, nodes.SearchBounds, nodes.LeafCorners
+    own = WIDE // threads
+
+    @wp.kernel(enable_backward=False, module="unique")
+    def measure(
+        corners: wp.array(dtype=LeafCorners),
+        count: int,
+        a: wp.array(dtype=wp.vec3d),
+        b: wp.array(dtype=wp.vec3d),
+        out: wp.array3d(dtype=wp.float64),
+    ):
+        part, k = wp.tid()
+        line = SearchSegment()
+        line.a = a[k]
+        line.b = b[k]
+        line.length = wp.length(b[k] - a[k])
+        line.axis = (b[k] - a[k]) / line.length
+        got = NearestTriangles()
+        got.face = -1
+        got.side = wp.float64(1e20)
+        got.end = got.side
+        got.start = got.side
+        bounds = SearchBounds()
+        bounds.side = got.side
+        bounds.end = got.side
+        bounds.start = got.side
+        measure_triangles(corners, k, WIDE * k + own * part, count, part, line, bounds, got)
+        out[part, k, 0] = got.side
+        out[part, k, 1] = got.end
+        out[part, k, 2] = got.start
+        out[part, k, 3] = wp.float64(got.face)
+        out[part, k, 4] = got.share
+        out[part, k, 5] = got.v
+        out[part, k, 6] = got.w
+
+    out = wp.zeros((threads, len(starts), 7), dtype=wp.float64)
+    vectors = (wp.array(x, dtype=wp.vec3d) for x in (starts, stops))
+    corners = wp.array(arrays["corners"], dtype=LeafCorners)
+    wp.launch(measure, out.shape[:2], [corners, int(arrays["faces"][0]), *vectors, out], device="cpu")
+    return out.numpy()
+
+
+def test_triangles_measured_side_by_side_are_those_measured_one_by_one():
+    wp.init()
+    # The last leaf is not full, so that places without a triangle are met.
+    surface = _surface()
+    surface = TriangleMesh(surface.vertices, surface.faces[:-3])
+    arrays = _shapes(surface)
+    assert arrays["faces"][0] % WIDE
+    leaves = len(arrays["corners"])
+    starts, stops = _segments(surface, leaves)
+    together, apart = _measure_leaves(arrays, starts, stops, 1)[0], _measure_leaves(arrays, starts, stops, WIDE)
+    np.testing.assert_array_equal(together[:, :3], apart[..., :3].min(axis=0))
+    # Of triangles that are as near the first counts.
+    first = apart[..., 0].argmin(axis=0)
+    np.testing.assert_array_equal(together[:, 3:], apart[first, np.arange(leaves), 3:])
+    assert len(np.unique(together[:, 3] % WIDE)) == WIDE
 
 
 @pytest.mark.parametrize("lanes", [2, 4, 8])

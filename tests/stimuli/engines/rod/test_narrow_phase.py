@@ -102,8 +102,25 @@ def test_segments_and_points_are_as_far_from_triangles_as_trimesh_says():
     import trimesh
 
     kernels = in_double("distances")
+    native = kernels.TRIANGLES
     vec2, vec3, vec4 = kernels.vec2, kernels.vec3, kernels.vec4
-    segment_triangle, point_triangle = kernels.segment_triangle, kernels.point_triangle
+
+    @wp.func_native(
+        native
+        + """wp::vec_t<4, real> found;
+        segment_triangle(a.c, b.c, p.c, q.c, r.c, found.c[0], found.c[1], found.c[2], found.c[3]);
+        return found;"""
+    )
+    def segment_triangle(a: vec3, b: vec3, p: vec3, q: vec3, r: vec3) -> vec4: ...
+
+    @wp.func_native(
+        native
+        + """wp::vec_t<2, real> found;
+        real square;
+        from_triangle(x.c, p.c, q.c, r.c, square, found.c[0], found.c[1]);
+        return found;"""
+    )
+    def point_triangle(x: vec3, p: vec3, q: vec3, r: vec3) -> vec2: ...
 
     @wp.kernel(enable_backward=False, module="unique")
     def measure(

@@ -22,7 +22,7 @@ def test_a_triangle_without_a_width_in_a_sharp_edge_does_not_hide_the_other_side
     np.testing.assert_allclose(found[3, 5], up, atol=1e-6)  # edge 4–1
     np.testing.assert_allclose(found[1, 4:], np.tile(up, (3, 1)), atol=1e-6)
     np.testing.assert_allclose(found[2, 3], up, atol=1e-6)  # corner 4
-    assert len(PackedSurface.of(corners, faces).corners) == 5
+    assert PackedSurface.of(corners, faces).triangles == 5
     usual = pseudo_normals(corners[:4], np.array([[0, 1, 2], [0, 3, 1], [0, 2, 3], [1, 3, 2]]))
     np.testing.assert_allclose(found[0, [0, 1, 2, 3]], usual[0, [0, 1, 2, 3]], atol=1e-6)
 

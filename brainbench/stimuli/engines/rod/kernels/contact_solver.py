@@ -22,11 +22,12 @@ from .delassus import (
     PerContact1,
     SolverState,
     ThreadContacts,
+    add_rates,
     apply_forces,
     build_delassus,
     own_contacts,
+    own_rows,
     row,
-    row_size,
     select_contacts,
     store_forces,
     stride,
@@ -119,11 +120,12 @@ def contact_rates(solver: wp.ref[SolverState], own: wp.ref[ThreadContacts], matr
             own.rate[3 * k + 1] = row(own.free_rate, 3 * k + 1)
             own.rate[3 * k + 2] = row(own.free_rate, 3 * k + 2)
     for e in range(solver.warp_contacts):
-        for b in range(3):
-            force_k = broadcast(row(own.force, wp.static(3 * stride) * e + b), e)
-            if refresh == 1:
-                for r in range(3 * solver.own_count):
-                    own.rate[r] = row(own.rate, r) + row(matrix, r * wp.static(row_size) + 3 * e + b) * force_k
+        k = wp.static(3 * stride) * e
+        f0 = broadcast(row(own.force, k), e)
+        f1 = broadcast(row(own.force, k + 1), e)
+        f2 = broadcast(row(own.force, k + 2), e)
+        if refresh == 1:
+            add_rates(own, matrix, e, vec3(f0, f1, f2), solver.own_count)
 
 
 @wp.func(inline=True)
@@ -173,9 +175,7 @@ def gauss_seidel_sweep(
         d0 = broadcast(d0, c)
         d1 = broadcast(d1, c)
         d2 = broadcast(d2, c)
-        for r in range(3 * solver.own_count):
-            e = r * wp.static(row_size) + 3 * c
-            own.rate[r] = row(own.rate, r) + row(matrix, e) * d0 + row(matrix, e + 1) * d1 + row(matrix, e + 2) * d2
+        add_rates(own, matrix, c, vec3(d0, d1, d2), solver.own_count)
     gap_error = group_max(gap_error)
     force_change = group_sum(force_change)
     force_sum = group_sum(force_sum)
@@ -282,11 +282,11 @@ def share_normal_forces(
             stick1 = zero
             stick2 = zero
         for k in range(each):
-            r = 3 * k * wp.static(row_size) + 3 * e
-            normals[k * wp.static(max_contacts) + e] = (
-                row(matrix, r) + row(matrix, r + 1) * slide1 + row(matrix, r + 2) * slide2
-            )
-            asked[k] = asked[k] - row(matrix, r + 1) * stick1 - row(matrix, r + 2) * stick2
+            r = 3 * e * wp.static(own_rows) + 3 * k
+            along1 = row(matrix, r + wp.static(own_rows))
+            along2 = row(matrix, r + wp.static(2 * own_rows))
+            normals[k * wp.static(max_contacts) + e] = row(matrix, r) + along1 * slide1 + along2 * slide2
+            asked[k] = asked[k] - along1 * stick1 - along2 * stick2
     # Active set: which contacts press, one change at a time.
     agreed = 1 - guessing
     for _ in range(tries):

@@ -12,9 +12,10 @@ import warp as wp
 
 from brainbench.stimuli.engines.rod.limits import CLOSED, CREVICE
 
-from .algebra import JointInverse, JointVector, reader, vec3, vec6
+from .algebra import JointVector, reader, vec3, vec6
+from .distances import NUMBERS
 from .parameters import capacity, group_size, hinges, max_contacts, real
-from .state import ContactProblems, PerLinkJoint, most_candidates
+from .state import ContactProblems, JointRecord, PerLinkJoint, most_candidates
 from .thread_groups import broadcast, group_sum, warp_max
 
 own_contacts = max_contacts if group_size == 1 else 1
@@ -25,9 +26,14 @@ PerContactInt: Any = wp.types.vector(own_contacts, wp.int32)
 PerContact1: Any = wp.types.vector(own_contacts, real)
 PerContact3: Any = wp.types.matrix((own_contacts, 3), real)
 PerContact6: Any = wp.types.matrix((own_contacts, 6), real)
-PerRow1: Any = wp.types.vector(3 * own_contacts, real)
-PerRow3: Any = wp.types.matrix((3 * own_contacts, 3), real)
-DelassusRows: Any = wp.types.vector(3 * own_contacts * row_size, real)
+lanes = 8 if group_size == 1 else 3
+"""Rows that a thread computes side by side: a processor takes some, and a GPU's thread its own three, at once."""
+own_rows = -(-3 * own_contacts // lanes) * lanes
+PerRow1: Any = wp.types.vector(own_rows, real)
+PerRow3: Any = wp.types.matrix((own_rows, 3), real)
+ByRow3: Any = wp.types.matrix((3, own_rows), real)
+DelassusRows: Any = wp.types.vector(row_size * own_rows, real)
+"""The thread's own rows, column after column."""
 NormalMatrix: Any = wp.types.vector(own_contacts * max_contacts, real)
 
 
@@ -165,113 +171,183 @@ def select_contacts(problems: ContactProblems, solver: wp.ref[SolverState], own:
     solver.warp_contacts = warp_max(solver.contacts)
 
 
+@wp.struct
+class UnitForces:
+    """Unit force of each row as it is below the present link, and what its joint does: [axis or hinge, row]."""
+
+    w: ByRow3
+    v: ByRow3
+    joint_rate: ByRow3
+    impulse: ByRow3
+    """h D⁻¹ of the joint rates."""
+
+
+ROWS = (
+    NUMBERS
+    + f"""
+constexpr int stride = {own_rows}, lanes = {lanes};
+// Rows of contacts that the whisker lacks are zeros.
+const int rows = (3 * each + lanes - 1) / lanes * lanes;
+"""
+)
+LANES = "for (int k = 0; k < rows; k += lanes) SIDE_BY_SIDE for (int r = k; r < k + lanes; r++)"
+
+
+TWIST = """
+    if (twists) {
+        const real u3 = dot(j.axis3.c, w) + dot(j.moment3.c, v);
+        for (int d = 0; d < 3; d++) { w[d] = w[d] - j.gain3_w.c[d] * u3; v[d] = v[d] - j.gain3_v.c[d] * u3; }
+        unit.joint_rate.data[2][r] = u3;
+        unit.impulse.data[2][r] = step * j.inverse_inertia.c[3] * u3;
+    }
+"""
+
+
+@wp.func_native(
+    ROWS
+    + f"""
+const auto j = joints.data[joint];
+const real i11 = j.inverse_inertia.c[0], i12 = j.inverse_inertia.c[1], i22 = j.inverse_inertia.c[2];
+{LANES} {{
+    real w[3], v[3];
+    for (int d = 0; d < 3; d++) {{ w[d] = unit.w.data[d][r]; v[d] = unit.v.data[d][r]; }}
+    {TWIST if hinges == 3 else ""}
+    const real u1 = dot(j.axis1.c, w) + dot(j.moment1.c, v), u2 = dot(j.axis2.c, w) + dot(j.moment2.c, v);
+    for (int d = 0; d < 3; d++) {{
+        unit.w.data[d][r] = w[d] - j.gain1_w.c[d] * u1 - j.gain2_w.c[d] * u2;
+        unit.v.data[d][r] = v[d] - j.gain1_v.c[d] * u1 - j.gain2_v.c[d] * u2;
+    }}
+    unit.joint_rate.data[0][r] = u1;
+    unit.joint_rate.data[1][r] = u2;
+    unit.impulse.data[0][r] = step * (i11 * u1 + i12 * u2);
+    unit.impulse.data[1][r] = step * (i12 * u1 + i22 * u2);
+}}
+"""
+)
+def pass_joint(
+    joints: wp.array(dtype=JointRecord), joint: int, twists: int, step: real, each: int, unit: wp.ref[UnitForces]
+):
+    """Carry the unit forces of a thread's ``each`` contacts over a joint, and find what they do to it."""
+    ...
+
+
+@wp.func_native(
+    ROWS
+    + f"""
+real *g0 = matrix.c + 3 * contact * stride, *g1 = g0 + stride, *g2 = g1 + stride;
+const real *h1 = unit.impulse.data[0], *h2 = unit.impulse.data[1], *h3 = unit.impulse.data[2];
+if (twists)
+    {LANES.replace("k = 0", "k = first / lanes * lanes")} {{
+        g0[r] = g0[r] + h1[r] * rate1.c[0] + h2[r] * rate2.c[0] + h3[r] * rate3.c[0];
+        g1[r] = g1[r] + h1[r] * rate1.c[1] + h2[r] * rate2.c[1] + h3[r] * rate3.c[1];
+        g2[r] = g2[r] + h1[r] * rate1.c[2] + h2[r] * rate2.c[2] + h3[r] * rate3.c[2];
+    }}
+else
+    {LANES.replace("k = 0", "k = first / lanes * lanes")} {{
+        g0[r] = g0[r] + h1[r] * rate1.c[0] + h2[r] * rate2.c[0];
+        g1[r] = g1[r] + h1[r] * rate1.c[1] + h2[r] * rate2.c[1];
+        g2[r] = g2[r] + h1[r] * rate1.c[2] + h2[r] * rate2.c[2];
+    }}
+"""
+)
+def add_joint(
+    unit: wp.ref[UnitForces],
+    contact: int,
+    rate1: vec3,
+    rate2: vec3,
+    rate3: vec3,
+    twists: int,
+    first: int,
+    each: int,
+    matrix: wp.ref[DelassusRows],
+):
+    """Add a joint's part of G to the three columns of a contact, whose joint rates are given, from a row on."""
+    ...
+
+
+@wp.func_native(ROWS + f"for (int c = 0; c < 3 * count; c++) {LANES} matrix.c[c * stride + r] = zero;")
+def clear(matrix: wp.ref[DelassusRows], count: int, each: int):
+    """Set the columns of some contacts to zero."""
+    ...
+
+
+@wp.func_native(
+    ROWS
+    + f"""
+const real *g0 = matrix.c + 3 * contact * stride, *g1 = g0 + stride, *g2 = g1 + stride;
+{LANES} own.rate.c[r] = own.rate.c[r] + g0[r] * force.c[0] + g1[r] * force.c[1] + g2[r] * force.c[2];
+"""
+)
+def add_rates(own: wp.ref[ThreadContacts], matrix: wp.ref[DelassusRows], contact: int, force: vec3, each: int):
+    """Add to the rates at a thread's ``each`` contacts what a contact's force does there."""
+    ...
+
+
+@wp.func(inline=True)
+def joint_rates(unit: wp.ref[UnitForces], hinge: int, r: int, contact: int) -> vec3:
+    """Return what the three unit forces of a contact, from row r of its thread on, do to a hinge of the joint."""
+    return vec3(
+        broadcast(unit.joint_rate[hinge, r], contact),
+        broadcast(unit.joint_rate[hinge, r + 1], contact),
+        broadcast(unit.joint_rate[hinge, r + 2], contact),
+    )
+
+
 @wp.func(inline=True)
 def build_delassus(
     problems: ContactProblems, solver: wp.ref[SolverState], own: wp.ref[ThreadContacts], matrix: wp.ref[DelassusRows]
 ):
     """Carry unit forces up the chain and sum the rows of the Delassus matrix."""
     zero = real(0.0)
-    none = vec3(zero, zero, zero)
     first_joint = solver.job * wp.static(capacity)
     count = solver.warp_contacts
     thread = solver.thread
     each = solver.own_count
-    fw = PerRow3()
-    fv = PerRow3()
-    ju1 = PerRow1()
-    ju2 = PerRow1()
-    ju3 = PerRow1()
-    wu1 = PerRow1()
-    wu2 = PerRow1()
-    wu3 = PerRow1()
-    # w, v: the unit force of each row as it is below the present link; ju: its joint rates; wu: h D⁻¹ of them.
-    for r in range(3 * each):
-        for e in range(3 * count):
-            matrix[r * wp.static(row_size) + e] = zero
+    unit = UnitForces()
+    clear(matrix, count, each)
     for back in range(solver.last_link + 1):
         i = solver.last_link - back
-        joint = first_joint + i
         for k in range(each):
-            # Only joints between the base and the contact feel its force.
-            reached = thread + k < solver.contacts and row(own.link, k) >= i
-            s1 = none
-            s2 = none
-            m1 = none
-            m2 = none
-            s3 = none
-            m3 = none
-            inv = JointInverse()
-            if reached:
-                s1 = problems.joint[joint].axis1
-                s2 = problems.joint[joint].axis2
-                m1 = problems.joint[joint].moment1
-                m2 = problems.joint[joint].moment2
-                inv = problems.joint[joint].inverse_inertia
-                if wp.static(hinges == 3):
-                    if i % 2 == 1:
-                        s3 = problems.joint[joint].axis3
-                        m3 = problems.joint[joint].moment3
-            for a in range(3):
-                r = 3 * k + a
-                u1 = zero
-                u2 = zero
-                u3 = zero
-                if reached:
-                    w = fw[r]
-                    v = fv[r]
-                    # A contact's force enters at its own link.
-                    if row(own.link, k) == i:
-                        v = row(own.axis, r)
-                        w = wp.cross(row(own.point, k), v)
-                    if wp.static(hinges == 3):
-                        if i % 2 == 1:
-                            u3 = wp.dot(s3, w) + wp.dot(m3, v)
-                            w = w - problems.joint[joint].gain3_w * u3
-                            v = v - problems.joint[joint].gain3_v * u3
-                    u1 = wp.dot(s1, w) + wp.dot(m1, v)
-                    u2 = wp.dot(s2, w) + wp.dot(m2, v)
-                    fw[r] = w - problems.joint[joint].gain1_w * u1 - problems.joint[joint].gain2_w * u2
-                    fv[r] = v - problems.joint[joint].gain1_v * u1 - problems.joint[joint].gain2_v * u2
-                ju1[r] = u1
-                ju2[r] = u2
-                wu1[r] = solver.step * (inv[0] * u1 + inv[1] * u2)
-                wu2[r] = solver.step * (inv[1] * u1 + inv[2] * u2)
-                if wp.static(hinges == 3):
-                    if i % 2 == 1:
-                        ju3[r] = u3
-                        wu3[r] = solver.step * inv[3] * u3
+            # A contact's force enters at its own link; only joints between that and the base feel it.
+            if thread + k < solver.contacts and row(own.link, k) == i:
+                for a in range(3):
+                    v = row(own.axis, 3 * k + a)
+                    w = wp.cross(row(own.point, k), v)
+                    for d in range(3):
+                        unit.v[d, 3 * k + a] = v[d]
+                        unit.w[d, 3 * k + a] = w[d]
+        twists = int(0)
+        if wp.static(hinges == 3):
+            twists = i % 2
+        # A thread of a GPU follows the longest whisker of its warp, beyond the end of its own.
+        if wp.static(group_size == 1) or (thread < solver.contacts and row(own.link, 0) >= i):
+            pass_joint(problems.joint, first_joint + i, twists, solver.step, each, unit)
         # Both contacts share this joint: its part of G. One thread alone computes the lower half.
         for e in range(count):
             if wp.static(group_size > 1) or row(own.link, e) >= i:
-                for b in range(3):
-                    o1 = broadcast(ju1[wp.static(3 * stride) * e + b], e)
-                    o2 = broadcast(ju2[wp.static(3 * stride) * e + b], e)
-                    if wp.static(hinges == 3) and i % 2 == 1:
-                        o3 = broadcast(ju3[wp.static(3 * stride) * e + b], e)
-                        for r in range(wp.static(3 * stride) * e, 3 * each):
-                            c = r * wp.static(row_size) + 3 * e + b
-                            matrix[c] = row(matrix, c) + wu1[r] * o1 + wu2[r] * o2 + wu3[r] * o3
-                    else:
-                        for r in range(wp.static(3 * stride) * e, 3 * each):
-                            c = r * wp.static(row_size) + 3 * e + b
-                            matrix[c] = row(matrix, c) + wu1[r] * o1 + wu2[r] * o2
+                r = wp.static(3 * stride) * e
+                o1 = joint_rates(unit, 0, r, e)
+                o2 = joint_rates(unit, 1, r, e)
+                o3 = vec3(zero, zero, zero)
+                if wp.static(hinges == 3) and twists == 1:
+                    o3 = joint_rates(unit, 2, r, e)
+                add_joint(unit, e, o1, o2, o3, twists, r, each, matrix)
     if wp.static(group_size == 1):
         for r in range(3 * count):
-            for e in range(r):
-                matrix[e * wp.static(row_size) + r] = row(matrix, r * wp.static(row_size) + e)
+            for c in range(r):
+                matrix[r * wp.static(own_rows) + c] = row(matrix, c * wp.static(own_rows) + r)
     # Diagonal blocks, for the solution of single contacts.
     for k in range(each):
         if thread + k < solver.contacts:
-            c = 3 * (thread + k)
-            r0 = 3 * k * wp.static(row_size)
-            r1 = r0 + wp.static(row_size)
-            r2 = r1 + wp.static(row_size)
-            own.self_compliance[k, 0] = row(matrix, r0 + c)
-            own.self_compliance[k, 1] = row(matrix, r0 + c + 1)
-            own.self_compliance[k, 2] = row(matrix, r0 + c + 2)
-            own.self_compliance[k, 3] = row(matrix, r1 + c + 1)
-            own.self_compliance[k, 4] = row(matrix, r1 + c + 2)
-            own.self_compliance[k, 5] = row(matrix, r2 + c + 2)
+            c0 = 3 * (thread + k) * wp.static(own_rows) + 3 * k
+            c1 = c0 + wp.static(own_rows)
+            c2 = c1 + wp.static(own_rows)
+            own.self_compliance[k, 0] = row(matrix, c0)
+            own.self_compliance[k, 1] = row(matrix, c1)
+            own.self_compliance[k, 2] = row(matrix, c2)
+            own.self_compliance[k, 3] = row(matrix, c1 + 1)
+            own.self_compliance[k, 4] = row(matrix, c2 + 1)
+            own.self_compliance[k, 5] = row(matrix, c2 + 2)
 
 
 @wp.func(inline=True)

@@ -1,15 +1,19 @@
 """Distances between a link and the shapes it may touch: closed forms and exact triangles.
 
-Lengths in mm, in the frame of the shape. A link is a segment with a radius that varies linearly along it. The distance
-of a segment from a triangle is the least of ``segment_triangle`` and of ``point_triangle`` at both of its ends.
-Closest points as in Ericson, Real-Time Collision Detection (2005), chapter 5.
+Lengths in mm, in the frame of the shape. A link is a segment with a radius that varies linearly along it. Closest
+points as in Ericson, Real-Time Collision Detection (2005), chapter 5.
+
+Triangles come in eights, and rows of the contact problem too: a processor computes eight in the lanes of its vector
+unit. Its compiler makes vector code of no loop of Warp, but of loops over numbers in C++ without branches and calls, so
+what these loops need is native code (``NUMBERS``, ``SEGMENTS``, ``TRIANGLES``). On a GPU they have the few turns that
+are one thread's own. Every number is found by the same operations in the same order as one after another.
 """
 
 import warp as wp
 
 from brainbench.stimuli.engines.rod.limits import CAPSULE, CYLINDER, SPHERE
 
-from .algebra import maximum, minimum, vec2, vec3, vec4, vec5
+from .algebra import vec2, vec3, vec4, vec5
 from .parameters import real
 
 # As fine as the numbers: 2⁻²⁰ is about 1e-6, 2⁻⁴⁴ about 6e-14 of a link.
@@ -99,105 +103,131 @@ def segment_primitive(kind: int, size: vec3, a: vec3, b: vec3, ra: real, rb: rea
     return vec5(share, found[3] - (ra + (rb - ra) * share), found[0], found[1], found[2])
 
 
-@wp.func
-def point_triangle(x: vec3, p: vec3, q: vec3, r: vec3) -> vec2:
-    """Return the barycentric coordinates of q and r of the point of a triangle that is closest to x."""
-    pq = q - p
-    pr = r - p
-    px = x - p
-    # Ericson (2005), section 5.1.5.
-    # Voronoi regions of p, q, pq, r, pr, qr, and the face.
-    d1 = wp.dot(pq, px)
-    d2 = wp.dot(pr, px)
-    zero = real(0.0)
-    one = real(1.0)
-    if d1 <= zero and d2 <= zero:
-        return vec2(zero, zero)
-    qx = x - q
-    d3 = wp.dot(pq, qx)
-    d4 = wp.dot(pr, qx)
-    if d3 >= zero and d4 <= d3:
-        return vec2(one, zero)
-    vc = d1 * d4 - d3 * d2
-    if vc <= zero and d1 >= zero and d3 <= zero:
-        return vec2(d1 / (d1 - d3), zero)
-    rx = x - r
-    d5 = wp.dot(pq, rx)
-    d6 = wp.dot(pr, rx)
-    if d6 >= zero and d5 <= d6:
-        return vec2(zero, one)
-    vb = d5 * d2 - d1 * d6
-    if vb <= zero and d2 >= zero and d6 <= zero:
-        return vec2(zero, d2 / (d2 - d6))
-    va = d3 * d6 - d5 * d4
-    if va <= zero and d4 - d3 >= zero and d5 - d6 >= zero:
-        share = (d4 - d3) / (d4 - d3 + d5 - d6)
-        return vec2(one - share, share)
-    whole = va + vb + vc
-    return vec2(vb / whole, vc / whole)
+NUMBERS = f"""
+using real = wp::{real.__name__};
+#if defined(__CUDA_ARCH__)
+#define INLINE
+#define SIDE_BY_SIDE
+const auto lower = [](real x, real y) {{ return min(x, y); }};
+const auto upper = [](real x, real y) {{ return max(x, y); }};
+const auto magnitude = [](real x) {{ return abs(x); }};
+#else
+#define INLINE __attribute__((always_inline))
+#define SIDE_BY_SIDE _Pragma("clang loop vectorize(assume_safety) unroll(disable)")
+const auto lower = [](real x, real y) {{ return x < y ? x : y; }};
+const auto upper = [](real x, real y) {{ return x > y ? x : y; }};
+const auto magnitude = [](real x) {{ return __builtin_elementwise_abs(x); }};
+#endif
+const real zero = 0, half = real(0.5), one = 1;
+const auto dot = [](const real* x, const real* y) {{ return x[0] * y[0] + x[1] * y[1] + x[2] * y[2]; }};
+const auto cross = [](const real* x, const real* y, real* z) {{
+    z[0] = x[1] * y[2] - x[2] * y[1]; z[1] = x[2] * y[0] - x[0] * y[2]; z[2] = x[0] * y[1] - x[1] * y[0];
+}};
+"""
+"""Numbers of the solver's precision, and vectors of three."""
+
+SEGMENTS = (
+    NUMBERS
+    + f"""
+// Closest points of the segments a + s d1 and p + t d2: Ericson (2005), section 5.1.9.
+const auto segments = [&](const real* a, const real* d1, const real* p, const real* d2, real& s, real& t) INLINE {{
+    const real r[3] = {{a[0] - p[0], a[1] - p[1], a[2] - p[2]}};
+    const real aa = dot(d1, d1), ee = dot(d2, d2), f = dot(d2, r), c = dot(d1, r), b = dot(d1, d2);
+    // On the infinite lines; parallel ones take the middle.
+    const real determinant = aa * ee - b * b;
+    const real crossing = lower(upper((b * f - c * ee) / determinant, zero), one);
+    const real along = determinant > real(1e-6) * aa * ee ? crossing : half;
+    const real across = (b * along + f) / upper(ee, real({tiny}));
+    // Clamped to the second segment, then again to the first.
+    const real first = lower(upper(-c / aa, zero), one), last = lower(upper((b - c) / aa, zero), one);
+    s = across < zero ? first : across > one ? last : along;
+    t = across < zero ? zero : across > one ? one : across;
+}};
+"""
+)
+"""Closest points of two segments."""
+
+TRIANGLES = (
+    SEGMENTS
+    + f"""
+// Barycentric v and w of q and r of the point of a triangle that is closest to x: Ericson (2005), section 5.1.5.
+const auto point_triangle = [&](const real* x, const real* p, const real* q, const real* r, real& v, real& w) INLINE {{
+    real pq[3], pr[3], px[3], qx[3], rx[3];
+    for (int d = 0; d < 3; d++) {{
+        pq[d] = q[d] - p[d]; pr[d] = r[d] - p[d]; px[d] = x[d] - p[d]; qx[d] = x[d] - q[d]; rx[d] = x[d] - r[d];
+    }}
+    const real d1 = dot(pq, px), d2 = dot(pr, px), d3 = dot(pq, qx), d4 = dot(pr, qx), d5 = dot(pq, rx);
+    const real d6 = dot(pr, rx), vc = d1 * d4 - d3 * d2, vb = d5 * d2 - d1 * d6, va = d3 * d6 - d5 * d4;
+    const real whole = va + vb + vc, share = (d4 - d3) / (d4 - d3 + d5 - d6);
+    // Voronoi regions of the face, then from the last to the first of p, q, pq, r, pr, qr: the first counts.
+    v = vb / whole; w = vc / whole;
+    const bool at_qr = (va <= zero) & (d4 - d3 >= zero) & (d5 - d6 >= zero);
+    v = at_qr ? one - share : v; w = at_qr ? share : w;
+    const bool at_pr = (vb <= zero) & (d2 >= zero) & (d6 <= zero);
+    const real on_pr = d2 / (d2 - d6);
+    v = at_pr ? zero : v; w = at_pr ? on_pr : w;
+    const bool at_r = (d6 >= zero) & (d5 <= d6);
+    v = at_r ? zero : v; w = at_r ? one : w;
+    const bool at_pq = (vc <= zero) & (d1 >= zero) & (d3 <= zero);
+    const real on_pq = d1 / (d1 - d3);
+    v = at_pq ? on_pq : v; w = at_pq ? zero : w;
+    const bool at_q = (d3 >= zero) & (d4 <= d3);
+    v = at_q ? one : v; w = at_q ? zero : w;
+    const bool at_p = (d1 <= zero) & (d2 <= zero);
+    v = at_p ? zero : v; w = at_p ? zero : w;
+}};
+// Squared distance of x from that point, and v and w.
+const auto from_triangle =
+    [&](const real* x, const real* p, const real* q, const real* r, real& square, real& v, real& w) INLINE {{
+    real away[3];
+    point_triangle(x, p, q, r, v, w);
+    for (int d = 0; d < 3; d++) away[d] = x[d] - p[d] - (q[d] - p[d]) * v - (r[d] - p[d]) * w;
+    square = dot(away, away);
+}};
+// Squared distance of a segment from the edges of a triangle, 0 where it pierces the face; with the place s on a–b.
+const auto segment_triangle = [&](const real* a, const real* b, const real* p, const real* q, const real* r,
+                                  real& square, real& s, real& v, real& w) INLINE {{
+    real along[3], pq[3], pr[3], qr[3], gap[3], normal[3], from_a[3], inside[3], side[3], place, edge, found;
+    for (int d = 0; d < 3; d++) {{
+        along[d] = b[d] - a[d]; pq[d] = q[d] - p[d]; pr[d] = r[d] - p[d]; qr[d] = r[d] - q[d]; from_a[d] = p[d] - a[d];
+    }}
+    segments(a, along, p, pq, s, v);
+    for (int d = 0; d < 3; d++) gap[d] = a[d] + along[d] * s - (p[d] + pq[d] * v);
+    square = dot(gap, gap); w = zero;
+    segments(a, along, p, pr, place, edge);
+    for (int d = 0; d < 3; d++) gap[d] = a[d] + along[d] * place - (p[d] + pr[d] * edge);
+    found = dot(gap, gap);
+    bool nearer = found < square;
+    square = nearer ? found : square; s = nearer ? place : s; v = nearer ? zero : v; w = nearer ? edge : w;
+    segments(a, along, q, qr, place, edge);
+    for (int d = 0; d < 3; d++) gap[d] = a[d] + along[d] * place - (q[d] + qr[d] * edge);
+    found = dot(gap, gap);
+    nearer = found < square;
+    square = nearer ? found : square; s = nearer ? place : s; v = nearer ? one - edge : v; w = nearer ? edge : w;
+    // A segment that crosses the face touches it, whatever its ends and the edges say.
+    cross(pq, pr, normal);
+    const real slope = dot(normal, along);
+    place = dot(normal, from_a) / slope;
+    for (int d = 0; d < 3; d++) inside[d] = a[d] + along[d] * place - p[d];
+    // Barycentric coordinates by areas: the point is inside when none is negative.
+    const real area = dot(normal, normal);
+    cross(inside, pr, side);
+    const real inside_v = dot(side, normal) / area;
+    cross(pq, inside, side);
+    const real inside_w = dot(side, normal) / area;
+    const bool pierced = ((slope > real({tiny})) | (-slope > real({tiny}))) & (place > zero) & (place < one)
+        & (inside_v >= zero) & (inside_w >= zero) & (inside_v + inside_w <= one);
+    square = pierced ? zero : square; s = pierced ? place : s; v = pierced ? inside_v : v; w = pierced ? inside_w : w;
+}};
+"""
+)
+"""Distances from triangles, with :data:`SEGMENTS`: ``from_triangle`` of a point, and ``segment_triangle``, which with
+the former at both ends of the segment gives its distance."""
 
 
-@wp.func
+@wp.func_native(
+    SEGMENTS + "wp::vec_t<2, real> pair; segments(a.c, d1.c, p.c, d2.c, pair.c[0], pair.c[1]); return pair;"
+)
 def segments(a: vec3, d1: vec3, p: vec3, d2: vec3) -> vec2:
     """Return s and t of the closest points of the segments a + s d1 and p + t d2."""
-    r = a - p
-    aa = wp.dot(d1, d1)
-    ee = wp.dot(d2, d2)
-    f = wp.dot(d2, r)
-    c = wp.dot(d1, r)
-    b = wp.dot(d1, d2)
-    zero = real(0.0)
-    one = real(1.0)
-    # Ericson (2005), section 5.1.9.
-    # On the infinite lines; parallel ones take the middle.
-    determinant = aa * ee - b * b
-    s = real(0.5)
-    if determinant > real(1e-6) * aa * ee:
-        s = minimum(maximum((b * f - c * ee) / determinant, zero), one)
-    t = (b * s + f) / maximum(ee, real(tiny))
-    # Clamped to the second segment, then again to the first.
-    if t < zero:
-        t = zero
-        s = minimum(maximum(-c / aa, zero), one)
-    elif t > one:
-        t = one
-        s = minimum(maximum((b - c) / aa, zero), one)
-    return vec2(s, t)
-
-
-@wp.func
-def segment_triangle(a: vec3, b: vec3, p: vec3, q: vec3, r: vec3) -> vec4:
-    """Return (squared distance, place along a–b, barycentric q, barycentric r) of the closest points of a segment and
-    the edges of a triangle; distance 0 where the segment pierces the face."""
-    along = b - a
-    pq = q - p
-    pr = r - p
-    zero = real(0.0)
-    one = real(1.0)
-    pair = segments(a, along, p, pq)
-    gap = a + along * pair[0] - (p + pq * pair[1])
-    best = vec4(wp.dot(gap, gap), pair[0], pair[1], zero)
-    pair = segments(a, along, p, pr)
-    gap = a + along * pair[0] - (p + pr * pair[1])
-    square = wp.dot(gap, gap)
-    if square < best[0]:
-        best = vec4(square, pair[0], zero, pair[1])
-    pair = segments(a, along, q, r - q)
-    gap = a + along * pair[0] - (q + (r - q) * pair[1])
-    square = wp.dot(gap, gap)
-    if square < best[0]:
-        best = vec4(square, pair[0], one - pair[1], pair[1])
-    # A segment that crosses the face touches it, whatever its ends and the edges say.
-    normal = wp.cross(pq, pr)
-    slope = wp.dot(normal, along)
-    if wp.abs(slope) > real(tiny):
-        share = wp.dot(normal, p - a) / slope
-        if share > zero and share < one:
-            inside = a + along * share - p
-            square = wp.dot(normal, normal)
-            # Barycentric coordinates by areas: the point is inside when none is negative.
-            v = wp.dot(wp.cross(inside, pr), normal) / square
-            w = wp.dot(wp.cross(pq, inside), normal) / square
-            if v >= zero and w >= zero and v + w <= one:
-                best = vec4(zero, share, v, w)
-    return best
+    ...

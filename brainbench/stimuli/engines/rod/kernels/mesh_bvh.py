@@ -1,33 +1,75 @@
 """Nearest triangles of a surface to a link: a group of threads goes down the surface's bounding volume hierarchy.
 
 The tree is that of ``brainbench.stimuli.engines.rod.mesh_bvh``: eight children a node, without pointers. The search
-always opens the box that may hold something nearer and is nearest, one thread a child, and measures triangles at the
-leaves, one thread a triangle. It begins at the leaf where the last search of the same link ended, so that hardly
-anything else is left to open. All lengths are in units of the surface.
+always opens the box that may hold something nearer and is nearest, and measures the triangles of leaves. It begins at
+the leaf where the last search of the same link ended, so that hardly anything else is left to open. Each thread of a
+group takes its share of eight boxes or triangles: one on a GPU, all on a processor, side by side (``distances``). All
+lengths are in units of the surface.
 """
 
 from typing import Any
 
 import warp as wp
 
-from brainbench.stimuli.engines.rod.mesh_bvh import LEVELS, WIDE
+from brainbench.stimuli.engines.rod.mesh_bvh import BITS, LEVELS, WIDE
 
 from .algebra import maximum, minimum, vec3
-from .distances import point_triangle, segment_triangle
+from .distances import NUMBERS, TRIANGLES
 from .parameters import group_size, real
-from .state import ShapeArrays
+from .state import LeafCorners, NodeBoxes, ShapeArrays
 from .thread_groups import broadcast, group_min, group_min_int, warp_max
 
 children = WIDE // group_size
+stride = 1 if children > 1 else 0
+"""Child k of the node stands at stride · k among its thread's own."""
 Kept: Any = wp.types.matrix((LEVELS, children), real)
 beyond = 1e30
 none_left = 2**31 - 1
 
 
+@wp.func_native("return corners.data[leaf].data[row][rank];")
+def leaf_number(corners: wp.array(dtype=LeafCorners), leaf: int, row: int, rank: int) -> real:
+    """Return a coordinate of a triangle of a leaf, without a copy of the whole."""
+    ...
+
+
+@wp.func
+def corner(corners: wp.array(dtype=LeafCorners), leaf: int, which: int, rank: int) -> vec3:
+    """Return a corner of a triangle of a leaf."""
+    return vec3(
+        leaf_number(corners, leaf, 3 * which, rank),
+        leaf_number(corners, leaf, 3 * which + 1, rank),
+        leaf_number(corners, leaf, 3 * which + 2, rank),
+    )
+
+
+@wp.struct
+class SearchSegment:
+    """The segment that is asked about, from a to b."""
+
+    a: vec3
+    b: vec3
+    axis: vec3
+    """Its direction."""
+    length: real
+    middle: vec3
+    reach: vec3
+    """Half of its extent along each coordinate."""
+
+
+@wp.struct
+class SearchBounds:
+    """Squared distances beyond which nothing is looked at, for the segment, for its end b and for its start a."""
+
+    side: real
+    end: real
+    start: real
+
+
 @wp.struct
 class NearestTriangles:
-    """Squared distances from the segment, its end b and its start a, the rank of the triangle of each (−1: none)
-    and the place on it."""
+    """Squared distances from the segment, its end b and its start a, the rank of the triangle of each (−1: none) and
+    the place on it."""
 
     side: real
     share: real
@@ -46,13 +88,171 @@ class NearestTriangles:
     """Boxes opened."""
 
 
+SHARE = f"""
+constexpr int children = {children};
+// Rounding must not hide a triangle.
+const real sure = real(0.998);
+"""
+SEGMENT = "const real *a = line.a.c, *b = line.b.c, *axis = line.axis.c;"
+
+
+@wp.func_native(
+    TRIANGLES
+    + SHARE
+    + SEGMENT
+    + """
+const auto& c = corners.data[leaf].data;
+const auto triangle = [&](int k, real* p, real* q, real* r) INLINE {
+    for (int d = 0; d < 3; d++) {
+        p[d] = c[d][children * part + k]; q[d] = c[3 + d][children * part + k]; r[d] = c[6 + d][children * part + k];
+    }
+};
+// No triangle is nearer than these.
+real side[children], end[children], start[children];
+SIDE_BY_SIDE for (int k = 0; k < children; k++) {
+    real corner[3][3], along[3], beside[3][3], way[3];
+    triangle(k, corner[0], corner[1], corner[2]);
+    for (int i = 0; i < 3; i++) {
+        for (int d = 0; d < 3; d++) corner[i][d] = corner[i][d] - a[d];
+        along[i] = dot(corner[i], axis);
+        for (int d = 0; d < 3; d++) beside[i][d] = corner[i][d] - axis[d] * along[i];
+    }
+    // No point of a triangle is less far along this way than its nearest corner: a bound from three products.
+    for (int d = 0; d < 3; d++) way[d] = beside[0][d] + beside[1][d] + beside[2][d];
+    real near = lower(dot(beside[0], way), lower(dot(beside[1], way), dot(beside[2], way)));
+    near = upper(near, zero);
+    near = near * near / upper(dot(way, way), real(1e-20));
+    // Along the axis, from the segment and from its ends.
+    const real low = lower(along[0], lower(along[1], along[2])), high = upper(along[0], upper(along[1], along[2]));
+    const real off_side = upper(zero, upper(low - line.length, -high));
+    const real off_end = upper(zero, upper(low - line.length, line.length - high));
+    const real off_start = upper(zero, upper(low, -high));
+    side[k] = sure * (near + off_side * off_side);
+    end[k] = sure * (near + off_end * off_end);
+    start[k] = sure * (near + off_start * off_start);
+}
+// Places of the last leaf may be empty. All triangles are measured as soon as one may be nearer, and then kept one
+// after another, as if each had been asked for by itself.
+const int held = count - first < children ? count - first : children;
+const auto any = [&](const real* bound, real most) INLINE {
+    int found = 0;
+    for (int k = 0; k < held; k++) found |= bound[k] < most;
+    return found;
+};
+real square[children], share[children], v[children], w[children];
+if (any(side, lower(bounds.side, got.side))) {
+    SIDE_BY_SIDE for (int k = 0; k < children; k++) {
+        real p[3], q[3], r[3];
+        triangle(k, p, q, r);
+        segment_triangle(a, b, p, q, r, square[k], share[k], v[k], w[k]);
+    }
+    for (int k = 0; k < held; k++)
+        if (side[k] < lower(bounds.side, got.side) && square[k] < got.side) {
+            got.side = square[k]; got.share = share[k]; got.face = first + k; got.v = v[k]; got.w = w[k];
+        }
+}
+const auto measure =
+    [&](const real* x, const real* bound, real most, real& best, int& face, real& at_v, real& at_w) INLINE {
+    if (!any(bound, lower(most, best))) return;
+    SIDE_BY_SIDE for (int k = 0; k < children; k++) {
+        real p[3], q[3], r[3];
+        triangle(k, p, q, r);
+        from_triangle(x, p, q, r, square[k], v[k], w[k]);
+    }
+    for (int k = 0; k < held; k++)
+        if (bound[k] < lower(most, best) && square[k] < best) {
+            best = square[k]; face = first + k; at_v = v[k]; at_w = w[k];
+        }
+};
+measure(b, end, bounds.end, got.end, got.end_face, got.end_v, got.end_w);
+measure(a, start, bounds.start, got.start, got.start_face, got.start_v, got.start_w);
+"""
+)
+def measure_triangles(
+    corners: wp.array(dtype=LeafCorners),
+    leaf: int,
+    first: int,
+    count: int,
+    part: int,
+    line: SearchSegment,
+    bounds: SearchBounds,
+    got: wp.ref[NearestTriangles],
+):
+    """Keep what is nearer in a leaf than what was found before.
+
+    ``first`` is the rank of the thread's first triangle among the ``count`` of the surface.
+    """
+    ...
+
+
+@wp.func_native(
+    NUMBERS
+    + SHARE
+    + SEGMENT
+    + f"""
+const auto& c = boxes.data[node].data;
+SIDE_BY_SIDE for (int k = 0; k < children; k++) {{
+    const int n = children * part + k;
+    real wide[3], centre[3], x[3], gap[3], off[3];
+    for (int d = 0; d < 3; d++) {{
+        wide[d] = half * (c[3 + d][n] - c[d][n]);
+        centre[d] = c[d][n] + wide[d];
+        gap[d] = upper(magnitude(centre[d] - line.middle.c[d]) - wide[d] - line.reach.c[d], zero);
+        x[d] = centre[d] - a[d];
+    }}
+    real bound = dot(gap, gap);
+    const bool worth = sure * bound < upper(bounds.side, bounds.end);
+    // All of the segment lies behind the plane through its point nearest to the centre.
+    const real t = lower(upper(dot(x, axis), zero), line.length);
+    for (int d = 0; d < 3; d++) off[d] = x[d] - axis[d] * t;
+    const real square = dot(off, off);
+    const real over = square - magnitude(off[0]) * wide[0] - magnitude(off[1]) * wide[1] - magnitude(off[2]) * wide[2];
+    bound = over > zero ? upper(bound, over * over / square) : bound;
+    for (int d = 0; d < 3; d++) gap[d] = upper(magnitude(centre[d] - b[d]) - wide[d], zero);
+    side.data[level][k] = worth ? bound : real({beyond});
+    end.data[level][k] = worth ? dot(gap, gap) : real({beyond});
+}}
+"""
+)
+def bound_boxes(
+    boxes: wp.array(dtype=NodeBoxes),
+    node: int,
+    part: int,
+    line: SearchSegment,
+    bounds: SearchBounds,
+    level: int,
+    side: wp.ref[Kept],
+    end: wp.ref[Kept],
+):
+    """Find how near the children of a node can be to the segment and to b; ``beyond`` where that is no matter."""
+    ...
+
+
+@wp.func_native(
+    NUMBERS
+    + SHARE
+    + f"""
+int code = {none_left};
+SIDE_BY_SIDE for (int k = 0; k < children; k++) {{
+    const real bound = side.data[level][k];
+    const bool worth = (sure * bound < bounds.side) | (sure * end.data[level][k] < bounds.end);
+    // The bits of positive floats are ordered like their values, so one minimum gives box and rank.
+    const int own = ((wp::cast<int>(wp::float32(bound)) >> 3) << 3) + children * part + k;
+    const int here = worth ? own : {none_left};
+    code = here < code ? here : code;
+}}
+return code;
+"""
+)
+def nearest_child(side: wp.ref[Kept], end: wp.ref[Kept], level: int, part: int, bounds: SearchBounds) -> int:
+    """Return the bound of the nearest child that may hold something nearer, with its rank in the last three bits."""
+    ...
+
+
 @wp.func
-def level_size(count: int, level: int) -> int:
-    """Return the number of boxes of a level, of a surface of ``count`` triangles."""
-    size = (count + wp.static(WIDE - 1)) // wp.static(WIDE)
-    for _ in range(level):
-        size = (size + wp.static(WIDE - 1)) // wp.static(WIDE)
-    return size
+def node_count(count: int, level: int) -> int:
+    """Return the number of nodes of a level, of a surface of ``count`` triangles; level −1 is that of leaves."""
+    return ((count - 1) >> (wp.static(BITS) * (level + 2))) + 1
 
 
 @wp.func
@@ -65,36 +265,35 @@ def nearest_triangles(
     ``leaf`` is where to begin (−1: anywhere), ``part`` the thread's place in its group, ``live`` whether the group
     has a question or only keeps others company.
     """
-    zero = real(0.0)
     far = real(wp.static(beyond))
-    # Rounding must not hide a triangle.
-    sure = real(0.998)
     first_face = shapes.face[s]
     count = shapes.faces[s]
+    first_leaf = first_face // wp.static(WIDE)
     row = shapes.box[s]
-    size = (count + wp.static(WIDE - 1)) // wp.static(WIDE)
-    # Boxes of all levels stand one behind the other, leaves first; the search begins at the top.
+    # Nodes of all levels stand one behind the other, those of leaves first; the search begins at the top.
     level = int(0)
-    while size > wp.static(WIDE):
-        row = row + size
-        size = (size + wp.static(WIDE - 1)) // wp.static(WIDE)
+    while node_count(count, level) > 1:
+        row = row + node_count(count, level)
         level = level + 1
     top = level
     node = int(0)
     opened = int(-1)
     begun = int(-1)
-    if leaf >= 0 and leaf < level_size(count, 0):
+    if leaf >= 0 and leaf < node_count(count, -1):
         opened = leaf
         begun = leaf
     measure = int(1)
     busy = live
 
     along = b - a
-    length = wp.length(along)
-    axis = along / maximum(length, real(1e-20))
     half = real(0.5) * along
-    middle = a + half
-    reach = vec3(wp.abs(half[0]), wp.abs(half[1]), wp.abs(half[2]))
+    line = SearchSegment()
+    line.a = a
+    line.b = b
+    line.length = wp.length(along)
+    line.axis = along / maximum(line.length, real(1e-20))
+    line.middle = a + half
+    line.reach = vec3(wp.abs(half[0]), wp.abs(half[1]), wp.abs(half[2]))
 
     # Squared distances of the nearest so far.
     got = NearestTriangles()
@@ -105,117 +304,32 @@ def nearest_triangles(
     got.end_face = -1
     got.start_face = -1
     side = got.side
-    all_of = got.side
-    # Beyond these, squared, nothing is looked at for the sake of the segment and of its end.
-    side_most = got.side
-    end_most = got.side
+    end = got.side
+    bounds = SearchBounds()
+    bounds.side = got.side
+    bounds.end = got.side
+    bounds.start = got.side
     own_only = within * within
     side_kept = Kept()
     end_kept = Kept()
-    each = int(wp.static(children)) + wp.min(0, part)
 
     while warp_max(busy) == 1:
         if busy == 1 and opened >= 0:
-            for k in range(each):
-                place = wp.static(WIDE) * opened + part * wp.static(children) + k
-                if place < count:
-                    p = shapes.corner[first_face + place, 0]
-                    q = shapes.corner[first_face + place, 1]
-                    r = shapes.corner[first_face + place, 2]
-                    # No triangle is nearer than this, squared: beside the axis, and along it from the segment and
-                    # from its ends.
-                    tp = wp.dot(p - a, axis)
-                    tq = wp.dot(q - a, axis)
-                    tr = wp.dot(r - a, axis)
-                    beside_p = p - a - axis * tp
-                    beside_q = q - a - axis * tq
-                    beside_r = r - a - axis * tr
-                    # No point of a triangle is less far along ``way`` than its nearest corner: a bound from three
-                    # products.
-                    way = beside_p + beside_q + beside_r
-                    beside = minimum(wp.dot(beside_p, way), minimum(wp.dot(beside_q, way), wp.dot(beside_r, way)))
-                    beside = maximum(beside, zero)
-                    beside = beside * beside / maximum(wp.length_sq(way), real(1e-20))
-                    low = minimum(tp, minimum(tq, tr))
-                    high = maximum(tp, maximum(tq, tr))
-                    apart = maximum(zero, maximum(low - length, -high))
-                    if sure * (beside + apart * apart) < minimum(side_most, got.side):
-                        at = segment_triangle(a, b, p, q, r)
-                        if at[0] < got.side:
-                            got.side = at[0]
-                            got.share = at[1]
-                            got.v = at[2]
-                            got.w = at[3]
-                            got.face = place
-                    apart = maximum(zero, maximum(low - length, length - high))
-                    if sure * (beside + apart * apart) < minimum(end_most, got.end):
-                        spot = point_triangle(b, p, q, r)
-                        square = wp.length_sq(b - p - (q - p) * spot[0] - (r - p) * spot[1])
-                        if square < got.end:
-                            got.end = square
-                            got.end_v = spot[0]
-                            got.end_w = spot[1]
-                            got.end_face = place
-                    apart = maximum(zero, maximum(low, -high))
-                    if sure * (beside + apart * apart) < minimum(all_of, got.start):
-                        spot = point_triangle(a, p, q, r)
-                        square = wp.length_sq(a - p - (q - p) * spot[0] - (r - p) * spot[1])
-                        if square < got.start:
-                            got.start = square
-                            got.start_v = spot[0]
-                            got.start_w = spot[1]
-                            got.start_face = place
-        # Bounds that all threads of the group share.
+            first = wp.static(WIDE) * opened + wp.static(children) * part
+            measure_triangles(shapes.corners, first_leaf + opened, first, count, part, line, bounds, got)
+        # Bounds that all threads of the group share; of a start only one that is nearest of all matters.
         side = group_min(got.side)
         end = group_min(got.end)
         all_of = minimum(minimum(side, end), group_min(got.start))
-        side_most = minimum(side, maximum(all_of, own_only))
-        end_most = minimum(end, maximum(all_of, own_only))
+        bounds.side = minimum(side, maximum(all_of, own_only))
+        bounds.end = minimum(end, maximum(all_of, own_only))
+        bounds.start = all_of
         if busy == 1 and measure == 1:
-            # How near the children of the node can be: beside the segment, and from its end.
-            for k in range(each):
-                place = wp.static(WIDE) * node + part * wp.static(children) + k
-                side_kept[level, k] = far
-                end_kept[level, k] = far
-                if place < size:
-                    low3 = shapes.low[row + place]
-                    high3 = shapes.high[row + place]
-                    wide = real(0.5) * (high3 - low3)
-                    centre = low3 + wide
-                    off = centre - middle
-                    gap = vec3(
-                        maximum(wp.abs(off[0]) - wide[0] - reach[0], zero),
-                        maximum(wp.abs(off[1]) - wide[1] - reach[1], zero),
-                        maximum(wp.abs(off[2]) - wide[2] - reach[2], zero),
-                    )
-                    bound = wp.length_sq(gap)
-                    if sure * bound < maximum(side_most, end_most):
-                        # All of the segment lies behind the plane through its point nearest to the centre.
-                        t = minimum(maximum(wp.dot(centre - a, axis), zero), length)
-                        off = centre - a - axis * t
-                        square = wp.length_sq(off)
-                        over = square - wp.abs(off[0]) * wide[0] - wp.abs(off[1]) * wide[1] - wp.abs(off[2]) * wide[2]
-                        if over > zero:
-                            bound = maximum(bound, over * over / square)
-                        side_kept[level, k] = bound
-                        off = centre - b
-                        gap = vec3(
-                            maximum(wp.abs(off[0]) - wide[0], zero),
-                            maximum(wp.abs(off[1]) - wide[1], zero),
-                            maximum(wp.abs(off[2]) - wide[2], zero),
-                        )
-                        end_kept[level, k] = wp.length_sq(gap)
+            bound_boxes(shapes.boxes, row + node, part, line, bounds, level, side_kept, end_kept)
         measure = 0
         opened = -1
         # The nearest child that may hold something nearer; its rank among eight in the last bits of its bound.
-        code = int(wp.static(none_left))
-        for k in range(each):
-            bound = side_kept[level, k]
-            if sure * bound < side_most or sure * end_kept[level, k] < end_most:
-                rank = part * wp.static(children) + k
-                # The bits of positive floats are ordered like their values, so one minimum gives box and rank.
-                code = wp.min(code, ((wp.cast(wp.float32(bound), wp.int32) >> 3) << 3) + rank)
-        code = group_min_int(code)
+        code = group_min_int(nearest_child(side_kept, end_kept, level, part, bounds))
         if busy == 1:
             if code == wp.static(none_left):
                 if level == top:
@@ -223,16 +337,15 @@ def nearest_triangles(
                 else:
                     # The tree has no pointers: parent and children of a box follow from its rank.
                     # Nothing left below: back to the parent.
-                    row = row + size
+                    row = row + node_count(count, level)
                     level = level + 1
-                    size = (size + wp.static(WIDE - 1)) // wp.static(WIDE)
                     node = node // wp.static(WIDE)
             else:
                 rank = code % wp.static(WIDE)
                 # Open this child, and never again.
                 if rank // wp.static(children) == part:
-                    side_kept[level, rank % wp.static(children)] = far
-                    end_kept[level, rank % wp.static(children)] = far
+                    side_kept[level, wp.static(stride) * (rank % wp.static(children))] = far
+                    end_kept[level, wp.static(stride) * (rank % wp.static(children))] = far
                 node = wp.static(WIDE) * node + rank
                 if level == 0:
                     if node != begun:
@@ -241,8 +354,7 @@ def nearest_triangles(
                     node = node // wp.static(WIDE)
                 else:
                     level = level - 1
-                    size = level_size(count, level)
-                    row = row - size
+                    row = row - node_count(count, level)
                     measure = 1
                     got.boxes = got.boxes + 1
 

@@ -11,7 +11,7 @@ from brainbench.stimuli.engines.rod.mesh_bvh import WIDE
 
 from .algebra import unrotate, vec2, vec3, vec4
 from .distances import primitive, segment_primitive
-from .mesh_bvh import NearestTriangles, nearest_triangles
+from .mesh_bvh import NearestTriangles, corner, nearest_triangles
 from .motion import BodyMotion, pose_from
 from .parameters import against, group_size, module_options, real
 from .state import ChainArrays, JobArrays, LinkDistance, LinkTaper, MotionArrays, PausedWhiskers, ShapeArrays
@@ -47,8 +47,10 @@ def pseudo_normal(shapes: ShapeArrays, face: int, v: real, w: real) -> vec3:
 @wp.func
 def surface_point(shapes: ShapeArrays, face: int, v: real, w: real) -> vec3:
     """Return the point of a triangle with these barycentric coordinates."""
-    p = shapes.corner[face, 0]
-    return p + (shapes.corner[face, 1] - p) * v + (shapes.corner[face, 2] - p) * w
+    leaf = face // wp.static(WIDE)
+    rank = face % wp.static(WIDE)
+    p = corner(shapes.corners, leaf, 0, rank)
+    return p + (corner(shapes.corners, leaf, 1, rank) - p) * v + (corner(shapes.corners, leaf, 2, rank) - p) * w
 
 
 @wp.func

@@ -12,6 +12,7 @@ from typing import Any
 import warp as wp
 
 from brainbench.stimuli.engines.rod.limits import LISTED, SPARE, contacts_for
+from brainbench.stimuli.engines.rod.mesh_bvh import WIDE
 
 from .algebra import JointInverse, JointVector, mat33, reader, vec3, vec4
 from .motion import Instant, MotionArrays  # noqa: F401 — launches take all arrays from here
@@ -32,6 +33,8 @@ PerCandidate3: Any = wp.types.matrix((most_candidates, 3), real)
 PerCandidateInt: Any = wp.types.vector(most_candidates, wp.int32)
 PerListed1: Any = wp.types.vector(LISTED, real)
 PerListedInt: Any = wp.types.vector(LISTED, wp.int32)
+LeafCorners: Any = wp.types.matrix((9, WIDE), real)
+NodeBoxes: Any = wp.types.matrix((6, WIDE), real)
 
 row = reader(
     (PerLink1, real), (PerLinkJoint, JointVector), (PerLinkInverse, JointInverse), (PerLink3, vec3),
@@ -124,13 +127,11 @@ class ShapeArrays:
     faces: wp.array(dtype=wp.int32)
     """[shape] number of its triangles."""
     box: wp.array(dtype=wp.int32)
-    """[shape] first of its boxes below."""
-    low: wp.array(dtype=vec3)
-    """[box] lowest corner; boxes as in ``brainbench.stimuli.engines.rod.mesh_bvh``."""
-    high: wp.array(dtype=vec3)
-    """[box] highest corner."""
-    corner: wp.array2d(dtype=vec3)
-    """[triangle, 3]"""
+    """[shape] first of its nodes below."""
+    boxes: wp.array(dtype=NodeBoxes)
+    """[node] boxes of its children, as in ``brainbench.stimuli.engines.rod.mesh_bvh``."""
+    corners: wp.array(dtype=LeafCorners)
+    """[leaf] of its triangles; each surface begins with a leaf of its own."""
     outward: wp.array2d(dtype=vec3)
     """[triangle, 7] angle-weighted normals: face, three corners, edges opposite to them."""
 
