@@ -212,7 +212,7 @@ def test_a_link_outside_is_never_told_that_it_overlaps_wherever_the_search_begin
 
 def _measure_leaves(arrays, starts, stops, threads):
     """Numbers [thread, segment, 7] that the threads of a group find in the leaf of each segment's rank."""
-    nodes = specialize("mesh_nodes", real=wp.float64, group_size=threads)
+    nodes = specialize("mesh_bvh", real=wp.float64, group_size=threads)
     measure_triangles, NearestTriangles = nodes.measure_triangles, nodes.NearestTriangles
     SearchSegment, SearchBounds, LeafCorners = nodes.SearchSegment, nodes.SearchBounds, nodes.LeafCorners
     own = WIDE // threads

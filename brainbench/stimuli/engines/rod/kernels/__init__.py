@@ -1,10 +1,10 @@
 """Warp kernels of the whisker solver. Units: mg, mm, ms, mN, µN·m.
 
 ``step`` runs whiskers from reading to reading. In each step ``articulated_body`` finds the motion of the chain and its
-accelerations without contact, ``broad_phase`` and ``narrow_phase`` (with ``distances``, ``mesh_bvh`` and
-``mesh_nodes``) where it may touch something, ``contact_problem``, ``delassus`` and ``contact_solver`` the contact
-forces. ``sleeping`` skips whiskers at rest; on a GPU ``scheduling`` pauses whiskers while kernels of ``narrow_phase``
-and ``contact_solver`` find the distances and forces that they wait for.
+accelerations without contact, ``broad_phase`` and ``narrow_phase`` (with ``distances`` and ``mesh_bvh``) where it may
+touch something, ``contact_problem``, ``delassus`` and ``contact_solver`` the contact forces. ``sleeping`` skips
+whiskers at rest; on a GPU ``scheduling`` pauses whiskers while kernels of ``narrow_phase`` and ``contact_solver`` find
+the distances and forces that they wait for.
 
 The modules are ordinary Warp code for the types and sizes in ``parameters``. :func:`specialize` loads them once for
 each precision and size, like a template.

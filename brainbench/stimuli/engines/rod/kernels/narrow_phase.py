@@ -11,10 +11,10 @@ from brainbench.stimuli.engines.rod.mesh_bvh import WIDE
 
 from .algebra import unrotate, vec2, vec3, vec4
 from .distances import primitive, segment_primitive
-from .mesh_bvh import NearestTriangles, nearest_triangles
+from .mesh_bvh import NearestTriangles, corner, nearest_triangles
 from .motion import BodyMotion, pose_from
 from .parameters import against, group_size, module_options, real
-from .state import ChainArrays, JobArrays, LinkDistance, LinkTaper, MotionArrays, PausedWhiskers, ShapeArrays, corner
+from .state import ChainArrays, JobArrays, LinkDistance, LinkTaper, MotionArrays, PausedWhiskers, ShapeArrays
 from .thread_groups import warp_max
 
 

@@ -43,22 +43,6 @@ row = reader(
 )  # fmt: skip
 
 
-@wp.func_native("return corners.data[leaf].data[row][rank];")
-def leaf_number(corners: wp.array(dtype=LeafCorners), leaf: int, row: int, rank: int) -> real:
-    """Return a coordinate of a triangle of a leaf, without a copy of the whole."""
-    ...
-
-
-@wp.func
-def corner(corners: wp.array(dtype=LeafCorners), leaf: int, which: int, rank: int) -> vec3:
-    """Return a corner of a triangle of a leaf."""
-    return vec3(
-        leaf_number(corners, leaf, 3 * which, rank),
-        leaf_number(corners, leaf, 3 * which + 1, rank),
-        leaf_number(corners, leaf, 3 * which + 2, rank),
-    )
-
-
 @wp.struct
 class LinkBuild:
     """Geometry and mass of a link."""
