@@ -58,7 +58,7 @@ def _overlapping_boxes():
 
 FLAGGED = {
     "starts in an object": ("starts 0.11 mm deep", lambda **some: _reason(_ball(1.1002e-4), **some)),
-    "gets deep into one": (
+    "penetrates one too far": (
         "mm deep in an object at 0.0",
         lambda: _reason(_moving((C2.arc_length + 0.0055, 0, 0), (-0.1, 0, 0), Sphere((0, 0, 0), 0.005))),
     ),
@@ -66,16 +66,16 @@ FLAGGED = {
         "base point",
         lambda **some: _reason(_moving((0, -2e-3, 0), (0, 0.2, 0), _peg(2e-4)), **some),
     ),
-    "bears too much": ("stretch", lambda: _reason(_moving((5e-4, -1e-3, 0), (0, 0.1, 0), _peg(1e-4)))),
-    "unsolved contacts": ("missed by 6%", lambda: _judged(residual=0.06)),
-    "contacts without a solution": (
+    "carries too large a force": ("stretch", lambda: _reason(_moving((5e-4, -1e-3, 0), (0, 0.1, 0), _peg(1e-4)))),
+    "has contacts that were not solved": ("missed by 6%", lambda: _judged(residual=0.06)),
+    "has contacts without a solution": (
         "missed by 1000%",
         lambda: _reason(_moving((C2.arc_length + 0.0055, 0, 0), (-0.025, 0, 0), Sphere((0, 0, 0), 0.005))),
     ),
-    "too many contacts": ("more contacts", lambda: _judged(crowded=3)),
+    "has too many contacts": ("more contacts", lambda: _judged(crowded=3)),
     "folds": ("bent by", lambda: _reason(loads=(Load(C2.arc_length, (0.0, 1.0, 0.0)),))),
-    "is no number": ("finite", lambda: _judged(status=LOST, failed=0.1)),
-    "meets something too fast": (
+    "is not finite": ("finite", lambda: _judged(status=LOST, failed=0.1)),
+    "meets an object that moves too fast": (
         "further than contacts are looked for",
         lambda: _reason(_moving((0.008, -0.1, 0), (0, 10.0, 0), _peg(1e-3)), step=2e-3),
     ),
@@ -87,10 +87,10 @@ FLAGGED = {
 """Row of the table: words of the reason, and how it comes about."""
 
 NOT_FLAGGED = {
-    "starts in touch": lambda: _reason(_ball(1e-5)),
+    "starts in contact": lambda: _reason(_ball(1e-5)),
     "overlaps for a step": lambda: _judged(depth=0.9 * LARGEST_OVERLAP),
     "has an object behind its base": lambda: _reason(Obstacle((Sphere((-1.1e-3, 0.0, 0.0), 1e-3),))),
-    "sticks at another time": lambda: str(judge(facts()).suspicious[0] or ""),
+    "sticks or slips at another time": lambda: str(judge(facts()).suspicious[0] or ""),
     "lies in bodies that overlap": lambda: _reason(_overlapping_boxes()),
 }
 
