@@ -252,7 +252,7 @@ def found_logs(folders: list[Path], named: dict[str, StudentResult]) -> dict[tup
 
     logs = {}
     for path in (path for folder in folders for path in sorted(folder.rglob("log.jsonl"))):
-        config = DistillConfig.of(read_json(path.parent / "config.json")["distill"])
+        config = DistillConfig.of_run(read_json(path.parent / "config.json")["distill"])
         arm = arm_of(config)
         if arm not in named or config.seed not in named[arm].seeds:
             continue
@@ -327,7 +327,7 @@ def main() -> None:
     parser.add_argument("--write", action="store_true")
     parser.add_argument("--task", default="in_palm_rotate")
     parser.add_argument("--config", default="default", help="configuration of the task; that of the teacher")
-    parser.add_argument("--contacts", default="published", choices=list(CONTACTS))
+    parser.add_argument("--contacts", choices=list(CONTACTS), help="by default those of the teacher")
     parser.add_argument("--draw", type=int, help="seed of untrained networks and reservoirs; by default the student's")
     parser.add_argument("--arms", nargs="+", default=list(ARMS), choices=list(ARMS))
     parser.add_argument("--device", default="cpu")

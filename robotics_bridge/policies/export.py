@@ -12,18 +12,16 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
-from brainbench.core.errors import DataError, check_name
+from brainbench.core.errors import DataError
 from brainbench.core.files import atomic_path, file_hash, provenance, write_json
 from brainbench.models.activations import evaluating
 from brainbench.models.export import require_onnx
-from robotics_bridge.policies.contract import FORMATS, check_contract
+from robotics_bridge.policies.contract import check_contract
 from robotics_bridge.policies.runners import Runner, read_policy
 
 if TYPE_CHECKING:
     from robotics_bridge.policies.student import TactilePolicy
 
-SUFFIXES: dict[str, str] = dict(zip(FORMATS, (".onnx", ".pt"), strict=True))
-"""Formats and their suffixes: ONNX, and TorchScript."""
 TOLERANCE = 1e-4
 """Largest difference of an action between file and policy, relative to the largest action."""
 STEPS = 60
@@ -37,7 +35,6 @@ class PolicyExport:
     path: Path
     contract: Path
     """The JSON contract."""
-    format: str
     state_size: int
     """H."""
     difference: float
@@ -48,7 +45,6 @@ def export_policy(
     policy: TactilePolicy,
     path: str | Path,
     *,
-    format: str = "onnx",
     deployment: Mapping[str, Any] | None = None,
     name: str = "",
 ) -> PolicyExport:
@@ -56,26 +52,23 @@ def export_policy(
 
     Args:
         policy: What is written.
-        path: The suffix of the format is added when there is none.
-        format: ``onnx`` or ``jit``.
+        path: The suffix .onnx is added when there is none.
         deployment: What a robot needs besides (rate, joints, limits, …); kept in the contract.
         name: What the contract calls the policy.
 
     Raises:
-        UsageError: there is no such format.
-        MissingDependencyError: a package of the extra ``export`` is missing, for ``onnx``.
+        MissingDependencyError: a package of the extra ``export`` is missing.
         DataError: the file does not compute what the policy does, or the contract has values out of range.
     """
-    check_name("format of a policy", format, SUFFIXES)
-    target = Path(path) if Path(path).suffix else Path(path).with_suffix(SUFFIXES[format])
+    target = Path(path) if Path(path).suffix else Path(path).with_suffix(".onnx")
     contract = {
         "policy": name or type(policy).__name__,
-        "format": format,
+        "format": "onnx",
         "file": target.name,
         # A list: the order counts, and JSON keeps that of lists alone.
         "inputs": [[key, list(shape)] for key, shape in policy.shapes.items()],
         "state": policy.core.state_size,
-        "reset": "a state of zeros is the one before the first step" if format == "onnx" else "call reset()",
+        "reset": "a state of zeros is the one before the first step",
         "network": policy.config,
         "deployment": dict(deployment or {}),
         "provenance": provenance(),
@@ -84,9 +77,9 @@ def export_policy(
     with atomic_path(target) as temporary, warnings.catch_warnings():
         # The exporters warn of their own parts' deprecations, which nobody here can act on.
         warnings.simplefilter("ignore")
-        _write(policy, temporary, format)
+        _write(policy, temporary)
         # What the policy reads counts, not what the exported part says of itself.
-        difference = compare(policy, read_policy(temporary, policy.shapes, format=format))
+        difference = compare(policy, read_policy(temporary, policy.shapes))
         if not difference <= TOLERANCE:
             raise DataError(
                 f"The exported file differs from the policy by {difference:.2g} of the largest action (allowed "
@@ -94,13 +87,10 @@ def export_policy(
             )
     contract |= {"difference": difference, "sha256": file_hash(target, length=64)}
     file = write_json(target.with_name(f"{target.name}.json"), contract)
-    return PolicyExport(target, file, format, policy.core.state_size, difference)
+    return PolicyExport(target, file, policy.core.state_size, difference)
 
 
-def _write(policy: TactilePolicy, path: Path, format: str) -> None:
-    if format == "jit":
-        torch.jit.script(policy.as_jit()).save(str(path))
-        return
+def _write(policy: TactilePolicy, path: Path) -> None:
     require_onnx()
     step: Any = policy.as_onnx()
     batch = torch.export.Dim("batch", min=1, max=8192)

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import copy
-import math
-import warnings
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import torch
 from torch import nn
@@ -55,45 +53,3 @@ class StepPolicy(nn.Module):
     def output_names(self) -> list[str]:
         """Names of the outputs."""
         return ["actions", "h_out"]
-
-
-class JitPolicy(nn.Module):
-    """forward(obs [1, D]) → actions [1, A]; D is all groups flattened, in the order of :attr:`StepPolicy.input_names`.
-
-    The step is traced, since encoders are no TorchScript; what remembers is scripted, so ``torch.jit.script`` of the
-    whole gives a file with ``forward`` and ``reset``.
-    """
-
-    def __init__(self, policy: TactilePolicy) -> None:
-        super().__init__()
-        step = _FlatStep(StepPolicy(policy))
-        example = (torch.zeros(1, step.size), torch.zeros(1, step.step.state_size))
-        with warnings.catch_warnings(), torch.no_grad():
-            # PyTorch announces the end of TorchScript; the user who asks for it knows.
-            warnings.simplefilter("ignore")
-            self.step: Any = torch.jit.trace(step, example)
-        self.register_buffer("hidden_state", torch.zeros(1, step.step.state_size))
-
-    def forward(self, obs: torch.Tensor) -> torch.Tensor:
-        """Advance by one control step."""
-        actions, after = self.step(obs, self.hidden_state)
-        self.hidden_state[:] = after  # pyright: ignore[reportIndexIssue]
-        return actions
-
-    @torch.jit.export
-    def reset(self) -> None:
-        """Forget."""
-        self.hidden_state[:] = 0.0  # pyright: ignore[reportIndexIssue]
-
-
-class _FlatStep(nn.Module):
-    def __init__(self, step: StepPolicy) -> None:
-        super().__init__()
-        self.step: StepPolicy = step
-        self.sizes: list[int] = [math.prod(shape) for shape in step.shapes.values()]
-        self.size: int = sum(self.sizes)
-
-    def forward(self, obs: torch.Tensor, h_in: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        shapes = self.step.shapes.values()
-        parts = [part.reshape(-1, *shape) for part, shape in zip(obs.split(self.sizes, 1), shapes, strict=True)]
-        return self.step(*parts, h_in)

@@ -34,14 +34,23 @@ def make_env(
     config: str = "default",
     change: list[str] | None = None,
     task_file: Path | None = None,
+    agents: Iterable[str] = (),
     **options: Any,
 ) -> Env:
-    """Return the environment of a command; a task of the user's own is read first, then changed."""
+    """Return the environment of a command; a task of the user's own is read first, then changed.
+
+    Trained ``agents`` find the contacts in which they were trained, unless ``change`` names others or ``config`` is
+    ``published``, which defines them.
+    """
     from robotics_bridge import tasks
+    from robotics_bridge.policies.fit import with_contacts_of
     from robotics_bridge.tasks.overrides import apply_overrides
 
     read_task_file(task_file)
-    return tasks.make(apply_overrides(tasks.load(name, config), change or ()), **options)
+    task, change = tasks.load(name, config), change or []
+    if config != "published" and not any(word.startswith("contacts") for word in change):
+        task = with_contacts_of(task, agents)
+    return tasks.make(apply_overrides(task, change), **options)
 
 
 def read_task_file(path: Path | None) -> None:
@@ -107,11 +116,9 @@ def agent_of(name: str, env: Env, *, seed: int = 0) -> Any:
 
 def _student(name: str) -> dict[str, Any]:
     """Return what the configuration of a student's run says; nothing for other agents."""
-    from robotics_bridge.policies.schema import Values
-    from robotics_bridge.policies.shipped import FOLDER
+    from robotics_bridge.policies.shipped import stored
 
-    folder = FOLDER / name if not Path(name).exists() and (FOLDER / name).is_dir() else Path(name)
-    facts = dict(Values.read(folder / "config.json").values) if (folder / "config.json").is_file() else {}
+    facts = stored(name)
     return facts if facts.get("brainbench_student") else {}
 
 
@@ -128,11 +135,11 @@ def touch_of(names: list[str]) -> dict[str, Any]:
     for name in names:
         if facts := _student(name):
             # Loads the students' networks, which other agents do not need.
-            from robotics_bridge.policies.training.distill_config import EARLIER_TWIST, DistillConfig
+            from robotics_bridge.policies.training.distill_config import DistillConfig
 
             kept = Values("config.json", facts).part("distill").fields(DistillConfig)
             found[name] = {key: kept[key] for key in TOUCH if key in kept}
-            config = DistillConfig.of({"twist": EARLIER_TWIST, **kept})
+            config = DistillConfig.of_run(kept)
             if config.knobs and config.observe in ("force", "force_torque"):
                 found[name]["knobs"] = config.knobs
     if any(senses != next(iter(found.values())) for senses in found.values()):
