@@ -23,12 +23,19 @@ _LOG = logging.getLogger(__name__)
 def trained_contacts(described: Mapping[str, Any], where: str = "config.json") -> ContactModel:
     """Return the contact model in which the policy of a ``config.json`` was trained.
 
-    Runs of versions that did not state it had the published one. DataError or UsageError for values that are none.
+    Runs of versions that did not state it had the published one.
+
+    Raises:
+        DataError: a value is of another kind, or out of range.
     """
-    if not described.get("contacts"):
+    if described.get("contacts") is None:
         return CONTACTS["published"]
     found = Values(where, described).part("contacts").fields(ContactModel)
-    return ContactModel(**found | ({"impedance": tuple(found["impedance"])} if "impedance" in found else {}))
+    plain: dict[str, Any] = {key: tuple(value) if isinstance(value, list) else value for key, value in found.items()}
+    try:
+        return ContactModel(**plain)
+    except UsageError as error:
+        raise DataError(f"{where!r} is damaged: {error}") from error
 
 
 def with_contacts_of(task: Task, policies: Iterable[str]) -> Task:
