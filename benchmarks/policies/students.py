@@ -317,9 +317,7 @@ def seen(log: list[dict[str, Any]], iteration: int) -> float:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument(
-        "--teacher", type=Path, default=Path("in_palm_rotate.careful"), help="shipped, or a run's folder"
-    )
+    parser.add_argument("--teacher", type=Path, default=Path("in_palm_rotate.firm"), help="shipped, or a run's folder")
     parser.add_argument("--lay-out", type=Path, nargs="+", help="folders of students that came back")
     parser.add_argument("--at-least", type=int, default=0, help="iterations; what learned fewer is left out, by name")
     parser.add_argument("--records", type=Path, help="folder for records of what is laid out")
