@@ -157,6 +157,7 @@ def _tape_recorder(native: bool) -> Recorder:
         tape, wp = _Tape(), warp()
         with pytest.MonkeyPatch.context() as patch, tape:
             patch.setattr(wp, "launch", tape.note(wp.launch))
+            patch.setattr(wp.Launch, "launch", tape.note(wp.Launch.launch))
             patch.setattr(wp.array, "zero_", tape.note(wp.array.zero_))
             for name in () if native else ("reset", "refresh", "apply_push"):
                 patch.setattr(Simulation, name, tape.note(getattr(Simulation, name)))
