@@ -7,7 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.policies.jobs import read_jobs
+from tests.factories.benchmark_programs import benchmark_program
+
+read_jobs = benchmark_program("policies/jobs.py").read_jobs
 
 
 def test_every_job_has_a_command_that_exists_and_minutes() -> None:
