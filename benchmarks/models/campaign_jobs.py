@@ -83,7 +83,7 @@ class Job:
             return 15.0
         parts = self.architecture
         step = _MILLISECONDS[parts.cell or parts.encoder] + _ATTENDER[parts.attender] + 6 * parts.layer_norm
-        step *= {"supervised": 1.0, "ae": 1.1}.get(self.objective, 1.65) * (1 if parts.small else 7)
+        step *= {"supervised": 1.0, "ae": 1.1}.get(self.objective, 1.65) * (1 if parts.small else 3.7)
         searched = self.seed == 0 and self.rate is None
         return 0.1 * step * (self.epochs + SEARCH_EPOCHS * len(RATES) * searched) + 15.0
 
