@@ -179,8 +179,7 @@ class ShadowTouch:
         joints: Names of the joints in the order of the reports.
         rate: Control steps per second.
         sub_steps: S.
-        twist: Torsional friction of its force taxels (N·m·s); None: they hold what they touch.
-        contacts: Those in which the policy was trained.
+        **settings: ``twist`` and ``contacts`` of :class:`SimulatedHand`, as in training.
     """
 
     def __init__(
@@ -193,14 +192,11 @@ class ShadowTouch:
         joints: tuple[str, ...],
         rate: float = 40.0,
         sub_steps: int = 5,
-        twist: float | None = None,
-        contacts: ContactModel = CONTACTS["firm"],
+        **settings: Any,
     ) -> None:
         self.sub_steps = sub_steps
-        self.hand = SimulatedHand(
-            hand, rate * sub_steps, observe=observe, placement=placement, resolution=resolution, twist=twist,
-            contacts=contacts,
-        )  # fmt: skip
+        senses = {"observe": observe, "placement": placement, "resolution": resolution}
+        self.hand = SimulatedHand(hand, rate * sub_steps, **senses, **settings)
         self._order = [joints.index(name) for name in self.hand.joints]
 
     def __call__(self, reading: HandReading) -> NDArray[np.float32]:

@@ -24,11 +24,7 @@ MOST_POLICY = 2 << 30
 
 
 def read_policy(
-    path: str | Path,
-    shapes: Mapping[str, tuple[int, ...]],
-    *,
-    threads: int | None = None,
-    actions: int | None = None,
+    path: str | Path, shapes: Mapping[str, tuple[int, ...]], *, threads: int | None = None, actions: int | None = None
 ) -> Runner:
     """Return an exported policy as a function of one step of one hand that remembers.
 

@@ -18,7 +18,7 @@ from torch import nn
 
 from brainbench.core.errors import UsageError, check_name
 from robotics_bridge.policies.encoders.arms import EncoderConfig, Stepped, TactileEncoder, perceptron
-from robotics_bridge.policies.exported import StepPolicy
+from robotics_bridge.policies.export import StepPolicy
 
 if TYPE_CHECKING:
     from rsl_rl.models import MLPModel

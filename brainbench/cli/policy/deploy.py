@@ -173,6 +173,5 @@ def _shadow(deployed: DeployedPolicy, joints: tuple[str, ...]) -> Any:
             f"The contract does not say {sorted(missing)[0]!r}, so no touch can be simulated beside the hand."
         )
     names = (facts[name] for name in ("observe", "placement", "resolution"))
-    settings = {name: facts[name] for name in ("twist", "contacts")}
-    settings |= {"rate": contract.rate, "sub_steps": facts["sub_steps"]}
-    return ShadowTouch(contract.hand, *names, joints=joints, **settings)
+    settings = {name: facts[name] for name in ("sub_steps", "twist", "contacts")}
+    return ShadowTouch(contract.hand, *names, joints=joints, rate=contract.rate, **settings)

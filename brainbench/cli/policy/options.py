@@ -99,10 +99,11 @@ def check_paths(video: Path | None, strip: Path | None) -> None:
 def agent_of(name: str, env: Env, *, seed: int = 0) -> Any:
     """Return the agent ``zero`` or ``random``, a shipped policy, or the teacher or student of a run's folder."""
     from robotics_bridge.policies import evaluate
+    from robotics_bridge.policies.shipped import stored
 
     if name in evaluate.AGENTS:
         return evaluate.agent(name, env, seed=seed)
-    if _student(name):
+    if stored(name).get("brainbench_student"):
         from robotics_bridge.policies.fit import check_fit
         from robotics_bridge.policies.training.student_files import load_student
 
@@ -114,14 +115,6 @@ def agent_of(name: str, env: Env, *, seed: int = 0) -> Any:
     return teacher.load_teacher(name, env)
 
 
-def _student(name: str) -> dict[str, Any]:
-    """Return what the configuration of a student's run says; nothing for other agents."""
-    from robotics_bridge.policies.shipped import stored
-
-    facts = stored(name)
-    return facts if facts.get("brainbench_student") else {}
-
-
 def touch_of(names: list[str]) -> dict[str, Any]:
     """Return the tactile options of the student among some agents; nothing if there is none.
 
@@ -130,10 +123,11 @@ def touch_of(names: list[str]) -> dict[str, Any]:
     """
     from brainbench.core.errors import UsageError
     from robotics_bridge.policies.schema import Values
+    from robotics_bridge.policies.shipped import stored
 
     found: dict[str, dict[str, Any]] = {}
     for name in names:
-        if facts := _student(name):
+        if (facts := stored(name)).get("brainbench_student"):
             # Loads the students' networks, which other agents do not need.
             from robotics_bridge.policies.training.distill_config import DistillConfig
 

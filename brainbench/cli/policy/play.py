@@ -144,9 +144,8 @@ def play(
             drawing.write_strip(strip, stills, times)
     told = {
         "task": env.task.name, "hand": env.hand.name, "contacts": contacts, "agent": agent,
-        "seconds": steps * env.step_dt,
-        "reward": sum(rewards), "episodes_ended": ended, "metric": env.task.success.metric, "files": pictures,
-        "goals": goals, "turned": turned, "dropped": dropped,
+        "seconds": steps * env.step_dt, "reward": sum(rewards), "episodes_ended": ended,
+        "metric": env.task.success.metric, "files": pictures, "goals": goals, "turned": turned, "dropped": dropped,
     }  # fmt: skip
     shown: dict[str, object] = {
         "task": told["task"], "hand": told["hand"], "contacts": contacts, "agent": agent,
