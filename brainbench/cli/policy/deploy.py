@@ -80,6 +80,7 @@ def deploy(
     from robotics_bridge.deploy.simulated_hand import Faults, simulated_hand
     from robotics_bridge.deploy.timing import realtime
     from robotics_bridge.deploy.udp import UdpDriver
+    from robotics_bridge.tasks.contact_model import contacts_name
 
     deployed = session.read_deployed(policy)
     contract = deployed.contract
@@ -91,8 +92,9 @@ def deploy(
     contacts = contract.more["contacts"]
     remote = None if driver == "sim" else _remote(driver, key, deployed)
     # What is missing is said before a hand is started or greeted.
+    beside = f"simulated beside the hand, {contacts_name(contacts)} contacts"
     told = {
-        name: f"{what}: {'simulated beside the hand' if shadow and name == 'tactile' else 'constant'}"
+        name: f"{what}: {beside if shadow and name == 'tactile' else 'constant'}"
         for name, what in deployed.require({*given, *(("tactile",) if shadow else ())}).items()
     }
     with contextlib.ExitStack() as stack:
