@@ -47,15 +47,14 @@ def with_contacts_of(task: Task, policies: Iterable[str]) -> Task:
         UsageError: the policies were trained with different contacts.
     """
     found = {name: trained_contacts(described) for name in policies if (described := stored(name))}
-    if not found:
-        return task
-    if len({*found.values()}) > 1:
+    models = {*found.values()} or {task.contacts}
+    if len(models) > 1:
         told = ", ".join(f"{name} ({contacts_name(model)})" for name, model in found.items())
         raise UsageError(
             f"The policies were trained with different contacts: {told}. Say which they all get (--change "
             "contacts=firm), or take one at a time."
         )
-    return replace(task, contacts=next(iter(found.values())))
+    return replace(task, contacts=models.pop())
 
 
 def check_fit(described: Mapping[str, Any], env: Env, name: str) -> None:

@@ -45,14 +45,9 @@ def sensing_policy(env: Env, settings: TeacherSettings, seed: int, observe: tupl
             given = "make the environment with an observation type" if name == TACTILE else "leave it out"
             raise UsageError(f"Task {env.task.name!r} gives no {name!r} here: {given}.")
     o, named = env.options, contacts_name(env.task.contacts)
-    senses: dict[str, Any] = {
-        "observe": o.observe,
-        "placement": o.placement,
-        "resolution": o.resolution,
-        "noisy": o.noisy,
-    }
-    if "touch" not in observe:
-        senses = {"observe": "none"}
+    senses: dict[str, Any] = {"observe": "none"}
+    if "touch" in observe:
+        senses = {name: getattr(o, name) for name in ("observe", "placement", "resolution", "noisy")}
     return DistillConfig(
         task=env.task.name, hand=str(env.hand.path or env.hand.name), embedder="lstm", hidden=settings.hidden,
         num_envs=env.num_envs, seed=seed, contacts=named if named in CONTACTS else None, **senses,
