@@ -17,7 +17,7 @@ from tensordict import TensorDict
 
 from benchmarks.report import table, write_section
 from robotics_bridge.policies.encoders.arms import ARMS, EncoderConfig
-from robotics_bridge.policies.export import STEPS, SUFFIXES, TOLERANCE, export_policy
+from robotics_bridge.policies.export import STEPS, TOLERANCE, export_policy
 from robotics_bridge.policies.runners import read_policy
 from robotics_bridge.policies.student import TactilePolicy
 
@@ -49,25 +49,24 @@ def main() -> None:
         for name in (None, *ARMS, *NETWORKS):
             policy = student(name)
             row = {group: np.zeros(shape, np.float32) for group, shape in policy.shapes.items()}
-            for format in SUFFIXES:
-                found = export_policy(policy, Path(folder) / f"{name}.{format}", format=format)
-                run = read_policy(found.path, policy.shapes, format=format)
-                spent = []
-                for call in range(_CALLS):
-                    begun = time.perf_counter()
-                    run(row, call == 0)
-                    spent.append(1e3 * (time.perf_counter() - begun))
-                size = found.path.stat().st_size / 1e6
-                figures = [f"{found.difference:.1e}", str(found.state_size), f"{size:.1f}"]
-                lines.append([name or "none", format, *figures, f"{statistics.median(spent):.2f}"])
-                print(*lines[-1], flush=True)
+            found = export_policy(policy, Path(folder) / f"{name}.onnx")
+            run = read_policy(found.path, policy.shapes, threads=1)
+            spent = []
+            for call in range(_CALLS):
+                begun = time.process_time()
+                run(row, call == 0)
+                spent.append(1e3 * (time.process_time() - begun))
+            size = found.path.stat().st_size / 1e6
+            figures = [f"{found.difference:.1e}", str(found.state_size), f"{size:.1f}"]
+            lines.append([name or "none", *figures, f"{statistics.median(spent):.2f}"])
+            print(*lines[-1], flush=True)
     text = (
         f"Largest difference of an action from the policy's over {STEPS} steps with resets, relative to the largest "
         f"action (a file beyond {TOLERANCE:g} is not kept); numbers of memory per row; median of {_CALLS} steps of "
         "one row. Students of `in_palm_rotate` with `force_torque` on the whole hand (none: without touch); "
         "normalisers, taxel grid, encoder, head and memory in one file.\n\n"
     )
-    body = text + table(["encoder", "format", "difference", "memory", "MB", "ms a step"], lines)
+    body = text + table(["encoder", "difference", "memory", "MB", "processor ms a step"], lines)
     if options.write:
         write_section("Exported policies", "python -m benchmarks.policies.exports --write", body, subject="policies")
 

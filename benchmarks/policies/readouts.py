@@ -1,6 +1,6 @@
 """Lay out the read-outs of tactile encoders that ``brainbench policy probe --out FILE`` measured.
 
-    brainbench policy probe in_palm_rotate --agent in_palm_rotate.careful --config careful --seconds 8 --out FILE
+    brainbench policy probe in_palm_rotate --agent in_palm_rotate.firm --config careful --seconds 8 --out FILE
     python -m benchmarks.policies.readouts --record FILE [FILE …] [--device "one NVIDIA H100"] [--notes FILE] [--write]
 
 Prints the tables; with ``--write`` keeps them as a section of RESULTS.md, draws ``docs/images/policy-readouts.png``,
@@ -32,8 +32,7 @@ def body(record: Mapping[str, Any]) -> str:
     ]
     pairs = [[one["arm"], one["less"], *(_cell(one[name], "+") for name in TARGETS)] for one in record["differences"]]
     extent = f"{record['environments']} environments of {record['task']} for {record['seconds']:g} s"
-    changed = "".join(f", {word}" for word in record["change"])
-    head = f"**{extent} under `{record['agent']}`{changed}**"
+    head = f"**{extent} under `{record['agent']}`, {record['contacts']} contacts**"
     return "\n\n".join(
         [head, table(["arm", "features", "draws", *TARGETS], arms), table(["arm", "less", *TARGETS], pairs)]
     )
@@ -84,8 +83,7 @@ def main() -> None:
     if options.write:
         draw(records[0])
         for record in records:
-            name = "-".join([record["task"], *(word.partition("=")[2] for word in record["change"])])
-            write_json(RECORDS / f"readouts-{name}.json", record)
+            write_json(RECORDS / f"readouts-{record['task']}-{record['contacts']}.json", record)
         commands = [*map(command, records), "python -m benchmarks.policies.readouts --record FILE … --write"]
         write_section(
             "Read-outs of tactile encoders", "; ".join(commands), text, where=options.device, subject="policies"

@@ -252,7 +252,7 @@ def found_logs(folders: list[Path], named: dict[str, StudentResult]) -> dict[tup
 
     logs = {}
     for path in (path for folder in folders for path in sorted(folder.rglob("log.jsonl"))):
-        config = DistillConfig.of(read_json(path.parent / "config.json")["distill"])
+        config = DistillConfig.of_run(read_json(path.parent / "config.json")["distill"])
         arm = arm_of(config)
         if arm not in named or config.seed not in named[arm].seeds:
             continue
@@ -317,9 +317,7 @@ def seen(log: list[dict[str, Any]], iteration: int) -> float:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument(
-        "--teacher", type=Path, default=Path("in_palm_rotate.careful"), help="shipped, or a run's folder"
-    )
+    parser.add_argument("--teacher", type=Path, default=Path("in_palm_rotate.firm"), help="shipped, or a run's folder")
     parser.add_argument("--lay-out", type=Path, nargs="+", help="folders of students that came back")
     parser.add_argument("--at-least", type=int, default=0, help="iterations; what learned fewer is left out, by name")
     parser.add_argument("--records", type=Path, help="folder for records of what is laid out")
@@ -327,7 +325,7 @@ def main() -> None:
     parser.add_argument("--write", action="store_true")
     parser.add_argument("--task", default="in_palm_rotate")
     parser.add_argument("--config", default="default", help="configuration of the task; that of the teacher")
-    parser.add_argument("--contacts", default="published", choices=list(CONTACTS))
+    parser.add_argument("--contacts", choices=list(CONTACTS), help="by default those of the teacher")
     parser.add_argument("--draw", type=int, help="seed of untrained networks and reservoirs; by default the student's")
     parser.add_argument("--arms", nargs="+", default=list(ARMS), choices=list(ARMS))
     parser.add_argument("--device", default="cpu")

@@ -9,6 +9,10 @@ A folder is what ``--out`` named. ``--after`` names the run whose networks anoth
     python -m benchmarks.policies.teachers --first TASK=FOLDER … [--notes FILE] [--write]
 
 is the section of first teachers, one run per task, with what their episodes of training were like on the way.
+
+    python -m benchmarks.policies.teachers --evaluated ENGINE=FILE … [--notes FILE] [--write]
+
+is the section of the teacher under firm contacts: files of ``brainbench policy evaluate --out``, kept in ``records``.
 """
 
 from __future__ import annotations
@@ -112,6 +116,19 @@ def first(runs: dict[str, Path]) -> str:
     return f"{table(columns, found)}\n\n{table(moments, way)}"
 
 
+def evaluated(files: dict[str, Path]) -> str:
+    """One row per engine and agent."""
+    names = ("goals", "turn_rate", "seconds", "dropped")
+    rows = [
+        [engine, row["agent"], str(row["episodes"]), share(row)]
+        + [f"{row[name]:.2f} ± {row[f'{name}_half_width']:.2f}" for name in names]
+        for engine, file in files.items()
+        for row in json.loads(file.read_text(encoding="utf-8"))
+    ]
+    columns = ["engine", "agent", "episodes", "success", "goals an episode", "rad/s", "s", "dropped"]
+    return table(columns, rows)
+
+
 def draw(section: str) -> None:
     """Draw success and goals of each agent of the section's table, with 95 % intervals."""
     rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in section.splitlines() if line[:1] == "|"]
@@ -133,24 +150,33 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--runs", nargs="+", default=[])
     parser.add_argument("--first", nargs="+", default=[], help="one run per task, in place of --runs")
+    parser.add_argument("--evaluated", nargs="+", default=[])
     parser.add_argument("--after", nargs="*", default=[])
     parser.add_argument("--processor", nargs="*", default=[])
     parser.add_argument("--notes", type=Path, help="text that follows the table")
     parser.add_argument("--device", default="one NVIDIA H200 per run")
     parser.add_argument("--write", action="store_true")
     options = parser.parse_args()
-    if bool(options.runs) == bool(options.first):
-        parser.error("give --runs or --first")
+    if sum(map(bool, (options.runs, options.first, options.evaluated))) != 1:
+        parser.error("give --runs, --first or --evaluated")
     runs = {name: Path(folder) for name, folder in pairs(options.runs or options.first).items()}
     after = pairs(options.after)
-    if options.first:
+    if options.evaluated:
+        text = evaluated({name: Path(file) for name, file in pairs(options.evaluated).items()})
+    elif options.first:
         text = first(runs)
     else:
         text = body(runs, after, {name: Path(file) for name, file in pairs(options.processor).items()})
     if options.notes:
         text += "\n\n" + options.notes.read_text(encoding="utf-8").strip()
     print(text)
-    if options.write and options.first:
+    if options.write and options.evaluated:
+        command = (
+            "brainbench policy evaluate in_palm_rotate in_palm_rotate.firm in_palm_rotate.careful --config careful "
+        )
+        command += "--change contacts=firm --out FILE; python -m benchmarks.policies.teachers --evaluated ENGINE=FILE …"
+        write_section("Teacher under firm contacts", command, text, where=options.device, subject="policies")
+    elif options.write and options.first:
         command = (
             f"python -m benchmarks.policies.tasks --part teacher --device cuda --tasks {' '.join(runs)} --envs 8192 …"
         )

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from brainbench.core.errors import DataError, DataFileNotFoundError, UsageError, listing, shown
+from brainbench.core.errors import DataError, DataFileNotFoundError, UsageError, listing
 from brainbench.core.files import file_hash
 from robotics_bridge import hands
 from robotics_bridge.deploy.controller import Actuation, Controller, Source
@@ -141,11 +141,6 @@ def read_deployed(path: str | Path) -> DeployedPolicy:
                 f"There is no file {str(file)!r}; brainbench policy export writes a policy and its contract."
             )
     found = PolicyContract.read(contract)
-    if found.format != "onnx":
-        raise DataError(
-            f"{shown(str(path))} is TorchScript, a program that may read and write files; a hand runs ONNX alone: "
-            "export the policy with --format onnx."
-        )
     if found.sha256 and found.sha256 != file_hash(path, length=64):
         raise DataError(f"{str(path)!r} is not the file that its contract describes; export the policy again.")
     return DeployedPolicy(path, found)

@@ -27,6 +27,7 @@ from robotics_bridge.hands.observations import observation_type, observe, sensor
 from robotics_bridge.hands.scenes import OBJECT, holding
 from robotics_bridge.physics import MujocoEngine
 from robotics_bridge.sensors import SensorSuite
+from robotics_bridge.tasks.contact_model import CONTACTS, ContactModel, set_contacts
 from robotics_bridge.tasks.overrides import set_field
 
 HOLD_AFTER = 0.25
@@ -93,6 +94,7 @@ class SimulatedHand:
         placement: Of its taxels.
         resolution: Of its taxels.
         twist: Torsional friction of force taxels (N·m·s); None: they hold what they touch.
+        contacts: Firmness of contacts and strength of the drives.
     """
 
     def __init__(
@@ -104,9 +106,15 @@ class SimulatedHand:
         placement: str = "tips",
         resolution: str = "med",
         twist: float | None = None,
+        contacts: ContactModel = CONTACTS["firm"],
     ) -> None:
-        self.hand, self.rate = hands.load(hand), rate
-        self.engine = MujocoEngine(holding(self.hand, timestep=1 / rate), 1, threads=1)
+        self.hand, self.rate, self._substeps = hands.load(hand), rate, contacts.substeps
+        body = holding(self.hand, timestep=1 / rate / contacts.substeps)
+        set_contacts(body, contacts)
+        # Drives as in the tasks: stiffness, damping, effort and armature together.
+        for numbers in (body.actuator_gainprm, body.actuator_biasprm, body.actuator_forcerange, body.dof_armature):
+            numbers *= contacts.drive_scale
+        self.engine = MujocoEngine(body, 1, threads=1)
         self.observe, self.layout = observe, self.hand.layout(resolution, placement)
         sensors = sensors_for(observe, self.layout, track=(OBJECT,), twist=twist)
         self.suite = SensorSuite(self.engine.scene, sensors, num_envs=1)
@@ -141,7 +149,7 @@ class SimulatedHand:
 
     def step(self) -> None:
         """Advance by one report."""
-        self.engine.step()
+        self.engine.step(self._substeps)
         self.suite.update(self.engine.state, 1 / self.rate)
 
     def touch(self) -> NDArray[np.float32]:
@@ -171,7 +179,7 @@ class ShadowTouch:
         joints: Names of the joints in the order of the reports.
         rate: Control steps per second.
         sub_steps: S.
-        twist: Torsional friction of its force taxels (N·m·s); None: they hold what they touch.
+        **settings: ``twist`` and ``contacts`` of :class:`SimulatedHand`, as in training.
     """
 
     def __init__(
@@ -184,12 +192,11 @@ class ShadowTouch:
         joints: tuple[str, ...],
         rate: float = 40.0,
         sub_steps: int = 5,
-        twist: float | None = None,
+        **settings: Any,
     ) -> None:
         self.sub_steps = sub_steps
-        self.hand = SimulatedHand(
-            hand, rate * sub_steps, observe=observe, placement=placement, resolution=resolution, twist=twist
-        )
+        senses = {"observe": observe, "placement": placement, "resolution": resolution}
+        self.hand = SimulatedHand(hand, rate * sub_steps, **senses, **settings)
         self._order = [joints.index(name) for name in self.hand.joints]
 
     def __call__(self, reading: HandReading) -> NDArray[np.float32]:
@@ -252,8 +259,10 @@ def _spoil(
         yield bytes(data)
 
 
-def _process(name: str, rate: float, faults: Faults, seconds: float, key: bytes, ready: Any) -> None:
-    hand = SimulatedHand(name, rate)
+def _process(
+    name: str, rate: float, contacts: ContactModel, faults: Faults, seconds: float, key: bytes, ready: Any
+) -> None:
+    hand = SimulatedHand(name, rate, contacts=contacts)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as link:
         link.bind((LOOPBACK, 0))
         ready.send((link.getsockname()[1], hand.joints, hand.fingers))
@@ -262,8 +271,9 @@ def _process(name: str, rate: float, faults: Faults, seconds: float, key: bytes,
 
 @contextlib.contextmanager
 def simulated_hand(
-    hand: str = "xhand1", *, rate: float = 200.0, faults: Faults | None = None, seconds: float = 600.0
-) -> Iterator[tuple[tuple[str, int], tuple[str, ...], tuple[str, ...], bytes]]:
+    hand: str = "xhand1", *, rate: float = 200.0, contacts: ContactModel = CONTACTS["firm"],
+    faults: Faults | None = None, seconds: float = 600.0,
+) -> Iterator[tuple[tuple[str, int], tuple[str, ...], tuple[str, ...], bytes]]:  # fmt: skip
     """Run a simulated hand in a process of its own; yield its address, joints, fingers and key.
 
     Raises:
@@ -272,7 +282,8 @@ def simulated_hand(
     context = multiprocessing.get_context("spawn")
     ours, theirs = context.Pipe()
     key = new_key()
-    process = context.Process(target=_process, args=(hand, rate, faults or Faults(), seconds, key, theirs), daemon=True)
+    given = (hand, rate, contacts, faults or Faults(), seconds, key, theirs)
+    process = context.Process(target=_process, args=given, daemon=True)
     process.start()
     theirs.close()
     try:

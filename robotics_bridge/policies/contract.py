@@ -15,10 +15,10 @@ from typing import Any
 from brainbench.core.errors import DataError, UsageError
 from brainbench.core.files import to_json
 from robotics_bridge.hands.observations import OBSERVATIONS
+from robotics_bridge.policies.fit import trained_contacts
 from robotics_bridge.policies.schema import Values
 from robotics_bridge.sensors.taxels.sensors import PUBLISHED_TWIST
 
-FORMATS = ("onnx", "jit")
 RATE = (1.0, 1000.0)
 """Control steps per second [Hz]."""
 ANGLE = (-4 * math.pi, 4 * math.pi)
@@ -39,8 +39,6 @@ REQUIRED = ("action_map", "frozen", "hand", "joints", "rate")
 class PolicyContract:
     """What the file of an exported policy reads, and what a robot needs to run it."""
 
-    format: str
-    """``onnx`` or ``jit``."""
     inputs: Mapping[str, tuple[int, ...]]
     """Group → shape, in the order of the file."""
     rate: float
@@ -64,7 +62,7 @@ class PolicyContract:
     more: Mapping[str, Any] = field(default_factory=dict)
     """``task``, ``placement``, ``resolution``, ``sub_steps``, ``command`` (what it is told by default) and
     ``action_limit``, where they stand in the contract, and ``twist``, the torsional friction of force taxels (N·m·s;
-    None: they hold)."""
+    None: they hold), and ``contacts``, the contact model in which it was trained."""
 
     @classmethod
     def read(cls, path: Path) -> PolicyContract:
@@ -81,6 +79,12 @@ class PolicyContract:
         """Return the contract of a file's values; errors as :meth:`read`."""
         if not {"inputs", "format", "deployment"} <= set(found.values):
             raise DataError(f"{found.where!r} is not the contract of a policy.")
+        if found.values["format"] == "jit":
+            raise DataError(
+                f"{found.where!r} is of TorchScript, a program that may read and write files; a hand runs ONNX alone: "
+                "export the policy again."
+            )
+        found.text("format", ("onnx",))
         given = found.part("deployment")
         if missing := [name for name in REQUIRED if name not in given.values]:
             raise UsageError(
@@ -119,8 +123,9 @@ class PolicyContract:
         more["twist"] = PUBLISHED_TWIST
         if "twist" in given.values:
             more["twist"] = None if given.values["twist"] is None else given.number("twist", 0.0, MOST_TWIST)
+        more["contacts"] = trained_contacts(given.values, found.where)
         return cls(
-            found.text("format", FORMATS), inputs, given.number("rate", *RATE), given.text("hand"), joints, moved,
+            inputs, given.number("rate", *RATE), given.text("hand"), joints, moved,
             action_map, frozen, links, observe, found.text("sha256") if "sha256" in found.values else "", more,
         )  # fmt: skip
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 import warnings
 from collections.abc import Mapping
@@ -11,23 +12,56 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
+from torch import nn
 
-from brainbench.core.errors import DataError, check_name
+from brainbench.core.errors import DataError
 from brainbench.core.files import atomic_path, file_hash, provenance, write_json
 from brainbench.models.activations import evaluating
 from brainbench.models.export import require_onnx
-from robotics_bridge.policies.contract import FORMATS, check_contract
+from robotics_bridge.policies.contract import check_contract
 from robotics_bridge.policies.runners import Runner, read_policy
 
 if TYPE_CHECKING:
     from robotics_bridge.policies.student import TactilePolicy
 
-SUFFIXES: dict[str, str] = dict(zip(FORMATS, (".onnx", ".pt"), strict=True))
-"""Formats and their suffixes: ONNX, and TorchScript."""
 TOLERANCE = 1e-4
 """Largest difference of an action between file and policy, relative to the largest action."""
 STEPS = 60
 """Steps of the comparison; rows are reset on the way."""
+
+
+class StepPolicy(nn.Module):
+    """(group …, h_in [B, H]) → (actions [B, A], h_out [B, H]): a copy of the policy on the processor."""
+
+    is_recurrent = True
+
+    def __init__(self, policy: TactilePolicy) -> None:
+        super().__init__()
+        # Its parts, and not the policy itself: what its distribution last drew hangs on a graph and cannot be copied.
+        parts = (policy.obs_normalizer, policy.core, policy.mlp)
+        self.normaliser, self.core, self.mlp = (copy.deepcopy(part).cpu().float().eval() for part in parts)
+        sampled = policy.distribution
+        self.output: nn.Module = nn.Identity() if sampled is None else sampled.as_deterministic_output_module().cpu()
+        self.shapes: dict[str, tuple[int, ...]] = policy.shapes
+        self.flat: tuple[str, ...] = tuple(policy.obs_groups)
+        self.state_size: int = policy.core.state_size
+        """H."""
+        self.input_names, self.output_names = [*self.shapes, "h_in"], ["actions", "h_out"]
+
+    def forward(self, *inputs: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Advance by one control step; groups come in the order of :attr:`input_names`."""
+        obs = dict(zip(self.shapes, inputs[:-1], strict=True))
+        flat: list[torch.Tensor] = []
+        if self.flat:
+            sizes = [self.shapes[name][0] for name in self.flat]
+            flat = list(self.normaliser(torch.cat([obs[name] for name in self.flat], -1)).split(sizes, -1))
+        taxels = next((obs[name] for name in self.shapes if name not in self.flat), None)
+        latent, h_out = self.core(flat, taxels, inputs[-1])
+        return self.output(self.mlp(latent)), h_out
+
+    def get_dummy_inputs(self, batch: int = 1) -> tuple[torch.Tensor, ...]:
+        """Return inputs of zeros."""
+        return (*(torch.zeros(batch, *shape) for shape in self.shapes.values()), torch.zeros(batch, self.state_size))
 
 
 @dataclass(frozen=True)
@@ -37,7 +71,6 @@ class PolicyExport:
     path: Path
     contract: Path
     """The JSON contract."""
-    format: str
     state_size: int
     """H."""
     difference: float
@@ -45,37 +78,29 @@ class PolicyExport:
 
 
 def export_policy(
-    policy: TactilePolicy,
-    path: str | Path,
-    *,
-    format: str = "onnx",
-    deployment: Mapping[str, Any] | None = None,
-    name: str = "",
+    policy: TactilePolicy, path: str | Path, *, deployment: Mapping[str, Any] | None = None, name: str = ""
 ) -> PolicyExport:
     """Write a policy and compare the file with it, step by step with resets; a file that differs is not kept.
 
     Args:
         policy: What is written.
-        path: The suffix of the format is added when there is none.
-        format: ``onnx`` or ``jit``.
+        path: The suffix .onnx is added when there is none.
         deployment: What a robot needs besides (rate, joints, limits, …); kept in the contract.
         name: What the contract calls the policy.
 
     Raises:
-        UsageError: there is no such format.
-        MissingDependencyError: a package of the extra ``export`` is missing, for ``onnx``.
+        MissingDependencyError: a package of the extra ``export`` is missing.
         DataError: the file does not compute what the policy does, or the contract has values out of range.
     """
-    check_name("format of a policy", format, SUFFIXES)
-    target = Path(path) if Path(path).suffix else Path(path).with_suffix(SUFFIXES[format])
+    target = Path(path) if Path(path).suffix else Path(path).with_suffix(".onnx")
     contract = {
         "policy": name or type(policy).__name__,
-        "format": format,
+        "format": "onnx",
         "file": target.name,
         # A list: the order counts, and JSON keeps that of lists alone.
         "inputs": [[key, list(shape)] for key, shape in policy.shapes.items()],
         "state": policy.core.state_size,
-        "reset": "a state of zeros is the one before the first step" if format == "onnx" else "call reset()",
+        "reset": "a state of zeros is the one before the first step",
         "network": policy.config,
         "deployment": dict(deployment or {}),
         "provenance": provenance(),
@@ -84,9 +109,9 @@ def export_policy(
     with atomic_path(target) as temporary, warnings.catch_warnings():
         # The exporters warn of their own parts' deprecations, which nobody here can act on.
         warnings.simplefilter("ignore")
-        _write(policy, temporary, format)
+        _write(policy, temporary)
         # What the policy reads counts, not what the exported part says of itself.
-        difference = compare(policy, read_policy(temporary, policy.shapes, format=format))
+        difference = compare(policy, read_policy(temporary, policy.shapes))
         if not difference <= TOLERANCE:
             raise DataError(
                 f"The exported file differs from the policy by {difference:.2g} of the largest action (allowed "
@@ -94,13 +119,10 @@ def export_policy(
             )
     contract |= {"difference": difference, "sha256": file_hash(target, length=64)}
     file = write_json(target.with_name(f"{target.name}.json"), contract)
-    return PolicyExport(target, file, format, policy.core.state_size, difference)
+    return PolicyExport(target, file, policy.core.state_size, difference)
 
 
-def _write(policy: TactilePolicy, path: Path, format: str) -> None:
-    if format == "jit":
-        torch.jit.script(policy.as_jit()).save(str(path))
-        return
+def _write(policy: TactilePolicy, path: Path) -> None:
     require_onnx()
     step: Any = policy.as_onnx()
     batch = torch.export.Dim("batch", min=1, max=8192)

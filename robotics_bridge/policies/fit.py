@@ -3,20 +3,58 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping
-from dataclasses import asdict
+from collections.abc import Iterable, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from brainbench.core.errors import DataError, UsageError
-from robotics_bridge.policies.shipped import unmeasured_inputs
-from robotics_bridge.tasks.contact_model import CONTACTS, ContactModel
-from robotics_bridge.tasks.task import TASK_VERSION
+from robotics_bridge.policies.schema import Values
+from robotics_bridge.policies.shipped import stored, unmeasured_inputs
+from robotics_bridge.tasks.contact_model import CONTACTS, ContactModel, contacts_name
+from robotics_bridge.tasks.task import TASK_VERSION, Task
 
 if TYPE_CHECKING:
     from robotics_bridge.envs.env import Env
 
 _LOG = logging.getLogger(__name__)
+
+
+def trained_contacts(described: Mapping[str, Any], where: str = "config.json") -> ContactModel:
+    """Return the contact model in which the policy of a ``config.json`` was trained.
+
+    Runs of versions that did not state it had the published one.
+
+    Raises:
+        DataError: a value is of another kind, or out of range.
+    """
+    if described.get("contacts") is None:
+        return CONTACTS["published"]
+    found = Values(where, described).part("contacts").fields(ContactModel)
+    plain: dict[str, Any] = {key: tuple(value) if isinstance(value, list) else value for key, value in found.items()}
+    try:
+        return ContactModel(**plain)
+    except UsageError as error:
+        raise DataError(f"{where!r} is damaged: {error}") from error
+
+
+def with_contacts_of(task: Task, policies: Iterable[str]) -> Task:
+    """Return a task with the contacts in which some policies were trained; unchanged without any.
+
+    A policy is a shipped one or the folder of a run; ``zero`` and ``random`` were trained in none.
+
+    Raises:
+        UsageError: the policies were trained with different contacts.
+    """
+    found = {name: trained_contacts(described) for name in policies if (described := stored(name))}
+    models = {*found.values()} or {task.contacts}
+    if len(models) > 1:
+        told = ", ".join(f"{name} ({contacts_name(model)})" for name, model in found.items())
+        raise UsageError(
+            f"The policies were trained with different contacts: {told}. Say which they all get (--change "
+            "contacts=firm), or take one at a time."
+        )
+    return replace(task, contacts=models.pop())
 
 
 def check_fit(described: Mapping[str, Any], env: Env, name: str) -> None:
@@ -49,12 +87,8 @@ def check_fit(described: Mapping[str, Any], env: Env, name: str) -> None:
             "The student %r reads %s, which only the simulation knows: on a hand it does worse.", name,
             ", ".join(unmeasured),
         )  # fmt: skip
-    plain = asdict(ContactModel()) | (described.get("contacts") or {})
-    own = {key: tuple(value) if isinstance(value, list) else value for key, value in plain.items()}
-    if own != asdict(env.task.contacts):
-        names = {model: word for word, model in CONTACTS.items()}
+    if (own := trained_contacts(described)) != env.task.contacts:
         _LOG.warning(
-            "The policy %r was trained with contacts %s; these are %s.", name,
-            next((word for word, model in CONTACTS.items() if asdict(model) == own), "of its own"),
-            names.get(env.task.contacts, "of their own"),
+            "The policy %r was trained with contacts %s; these are %s.", name, contacts_name(own),
+            contacts_name(env.task.contacts),
         )  # fmt: skip

@@ -100,9 +100,14 @@ class StudentResult:
         """Mean success."""
         return float(np.mean(self.success))
 
+    @property
+    def world(self) -> tuple[str, str, str]:
+        """Task, hand and contacts: results of different worlds are not compared."""
+        return self.config.task, self.config.hand, self.config.contacts or "–"
+
 
 def read_results(folders: Iterable[str | Path], *, at_least: int = 0) -> list[StudentResult]:
-    """Return the results of all evaluated students below some folders, best first within each task and hand.
+    """Return the results of all evaluated students below some folders, best first within each task, hand and contacts.
 
     Where a student was trained more than once with the same training seed, the one that learned longest counts: two
     runs of one seed are no two seeds. Students that learned fewer iterations than ``at_least`` are left out; those that
@@ -118,7 +123,7 @@ def read_results(folders: Iterable[str | Path], *, at_least: int = 0) -> list[St
             described = read_json(path.parent / "config.json")
             if not isinstance(described, dict) or not isinstance(described.get("distill"), dict):
                 continue
-            member = _Member(DistillConfig.of(described["distill"]), tuple(_evaluations(path)))
+            member = _Member(DistillConfig.of_run(described["distill"]), tuple(_evaluations(path)))
             groups[member.config.name.rpartition("_seed")[0]].append(member)
     if not groups:
         raise DataFileNotFoundError(
@@ -130,9 +135,9 @@ def read_results(folders: Iterable[str | Path], *, at_least: int = 0) -> list[St
         raise DataFileNotFoundError(
             f"None of the students learned {at_least} iterations; the longest that any did is {longest}."
         )
-    bare = {(r.config.task, r.config.hand): r for r in results if r.config.observe == "none"}
-    found = [_against(result, bare.get((result.config.task, result.config.hand))) for result in results]
-    return sorted(found, key=lambda r: (r.config.task, r.config.hand, -r.value, r.config.name))
+    bare = {r.world: r for r in results if r.config.observe == "none"}
+    found = [_against(result, bare.get(result.world)) for result in results]
+    return sorted(found, key=lambda r: (r.world, -r.value, r.config.name))
 
 
 @dataclass(frozen=True)
@@ -238,8 +243,8 @@ def _against(result: StudentResult, bare: StudentResult | None) -> StudentResult
 
 
 COLUMNS = (
-    "task", "hand", "touch", "placement", "resolution", "noise", "encoder", "iterations", "seeds", "success",
-    "over none", "goals", "rad/s", "s", "return",
+    "task", "hand", "contacts", "touch", "placement", "resolution", "noise", "encoder", "iterations", "seeds",
+    "success", "over none", "goals", "rad/s", "s", "return",
 )  # fmt: skip
 
 
@@ -266,7 +271,7 @@ def rows(results: Sequence[StudentResult]) -> list[list[str]]:
             where = [config.placement, config.resolution, "noisy" if config.noisy else "clean", tactile.arm + learning]
         found.append(
             [
-                config.task, config.hand, config.observe, *where,
+                *result.world, config.observe, *where,
                 _learned(result.learned) or "–", str(len(result.seeds)),
                 f"{result.value:.3f}{_span(result.interval)}",
                 "–" if result.gain is None else f"{result.gain:+.3f}{_span(result.difference)}",
@@ -295,7 +300,7 @@ def agent_rows(agents: Sequence[Mapping[str, Any]]) -> list[list[str]]:
     names = ("goals", "turn_rate", "seconds", "returns")
     return [
         [
-            item["task"], "–", Path(item["agent"]).name, *["–"] * 6,
+            item["task"], "–", item.get("contacts", "–"), Path(item["agent"]).name, *["–"] * 6,
             "{:.3f} [{:.3f}, {:.3f}]".format(item["success_rate"], *item["success_interval"]), "–",
             *(_mean_of(item, name) for name in names),
         ]
@@ -362,14 +367,17 @@ def command(config: DistillConfig, *, stop_at: int | None = None) -> str:
 def records(results: Sequence[StudentResult]) -> list[ResultRecord]:
     """Return one result record per group of students, for a leaderboard.
 
-    A board is a task on a hand: its recordings are the evaluation protocol, its animals the training seeds. A record
-    is ``unreliable`` where fewer than :data:`FEWEST_SEEDS` students were trained.
+    A board is a task on a hand under a contact model: its recordings are the evaluation protocol, its animals the
+    training seeds. A record is ``unreliable`` where fewer than :data:`FEWEST_SEEDS` students were trained.
     """
     found = []
     for result in results:
         config, tactile = result.config, result.config.tactile
         protocol = {"task": config.task, "hand": config.hand, "variant": config.variant}
         source = "{task} on {hand} ({variant})".format(**protocol)
+        if config.contacts not in (None, "published"):  # records of versions before know no other contacts
+            protocol["contacts"] = config.contacts
+            source = f"{source}, {config.contacts} contacts"
         name = config.name.rpartition("_seed")[0]
         commands = [
             command(replace(config, seed=seed), stop_at=learned)
@@ -408,18 +416,18 @@ def records(results: Sequence[StudentResult]) -> list[ResultRecord]:
 
 
 def draw(results: Sequence[StudentResult], path: str | Path, *, agents: Sequence[Mapping[str, Any]] = ()) -> Path:
-    """Draw success and rotation with intervals, two panels per task and hand; agents that are no students as lines.
+    """Draw success and rotation with intervals, two panels per task, hand and contacts; other agents as lines.
 
     A mark is a mean, a dot the success of one training seed.
     """
-    groups: dict[tuple[str, str], list[StudentResult]] = defaultdict(list)
+    groups: dict[tuple[str, str, str], list[StudentResult]] = defaultdict(list)
     for result in results:
-        groups[result.config.task, result.config.hand].append(result)
+        groups[result.world].append(result)
     longest = max(len(found) for found in groups.values())
     turning = any("turn_rate" in result.graded for result in results)
     size = (5.4 + 3.6 * turning, (1.7 + 0.38 * longest) * len(groups))
     figure, axes = panels(len(groups), 1 + turning, size, sharey="row")
-    for row, ((task, hand), found) in zip(axes, groups.items(), strict=True):
+    for row, ((task, hand, contacts), found) in zip(axes, groups.items(), strict=True):
         for height, result in enumerate(reversed(found)):
             interval = result.interval
             low, high = (result.value,) * 2 if interval is None else (interval.low, interval.high)
@@ -432,7 +440,8 @@ def draw(results: Sequence[StudentResult], path: str | Path, *, agents: Sequence
                 axis.plot([low, high], [height, height], color=color, lw=1.5)
                 axis.plot(mean, height, "|", color=color, ms=11, mew=2)
             row[0].plot(result.success, [height] * len(result.success), "o", color=color, ms=4, mec="white", mew=0.5)
-        others = [item for item in agents if item["task"] == task]
+        # Agents of versions that did not state it were evaluated under the contacts of their students.
+        others = [item for item in agents if item["task"] == task and item.get("contacts", contacts) == contacts]
         for number, item in enumerate(others, start=1):
             name, color = Path(item["agent"]).name, COLORS[number % len(COLORS)]
             label = {"zero": "no movement", "random": "random movement"}.get(name, name)
@@ -445,7 +454,7 @@ def draw(results: Sequence[StudentResult], path: str | Path, *, agents: Sequence
                 axis.axvspan(low, high, color=color, alpha=0.15, lw=0)
         row[0].set_yticks(range(len(found)), [_label(result) for result in reversed(found)])
         row[0].set_xlabel("share of successful episodes")
-        row[0].set_title(f"task {task}, hand {hand}")
+        row[0].set_title(f"task {task}, hand {hand}, contacts {contacts}")
         if turning:
             row[1].set_xlabel("rotation about the axis (rad/s)")
         if others:

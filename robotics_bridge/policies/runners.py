@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import torch
 
 from brainbench.core.errors import BrainbenchError, DataError
 from brainbench.core.reading.regular import check_file
@@ -26,38 +24,31 @@ MOST_POLICY = 2 << 30
 
 
 def read_policy(
-    path: str | Path,
-    shapes: Mapping[str, tuple[int, ...]],
-    *,
-    format: str = "onnx",
-    threads: int | None = None,
-    actions: int | None = None,
+    path: str | Path, shapes: Mapping[str, tuple[int, ...]], *, threads: int | None = None, actions: int | None = None
 ) -> Runner:
     """Return an exported policy as a function of one step of one hand that remembers.
 
     Args:
         path: The file.
         shapes: Group → shape, in the order of the contract's ``inputs``.
-        format: ``onnx``, or ``jit`` (TorchScript), a program that may read and write files: for your own alone.
         threads: Threads that ONNX Runtime computes with; its own choice if None.
         actions: A; not checked if None.
 
     Raises:
         DataError: the file cannot be read, has other inputs or actions, or holds weights that are not finite.
-        MissingDependencyError: a package of the extra ``export`` is missing, for ``onnx``.
+        MissingDependencyError: a package of the extra ``export`` is missing.
     """
-    if format == "onnx":
-        require_onnx()
+    require_onnx()
     check_file(path, "policy", most=MOST_POLICY)
     try:
-        run: Runner = _JitRunner(path, shapes) if format == "jit" else _OnnxRunner(path, shapes, threads)
+        run: Runner = _OnnxRunner(path, shapes, threads)
         # A step of zeros shows here, and not with a hand in motion, what a file computes.
         tried = run({name: np.zeros(shape, np.float32) for name, shape in shapes.items()}, True)
     except BrainbenchError:
         raise
-    except Exception as error:  # ONNX, ONNX Runtime and TorchScript have no common public base of errors
+    except Exception as error:  # ONNX and ONNX Runtime have no common public base of errors
         first = str(error).strip().partition("\n")[0][:80]
-        raise DataError(f"{str(path)!r} cannot be read as a policy in the format {format!r} ({first}).") from error
+        raise DataError(f"{str(path)!r} cannot be read as an ONNX policy ({first}).") from error
     if tried.ndim != 1 or (actions is not None and len(tried) != actions):
         raise DataError(f"{str(path)!r} gives actions of shape {tried.shape}; its contract has {actions}.")
     if not np.isfinite(tried).all():
@@ -103,20 +94,3 @@ def _tensors(message: Any) -> Iterator[Any]:
         if field.message_type is not None:
             for item in (value,) if hasattr(value, "DESCRIPTOR") else value:
                 yield from _tensors(item)
-
-
-class _JitRunner:
-    def __init__(self, path: str | Path, shapes: Mapping[str, tuple[int, ...]]) -> None:
-        with warnings.catch_warnings():
-            # PyTorch announces the end of TorchScript; the user who exported to it knows.
-            warnings.simplefilter("ignore")
-            self.module = torch.jit.load(str(path))
-        self.names = tuple(shapes)
-        check_finite(self.module.state_dict(), str(path))
-
-    def __call__(self, obs: Mapping[str, NDArray[np.float32]], forget: bool = False) -> NDArray[np.float32]:
-        if forget:
-            self.module.reset()
-        flat = np.concatenate([np.asarray(obs[name], np.float32).reshape(-1) for name in self.names])
-        with torch.no_grad():
-            return self.module(torch.from_numpy(flat)[None])[0].numpy()

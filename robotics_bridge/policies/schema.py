@@ -139,5 +139,8 @@ _KINDS: dict[str, Callable[[Any], bool]] = {
         _list(value, 1, 32) and all(type(item) is int and 0 < item <= 65536 for item in value)
     ),
     "tuple[float, float]": lambda value: _list(value, 2, 2) and all(_within(item, -1e12, 1e12) for item in value),
+    "tuple[float, float, float]": lambda value: (
+        _list(value, 3, 3) and all(_within(item, -1e12, 1e12) for item in value)
+    ),
 }
 """Annotation of a field → whether a JSON value is of its kind; literals are texts, which their class checks."""

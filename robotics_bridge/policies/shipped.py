@@ -9,6 +9,7 @@ from typing import Any
 
 from brainbench.core.errors import check_name
 from brainbench.core.files import read_json
+from robotics_bridge.policies.schema import Values
 from robotics_bridge.tasks.task import MEASURED
 
 AGENTS = ("zero", "random")
@@ -22,6 +23,13 @@ def list_policies(kind: str, task: str | None = None) -> list[str]:
     files = sorted(FOLDER.glob("*/config.json"))
     found = [file.parent.name for file in files if ("brainbench_student" in read_json(file)) == (kind == "student")]
     return [name for name in found if task in (None, name.partition(".")[0])]
+
+
+def stored(name: str | os.PathLike[str]) -> dict[str, Any]:
+    """Return what the ``config.json`` of a policy by name, folder or model file says; nothing for other agents."""
+    path = Path(name) if Path(name).exists() else FOLDER / str(name)
+    path = (path if path.is_dir() else path.parent) / "config.json"
+    return dict(Values.read(path).values) if path.is_file() else {}
 
 
 def unmeasured_inputs(described: Mapping[str, Any]) -> tuple[str, ...]:

@@ -18,7 +18,7 @@ from torch import nn
 
 from brainbench.core.errors import UsageError, check_name
 from robotics_bridge.policies.encoders.arms import EncoderConfig, Stepped, TactileEncoder, perceptron
-from robotics_bridge.policies.exported import JitPolicy, StepPolicy
+from robotics_bridge.policies.export import StepPolicy
 
 if TYPE_CHECKING:
     from rsl_rl.models import MLPModel
@@ -269,8 +269,8 @@ class TactilePolicy(MLPModel):
             self.core.tactile.observe_scale(obs[TACTILE].reshape(-1, 1, *self.core.tactile.shape))
 
     def as_jit(self) -> nn.Module:
-        """Return a scriptable module: forward(obs [1, all groups flattened, in order]) → actions; it remembers."""
-        return JitPolicy(self)
+        """Raise UsageError: rsl_rl's own script would lose the encoder, and PyTorch ends TorchScript."""
+        raise UsageError("This policy is no TorchScript; export it as ONNX: robotics_bridge.policies.export.")
 
     def as_onnx(self, verbose: bool = False) -> nn.Module:
         """Return a module of one step for ONNX: (group …, h_in) → (actions, h_out)."""

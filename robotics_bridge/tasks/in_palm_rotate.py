@@ -84,8 +84,8 @@ def default() -> Task:
     Actions are counted from a cupped hand instead of a flat one: from there random actions turn the block now and
     then. Rotation weighs more, but only slow turns count, and so does coming nearer to the goal in every direction;
     reaching it pays; the goal begins wide. The block's place is where it lies, 2 cm higher, so that lying still costs
-    nothing. Without the approach to the goal, teachers threw the block round and lost it. Actions are bounded. Taxels
-    hold what they touch.
+    nothing. Without the approach to the goal, teachers threw the block round and lost it. Contacts, actions and taxels
+    are those of :func:`~robotics_bridge.tasks.registry.bounded`.
     """
     task = bounded(published())
     rewards = {

@@ -7,6 +7,7 @@ from dataclasses import replace
 from importlib import import_module
 
 from brainbench.core.errors import UsageError, unknown_name
+from robotics_bridge.tasks.contact_model import CONTACTS
 from robotics_bridge.tasks.task import ACTION_LIMIT, Task
 
 Maker = Callable[[], Task]
@@ -38,13 +39,13 @@ def register(name: str, config: str = "default") -> Callable[[Maker], Maker]:
 
 
 def bounded(task: Task) -> Task:
-    """Return a published task as we train it: bounded actions, taxels that hold, and students with a command.
+    """Return a published task as we train it: firm contacts, bounded actions, taxels that hold, students with commands.
 
     A student is told what to do and does not read the goal, which follows from the object's pose.
     """
     student = tuple(name for name in task.groups["student"] if name != "goal")
     groups = {**task.groups, "student": (*student, "command")}
-    return replace(task, action_limit=ACTION_LIMIT, taxel_twist=None, groups=groups)
+    return replace(task, contacts=CONTACTS["firm"], action_limit=ACTION_LIMIT, taxel_twist=None, groups=groups)
 
 
 def register_bounded(name: str, published: Maker) -> None:

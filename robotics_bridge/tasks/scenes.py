@@ -15,7 +15,7 @@ from brainbench.core.errors import UsageError, check_name
 from robotics_bridge.hands.hand import Hand
 from robotics_bridge.hands.scenes import palm_surface
 from robotics_bridge.physics.scene import excluded_links
-from robotics_bridge.tasks.contact_model import ContactModel
+from robotics_bridge.tasks.contact_model import ContactModel, set_contacts
 from robotics_bridge.tasks.objects import ObjectShape, add_object, slots, with_sizes
 from robotics_bridge.tasks.task import Pose, Task
 
@@ -82,9 +82,9 @@ def build(task: Task, hand: Hand) -> TaskModel:
             add_object(
                 spec, name, shape, kinds, density=task.density, condim=3, friction=(task.friction, 0.005, 0.0001)
             )
-        if task.contacts != ContactModel():
-            _set_contacts(spec, task.contacts)
         models.append(spec.compile())
+        if task.contacts != ContactModel():
+            set_contacts(models[-1], task.contacts)
     first = models[0]
     joints = tuple(drives)
     ids = [first.joint(name).id for name in joints]
@@ -147,13 +147,6 @@ def _hand_spec(task: Task, hand: Hand) -> tuple[Any, dict[str, tuple[float, floa
     if task.furniture is not None:
         task.furniture(spec)
     return spec, drives
-
-
-def _set_contacts(spec: Any, contacts: ContactModel) -> None:
-    for geom in spec.geoms:
-        geom.solref = (contacts.time_constant, contacts.damping_ratio)
-        # MuJoCo's sigmoid of the impedance keeps its default middle and power.
-        geom.solimp = (*contacts.impedance, 0.5, 2.0)
 
 
 def _drives(hand: Hand) -> dict[str, tuple[float, float, float]]:

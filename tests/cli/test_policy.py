@@ -55,7 +55,7 @@ def test_a_played_task_leaves_a_strip_of_frames(tmp_path: Path) -> None:
 
 
 def test_what_a_shipped_policy_did_is_told_in_goals_turns_and_drops() -> None:
-    words = ("play", "in_palm_rotate", "--agent", "in_palm_rotate.careful", "--seconds", "2", "--seed", "2")
+    words = ("play", "in_palm_rotate", "--agent", "in_palm_rotate.firm", "--seconds", "2", "--seed", "2")
     told = {line.split("  ")[0]: line.split("  ")[-1].strip() for line in _run(*words).splitlines()}
     found = json.loads(_run(*words, "--json"))
     assert int(told["goals reached"]) == found["goals"] >= 1
@@ -75,7 +75,7 @@ def test_playing_needs_no_package_for_training_and_checks_names_first() -> None:
         words = ["policy", "play", "in_palm_rotate", "--agent", agent, "--seconds", "0.1", *more]
         return subprocess.run([sys.executable, "-c", code, *words], capture_output=True, text=True, check=False)
 
-    for agent in ("in_palm_rotate.careful", "in_palm_rotate.force-torque-hand"):
+    for agent in ("in_palm_rotate.firm", "in_palm_rotate.force-torque-hand"):
         done = play(agent)
         assert done.returncode == 0, done.stderr
         assert "CUDA" not in done.stderr
@@ -86,24 +86,41 @@ def test_playing_needs_no_package_for_training_and_checks_names_first() -> None:
         assert (done.returncode, done.stderr.count("\n")) == (2, 1), done.stderr
 
 
-def test_a_shipped_teacher_is_listed_and_plays() -> None:
-    found = {row["task"]: row["shipped"] for row in json.loads(_run("tasks", "--json"))}
-    assert "in_palm_rotate.careful" in found["in_palm_rotate"]
-    words = ("--agent", "in_palm_rotate.careful", "--seconds", "2", "--seed", "2", "--json")
-    out = json.loads(_run("play", "in_palm_rotate", *words))
-    # It keeps the block and reaches goals, of 20 each; random agents lose by moving.
-    assert out["episodes_ended"] == 0
-    assert out["reward"] > 5
+def test_shipped_policies_are_listed_with_the_contacts_that_they_were_trained_in() -> None:
+    found = {row["task"]: row["contacts"] for row in json.loads(_run("tasks", "--json"))}["in_palm_rotate"]
+    contacts = {"careful": "published", "firm": "firm", "force-torque-hand": "published"}
+    assert found == {f"in_palm_rotate.{name}": model for name, model in contacts.items()}
+    told = [line.split() for line in _run("tasks").splitlines() if line.startswith("in_palm_rotate.")]
+    assert [(name, model) for name, _, model, *_ in told] == list(found.items())
+
+
+def test_a_policy_plays_in_the_contacts_that_it_was_trained_in_unless_told_otherwise() -> None:
+    def contacts(agent: str, *more: str) -> str:
+        words = ("--agent", agent, "--seconds", "0.05", *more)
+        return json.loads(_run("play", "in_palm_rotate", *words, "--json"))["contacts"]
+
+    firm = ("--change", "contacts=firm")
+    assert contacts("random") == contacts("in_palm_rotate.firm") == contacts("in_palm_rotate.careful", *firm) == "firm"
+    for name in ("careful", "force-torque-hand"):
+        assert contacts(f"in_palm_rotate.{name}") == "published"
+    assert contacts("in_palm_rotate.firm", "--config", "published") == "published"
+    both = ("evaluate", "in_palm_rotate", "in_palm_rotate.careful", "in_palm_rotate.firm")
+    with pytest.raises(UsageError, match="different contacts"):
+        _run(*both)
 
 
 def test_a_shipped_student_plays_with_its_own_touch_and_is_exported_here(tmp_path: Path, monkeypatch) -> None:
+    from robotics_bridge.deploy.session import read_deployed
+    from robotics_bridge.tasks.contact_model import CONTACTS
+
     monkeypatch.chdir(tmp_path)
     name = "in_palm_rotate.force-torque-hand"
     out = json.loads(_run("play", "in_palm_rotate", "--agent", name, "--seconds", "0.2", "--json"))
     assert out["agent"] == name
     _run("export", name)
     assert (tmp_path / f"{name}.onnx").is_file()
-    assert json.loads((tmp_path / f"{name}.onnx.json").read_text())["deployment"]["observe"] == "force_torque"
+    contract = read_deployed(tmp_path / f"{name}.onnx").contract
+    assert (contract.observe, contract.more["contacts"]) == ("force_torque", CONTACTS["published"])
 
 
 def test_a_task_of_ones_own_is_trained_and_evaluated(tmp_path: Path, quick: Path) -> None:
@@ -118,6 +135,7 @@ def test_a_task_of_ones_own_is_trained_and_evaluated(tmp_path: Path, quick: Path
     arguments = ["quick", str(run), "--task-file", str(quick), "--envs", "2", "--episodes", "2", "--seeds", "1"]
     found = json.loads(_run("evaluate", *arguments, "--json"))
     assert [row["agent"] for row in found] == ["zero", "random", str(run)]
+    assert {row["contacts"] for row in found} == {"firm"}
     assert all(row["episodes"] == 2 for row in found)
 
 

@@ -30,7 +30,7 @@ def contract_of() -> dict[str, Any]:
     return {"format": "onnx", "file": "policy.onnx", "inputs": inputs, "state": 0, "deployment": deployment}
 
 
-def export_small(folder: Path, *, format: str = "onnx") -> Path:
+def export_small(folder: Path) -> Path:
     """Write an untrained policy of the XHand1, all of whose joints move, as ``brainbench policy export`` does."""
     hand = hands.load("xhand1")
     joints = hand.joints
@@ -46,7 +46,7 @@ def export_small(folder: Path, *, format: str = "onnx") -> Path:
         "rate": 40, "hand": "xhand1", "observe": "agg_force", "joints": joints, "action_map": mapping, "frozen": {},
         "links": list(hand.layout("med", "tips")), "task": "hold",
     }  # fmt: skip
-    return export_policy(policy, folder / "policy", format=format, deployment=deployment).path
+    return export_policy(policy, folder / "policy", deployment=deployment).path
 
 
 def student_folder(folder: Path) -> Path:

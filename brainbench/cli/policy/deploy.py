@@ -23,18 +23,16 @@ def export(
             callback=out_file, help="File to write; by default policy.onnx in the folder of the run, or here."
         ),
     ] = None,
-    format: Annotated[str, typer.Option(help="onnx or jit.")] = "onnx",
     as_json: JsonOption = False,
 ) -> None:
     """Write a student with normalisers, taxel grid, encoder and head in one file, and compare it step by step."""
-    from robotics_bridge.policies.export import STEPS, SUFFIXES, export_policy
+    from robotics_bridge.policies.export import STEPS, export_policy
     from robotics_bridge.policies.training.student_files import load_student
 
     student, described = load_student(run)
-    suffix = SUFFIXES.get(format, "")
-    target = out or (run / f"policy{suffix}" if run.exists() else Path(f"{run.name}{suffix}"))
+    target = out or (run / "policy.onnx" if run.exists() else Path(f"{run.name}.onnx"))
     with progress_bar("exporting the policy"):
-        found = export_policy(student, target, format=format, deployment=described["deployment"], name=run.name)
+        found = export_policy(student, target, deployment=described["deployment"], name=run.name)
     text = (
         f"{found.path}: {found.state_size:,} numbers of memory; {STEPS} steps with resets differ by at most "
         f"{found.difference:.1e} of the largest action\n{found.contract}"
@@ -82,6 +80,7 @@ def deploy(
     from robotics_bridge.deploy.simulated_hand import Faults, simulated_hand
     from robotics_bridge.deploy.timing import realtime
     from robotics_bridge.deploy.udp import UdpDriver
+    from robotics_bridge.tasks.contact_model import contacts_name
 
     deployed = session.read_deployed(policy)
     contract = deployed.contract
@@ -90,14 +89,18 @@ def deploy(
         check_folder(record, contract.rate)
     faults = Faults.parse(fault or [])
     given = _inputs(deployed, goal, inputs or [])
+    contacts = contract.more["contacts"]
     remote = None if driver == "sim" else _remote(driver, key, deployed)
     # What is missing is said before a hand is started or greeted.
+    beside = f"simulated beside the hand, {contacts_name(contacts)} contacts"
     told = {
-        name: f"{what}: {'simulated beside the hand' if shadow and name == 'tactile' else 'constant'}"
+        name: f"{what}: {beside if shadow and name == 'tactile' else 'constant'}"
         for name, what in deployed.require({*given, *(("tactile",) if shadow else ())}).items()
     }
     with contextlib.ExitStack() as stack:
-        ends = remote or stack.enter_context(simulated_hand(contract.hand, faults=faults, seconds=seconds + 60))
+        ends = remote or stack.enter_context(
+            simulated_hand(contract.hand, contacts=contacts, faults=faults, seconds=seconds + 60)
+        )
         address, joints, fingers, secret = ends
         link = stack.enter_context(UdpDriver(address, joints, fingers, secret))
         task = str(contract.more.get("task", "deployed policy"))
@@ -172,5 +175,5 @@ def _shadow(deployed: DeployedPolicy, joints: tuple[str, ...]) -> Any:
             f"The contract does not say {sorted(missing)[0]!r}, so no touch can be simulated beside the hand."
         )
     names = (facts[name] for name in ("observe", "placement", "resolution"))
-    settings = {"rate": contract.rate, "sub_steps": facts["sub_steps"], "twist": facts["twist"]}
-    return ShadowTouch(contract.hand, *names, joints=joints, **settings)
+    settings = {name: facts[name] for name in ("sub_steps", "twist", "contacts")}
+    return ShadowTouch(contract.hand, *names, joints=joints, rate=contract.rate, **settings)

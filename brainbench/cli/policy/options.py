@@ -34,14 +34,23 @@ def make_env(
     config: str = "default",
     change: list[str] | None = None,
     task_file: Path | None = None,
+    agents: Iterable[str] = (),
     **options: Any,
 ) -> Env:
-    """Return the environment of a command; a task of the user's own is read first, then changed."""
+    """Return the environment of a command; a task of the user's own is read first, then changed.
+
+    Trained ``agents`` find the contacts in which they were trained, unless ``change`` names others or ``config`` is
+    ``published``, which defines them.
+    """
     from robotics_bridge import tasks
+    from robotics_bridge.policies.fit import with_contacts_of
     from robotics_bridge.tasks.overrides import apply_overrides
 
     read_task_file(task_file)
-    return tasks.make(apply_overrides(tasks.load(name, config), change or ()), **options)
+    task, change = tasks.load(name, config), change or []
+    if config != "published" and not any(word.startswith("contacts") for word in change):
+        task = with_contacts_of(task, agents)
+    return tasks.make(apply_overrides(task, change), **options)
 
 
 def read_task_file(path: Path | None) -> None:
@@ -90,10 +99,11 @@ def check_paths(video: Path | None, strip: Path | None) -> None:
 def agent_of(name: str, env: Env, *, seed: int = 0) -> Any:
     """Return the agent ``zero`` or ``random``, a shipped policy, or the teacher or student of a run's folder."""
     from robotics_bridge.policies import evaluate
+    from robotics_bridge.policies.shipped import stored
 
     if name in evaluate.AGENTS:
         return evaluate.agent(name, env, seed=seed)
-    if _student(name):
+    if stored(name).get("brainbench_student"):
         from robotics_bridge.policies.fit import check_fit
         from robotics_bridge.policies.training.student_files import load_student
 
@@ -105,16 +115,6 @@ def agent_of(name: str, env: Env, *, seed: int = 0) -> Any:
     return teacher.load_teacher(name, env)
 
 
-def _student(name: str) -> dict[str, Any]:
-    """Return what the configuration of a student's run says; nothing for other agents."""
-    from robotics_bridge.policies.schema import Values
-    from robotics_bridge.policies.shipped import FOLDER
-
-    folder = FOLDER / name if not Path(name).exists() and (FOLDER / name).is_dir() else Path(name)
-    facts = dict(Values.read(folder / "config.json").values) if (folder / "config.json").is_file() else {}
-    return facts if facts.get("brainbench_student") else {}
-
-
 def touch_of(names: list[str]) -> dict[str, Any]:
     """Return the tactile options of the student among some agents; nothing if there is none.
 
@@ -123,16 +123,17 @@ def touch_of(names: list[str]) -> dict[str, Any]:
     """
     from brainbench.core.errors import UsageError
     from robotics_bridge.policies.schema import Values
+    from robotics_bridge.policies.shipped import stored
 
     found: dict[str, dict[str, Any]] = {}
     for name in names:
-        if facts := _student(name):
+        if (facts := stored(name)).get("brainbench_student"):
             # Loads the students' networks, which other agents do not need.
-            from robotics_bridge.policies.training.distill_config import EARLIER_TWIST, DistillConfig
+            from robotics_bridge.policies.training.distill_config import DistillConfig
 
             kept = Values("config.json", facts).part("distill").fields(DistillConfig)
             found[name] = {key: kept[key] for key in TOUCH if key in kept}
-            config = DistillConfig.of({"twist": EARLIER_TWIST, **kept})
+            config = DistillConfig.of_run(kept)
             if config.knobs and config.observe in ("force", "force_torque"):
                 found[name]["knobs"] = config.knobs
     if any(senses != next(iter(found.values())) for senses in found.values()):

@@ -31,14 +31,16 @@ from brainbench.cli.policy.options import (
 
 def list_tasks(as_json: JsonOption = False) -> None:
     """List the tasks with their success, length, observation groups, and the policies that come with the package."""
-    from brainbench.core.files import read_json
     from robotics_bridge import tasks
-    from robotics_bridge.policies.shipped import FOLDER, list_policies, unmeasured_inputs
+    from robotics_bridge.policies.fit import trained_contacts
+    from robotics_bridge.policies.shipped import list_policies, stored, unmeasured_inputs
+    from robotics_bridge.tasks.contact_model import contacts_name
 
     found = []
     for name in tasks.list_tasks():
         task = tasks.load(name)
         student = [*task.groups["student"], "tactile"]
+        shipped = [*list_policies("teacher", name), *list_policies("student", name)]
         found.append(
             {
                 "task": name,
@@ -48,12 +50,9 @@ def list_tasks(as_json: JsonOption = False) -> None:
                 "success_from": task.success.threshold,
                 "student": student,
                 "teacher": list(task.groups["actor"]),
-                "shipped": [*list_policies("teacher", name), *list_policies("student", name)],
-                "unmeasured": {
-                    shipped: read
-                    for shipped in list_policies("student", name)
-                    if (read := unmeasured_inputs(read_json(FOLDER / shipped / "config.json")))
-                },
+                "shipped": shipped,
+                "contacts": {policy: contacts_name(trained_contacts(stored(policy))) for policy in shipped},
+                "unmeasured": {policy: read for policy in shipped if (read := unmeasured_inputs(stored(policy)))},
             }
         )
     columns = {
@@ -63,9 +62,13 @@ def list_tasks(as_json: JsonOption = False) -> None:
         "success": "{0[metric]} ≥ {0[success_from]:.3g}",
         "student sees": lambda item: ", ".join(item["student"]),
     }
-    shipped = [(name, row["task"], row["unmeasured"].get(name, ())) for row in found for name in row["shipped"]]
-    told = {"trained policy": "{0[0]}", "task": "{0[1]}", "reads what no hand measures": lambda row: ", ".join(row[2])}
-    trained = table_of("", shipped, told)
+    policies = [
+        (name, row["task"], row["contacts"][name], ", ".join(row["unmeasured"].get(name, ())))
+        for row in found
+        for name in row["shipped"]
+    ]
+    heads = ("trained policy", "task", "contacts", "reads what no hand measures")
+    trained = table_of("", policies, {head: f"{{0[{index}]}}" for index, head in enumerate(heads)})
     emit(found, f"{table_of('', found, columns)}\n\n{trained}", as_json=as_json)
 
 
@@ -89,6 +92,7 @@ def play(
 ) -> None:
     """Run an agent in one environment of a task and show what happens, as numbers and as a film."""
     from brainbench.core.errors import UsageError
+    from robotics_bridge.tasks.contact_model import contacts_name
 
     if not (seconds > 0 and math.isfinite(seconds) and rate > 0 and width >= 64):
         raise UsageError(
@@ -101,7 +105,11 @@ def play(
         check_paths(video, strip)
         from brainbench.cli.policy import pictures as drawing
     options |= touch_of([agent])
-    env = make_env(task, config=config, change=change, task_file=task_file, num_envs=1, hand=hand, threads=1, **options)
+    env = make_env(
+        task, config=config, change=change, task_file=task_file, agents=[agent], num_envs=1, hand=hand, threads=1,
+        **options,
+    )  # fmt: skip
+    contacts = contacts_name(env.task.contacts)
     act = agent_of(agent, env, seed=options["seed"])
     steps = max(round(seconds / env.step_dt), 1)
     rewards: list[float] = []
@@ -135,13 +143,14 @@ def play(
         if strip is not None:
             drawing.write_strip(strip, stills, times)
     told = {
-        "task": env.task.name, "hand": env.hand.name, "agent": agent, "seconds": steps * env.step_dt,
-        "reward": sum(rewards), "episodes_ended": ended, "metric": env.task.success.metric, "files": pictures,
-        "goals": goals, "turned": turned, "dropped": dropped,
+        "task": env.task.name, "hand": env.hand.name, "contacts": contacts, "agent": agent,
+        "seconds": steps * env.step_dt, "reward": sum(rewards), "episodes_ended": ended,
+        "metric": env.task.success.metric, "files": pictures, "goals": goals, "turned": turned, "dropped": dropped,
     }  # fmt: skip
     shown: dict[str, object] = {
-        "task": told["task"], "hand": told["hand"], "agent": agent, "simulated": f"{told['seconds']:g} s",
-        "goals reached": goals, "turned": f"{round(turned, 2) + 0:.2f} rad about the commanded axis",
+        "task": told["task"], "hand": told["hand"], "contacts": contacts, "agent": agent,
+        "simulated": f"{told['seconds']:g} s", "goals reached": goals,
+        "turned": f"{round(turned, 2) + 0:.2f} rad about the commanded axis",
         "dropped": f"{dropped} times", "episodes ended": ended, "reward": f"{sum(rewards):.3g}",
     }  # fmt: skip
     shown |= {"files": ", ".join(map(str, pictures))} if pictures else {}
@@ -176,14 +185,17 @@ def evaluate(
     from brainbench.core.errors import UsageError
     from brainbench.core.files import write_json
     from robotics_bridge.policies.evaluate import evaluate as run
+    from robotics_bridge.tasks.contact_model import contacts_name
 
     if seeds < 1:
         raise UsageError(f"An evaluation needs at least one seed; received {seeds}.")
     check_names(task, agents or [], task_file)
     touch = touch_of(list(agents or []))
     env = make_env(
-        task, config=config, change=change, task_file=task_file, num_envs=envs, hand=hand, device=device, **touch
-    )
+        task, config=config, change=change, task_file=task_file, agents=agents or (), num_envs=envs, hand=hand,
+        device=device, **touch,
+    )  # fmt: skip
+    contacts = contacts_name(env.task.contacts)
     names = ["zero", "random", *(name for name in agents or [] if name not in ("zero", "random"))]
     found: list[dict[str, Any]] = []
     with progress_bar() as progress:
@@ -191,7 +203,7 @@ def evaluate(
             result = run(
                 env, agent_of(name, env), episodes=episodes, seed=tuple(range(seeds)), name=name, progress=progress
             )
-            found.append(result.summary())
+            found.append({**result.summary(), "contacts": contacts})
     if out is not None:
         write_json(out, found)
     columns = {
@@ -206,4 +218,4 @@ def evaluate(
         ">dropped": "{0[dropped]:.3f}",
         ">diverged": "{0[diverged]}",
     }
-    emit(found, table_of(env.task.text, found, columns), as_json=as_json)
+    emit(found, table_of(f"{env.task.text}; contacts: {contacts}", found, columns), as_json=as_json)

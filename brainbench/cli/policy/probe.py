@@ -52,16 +52,18 @@ def probe(
     from robotics_bridge.policies.readouts.probe import differences, plain
     from robotics_bridge.policies.readouts.probe import probe as run
     from robotics_bridge.policies.readouts.rollout import TARGETS
+    from robotics_bridge.tasks.contact_model import contacts_name
 
     options = replace(options, arms=tuple(arm or ()))
     check_names(task, [agent], task_file)
     env = make_env(
-        task, config=config, change=change, task_file=task_file, num_envs=envs, hand=hand, device=device,
-        observe="force_torque", seed=options.seed,
+        task, config=config, change=change, task_file=task_file, agents=[agent], num_envs=envs, hand=hand,
+        device=device, observe="force_torque", seed=options.seed,
     )  # fmt: skip
     with progress_bar() as progress:
         found = run(env, agent_of(agent, env), options, progress)
     told: dict[str, Any] = {"task": task, "config": config, "change": change or [], "agent": agent}
+    told |= {"contacts": contacts_name(env.task.contacts)}
     told |= {"environments": envs, "seconds": options.seconds}
     told |= {"arms": [plain(item) for item in found], "differences": differences(found)}
     if out is not None:

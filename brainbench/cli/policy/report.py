@@ -91,7 +91,7 @@ def _pairs(results: Sequence[StudentResult]) -> list[dict[str, Any]]:
     from robotics_bridge.policies.contrasts import contrast, pooled_spread
 
     found = []
-    for place, members in groupby(results, key=lambda result: (result.config.task, result.config.hand)):
+    for place, members in groupby(results, key=lambda result: result.world):
         group = list(members)
         spread, freedom = pooled_spread([result.success for result in group])
         pairs = list(combinations(group, 2))
@@ -100,7 +100,7 @@ def _pairs(results: Sequence[StudentResult]) -> list[dict[str, Any]]:
             names = [_short(result, place) for result in (one, other)]
             found.append(
                 {
-                    "task": place[0], "hand": place[1], "first": names[0], "second": names[1],
+                    "task": place[0], "hand": place[1], "contacts": place[2], "first": names[0], "second": names[1],
                     "difference": item.difference, "interval": (item.interval.low, item.interval.high), "p": float(p),
                     "spread": spread, "degrees_of_freedom": freedom,
                 }
@@ -108,5 +108,5 @@ def _pairs(results: Sequence[StudentResult]) -> list[dict[str, Any]]:
     return found
 
 
-def _short(result: StudentResult, place: tuple[str, str]) -> str:
-    return result.config.name.rpartition("_seed")[0].removeprefix("_".join(place) + "_")
+def _short(result: StudentResult, place: tuple[str, str, str]) -> str:
+    return result.config.name.rpartition("_seed")[0].removeprefix("_".join(place[:2]) + "_")

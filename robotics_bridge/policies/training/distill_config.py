@@ -18,8 +18,8 @@ from robotics_bridge.tasks.settings import StudentSettings
 
 LOSSES = ("mse", "inv_var_mse")
 """``inv_var_mse``: each action's squared error over the variance of the teacher's action in the rollout."""
-EARLIER_TWIST = PUBLISHED_TWIST
-"""N·m·s, where a stored student does not state its law."""
+EARLIER = {"twist": PUBLISHED_TWIST, "contacts": "published"}
+"""What stored students had where they do not state it."""
 MOST = {"learning_rate": 1.0, "clip": 100.0, "max_grad_norm": 1e6}
 """Largest value of settings that are numbers above 0."""
 
@@ -45,9 +45,10 @@ class DistillConfig:
     """Taxels with the published noise (table 4.12)."""
     twist: float | None = None
     """Torsional friction of the force taxels [N·m·s]; by default the task's own. Runs of versions that did not state
-    it had the published 2 (:data:`EARLIER_TWIST`)."""
-    contacts: str = "published"
-    """Contact model of the task: ``published`` or ``firm``."""
+    it had the published 2 (:data:`EARLIER`)."""
+    contacts: str | None = None
+    """Contact model, ``firm`` or ``published``; by default that in which the teacher was trained. Runs state it; those
+    of versions that did not had the published one."""
     encoder: str = AUTO
     """Tactile encoder: an arm of :data:`~robotics_bridge.policies.encoders.arms.ARMS`, or a network's name."""
     encoder_settings: Mapping[str, Any] = field(default_factory=dict)
@@ -90,7 +91,8 @@ class DistillConfig:
     def __post_init__(self) -> None:
         object.__setattr__(self, "hidden", tuple(self.hidden))
         observation_type(self.observe)
-        check_name("contacts of a task", self.contacts, CONTACTS)
+        if self.contacts is not None:
+            check_name("contacts of a task", self.contacts, CONTACTS)
         check_name("encoder of flat groups", self.embedder, EMBEDDERS)
         check_name("loss", self.loss or "mse", LOSSES)
         check_name("precision", self.precision, ("float32", "bf16"))
@@ -111,6 +113,11 @@ class DistillConfig:
         for name in value:
             check_name("setting of a student", name, cls.__dataclass_fields__)
         return cls(**value)
+
+    @classmethod
+    def of_run(cls, value: Mapping[str, Any]) -> DistillConfig:
+        """Return the configuration of a stored run, which may be of a version that had fewer fields."""
+        return cls.of({**EARLIER, **value})
 
     def plain(self) -> dict[str, Any]:
         """Return the fields as JSON types; :meth:`of` undoes it."""
@@ -144,7 +151,7 @@ class DistillConfig:
             learning = f"-{self.tactile.learning}" if "learning" in self.encoder_settings else ""
             arm = self.tactile.arm.replace("/", "-").replace(":", "-")
             parts += [self.placement, self.resolution, "noisy" if self.noisy else "clean", f"{arm}{learning}"]
-        parts += [] if self.contacts == "published" else [self.contacts]
+        parts += [] if self.contacts in (None, "firm") else [self.contacts]
         return "_".join([*parts, f"seed{self.seed}"])
 
     def share(self, iteration: int) -> float:

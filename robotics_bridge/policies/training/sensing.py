@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 from brainbench.core.errors import UsageError, check_name
 from robotics_bridge.policies.student import TACTILE
 from robotics_bridge.policies.training.distill_config import DistillConfig
+from robotics_bridge.tasks.contact_model import CONTACTS, contacts_name
 from robotics_bridge.tasks.settings import TeacherSettings
 from robotics_bridge.tasks.task import GROUPS, check_measured
 
@@ -43,16 +44,11 @@ def sensing_policy(env: Env, settings: TeacherSettings, seed: int, observe: tupl
         if name not in env.observation_shapes:
             given = "make the environment with an observation type" if name == TACTILE else "leave it out"
             raise UsageError(f"Task {env.task.name!r} gives no {name!r} here: {given}.")
-    o = env.options
-    senses: dict[str, Any] = {
-        "observe": o.observe,
-        "placement": o.placement,
-        "resolution": o.resolution,
-        "noisy": o.noisy,
-    }
-    if "touch" not in observe:
-        senses = {"observe": "none"}
+    o, named = env.options, contacts_name(env.task.contacts)
+    senses: dict[str, Any] = {"observe": "none"}
+    if "touch" in observe:
+        senses = {name: getattr(o, name) for name in ("observe", "placement", "resolution", "noisy")}
     return DistillConfig(
         task=env.task.name, hand=str(env.hand.path or env.hand.name), embedder="lstm", hidden=settings.hidden,
-        num_envs=env.num_envs, seed=seed, **senses,
+        num_envs=env.num_envs, seed=seed, contacts=named if named in CONTACTS else None, **senses,
     )  # fmt: skip

@@ -18,7 +18,7 @@ from robotics_bridge.policies.encoders.arms import EncoderConfig
 from robotics_bridge.policies.schema import Values
 from robotics_bridge.policies.shipped import policy_path
 from robotics_bridge.policies.student import TACTILE, TactilePolicy
-from robotics_bridge.policies.training.distill_config import EARLIER_TWIST, DistillConfig
+from robotics_bridge.policies.training.distill_config import DistillConfig
 
 CONFIG, MODEL = "config.json", "model.safetensors"
 
@@ -55,7 +55,7 @@ def load_student(folder: str | Path, *, device: str = "cpu") -> tuple[TactilePol
     if not (folder / MODEL).is_file():
         raise DataError(f"The student in {str(folder)!r} has no weights yet; its run was interrupted early.")
     given = described.part("distill")
-    config = DistillConfig.of({"twist": EARLIER_TWIST, **given.fields(DistillConfig)})
+    config = DistillConfig.of_run(given.fields(DistillConfig))
     if "task_version" not in described.values:
         # Students of earlier versions do not state it.
         config = replace(config, encoder_settings={"standardise": "layer", **config.encoder_settings})

@@ -16,13 +16,14 @@ from robotics_bridge import tasks
 from robotics_bridge.policies.encoders.arms import ARMS, EncoderConfig
 from robotics_bridge.policies.encoders.calibration import HandCalibration
 from robotics_bridge.policies.evaluate import Policy, evaluate
+from robotics_bridge.policies.fit import with_contacts_of
 from robotics_bridge.policies.report import EVALUATION, GRADED
 from robotics_bridge.policies.shipped import list_policies
 from robotics_bridge.policies.training.distill import DistillResult, distill
 from robotics_bridge.policies.training.distill_config import DistillConfig
 from robotics_bridge.policies.training.student_files import CONFIG, load_student
 from robotics_bridge.policies.training.teacher import load_teacher
-from robotics_bridge.tasks.contact_model import CONTACTS
+from robotics_bridge.tasks.contact_model import CONTACTS, contacts_name
 
 _log = logging.getLogger(__name__)
 
@@ -73,12 +74,18 @@ def train_student(
             f"({', '.join(list_policies('teacher'))})."
         )
     out = Path(out)
-    task = replace(tasks.load(config.task, config.variant), contacts=CONTACTS[config.contacts])
+    task = tasks.load(config.task, config.variant)
+    if config.contacts is not None:
+        task = replace(task, contacts=CONTACTS[config.contacts])
+    elif config.variant != "published":
+        task = with_contacts_of(task, [config.teacher])
     env = tasks.make(
         task, num_envs=config.num_envs, device=device, hand=config.hand, observe=config.observe,
         placement=config.placement, resolution=config.resolution, noisy=config.noisy,
         seed=config.seed, knobs=config.knobs,
     )  # fmt: skip
+    named = contacts_name(task.contacts)
+    config = replace(config, contacts=named if named in CONTACTS else None)
     teacher = load_teacher(config.teacher, env)
     config = calibrated(config, env, teacher, out)
     result = distill(config, out, env=env, teacher=teacher, stop_after=stop_after, stop_at=stop_at, progress=progress)

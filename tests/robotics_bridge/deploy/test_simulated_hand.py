@@ -6,9 +6,10 @@ import numpy as np
 
 from robotics_bridge import hands
 from robotics_bridge.deploy.driver import HandReading
-from robotics_bridge.deploy.simulated_hand import ShadowTouch
+from robotics_bridge.deploy.simulated_hand import ShadowTouch, SimulatedHand
 from robotics_bridge.deploy.touch import RealTouch
 from robotics_bridge.hands.scenes import closing
+from robotics_bridge.tasks.contact_model import CONTACTS
 
 HAND = hands.load("xhand1")
 
@@ -31,6 +32,24 @@ def test_it_follows_the_reported_joints_whatever_their_order_and_feels_the_ball(
     assert np.isfinite(felt).all()
     assert np.abs(felt[..., :3]).max() > 0.01
     assert np.abs(shadow.hand.position - reported[order]).mean() < 0.2
+
+
+def test_its_contacts_are_those_of_the_policy() -> None:
+    """A ball on the palm sinks in less under firm contacts, and drives of a scaled strength move the fingers alike."""
+    depth, way = {}, {}
+    for name, contacts in CONTACTS.items():
+        hand = SimulatedHand(contacts=contacts)
+        hand.drive(hand.position + 0.3)
+        for _ in range(20):
+            hand.step()
+        way[name] = hand.position
+        hand.drive(np.zeros(12))
+        for _ in range(200):
+            hand.step()
+        state = hand.engine.state
+        depth[name] = -float(state.contact_distance.numpy()[: int(state.contact_count.numpy()[0])].min())
+    assert 0 < depth["firm"] < 0.3 * depth["published"]
+    assert np.abs(way["firm"] - way["published"]).max() < 0.03
 
 
 def test_measured_links_replace_simulated_ones() -> None:

@@ -5,11 +5,13 @@ from __future__ import annotations
 import copy
 import json
 import math
+from dataclasses import asdict
 
 import pytest
 
 from brainbench.core.errors import BrainbenchError, DataError, UsageError
 from robotics_bridge.policies.contract import PolicyContract
+from robotics_bridge.tasks.contact_model import CONTACTS
 from tests.factories.mutations import mutate, mutate_text
 from tests.factories.policies import contract_of
 
@@ -36,6 +38,9 @@ def test_a_contract_is_read_as_it_was_written(tmp_path) -> None:
     assert (found.rate, found.joints, found.moved, found.frozen) == (40.0, ("a", "b", "c"), ("a", "c"), {"b": 0.3})
     assert found.inputs == {"proprio": (8,), "goal": (1,), "tactile": (5, 2, 3)}
     assert found.action_map["scale"] == (0.5, -0.5)
+    assert found.more["contacts"] == CONTACTS["published"]
+    firm = _set(contract_of(), "deployment.contacts", asdict(CONTACTS["firm"]))
+    assert _read(tmp_path, firm).more["contacts"] == CONTACTS["firm"]
 
 
 @pytest.mark.parametrize(
@@ -59,6 +64,7 @@ def test_a_contract_is_read_as_it_was_written(tmp_path) -> None:
         ("deployment.links", [[], ["l", "l"], ["l"], "l"]),
         ("deployment.observe", ["agg_farce", "bool", 3]),
         ("deployment.sub_steps", [0, -5, 5.0, 10**6, NAN]),
+        ("deployment.contacts", [[1], "firm", {"time_constant": NAN}, {"substeps": 2.5}, {"impedance": [0.9]}]),
         ("sha256", [1, None]),
     ],
 )  # fmt: skip

@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import logging
+from dataclasses import asdict
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
 from brainbench.core.errors import DataError, UsageError
-from robotics_bridge.policies.fit import check_fit
-from robotics_bridge.tasks.contact_model import CONTACTS
+from brainbench.core.files import to_plain, write_json
+from robotics_bridge import tasks
+from robotics_bridge.policies.fit import check_fit, trained_contacts, with_contacts_of
+from robotics_bridge.tasks.contact_model import CONTACTS, ContactModel
 from robotics_bridge.tasks.task import TASK_VERSION
 
 
@@ -35,3 +39,34 @@ def test_other_contacts_are_told(caplog: pytest.LogCaptureFixture) -> None:
         check_fit({"hand": "xhand1"}, _env("firm"), "mine")
     assert "published" in caplog.text
     assert "firm" in caplog.text
+
+
+def test_a_policy_says_in_which_contacts_it_was_trained_and_earlier_ones_had_the_published() -> None:
+    own = ContactModel(time_constant=0.011, impedance=(0.8, 0.9, 0.002))
+    assert trained_contacts({"contacts": to_plain(asdict(own))}) == own
+    assert trained_contacts({}) == CONTACTS["published"]
+    for wrong in (
+        {"time_constant": "1"},
+        {"impedance": [1.0]},
+        {"impedance": [0.9, 0.8, 1.0]},
+        {"drive_scale": 0},
+        [1],
+    ):
+        with pytest.raises(DataError):
+            trained_contacts({"contacts": wrong})
+
+
+def test_policies_act_in_the_contacts_that_they_were_trained_in(tmp_path: Path) -> None:
+    task = tasks.load("in_palm_rotate")
+    assert with_contacts_of(task, ("zero", "random")) == task
+    for name, contacts in (("careful", "published"), ("force-torque-hand", "published"), ("firm", "firm")):
+        assert with_contacts_of(task, ("zero", f"in_palm_rotate.{name}")).contacts == CONTACTS[contacts]
+    own = ContactModel(time_constant=0.011)
+    write_json(tmp_path / "config.json", {"contacts": asdict(own)})
+    (tmp_path / "model_3.safetensors").touch()
+    for path in (tmp_path, tmp_path / "model_3.safetensors"):
+        assert with_contacts_of(task, [str(path)]).contacts == own
+    with pytest.raises(
+        UsageError, match=r"careful \(published\), in_palm_rotate.firm \(firm\).*--change contacts=firm"
+    ):
+        with_contacts_of(task, ("in_palm_rotate.careful", "in_palm_rotate.firm"))

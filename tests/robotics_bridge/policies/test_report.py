@@ -7,7 +7,7 @@ import pytest
 from scipy import stats
 
 from brainbench.core.errors import DataError
-from brainbench.core.files import read_json, write_json
+from brainbench.core.files import content_hash, read_json, write_json
 from brainbench.core.statistics import newcombe_interval
 from leaderboards import rank, write_record
 from leaderboards.store import read_record
@@ -88,6 +88,19 @@ def test_the_gain_of_a_single_student_has_an_interval_over_episodes(tmp_path) ->
     assert felt.difference is not None
     assert (felt.difference.low, felt.difference.high) == pytest.approx((expected.low, expected.high))
     assert bare.gain is None
+
+
+def test_students_of_other_contacts_are_not_compared(tmp_path) -> None:
+    for contacts, share in (("firm", 0.5), ("published", 0.2)):
+        _write(tmp_path, [share] * 3, observe="none", contacts=contacts)
+        _write(tmp_path, [0.8] * 3, observe="force_torque", contacts=contacts)
+    results = read_results([tmp_path])
+    assert [result.world[2] for result in results] == ["firm", "firm", "published", "published"]
+    assert [result.gain for result in results] == pytest.approx([0.3, None, 0.6, None])
+    firm, _, published, _ = records(results)
+    protocol = {"task": "in_palm_rotate", "hand": "xhand1", "variant": "default"}
+    hashes = [record.score.provenance.recordings["content_hash"] for record in (firm, published)]
+    assert hashes == [content_hash({**protocol, "contacts": "firm"}), content_hash(protocol)]
 
 
 def test_what_all_students_share_is_said_once(tmp_path) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import io
-import warnings
 
 import pytest
 import torch
@@ -82,14 +81,6 @@ def test_ppo_learns_through_a_network_with_memory(learning) -> None:
     assert moved is (learning == "finetuned")
     assert not torch.equal(head, policy.mlp[0].weight)  # type: ignore[index]
     assert policy.get_hidden_state().shape == (1, 8, policy.core.state_size)
-    script = _quietly(lambda: torch.jit.script(policy.as_jit()))
-    assert script(torch.zeros(1, 3 + 5 * 45 * 6)).shape == (1, 2)
-
-
-def _quietly(make):
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        return make()
 
 
 def test_rsl_rls_own_distillation_learns_touch_with_it() -> None:

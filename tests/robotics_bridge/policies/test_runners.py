@@ -8,14 +8,14 @@ import shutil
 import numpy as np
 import onnx
 import pytest
-import torch
 from onnx import numpy_helper
 
 from brainbench.core.errors import BrainbenchError, DataError
+from brainbench.core.files import write_json
 from robotics_bridge.deploy.session import read_deployed
 from robotics_bridge.policies.runners import read_policy
 from tests.factories.mutations import mutate_text
-from tests.factories.policies import export_small
+from tests.factories.policies import contract_of, export_small
 from tests.factories.reading_trials import time_limit
 
 SHAPES = {"proprio": (36,), "goal": (1,), "tactile": (5, 5, 3)}
@@ -23,10 +23,10 @@ SHAPES = {"proprio": (36,), "goal": (1,), "tactile": (5, 5, 3)}
 
 @pytest.fixture(scope="module")
 def exported(tmp_path_factory):
-    return {format: export_small(tmp_path_factory.mktemp(format), format=format) for format in ("onnx", "jit")}
+    return export_small(tmp_path_factory.mktemp("onnx"))
 
 
-def _check_mutants(path, folder, format: str, cases: int) -> None:
+def _check_mutants(path, folder, cases: int) -> None:
     whole, refused = path.read_bytes(), 0
     target = folder / path.name
     shutil.copy(path.with_name(f"{path.name}.json"), folder)
@@ -36,7 +36,7 @@ def _check_mutants(path, folder, format: str, cases: int) -> None:
             with pytest.raises(DataError, match=path.name):
                 read_deployed(target)
         try:
-            run = read_policy(target, SHAPES, format=format, threads=1, actions=12)
+            run = read_policy(target, SHAPES, threads=1, actions=12)
         except BrainbenchError as error:
             refused += 1
             assert "\n" not in str(error)  # noqa: PT017 - of many cases, most raise
@@ -46,20 +46,18 @@ def _check_mutants(path, folder, format: str, cases: int) -> None:
     assert refused > cases // 4
 
 
-@pytest.mark.parametrize("format", ["onnx", "jit"])
-def test_damaged_files_are_refused_or_compute_finite_actions(exported, tmp_path, format) -> None:
-    _check_mutants(exported[format], tmp_path, format, 30)
+def test_damaged_files_are_refused_or_compute_finite_actions(exported, tmp_path) -> None:
+    _check_mutants(exported, tmp_path, 30)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("format", ["onnx", "jit"])
-def test_many_damaged_files_are_refused_or_compute_finite_actions(exported, tmp_path, format) -> None:
-    _check_mutants(exported[format], tmp_path, format, 500)
+def test_many_damaged_files_are_refused_or_compute_finite_actions(exported, tmp_path) -> None:
+    _check_mutants(exported, tmp_path, 500)
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
 def test_weights_that_are_not_finite_are_refused_by_name(exported, tmp_path, value) -> None:
-    model = onnx.load(exported["onnx"])
+    model = onnx.load(exported)
     weight = next(item for item in model.graph.initializer if "mlp.0.weight" in item.name)
     array = numpy_helper.to_array(weight).copy()
     array.flat[0] = value
@@ -67,24 +65,17 @@ def test_weights_that_are_not_finite_are_refused_by_name(exported, tmp_path, val
     onnx.save(model, tmp_path / "policy.onnx")
     with pytest.raises(DataError, match=r"mlp\.0\.weight"):
         read_policy(tmp_path / "policy.onnx", SHAPES)
-    with pytest.warns(DeprecationWarning, match="load"):
-        module = torch.jit.load(str(exported["jit"]))
-    with torch.no_grad():
-        next(iter(module.parameters())).view(-1)[0] = value
-    module.save(str(tmp_path / "policy.pt"))
-    with pytest.raises(DataError, match="not finite"):
-        read_policy(tmp_path / "policy.pt", SHAPES, format="jit")
 
 
 def test_weights_in_other_files_are_not_opened(exported, tmp_path) -> None:
-    model = onnx.load(exported["onnx"])
+    model = onnx.load(exported)
     onnx.save(model, tmp_path / "policy.onnx", save_as_external_data=True, location="elsewhere", size_threshold=0)
     with pytest.raises(DataError, match="other files"):
         read_policy(tmp_path / "policy.onnx", SHAPES)
 
 
 def test_constants_of_branches_in_other_files_are_not_opened(exported, tmp_path) -> None:
-    model = onnx.load(exported["onnx"])
+    model = onnx.load(exported)
     (tmp_path / "elsewhere").write_bytes(bytes(4))
     value = onnx.TensorProto(name="w", data_type=onnx.TensorProto.FLOAT, dims=[1], data_location=1)
     value.external_data.add(key="location", value="elsewhere")
@@ -109,28 +100,29 @@ def test_a_memory_without_bounds_is_refused(tmp_path) -> None:
 
 def test_what_is_no_file_is_not_waited_for(tmp_path) -> None:
     os.mkfifo(tmp_path / "policy.onnx")
-    (tmp_path / "policy.pt").symlink_to("/dev/zero")
-    for path, format in ((tmp_path / "policy.onnx", "onnx"), (tmp_path / "policy.pt", "jit")):
+    (tmp_path / "endless.onnx").symlink_to("/dev/zero")
+    for name in ("policy.onnx", "endless.onnx"):
         with time_limit(), pytest.raises(DataError, match="device"):
-            read_policy(path, SHAPES, format=format)
+            read_policy(tmp_path / name, SHAPES)
 
 
-def test_a_program_is_not_deployed(exported) -> None:
+def test_a_program_is_not_deployed(tmp_path) -> None:
+    """Files of versions that wrote TorchScript."""
+    (tmp_path / "policy.pt").write_bytes(b"PK")
+    write_json(tmp_path / "policy.pt.json", contract_of() | {"format": "jit"})
     with pytest.raises(DataError, match="TorchScript"):
-        read_deployed(exported["jit"])
+        read_deployed(tmp_path / "policy.pt")
 
 
 def test_files_that_fit_another_contract_are_refused(exported, tmp_path) -> None:
-    for path, format in ((exported["onnx"], "onnx"), (exported["jit"], "jit")):
-        with pytest.raises(DataError, match=r"\(12,\)"):
-            read_policy(path, SHAPES, format=format, actions=5)
-        for shapes in ({**SHAPES, "goal": (2,)}, {**SHAPES, "tactile": (5, 5)}, {"proprio": (36,)}):
-            with pytest.raises(DataError, match=path.name):
-                read_policy(path, shapes, format=format)
+    with pytest.raises(DataError, match=r"\(12,\)"):
+        read_policy(exported, SHAPES, actions=5)
+    for shapes in ({**SHAPES, "goal": (2,)}, {**SHAPES, "tactile": (5, 5)}, {"proprio": (36,)}):
+        with pytest.raises(DataError, match=exported.name):
+            read_policy(exported, shapes)
     with pytest.raises(DataError, match="'thermal'"):
-        read_policy(exported["onnx"], {**SHAPES, "thermal": (3,)})
+        read_policy(exported, {**SHAPES, "thermal": (3,)})
     (tmp_path / "empty.onnx").touch()
     for path in (tmp_path, tmp_path / "empty.onnx", tmp_path / "none.onnx"):
-        for format in ("onnx", "jit"):
-            with pytest.raises(DataError, match=path.name):
-                read_policy(path, SHAPES, format=format)
+        with pytest.raises(DataError, match=path.name):
+            read_policy(path, SHAPES)

@@ -7,14 +7,13 @@ import warnings
 import numpy as np
 import pytest
 import torch
-from rsl_rl.models import MLPModel
 from rsl_rl.utils import resolve_class, split_and_pad_trajectories
 from tensordict import TensorDict
 
 from brainbench import load_model
 from brainbench.core.errors import DataError, UsageError
 from robotics_bridge.policies.encoders.arms import ARMS, EncoderConfig, RunningScale
-from robotics_bridge.policies.export import compare, export_policy
+from robotics_bridge.policies.export import StepPolicy, compare, export_policy
 from robotics_bridge.policies.runners import read_policy
 from robotics_bridge.policies.student import TactilePolicy
 
@@ -135,28 +134,25 @@ def test_onnx_file_follows_the_policy_for_sixty_steps_with_resets(name, tmp_path
     assert '"rate": 40' in found.contract.read_text()
 
 
-def test_torchscript_file_follows_the_policy_too(tmp_path) -> None:
+def test_a_policy_that_was_sampled_in_training_is_exported_and_never_as_a_program(tmp_path) -> None:
     policy = _make_policy(distribution_cfg={"class_name": "GaussianDistribution", "init_std": 1.0})
-    found = export_policy(policy, tmp_path / "policy", format="jit")
-    assert found.path.suffix == ".pt"
-    assert found.difference < 1e-4
+    assert export_policy(policy, tmp_path / "policy").difference < 1e-4
+    with pytest.raises(UsageError, match="ONNX"):
+        policy.as_jit()
 
 
 class _Forgetful(TactilePolicy):
     """What a user would write who overrides the latent alone: exports fall back on rsl_rl's, without encoders."""
 
-    def as_onnx(self, verbose: bool = False):
-        return _HeadOnly(self)
+    exported: type
 
-    def as_jit(self):
-        return _Numb(self)
+    def as_onnx(self, verbose: bool = False):
+        return self.exported(self)
 
 
 class _HeadOnly(torch.nn.Module):
     def __init__(self, policy: TactilePolicy) -> None:
         super().__init__()
-        from robotics_bridge.policies.exported import StepPolicy
-
         full = StepPolicy(policy)
         self.mlp, self.latent = full.mlp, policy.core.features
         self.shapes = {name: shape for name, shape in full.shapes.items() if name != "tactile"}
@@ -171,38 +167,23 @@ class _HeadOnly(torch.nn.Module):
         return torch.zeros(batch, 30), torch.zeros(batch, 1), torch.zeros(batch, 1)
 
 
-class _Numb(torch.nn.Module):
+class _Numb(StepPolicy):
     """Takes touch, and does not use it."""
 
-    def __init__(self, policy: TactilePolicy) -> None:
-        super().__init__()
-        full = policy.__class__.__mro__[1].as_jit(policy)
-        self.full = full
-        self.touch = 5 * ITEMS * 6
-
-    def forward(self, obs: torch.Tensor) -> torch.Tensor:
-        return self.full(torch.cat((obs[:, : -self.touch], torch.zeros_like(obs[:, -self.touch :])), 1))
-
-    @torch.jit.export
-    def reset(self) -> None:
-        self.full.reset()
+    def forward(self, *inputs):
+        return super().forward(*(0.0 * item if item.ndim > 2 else item for item in inputs))
 
 
-@pytest.mark.parametrize(("form", "message"), [("onnx", "no input 'tactile'"), ("jit", "differs from the policy")])
-def test_an_export_that_loses_the_encoder_fails_and_leaves_no_file(form, message, tmp_path) -> None:
+@pytest.mark.parametrize(("wrong", "message"), [(_HeadOnly, "no input 'tactile'"), (_Numb, "differs from the policy")])
+def test_an_export_that_loses_the_encoder_fails_and_leaves_no_file(wrong, message, tmp_path) -> None:
     with torch.random.fork_rng():
         torch.manual_seed(0)
         tactile = {"name": NETWORK, "placement": "tips", "resolution": "low"}
         policy = _Forgetful(_observations(1)[0], GROUPS, "student", 12, tactile=tactile)
+    policy.exported = wrong
     with pytest.raises(DataError, match=message):
-        export_policy(policy, tmp_path / "policy", format=form)
+        export_policy(policy, tmp_path / "policy")
     assert not list(tmp_path.iterdir())
-
-
-def test_rsl_rls_own_export_of_a_model_that_only_overrides_the_latent_would_lose_the_encoder() -> None:
-    policy = _make_policy()
-    with pytest.raises((RuntimeError, ValueError)):
-        MLPModel.as_jit(policy)(torch.zeros(1, policy.obs_dim))  # the trap that as_jit here avoids
 
 
 def test_running_scale_counts_only_what_touches() -> None:

@@ -49,10 +49,15 @@ def test_a_free_finger_moves_as_before_and_is_observed_as_often() -> None:
     assert (ways[0] - ways[1]).abs().max() < 0.03
 
 
+@pytest.mark.parametrize("name", tasks.list_tasks())
+def test_tasks_are_firm_by_default_and_published_where_they_say_so(name: str) -> None:
+    assert tasks.load(name).contacts == CONTACTS["firm"]
+    assert tasks.load(name, "published").contacts == CONTACTS["published"] == ContactModel()
+
+
 def test_words_name_contacts_and_their_numbers() -> None:
-    assert apply_overrides(TASK, ["contacts=firm"]).contacts == CONTACTS["firm"]
+    assert apply_overrides(TASK, ["contacts=published"]).contacts == CONTACTS["published"]
     assert apply_overrides(TASK, ["contacts=firm", "contacts.substeps=3"]).contacts.substeps == 3
-    assert TASK.contacts == ContactModel() == CONTACTS["published"]
     for word, culprit in (
         ("contacts=firn", "did you mean 'firm'"), ("contacts.substeps=0", "received 0"),
         ("contacts.impedance=0.9,0.8,0.001", "two shares"), ("contacts.time_constant=0.001", "more contacts.substeps"),

@@ -7,9 +7,11 @@ import logging
 import pytest
 
 from brainbench.core.errors import UsageError
-from brainbench.core.files import write_json
+from brainbench.core.files import read_json, write_json
+from robotics_bridge.policies.fit import trained_contacts
 from robotics_bridge.policies.training.distill_config import DistillConfig
 from robotics_bridge.policies.training.students import calibrated, train_student
+from robotics_bridge.tasks.contact_model import CONTACTS
 from tests.factories.task_worlds import Follower, TouchWorld
 
 
@@ -53,3 +55,25 @@ def test_a_teacher_that_touches_nothing_is_mentioned(tmp_path, caplog) -> None:
 def test_a_student_needs_a_teacher(tmp_path) -> None:
     with pytest.raises(UsageError, match=r"teacher: .*brainbench policy train"):
         train_student(_config(), tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("teacher", "changes", "contacts"),
+    [
+        ("careful", {}, "published"),
+        ("firm", {}, "firm"),
+        ("careful", {"contacts": "firm"}, "firm"),
+        ("firm", {"variant": "published"}, "published"),
+    ],
+)
+def test_a_student_is_taught_in_the_contacts_of_its_teacher_unless_told_otherwise(
+    tmp_path, teacher, changes, contacts
+) -> None:
+    config = DistillConfig(
+        task="in_palm_rotate", teacher=f"in_palm_rotate.{teacher}", observe="none", hidden=(8,), num_envs=2,
+        steps_per_env=2, iterations=1, epochs=1, **changes,
+    )  # fmt: skip
+    train_student(config, tmp_path, episodes=0)
+    described = read_json(tmp_path / "config.json")
+    assert described["distill"]["contacts"] == contacts
+    assert trained_contacts(described) == trained_contacts(described["deployment"]) == CONTACTS[contacts]
