@@ -14,11 +14,12 @@ from brainbench.cli.options import SCORE, with_options
 from brainbench.cli.output import JsonOption, emit, progress_bar
 from brainbench.core.errors import UsageError
 from brainbench.core.files import content_hash, write_json
-from brainbench.core.records import ResultRecord, Score
-from leaderboards.held_out import DATA, Commitment, digest, new_salt
 
 if TYPE_CHECKING:
     import xarray as xr
+
+    from brainbench.core.records import ResultRecord, Score
+    from leaderboards.held_out import Commitment
 
 FEWEST = {"animals": 2, "stimuli": 3}
 """Fewest on either side: less has no score."""
@@ -44,6 +45,7 @@ def hold_out(
     """
     from brainbench.datasets import write_recordings
     from brainbench.scoring.neural_responses import open_neural_responses
+    from leaderboards.held_out import DATA, Commitment, digest, new_salt
 
     if (animals > 0) == (stimuli > 0):
         raise UsageError(f"Hold back either --animals or --stimuli; received {animals} and {stimuli}.")

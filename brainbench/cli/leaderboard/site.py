@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import webbrowser
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from brainbench.cli.destinations import out_file, out_folder
 from brainbench.cli.output import JsonOption, emit, progress_bar, table_of
-from leaderboards.store import StoredRecord, read_records
+
+if TYPE_CHECKING:
+    from leaderboards.store import StoredRecord
 
 RECORDS = Path("brainbench-results")
 """Folder that is read where none is named."""
@@ -29,6 +31,7 @@ def build(
 ) -> None:
     """Write the static site of a leaderboard: a folder of pages that need no server and no network."""
     from leaderboards.site.build import build_leaderboard
+    from leaderboards.store import read_records
 
     stored = read_records(records or [RECORDS])
     with progress_bar("building the pages"):

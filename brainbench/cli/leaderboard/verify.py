@@ -7,12 +7,8 @@ from typing import Annotated, Any
 
 import typer
 
-from brainbench.cli.leaderboard.held_out import score_held_out
-from brainbench.cli.leaderboard.scoring import refuse_foreign_code, score_again
 from brainbench.cli.output import JsonOption, emit, progress_bar, table_of
 from brainbench.core.errors import BrainbenchError
-from leaderboards.held_out import Commitment
-from leaderboards.store import read_records
 
 
 def verify(
@@ -39,8 +35,12 @@ def verify(
     anything, and could read the answer. Exit status 1 if a file was edited, a repetition gives something else or
     cannot be made; what differs is printed.
     """
+    from brainbench.cli.leaderboard.held_out import score_held_out
+    from brainbench.cli.leaderboard.scoring import refuse_foreign_code, score_again
     from leaderboards.audit import remarks
     from leaderboards.changes import differences
+    from leaderboards.held_out import Commitment
+    from leaderboards.store import read_records
 
     # A commitment or a secret that is not usable is told before anything is scored.
     told = None if held_out is None else Commitment.read(held_out)

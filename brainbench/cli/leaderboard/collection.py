@@ -1,0 +1,114 @@
+"""A folder of records grows: files are taken in, and models are scored into it."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Hashable
+from pathlib import Path
+from typing import Any
+
+from brainbench.cli.leaderboard.scoring import ScoringJob, full_settings, missing
+from brainbench.cli.output import progress_bar
+from brainbench.core.errors import DataFileNotFoundError
+from brainbench.core.files import to_json
+from brainbench.core.records import ResultRecord
+from brainbench.core.writing.locks import lock_folder
+from leaderboards.audit import computation, conflicting, remarks
+from leaderboards.store import StoredRecord, read_records, write_record
+from leaderboards.writing import in_one_sentence, sweep
+
+
+def record_files(sources: list[Path]) -> list[Path]:
+    """Return the record files among files and folders; a :class:`DataFileNotFoundError` for one that is missing."""
+    found: list[Path] = []
+    for source in sources:
+        if not source.exists():
+            raise DataFileNotFoundError(f"There is no record file or folder {str(source)!r}.")
+        inside = (path for path in source.rglob("*.json") if not path.name.startswith("."))
+        found += sorted(inside) if source.is_dir() else [source]
+    return found
+
+
+def take_in(paths: list[Path], to: Path, *, keep_both: bool) -> list[dict[str, Any]]:
+    """Take in files one after the other; what one brought counts for the next."""
+    present: dict[Hashable, dict[str, ResultRecord]] = defaultdict(dict)
+    for record in (record for _, record in (_present(to) if paths else [])):
+        present[computation(record)][record.identity] = record
+    done = []
+    for path in paths:
+        (stored,) = read_records(path)
+        done.append({"record": path.name} | _take_in_one(stored, to, present, keep_both=keep_both))
+    return done
+
+
+def _take_in_one(
+    stored: StoredRecord, to: Path, present: dict[Hashable, dict[str, ResultRecord]], *, keep_both: bool
+) -> dict[str, Any]:
+    record = stored.record
+    if record is None:
+        return {"state": "refused", "model": None, "note": f": {stored.problem}"}
+    alike = present[computation(record)]
+    rival = None if keep_both else next(conflicting(record, alike.values()), None)
+    if rival is not None:
+        note = (
+            f": the same computation gave {rival.score.value:.4f} in a record that is there "
+            f"({rival.identity}) and {record.score.value:.4f} here; see which holds with: "
+            f"brainbench leaderboard verify {stored.path}"
+        )
+        return {"state": "refused", "model": record.score.name, "note": note}
+    state = "known" if record.identity in alike else "added"
+    written = write_record(record, to)
+    alike[record.identity] = record
+    note = "".join(f"\n          {doubt}" for doubt in remarks([stored]).get(record.identity, ()))
+    return {"state": state, "record": written.name, "model": record.score.name, "note": note}
+
+
+def _present(to: Path) -> list[tuple[Path, ResultRecord]]:
+    """Return the records of a folder; what killed writers left there is removed."""
+    if not to.is_dir():
+        return []
+    with in_one_sentence(to), lock_folder(to) as alone:
+        if alone:
+            sweep(to, lambda name: name.endswith(".json"))
+    if not any(to.rglob("*.json")):
+        return []
+    return [(item.path, item.record) for item in read_records(to) if item.record is not None]
+
+
+def _question(record: ResultRecord) -> str:
+    """Return what two records share when they answer the same question, the old one with what has since changed."""
+    origin = record.score.provenance
+    return to_json([record.score.name, origin.recordings.get("source"), full_settings(origin.settings)])
+
+
+def score_jobs(
+    jobs: list[ScoringJob], to: Path, *, prune: bool, workers: int, scheduler: str | None
+) -> list[dict[str, Any]]:
+    """Score what a folder does not hold yet into it; with ``prune`` remove what a new score replaces."""
+    from brainbench.core.jobs import run_jobs
+
+    if not jobs:
+        return []
+    done: list[dict[str, Any]] = []
+    with progress_bar() as progress:
+        present = _present(to)
+        asked: dict[str, list[Path]] = defaultdict(list)
+        for old, record in present if prune else ():
+            asked[_question(record)].append(old)
+        open_jobs = missing(jobs, [record for _, record in present])
+        open_ones = {id(job) for job in open_jobs}
+        done += [
+            {"state": "known", "record": None, "model": f"{job.model} seed {job.options.model_seed}", "note": ""}
+            for job in jobs
+            if id(job) not in open_ones
+        ]
+        scored = run_jobs(ScoringJob.run, open_jobs, workers=workers, scheduler=scheduler)
+        for index, (place, record) in enumerate(scored, start=1):
+            progress(index, len(open_jobs), "models scored")
+            path = write_record(record, to)
+            replaced = [old for old in (asked[_question(record)] if prune else ()) if old != path]
+            for old in replaced:
+                old.unlink(missing_ok=True)
+            note = "".join(f"\n          replaces {old.name}" for old in replaced)
+            done.append({"state": "scored", "record": path.name, "model": open_jobs[place].model, "note": note})
+    return done
