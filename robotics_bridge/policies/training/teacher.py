@@ -19,13 +19,7 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 
-from brainbench.core.errors import (
-    BrainbenchError,
-    DataError,
-    DataFileNotFoundError,
-    UsageError,
-    missing_dependency,
-)
+from brainbench.core.errors import BrainbenchError, DataError, DataFileNotFoundError, UsageError, missing_dependency
 from brainbench.core.files import file_hash, provenance, read_mapping, write_json
 from brainbench.core.progress import Progress
 from brainbench.core.reading.regular import readable
