@@ -198,7 +198,9 @@ def _remarks(network: Network) -> str:
     marks: list[Any] = [(f"{line.status}", seed) for seed, line in lines.items() if line.status != "finished"]
     marks += [("collapsed", seed) for seed, line in lines.items() if line.evaluation and line.evaluation.collapsed]
     told = [f"{name} (seed {seed})" for name, seed in marks]
-    return ", ".join(told + ([] if network.records else ["not scored yet"]))
+    # Of a learning rate that was given instead of searched, the accuracy alone is asked for.
+    unscored = "accuracy only" if any(line.rate for line in lines.values()) else "not scored yet"
+    return ", ".join(told + ([] if network.records else [unscored]))
 
 
 def _left_out(campaign: Campaign) -> list[str]:
