@@ -7,7 +7,7 @@ from pathlib import Path
 
 import typer
 
-from brainbench.core.errors import UsageError, missing_dependency, shown, unknown_name
+from brainbench.core.errors import UsageError, check_name, missing_dependency, shown
 from brainbench.core.figures.style import check_format
 from brainbench.core.files import check_folder
 
@@ -55,8 +55,7 @@ def report_file(path: Path | None) -> Path | None:
             f"--report names {shown(str(path))}, which has no ending; give a file that ends in one of {allowed}, or "
             "leave --report out for no report."
         )
-    if kind not in FORMATS:
-        raise unknown_name("report format", kind, FORMATS, hint="The ending of --report chooses it.")
+    check_name("report format", kind, FORMATS, hint="The ending of --report chooses it.")
     if kind == "pdf" and find_spec("weasyprint") is None:
         raise missing_dependency("weasyprint", extra="board", purpose="A report as PDF")
     return _file(path, "--report")
