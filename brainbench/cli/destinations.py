@@ -1,9 +1,10 @@
-"""What a command will write, checked when the command line is read: before anything slow."""
+"""Outputs of a command, checked when the command line is read: before anything slow."""
 
 from __future__ import annotations
 
 from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 
 import typer
 
@@ -22,6 +23,16 @@ def out_folder(option: typer.CallbackParam, path: Path | None) -> Path | None:
 def out_file(option: typer.CallbackParam, path: Path | None) -> Path | None:
     """Return the file of an option if it can be written; else a :class:`UsageError`."""
     return None if path is None else _file(path, option.opts[0])
+
+
+def out_folder_option(help: str) -> Any:
+    """Return the option ``--out`` of a command that writes a folder."""
+    return typer.Option("--out", "-o", callback=out_folder, help=help)
+
+
+def out_file_option(help: str) -> Any:
+    """Return the option ``--out`` of a command that writes a file."""
+    return typer.Option("--out", "-o", callback=out_file, help=help)
 
 
 def picture_file(option: typer.CallbackParam, path: Path | None) -> Path | None:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from brainbench.cli.destinations import out_folder
+from brainbench.cli.destinations import out_folder_option
 from brainbench.cli.options import SchedulerOption, WorkersOption, with_options
 from brainbench.cli.output import JsonOption, emit, facts, progress_bar
 from brainbench.cli.stimuli.scenes import BackendOption, FidelityOption, WhiskersOption
@@ -39,10 +39,7 @@ def sweep(
             show_default=False,
         ),
     ] = None,
-    out: Annotated[
-        Path | None,
-        typer.Option("--out", "-o", callback=out_folder, help="Simulate, into shards and a manifest in this folder."),
-    ] = None,
+    out: Annotated[Path | None, out_folder_option("Simulate, into shards and a manifest in this folder.")] = None,
     options: Any = None,
     workers: WorkersOption = None,
     scheduler: SchedulerOption = None,
