@@ -1,4 +1,4 @@
-"""Which scores are told apart when animals and stimuli are both samples, and the ranks that this leaves open.
+"""Scores that are told apart when animals and stimuli are both samples, and the ranks that this leaves open.
 
 Scores are compared on the scale that all metrics share (:attr:`Score.scaled`). Two models were scored on the same
 animals and stimuli, so the test is paired: the difference of every animal, and the difference without each stimulus

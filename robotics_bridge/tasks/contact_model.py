@@ -1,4 +1,4 @@
-"""How firm contacts are, and how strong the drives that press on them. SI units, radians."""
+"""Firmness of contacts, and strength of the drives that press on them. SI units, radians."""
 
 from __future__ import annotations
 

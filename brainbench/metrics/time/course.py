@@ -77,7 +77,7 @@ class TimeCourse:
     permutations: int
     """Orders of the stimuli, the given one included."""
     reasons: tuple[str, ...] = ()
-    """What a reader must know, in words."""
+    """Remarks for a reader, in words."""
 
 
 def score_over_time(

@@ -26,7 +26,7 @@ ALPHA = 0.05
 
 @dataclass(frozen=True)
 class LayerLatency:
-    """How far the animals lag behind one layer."""
+    """Lag of the animals behind one layer."""
 
     layer: str
     latency: float

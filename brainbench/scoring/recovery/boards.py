@@ -29,7 +29,7 @@ LEVEL = 0.05
 
 @dataclass(frozen=True)
 class RecoveryBoard:
-    """What a recovery keeps of one board."""
+    """Result of one board that a recovery keeps."""
 
     true: int
     """Candidate from which the animals were drawn."""

@@ -40,8 +40,8 @@ class Fidelity:
     """``quasistatic`` leaves out inertia and damping: whiskers are in balance at every time step. For slow sweeps; of
     the backends ``rod`` alone knows it, and ``steps_per_period`` means nothing in it."""
     twist: bool | None = field(default=None, metadata={"later": True, "before": False})
-    """Whether whiskers twist about their axis; a whisker that stays in one plane is computed without in any case. None:
-    as the scenes say (:attr:`brainbench.stimuli.scenes.scene.Scene.twist`), where the backend can."""
+    """True lets whiskers twist about their axis; one that stays in one plane is computed without in any case. None: as
+    the scenes say (:attr:`brainbench.stimuli.scenes.scene.Scene.twist`), where the backend can."""
 
     def __post_init__(self) -> None:
         check_fields(self, "links", least=2, most=MOST_LINKS, whole=True)
