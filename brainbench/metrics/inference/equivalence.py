@@ -17,9 +17,14 @@ from numpy.typing import ArrayLike
 from brainbench.core.errors import UsageError
 from brainbench.core.reading.ranges import check_number
 from brainbench.core.records import Interval, Score, Status
-from brainbench.core.statistics import FEWEST_ANIMALS, FEWEST_STIMULI, two_factor_error
-from brainbench.metrics.inference.intervals import two_factor_interval
-from brainbench.metrics.inference.multiple import paired_differences, student_tail
+from brainbench.core.statistics import (
+    FEWEST_ANIMALS,
+    FEWEST_STIMULI,
+    paired_differences,
+    student_tail,
+    two_factor_error,
+    two_factor_interval,
+)
 
 MARGIN = 0.1
 """Difference on the common scale below which model and animals count as alike."""

@@ -20,9 +20,8 @@ from numpy.typing import ArrayLike
 from brainbench.core.errors import UsageError
 from brainbench.core.reading.ranges import check_number
 from brainbench.core.records import Interval
-from brainbench.core.statistics import FEWEST_ANIMALS, FEWEST_STIMULI
+from brainbench.core.statistics import FEWEST_ANIMALS, FEWEST_STIMULI, two_factor_interval
 from brainbench.metrics.arrays import finite_mean
-from brainbench.metrics.inference.intervals import two_factor_interval
 from brainbench.metrics.inference.permutation import tail_p
 from brainbench.metrics.layers import most_chosen
 from brainbench.metrics.rdms.comparison import check_comparison

@@ -14,8 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from brainbench.core.records import Interval
+from brainbench.core.statistics import two_factor_interval
 from brainbench.metrics.arrays import finite_mean
-from brainbench.metrics.inference.intervals import two_factor_interval
 from brainbench.metrics.inference.permutation import tail_p
 from brainbench.metrics.rdms.pairs import Floats
 from brainbench.metrics.time.lags import best_lag, votes
