@@ -31,10 +31,13 @@ def check_number(
     )
 
 
-def check_fields(options: Any, *names: str, **bounds: Any) -> None:
-    """Check fields of a dataclass as :func:`check_number` does; None passes where the type of the field allows it."""
+def check_fields(options: Any, *names: str, of: str = "{}", **bounds: Any) -> None:
+    """Check fields of a dataclass as :func:`check_number` does; None passes where the type of the field allows it.
+
+    Errors call a field by its name in place of the braces of ``of``.
+    """
     kinds = {field.name: str(field.type) for field in fields(options)}
     for name in names:
         value = getattr(options, name)
         if value is not None or "None" not in kinds[name]:
-            check_number(name, value, **bounds)
+            check_number(of.format(name), value, **bounds)

@@ -13,7 +13,7 @@ from importlib import resources
 from typing import Any, Literal
 
 from brainbench.core.errors import UsageError, check_name, shown
-from brainbench.core.reading.ranges import check_fields, check_number
+from brainbench.core.reading.ranges import check_fields
 from brainbench.core.tradeoffs import TradeoffPoint, cheapest
 from brainbench.stimuli.engines import DEFAULT_ENGINE
 from brainbench.stimuli.whiskers.chain import Chain
@@ -46,7 +46,7 @@ class Fidelity:
     def __post_init__(self) -> None:
         check_fields(self, "links", least=2, most=MOST_LINKS, whole=True)
         check_fields(self, "links_per_mm", above=0)
-        check_number("time_step (s)", self.time_step, least=1e-7, most=5e-3)
+        check_fields(self, "time_step", least=1e-7, most=5e-3, of="{} (s)")
 
         if self.twist not in (None, True, False):
             raise UsageError(f"twist must be True, False or None; received {shown(self.twist)}.")

@@ -58,8 +58,8 @@ class Camera:
                 raise UsageError(f"The {name} of a camera is a name or three finite numbers; received {value!r}.")
         if not any(self.view):
             raise UsageError("The view of a camera is a direction; (0, 0, 0) is none.")
-        check_fields(self, "width", above=0)
-        check_fields(self, "field_of_view", above=0, below=math.pi)
+        check_fields(self, "width", above=0, of="{} (m)")
+        check_fields(self, "field_of_view", above=0, below=math.pi, of="{} (rad)")
 
     @property
     def axes(self) -> NDArray[np.float64]:

@@ -71,7 +71,7 @@ class Frames:
                 raise UsageError(f"{name} of the frames must be a whole number of at least 1; received {value!r}.")
         for name, allowed in (("phase", ("zero", "causal")), ("axes", ("world", "follicle"))):
             check_name(f"{name} of the frames", getattr(self, name), allowed)
-        check_fields(self, "clip", above=0)
+        check_fields(self, "clip", above=0, of="{} of the frames (N)")
         if self.lowpass is not None:
             self._check_filter(self.lowpass)
 
