@@ -34,19 +34,4 @@ if TYPE_CHECKING:
     from brainbench.scoring.options import ScoreOptions
     from brainbench.scoring.scores import score
 
-
-__getattr__, __dir__ = lazy_exports(
-    __name__,
-    {
-        "BrainbenchError": "brainbench.core.errors",
-        "ResultRecord": "brainbench.core.records",
-        "Score": "brainbench.core.records",
-        "ScoreOptions": "brainbench.scoring",
-        "extract": "brainbench.models.activations",
-        "list_models": "brainbench.models.registry",
-        "load_model": "brainbench.models.registry",
-        "open_recordings": "brainbench.datasets",
-        "register_model": "brainbench.models.registry",
-        "score": "brainbench.scoring",
-    },
-)
+__getattr__, __dir__ = lazy_exports(__name__)

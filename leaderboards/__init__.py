@@ -22,10 +22,4 @@ if TYPE_CHECKING:
 
 __all__ = ["build_leaderboard", "rank", "read_records", "write_record", "write_report"]
 
-_EXPORTS = {
-    "rank": ".boards",
-    **dict.fromkeys(("read_records", "write_record"), ".store"),
-    "build_leaderboard": ".site.build",
-    "write_report": ".site.score_page",
-}
-__getattr__, __dir__ = lazy_exports(__name__, _EXPORTS)
+__getattr__, __dir__ = lazy_exports(__name__)

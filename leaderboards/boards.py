@@ -56,7 +56,7 @@ class Board:
     entries: tuple[Entry, ...]
     baselines: tuple[Baseline, ...] = field(default=())
     lacks: str = ""
-    """What it lacks for ranks, in words; empty when models can be told apart."""
+    """Lack that forbids ranks, in words; empty when models can be told apart."""
 
     @property
     def ranked(self) -> tuple[Entry, ...]:

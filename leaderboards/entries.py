@@ -117,7 +117,7 @@ class Entry:
 
     @property
     def standing(self) -> Standing:
-        """What can be said of it; of several seeds the least."""
+        """Strongest statement about it; of several seeds the least."""
         found = [standing_of(record.score, above_raw=self.above_raw) for record in self.records]
         return STANDINGS[max(map(STANDINGS.index, found))]
 

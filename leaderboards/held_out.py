@@ -29,11 +29,11 @@ class Commitment:
     """The public part of held-out recordings."""
 
     kind: Literal["animals", "stimuli"]
-    """What was held back."""
+    """Kind that was held back: animals or stimuli."""
     held: int
-    """How many of them."""
+    """Number held back."""
     kept: int
-    """How many are public."""
+    """Number that is public."""
     recordings: str
     """Content hash of the recordings before they were split."""
     digest: str

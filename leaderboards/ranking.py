@@ -1,4 +1,4 @@
-"""Which scores are told apart when animals and stimuli are both samples, and the ranks that this leaves open.
+"""Scores that are told apart when animals and stimuli are both samples, and the ranks that this leaves open.
 
 Scores are compared on the scale that all metrics share (:attr:`Score.scaled`). Two models were scored on the same
 animals and stimuli, so the test is paired: the difference of every animal, and the difference without each stimulus
@@ -73,28 +73,6 @@ class Sample:
         return Interval(self.value - half, self.value + half, LEVEL, f"t over {over}")
 
 
-@dataclass(frozen=True)
-class Comparison:
-    """The paired difference of two models on the common scale."""
-
-    difference: float
-    interval: Interval
-    p: float
-    """Two-sided, of this pair alone."""
-
-
-def compare(one: Score, other: Score) -> Comparison | None:
-    """Return the difference ``one`` − ``other``; None with too few animals or stimuli in common to test it."""
-    from scipy.special import stdtrit
-
-    pair = [Sample.of([one]), Sample.of([other])]
-    mean, error, freedom, p = (float(values[0, 1]) for values in _tests(pair))
-    if math.isnan(p):
-        return None
-    half = float(stdtrit(freedom, (1 + LEVEL) / 2)) * error if error > 0 else 0.0
-    return Comparison(mean, Interval(mean - half, mean + half, LEVEL, "t over animals and stimuli, paired"), p)
-
-
 def told_apart(samples: Sequence[Sample]) -> NDArray[np.bool_]:
     """Return [N, N] for each pair whether model j is told apart above model i.
 
@@ -105,7 +83,7 @@ def told_apart(samples: Sequence[Sample]) -> NDArray[np.bool_]:
 
     if not samples:
         return np.zeros((0, 0), dtype=bool)
-    difference, _, _, p = _tests(samples)
+    difference, p = _tests(samples)
     pairs = np.triu(np.isfinite(p), 1)
     adjusted = np.ones_like(p)
     if pairs.any():
@@ -135,8 +113,11 @@ def lacking(animals: int, stimuli: int) -> str:
     return " and ".join(f"at least {fewest} {what} (here {n})" for what, fewest, n in rules if n < fewest)
 
 
-def _tests(samples: Sequence[Sample]) -> tuple[NDArray[np.float64], ...]:
-    """Return differences i − j, standard errors, degrees of freedom and two-sided p, each [N, N]; NaN: not tested."""
+def _tests(samples: Sequence[Sample]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return differences i − j and two-sided p, each [N, N]; NaN: not tested.
+
+    Of models of one seed each the test is that of :func:`brainbench.core.statistics.compare_scores`.
+    """
     from scipy.special import stdtr
 
     names = sorted({name for sample in samples for name in sample.animals})
@@ -147,8 +128,7 @@ def _tests(samples: Sequence[Sample]) -> tuple[NDArray[np.float64], ...]:
     for row, sample in zip(left_out, samples, strict=True):
         if len(sample.without_stimulus) == size:
             row[:] = sample.without_stimulus
-    shape = (len(samples), len(samples))
-    difference, errors, freedoms, p = (np.full(shape, math.nan) for _ in range(4))
+    difference, p = (np.full((len(samples), len(samples)), math.nan) for _ in range(2))
     variances = np.array([sample.seed_variance for sample in samples])
     for i in range(len(samples)):
         animals, stimuli = table[i] - table, left_out[i] - left_out
@@ -161,9 +141,9 @@ def _tests(samples: Sequence[Sample]) -> tuple[NDArray[np.float64], ...]:
         error, freedom = two_factor_error(animals[enough], stimuli[enough])
         error, freedom = _with_seeds(error, freedom, [variances[i], variances[enough].T])
         t = np.divide(np.abs(mean), error, out=np.where(mean == 0, 0.0, math.inf), where=error > 0)
-        difference[i, enough], errors[i, enough], freedoms[i, enough] = mean, error, freedom
+        difference[i, enough] = mean
         p[i, enough] = 2 * stdtr(np.where(error > 0, freedom, 1.0), -t)
-    return difference, errors, freedoms, p
+    return difference, p
 
 
 def _with_seeds(error: NDArray[np.float64], freedom: NDArray[np.float64], seeds: Sequence[Any]) -> tuple:

@@ -19,7 +19,7 @@ MEANINGS: dict[Standing, str] = {
     "unreliable": "Computed, but not to be trusted: the data are too noisy or too few.",
     "undefined": "No number exists.",
 }
-"""What can be said of a score, from the most to the least: every page uses these words and no others."""
+"""Statements about a score, from the most to the least: every page uses these words and no others."""
 STANDINGS = tuple(MEANINGS)
 DOUBTFUL: tuple[Standing, ...] = ("unreliable", "undefined")
 """Standings of scores that no conclusion is drawn from."""

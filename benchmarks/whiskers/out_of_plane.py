@@ -8,8 +8,8 @@ from functools import partial
 
 from benchmarks.report import table
 from brainbench.stimuli.validation import references
-from brainbench.stimuli.validation.out_of_plane import load_aside, push_aside
 from brainbench.stimuli.whiskers.array import WhiskerArray
+from tests.factories.out_of_plane import load_aside, push_aside
 
 SUBJECTS = ("mouse C2", "mouse C5", "rat C1", "rat D4")
 ARCS = (0.5, 0.8)

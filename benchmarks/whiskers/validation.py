@@ -22,9 +22,9 @@ from brainbench.stimuli.engines import list_engines
 from brainbench.stimuli.engines.fidelity import Fidelity, list_presets
 from brainbench.stimuli.motion.trajectories import smooth_step
 from brainbench.stimuli.validation import bench_tests, references
-from brainbench.stimuli.validation.shaken_base import shaken_base
 from brainbench.stimuli.whiskers.array import WhiskerArray
 from brainbench.stimuli.whiskers.whisker import Whisker
+from tests.factories.shaken_base import shaken_base
 
 PARTS = ("plane", "out-of-plane", "fast-bases")
 ARCS = (0.3, 0.5, 0.7, 0.8)

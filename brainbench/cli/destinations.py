@@ -1,13 +1,14 @@
-"""What a command will write, checked when the command line is read: before anything slow."""
+"""Outputs of a command, checked when the command line is read: before anything slow."""
 
 from __future__ import annotations
 
 from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 
 import typer
 
-from brainbench.core.errors import UsageError, missing_dependency, shown, unknown_name
+from brainbench.core.errors import UsageError, check_name, missing_dependency, shown
 from brainbench.core.figures.style import check_format
 from brainbench.core.files import check_folder
 
@@ -22,6 +23,16 @@ def out_folder(option: typer.CallbackParam, path: Path | None) -> Path | None:
 def out_file(option: typer.CallbackParam, path: Path | None) -> Path | None:
     """Return the file of an option if it can be written; else a :class:`UsageError`."""
     return None if path is None else _file(path, option.opts[0])
+
+
+def out_folder_option(help: str) -> Any:
+    """Return the option ``--out`` of a command that writes a folder."""
+    return typer.Option("--out", "-o", callback=out_folder, help=help)
+
+
+def out_file_option(help: str) -> Any:
+    """Return the option ``--out`` of a command that writes a file."""
+    return typer.Option("--out", "-o", callback=out_file, help=help)
 
 
 def picture_file(option: typer.CallbackParam, path: Path | None) -> Path | None:
@@ -55,8 +66,7 @@ def report_file(path: Path | None) -> Path | None:
             f"--report names {shown(str(path))}, which has no ending; give a file that ends in one of {allowed}, or "
             "leave --report out for no report."
         )
-    if kind not in FORMATS:
-        raise unknown_name("report format", kind, FORMATS, hint="The ending of --report chooses it.")
+    check_name("report format", kind, FORMATS, hint="The ending of --report chooses it.")
     if kind == "pdf" and find_spec("weasyprint") is None:
         raise missing_dependency("weasyprint", extra="board", purpose="A report as PDF")
     return _file(path, "--report")

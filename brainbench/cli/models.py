@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from brainbench.cli.destinations import out_file, out_folder
+from brainbench.cli.destinations import out_file_option, out_folder_option
 from brainbench.cli.model_card import model_card
 from brainbench.cli.output import JsonOption, emit, facts, list_without_command, progress_bar, table, table_of
 from brainbench.core.files import to_plain
@@ -142,7 +142,7 @@ def import_(
     file: Annotated[Path, typer.Argument(help="Lightning .ckpt, state dict of PyTorch, or .safetensors.")],
     architecture: Annotated[str | None, typer.Option(help="Registry name, where the file leaves a choice.")] = None,
     config: Annotated[Path | None, typer.Option(help="The run's settings: config.yaml, or its graph in JSON.")] = None,
-    out: Annotated[Path | None, typer.Option("--out", "-o", callback=out_folder, help="Folder to write.")] = None,
+    out: Annotated[Path | None, out_folder_option("Folder to write.")] = None,
     as_json: JsonOption = False,
 ) -> None:
     """Turn weights of the published study into a model that can be scored; nothing in the file is executed."""
@@ -165,7 +165,7 @@ def import_(
 def export(
     model: Annotated[str, typer.Argument(help="A registry name, or local-dir:FOLDER of a trained model.")],
     format: Annotated[str, typer.Option(help="onnx, or torch (an exported program).")] = "onnx",
-    out: Annotated[Path | None, typer.Option("--out", "-o", callback=out_file, help="File to write.")] = None,
+    out: Annotated[Path | None, out_file_option("File to write.")] = None,
     seed: Annotated[int, typer.Option(help="Seed of untrained weights.")] = 0,
     as_json: JsonOption = False,
 ) -> None:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from brainbench.cli.destinations import beside, out_folder
+from brainbench.cli.destinations import beside, out_folder_option
 from brainbench.cli.options import SCORE, option, with_options
 from brainbench.cli.output import JsonOption, emit, progress_bar, table, table_of
 from brainbench.cli.score_text import left_out
@@ -135,7 +135,7 @@ def export(
 @app.command("fetch")
 def fetch(
     name: Annotated[str, typer.Argument(help="A layout ('rodgers') or the six digits of a dandiset.")],
-    out: Annotated[Path, typer.Option("--out", "-o", callback=out_folder, help="Folder to put it in.")] = Path(),
+    out: Annotated[Path, out_folder_option("Folder to put it in.")] = Path(),
     assets: Annotated[str | None, typer.Option(help="Glob of the files wanted, e.g. 'sub-231CR/*'.")] = None,
     as_json: JsonOption = False,
 ) -> None:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from brainbench.cli.destinations import out_folder
+from brainbench.cli.destinations import out_folder_option
 from brainbench.cli.options import SCORE, SchedulerOption, WorkersOption, option, with_options
 from brainbench.cli.output import JsonOption, emit, progress_bar, table_of
 from brainbench.core.errors import UsageError
@@ -59,13 +59,7 @@ def recovery(
     fidelity: Annotated[str, option(SCORE, "fidelity")] = "balanced",
     seed: Annotated[int, typer.Option(help="Seed of the animals, and of untrained weights.")] = 0,
     out: Annotated[
-        Path | None,
-        typer.Option(
-            "--out",
-            "-o",
-            callback=out_folder,
-            help="Folder for result and picture, and for going on after an interruption.",
-        ),
+        Path | None, out_folder_option("Folder for result and picture, and for going on after an interruption.")
     ] = None,
     workers: WorkersOption = None,
     scheduler: SchedulerOption = None,

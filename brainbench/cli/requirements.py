@@ -1,4 +1,4 @@
-"""What each command needs beside its input: packages of extras, and a cache that can be written.
+"""Requirements of each command beside its input: packages of extras, and a cache that can be written.
 
 One table for all commands; it is asked when the command line is read, before anything slow.
 """
@@ -27,7 +27,7 @@ class Requirement:
     extra: str
     purpose: str
     when: Callable[[Mapping[str, Any]], bool] = lambda values: True
-    """Whether the values of the command's parameters need them."""
+    """Test of the values of the command's parameters: true if they need them."""
 
 
 def _given(*names: str) -> Callable[[Mapping[str, Any]], bool]:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from brainbench.cli import destinations
+from brainbench.cli.destinations import out_folder_option
 from brainbench.cli.options import SCORE, SCORE_FLAGS, with_options
 from brainbench.cli.output import JsonOption, emit, progress_bar
 
@@ -34,10 +35,7 @@ def score(
         ),
     ],
     options: ScoreOptions,
-    out: Annotated[
-        Path,
-        typer.Option("--out", "-o", callback=destinations.out_folder, help="Folder of record and report."),
-    ] = Path("brainbench-results"),
+    out: Annotated[Path, out_folder_option("Folder of record and report.")] = Path("brainbench-results"),
     report_file: Annotated[
         Path | None,
         typer.Option(

@@ -8,6 +8,7 @@ from typing import Any
 
 from brainbench.cli.output import spanned, table, table_of
 from brainbench.core.records import ResultRecord, Score
+from brainbench.core.statistics import compare_scores
 
 RAW_INPUT = "raw input"
 
@@ -68,7 +69,7 @@ def _weights(record: ResultRecord) -> str:
 
 def _against_raw_input(record: ResultRecord) -> str:
     """Say whether a score is told apart from that of the raw input, by the test that boards use."""
-    from leaderboards.ranking import compare, lacking
+    from leaderboards.ranking import lacking
 
     score, raw = record.score, record.baselines.get(RAW_INPUT)
     if raw is None:
@@ -76,12 +77,11 @@ def _against_raw_input(record: ResultRecord) -> str:
     for one in (score, raw):
         if one.status != "ok":
             return f"Not compared with raw input: the score of {one.name} is {one.status} ({'; '.join(one.reasons)})."
-    if (found := compare(score, raw)) is None:
+    found = compare_scores(score, raw)
+    if not found.verdict:
         lacks = lacking(sum(item.status == "ok" for item in score.subjects), len(score.stimuli))
         return f"Not compared with raw input: this needs {lacks or 'values of single animals and stimuli'}."
-    low, high = found.interval.low, found.interval.high
-    verdict = "Above" if low > 0 else "Below" if high < 0 else "Not told apart from"
-    return f"{verdict} raw input: difference {spanned(found.difference, found.interval)}, p = {_p(found.p)}"
+    return f"{found.verdict} raw input: difference {spanned(found.difference, found.interval)}, p = {_p(found.p)}"
 
 
 def _rows(score: Score) -> Iterator[list[str]]:

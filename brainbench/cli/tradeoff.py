@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from brainbench.cli.destinations import out_file, picture_file
+from brainbench.cli.destinations import out_file, out_file_option, picture_file
 from brainbench.cli.options import items, numbers
 from brainbench.cli.output import JsonOption, emit, progress_bar, table_of
 from brainbench.stimuli.engines import DEFAULT_ENGINE
@@ -17,9 +17,7 @@ app = typer.Typer(no_args_is_help=True, help="Measure accuracy against cost.")
 
 @app.command("whisker")
 def whisker(
-    out: Annotated[
-        Path, typer.Option("--out", "-o", callback=out_file, help="Table (.json); points in it are kept.")
-    ] = Path("whisker-tradeoff.json"),
+    out: Annotated[Path, out_file_option("Table (.json); points in it are kept.")] = Path("whisker-tradeoff.json"),
     links: Annotated[str, typer.Option(help="Links per whisker, comma-separated; the default grid if empty.")] = "",
     time_steps: Annotated[str, typer.Option(help="Time steps in ms, comma-separated; the default grid if empty.")] = "",
     backends: Annotated[str, typer.Option(help="Backends, comma-separated.")] = DEFAULT_ENGINE,
@@ -161,9 +159,7 @@ def model(
 
 @app.command("tactile")
 def tactile(
-    out: Annotated[Path, typer.Option("--out", "-o", callback=out_file, help="Table (.json).")] = Path(
-        "tactile-tradeoff.json"
-    ),
+    out: Annotated[Path, out_file_option("Table (.json).")] = Path("tactile-tradeoff.json"),
     plot: Annotated[
         Path | None, typer.Option(callback=picture_file, help="Also draw error against cost (.png, .svg, .pdf).")
     ] = None,

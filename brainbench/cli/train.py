@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from brainbench.cli.destinations import out_folder
+from brainbench.cli.destinations import out_folder_option
 from brainbench.cli.options import part_of, with_options
 from brainbench.cli.output import JsonOption, emit, progress_bar, table_of
 from brainbench.core.errors import DataError, UsageError
@@ -39,10 +39,7 @@ def train(
     config: Annotated[
         Path | None, typer.Option(help="TOML or JSON file of training options; options given here win.")
     ] = None,
-    out: Annotated[
-        Path | None,
-        typer.Option("--out", "-o", callback=out_folder, help="Folder of the run; started again, it goes on."),
-    ] = None,
+    out: Annotated[Path | None, out_folder_option("Folder of the run; started again, it goes on.")] = None,
     device: Annotated[str | None, typer.Option(help="cpu, cuda or cuda:N; CUDA when there is one.")] = None,
     stop_after: Annotated[float | None, typer.Option(help="Save the state and stop after so many seconds.")] = None,
     sweep: Annotated[

@@ -3,27 +3,43 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
+from functools import cache
 from importlib import import_module
+from importlib.util import find_spec
 from typing import Any
 
 
-def lazy_exports(package: str, exports: Mapping[str, str]) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:
-    """Return a package's ``__getattr__`` and ``__dir__`` for names that stand in other modules.
+def lazy_exports(package: str) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:
+    """Return ``__getattr__`` and ``__dir__`` of a package (``__name__``) for its ``__all__`` and for its modules.
 
-    Args:
-        package: ``__name__`` of the package.
-        exports: public name → the module that holds it, relative to the package where it begins with a dot. A module
-            itself is exported by a path that ends in its name and a dot: ``{"references": ".validation.references."}``.
+    Where a name stands is read from the imports under ``if TYPE_CHECKING:``, which type checkers read too.
     """
 
+    @cache
+    def exports() -> dict[str, str]:
+        """Return the module of each public name, from the source of the package."""
+        import ast  # as slow as all of the package, and not needed to import it
+        from pathlib import Path
+
+        module = sys.modules[package]
+        blocks = [
+            node.body
+            for node in ast.parse(Path(str(module.__file__)).read_text(encoding="utf-8")).body
+            if isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING"
+        ]
+        imports = [node for body in blocks for node in body if isinstance(node, ast.ImportFrom)]
+        found = {alias.name: str(node.module) for node in imports for alias in node.names}
+        return {name: where for name, where in found.items() if name in module.__all__}
+
     def load(name: str) -> Any:
-        if name not in exports:
+        if where := exports().get(name):
+            value = getattr(import_module(where), name)
+        elif not name.startswith("_") and find_spec(f"{package}.{name}"):
+            value = import_module(f"{package}.{name}")
+        else:
             raise AttributeError(f"module {package!r} has no attribute {name!r}")
-        path = exports[name]
-        module = import_module(path.removesuffix("."), package)
-        value = module if path.endswith(".") else getattr(module, name)
         setattr(sys.modules[package], name, value)
         return value
 
-    return load, lambda: sorted(exports)
+    return load, lambda: sorted(exports())

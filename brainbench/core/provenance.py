@@ -82,7 +82,7 @@ class Provenance(Mapping[str, Any]):
 
     @property
     def time_rule(self) -> str:
-        """How the time axis entered the RDMs, ``mean`` or ``concatenate``; empty if not stated."""
+        """Use of the time axis in the RDMs, ``mean`` or ``concatenate``; empty if not stated."""
         return _text(self.settings.get("time"))
 
     @property

@@ -1,15 +1,16 @@
-"""Intervals of means, proportions and differences of proportions: one place for the whole project."""
+"""Intervals of means, proportions and their differences, and the paired test of two scores: for the whole project."""
 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from typing import TypeGuard
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from brainbench.core.errors import DataError, UsageError
-from brainbench.core.records import Interval
+from brainbench.core.records import Interval, Score
 
 LEVEL = 0.95
 """Confidence level where none is asked for."""
@@ -70,6 +71,38 @@ def two_factor_error(
     return np.where(known, np.sqrt(total), np.nan), np.where(known, freedom, np.nan)
 
 
+def two_factor_interval(
+    value: float, animals: ArrayLike, without_stimulus: ArrayLike, level: float = LEVEL
+) -> Interval | None:
+    """Return the t interval of a mean over animals and stimuli; None for fewer than two of either.
+
+    ``animals`` [A] are the values of single animals, ``without_stimulus`` [K] the mean without each stimulus in turn.
+
+    Raises:
+        UsageError: a level outside (0, 1).
+    """
+    from scipy.special import stdtrit
+
+    check_level(level)
+    error, freedom = (float(found) for found in two_factor_error(animals, without_stimulus))
+    if not math.isfinite(error):
+        return None
+    half = float(stdtrit(freedom, (1 + level) / 2)) * error if error > 0 else 0.0
+    count, stimuli = (np.isfinite(np.asarray(part, dtype=np.float64)).sum() for part in (animals, without_stimulus))
+    what = f"t over {count} animals and {stimuli} stimuli (jackknife)"
+    return Interval(value - half, value + half, level, what)
+
+
+def student_tail(distance: float, error: float, freedom: float) -> float:
+    """Return P(t ≥ distance/error) with some degrees of freedom."""
+    from scipy.special import stdtr
+
+    # Without spread the t statistic is infinite; the sign of the distance alone decides.
+    if error == 0:
+        return 0.0 if distance > 0 else 1.0 if distance < 0 else 0.5
+    return float(stdtr(freedom, -distance / error))
+
+
 def _spread(values: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the sum [...] of squared deviations from the mean of the finite values [..., N]."""
     finite = np.isfinite(values)
@@ -128,3 +161,67 @@ def check_level(level: float) -> None:
     """Raise UsageError unless a confidence level lies between 0 and 1."""
     if not 0 < level < 1:
         raise UsageError(f"A confidence level lies between 0 and 1, such as 0.95; received {level}.")
+
+
+@dataclass(frozen=True)
+class PairTest:
+    """Two models on the same animals and stimuli."""
+
+    first: str
+    second: str
+    difference: float
+    """The first's value minus the second's, on the common scale."""
+    interval: Interval | None
+    """Interval of the difference, over animals and stimuli."""
+    p: float
+    """Two-sided, by Student's t of the difference over its two-factor standard error."""
+    p_corrected: float
+    """Corrected for the number of pairs."""
+    reason: str = ""
+    """Reason for a missing p; empty otherwise."""
+
+    @property
+    def verdict(self) -> str:
+        """``Above``, ``Below`` or ``Not told apart from`` the second; empty where it is not tested."""
+        if math.isnan(self.p) or self.interval is None:
+            return ""
+        return "Above" if self.interval.low > 0 else "Below" if self.interval.high < 0 else "Not told apart from"
+
+
+def compare_scores(first: Score, second: Score) -> PairTest:
+    """Test the difference of two scores over the animals and the stimuli that both have.
+
+    Fewer than :data:`FEWEST_ANIMALS` animals or :data:`FEWEST_STIMULI` stimuli give no p.
+    """
+    animals, without = paired_differences(first, second)
+    names = first.name, second.name
+    if len(animals) < 2:
+        why = "fewer than two animals have a value for both models"
+        return PairTest(*names, float(animals.mean()) if len(animals) else math.nan, None, math.nan, math.nan, why)
+    difference = float(animals.mean())
+    interval = two_factor_interval(difference, animals, without)
+    stimuli = int(np.isfinite(without).sum())
+    if len(animals) < FEWEST_ANIMALS or stimuli < FEWEST_STIMULI:
+        why = f"{len(animals)} animals and {stimuli} stimuli; at least {FEWEST_ANIMALS} and {FEWEST_STIMULI} are needed"
+        return PairTest(*names, difference, interval, math.nan, math.nan, why)
+    error, freedom = two_factor_error(animals, without)
+    p = 2 * student_tail(abs(difference), float(error), float(freedom))
+    return PairTest(*names, difference, interval, p, math.nan)
+
+
+def paired_differences(first: Score, second: Score) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the differences of two scores on the common scale: of animals [A], and without each stimulus [K].
+
+    Animals are those that both could use with status ``ok`` (else with any value).
+    """
+    pairs = []
+    for wanted in (("ok",), ("ok", "unreliable")):
+        one, two = ({s.subject: s.value for s in x.subjects if s.status in wanted} for x in (first, second))
+        pairs = [first.on_scale(one[name]) - second.on_scale(two[name]) for name in sorted(one.keys() & two.keys())]
+        if pairs := [difference for difference in pairs if math.isfinite(difference)]:
+            break
+    without = []
+    if set(first.stimuli) == set(second.stimuli):
+        one, two = (dict(zip(x.stimuli, x.without_stimulus, strict=False)) for x in (first, second))
+        without = [first.on_scale(one[k]) - second.on_scale(two[k]) for k in one.keys() & two.keys()]
+    return np.array(pairs, dtype=np.float64), np.array(without, dtype=np.float64)

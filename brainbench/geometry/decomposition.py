@@ -17,8 +17,9 @@ from typing import Any, Literal
 
 import numpy as np
 
-from brainbench.core.errors import DataError, UsageError, missing_dependency, unknown_name
+from brainbench.core.errors import DataError, UsageError, check_name, missing_dependency
 from brainbench.core.files import cache_dir, content_hash
+from brainbench.core.reading.ranges import check_fields
 from brainbench.core.reading.sealed import read_sealed, write_sealed
 from brainbench.geometry.distance import Deviation, deviation, hausdorff
 from brainbench.geometry.mesh import Mesh, convex_hull
@@ -61,18 +62,13 @@ class DecompositionSettings:
     """Limit of memory [bytes]; the work is stopped beyond it. Does not change a result."""
 
     def __post_init__(self) -> None:
-        if self.method not in METHODS:
-            raise unknown_name("decomposition method", self.method, METHODS)
-        if not 0.01 <= self.threshold <= 1:
-            raise UsageError(f"The threshold of a decomposition lies between 0.01 and 1; received {self.threshold!r}.")
-        if self.most_pieces is not None and self.most_pieces < 1:
-            raise UsageError(f"A decomposition has at least 1 piece; received {self.most_pieces!r}.")
+        check_name("decomposition method", self.method, METHODS)
+        check_fields(self, "threshold", least=0.01, most=1)
+        check_fields(self, "most_pieces", least=1, whole=True)
         if self.most_pieces is not None and self.method == "vhacd":
             raise UsageError("V-HACD in PyBullet has no limit on the number of pieces; use method = 'coacd' for one.")
-        if self.most_faces < 500:
-            raise UsageError(f"most_faces must be at least 500; received {self.most_faces!r}.")
-        if not (self.seconds > 0 and self.memory > 0):
-            raise UsageError("The limits of time and memory must be positive.")
+        check_fields(self, "most_faces", least=500, whole=True)
+        check_fields(self, "seconds", "memory", above=0)
 
     def config(self) -> dict[str, Any]:
         """Return the plain values that determine the pieces."""

@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from brainbench.core.errors import DataError, UsageError, unknown_name
+from brainbench.core.errors import DataError, check_name, unknown_name
+from brainbench.core.reading.ranges import check_number
 from brainbench.core.reading.regular import check_file, readable
 
 if TYPE_CHECKING:
@@ -136,8 +137,7 @@ class Mesh:
 
     def scaled(self, factor: float) -> Mesh:
         """Return the mesh scaled about its origin."""
-        if not (np.isfinite(factor) and factor > 0):
-            raise UsageError(f"A mesh is scaled by a positive factor; received {factor!r}.")
+        check_number("The scale of a mesh", factor, above=0)
         return Mesh(self.vertices * factor, self.faces, self.name)
 
     def transformed(self, rotation: ArrayLike, translation: ArrayLike = (0.0, 0.0, 0.0)) -> Mesh:
@@ -208,8 +208,7 @@ def load_mesh(path: str | os.PathLike[str], *, unit: str) -> Mesh:
     """
     import trimesh
 
-    if unit not in UNITS:
-        raise unknown_name("length unit", unit, UNITS)
+    check_name("length unit", unit, UNITS)
     path = check_file(path, "mesh file")
     with readable(path, "mesh"):
         loaded: Any = trimesh.load(path, force="mesh", process=False)
@@ -230,8 +229,7 @@ def save_mesh(path: str | os.PathLike[str], mesh: Mesh, *, unit: str) -> Path:
     """
     from brainbench.core.files import atomic_path
 
-    if unit not in UNITS:
-        raise unknown_name("length unit", unit, UNITS)
+    check_name("length unit", unit, UNITS)
     path = Path(path)
     if path.suffix.lower() not in WRITABLE:
         raise unknown_name("mesh format", path.suffix or path.name, WRITABLE, hint="The suffix of the file chooses it.")

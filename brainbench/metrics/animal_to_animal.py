@@ -12,9 +12,10 @@ import numpy as np
 from brainbench.core.errors import UsageError
 from brainbench.core.provenance import Provenance
 from brainbench.core.records import Interval, Score, Status, SubjectScore
+from brainbench.core.statistics import two_factor_interval
 from brainbench.metrics.animals import Animals, ceiling_of, gather, mean_rdm, mean_reliability
 from brainbench.metrics.comparisons import LayerComparisons
-from brainbench.metrics.inference.intervals import held_to_scale, interval_reasons, two_factor_interval
+from brainbench.metrics.inference.intervals import held_to_scale, interval_reasons
 from brainbench.metrics.inference.permutation import SMALLEST_STIMULI, TIE, label_orders
 from brainbench.metrics.rdms.pairs import Floats
 from brainbench.metrics.reliability.noise_correction import RELIABILITY_GATE, Corrected

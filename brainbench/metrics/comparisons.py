@@ -24,7 +24,7 @@ Orders = Callable[[], Iterable[Ints]]
 
 @dataclass(frozen=True)
 class LayerComparisons:
-    """What a metric says of the layers of one model and a number of animals."""
+    """Verdict of a metric on the layers of one model and a number of animals."""
 
     metric: Metric
     layers: Sequence[Floats] = field(repr=False)

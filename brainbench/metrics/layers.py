@@ -27,7 +27,7 @@ Kind = Literal["fixed", "others", "halves", "maximum"]
 
 @dataclass(frozen=True)
 class LayerRule:
-    """How the layer for each animal is chosen among comparisons [..., L, A]."""
+    """Choice of the layer for each animal among comparisons [..., L, A]."""
 
     kind: Kind
     words: str

@@ -16,12 +16,12 @@ import numpy as np
 from brainbench.core.errors import UsageError, unknown_name
 from brainbench.core.provenance import Provenance
 from brainbench.core.records import LayerScore, Score, Status, SubjectScore
-from brainbench.core.statistics import t_interval
+from brainbench.core.statistics import t_interval, two_factor_interval
 from brainbench.metrics.animals import Animals, ceiling_of, gather, mean_rdm, mean_reliability, recorded_rdm
 from brainbench.metrics.arrays import finite_mean
 from brainbench.metrics.comparisons import LayerComparisons
 from brainbench.metrics.evaluation import LayerEvaluation, attainable_value, defined_layers, evaluate
-from brainbench.metrics.inference.intervals import held_to_scale, interval_reasons, two_factor_interval
+from brainbench.metrics.inference.intervals import held_to_scale, interval_reasons
 from brainbench.metrics.inference.permutation import SMALLEST_STIMULI, PermutationTest, layer_p, smallest_p
 from brainbench.metrics.layers import first_best, most_chosen
 from brainbench.metrics.rdms.pairs import Floats

@@ -33,14 +33,4 @@ def _import_foreign(path: Path, settings: Path | None) -> Path:
 
 foreign_importers.append(_import_foreign)
 
-__getattr__, __dir__ = lazy_exports(
-    __name__,
-    {
-        "describe_model": ".registry",
-        "extract": ".activations",
-        "list_models": ".registry",
-        "load_model": ".registry",
-        "load_user_model": ".user_models",
-        "register_model": ".registry",
-    },
-)
+__getattr__, __dir__ = lazy_exports(__name__)

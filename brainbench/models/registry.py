@@ -36,7 +36,7 @@ _LOG = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class ModelFacts:
-    """What is stated of an architecture when it is registered."""
+    """Facts stated of an architecture when it is registered."""
 
     name: str
     family: str
@@ -133,7 +133,7 @@ def list_models(pattern: str = "*") -> list[str]:
 
 @dataclass(frozen=True)
 class LocatedModel:
-    """What a name stands for: the registered architecture, and where its weights are if it is a trained one."""
+    """Meaning of a name: the registered architecture, and where its weights are if it is a trained one."""
 
     name: str
     record: ModelRecord

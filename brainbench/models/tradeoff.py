@@ -16,6 +16,7 @@ import torch
 from torch import nn
 
 from brainbench.core.errors import UsageError, check_name
+from brainbench.core.reading.ranges import check_fields
 from brainbench.core.tradeoffs import TradeoffPoint
 from brainbench.models.graph.spec import UNROLLS, Unroll
 from brainbench.models.graph.temporal_graph import TemporalGraph
@@ -47,8 +48,7 @@ class ModelSetting:
     def __post_init__(self) -> None:
         check_name("precision", self.precision, PRECISIONS)
         check_name("unrolling", self.unroll, UNROLLS)
-        if self.steps < 1:
-            raise UsageError(f"A sweep has at least 1 step; received {self.steps}.")
+        check_fields(self, "steps", least=1)
 
 
 class Reduced(nn.Module):

@@ -15,6 +15,4 @@ if TYPE_CHECKING:
 
 __all__ = ["ScoreOptions", "score", "score_record"]
 
-__getattr__, __dir__ = lazy_exports(
-    __name__, {"ScoreOptions": ".options", "score": ".scores", "score_record": ".scores"}
-)
+__getattr__, __dir__ = lazy_exports(__name__)

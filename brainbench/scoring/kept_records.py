@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-import logging
 import re
 from pathlib import Path
 
-from brainbench.core.errors import DataError, UsageError
+from brainbench.core.errors import UsageError
 from brainbench.core.files import cache_dir, content_hash, read_json, write_text
 from brainbench.core.reading.code_stamp import code_stamp
+from brainbench.core.reading.sealed import keeping, read_entry
 from brainbench.core.records import ResultRecord
 from brainbench.scoring.demo import DEMOS
 from brainbench.scoring.options import ScoreOptions
-
-_LOG = logging.getLogger(__name__)
 
 
 def record_path(model: str, options: ScoreOptions, command: str) -> Path | None:
@@ -42,20 +40,11 @@ def record_path(model: str, options: ScoreOptions, command: str) -> Path | None:
 
 def read_kept(path: Path | None) -> ResultRecord | None:
     """Return the record that the cache keeps at ``path``; None without one, or with a damaged one."""
-    if path is None or not path.is_file():
-        return None
-    try:
-        return ResultRecord.from_json(read_json(path))
-    except DataError as error:
-        _LOG.warning("The record in the cache is damaged and is made again (%s).", error)
-        return None
+    return None if path is None else read_entry(path, "record", lambda file: ResultRecord.from_json(read_json(file)))
 
 
 def keep(record: ResultRecord, path: Path | None) -> None:
-    """Keep a record in the cache; where nothing can be written, a warning says so and work goes on."""
-    if path is None:
-        return
-    try:
-        write_text(path, record.to_json())
-    except OSError as error:
-        _LOG.warning("The record could not be kept in the cache (%s).", error)
+    """Keep a record in the cache, where it can be written."""
+    if path is not None:
+        with keeping("record"):
+            write_text(path, record.to_json())

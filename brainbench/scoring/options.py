@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from brainbench.core.errors import UsageError, check_name, shown
-from brainbench.core.reading.ranges import check_number
+from brainbench.core.reading.ranges import check_fields
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -103,17 +103,13 @@ class ScoreOptions:
         for name in _NO_NUMBERS:
             if isinstance(getattr(self, name), (int, float)):
                 raise UsageError(f"{name} must be a text; received {shown(getattr(self, name))}.")
-        check_number("seed", self.seed, least=0, whole=True)
-        if self.weights_seed is not None:
-            check_number("weights_seed", self.weights_seed, least=0, whole=True)
-        if self.bin is not None:
-            check_number("bin", self.bin, above=0)
+        check_fields(self, "seed", "weights_seed", least=0, whole=True)
+        check_fields(self, "bin", above=0)
         check_name("time rule", self.time, TIME_RULES)
         check_name("readout", self.readout, READOUTS)
         if self.readout == "published" and (self.time != "mean" or self.over_time):
             raise UsageError("The published readout averages time by its own rule; leave out --time and --over-time.")
-        if self.units_reliability is not None:
-            check_number("units_reliability", self.units_reliability, above=-1, below=1)
+        check_fields(self, "units_reliability", above=-1, below=1)
 
     @classmethod
     def of(cls, values: Mapping[str, Any]) -> ScoreOptions:

@@ -53,22 +53,4 @@ __all__ = [
     "write_stimulus_set",
 ]
 
-_MODULES = {
-    ".engines.fidelity": ("Fidelity",),
-    ".motion.trajectories": ("Whisking",),
-    ".objects.placed_object": ("PlacedObject",),
-    ".objects.solid": ("Solid",),
-    ".readout": ("to_grid",),
-    ".scenes.frames": ("Frames",),
-    ".scenes.recipes": ("get_recipe", "list_recipes"),
-    ".scenes.scene": ("Head", "Scene"),
-    ".scenes.scene_files": ("load_scene",),
-    ".simulation": ("simulate",),
-    ".sources": ("Stimuli", "load_stimuli"),
-    ".stimulus_set": ("read_stimulus_set", "write_stimulus_set"),
-    ".sweeps.grid": ("SweepGrid",),
-    ".validation.references.": ("references",),
-    ".whiskers.array": ("WhiskerArray",),
-    ".whiskers.whisker": ("Whisker",),
-}
-__getattr__, __dir__ = lazy_exports(__name__, {name: module for module, names in _MODULES.items() for name in names})
+__getattr__, __dir__ = lazy_exports(__name__)

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brainbench.core.contracts import GRID_SHAPE, check_stimulus_set
-from brainbench.core.errors import DataError, UsageError, listing, unknown_name
+from brainbench.core.errors import DataError, UsageError, check_name, listing
 from brainbench.core.files import content_hash
 from brainbench.stimuli.scenes.frames import Axes
 from brainbench.stimuli.stimulus_set import hash_stimulus_set
@@ -73,8 +73,7 @@ def to_axes(dataset: xr.Dataset, axes: Axes) -> xr.Dataset:
     Raises:
         UsageError: the axes are unknown, or the set does not hold the poses.
     """
-    if axes not in get_args(Axes):
-        raise unknown_name("axes", str(axes), get_args(Axes))
+    check_name("axes", axes, get_args(Axes))
     if axes == dataset.attrs.get("axes", "world"):
         return dataset
     if ORIENTATION not in dataset:

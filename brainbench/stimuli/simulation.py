@@ -16,10 +16,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brainbench.core.contracts import check_stimulus_set
-from brainbench.core.errors import BrainbenchError, DataError, UsageError
+from brainbench.core.errors import BrainbenchError, UsageError
 from brainbench.core.files import cache_dir, content_hash, portable, to_json
 from brainbench.core.progress import PREPARATION, Progress
-from brainbench.core.reading.sealed import seal_file, trust_sealed
+from brainbench.core.reading import sealed
+from brainbench.core.reading.sealed import keeping, seal_file, trust_sealed
 from brainbench.stimuli.engines import DEFAULT_ENGINE, PHYSICS_VERSION, get_engine
 from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.engines.job_schedule import plan
@@ -80,27 +81,26 @@ def simulate(
     dataset = simulate_uncached(chosen, fidelity, engine, progress=progress)
     _warn_unstable(dataset)
     if path is not None:
-        try:
+        with keeping("stimuli"):
             write_stimulus_set(dataset, path)
             seal_file(path)
             dataset.encoding[ENTRY] = path
-        except OSError as error:
-            _LOG.warning("the stimuli could not be kept in the cache (%s)", error)
     return dataset
 
 
 def read_entry(path: Path) -> xr.Dataset | None:
     """Return a stimulus set that the package or the cache keeps; None without one, or with a damaged one."""
-    for file in dict.fromkeys((find_entry(path), path)):
-        if file is None or not file.exists():
-            continue
-        try:
-            state = file.stat()
-            # A score asks for its stimuli twice, for the demo recordings and for the network.
-            return _read_entry(file, state.st_size, state.st_mtime_ns).copy(deep=True)
-        except DataError as error:
-            _LOG.warning("stored stimuli are damaged and are simulated again: %s", error)
-    return None
+
+    def read(file: Path) -> xr.Dataset:
+        state = file.stat()
+        # A score asks for its stimuli twice, for the demo recordings and for the network.
+        return _read_entry(file, state.st_size, state.st_mtime_ns).copy(deep=True)
+
+    # The package's own entry goes first; a damaged one does not hide that of the cache.
+    found = (
+        sealed.read_entry(file, "set of stimuli", read) for file in dict.fromkeys((find_entry(path) or path, path))
+    )
+    return next((dataset for dataset in found if dataset is not None), None)
 
 
 @functools.lru_cache(maxsize=1)

@@ -33,7 +33,7 @@ from typing import Any
 
 import numpy as np
 
-from brainbench.core.errors import BrainbenchError, DataError, unknown_name
+from brainbench.core.errors import BrainbenchError, DataError, check_name, unknown_name
 from brainbench.core.files import read_json, write_json, write_text
 from brainbench.core.progress import Progress
 from brainbench.core.tradeoffs import TradeoffPoint, pareto_front
@@ -109,8 +109,7 @@ def settings(
     still = [Fidelity(links=n, time_step=step, solver="quasistatic") for n, (step, _) in steps]
     fidelities = {"dynamic": dict.fromkeys([*presets, *grid]), "quasistatic": still}
     for solver in solvers:
-        if solver not in fidelities:
-            raise unknown_name("solver", solver, fidelities)
+        check_name("solver", solver, fidelities)
     chosen = [
         SimulationSetting(fidelity, name)
         for solver in fidelities

@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from brainbench.core.contracts import CHANNELS, check_stimulus_set
-from brainbench.core.errors import DataError, UsageError, unknown_name
+from brainbench.core.errors import DataError, UsageError, check_name
 from brainbench.core.files import write_text
 from brainbench.core.reading.tables import read_numbers
 from brainbench.core.reading.texts import read_text
@@ -151,14 +151,12 @@ def save_run(
         UsageError: the stimulus is unknown or not said, whiskers lack a side, or the shapes do not fit.
     """
     check_stimulus_set(dataset)
-    if dialect not in DIALECTS:
-        raise unknown_name("dialect", dialect, DIALECTS)
+    check_name("dialect", dialect, DIALECTS)
     labels = [str(label) for label in dataset["stimulus"].values]
     if stimulus is None and len(labels) > 1:
         raise UsageError(f"The stimulus set has {len(labels)} stimuli; say which one to write: {labels[0]!r}, …")
     chosen = labels[0] if stimulus is None else stimulus
-    if chosen not in labels:
-        raise unknown_name("stimulus", chosen, labels)
+    check_name("stimulus", chosen, labels)
     if not str(dataset.attrs.get("frame", "world")).startswith("world"):
         raise UsageError("WHISKiT's results are in world axes; read the stimulus set in world axes to write them.")
     one = dataset.isel(stimulus=labels.index(chosen))

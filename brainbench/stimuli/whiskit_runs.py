@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brainbench.core.contracts import CHANNELS, GRID_SHAPE
-from brainbench.core.errors import DataError, UsageError, listing, unknown_name
+from brainbench.core.errors import DataError, UsageError, check_name, listing, unknown_name
 from brainbench.core.reading.tables import read_numbers
 from brainbench.stimuli.external import FRAME_STATUSES, assemble_stimulus_set
 from brainbench.stimuli.scenes.frames import Frames
@@ -118,8 +118,7 @@ def read_runs(
         UsageError: the rate is unknown, or an option is out of range.
         DataError: a run cannot be read, or runs differ in whiskers or rows.
     """
-    if cleaning not in get_args(Cleaning):
-        raise unknown_name("cleaning", cleaning, get_args(Cleaning))
+    check_name("cleaning", cleaning, get_args(Cleaning))
     paths = [Path(folder).absolute() for folder in folders]
     if not paths:
         raise DataError("There is no run of WHISKiT (whisker_ID.csv and dynamics/) to be read.")

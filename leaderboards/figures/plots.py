@@ -127,7 +127,7 @@ def colours(names: Iterable[str]) -> dict[str, str]:
 
 
 _NAMES = ("grey", "blue", "orange", "teal", "violet", "ochre", "pink", "green", "sky")
-"""Of the classes ``c0`` to ``c8``."""
+"""Colour names of the classes ``c0`` to ``c8``."""
 
 
 def legend_words(colour: dict[str, str]) -> str:

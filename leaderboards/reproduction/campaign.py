@@ -156,7 +156,7 @@ def _records(board: Board) -> list[ResultRecord]:
 
 
 class _Identity(NamedTuple):
-    """What tells one training from another."""
+    """Fields that tell one training from another."""
 
     model: str
     objective: str

@@ -1,4 +1,4 @@
-"""What each claim of the study compares: networks that differ in the one thing that the claim names."""
+"""Comparisons behind each claim of the study: networks that differ in the one thing that the claim names."""
 
 from __future__ import annotations
 

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from brainbench.core.records import ResultRecord
+from brainbench.core.statistics import compare_scores
 from leaderboards import text
 from leaderboards.boards import RAW_INPUT
 from leaderboards.entries import Entry
@@ -22,7 +23,7 @@ from leaderboards.figures.architecture import diagram, layer_order
 from leaderboards.figures.rdms import rdm_picture
 from leaderboards.figures.record import beside, layers, raw
 from leaderboards.figures.time_course import draw_time_course
-from leaderboards.ranking import compare, lacking
+from leaderboards.ranking import lacking
 from leaderboards.site.page import render
 from leaderboards.standing import not_repeatable, standing_of
 from leaderboards.writing import write_files
@@ -68,13 +69,12 @@ def comparisons(record: ResultRecord) -> list[str]:
         others["animal-to-animal"] = record.animal_to_animal
     sentences, untested = [], []
     for name, other in others.items():
-        found = compare(score, other) if "ok" == score.status == other.status else None
-        if found is None:
+        found = compare_scores(score, other)
+        if not found.verdict or not "ok" == score.status == other.status:
             untested.append(name)
             continue
-        low, high = found.interval.low, found.interval.high
-        verdict = "Above" if low > 0 else "Below" if high < 0 else "Not told apart from"
-        sentences.append(f"{verdict} {name}: difference {text.number(found.difference)} {text.span(found.interval)}.")
+        told = f"difference {text.number(found.difference)} {text.span(found.interval)}"
+        sentences.append(f"{found.verdict} {name}: {told}.")
     if untested:
         lacks = lacking(sum(item.status == "ok" for item in score.subjects), len(score.stimuli))
         why = f"this needs {lacks}" if lacks else "not both state reliable values of single animals and stimuli"
@@ -86,14 +86,14 @@ def _score_view(record: ResultRecord) -> dict[str, Any]:
     """Return what both templates show of a score."""
     score, card = record.score, record.card
     raw_input = record.baselines.get(RAW_INPUT)
-    found = compare(score, raw_input) if raw_input is not None else None
+    above = raw_input is not None and compare_scores(score, raw_input).verdict == "Above"
     named = [("model", score.name, score), ("animals", "animal-to-animal", record.animal_to_animal)]
     named += [("baseline", name, item) for name, item in record.baselines.items()]
     pairs = list(zip(combinations(score.stimuli, 2), score.model_rdm, score.brain_rdm, strict=False))
     return {
         "title": f"{score.name}: brainbench score",
         "record": record,
-        "standing": standing_of(score, above_raw=found is not None and found.interval.low > 0),
+        "standing": standing_of(score, above_raw=above),
         "scaled": math.isfinite(score.scaled),
         "not_repeatable": not_repeatable(record),
         "ways": text.ways_to_get(record),

@@ -1,4 +1,4 @@
-"""What a receiver of authentic frames believes: each number once, in order, and nothing old."""
+"""Rules of a receiver of authentic frames: each number once, in order, and nothing old."""
 
 from __future__ import annotations
 

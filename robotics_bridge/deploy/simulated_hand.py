@@ -16,7 +16,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from brainbench.core.errors import DataError, UsageError
+from brainbench.core.errors import DataError
+from brainbench.core.reading.ranges import check_fields
 from robotics_bridge import hands
 from robotics_bridge.deploy.driver import HandReading
 from robotics_bridge.deploy.frames import new_key
@@ -63,12 +64,8 @@ class Faults:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        for name in ("drop", "damage", "absurd", "nan"):
-            if not 0 <= getattr(self, name) <= 1:
-                raise UsageError(f"The fault {name!r} is a probability; received {getattr(self, name)!r}.")
-        for name in ("delay", "delay_after", "jitter", "silent_after", "frozen_after"):
-            if not 0 <= getattr(self, name) < 3600:
-                raise UsageError(f"The fault {name!r} is a time in seconds; received {getattr(self, name)!r}.")
+        check_fields(self, "drop", "damage", "absurd", "nan", least=0, most=1)
+        check_fields(self, "delay", "delay_after", "jitter", "silent_after", "frozen_after", least=0, below=3600)
 
     @classmethod
     def parse(cls, texts: list[str]) -> Faults:

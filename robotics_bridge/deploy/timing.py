@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from brainbench.core.errors import UsageError
 
 PRIORITY = 20
-"""Of SCHED_FIFO (1–99); above ordinary threads, below the kernel's own (50)."""
+"""Priority under SCHED_FIFO (1–99); above ordinary threads, below the kernel's own (50)."""
 
 
 @contextlib.contextmanager

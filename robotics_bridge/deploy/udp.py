@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brainbench.core.errors import UsageError
+from brainbench.core.reading.ranges import check_number
 from robotics_bridge.deploy import frames
 from robotics_bridge.deploy.driver import HandReading, LinkCounters
 from robotics_bridge.deploy.frames import Frame
@@ -58,10 +59,7 @@ class UdpDriver:
                 f"A hand has 1 to {frames.MOST} joints and at most {frames.MOST} fingers; received {len(joints)} and "
                 f"{len(fingers)}."
             )
-        if not 0 < max_age <= MOST_AGE:
-            raise UsageError(
-                f"The oldest report that is used is above 0 s, at most {MOST_AGE:g} s; received {max_age!r}."
-            )
+        check_number("max_age (s)", max_age, above=0, most=MOST_AGE)
         self.address, self.joints, self.fingers = (address[0] or LOOPBACK, address[1]), joints, fingers
         self.counters = LinkCounters()
         self._key, self._max_age = key, max_age

@@ -8,7 +8,7 @@ from typing import Any
 
 from brainbench.core.devices import pick_device
 from brainbench.core.errors import UsageError, check_name
-from brainbench.core.reading.ranges import check_number
+from brainbench.core.reading.ranges import check_fields
 from robotics_bridge.hands.observations import observation_type
 from robotics_bridge.physics.state import MOST_ENVS
 
@@ -50,7 +50,7 @@ class EnvOptions:
     """
 
     def __post_init__(self) -> None:
-        check_number("num_envs", self.num_envs, least=1, most=MOST_ENVS, whole=True)
+        check_fields(self, "num_envs", least=1, most=MOST_ENVS, whole=True)
         object.__setattr__(self, "engine", self.engine or ("mujoco" if self.device == "cpu" else "warp"))
         check_name("engine", self.engine, ENGINES)
         observation_type(self.observe)

@@ -153,7 +153,6 @@ def record_exploration(
     resolution: str = "med",
     placement: str = "hand",
     noisy: bool = False,
-    twist: float = TWIST,
     frames: int = 110,
     seed: int = 0,
     progress: Progress | None = None,
@@ -166,7 +165,6 @@ def record_exploration(
         hand: Name or file of the hand.
         resolution: Of its taxels, as ``placement``.
         noisy: With the published imperfections of force taxels, drawn by ``seed``.
-        twist: Torsional friction of a taxel (N·m·s); the other parameters are the published ones.
         frames: T, of 9 ms; a procedure is stretched over them.
         progress: Called with (frames done, frames, what).
 
@@ -180,7 +178,7 @@ def record_exploration(
     conditions = [(item, procedure) for item in objects for procedure in chosen]
     world = _World(hand, [item for item, _ in conditions], SUB_STEP_SECONDS * frames)
     grid = TaxelGrid(world.hand, resolution=resolution, placement=placement)
-    sensors = sensors_for("force_torque", grid.layout, noisy=noisy, track=(OBJECT,), twist=twist)
+    sensors = sensors_for("force_torque", grid.layout, noisy=noisy, track=(OBJECT,), twist=TWIST)
     suite = SensorSuite(world.engine.scene, sensors, num_envs=len(conditions), seed=seed)
     felt = []
     for frame in range(frames):
@@ -194,7 +192,7 @@ def record_exploration(
             progress(frame + 1, frames, "exploring")
     several = len(chosen) > 1
     config = {
-        "hand": hand, "resolution": resolution, "placement": placement, "noisy": noisy, "twist": twist,
+        "hand": hand, "resolution": resolution, "placement": placement, "noisy": noisy, "twist": TWIST,
         "frames": frames, "seed": seed,
         "procedures": [procedure.name for procedure in chosen],
         "objects": [

@@ -41,6 +41,4 @@ def load(name_or_path: str | os.PathLike[str]) -> Hand:
     raise unknown_name("hand", name, _OWN, hint="Or give the path of a URDF or MJCF file.")
 
 
-__getattr__, __dir__ = lazy_exports(
-    __name__, {"observations": ".observations.", "scenes": ".scenes.", "surface": ".surface."}
-)
+__getattr__, __dir__ = lazy_exports(__name__)

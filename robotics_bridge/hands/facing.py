@@ -1,4 +1,4 @@
-"""Which side of a link touches: where it goes when fingers flex, or towards the opposite jaw."""
+"""The side of a link that touches: where it goes when fingers flex, or towards the opposite jaw."""
 
 from __future__ import annotations
 

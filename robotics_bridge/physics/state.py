@@ -25,7 +25,7 @@ CROWDED = 2
 UNFELT = 4
 """Bit of :attr:`HandState.status`: a contact pushed a link with taxels of ``total="engine"`` where none felt it."""
 _CONTACT = {"distance": 0.0, "force": float("nan"), "position": 0.0, "normal": 0.0, "friction": 0.0}
-"""What may be told of a contact, and what it is where nobody tells."""
+"""Quantities of a contact, and their values where nobody tells them."""
 MOST_ENVS = 1_000_000
 """Most environments at once; more is a slip of the keys that would fill the memory."""
 

@@ -42,17 +42,4 @@ __all__ = [
     "TemperatureGrid",
 ]
 
-_MODULES = {
-    ".afferents": ("AfferentFilter",),
-    ".audio.microphone": ("Microphone",),
-    ".audio.sensors": ("ActuationAudio", "ContactAudio"),
-    ".elastomer.taxel": ("ElastomerTaxel",),
-    ".fidelity": ("Fidelity",),
-    ".noise.model": ("Noise",),
-    ".probes.placement": ("Probes",),
-    ".probes.sensors": ("ContactDepthProbe", "ContactProbe", "SurfaceDistanceProbe"),
-    ".suite": ("SensorSuite",),
-    ".taxels.sensors": ("KinematicTaxel", "ProximityTaxel"),
-    ".temperature.grid": ("TemperatureGrid",),
-}
-__getattr__, __dir__ = lazy_exports(__name__, {name: path for path, names in _MODULES.items() for name in names})
+__getattr__, __dir__ = lazy_exports(__name__)

@@ -15,7 +15,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.signal import butter, sosfilt_zi
 
-from brainbench.core.errors import UsageError, unknown_name
+from brainbench.core.errors import UsageError, check_name
+from brainbench.core.reading.ranges import check_fields
 
 if TYPE_CHECKING:
     import torch
@@ -39,8 +40,7 @@ class Band:
     def __post_init__(self) -> None:
         if not (0 <= self.low < self.high and math.isfinite(self.high)):
             raise UsageError(f"A band runs from a lower to a higher frequency (Hz); received {self.low}, {self.high}.")
-        if not 1 <= self.order <= 8:
-            raise UsageError(f"The order of a band filter is 1 to 8; received {self.order}.")
+        check_fields(self, "order", least=1, most=8, whole=True)
 
     def sections(self, rate: float) -> np.ndarray:
         """Return the second-order sections [n, 6] at a sample rate (Hz).
@@ -88,8 +88,7 @@ class AfferentFilter:
     ) -> None:
         if not isinstance(bands, Mapping):
             for name in bands:
-                if name not in AFFERENTS:
-                    raise unknown_name("afferent", name, AFFERENTS)
+                check_name("afferent", name, AFFERENTS)
             bands = {name: AFFERENTS[name] for name in bands}
         self.rate, self.bands, self.rectify = rate, dict(bands), rectify
         self._sections = {name: band.sections(rate) for name, band in self.bands.items()}

@@ -11,8 +11,9 @@ from functools import cache
 from pathlib import Path
 from typing import Literal
 
-from brainbench.core.errors import UsageError, unknown_name
+from brainbench.core.errors import check_name
 from brainbench.core.files import read_json
+from brainbench.core.reading.ranges import check_fields
 from brainbench.core.tradeoffs import TradeoffPoint, cheapest
 from robotics_bridge.sensors.sensor import Sensor
 
@@ -36,19 +37,14 @@ class SensorFidelity:
     """Surface points of tracked objects, for proximity and elastomer taxels."""
 
     def __post_init__(self) -> None:
-        if self.query not in ("sdf", "raycast"):
-            raise unknown_name("query", self.query, ("sdf", "raycast"))
-        if not 4 <= self.resolution <= 512 or self.points < 1:
-            raise UsageError(
-                f"A field has 4 to 512 cells and a surface at least one point; received resolution={self.resolution} "
-                f"and points={self.points}."
-            )
+        check_name("query", self.query, ("sdf", "raycast"))
+        check_fields(self, "resolution", least=4, most=512, whole=True)
+        check_fields(self, "points", least=1, whole=True)
 
     @classmethod
     def preset(cls, name: str) -> SensorFidelity:
         """Return ``fast``, ``balanced`` or ``accurate``; an unknown name raises UsageError."""
-        if name not in PRESETS:
-            raise unknown_name("tactile fidelity", name, PRESETS)
+        check_name("tactile fidelity", name, PRESETS)
         return PRESETS[name]
 
     @classmethod

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, ClassVar, Literal, Self
 
 from brainbench.core.errors import UsageError
 from brainbench.core.plugins import load_object
+from brainbench.core.reading.ranges import check_fields
 from robotics_bridge.sensors.noise.model import BASE_KNOBS, PROBE_KNOBS, Noise
 from robotics_bridge.sensors.probes.placement import Probes
 
@@ -60,8 +61,7 @@ class Sensor(abc.ABC):
 
     def __post_init__(self) -> None:
         self.noise.check(self.knobs, type(self).__name__)
-        if self.history < 0:
-            raise UsageError(f"A history holds 0 or more readings; received {self.history}.")
+        check_fields(self, "history", least=0, whole=True)
 
     @abc.abstractmethod
     def layout(self) -> tuple[int, ...]:

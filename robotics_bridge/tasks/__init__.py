@@ -18,4 +18,4 @@ if TYPE_CHECKING:
 
 __all__ = ["Reward", "Task", "forget", "list_tasks", "load", "make", "register"]
 
-__getattr__, __dir__ = lazy_exports(__name__, {"make": "robotics_bridge.envs.env"})
+__getattr__, __dir__ = lazy_exports(__name__)

@@ -1,4 +1,4 @@
-"""How firm contacts are, and how strong the drives that press on them. SI units, radians."""
+"""Firmness of contacts, and strength of the drives that press on them. SI units, radians."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from brainbench.core.errors import UsageError
-from brainbench.core.reading.ranges import check_number
+from brainbench.core.reading.ranges import check_fields
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -30,9 +30,8 @@ class ContactModel:
     alone, so it stays the same; the force of a blocked finger and the blow of a fast one become smaller."""
 
     def __post_init__(self) -> None:
-        for name in ("time_constant", "damping_ratio", "drive_scale"):
-            check_number(f"contacts.{name}", getattr(self, name), above=0)
-        check_number("contacts.substeps", self.substeps, least=1, most=100, whole=True)
+        check_fields(self, "time_constant", "damping_ratio", "drive_scale", above=0, of="contacts.{}")
+        check_fields(self, "substeps", least=1, most=100, whole=True, of="contacts.{}")
         low, high, width = self.impedance
         if not (0 < low <= high < 1 and width > 0):
             raise UsageError(

@@ -35,7 +35,7 @@ CELLS = tuple(
 )
 """Conductivity, emissivity and heat generation of the sixteen cells of figure 4.8."""
 _SPANS = {"x": (-0.22, 0.22), "y": (-0.22, 0.22), "z": (-0.2, 0.05)}
-"""How far the hand can be carried from above the middle of the bin [m]."""
+"""Distance that the hand can be carried from above the middle of the bin [m]."""
 _SITES = tuple((0.13 * (i - 1), 0.13 * (j - 1), -0.13 * (i - 1) * math.sin(TILT)) for i in range(3) for j in range(3))
 
 

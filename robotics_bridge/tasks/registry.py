@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from importlib import import_module
 
-from brainbench.core.errors import UsageError, unknown_name
+from brainbench.core.errors import UsageError, check_name, unknown_name
 from robotics_bridge.tasks.contact_model import CONTACTS
 from robotics_bridge.tasks.task import ACTION_LIMIT, Task
 
@@ -76,6 +76,5 @@ def load(name: str, config: str = "default") -> Task:
     if name not in _MADE:
         hint = "A task of your own: import its file first (or `brainbench policy … --task-file FILE`)."
         raise unknown_name("task", name, list_tasks(), hint=hint)
-    if config not in _MADE[name]:
-        raise unknown_name(f"configuration of task {name}", config, _MADE[name])
+    check_name(f"configuration of task {name}", config, _MADE[name])
     return _MADE[name][config]()

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from brainbench.core.errors import UsageError, check_name
-from brainbench.core.reading.ranges import check_number
+from brainbench.core.reading.ranges import check_fields, check_number
 
 SCHEDULES = ("adaptive", "fixed")
 BOUNDED = "robotics_bridge.policies.training.bounded_ppo:BoundedPPO"
@@ -75,17 +75,13 @@ class TeacherSettings:
                 f"A learning rate lies within its range, and that within {_WIDEST}; received {self.learning_rate!r} "
                 f"and {(low, high)}."
             )
-        for name in ("num_envs", "steps_per_env", "epochs", "minibatches", "rnd_outputs"):
-            check_number(name, getattr(self, name), least=1, whole=True)
-        check_number("iterations", self.iterations, least=0, whole=True)
+        check_fields(self, "num_envs", "steps_per_env", "epochs", "minibatches", "rnd_outputs", least=1, whole=True)
+        check_fields(self, "iterations", least=0, whole=True)
         for width in self.hidden:
             check_number("A width of the hidden layers", width, least=1, most=65_536, whole=True)
-        for name in ("discount", "gae_lambda"):
-            check_number(name, getattr(self, name), least=0, most=1)
-        for name in ("clip", "desired_kl", "max_grad_norm", "initial_std"):
-            check_number(name, getattr(self, name), above=0)
-        for name in ("entropy", "value_loss", "rnd_weight", "rnd_learning_rate"):
-            check_number(name, getattr(self, name), least=0)
+        check_fields(self, "discount", "gae_lambda", least=0, most=1)
+        check_fields(self, "clip", "desired_kl", "max_grad_norm", "initial_std", above=0)
+        check_fields(self, "entropy", "value_loss", "rnd_weight", "rnd_learning_rate", least=0)
         if not 0 < self.std_range[0] <= self.std_range[1] < math.inf:
             raise UsageError(f"std_range is a range of positive numbers; received {self.std_range!r}.")
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 from brainbench.core.errors import UsageError, check_name
-from brainbench.core.reading.ranges import check_number
+from brainbench.core.reading.ranges import check_fields, check_number
 from robotics_bridge.tasks.contact_model import CONTACTS, ContactModel
 from robotics_bridge.tasks.goals import Goal
 from robotics_bridge.tasks.objects import PRIMITIVES, ObjectShape
@@ -231,18 +231,13 @@ class Task:
 
     def __post_init__(self) -> None:
         of = f"of task {self.name!r}"
-        check_number(f"episode (s) {of}", self.episode, above=0)
-        check_number(f"density (kg/m³) {of}", self.density, above=0)
-        check_number(f"copies {of}", self.copies, least=1, whole=True)
-        check_number(f"turn_window {of}", self.turn_window, least=1, whole=True)
-        for name in ("friction", "action_ratio"):
-            check_number(f"{name} {of}", getattr(self, name), least=0)
-        for name in ("position", "velocity"):
-            check_number(f"noise.{name} {of}", getattr(self.noise, name), least=0)
-        for name in ("timestep", "tolerance"):
-            check_number(f"solver.{name} {of}", getattr(self.solver, name), above=0)
-        for name in ("decimation", "iterations", "line_search"):
-            check_number(f"solver.{name} {of}", getattr(self.solver, name), least=1, whole=True)
+        own = f"{{}} {of}"
+        check_fields(self, "episode", "density", "action_limit", above=0, of=own)
+        check_fields(self, "copies", "turn_window", least=1, whole=True, of=own)
+        check_fields(self, "friction", "action_ratio", least=0, of=own)
+        check_fields(self.noise, "position", "velocity", least=0, of=f"noise.{own}")
+        check_fields(self.solver, "timestep", "tolerance", above=0, of=f"solver.{own}")
+        check_fields(self.solver, "decimation", "iterations", "line_search", least=1, whole=True, of=f"solver.{own}")
         least = 2 * self.solver.timestep / self.contacts.substeps
         if self.contacts.time_constant < least:
             raise UsageError(
@@ -253,8 +248,6 @@ class Task:
         check_number(f"object_changes.size {of}", self.object_changes.size[0], above=0)
         for name, reward in self.rewards.items():
             check_number(f"weight of {name!r} {of}", reward.weight)
-        if self.action_limit is not None:
-            check_number(f"action_limit {of}", self.action_limit, above=0)
         if not self.objects:
             raise UsageError(f"Task {self.name!r} needs at least one object.")
         for name, (low, high) in self._ranges().items():

@@ -6,7 +6,7 @@ import pytest
 
 from brainbench.cli.score_text import left_out, score_text
 from brainbench.core.records import Interval, ModelCard
-from brainbench.metrics.inference.multiple import compare_scores
+from brainbench.core.statistics import compare_scores
 from tests.factories.records import draw_board, make_record
 
 

@@ -12,9 +12,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
 
-from brainbench.core.statistics import FEWEST_ANIMALS, FEWEST_STIMULI
+from brainbench.core.statistics import FEWEST_ANIMALS, FEWEST_STIMULI, compare_scores
 from leaderboards import ranking
-from leaderboards.ranking import Sample, compare, lacking, rank_ranges, told_apart
+from leaderboards.ranking import Sample, lacking, rank_ranges, told_apart
 from tests.factories.records import draw_board
 
 
@@ -57,7 +57,7 @@ def test_a_better_model_is_found_with_forty_stimuli():
 
 def test_the_test_is_the_two_factor_t_test():
     one, other = (record.score for record in draw_board({"a": 0.8, "b": 0.4}))
-    found = compare(one, other)
+    found = compare_scores(one, other)
     animals = np.array([a.value - b.value for a, b in zip(one.subjects, other.subjects, strict=True)])
     left_out = np.array(one.without_stimulus) - np.array(other.without_stimulus)
     size, count = len(animals), len(left_out)
@@ -74,14 +74,14 @@ def test_metrics_with_another_chance_are_compared_on_the_common_scale():
     plain = [record.score for record in draw_board({"a": 0.8, "b": 0.4})]
     lifted = [record.score for record in draw_board({"a": 0.8, "b": 0.4}, chance=0.6)]
     assert lifted[0].value == pytest.approx(0.6 + 0.4 * plain[0].value)
-    assert compare(*lifted).difference == pytest.approx(compare(*plain).difference)
-    assert compare(*lifted).p == pytest.approx(compare(*plain).p)
+    assert compare_scores(*lifted).difference == pytest.approx(compare_scores(*plain).difference)
+    assert compare_scores(*lifted).p == pytest.approx(compare_scores(*plain).p)
 
 
 @pytest.mark.parametrize("design", [{"animals": FEWEST_ANIMALS - 1}, {"stimuli": FEWEST_STIMULI - 1}])
 def test_too_few_animals_or_stimuli_are_not_tested(design):
     records = draw_board({"a": 0.9, "b": 0.1}, **design)
-    assert compare(*(record.score for record in records)) is None
+    assert compare_scores(*(record.score for record in records)).verdict == ""
     assert not told_apart([Sample.of([record.score]) for record in records]).any()
 
 
@@ -93,7 +93,7 @@ def test_what_a_design_lacks_is_said():
 
 def test_a_model_does_not_differ_from_itself():
     (record,) = draw_board({"a": 0.8})
-    found = compare(record.score, record.score)
+    found = compare_scores(record.score, record.score)
     assert (found.difference, found.p) == (0.0, 1.0)
 
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from brainbench.cli.destinations import out_folder
+from brainbench.cli.destinations import out_folder, out_folder_option
 from brainbench.cli.options import SCORE, with_options
 from brainbench.cli.output import JsonOption, emit, progress_bar
 from brainbench.core.errors import UsageError
@@ -30,9 +30,7 @@ def hold_out(
     recordings: Annotated[str, typer.Argument(help="An NWB or HDF5 file, a folder, a glob, or 'demo'.")],
     animals: Annotated[int, typer.Option(help="Number of animals to hold back.")] = 0,
     stimuli: Annotated[int, typer.Option(help="Number of stimuli to hold back.")] = 0,
-    out: Annotated[Path, typer.Option("--out", "-o", callback=out_folder, help="Folder of what is published.")] = Path(
-        "board"
-    ),
+    out: Annotated[Path, out_folder_option("Folder of what is published.")] = Path("board"),
     secret: Annotated[
         Path, typer.Option(callback=out_folder, help="Folder of what is kept back; never publish it.")
     ] = Path("held-out-secret"),

@@ -7,15 +7,13 @@ from typing import Annotated
 
 import typer
 
-from brainbench.cli.destinations import out_folder
+from brainbench.cli.destinations import out_folder_option
 from brainbench.cli.output import JsonOption, emit, table_of
 
 
 def reproduce(
     folder: Annotated[Path, typer.Argument(help="Folder with trainings.jsonl and records/.")],
-    out: Annotated[Path, typer.Option("--out", "-o", callback=out_folder, help="Folder of the page.")] = Path(
-        "reproduction"
-    ),
+    out: Annotated[Path, out_folder_option("Folder of the page.")] = Path("reproduction"),
     as_json: JsonOption = False,
 ) -> None:
     """Judge every claim of the published study on a campaign, and write the page with figures 3.3 to 3.8."""

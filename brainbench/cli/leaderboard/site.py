@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from brainbench.cli.destinations import out_file, out_folder
+from brainbench.cli.destinations import out_file_option, out_folder_option
 from brainbench.cli.output import JsonOption, emit, progress_bar, table_of
 
 if TYPE_CHECKING:
@@ -22,9 +22,7 @@ def build(
     records: Annotated[
         list[Path] | None, typer.Argument(help="Record files or folders of them; ./brainbench-results by default.")
     ] = None,
-    out: Annotated[Path, typer.Option("--out", "-o", callback=out_folder, help="Folder of the site.")] = Path(
-        "leaderboard"
-    ),
+    out: Annotated[Path, out_folder_option("Folder of the site.")] = Path("leaderboard"),
     title: Annotated[str, typer.Option(help="Title of the page.")] = "Which networks process touch like a brain?",
     show: Annotated[bool, typer.Option("--open", help="Open the site in a browser.")] = False,
     as_json: JsonOption = False,
@@ -48,9 +46,7 @@ def report(
     records: Annotated[
         list[Path] | None, typer.Argument(help="Record files, folders of them or a built site; ./brainbench-results.")
     ] = None,
-    out: Annotated[
-        Path | None, typer.Option("--out", "-o", callback=out_file, help="File to write; leaderboard-report.FORMAT.")
-    ] = None,
+    out: Annotated[Path | None, out_file_option("File to write; leaderboard-report.FORMAT.")] = None,
     format: Annotated[
         str | None, typer.Option("--format", "-f", help="md, html or pdf; by the suffix of --out, else html.")
     ] = None,

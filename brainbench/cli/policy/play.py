@@ -8,7 +8,7 @@ from typing import Annotated, Any
 
 import typer
 
-from brainbench.cli.destinations import out_file
+from brainbench.cli.destinations import out_file, out_file_option
 from brainbench.cli.options import with_options
 from brainbench.cli.output import JsonOption, emit, facts, progress_bar, table_of
 from brainbench.cli.policy.options import (
@@ -171,9 +171,7 @@ def evaluate(
     change: ChangeOption = None,
     task_file: TaskFileOption = None,
     device: DeviceOption = "cpu",
-    out: Annotated[
-        Path | None, typer.Option("--out", "-o", callback=out_file, help="Write the result as JSON here too.")
-    ] = None,
+    out: Annotated[Path | None, out_file_option("Write the result as JSON here too.")] = None,
     as_json: JsonOption = False,
 ) -> None:
     """Compare agents over whole episodes: success rate with its 95 % interval, and what it does not tell.

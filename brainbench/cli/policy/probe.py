@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
-from brainbench.cli.destinations import out_file
+from brainbench.cli.destinations import out_file_option
 from brainbench.cli.options import with_options
 from brainbench.cli.output import JsonOption, emit, progress_bar, table_of
 from brainbench.cli.policy.options import (
@@ -36,9 +36,7 @@ def probe(
     change: ChangeOption = None,
     task_file: TaskFileOption = None,
     device: DeviceOption = "cpu",
-    out: Annotated[
-        Path | None, typer.Option("--out", "-o", callback=out_file, help="Write the result as JSON here too.")
-    ] = None,
+    out: Annotated[Path | None, out_file_option("Write the result as JSON here too.")] = None,
     as_json: JsonOption = False,
 ) -> None:
     """Read object position, velocity, spin and contact linearly from what encoders make of one rollout's touch.

@@ -8,7 +8,7 @@ from typing import Annotated, Any
 
 import typer
 
-from brainbench.cli.destinations import out_folder
+from brainbench.cli.destinations import out_folder, out_folder_option
 from brainbench.cli.options import part_of, with_options
 from brainbench.cli.output import JsonOption, emit, facts, progress_bar, table
 from brainbench.cli.policy.options import (
@@ -29,10 +29,7 @@ from brainbench.cli.policy.options import (
 def train(
     task: TaskArgument,
     options: Any,
-    out: Annotated[
-        Path | None,
-        typer.Option("--out", "-o", callback=out_folder, help="Folder of the run; started again, it goes on."),
-    ] = None,
+    out: Annotated[Path | None, out_folder_option("Folder of the run; started again, it goes on.")] = None,
     envs: Annotated[int | None, typer.Option("--envs", help="Environments at once (published: 8192).")] = None,
     hand: HandOption = "xhand1",
     config: ConfigOption = "default",

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from brainbench.cli.destinations import out_file
+from brainbench.cli.destinations import out_file_option
 from brainbench.cli.options import numbers
 from brainbench.cli.output import JsonOption, emit, progress_bar
 from brainbench.cli.stimuli import scenes
@@ -18,9 +18,7 @@ from brainbench.stimuli.engines import DEFAULT_ENGINE
 
 def render(
     source: Annotated[str, typer.Argument(help="A recipe name or a scene file (.toml).")],
-    out: Annotated[
-        Path, typer.Option("--out", "-o", callback=out_file, help="File to write: .png for one instant, .mp4 or .gif.")
-    ],
+    out: Annotated[Path, out_file_option("File to write: .png for one instant, .mp4 or .gif.")],
     stimulus: StimulusOption = None,
     at: Annotated[
         float | None, typer.Option(help="Instant of a picture, ms. [default: first full protraction]")
@@ -87,15 +85,7 @@ def render(
 
 def plot(
     source: Annotated[str, typer.Argument(help="A recipe name, a scene file (.toml) or a stimulus-set file (.h5).")],
-    out: Annotated[
-        Path,
-        typer.Option(
-            "--out",
-            "-o",
-            callback=out_file,
-            help="File to write (.png, .svg, .pdf); several stimuli make one file each.",
-        ),
-    ],
+    out: Annotated[Path, out_file_option("File to write (.png, .svg, .pdf); several stimuli make one file each.")],
     channel: Annotated[
         str, typer.Option(help="Fxyz, Mxyz (three components), F, M (magnitude), Fx, Fy, Fz, Mx, My or Mz.")
     ] = "Fxyz",

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from brainbench.cli.destinations import out_file
+from brainbench.cli.destinations import out_file_option
 from brainbench.cli.output import JsonOption, emit, progress_bar, table_of
 
 if TYPE_CHECKING:
@@ -18,9 +18,7 @@ _DISTANCES = {"close": 0.0, "medium": 4e-4, "far": 8e-4}
 
 
 def hand(
-    out: Annotated[
-        Path | None, typer.Option("--out", "-o", callback=out_file, help="Stimulus-set file to write (.h5).")
-    ] = None,
+    out: Annotated[Path | None, out_file_option("Stimulus-set file to write (.h5).")] = None,
     objects: Annotated[
         list[str] | None,
         typer.Option(

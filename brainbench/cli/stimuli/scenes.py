@@ -10,7 +10,7 @@ import typer
 
 from brainbench.cli.options import SCORE, option
 from brainbench.cli.output import JsonOption, emit, table
-from brainbench.core.errors import UsageError, unknown_name
+from brainbench.core.errors import UsageError, check_name
 from brainbench.core.reading.regular import readable
 
 if TYPE_CHECKING:
@@ -72,8 +72,7 @@ def choose_scene(recipe: Recipe, stimulus: str | None) -> Scene:
             f"{recipe.name!r} has {len(recipe.scenes)} scenes and one is drawn at a time; choose with --stimulus "
             f"({', '.join(recipe.labels[:8])}{', …' if len(recipe.labels) > 8 else ''})."
         )
-    if stimulus not in recipe.labels:
-        raise unknown_name("stimulus", stimulus, recipe.labels)
+    check_name("stimulus", stimulus, recipe.labels)
     return recipe.scenes[recipe.labels.index(stimulus)]
 
 
@@ -131,8 +130,7 @@ def _of_file(dataset: xr.Dataset, stimulus: str | None) -> dict[str, Any]:
     scenes = json.loads(dataset.attrs["scene"])
     labels = [scene["label"] for scene in scenes]
     if stimulus is not None:
-        if stimulus not in labels:
-            raise unknown_name("stimulus", stimulus, labels)
+        check_name("stimulus", stimulus, labels)
         scenes = [scenes[labels.index(stimulus)]]
     made = {name: dataset.attrs[name] for name in ("backend", "version", "content_hash")}
     return {

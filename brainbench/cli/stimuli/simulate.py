@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
-from brainbench.cli.destinations import out_file
+from brainbench.cli.destinations import out_file_option
 from brainbench.cli.options import items, numbers
 from brainbench.cli.output import JsonOption, emit, progress_bar, table_of
 from brainbench.cli.stimuli.scenes import BackendOption, FidelityOption, WhiskersOption
@@ -17,9 +17,7 @@ from brainbench.stimuli.engines import DEFAULT_ENGINE
 
 def simulate(
     source: Annotated[str, typer.Argument(help="A recipe name or a scene file (.toml).")],
-    out: Annotated[
-        Path | None, typer.Option("--out", "-o", callback=out_file, help="Stimulus-set file to write (.h5).")
-    ] = None,
+    out: Annotated[Path | None, out_file_option("Stimulus-set file to write (.h5).")] = None,
     whiskers: WhiskersOption = "all",
     fidelity: FidelityOption = "balanced",
     backend: BackendOption = DEFAULT_ENGINE,

@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from brainbench.cli.destinations import out_folder
+from brainbench.cli.destinations import out_folder_option
 from brainbench.cli.options import SchedulerOption, WorkersOption, with_options
 from brainbench.cli.output import JsonOption, emit, facts, progress_bar
 from brainbench.cli.stimuli.scenes import BackendOption, FidelityOption, WhiskersOption
-from brainbench.core.errors import UsageError, unknown_name
+from brainbench.core.errors import UsageError, check_name
 from brainbench.stimuli.engines import DEFAULT_ENGINE
 
 if TYPE_CHECKING:
@@ -39,10 +39,7 @@ def sweep(
             show_default=False,
         ),
     ] = None,
-    out: Annotated[
-        Path | None,
-        typer.Option("--out", "-o", callback=out_folder, help="Simulate, into shards and a manifest in this folder."),
-    ] = None,
+    out: Annotated[Path | None, out_folder_option("Simulate, into shards and a manifest in this folder.")] = None,
     options: Any = None,
     workers: WorkersOption = None,
     scheduler: SchedulerOption = None,
@@ -63,8 +60,7 @@ def sweep(
     from brainbench.stimuli.sweeps.plan import GenerationPlan, GenerationSettings
     from brainbench.stimuli.sweeps.sweep_scenes import GRIDS, SweepScenes, counts
 
-    if grid not in GRIDS:
-        raise unknown_name("sweep grid", grid, GRIDS)
+    check_name("sweep grid", grid, GRIDS)
     if out is None and scheduler is not None:
         raise UsageError("--scheduler simulates, and needs a folder for it: --out.")
     surfaces = get_engine(backend).surfaces

@@ -9,7 +9,7 @@ from typing import Annotated, Any
 
 import typer
 
-from brainbench.cli.destinations import out_file, out_folder
+from brainbench.cli.destinations import out_file_option, out_folder_option
 from brainbench.cli.output import JsonOption, emit, progress_bar, table, table_of
 from brainbench.cli.policy.options import HandOption
 
@@ -24,9 +24,7 @@ def _tracked(items: Sequence[Any], what: str) -> Iterator[Any]:
 
 
 def demo(
-    out: Annotated[Path, typer.Option("--out", "-o", callback=out_folder, help="Folder for the pictures.")] = Path(
-        "tactile-demo"
-    ),
+    out: Annotated[Path, out_folder_option("Folder for the pictures.")] = Path("tactile-demo"),
     hand: HandOption = "xhand1",
     resolution: Annotated[str, typer.Option(help="low, med or high.")] = "high",
     noisy: Annotated[bool, typer.Option("--noisy", help="Draw measured readings with the published noise.")] = False,
@@ -64,9 +62,7 @@ def layouts(
     hand: HandOption = "xhand1",
     probes: Annotated[Path | None, typer.Option(help="Probe file (published JSON form) to show instead.")] = None,
     links: Annotated[bool, typer.Option("--links", help="Also list every link.")] = False,
-    out: Annotated[
-        Path | None, typer.Option("--out", "-o", callback=out_folder, help="Write the layouts as probe files here.")
-    ] = None,
+    out: Annotated[Path | None, out_folder_option("Write the layouts as probe files here.")] = None,
     as_json: JsonOption = False,
 ) -> None:
     """Count the probes of a hand by resolution and placement, as table 4.11 of the thesis does."""
@@ -167,9 +163,7 @@ def check(
 
 def calibrate(
     log: Annotated[Path, typer.Argument(help="CSV with 'time' (s), probes, and optionally 'reference' and 'episode'.")],
-    out: Annotated[
-        Path | None, typer.Option("--out", "-o", callback=out_file, help="Write the preset here (.json).")
-    ] = None,
+    out: Annotated[Path | None, out_file_option("Write the preset here (.json).")] = None,
     max_delay: Annotated[float, typer.Option(help="Longest read delay that is tried (s).")] = 0.5,
     as_json: JsonOption = False,
 ) -> None:

@@ -15,7 +15,7 @@ import numpy as np
 from brainbench.cli.tactile import figures
 from brainbench.core.devices import mujoco_module as mujoco
 from brainbench.core.devices import warp
-from brainbench.core.errors import unknown_name
+from brainbench.core.errors import check_name
 from robotics_bridge import hands, sensors
 from robotics_bridge.hands.scenes import closing, holding
 from robotics_bridge.physics import Geometry, HandState, MujocoEngine, MujocoWarpEngine, TouchScene
@@ -62,8 +62,7 @@ class Grip:
 
     def sensors(self, name: str, resolution: str, placement: str, *, noisy: bool = False) -> dict[str, Any]:
         """Return a sensor of one class on every link of a layout, by link."""
-        if name not in CLASSES:
-            raise unknown_name("sensor class", name, CLASSES)
+        check_name("sensor class", name, CLASSES)
         kind = getattr(sensors, name)
         layout = self.hand.layout(resolution, placement)
         common = {"noise": sensors.Noise.preset(CLASSES[name])} if noisy else {}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import numbers
+from dataclasses import fields
 from typing import Any
 
 from brainbench.core.errors import UsageError, shown
@@ -28,3 +29,15 @@ def check_number(
     raise UsageError(
         f"{name} must be a {'whole' if whole else 'finite'} number{told and ', '}{told}; received {shown(value)}."
     )
+
+
+def check_fields(options: Any, *names: str, of: str = "{}", **bounds: Any) -> None:
+    """Check fields of a dataclass as :func:`check_number` does; None passes where the type of the field allows it.
+
+    Errors call a field by its name in place of the braces of ``of``.
+    """
+    kinds = {field.name: str(field.type) for field in fields(options)}
+    for name in names:
+        value = getattr(options, name)
+        if value is not None or "None" not in kinds[name]:
+            check_number(of.format(name), value, **bounds)

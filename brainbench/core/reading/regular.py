@@ -1,4 +1,4 @@
-"""What may be opened: a regular file of bounded size; and how the failure of a library is told in one sentence."""
+"""Guards of opening: a regular file of bounded size; and how the failure of a library is told in one sentence."""
 
 from __future__ import annotations
 

@@ -1,11 +1,12 @@
-"""Entries of the cache with the hash of what they hold: a damaged one is noticed and made again."""
+"""Entries of the cache: a damaged one is noticed and made again, and a full disk stops no work."""
 
 from __future__ import annotations
 
+import contextlib
 import logging
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,8 +16,29 @@ from brainbench.core.files import atomic_path, file_hash, hash_arrays, write_tex
 from brainbench.core.reading.archives import read_npz
 from brainbench.core.reading.hdf5 import trust_hdf5
 
+T = TypeVar("T")
 _HASH = "sha256"
 _LOG = logging.getLogger(__name__)
+
+
+def read_entry(path: Path, what: str, read: Callable[[Path], T]) -> T | None:
+    """Return what ``read`` makes of an entry of the cache; None without one or, with a warning, for a damaged one."""
+    if not path.is_file():
+        return None
+    try:
+        return read(path)
+    except DataError as error:
+        _LOG.warning("The %s in the cache, %s, is damaged and is made again (%s)", what, path, error)
+        return None
+
+
+@contextlib.contextmanager
+def keeping(what: str) -> Iterator[None]:
+    """Write an entry of the cache; where nothing can be written, a warning says so and work goes on."""
+    try:
+        yield
+    except OSError as error:
+        _LOG.warning("The %s could not be kept in the cache (%s)", what, error)
 
 
 def read_sealed(path: Path, what: str) -> dict[str, NDArray[Any]] | None:
@@ -26,27 +48,22 @@ def read_sealed(path: Path, what: str) -> dict[str, NDArray[Any]] | None:
         path: its file, written by :func:`write_sealed`.
         what: what it holds, for the warning.
     """
-    if not path.exists():
-        return None
-    try:
+
+    def read(path: Path) -> dict[str, NDArray[Any]]:
         arrays: dict[str, NDArray[Any]] = dict(read_npz(path, "entry of the cache"))
         if str(arrays.pop(_HASH, "none")) != hash_arrays(arrays):
             raise DataError("its numbers do not match its hash")
-    except DataError as error:
-        _LOG.warning("The %s in the cache, %s, is damaged and is made again (%s)", what, path, error)
-        return None
-    return arrays
+        return arrays
+
+    return read_entry(path, what, read)
 
 
 def write_sealed(path: Path, what: str, arrays: Mapping[str, Any], *, compress: bool = False) -> None:
     """Keep arrays in the cache, as ``.npz``; where nothing can be written, a warning says so and work goes on."""
     values = {name: np.asarray(value) for name, value in arrays.items()}
-    try:
-        with atomic_path(path) as temporary:
-            sealed: dict[str, Any] = {**values, _HASH: hash_arrays(values)}
-            (np.savez_compressed if compress else np.savez)(temporary, **sealed)
-    except OSError as error:
-        _LOG.warning("The %s could not be kept in the cache (%s)", what, error)
+    with keeping(what), atomic_path(path) as temporary:
+        sealed: dict[str, Any] = {**values, _HASH: hash_arrays(values)}
+        (np.savez_compressed if compress else np.savez)(temporary, **sealed)
 
 
 def seal_file(path: Path) -> None:

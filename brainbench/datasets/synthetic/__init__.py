@@ -38,13 +38,4 @@ __all__ = [
     "write_files",
 ]
 
-_MODULES = {
-    ".animals": ("FAULTS", "SyntheticAnimal", "calibrate", "measure_ceiling", "simulate"),
-    ".rodgers_demo": ("ensure_rodgers_demo", "make_rodgers_demo"),
-    ".design": ("PopulationDesign",),
-    ".populations": ("draw_animals", "stimulus_means"),
-    ".geometry": ("ResponseGeometry",),
-    ".sessions": ("make_sessions", "write_files"),
-    ".truth": ("read_truth",),
-}
-__getattr__, __dir__ = lazy_exports(__name__, {name: module for module, names in _MODULES.items() for name in names})
+__getattr__, __dir__ = lazy_exports(__name__)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from brainbench.core.errors import UsageError
+from brainbench.core.reading.ranges import check_fields
 
 MODULATION = 0.4
 """Largest modulation: beyond it too many rates would be cut off at zero for the truth to hold."""
@@ -45,24 +46,15 @@ class PopulationDesign:
     """Pairs (animal, stimulus) without any trial."""
 
     def __post_init__(self) -> None:
-        for name in ("animals", "sessions", "units"):
-            if getattr(self, name) < 1:
-                raise UsageError(f"A design needs at least one of {name}; received {getattr(self, name)}.")
+        check_fields(self, "animals", "sessions", "units", least=1, whole=True)
         fewest, most = self.trial_range
         if not 1 <= fewest <= most:
             raise UsageError(f"A design needs at least one of trials, fewest before most; received {self.trials}.")
-        for name in ("rate", "window"):
-            if not getattr(self, name) > 0:
-                raise UsageError(f"The {name} of a design is positive; received {getattr(self, name)}.")
-        for name in ("emphasis", "spread", "dispersion", "shared_gain", "session_gain"):
-            if not getattr(self, name) >= 0:
-                raise UsageError(f"The {name} of a design is not negative; received {getattr(self, name)}.")
-        if not 0 <= self.modulation <= MODULATION:
-            raise UsageError(f"The modulation lies between 0 and {MODULATION}; received {self.modulation}.")
-        if not 0 <= self.individual <= 1 or not self.drift > -1:
-            raise UsageError(
-                f"individual lies between 0 and 1 and drift above -1; received {self.individual} and {self.drift}."
-            )
+        check_fields(self, "rate", "window", above=0)
+        check_fields(self, "emphasis", "spread", "dispersion", "shared_gain", "session_gain", least=0)
+        check_fields(self, "modulation", least=0, most=MODULATION)
+        check_fields(self, "individual", least=0, most=1)
+        check_fields(self, "drift", above=-1)
 
     @property
     def trial_range(self) -> tuple[int, int]:

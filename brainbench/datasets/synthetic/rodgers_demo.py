@@ -18,9 +18,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brainbench.core.contracts import check_stimulus_set
-from brainbench.core.errors import DataError, UsageError, listing
+from brainbench.core.errors import DataError, listing
 from brainbench.core.files import content_hash
 from brainbench.core.progress import Progress
+from brainbench.core.reading.ranges import check_number
 from brainbench.datasets.layouts import rodgers
 from brainbench.datasets.synthetic.cache import ensure_recordings
 from brainbench.datasets.synthetic.geometry import ResponseGeometry
@@ -76,8 +77,7 @@ def make_rodgers_demo(
         DataError: the stimuli lack a label or ``contact``, or one never touches a tracked whisker.
         UsageError: fewer than one animal is asked for.
     """
-    if animals < 1:
-        raise UsageError(f"The demo needs at least one animal; received {animals}.")
+    check_number("The number of animals of the demo", animals, least=1, whole=True)
     stimuli = _in_vocabulary_order(check_stimulus_set(stimuli))
     geometry = ResponseGeometry.from_activations(wrench_features(stimuli), rodgers.LABELS)
     contact = stimuli["contact"].transpose("stimulus", "time", "whisker").values.astype(bool)

@@ -6,7 +6,7 @@ import os
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,9 +19,6 @@ from brainbench.datasets.synthetic.geometry import ResponseGeometry
 from brainbench.datasets.synthetic.populations import DrawnSession, PopulationDesign, draw_sessions
 from brainbench.datasets.synthetic.spikes import spike_trains
 from brainbench.datasets.synthetic.truth import SyntheticSession, correlation_rdm, write_synthetic_nwb, write_with_truth
-
-if TYPE_CHECKING:
-    pass
 
 _BEFORE = 0.5
 """From trial start to contact, s."""

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brainbench.core.errors import DataError, UsageError
+from brainbench.core.reading.ranges import check_number
 from brainbench.datasets.sessions import OBSERVED, SPIKES, Session, SessionTable, as_labels, natural_key
 from brainbench.datasets.trials.conditions import Conditions, joined_labels
 from brainbench.datasets.trials.covariates import trial_covariates
@@ -201,8 +202,7 @@ def count(
     if bin is None:
         bounds = edges
     else:
-        if not bin > 0:
-            raise UsageError(f"A bin is a positive number of seconds; received {bin}.")
+        check_number("bin (s)", bin, above=0)
         longest = max([length or 0.0, *span.tolist()])
         # Rounding must not add an empty bin when the length is a whole number of bins.
         number = max(1, math.ceil(longest / bin - 1e-6))

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brainbench.core.errors import DataError, UsageError, shown, unknown_name
-from brainbench.core.reading.ranges import check_number
+from brainbench.core.reading.ranges import check_fields
 from brainbench.datasets.sessions import Session, SessionTable
 
 FIRST_CONTACT = "first-contact"
@@ -52,10 +52,8 @@ class Window:
     def __post_init__(self) -> None:
         if self.stop is None and self.length is None:
             raise UsageError(f"The window from {self.anchor!r} has no end; give stop (an anchor) or length (s).")
-        for name in ("offset", "stop_offset", "shortest_contact"):
-            check_number(f"A window's {name} (s)", getattr(self, name))
-        if self.length is not None:
-            check_number("A window's length (s)", self.length, above=0)
+        check_fields(self, "offset", "stop_offset", "shortest_contact", of="A window's {} (s)")
+        check_fields(self, "length", above=0, of="A window's {} (s)")
         if self.stop == FIRST_CONTACT:
             raise UsageError("A window cannot end at the first contact, which is sought before its end.")
 

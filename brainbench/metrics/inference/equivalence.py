@@ -15,10 +15,16 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from brainbench.core.errors import UsageError
+from brainbench.core.reading.ranges import check_number
 from brainbench.core.records import Interval, Score, Status
-from brainbench.core.statistics import FEWEST_ANIMALS, FEWEST_STIMULI, two_factor_error
-from brainbench.metrics.inference.intervals import two_factor_interval
-from brainbench.metrics.inference.multiple import paired_differences, student_tail
+from brainbench.core.statistics import (
+    FEWEST_ANIMALS,
+    FEWEST_STIMULI,
+    paired_differences,
+    student_tail,
+    two_factor_error,
+    two_factor_interval,
+)
 
 MARGIN = 0.1
 """Difference on the common scale below which model and animals count as alike."""
@@ -70,10 +76,8 @@ def equivalence_test(
     >>> test.verdict, round(test.difference, 3)
     ('equivalent', 0.002)
     """
-    if not margin > 0:
-        raise UsageError(f"An equivalence margin is positive; received {margin}.")
-    if not 0 < alpha < 0.5:
-        raise UsageError(f"alpha lies between 0 and 0.5, such as 0.05; received {alpha}.")
+    check_number("An equivalence margin", margin, above=0)
+    check_number("alpha", alpha, above=0, below=0.5)
     difference, without = (np.asarray(part, dtype=np.float64).ravel() for part in (differences, without_stimulus))
     difference, without = difference[np.isfinite(difference)], without[np.isfinite(without)]
     count = len(difference)

@@ -20,9 +20,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from brainbench.core.errors import UsageError, check_name
-from brainbench.core.records import Interval, Score
-from brainbench.core.statistics import FEWEST_ANIMALS, FEWEST_STIMULI, two_factor_error
-from brainbench.metrics.inference.intervals import two_factor_interval
+from brainbench.core.records import Score
+from brainbench.core.statistics import PairTest, compare_scores
 from brainbench.metrics.inference.permutation import tail_p
 from brainbench.metrics.measures.rsa import RSA, check_layers
 from brainbench.metrics.rdms.comparison import check_comparison
@@ -41,24 +40,6 @@ class ModelTest:
     score: Score
     p_corrected: float
     """P(the best of all models under permuted stimuli scores as high), step-down; NaN where p is."""
-
-
-@dataclass(frozen=True)
-class PairTest:
-    """Two models on the same animals and stimuli."""
-
-    first: str
-    second: str
-    difference: float
-    """The first's value minus the second's, on the common scale."""
-    interval: Interval | None
-    """Interval of the difference, over animals and stimuli."""
-    p: float
-    """Two-sided, by Student's t of the difference over its two-factor standard error."""
-    p_corrected: float
-    """Corrected for the number of pairs."""
-    reason: str = ""
-    """Reason for a missing p; empty otherwise."""
 
 
 @dataclass(frozen=True)
@@ -167,52 +148,3 @@ def adjust(p: ArrayLike, correction: str) -> Floats:
 def check_correction(correction: str) -> None:
     """Raise UsageError with the nearest name unless ``correction`` is known."""
     check_name("correction for multiple tests", correction, CORRECTIONS)
-
-
-def compare_scores(first: Score, second: Score) -> PairTest:
-    """Test the difference of two scores over the animals and the stimuli that both have.
-
-    Fewer than :data:`FEWEST_ANIMALS` animals or :data:`FEWEST_STIMULI` stimuli give no p.
-    """
-    animals, without = paired_differences(first, second)
-    names = first.name, second.name
-    if len(animals) < 2:
-        why = "fewer than two animals have a value for both models"
-        return PairTest(*names, float(animals.mean()) if len(animals) else math.nan, None, math.nan, math.nan, why)
-    difference = float(animals.mean())
-    interval = two_factor_interval(difference, animals, without)
-    stimuli = int(np.isfinite(without).sum())
-    if len(animals) < FEWEST_ANIMALS or stimuli < FEWEST_STIMULI:
-        why = f"{len(animals)} animals and {stimuli} stimuli; at least {FEWEST_ANIMALS} and {FEWEST_STIMULI} are needed"
-        return PairTest(*names, difference, interval, math.nan, math.nan, why)
-    error, freedom = two_factor_error(animals, without)
-    p = 2 * student_tail(abs(difference), float(error), float(freedom))
-    return PairTest(*names, difference, interval, p, math.nan)
-
-
-def paired_differences(first: Score, second: Score) -> tuple[Floats, Floats]:
-    """Return the differences of two scores on the common scale: of animals [A], and without each stimulus [K].
-
-    Animals are those that both could use with status ``ok`` (else with any value).
-    """
-    pairs = []
-    for wanted in (("ok",), ("ok", "unreliable")):
-        one, two = ({s.subject: s.value for s in x.subjects if s.status in wanted} for x in (first, second))
-        pairs = [first.on_scale(one[name]) - second.on_scale(two[name]) for name in sorted(one.keys() & two.keys())]
-        if pairs := [difference for difference in pairs if math.isfinite(difference)]:
-            break
-    without = []
-    if set(first.stimuli) == set(second.stimuli):
-        one, two = (dict(zip(x.stimuli, x.without_stimulus, strict=False)) for x in (first, second))
-        without = [first.on_scale(one[k]) - second.on_scale(two[k]) for k in one.keys() & two.keys()]
-    return np.array(pairs, dtype=np.float64), np.array(without, dtype=np.float64)
-
-
-def student_tail(distance: float, error: float, freedom: float) -> float:
-    """Return P(t ≥ distance/error) with some degrees of freedom."""
-    from scipy.special import stdtr
-
-    # Without spread the t statistic is infinite; the sign of the distance alone decides.
-    if error == 0:
-        return 0.0 if distance > 0 else 1.0 if distance < 0 else 0.5
-    return float(stdtr(freedom, -distance / error))

@@ -23,6 +23,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from brainbench.core.errors import UsageError
+from brainbench.core.reading.ranges import check_fields, check_number
 from brainbench.core.records import Interval
 from brainbench.core.statistics import wilson_interval
 from brainbench.metrics.inference.permutation import SMALLEST_STIMULI, label_orders, smallest_p, tail_p
@@ -73,17 +74,11 @@ class ExperimentDesign:
 
     def __post_init__(self) -> None:
         """Refuse what no experiment can be."""
-        if self.stimuli < 2 or self.animals < 1 or self.layers < 1:
-            raise UsageError(
-                f"A design needs at least 2 stimuli, 1 animal and 1 layer; received {self.stimuli}, {self.animals} and "
-                f"{self.layers}."
-            )
-        if self.dimensions < 1:
-            raise UsageError(f"Representations have at least 1 dimension; received {self.dimensions}.")
-        for name, low, high in (("consistency", 0, 1), ("reliability", 0, 1), ("alpha", 0, 1), ("effect", -1, 1)):
-            value = getattr(self, name)
-            if not low <= value <= high or (name == "alpha" and value in (0, 1)):
-                raise UsageError(f"{name} lies between {low} and {high}; received {value}.")
+        check_fields(self, "stimuli", least=2, whole=True)
+        check_fields(self, "animals", "layers", "dimensions", least=1, whole=True)
+        check_fields(self, "consistency", "reliability", least=0, most=1)
+        check_fields(self, "alpha", above=0, below=1)
+        check_fields(self, "effect", least=-1, most=1)
         if self.effect**2 > self.consistency + 1e-12:
             raise UsageError(
                 f"No model can score {self.effect:g} on animals whose consistency is {self.consistency:g}: "
@@ -112,8 +107,7 @@ def power(design: ExperimentDesign, *, simulations: int = SIMULATIONS, seed: int
     Raises:
         UsageError: no positive number of simulations.
     """
-    if simulations < 1:
-        raise UsageError(f"A power analysis needs at least 1 simulation; received {simulations}.")
+    check_number("The number of simulations", simulations, least=1, whole=True)
     smallest = smallest_p(design.stimuli, RSA.orders)
     if design.stimuli < SMALLEST_STIMULI or smallest > design.alpha:
         reason = f"{design.stimuli} stimuli allow no p below {smallest:.3g}, whatever is true"
@@ -149,8 +143,7 @@ def needed(
     tried = {"stimuli": STIMULUS_COUNTS, "animals": ANIMAL_COUNTS}
     if vary not in tried:
         raise UsageError(f"A power analysis varies 'stimuli' or 'animals'; received {vary!r}.")
-    if not 0 < target < 1:
-        raise UsageError(f"A target power lies between 0 and 1; received {target}.")
+    check_number("The target power", target, above=0, below=1)
     for number in tried[vary]:
         changed = replace(design, **{vary: number})
         if power(changed, simulations=simulations, seed=seed).power >= target:

@@ -38,7 +38,7 @@ class Metric:
     name = ""
     """Name on the command line."""
     title = ""
-    """What is compared, how, and what corrects it for noise, in one line."""
+    """Comparison and its correction for noise, in one line."""
     corrected = False
     """True when values are corrected for noise."""
     comparison = "whitened-cosine"
@@ -63,7 +63,7 @@ class Metric:
     of_model_alone = False
     """True when a comparison says nothing of the animal."""
     reasons: tuple[str, ...] = ()
-    """What a reader of every score must know, in words."""
+    """Remarks for a reader of every score, in words."""
 
     def animal(
         self,

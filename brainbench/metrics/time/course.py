@@ -18,10 +18,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from brainbench.core.errors import UsageError
+from brainbench.core.reading.ranges import check_number
 from brainbench.core.records import Interval
-from brainbench.core.statistics import FEWEST_ANIMALS, FEWEST_STIMULI
+from brainbench.core.statistics import FEWEST_ANIMALS, FEWEST_STIMULI, two_factor_interval
 from brainbench.metrics.arrays import finite_mean
-from brainbench.metrics.inference.intervals import two_factor_interval
 from brainbench.metrics.inference.permutation import tail_p
 from brainbench.metrics.layers import most_chosen
 from brainbench.metrics.rdms.comparison import check_comparison
@@ -76,7 +76,7 @@ class TimeCourse:
     permutations: int
     """Orders of the stimuli, the given one included."""
     reasons: tuple[str, ...] = ()
-    """What a reader must know, in words."""
+    """Remarks for a reader, in words."""
 
 
 def score_over_time(
@@ -159,8 +159,7 @@ def score_over_time(
 def _checked(layers: Mapping[str, ArrayLike], animals: Sequence[AnimalMovie], width: float) -> list[Floats]:
     if not layers or not animals:
         raise UsageError("Scores over time need at least one layer and one animal.")
-    if not width > 0:
-        raise UsageError(f"The bins of a score over time have a positive width; received {width} s.")
+    check_number("The width of the bins of time (s)", width, above=0)
     movies = [np.atleast_2d(rdm_stack(movie, f"The RDMs of layer {name!r}")) for name, movie in layers.items()]
     bins, pairs = animals[0].rdms.shape
     for name, movie in zip(layers, movies, strict=True):

@@ -14,8 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from brainbench.core.records import Interval
+from brainbench.core.statistics import two_factor_interval
 from brainbench.metrics.arrays import finite_mean
-from brainbench.metrics.inference.intervals import two_factor_interval
 from brainbench.metrics.inference.permutation import tail_p
 from brainbench.metrics.rdms.pairs import Floats
 from brainbench.metrics.time.lags import best_lag, votes
@@ -26,7 +26,7 @@ ALPHA = 0.05
 
 @dataclass(frozen=True)
 class LayerLatency:
-    """How far the animals lag behind one layer."""
+    """Lag of the animals behind one layer."""
 
     layer: str
     latency: float

@@ -12,4 +12,4 @@ if TYPE_CHECKING:
 
 __all__ = ["GraphSpec", "TemporalGraph"]
 
-__getattr__, __dir__ = lazy_exports(__name__, {"GraphSpec": ".spec", "TemporalGraph": ".temporal_graph"})
+__getattr__, __dir__ = lazy_exports(__name__)

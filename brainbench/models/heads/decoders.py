@@ -9,6 +9,7 @@ from torch import nn
 from torch.nn import functional
 
 from brainbench.core.errors import UsageError, check_name
+from brainbench.core.reading.ranges import check_number
 from brainbench.models.ops.layers import RECTIFIER_GAIN, Linear, perceptron
 
 CLASSES = 117
@@ -91,6 +92,5 @@ def make_decoder(name: str, features: int, classes: int = CLASSES) -> nn.Module:
         UsageError: there is none of this name, or fewer than two classes.
     """
     check_name("decoder", name, DECODERS)
-    if classes < 2:
-        raise UsageError(f"A decoder needs at least 2 classes; received {classes}.")
+    check_number("The number of classes of a decoder", classes, least=2, whole=True)
     return DECODERS[name](features, classes)

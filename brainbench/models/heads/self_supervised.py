@@ -10,7 +10,7 @@ import torch
 from torch import nn
 
 from brainbench.core.contracts import GRID_SHAPE
-from brainbench.core.errors import UsageError
+from brainbench.core.reading.ranges import check_number
 from brainbench.models.ops.layers import RECTIFIER_GAIN, Linear, perceptron
 
 HIDDEN = 2048
@@ -51,8 +51,7 @@ class AutoencoderHead(nn.Module):
 
     def __init__(self, features: int, *, channels: int = 30, grid: tuple[int, int] = GRID_SHAPE) -> None:
         super().__init__()
-        if channels < 2:
-            raise UsageError(f"The autoencoder reconstructs 2 channels or more; received {channels}.")
+        check_number("The number of channels of an autoencoder", channels, least=2, whole=True)
         self.shape = (channels // 2, *grid)
         self.dense = Linear(features, channels // 2 * grid[0] * grid[1], gain=RECTIFIER_GAIN)
         self.layers = nn.Sequential()

@@ -35,7 +35,7 @@ class ForeignWeights:
 
 @dataclass(frozen=True)
 class Settings:
-    """What the settings of a run say of its network; None where they say nothing."""
+    """Statements of a run's settings about its network; None where they say nothing."""
 
     cell: str | None = None
     """Cell of a Zhuang encoder with ``-ln`` for layer norm; ``time-decay`` without gates."""

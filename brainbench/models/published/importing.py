@@ -33,7 +33,7 @@ class ImportedModel:
 
     folder: Path
     name: str
-    """What :func:`brainbench.load_model` takes: ``local-dir:FOLDER``."""
+    """Name for :func:`brainbench.load_model`: ``local-dir:FOLDER``."""
     architecture: str
     decoder: str | None
     """None: the file has none."""
@@ -41,7 +41,7 @@ class ImportedModel:
     parameters: int
     """Parameters of the network in the file."""
     not_imported: Mapping[str, int]
-    """What is no part of the network → how many entries of the file."""
+    """Part that is not the network's → number of its entries in the file."""
     sha256: str
 
 

@@ -1,4 +1,4 @@
-"""Which architecture the entries of a published file belong to, from their names and shapes alone."""
+"""The architecture that the entries of a published file belong to, from their names and shapes alone."""
 
 from __future__ import annotations
 

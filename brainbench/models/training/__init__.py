@@ -18,7 +18,4 @@ if TYPE_CHECKING:
 
 __all__ = ["ArrayData", "TrainingConfig", "TrainingResult", "train"]
 
-__getattr__, __dir__ = lazy_exports(
-    __name__,
-    {"ArrayData": ".batches", "TrainingConfig": ".config", "TrainingResult": ".trainer", "train": ".trainer"},
-)
+__getattr__, __dir__ = lazy_exports(__name__)

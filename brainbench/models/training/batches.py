@@ -14,7 +14,7 @@ from brainbench.core.errors import UsageError
 
 @dataclass(frozen=True)
 class BatchOptions:
-    """How a split is cut into batches."""
+    """Division of a split into batches."""
 
     batch_size: int = 256
     """Sweeps per batch of all processes."""

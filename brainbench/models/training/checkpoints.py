@@ -25,7 +25,7 @@ PREFIXES = (LOCAL, HUB)
 DTYPES = ("float32", "float16", "bfloat16")
 FOREIGN, SCORED, SETTINGS = "*.ckpt", "val_best.ckpt", "config.yaml"
 foreign_importers: list[Callable[[Path, Path | None], Path]] = []
-"""What makes a model's folder of a foreign file and its settings, if there are any; entered by the package."""
+"""Functions that make a model's folder of a foreign file and its settings, if there are any; entered by the package."""
 
 
 def save_checkpoint(

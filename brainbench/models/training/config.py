@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass, fields, replace
 from typing import Any
 
 from brainbench.core.errors import UsageError, check_name, shown, unknown_name
-from brainbench.core.reading.ranges import check_number
+from brainbench.core.reading.ranges import check_fields, check_number
 from brainbench.models.architecture import OBJECTIVES, Architecture, is_path
 from brainbench.models.recipes import BATCH_SIZE, EPOCHS, recipe_for
 from brainbench.models.training.checkpoints import DTYPES
@@ -80,10 +80,10 @@ class TrainingConfig:
         whole = (("epochs", 1), ("batch_size", 2), ("probe_epochs", 0), ("warmup_epochs", 0), ("seed", 0))
         for name, smallest in whole:
             check_number(name, getattr(self, name), least=smallest, most=2**31 - 1, whole=True)
-        check_number("learning_rate", self.learning_rate, above=0)
-        check_number("clip", self.clip, least=0)
-        check_number("masking", self.masking, least=0, below=1)
-        check_number("checkpoint_seconds", self.checkpoint_seconds, least=0)
+        check_fields(self, "learning_rate", above=0)
+        check_fields(self, "clip", least=0)
+        check_fields(self, "masking", least=0, below=1)
+        check_fields(self, "checkpoint_seconds", least=0)
 
     @classmethod
     def published(cls, model: str, objective: str = "supervised", **changes: Any) -> TrainingConfig:

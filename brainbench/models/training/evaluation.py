@@ -30,7 +30,7 @@ from brainbench.models.recipes import BATCH_SIZE, PROBE
 from brainbench.models.training.optimizers import make_optimizer, rate_factor
 
 RAW, RANDOM, TWIN = CONTROLS = ("raw-input", "random-features", "untrained-twin")
-"""What a network's accuracy is compared with, each read by the linear probe."""
+"""Controls of a network's accuracy, each read by the linear probe."""
 
 SPREAD_LIMIT = 0.01
 """A collapsed network's unit-length features scatter by less than this times what random directions do."""

@@ -11,6 +11,7 @@ from torch import nn
 from torch.optim import Optimizer
 
 from brainbench.core.errors import UsageError, check_name
+from brainbench.core.reading.ranges import check_number
 
 MOMENTUM = 0.9
 WEIGHT_DECAY = 1e-4
@@ -91,8 +92,7 @@ def make_optimizer(name: str, parameters: Iterable[nn.Parameter], learning_rate:
         UsageError: there is no such optimiser, or the rate is not a positive number.
     """
     check_name("optimizer", name, OPTIMIZERS)
-    if not (math.isfinite(learning_rate) and learning_rate > 0):
-        raise UsageError(f"A learning rate must be a positive number; received {learning_rate!r}.")
+    check_number("learning_rate", learning_rate, above=0)
     return OPTIMIZERS[name]([p for p in parameters if p.requires_grad], learning_rate)
 
 

@@ -32,13 +32,4 @@ __all__ = [
     "select_stimuli",
 ]
 
-_MODULES = {
-    ".candidates": ("Candidate", "open_candidates"),
-    ".cheapest": ("find_cheapest",),
-    ".confusion": ("Recovery",),
-    ".design": ("RecoveryDesign",),
-    ".figure": ("plot_confusion",),
-    ".selection": ("select_stimuli",),
-    ".study": ("recover",),
-}
-__getattr__, __dir__ = lazy_exports(__name__, {name: module for module, names in _MODULES.items() for name in names})
+__getattr__, __dir__ = lazy_exports(__name__)

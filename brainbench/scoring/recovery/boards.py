@@ -16,7 +16,8 @@ from typing import Any
 import numpy as np
 
 from brainbench.core.records import Score
-from brainbench.metrics.inference.multiple import adjust, compare_scores
+from brainbench.core.statistics import compare_scores
+from brainbench.metrics.inference.multiple import adjust
 from brainbench.metrics.measures.registry import get_metric
 from brainbench.metrics.rdms.pairs import Ints
 from brainbench.metrics.score import score_layers
@@ -29,7 +30,7 @@ LEVEL = 0.05
 
 @dataclass(frozen=True)
 class RecoveryBoard:
-    """What a recovery keeps of one board."""
+    """Result of one board that a recovery keeps."""
 
     true: int
     """Candidate from which the animals were drawn."""
@@ -111,7 +112,7 @@ def score_board(
 def told_apart(scores: Sequence[Score]) -> Ints:
     """Return [C, C]: 1 where a candidate is told apart above another, −1 below, 0 where they tie.
 
-    By the test of a board (:func:`brainbench.metrics.inference.multiple.compare_scores`: differences of scaled scores
+    By the test of a board (:func:`brainbench.core.statistics.compare_scores`: differences of scaled scores
     over animals and stimuli), false discovery rate 5 % over all pairs.
     """
     result = np.zeros((len(scores), len(scores)), dtype=np.int64)

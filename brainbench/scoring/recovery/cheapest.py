@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 from itertools import product
 from typing import Any
 
-from brainbench.core.errors import UsageError
 from brainbench.core.progress import Progress, track
+from brainbench.core.reading.ranges import check_number
 from brainbench.core.records import Interval
 from brainbench.scoring.recovery.candidates import Candidate
 from brainbench.scoring.recovery.design import RecoveryDesign
@@ -55,8 +55,7 @@ def find_cheapest(
     Raises:
         UsageError: a rate outside (0, 1).
     """
-    if not 0 < wanted < 1:
-        raise UsageError(f"A wanted rate lies between 0 and 1; received {wanted}.")
+    check_number("The wanted rate", wanted, above=0, below=1)
     pool = len(candidates[0].stimuli)
     sizes = [size for size in STIMULI if size < pool] + [pool]
     grid = sorted(product(ANIMALS, UNITS, TRIALS, sizes), key=lambda one: (one[0] * one[2] * one[3], one[1], one[0]))

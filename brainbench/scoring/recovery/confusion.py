@@ -1,4 +1,4 @@
-"""What the boards of a recovery say: how often the true candidate wins, ties and loses, and against whom."""
+"""Summary of the boards of a recovery: how often the true candidate wins, ties and loses, and against whom."""
 
 from __future__ import annotations
 
@@ -107,7 +107,7 @@ class Recovery:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What a reader must know beside the numbers."""
+        """Remarks for a reader, beside the numbers."""
         notes = []
         if self.design.population.animals < FEWEST_ANIMALS or self.stimuli < FEWEST_STIMULI:
             notes.append(

@@ -6,6 +6,7 @@ import re
 from dataclasses import dataclass, field
 
 from brainbench.core.errors import UsageError, shown
+from brainbench.core.reading.ranges import check_fields
 from brainbench.datasets.synthetic.design import PopulationDesign
 
 FEWEST_STIMULI = 4
@@ -40,8 +41,7 @@ class RecoveryDesign:
         for name, fewest in (("splits", 1), ("orders", 40)):
             if getattr(self, name) < fewest:
                 raise UsageError(f"A recovery needs at least {fewest} {name}; received {getattr(self, name)}.")
-        if self.stimuli is not None and self.stimuli < FEWEST_STIMULI:
-            raise UsageError(f"A recovery needs at least {FEWEST_STIMULI} stimuli; received {self.stimuli}.")
+        check_fields(self, "stimuli", least=FEWEST_STIMULI, whole=True)
 
 
 def parse_trials(text: str) -> int | tuple[int, int]:

@@ -14,6 +14,7 @@ from brainbench.core.errors import UsageError
 from brainbench.core.files import content_hash, read_json, read_mapping, to_plain, write_json
 from brainbench.core.jobs import run_jobs
 from brainbench.core.progress import Progress
+from brainbench.core.reading.ranges import check_number
 from brainbench.core.reading.regular import readable
 from brainbench.metrics.measures.registry import get_metric
 from brainbench.scoring.recovery.boards import RecoveryBoard, make_board
@@ -106,8 +107,7 @@ def check_candidates(candidates: Sequence[Candidate], design: RecoveryDesign, bo
     """Raise UsageError for what cannot be run, before any work."""
     if len(candidates) < 2:
         raise UsageError(f"A recovery tells candidates apart and needs at least two; received {len(candidates)}.")
-    if boards < 1:
-        raise UsageError(f"A recovery needs at least one board of each candidate; received {boards}.")
+    check_number("The number of boards", boards, least=1, whole=True)
     pool = len(candidates[0].stimuli)
     if any(item.stimuli != candidates[0].stimuli for item in candidates):
         raise UsageError("The candidates saw different stimuli; run all of them on the same ones in the same order.")

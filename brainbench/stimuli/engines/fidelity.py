@@ -12,7 +12,8 @@ from functools import cache
 from importlib import resources
 from typing import Any, Literal
 
-from brainbench.core.errors import UsageError, shown, unknown_name
+from brainbench.core.errors import UsageError, check_name, shown
+from brainbench.core.reading.ranges import check_fields
 from brainbench.core.tradeoffs import TradeoffPoint, cheapest
 from brainbench.stimuli.engines import DEFAULT_ENGINE
 from brainbench.stimuli.whiskers.chain import Chain
@@ -39,33 +40,24 @@ class Fidelity:
     """``quasistatic`` leaves out inertia and damping: whiskers are in balance at every time step. For slow sweeps; of
     the backends ``rod`` alone knows it, and ``steps_per_period`` means nothing in it."""
     twist: bool | None = field(default=None, metadata={"later": True, "before": False})
-    """Whether whiskers twist about their axis; a whisker that stays in one plane is computed without in any case. None:
-    as the scenes say (:attr:`brainbench.stimuli.scenes.scene.Scene.twist`), where the backend can."""
+    """True lets whiskers twist about their axis; one that stays in one plane is computed without in any case. None: as
+    the scenes say (:attr:`brainbench.stimuli.scenes.scene.Scene.twist`), where the backend can."""
 
     def __post_init__(self) -> None:
-        if not 2 <= self.links <= MOST_LINKS:
-            raise UsageError(f"links must lie between 2 and {MOST_LINKS}; received {shown(self.links)}.")
-        if self.links_per_mm is not None and not (math.isfinite(self.links_per_mm) and self.links_per_mm > 0):
-            raise UsageError(f"links_per_mm must be positive or None; received {self.links_per_mm!r}.")
-        if not 1e-7 <= self.time_step <= 5e-3:
-            raise UsageError(f"time_step must lie between 1e-7 and 5e-3 s; received {self.time_step!r}.")
+        check_fields(self, "links", least=2, most=MOST_LINKS, whole=True)
+        check_fields(self, "links_per_mm", above=0)
+        check_fields(self, "time_step", least=1e-7, most=5e-3, of="{} (s)")
 
         if self.twist not in (None, True, False):
             raise UsageError(f"twist must be True, False or None; received {shown(self.twist)}.")
-        if self.solver not in SOLVERS:
-            raise unknown_name("solver", str(self.solver), SOLVERS)
-        if self.precision not in PRECISIONS:
-            raise unknown_name("precision", str(self.precision), PRECISIONS)
-        if self.steps_per_period is not None and not 4 <= self.steps_per_period <= 1e4:
-            raise UsageError(
-                f"steps_per_period must lie between 4 and 10000, or be None; received {self.steps_per_period!r}."
-            )
+        check_name("solver", self.solver, SOLVERS)
+        check_name("precision", self.precision, PRECISIONS)
+        check_fields(self, "steps_per_period", least=4, most=1e4)
 
     @classmethod
     def preset(cls, name: str) -> Fidelity:
         """Return the preset called ``fast``, ``balanced`` or ``accurate``; any other is a :class:`UsageError`."""
-        if name not in _PRESETS:
-            raise unknown_name("fidelity preset", name, _PRESETS)
+        check_name("fidelity preset", name, _PRESETS)
         return cls(**_PRESETS[name])
 
     @classmethod
@@ -88,8 +80,7 @@ class Fidelity:
         values: dict[str, Any] = {}
         for change in changes:
             name, _, value = (part.strip() for part in change.partition("="))
-            if name not in names:
-                raise unknown_name("fidelity setting", name, names)
+            check_name("fidelity setting", name, names)
             values[name] = _value(name, value)
         name, _, error = (part.strip() for part in preset.partition("="))
         if name == "auto":
@@ -170,7 +161,7 @@ MARGIN = 0.85
 RESOLUTION = ("links", "links_per_mm", "time_step", "steps_per_period")
 """Fields that the measured settings differ in."""
 MOST_LINKS = 100
-"""Links per whisker that are allowed; cost grows with the cube, and error is far below 0.1 % before."""
+"""Links per whisker that are allowed; error is far below 0.1 % before. MuJoCo's cost grows with their square."""
 
 _PRESETS = {
     "fast": {"links": 8, "links_per_mm": 0.25, "time_step": 2e-4, "steps_per_period": 10},
@@ -201,6 +192,5 @@ def measured(backend: str = DEFAULT_ENGINE, share: float = 0.9) -> tuple[Tradeof
             error, cost = (math.inf if point[name] is None else point[name] for name in (SHARES[share], "cost"))
             settings = {name: point.get(name) for name in RESOLUTION}
             found.setdefault(point["backend"], []).append(TradeoffPoint(error / MARGIN, cost, settings))
-    if backend not in found:
-        raise unknown_name("measured backend", backend, found)
+    check_name("measured backend", backend, found)
     return tuple(found[backend])

@@ -1,4 +1,4 @@
-"""How finely a motion must be cut into cubic pieces, and how short the steps through it must be.
+"""Fineness of the cubic pieces that a motion is cut into, and of the steps through them.
 
 Time is divided into cells of :data:`KNOT`. Each is cut into 1, 2, 4 … :data:`MOST_PIECES` equal Hermite pieces until
 these follow the motion: its velocity to :data:`SPEED_ERROR` of the greatest and its position to :data:`PLACE_ERROR`.
@@ -129,7 +129,7 @@ class Cutting:
     stop: float
     step: float
     longest_step: float
-    """Of all whiskers that may share a motion: the last step looks at the pose so far behind ``stop``."""
+    """Longest step of all whiskers that may share a motion: the last step looks at the pose so far behind ``stop``."""
 
     def follicle(self, follicle: Follicle, size: float) -> MotionPieces:
         """Cut the motion of a base whose whisker has the arc length ``size`` (m); errors as :func:`cut`."""

@@ -1,4 +1,4 @@
-"""Whether a whisker stays in one plane: it then bends only, and its joints need no hinge for twist.
+"""Test of whether a whisker stays in one plane: it then bends only, and its joints need no hinge for twist.
 
 That holds when base, forces and objects are mirror images of themselves in a plane through the whisker, and nothing
 moves across it. A curved whisker has one such plane, a straight one has many: those of its loads and of round pegs are

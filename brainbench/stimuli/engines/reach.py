@@ -1,4 +1,4 @@
-"""Which parts or surfaces of the obstacles a whisker could ever touch. A scene costs only what it uses."""
+"""Parts and surfaces of the obstacles that a whisker could ever touch. A scene costs only what it uses."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class Reach:
     nearest: float
     """Least distance of anything touched from the base (m); points at a smaller arc length cannot touch."""
     indices: tuple[int, ...] = ()
-    """Which of all obstacles these are."""
+    """Numbers of these among all obstacles."""
 
     def __bool__(self) -> bool:
         """Return True when anything is within reach."""

@@ -14,7 +14,8 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from brainbench.core.errors import UsageError, unknown_name
+from brainbench.core.errors import UsageError, check_name, unknown_name
+from brainbench.core.reading.ranges import check_fields
 
 Vector = tuple[float, float, float]
 
@@ -50,20 +51,15 @@ class Camera:
     def __post_init__(self) -> None:
         if isinstance(self.view, str) and self.view not in VIEWS:
             raise unknown_name("view", self.view, VIEWS)
-        if self.projection not in PROJECTIONS:
-            raise unknown_name("projection", self.projection, PROJECTIONS)
+        check_name("projection", self.projection, PROJECTIONS)
         for name, value in {"view": self.view, "target": self.target}.items():
             given = None if isinstance(value, str) else value
             if given is not None and (len(given) != 3 or not all(map(math.isfinite, given))):
                 raise UsageError(f"The {name} of a camera is a name or three finite numbers; received {value!r}.")
         if not any(self.view):
             raise UsageError("The view of a camera is a direction; (0, 0, 0) is none.")
-        if self.width is not None and not (math.isfinite(self.width) and self.width > 0):
-            raise UsageError(f"The width of a picture must be positive (m); received {self.width!r}.")
-        if not 0 < self.field_of_view < math.pi:
-            raise UsageError(
-                f"The field of view must lie between 0 and 180° (in rad); received {self.field_of_view!r}."
-            )
+        check_fields(self, "width", above=0, of="{} (m)")
+        check_fields(self, "field_of_view", above=0, below=math.pi, of="{} (rad)")
 
     @property
     def axes(self) -> NDArray[np.float64]:

@@ -14,9 +14,10 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from brainbench.core.errors import UsageError, listing, unknown_name
+from brainbench.core.errors import UsageError, check_name, listing
 from brainbench.core.figures.style import check_format
 from brainbench.core.progress import Progress
+from brainbench.core.reading.ranges import check_fields
 from brainbench.stimuli.engines import DEFAULT_ENGINE
 from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.engines.protocol import WhiskerEngine
@@ -62,22 +63,14 @@ class Style:
     """Frames per second of a film."""
 
     def __post_init__(self) -> None:
-        if self.color not in COLORINGS:
-            raise unknown_name("colouring", self.color, COLORINGS)
-        if self.moment_limit is not None and not (math.isfinite(self.moment_limit) and self.moment_limit > 0):
-            raise UsageError(f"moment_limit must be positive (N·m); received {self.moment_limit!r}.")
-        if not (math.isfinite(self.thickness) and self.thickness > 0):
-            raise UsageError(
-                f"The thickness of whiskers is multiplied by a positive number; received {self.thickness!r}."
-            )
-        if not 0 <= self.opacity <= 1:
-            raise UsageError(f"The opacity of objects lies between 0 and 1; received {self.opacity!r}.")
+        check_name("colouring", self.color, COLORINGS)
+        check_fields(self, "moment_limit", "thickness", above=0)
+        check_fields(self, "opacity", least=0, most=1)
         if len(self.size) != 2 or not all(64 <= value <= 8192 for value in self.size):
             raise UsageError(f"The size of a picture is 64 to 8192 pixels each way; received {self.size!r}.")
         if self.supersampling not in (1, 2, 3, 4):
             raise UsageError(f"supersampling is 1, 2, 3 or 4; received {self.supersampling!r}.")
-        if not 0 < self.frames_per_second <= 120:
-            raise UsageError(f"A film has up to 120 frames per second; received {self.frames_per_second!r}.")
+        check_fields(self, "frames_per_second", above=0, most=120)
 
 
 class Picture:

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brainbench.core.contracts import CHANNELS, GRID_SHAPE, check_stimulus_set
-from brainbench.core.errors import UsageError, unknown_name
+from brainbench.core.errors import UsageError, check_name, unknown_name
 from brainbench.core.figures.style import INK, PALE, check_format, new_figure, save_figure
 from brainbench.stimuli.figures.canvas import round_up
 from brainbench.stimuli.whiskers.selection import ROWS
@@ -90,8 +90,7 @@ def plot(
 
 def check_channel(channel: str) -> None:
     """Raise a :class:`UsageError` unless ``channel`` is one of :data:`QUANTITIES`."""
-    if channel not in QUANTITIES:
-        raise unknown_name("channel", channel, QUANTITIES)
+    check_name("channel", channel, QUANTITIES)
 
 
 def _within(dataset: xr.Dataset, window: tuple[float, float] | None) -> xr.Dataset:

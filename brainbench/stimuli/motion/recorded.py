@@ -25,7 +25,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from brainbench.core.errors import DataError, UsageError, listing, unknown_name
+from brainbench.core.errors import DataError, UsageError, check_name, listing
+from brainbench.core.reading.ranges import check_fields
 from brainbench.core.reading.tables import read_numbers
 from brainbench.stimuli.engines.protocol import base_rotation
 from brainbench.stimuli.motion.hinge_angles import follow_angles
@@ -80,8 +81,7 @@ class Trajectory:
             raise DataError("A trajectory has velocities that are not finite numbers.")
         if len(set(self.names)) < len(self.names):
             raise DataError("A trajectory names a whisker twice.")
-        if not (math.isfinite(self.rate) and self.rate > 0):
-            raise UsageError(f"The rate of a trajectory must be positive (Hz); received {self.rate!r}.")
+        check_fields(self, "rate", above=0)
         velocity.setflags(write=False)
         object.__setattr__(self, "velocity", velocity)
 
@@ -108,8 +108,7 @@ class Trajectory:
         """
         from scipy.spatial.transform import Rotation
 
-        if name not in self.names:
-            raise unknown_name("whisker of the trajectory", name, self.names)
+        check_name("whisker of the trajectory", name, self.names)
         times = np.asarray(times, dtype=float)
         if times.size and (times.min() < 0 or times.max() > self.duration + _TAIL):
             raise UsageError(
@@ -267,8 +266,7 @@ def _names(path: str | os.PathLike[str], lines: int, layout: str | None) -> tupl
                 f"say it with layout=… (lines): {known}."
             )
         return LAYOUTS[fitting[0]]
-    if layout not in LAYOUTS:
-        raise unknown_name("layout of whisker lines", layout, LAYOUTS)
+    check_name("layout of whisker lines", layout, LAYOUTS)
     if layout not in fitting:
         raise DataError(f"{os.fspath(path)!r} has {lines} lines; the layout {layout!r} has {len(LAYOUTS[layout])}.")
     return LAYOUTS[layout]

@@ -35,9 +35,9 @@ DIAGONAL = 0.04
 
 
 MOST_CHARACTERS = 4096
-"""Of the name of an object: as many as a path may have."""
+"""Most characters of the name of an object: as many as a path may have."""
 MOST_MEMBERS = 1_000_000
-"""Of a family, in one data set."""
+"""Most members of a family in one data set."""
 SURFACE = "surface"
 """Stands for ``surfaces`` where shape families are built; other kinds of objects have their default then."""
 

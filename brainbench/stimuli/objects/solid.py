@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -11,8 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from brainbench.core.errors import UsageError
 from brainbench.core.files import content_hash, portable
+from brainbench.core.reading.ranges import check_number
 from brainbench.geometry import Mesh
 from brainbench.stimuli.objects.obstacle import ConvexPart, Part, TriangleMesh, bounds_of
 
@@ -48,8 +47,7 @@ class Solid:
 
     def scaled(self, factor: float) -> Solid:
         """Return the solid scaled about its origin."""
-        if not (math.isfinite(factor) and factor > 0):
-            raise UsageError(f"A solid is scaled by a positive factor; received {factor!r}.")
+        check_number("The scale of a solid", factor, above=0)
         parts = tuple(part.scaled(factor) for part in self.parts)
         surface = self.surface and self.surface.scaled(factor)
         return replace(self, parts=parts, mesh=self.mesh and self.mesh.scaled(factor), surface=surface)

@@ -9,7 +9,8 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from brainbench.core.errors import UsageError, unknown_name
+from brainbench.core.errors import UsageError, check_name
+from brainbench.core.reading.ranges import check_fields
 
 Axes = Literal["world", "follicle"]
 """``world``: axes of the world. ``follicle``: the whisker's base frame, which turns with it: x along the whisker
@@ -69,10 +70,8 @@ class Frames:
             if not isinstance(value, int) or value < 1:
                 raise UsageError(f"{name} of the frames must be a whole number of at least 1; received {value!r}.")
         for name, allowed in (("phase", ("zero", "causal")), ("axes", ("world", "follicle"))):
-            if getattr(self, name) not in allowed:
-                raise unknown_name(f"{name} of the frames", str(getattr(self, name)), allowed)
-        if self.clip is not None and not (math.isfinite(self.clip) and self.clip > 0):
-            raise UsageError(f"clip of the frames must be a positive force in N, or None; received {self.clip!r}.")
+            check_name(f"{name} of the frames", getattr(self, name), allowed)
+        check_fields(self, "clip", above=0, of="{} of the frames (N)")
         if self.lowpass is not None:
             self._check_filter(self.lowpass)
 

@@ -73,7 +73,7 @@ class Scene:
     animal: str = "a"
     """Name of the first animal, whose array, whisking and head stand above; used when there are others."""
     twist: bool = True
-    """Whether whiskers twist when :attr:`Fidelity.twist` leaves it open. False in recipes with shipped recordings or
+    """Twist of whiskers when :attr:`Fidelity.twist` leaves it open. False in recipes with shipped recordings or
     networks, which were made before whiskers could twist."""
 
     def __post_init__(self) -> None:

@@ -40,7 +40,7 @@ from brainbench.stimuli.whiskers.array import WhiskerArray
 
 @dataclass(frozen=True, eq=False)
 class SweepTable:
-    """What is known of the sweeps of a data set; arrays have one entry per sweep.
+    """Facts about the sweeps of a data set; arrays have one entry per sweep.
 
     Raises:
         DataError: sweeps of one object have different labels.

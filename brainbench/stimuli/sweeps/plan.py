@@ -15,7 +15,7 @@ from brainbench import __version__
 from brainbench.core.contracts import SWEEPS_FORMAT, SWEEPS_SCHEMA
 from brainbench.core.errors import UsageError, check_name
 from brainbench.core.files import content_hash, portable, to_plain
-from brainbench.core.reading.ranges import check_number
+from brainbench.core.reading.ranges import check_fields
 from brainbench.stimuli.engines import DEFAULT_ENGINE, PHYSICS_VERSION, get_engine
 from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.objects.collections import NamedObject
@@ -55,12 +55,8 @@ class GenerationSettings:
     def __post_init__(self) -> None:
         object.__setattr__(self, "fidelity", self.fidelity.resolved(get_engine(self.backend).twists))
         check_name("split", self.split, ("object", "sweep"))
-        for name in ("limit", "shard_size"):
-            if (value := getattr(self, name)) is not None:
-                check_number(name, value, least=1, whole=True)
-        check_number("retry, which divides the time step,", self.retry, least=1, whole=True)
-        if self.sample is not None:
-            check_number("sample, a fraction,", self.sample, above=0, most=1)
+        check_fields(self, "limit", "shard_size", "retry", least=1, whole=True)
+        check_fields(self, "sample", above=0, most=1)
         if self.limit is not None and self.sample is not None:
             raise UsageError("Give limit (the first sweeps of each object) or sample (a random fraction), not both.")
 

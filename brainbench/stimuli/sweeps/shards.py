@@ -55,7 +55,7 @@ class PreparedShard:
     reasons: tuple[str, ...]
     """Reason for which an object cannot be used; empty for the others."""
     packed: tuple[Any, ...]
-    """What :meth:`WhiskerEngine.pack` made of the objects, empty when the engine takes no sweeps."""
+    """Result of :meth:`WhiskerEngine.pack` for the objects, empty when the engine takes no sweeps."""
     tables: Mapping[str, NDArray[Any]]
     """The arrays that do not depend on the simulation."""
 

@@ -11,5 +11,4 @@ if TYPE_CHECKING:
 
 __all__ = ["peg", "point_load", "ringdown", "slip_off"]
 
-_MODULES = {".bench_tests": ("peg", "point_load", "ringdown", "slip_off"), ".references.": ("references",)}
-__getattr__, __dir__ = lazy_exports(__name__, {name: module for module, names in _MODULES.items() for name in names})
+__getattr__, __dir__ = lazy_exports(__name__)

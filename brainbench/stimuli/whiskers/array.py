@@ -16,7 +16,7 @@ from importlib import resources
 from typing import Any, Literal
 
 from brainbench.core.contracts import GRID_SHAPE
-from brainbench.core.errors import UsageError, unknown_name
+from brainbench.core.errors import UsageError, check_name, unknown_name
 from brainbench.stimuli.whiskers.selection import match_whiskers
 from brainbench.stimuli.whiskers.whisker import Whisker
 
@@ -92,10 +92,8 @@ class WhiskerArray:
         Raises:
             UsageError: a name is unknown, or the model equations of the mouse are asked for.
         """
-        if species not in SPECIES:
-            raise unknown_name("species", species, SPECIES)
-        if source not in SOURCES:
-            raise unknown_name("source of an array", source, SOURCES)
+        check_name("species", species, SPECIES)
+        check_name("source of an array", source, SOURCES)
         if source == "model" and "model" not in _read(species):
             raise UsageError(
                 f"There are no model equations of the {species} here: those of Bresee et al. (2023) are in no source "
@@ -144,8 +142,7 @@ class WhiskerArray:
 
     def on_side(self, side: Side) -> WhiskerArray:
         """Return the one-sided array on the right, on the left or, mirrored, on both sides (right first)."""
-        if side not in SIDES:
-            raise unknown_name("side", str(side), SIDES)
+        check_name("side", side, SIDES)
         if side == self.side:
             return self
         if self.side == "both":

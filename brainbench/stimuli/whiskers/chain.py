@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from brainbench.core.errors import UsageError
+from brainbench.core.reading.ranges import check_number
 from brainbench.stimuli.whiskers.whisker import Whisker
 
 # Ratio of the radii across a cell from which ``_compliance`` does without its parabola.
@@ -98,8 +98,7 @@ class Chain:
 
 def build_chain(whisker: Whisker, links: int) -> Chain:
     """Cut ``whisker`` into at least two ``links`` of equal arc length."""
-    if links < 2:
-        raise UsageError(f"A whisker needs at least 2 links to bend along its length; received {links}.")
+    check_number("The number of links", links, least=2, whole=True)
     nodes = np.linspace(0.0, whisker.arc_length, links + 1)
     points = whisker.centre_line(nodes)
     chords = np.diff(points, axis=0)

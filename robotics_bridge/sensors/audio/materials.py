@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from brainbench.core.errors import UsageError, unknown_name
+from brainbench.core.reading.ranges import check_fields, check_number
 
 
 @dataclass(frozen=True)
@@ -28,13 +29,9 @@ class ElasticMaterial:
     """Damping of the stiffness [s]."""
 
     def __post_init__(self) -> None:
-        for name in ("young_modulus", "density"):
-            if not (math.isfinite(getattr(self, name)) and getattr(self, name) > 0):
-                raise UsageError(f"The {name} of a material is positive; received {getattr(self, name)!r}.")
-        if not -1 < self.poisson_ratio < 0.49:
-            raise UsageError(f"A Poisson ratio lies between -1 and 0.49 here; received {self.poisson_ratio!r}.")
-        if not (self.alpha >= 0 and self.beta >= 0):
-            raise UsageError(f"Damping is zero or positive; received α {self.alpha!r}, β {self.beta!r}.")
+        check_fields(self, "young_modulus", "density", above=0)
+        check_fields(self, "poisson_ratio", above=-1, below=0.49)
+        check_fields(self, "alpha", "beta", least=0)
 
     def decay(self, frequency: float) -> float:
         """Return the decay rate d = (α + β ω²) / 2 [1/s] of a mode [Hz]."""
@@ -103,8 +100,7 @@ class Modes:
 
     def scaled(self, size: float) -> Modes:
         """Return the modes of a body ``size`` times as large of the same material (decays unchanged)."""
-        if not size > 0:
-            raise UsageError(f"A body is scaled by a positive factor; received {size!r}.")
+        check_number("The scale of a body", size, above=0)
         # Frequencies go with 1 / size, gains with 1 / mass, hence with 1 / size³.
         gain = tuple(value / size**3 for value in self.gain)
         return replace(self, frequency=tuple(value / size for value in self.frequency), gain=gain)

@@ -10,6 +10,7 @@ import torch
 
 from brainbench.core.devices import warp
 from brainbench.core.errors import UsageError
+from brainbench.core.reading.ranges import check_fields
 from robotics_bridge.physics.state import HandState
 from robotics_bridge.sensors.audio.kernels import sound as k
 from robotics_bridge.sensors.audio.sensors import AudioSensor
@@ -40,11 +41,8 @@ class Microphone:
     """Longest distance that is rendered with its full delay [m]; sets the memory."""
 
     def __post_init__(self) -> None:
-        for name in ("speed_of_sound", "nearest", "reach"):
-            if not (math.isfinite(getattr(self, name)) and getattr(self, name) > 0):
-                raise UsageError(f"{name} must be positive; received {getattr(self, name)!r}.")
-        if not (math.isfinite(self.power) and self.power >= 0):
-            raise UsageError(f"power must be zero or positive; received {self.power!r}.")
+        check_fields(self, "speed_of_sound", "nearest", "reach", above=0)
+        check_fields(self, "power", least=0)
 
     def build(self, suite: SensorSuite) -> Listener:
         """Return the listener of a suite; call its ``update`` after the suite's."""

@@ -6,12 +6,11 @@ surface (m/s) when its modes come from :func:`robotics_bridge.sensors.audio.mode
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar, cast
 
 from brainbench.core.devices import warp
-from brainbench.core.errors import UsageError
+from brainbench.core.reading.ranges import check_fields
 from robotics_bridge.sensors.audio.materials import Modes
 from robotics_bridge.sensors.sensor import Sensor
 
@@ -38,8 +37,7 @@ class AudioSensor(Sensor):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.samples < 1:
-            raise UsageError(f"A block holds at least one sample; received {self.samples}.")
+        check_fields(self, "samples", least=1, whole=True)
 
     @property
     def channels(self) -> int:  # type: ignore[override]
@@ -74,9 +72,7 @@ class ContactAudio(AudioSensor):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        for name in ("threshold", "impact", "scrape", "contact_time"):
-            if not (math.isfinite(getattr(self, name)) and getattr(self, name) >= 0):
-                raise UsageError(f"{name} must be zero or positive; received {getattr(self, name)!r}.")
+        check_fields(self, "threshold", "impact", "scrape", "contact_time", least=0)
 
     def layout(self) -> tuple[int, ...]:
         """Return the shape of one emitter."""
@@ -121,11 +117,9 @@ class ActuationAudio(AudioSensor):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.joints < 1 or self.partials < 0:
-            raise UsageError(f"Drives need joints ≥ 1 and partials ≥ 0; received {self.joints} and {self.partials}.")
-        for name in ("load", "power", "pitch", "rolloff", "friction", "hum", "hum_frequency"):
-            if not (math.isfinite(getattr(self, name)) and getattr(self, name) >= 0):
-                raise UsageError(f"{name} must be zero or positive; received {getattr(self, name)!r}.")
+        check_fields(self, "joints", least=1, whole=True)
+        check_fields(self, "partials", least=0, whole=True)
+        check_fields(self, "load", "power", "pitch", "rolloff", "friction", "hum", "hum_frequency", least=0)
 
     def layout(self) -> tuple[int, ...]:
         """Return the shape of one emitter per joint."""

@@ -5,7 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar, Literal
 
-from brainbench.core.errors import UsageError, unknown_name
+from brainbench.core.errors import UsageError, check_name
+from brainbench.core.reading.ranges import check_fields
 from robotics_bridge.sensors.noise.model import TAXEL_KNOBS
 from robotics_bridge.sensors.sensor import QueryRequirements, QuerySensor
 
@@ -37,15 +38,10 @@ class Layer:
     """Half widths (m), along and across, of the clamped frame where the widening vanishes; None means free edges."""
 
     def __post_init__(self) -> None:
-        if not 0 <= self.poisson <= 0.5:
-            raise UsageError(f"A Poisson ratio of a gel lies between 0 and 0.5; received {self.poisson!r}.")
-        if not self.softening > 0 or self.thickness < 0:
-            raise UsageError(
-                f"softening is positive and thickness not negative (m); received {self.softening!r} and "
-                f"{self.thickness!r}."
-            )
-        if not 0 <= self.recoil <= 2:
-            raise UsageError(f"recoil lies between 0 (as published) and 2; received {self.recoil!r}.")
+        check_fields(self, "poisson", least=0, most=0.5)
+        check_fields(self, "softening", above=0)
+        check_fields(self, "thickness", least=0)
+        check_fields(self, "recoil", least=0, most=2)
         if self.frame is not None and not min(self.frame) > 0:
             raise UsageError(f"The half widths of a frame are positive (m); received {self.frame!r}.")
 
@@ -91,8 +87,7 @@ class ElastomerTaxel(QuerySensor):
     def __post_init__(self) -> None:
         super().__post_init__()
         ways = ("auto", "separable", "fft", "direct")
-        if self.dilation not in ways:
-            raise unknown_name("way to sum dilation", self.dilation, ways)
+        check_name("way to sum dilation", self.dilation, ways)
         if self.dilation in ("separable", "fft") and not self.planar:
             raise UsageError(
                 f"dilation={self.dilation!r} needs a regular planar grid (Probes.grid); these probes are "
@@ -100,8 +95,7 @@ class ElastomerTaxel(QuerySensor):
             )
         if self.dilation == "separable" and self.layer and self.layer.recoil:
             raise UsageError("A layer with recoil has no separable dilation; use dilation='auto', 'fft' or 'direct'.")
-        if self.points < 0 or min(self.dilate_spread, self.shear_spread, self.enter, self.leave) < 0:
-            raise UsageError("points, spreads and the thresholds of an elastomer must not be negative.")
+        check_fields(self, "points", "dilate_spread", "shear_spread", "enter", "leave", least=0)
 
     @property
     def planar(self) -> bool:

@@ -15,4 +15,4 @@ if TYPE_CHECKING:
 
 __all__ = ["PRESETS", "Noise", "simulate"]
 
-__getattr__, __dir__ = lazy_exports(__name__, {"simulate": ".stages"})
+__getattr__, __dir__ = lazy_exports(__name__)

@@ -15,8 +15,9 @@ from dataclasses import dataclass, fields
 from typing import Any
 
 from brainbench.core.devices import warp
-from brainbench.core.errors import DataError, UsageError, listing, unknown_name
+from brainbench.core.errors import DataError, UsageError, check_name, listing
 from brainbench.core.files import read_json, to_plain, write_json
+from brainbench.core.reading.ranges import check_fields
 from brainbench.core.reading.regular import readable
 
 BASE_KNOBS = frozenset({"read_delay", "jitter", "white", "bias", "walk", "quantum"})
@@ -73,14 +74,10 @@ class Noise:
             if len(value) != 2 or not (math.isfinite(value[0]) and math.isfinite(value[1]) and value[0] <= value[1]):
                 raise UsageError(f"{name} is a range (low, high) with low ≤ high; received {value!r}.")
             object.__setattr__(self, name, (float(value[0]), float(value[1])))
-        for name in ("read_delay", "jitter", "white", "walk", "quantum", "radius", "hysteresis_tau", "crosstalk_sigma"):
-            if not (math.isfinite(getattr(self, name)) and getattr(self, name) >= 0):
-                raise UsageError(f"{name} must be zero or positive; received {getattr(self, name)!r}.")
-        for name in ("dead_probability", "crosstalk"):
-            if not 0 <= getattr(self, name) <= 1:
-                raise UsageError(f"{name} lies between 0 and 1; received {getattr(self, name)!r}.")
-        if not (math.isfinite(self.bias) and math.isfinite(self.hysteresis)):
-            raise UsageError(f"bias and hysteresis must be finite; received {self.bias!r} and {self.hysteresis!r}.")
+        check_fields(self, "read_delay", "jitter", "white", "walk", "quantum", "radius", least=0)
+        check_fields(self, "hysteresis_tau", "crosstalk_sigma", least=0)
+        check_fields(self, "dead_probability", "crosstalk", least=0, most=1)
+        check_fields(self, "bias", "hysteresis")
         if self.jitter > self.read_delay:
             raise UsageError(
                 f"jitter ({self.jitter:g} s) must not exceed read_delay ({self.read_delay:g} s): "
@@ -159,8 +156,7 @@ class Noise:
         Raises:
             UsageError: there is no preset of this name.
         """
-        if name not in PRESETS:
-            raise unknown_name("noise preset", name, PRESETS)
+        check_name("noise preset", name, PRESETS)
         return PRESETS[name]
 
 

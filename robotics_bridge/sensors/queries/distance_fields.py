@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brainbench.core.devices import warp
-from brainbench.core.errors import UsageError
 from brainbench.core.files import cache_dir
+from brainbench.core.reading.ranges import check_number
 from brainbench.core.reading.sealed import read_sealed, write_sealed
 from brainbench.geometry import Mesh
 from robotics_bridge.sensors.queries.kernels import distance
@@ -42,8 +42,7 @@ def sample_field(mesh: Mesh, resolution: int = 64, device: Any = "cpu") -> Field
     Raises:
         UsageError: the resolution is below 4 or above 512.
     """
-    if not 4 <= resolution <= 512:
-        raise UsageError(f"The resolution of a distance field lies between 4 and 512 cells; received {resolution}.")
+    check_number("The resolution of a distance field (cells)", resolution, least=4, most=512, whole=True)
     low, high = mesh.bounds
     # A margin of a quarter of the box on each side, so that most probes in reach fall within the samples.
     spacing = float((high - low).max()) / resolution

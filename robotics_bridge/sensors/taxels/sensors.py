@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar, Literal, Self
 
-from brainbench.core.errors import UsageError, unknown_name
+from brainbench.core.errors import UsageError, check_name
 from brainbench.core.plugins import load_object
+from brainbench.core.reading.ranges import check_fields
 from robotics_bridge.sensors.noise.model import GRID_KNOBS, TAXEL_KNOBS
 from robotics_bridge.sensors.sensor import Convention, ProbeSensor, QuerySensor
 
@@ -26,8 +26,7 @@ CONVENTIONS = ("physical", "thesis")
 
 def _check_convention(value: str) -> None:
     """Refuse an unknown force convention with UsageError."""
-    if value not in CONVENTIONS:
-        raise unknown_name("force convention", value, CONVENTIONS)
+    check_name("force convention", value, CONVENTIONS)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -86,19 +85,14 @@ class KinematicTaxel(QuerySensor):
     def __post_init__(self) -> None:
         super().__post_init__()
         _check_convention(self.convention)
-        if self.total not in ("law", "engine"):
-            raise unknown_name("total of a force field", self.total, ("law", "engine"))
+        check_name("total of a force field", self.total, ("law", "engine"))
         if self.twist is None:
             radius = float(self.probes.radius.max(initial=0.0))
             published = self.convention == "thesis"
             object.__setattr__(self, "twist", PUBLISHED_TWIST if published else self.shear * radius**2 / 2)
-        if not self.exponent > 0:
-            raise UsageError(f"The exponent of a contact law is positive; received {self.exponent!r}.")
-        if not (self.grip > 0 and (self.friction is None or 0 <= self.friction < math.inf)):
-            raise UsageError(
-                f"friction is a coefficient of 0 or more and grip a positive ratio; received {self.friction!r} and "
-                f"{self.grip!r}."
-            )
+        check_fields(self, "exponent", above=0)
+        check_fields(self, "grip", above=0)
+        check_fields(self, "friction", least=0)
         if self.sticky and self.convention == "thesis":
             raise UsageError("The published law has no friction at rest; leave out friction or convention='thesis'.")
 
@@ -141,5 +135,4 @@ class ProximityTaxel(ProbeSensor):
     def __post_init__(self) -> None:
         super().__post_init__()
         _check_convention(self.convention)
-        if self.points < 1:
-            raise UsageError(f"A proximity taxel needs at least one surface point; received {self.points}.")
+        check_fields(self, "points", least=1, whole=True)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from brainbench.core.errors import UsageError
+from brainbench.core.reading.ranges import check_fields, check_number
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -26,11 +26,8 @@ class Skin:
     """ν."""
 
     def __post_init__(self) -> None:
-        if not (self.thickness > 0 and self.modulus > 0 and 0 <= self.poisson <= 0.49):
-            raise UsageError(
-                "A skin has a positive thickness (m) and modulus (Pa) and a Poisson ratio of 0 to 0.49; received "
-                f"thickness={self.thickness!r}, modulus={self.modulus!r} and poisson={self.poisson!r}."
-            )
+        check_fields(self, "thickness", "modulus", above=0)
+        check_fields(self, "poisson", least=0, most=0.49)
 
     def law(self, area: float) -> dict[str, float]:
         """Return the settings of ``KinematicTaxel`` for taxels that take up an area (m²) each.
@@ -41,8 +38,7 @@ class Skin:
             base = Probes.grid(8, 8, size=(0.014, 0.014), center=(0, 0, -skin.thickness), radius=skin.thickness)
             KinematicTaxel(link="tip", probes=base, **skin.law(0.002**2))
         """
-        if not area > 0:
-            raise UsageError(f"The area of a taxel is positive (m²); received {area!r}.")
+        check_number("area (m²)", area, above=0)
         ratio = (1 - 2 * self.poisson) / (2 * (1 - self.poisson))
         constrained = self.modulus / (2 * (1 + self.poisson) * ratio)
         return {"stiffness": constrained * area / self.thickness, "exponent": 1.0, "damping": 0.0, "grip": ratio}

@@ -16,7 +16,8 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal, cast
 import numpy as np
 
 from brainbench.core.devices import warp
-from brainbench.core.errors import UsageError, unknown_name
+from brainbench.core.errors import UsageError, check_name
+from brainbench.core.reading.ranges import check_fields
 from brainbench.core.rotations import to_matrices
 from robotics_bridge.sensors.sensor import Sensor
 from robotics_bridge.sensors.temperature.materials import ThermalBody, ThermalMaterial, material
@@ -89,14 +90,11 @@ class TemperatureGrid(Sensor):
         if self.low is not None and self.high is not None and not all(a < b for a, b in zip(self.low, self.high)):  # noqa: B905
             raise UsageError(f"The corners of the grid must differ along every axis; received {self.low}, {self.high}.")
         for name in ("convection", "contact_conductance", "tau", "warm_range", "cold_range", "depth_weight"):
-            if not getattr(self, name) >= 0:
+            if not getattr(self, name) >= 0:  # infinite ones mean something
                 raise UsageError(f"{name} must be zero or positive; received {getattr(self, name)!r}.")
-        if not self.contact_radius > 0:
-            raise UsageError(f"contact_radius must be positive (m); received {self.contact_radius!r}.")
-        if not (math.isfinite(self.base_temperature) and math.isfinite(self.ambient_temperature)):
-            raise UsageError("Base and ambient temperature must be finite (°C).")
-        if self.conduction not in ("physical", "thesis"):
-            raise unknown_name("conduction", self.conduction, ("physical", "thesis"))
+        check_fields(self, "contact_radius", above=0)
+        check_fields(self, "base_temperature", "ambient_temperature")
+        check_name("conduction", self.conduction, ("physical", "thesis"))
         if np.shape(self.source) not in ((), tuple(self.cells)):
             raise UsageError(f"source is a number or an array {tuple(self.cells)}; received {np.shape(self.source)}.")
         for body in (*self.bodies.values(), self.other):

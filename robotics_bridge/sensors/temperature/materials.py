@@ -5,7 +5,8 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from brainbench.core.errors import UsageError, unknown_name
+from brainbench.core.errors import UsageError, check_name
+from brainbench.core.reading.ranges import check_fields
 
 
 @dataclass(frozen=True)
@@ -28,8 +29,7 @@ class ThermalMaterial:
         for name in ("conductivity", "density", "specific_heat"):
             if not (math.isfinite(getattr(self, name)) and getattr(self, name) > 0):
                 raise UsageError(f"The {name} of a material is positive; received {getattr(self, name)!r}.")
-        if not 0 <= self.emissivity <= 1:
-            raise UsageError(f"An emissivity lies between 0 and 1; received {self.emissivity!r}.")
+        check_fields(self, "emissivity", least=0, most=1)
 
     @property
     def diffusivity(self) -> float:
@@ -65,8 +65,7 @@ def material(name: str | ThermalMaterial) -> ThermalMaterial:
     """
     if isinstance(name, ThermalMaterial):
         return name
-    if name not in MATERIALS:
-        raise unknown_name("thermal material", name, MATERIALS)
+    check_name("thermal material", name, MATERIALS)
     return MATERIALS[name]
 
 

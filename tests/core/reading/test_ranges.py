@@ -1,9 +1,10 @@
 import math
+from dataclasses import dataclass
 
 import pytest
 
 from brainbench.core.errors import UsageError
-from brainbench.core.reading.ranges import check_number
+from brainbench.core.reading.ranges import check_fields, check_number
 
 
 def test_numbers_within_their_bounds_pass():
@@ -16,3 +17,22 @@ def test_numbers_within_their_bounds_pass():
 def test_whatever_else_is_refused_with_its_name(value):
     with pytest.raises(UsageError, match="epochs"):
         check_number("epochs", value, least=1, most=100, whole=True)
+
+
+@dataclass
+class Options:
+    seed: int | None = 0
+    epochs: int | None = None
+    rate: float = 0.1
+
+
+def test_none_passes_where_the_type_of_a_field_allows_it():
+    check_fields(Options(), "seed", "epochs", least=0, whole=True)
+    with pytest.raises(UsageError, match=r"rate .*received None"):
+        check_fields(Options(rate=None), "rate", above=0)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("wrong", [-1, True, float("nan"), float("inf"), "3", 1.5])
+def test_the_culprit_is_named_with_its_bound(wrong: object):
+    with pytest.raises(UsageError, match="epochs must be a whole number, at least 0; received"):
+        check_fields(Options(epochs=wrong), "seed", "epochs", least=0, whole=True)  # type: ignore[arg-type]

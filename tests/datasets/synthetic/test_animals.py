@@ -65,7 +65,7 @@ def test_the_truth_of_features_is_their_correlation_distance(seed, stimuli, feat
             UsageError,
             "3 stimuli need as many different",
         ),
-        (lambda: PopulationDesign(units=0), UsageError, "at least one of units; received 0"),
+        (lambda: PopulationDesign(units=0), UsageError, "units .*at least 1; received 0"),
         (lambda: PopulationDesign(rate=0.0), UsageError, r"rate .*received 0"),
         (lambda: PopulationDesign(dispersion=-1.0), UsageError, r"dispersion .*received -1"),
         (lambda: PopulationDesign(modulation=0.9), UsageError, r"modulation .*0\.4; received 0\.9"),

@@ -180,7 +180,7 @@ def test_unsuitable_stimuli_are_refused(monkeypatch, tmp_path):
         make_rodgers_demo("unused", stimuli.assign(wrench=stimuli["wrench"] * 0))
     with pytest.raises(DataError, match=r"'concave-far' .*'C0', 'C1'"):
         make_rodgers_demo("unused", stimuli.assign(contact=stimuli["contact"] & (stimuli["stimulus"] != "concave-far")))
-    with pytest.raises(UsageError, match="animal; received 0"):
+    with pytest.raises(UsageError, match=r"animals .*received 0"):
         make_rodgers_demo("unused", stimuli, animals=0)
     assert list(tmp_path.iterdir()) == []
 

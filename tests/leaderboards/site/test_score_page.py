@@ -12,9 +12,9 @@ from typing import Any
 import pytest
 
 from brainbench.core.records import ResultRecord
+from brainbench.core.statistics import compare_scores
 from leaderboards import build_leaderboard, write_report
 from leaderboards import text as words
-from leaderboards.ranking import compare
 from tests.factories.html_page import HOSTILE, Page, poisoned
 from tests.factories.records import draw_board, make_record
 
@@ -90,7 +90,7 @@ def test_report_shows_animals_methods_provenance_and_command(make_record, tmp_pa
 def test_a_report_compares_with_baselines_by_paired_differences(tmp_path):
     (record,) = draw_board({"net": 0.8}, raw=0.2)
     page = report(record, tmp_path)
-    found = compare(record.score, record.baselines["raw input"])
+    found = compare_scores(record.score, record.baselines["raw input"])
     assert f"Above raw input: difference {words.number(found.difference)} {words.span(found.interval)}" in page.text
     assert "above raw input" in page.text
     (weak,) = draw_board({"net": 0.2}, raw=0.2)

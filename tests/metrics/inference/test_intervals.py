@@ -10,8 +10,8 @@ import pytest
 from scipy import stats
 
 from brainbench.core.records import Interval, Score
-from brainbench.core.statistics import two_factor_error
-from brainbench.metrics.inference.intervals import held_to_scale, interval_reasons, two_factor_interval
+from brainbench.core.statistics import two_factor_error, two_factor_interval
+from brainbench.metrics.inference.intervals import held_to_scale, interval_reasons
 from brainbench.metrics.rdms.comparison import compare_all
 from brainbench.metrics.rdms.dissimilarity import rdm
 from brainbench.metrics.rdms.pairs import permuted_pairs

@@ -9,8 +9,9 @@ import pytest
 from scipy import stats
 
 from brainbench.core.errors import UsageError
+from brainbench.core.statistics import compare_scores
 from brainbench.metrics import compare, compare_models, permutation_test
-from brainbench.metrics.inference.multiple import adjust, compare_scores, step_down
+from brainbench.metrics.inference.multiple import adjust, step_down
 from brainbench.metrics.inference.permutation import layer_p, permuted_values
 from brainbench.metrics.measures.rsa import score_rdms
 from tests.factories.animals import STIMULI, make_rdm, make_subject

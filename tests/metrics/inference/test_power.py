@@ -137,10 +137,10 @@ def test_fewer_dimensions_hide_an_effect():
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"stimuli": 1}, "at least 2 stimuli"),
-        ({"reliability": 1.2}, "reliability lies between 0 and 1; received 1.2"),
-        ({"alpha": 0}, "alpha lies between"),
-        ({"dimensions": 0}, "at least 1 dimension; received 0"),
+        ({"stimuli": 1}, "stimuli .*at least 2"),
+        ({"reliability": 1.2}, "reliability .*at most 1; received 1.2"),
+        ({"alpha": 0}, "alpha .*above 0"),
+        ({"dimensions": 0}, "dimensions .*at least 1; received 0"),
         ({"effect": 0.95, "consistency": 0.5}, "bounds it by √consistency = 0.707"),
     ],
 )
@@ -154,7 +154,7 @@ def test_other_misuse_is_told_in_a_sentence():
         needed(ExperimentDesign(), "trials")
     with pytest.raises(UsageError, match="target power"):
         needed(ExperimentDesign(), target=1.0)
-    with pytest.raises(UsageError, match="at least 1 simulation"):
+    with pytest.raises(UsageError, match=r"simulations .*at least 1"):
         power(ExperimentDesign(), simulations=0)
 
 

@@ -18,7 +18,7 @@ def test_shapes():
     assert SimCLRHead(96)(features).shape == (4, 128)
     assert [tuple(item.shape) for item in SimSiamHead(96)(features)] == [(4, 2048), (4, 2048)]
     assert AutoencoderHead(96)(features.view(2, 2, 96)).shape == (2, 2, 30, 5, 7)
-    with pytest.raises(UsageError, match="or more; received 1"):
+    with pytest.raises(UsageError, match=r"channels .*received 1"):
         AutoencoderHead(96, channels=1)
 
 

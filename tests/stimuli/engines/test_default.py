@@ -11,7 +11,8 @@ from brainbench.stimuli.engines import DEFAULT_ENGINE, fidelity, get_engine, lis
 from brainbench.stimuli.figures import scenes
 from brainbench.stimuli.sweeps.plan import GenerationSettings
 from brainbench.stimuli.sweeps.simulation import simulate_sweeps
-from brainbench.stimuli.validation import bench_tests, out_of_plane
+from brainbench.stimuli.validation import bench_tests
+from tests.factories import out_of_plane
 
 ASKED = (
     simulation.simulate, simulation.prepare, load_stimuli, whisker_shapes.record, scenes.render, simulate_sweeps,

@@ -62,7 +62,7 @@ def test_perspective_enlarges_what_is_nearer_by_the_ratio_of_distances():
         ({"view": (0.0, math.nan, 0.0)}, "three finite numbers"),
         ({"projection": "ortographic"}, "did you mean 'orthographic'"),
         ({"width": 0.0}, r"width .*received 0"),
-        ({"field_of_view": 4.0}, "between 0 and 180"),
+        ({"field_of_view": 4.0}, "field_of_view .*above 0"),
         ({"target": (0.0, math.inf, 0.0)}, "target of a camera"),
     ],
 )

@@ -224,7 +224,7 @@ def test_what_is_not_used_does_not_change_the_name_of_a_stimulus():
         ({"lowpass": -1.0}, "positive frequency"),
         ({"phase": "zer"}, "did you mean 'zero'"),
         ({"axes": "head"}, "'head'. Allowed: 'world'"),
-        ({"clip": 0.0}, "positive force in N"),
+        ({"clip": 0.0}, "clip .*above 0"),
         ({"count": 0}, "count of the frames"),
         ({"interval": 0.0}, "interval is positive"),
     ],

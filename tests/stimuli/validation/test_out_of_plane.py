@@ -6,8 +6,8 @@ import pytest
 
 from brainbench.core.errors import UsageError
 from brainbench.stimuli.validation import references
-from brainbench.stimuli.validation.out_of_plane import load_aside, push_aside
 from brainbench.stimuli.whiskers.array import WhiskerArray
+from tests.factories.out_of_plane import load_aside, push_aside
 
 MOUSE, RAT = WhiskerArray.mouse()["C5"].whisker, WhiskerArray.rat()["D4"].whisker
 

@@ -8,8 +8,8 @@ import pytest
 from brainbench.core.errors import UsageError
 from brainbench.stimuli.motion.trajectories import smooth_step
 from brainbench.stimuli.validation import references
-from brainbench.stimuli.validation.shaken_base import base_moment_response, shaken_base
 from brainbench.stimuli.whiskers.whisker import Whisker
+from tests.factories.shaken_base import base_moment_response, shaken_base
 from tests.factories.whiskers import C2, H
 
 ROD = Whisker(0.015, 30e-6, 30e-6, young_modulus=5e9, density=1300.0, damping_ratio=1e-6)

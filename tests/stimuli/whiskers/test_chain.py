@@ -102,7 +102,7 @@ def test_a_step_too_long_to_damp_so_little_is_told():
 
 
 def test_one_link_cannot_bend():
-    with pytest.raises(UsageError, match="at least 2 links"):
+    with pytest.raises(UsageError, match=r"links .*at least 2"):
         build_chain(C2, 1)
 
 

@@ -66,7 +66,7 @@ class ContactNodes:
 
 @wp.struct
 class PressArrays:
-    """What every taxel touches."""
+    """Contact of every taxel."""
 
     weight: wp.array2d(dtype=wp.float32)
     """[B, N] d^α."""

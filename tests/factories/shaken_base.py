@@ -1,8 +1,8 @@
 """A whisker whose base is moved fast, beside an Euler-Bernoulli beam: what a follicle's motion alone makes it feel.
 
-The beam is solved in its modes from finite elements (:func:`.references.beam_matrices`), with the whisker's damping in
-proportion to stiffness; nothing of it comes from the chain of links. Frame as in :mod:`.bench_tests`. Letters: n time,
-f frequency, m mode.
+The beam is solved in its modes from finite elements (``references.beam_matrices``), with the whisker's damping in
+proportion to stiffness; nothing of it comes from the chain of links. Frame as in ``stimuli.validation.bench_tests``.
+Letters: n time, f frequency, m mode.
 """
 
 from __future__ import annotations

@@ -51,7 +51,7 @@ def push_aside(
     backend: str = DEFAULT_ENGINE,
     fidelity: Fidelity | str = "balanced",
 ) -> BenchTest:
-    """Push a whisker out of its plane and compare with the Kirchhoff rod (:mod:`.kirchhoff`).
+    """Push a whisker out of its plane and compare with the Kirchhoff rod (``stimuli.validation.kirchhoff``).
 
     The base stands still. A long frictionless round peg lies in parallel to the whisker's plane and normal to the
     whisker at arc length ``at`` (m). It moves along the plane's normal by ``offset`` (m, positive) from touching the
