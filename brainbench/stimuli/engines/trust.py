@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Protocol, Self, TypeVar
 
@@ -186,7 +186,7 @@ def halved(verdict: Verdict, change: NDArray[np.floating], which: NDArray[np.boo
 
 def force_change(force: NDArray[np.floating], half: NDArray[np.floating]) -> NDArray[np.floating]:
     """Return the difference [row, column] of two forces [row, reading, column, 3] over the larger (rms)."""
-    square = [np.einsum("rtcd,rtcd->rc", x, x) for x in (half - force, force, half)]
+    square = [np.einsum("rtcd,rtcd->rc", x, x, dtype=float) for x in (half - force, force, half)]
     return np.sqrt(square[0] / np.maximum(np.maximum(square[1], square[2]), 1e-30))
 
 
@@ -198,8 +198,12 @@ class Judged(Protocol):
         """Reliability of each whisker."""
         ...
 
+    def picked(self, which: NDArray[np.bool_]) -> Self:
+        """Return the results of some of these whiskers; their steps count for the first who asks."""
+        ...
+
     def replaced(self, which: NDArray[np.bool_], finer: Self) -> Self:
-        """Return the results with these whiskers as another simulation of them gave them."""
+        """Return the results with these whiskers as another simulation of them alone gave them."""
         ...
 
     def compared(self, which: NDArray[np.bool_], half: Self) -> Self:
@@ -207,26 +211,57 @@ class Judged(Protocol):
         ...
 
 
+Try = tuple[NDArray[np.bool_] | None, int]
+"""Whiskers to simulate, all when None, and what divides their steps."""
 Result = TypeVar("Result", bound=Judged)
 
 
-def run_with_retries(simulate: Callable[[NDArray[np.bool_] | None, int], Result], retry: int) -> Result:
+def run_with_retries(simulate: Callable[[Sequence[Try]], Sequence[Result]], retry: int, *, ahead: int = 0) -> Result:
     """Simulate whiskers, and those that finer steps may mend again: with steps over ``retry``, then over twice that.
 
-    After each of these, suspicious whiskers are compared with half the step (:func:`halved`). ``simulate`` is called
-    with which whiskers (all when None) and the divisor. A ``retry`` of 1 leaves all as they are.
+    After each of these, suspicious whiskers are compared with half the step (:func:`halved`). Results do not depend on
+    ``ahead``.
+
+    Args:
+        simulate: gives the results of tries, which may be simulated at the same time; whiskers of a mask are in its
+            order, and alone.
+        retry: 1 leaves all whiskers as they are.
+        ahead: tries with steps over at most ``ahead * retry`` are simulated at once, before it is known which of them
+            are needed. For devices on which further whiskers cost less time than further steps.
     """
-    result = simulate(None, 1)
-    left = np.ones_like(result.verdict.retryable)
-    for finer in (1, retry, 2 * retry) if retry > 1 else ():
+    (result,) = simulate([(None, 1)])
+    if retry == 1:
+        return result
+    known: dict[int, list[tuple[NDArray[np.bool_], Result]]] = {}
+
+    def run(*tries: tuple[NDArray[np.bool_], int]) -> None:
+        for (which, finer), found in zip(tries, simulate(tries), strict=True):
+            known.setdefault(finer, []).append((which, found))
+
+    def parts(which: NDArray[np.bool_], finer: int) -> Iterator[tuple[NDArray[np.bool_], Result]]:
+        """Yield these whiskers in parts with their results; what is not known yet is simulated."""
+        simulated = known.setdefault(finer, [])
+        missing = which & ~np.any([some for some, _ in simulated], axis=0)
+        if missing.any():
+            run((missing, finer))
+        for others, found in simulated:
+            some = which & others
+            if some.any():
+                yield some, found.picked(some[others])
+
+    suspicious = result.verdict.suspicious
+    doubtful = suspicious | result.verdict.retryable
+    wanted = {2: suspicious} | {retry * k: doubtful for k in (1, 2, 4) if k <= ahead}
+    if tries := [(which, finer) for finer, which in wanted.items() if which.any()]:
+        run(*tries)
+    left = np.ones_like(suspicious)
+    for finer in (1, retry, 2 * retry):
         if finer > 1:
             left = result.verdict.retryable.copy()
-            if not left.any():
-                break
-            result = result.replaced(left, simulate(left, finer))
-        suspicious = result.verdict.suspicious & left
-        if suspicious.any():
-            result = result.compared(suspicious, simulate(suspicious, 2 * finer))
+            for some, found in parts(left, finer):
+                result = result.replaced(some, found)
+        for some, half in parts(result.verdict.suspicious & left, 2 * finer):
+            result = result.compared(some, half)
     return result
 
 

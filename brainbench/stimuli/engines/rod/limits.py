@@ -64,6 +64,10 @@ def contacts_for(capacity: int) -> int:
     return CONTACTS[capacity > 12]
 
 
+TRIES_AHEAD = 2
+"""Whiskers that are simulated again on a GPU are so with steps over two, ``retry`` and this times ``retry`` at once. As
+few whiskers take as long as the one with most steps, tries one after the other would wait for one another."""
+
 WARP = 32
 """Threads of a GPU that run in step."""
 

@@ -18,10 +18,10 @@ from brainbench.stimuli.engines.rod.limits import AFTER_OTHERS, WARP, contacts_f
 from brainbench.stimuli.engines.rod.streams import AHEAD, streams_of, turn, wait_for
 
 BUDGET = 4
-"""Steps of a whisker in one slice."""
+"""Steps that a whisker begins in one slice."""
 FEW = 2**14
-"""Whiskers below which a slice is one step: a kernel then takes as long as its slowest thread, and whiskers in contact,
-which need two slices a step, would wait for others' four."""
+"""Whiskers below which one step begins in a slice: a kernel then takes as long as its slowest thread, and whiskers in
+contact, which need two slices a step, would wait for others' four."""
 SMALL = 2**10
 """Whiskers below which a recorded graph is kept as it is: threads without a whisker cost it nothing then."""
 SLICES_PER_CHECK = 8
@@ -49,12 +49,13 @@ class Slices:
 
         Args:
             kernels, capacity, lanes, device: as of the launch.
-            budget: steps of a whisker in one slice; by the number of whiskers when None.
+            budget: steps that a whisker begins in one slice; by the number of whiskers that are left when None.
             recorded: False when a GPU is given kernel after kernel instead of CUDA graphs.
             urgent: True when these go first among all that the GPU could do.
         """
         wp = warp()
         self.kernels, self.device, self.lanes, self.capacity = kernels, device, lanes, capacity
+        self.budget = budget
         self.recorded = device.is_cuda if recorded is None else recorded
         # Distances and contact forces of a slice need not wait for each other.
         self.stream: Any = None
@@ -75,7 +76,6 @@ class Slices:
             link=links,
             **dict.fromkeys(("query", "answer"), self.queries),
         )
-        on.budget = budget or (1 if lanes < FEW else BUDGET)
         queue = np.zeros(queues, dtype=np.int32)
         # All whiskers begin in the queue that waits for nothing.
         queue[AFTER_OTHERS] = np.arange(lanes)
@@ -134,6 +134,7 @@ class Slices:
     def _several(self, inputs: list[Any], left: int, block: int) -> None:
         """Launch some slices for at most ``left`` whiskers."""
         wp, on, device, kernels = warp(), self.struct, self.device, self.kernels
+        on.budget = self.budget or (1 if left < FEW else BUDGET)
         for _ in range(SLICES_PER_CHECK):
             wp.launch(kernels.run, left + 3 * WARP, [*inputs, on], device=device, stream=self.stream, block_dim=block)
             # After an even number of slices both arrays are back in place, so a recorded graph can be repeated.
