@@ -13,6 +13,7 @@ from __future__ import annotations
 import argparse
 import faulthandler
 import io
+import itertools
 import json
 import os
 import resource
@@ -48,6 +49,7 @@ def main() -> None:
     parser.add_argument("--side-by-side", type=int, help="most shards at once on a GPU, of the stages")
     parser.add_argument("--whole", action="store_true", help="of the kernels: few whiskers without slices as well")
     parser.add_argument("--ahead", help="of kernels and stages: tries ahead, several for the kernels by commas")
+    parser.add_argument("--room", help="the same: threads over which few whiskers are spread, 0 for none")
     parser.add_argument("--inside", choices=PARTS, help=argparse.SUPPRESS)
     parser.add_argument("--write", action="store_true", help="write the section of RESULTS.md")
     args = parser.parse_args()
@@ -129,6 +131,7 @@ def kernels(args: argparse.Namespace) -> None:
     from benchmarks.whiskers.throughput import load_objects
     from brainbench.core.files import content_hash
     from brainbench.stimuli import Fidelity
+    from brainbench.stimuli.engines.rod import scheduling
     from brainbench.stimuli.engines.rod.sweeps import SweepLauncher
     from brainbench.stimuli.sweeps.sweep_scenes import GRIDS, SweepScenes
 
@@ -138,8 +141,12 @@ def kernels(args: argparse.Namespace) -> None:
     groups = [(name, scenes.grid.sweeps(name)[: args.limit]) for name in scenes.objects]
     launcher.launch(groups[:1])
     seen, count = _timed_launches(), sum(len(some) for _, some in groups)
-    for ahead in map(int, args.ahead.split(",")) if args.ahead else (launcher.ahead,):
-        launcher.ahead = ahead
+    aheads, rooms = (
+        [int(word) for word in words.split(",")] if words else [usual]
+        for words, usual in ((args.ahead, launcher.ahead), (args.room, scheduling.ROOM))
+    )
+    for launcher.ahead, scheduling.ROOM in itertools.product(aheads, rooms):
+        print(f"ahead {launcher.ahead}, room {scheduling.ROOM:,}")
         seen.clear()
         started = time.perf_counter()
         batch = launcher.trusted(groups, 5)
@@ -153,7 +160,7 @@ def kernels(args: argparse.Namespace) -> None:
         first = seen[0][-1]["kernel"]
         every = sum(spent["kernel"] for *_, spent in seen)
         print(
-            f"kernels {count / first:,.0f} sweeps/s; with whiskers again (ahead {ahead}) {count / every:,.0f}; "
+            f"kernels {count / first:,.0f} sweeps/s; with whiskers again {count / every:,.0f}; "
             f"all {count / seconds:,.0f}; hash {content_hash([batch.wrench, batch.reasons, batch.steps])}",
             flush=True,
         )
@@ -207,12 +214,14 @@ def _timed_launches() -> list[tuple[str, int, int, dict[str, float]]]:
 def stages(args: argparse.Namespace) -> None:
     """Run the command in this process, and print when each shard was where and what its stages took."""
     from brainbench.cli import app
-    from brainbench.stimuli.engines.rod import launch
+    from brainbench.stimuli.engines.rod import launch, scheduling
     from brainbench.stimuli.sweeps import running
 
     seen, moments, lock = _timed_launches(), [], threading.Lock()
     if args.ahead:
         launch.TRIES_AHEAD = int(args.ahead)
+    if args.room:
+        scheduling.ROOM = int(args.room)
     if args.side_by_side:
         running.SIDE_BY_SIDE = args.side_by_side
     totals: dict[str, float] = {}
