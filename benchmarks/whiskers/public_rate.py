@@ -48,7 +48,10 @@ def main() -> None:
     parser.add_argument("--parts", default="command", help=f"of {', '.join(('command', *PARTS))}, by commas")
     parser.add_argument("--side-by-side", type=int, help="most shards at once on a GPU, of the stages")
     parser.add_argument("--whole", action="store_true", help="of the kernels: few whiskers without slices as well")
-    parser.add_argument("--ahead", help="of kernels and stages: tries ahead, several for the kernels by commas")
+    parser.add_argument(
+        "--ahead",
+        help="of kernels and stages: tries ahead as '1:24' (a digit a try); for the kernels several, by commas",
+    )
     parser.add_argument("--room", help="the same: threads over which few whiskers are spread, 0 for none")
     parser.add_argument("--inside", choices=PARTS, help=argparse.SUPPRESS)
     parser.add_argument("--write", action="store_true", help="write the section of RESULTS.md")
@@ -141,10 +144,8 @@ def kernels(args: argparse.Namespace) -> None:
     groups = [(name, scenes.grid.sweeps(name)[: args.limit]) for name in scenes.objects]
     launcher.launch(groups[:1])
     seen, count = _timed_launches(), sum(len(some) for _, some in groups)
-    aheads, rooms = (
-        [int(word) for word in words.split(",")] if words else [usual]
-        for words, usual in ((args.ahead, launcher.ahead), (args.room, scheduling.ROOM))
-    )
+    aheads = [_tries(word) for word in args.ahead.split(",")] if args.ahead else [launcher.ahead]
+    rooms = [int(word) for word in args.room.split(",")] if args.room else [scheduling.ROOM]
     for launcher.ahead, scheduling.ROOM in itertools.product(aheads, rooms):
         print(f"ahead {launcher.ahead}, room {scheduling.ROOM:,}")
         seen.clear()
@@ -166,6 +167,11 @@ def kernels(args: argparse.Namespace) -> None:
         )
     if args.whole:
         _few_at_once(launcher, groups, fidelity, args.device)
+
+
+def _tries(word: str) -> tuple[tuple[int, ...], tuple[int, ...]]:
+    first, then = word.split(":")
+    return tuple(map(int, first)), tuple(map(int, then))
 
 
 def _few_at_once(sliced: Any, groups: Any, fidelity: Any, device: str) -> None:
@@ -214,12 +220,12 @@ def _timed_launches() -> list[tuple[str, int, int, dict[str, float]]]:
 def stages(args: argparse.Namespace) -> None:
     """Run the command in this process, and print when each shard was where and what its stages took."""
     from brainbench.cli import app
-    from brainbench.stimuli.engines.rod import launch, scheduling
+    from brainbench.stimuli.engines.rod import limits, scheduling
     from brainbench.stimuli.sweeps import running
 
     seen, moments, lock = _timed_launches(), [], threading.Lock()
     if args.ahead:
-        launch.TRIES_AHEAD = int(args.ahead)
+        limits.AHEAD[True] = _tries(args.ahead)
     if args.room:
         scheduling.ROOM = int(args.room)
     if args.side_by_side:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Protocol, Self, TypeVar
 
@@ -213,54 +213,61 @@ class Judged(Protocol):
 
 Try = tuple[NDArray[np.bool_] | None, int]
 """Whiskers to simulate, all when None, and what divides their steps."""
+Ahead = tuple[Sequence[int], Sequence[int]]
+"""Multiples of ``retry`` by which steps are divided at once for whiskers in doubt: right after the first simulation,
+and after that with steps over ``retry``."""
+ONE_BY_ONE: Ahead = (), (2,)
+"""Only what is needed: who is in doubt with steps over ``retry`` needs those over twice that, as a half or as a try."""
 Result = TypeVar("Result", bound=Judged)
 
 
-def run_with_retries(simulate: Callable[[Sequence[Try]], Sequence[Result]], retry: int, *, ahead: int = 0) -> Result:
+def run_with_retries(
+    simulate: Callable[[Sequence[Try]], Sequence[Result]], retry: int, *, ahead: Ahead = ONE_BY_ONE
+) -> Result:
     """Simulate whiskers, and those that finer steps may mend again: with steps over ``retry``, then over twice that.
 
-    After each of these, suspicious whiskers are compared with half the step (:func:`halved`). Results do not depend on
-    ``ahead``.
+    After each of these, suspicious whiskers are compared with half the step (:func:`halved`).
 
     Args:
         simulate: gives the results of tries, which may be simulated at the same time; whiskers of a mask are in its
             order, and alone.
         retry: 1 leaves all whiskers as they are.
-        ahead: tries with steps over at most ``ahead * retry`` are simulated at once, before it is known which of them
-            are needed. For devices on which further whiskers cost less time than further steps.
+        ahead: tries that are simulated before it is known whether they are needed, where further whiskers cost less
+            time than further launches. Results do not depend on it.
     """
     (result,) = simulate([(None, 1)])
     if retry == 1:
         return result
     known: dict[int, list[tuple[NDArray[np.bool_], Result]]] = {}
 
-    def run(*tries: tuple[NDArray[np.bool_], int]) -> None:
-        for (which, finer), found in zip(tries, simulate(tries), strict=True):
-            known.setdefault(finer, []).append((which, found))
+    def run(wanted: Mapping[int, NDArray[np.bool_]]) -> None:
+        """Simulate whiskers, by what divides their steps, unless that was done before."""
+        tries = []
+        for finer, which in wanted.items():
+            missing = which & ~np.any([some for some, _ in known.setdefault(finer, [])], axis=0)
+            if missing.any():
+                tries.append((missing, finer))
+        for (which, finer), found in zip(tries, simulate(tries) if tries else (), strict=True):
+            known[finer].append((which, found))
 
     def parts(which: NDArray[np.bool_], finer: int) -> Iterator[tuple[NDArray[np.bool_], Result]]:
-        """Yield these whiskers in parts with their results; what is not known yet is simulated."""
-        simulated = known.setdefault(finer, [])
-        missing = which & ~np.any([some for some, _ in simulated], axis=0)
-        if missing.any():
-            run((missing, finer))
-        for others, found in simulated:
-            some = which & others
+        """Yield these whiskers in parts with their results."""
+        for simulated, found in known[finer]:
+            some = which & simulated
             if some.any():
-                yield some, found.picked(some[others])
+                yield some, found.picked(some[simulated])
 
-    suspicious = result.verdict.suspicious
-    doubtful = suspicious | result.verdict.retryable
-    wanted = {2: suspicious} | {retry * k: doubtful for k in (1, 2, 4) if k <= ahead}
-    if tries := [(which, finer) for finer, which in wanted.items() if which.any()]:
-        run(*tries)
-    left = np.ones_like(suspicious)
-    for finer in (1, retry, 2 * retry):
+    left = np.ones_like(result.verdict.retryable)
+    for finer, multiples in ((1, ahead[0]), (retry, ahead[1]), (2 * retry, ())):
         if finer > 1:
             left = result.verdict.retryable.copy()
+            run({finer: left})
             for some, found in parts(left, finer):
                 result = result.replaced(some, found)
-        for some, half in parts(result.verdict.suspicious & left, 2 * finer):
+        suspicious = result.verdict.suspicious & left
+        doubtful = suspicious | result.verdict.retryable
+        run({2 * finer: suspicious} | {retry * k: doubtful for k in multiples})
+        for some, half in parts(suspicious, 2 * finer):
             result = result.compared(some, half)
     return result
 

@@ -21,8 +21,8 @@ from brainbench.stimuli.engines.planarity import stays_in_plane
 from brainbench.stimuli.engines.protocol import Job, Progress, Trace, WhiskerEngine
 from brainbench.stimuli.engines.reach import Reach, reachable
 from brainbench.stimuli.engines.rod.compilation import load_kernels
-from brainbench.stimuli.engines.rod.launch import LaunchResult, WhiskerSolver, real_type, tries_ahead
-from brainbench.stimuli.engines.rod.limits import FINEST, WIDEST
+from brainbench.stimuli.engines.rod.launch import LaunchResult, WhiskerSolver, real_type
+from brainbench.stimuli.engines.rod.limits import AHEAD, FINEST, WIDEST
 from brainbench.stimuli.engines.rod.packing import (
     GRID,
     PackedJobs,
@@ -209,7 +209,7 @@ def _simulate_alike(
         np.add.at(seconds, rows, spent / len(rows))
         return result.split(counts)
 
-    result = run_with_retries(launch, retry, ahead=tries_ahead(device))
+    result = run_with_retries(launch, retry, ahead=AHEAD[device.is_cuda])
     found = (_trace(result, row, task.job, fidelity, seconds[row]) for row, task in enumerate(given))
     return dict(zip(tasks, found, strict=True))
 

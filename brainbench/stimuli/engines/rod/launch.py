@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from brainbench.core.devices import to_struct, warp
 from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.engines.rod.compilation import load_kernels
-from brainbench.stimuli.engines.rod.limits import FINEST, LIGHT, LONGEST_SPAN, TRIES_AHEAD
+from brainbench.stimuli.engines.rod.limits import FINEST, LIGHT, LONGEST_SPAN
 from brainbench.stimuli.engines.rod.packing import PackedJobs, PackedMotions, capacity_for, pack_chains
 from brainbench.stimuli.engines.rod.scheduling import Slices, allocate, make_problems
 from brainbench.stimuli.engines.rod.shapes import PackedShapes
@@ -249,11 +249,6 @@ class WhiskerSolver:
             forces = found["contact_wrench"].astype(float)
             result.contact_wrench = np.moveaxis(forces, 2, 0).reshape(count, frames, 6)
         return result
-
-
-def tries_ahead(device: Any) -> int:
-    """Return ``ahead`` of :func:`brainbench.stimuli.engines.trust.run_with_retries` for a device."""
-    return TRIES_AHEAD if device.is_cuda else 0
 
 
 def real_type(fidelity: Fidelity) -> type:

@@ -20,8 +20,8 @@ from brainbench.core.errors import UsageError
 from brainbench.core.rotations import euler_matrix, from_matrices
 from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.engines.protocol import base_rotation
-from brainbench.stimuli.engines.rod.launch import LaunchResult, WhiskerSolver, tries_ahead
-from brainbench.stimuli.engines.rod.limits import MESHES, WIDEST
+from brainbench.stimuli.engines.rod.launch import LaunchResult, WhiskerSolver
+from brainbench.stimuli.engines.rod.limits import AHEAD, MESHES, WIDEST
 from brainbench.stimuli.engines.rod.packing import PackedJobs, PackedMotions, still_knots
 from brainbench.stimuli.engines.rod.shapes import PackedShapes, PackedSurface
 from brainbench.stimuli.engines.sweep_batch import SweepBatch, describe_unstable, join_batches
@@ -62,7 +62,7 @@ class SweepLauncher:
         sliced = bool(against == MESHES and self.device.is_cuda) if sliced is None else sliced
         bounds = bounds or (SLICED_BOUNDS if sliced else BOUNDS)
         self.scenes, self.grid = scenes, grid
-        self.ahead = tries_ahead(self.device)
+        self.ahead = AHEAD[self.device.is_cuda]
         """As in :func:`brainbench.stimuli.engines.trust.run_with_retries`."""
         self.seconds: dict[str, float] = {}
         """Elapsed time of the last launch for placing objects, uploading, and computing."""
