@@ -154,7 +154,8 @@ def kernels(args: argparse.Namespace) -> None:
         seconds = time.perf_counter() - started
         for steps, whiskers, slices, spent in seen:
             print(
-                f"{count:,} sweeps, steps / {steps}: {whiskers:,} whiskers, {slices:,} slices, "
+                f"{count:,} sweeps, steps / {steps}: {whiskers:,} whiskers, {slices:,} slices"
+                f" of {1e3 * spent['kernel'] / max(slices, 1):.3f} ms, "
                 + ", ".join(f"{name} {each:.2f} s" for name, each in spent.items()),
                 flush=True,
             )
