@@ -13,6 +13,7 @@ from __future__ import annotations
 import argparse
 import faulthandler
 import io
+import itertools
 import json
 import os
 import resource
@@ -47,6 +48,11 @@ def main() -> None:
     parser.add_argument("--parts", default="command", help=f"of {', '.join(('command', *PARTS))}, by commas")
     parser.add_argument("--side-by-side", type=int, help="most shards at once on a GPU, of the stages")
     parser.add_argument("--whole", action="store_true", help="of the kernels: few whiskers without slices as well")
+    parser.add_argument(
+        "--ahead",
+        help="of kernels and stages: tries ahead as '1:24' (a digit a try); for the kernels several, by commas",
+    )
+    parser.add_argument("--room", help="the same: threads over which few whiskers are spread, 0 for none")
     parser.add_argument("--inside", choices=PARTS, help=argparse.SUPPRESS)
     parser.add_argument("--write", action="store_true", help="write the section of RESULTS.md")
     args = parser.parse_args()
@@ -126,8 +132,9 @@ def processor_seconds() -> float:
 def kernels(args: argparse.Namespace) -> None:
     """Print the rate of the kernels: all sweeps in one launch, then those that are simulated again."""
     from benchmarks.whiskers.throughput import load_objects
-    from brainbench.core.devices import warp
+    from brainbench.core.files import content_hash
     from brainbench.stimuli import Fidelity
+    from brainbench.stimuli.engines.rod import scheduling
     from brainbench.stimuli.engines.rod.sweeps import SweepLauncher
     from brainbench.stimuli.sweeps.sweep_scenes import GRIDS, SweepScenes
 
@@ -136,27 +143,36 @@ def kernels(args: argparse.Namespace) -> None:
     launcher = SweepLauncher(scenes, fidelity, args.device)
     groups = [(name, scenes.grid.sweeps(name)[: args.limit]) for name in scenes.objects]
     launcher.launch(groups[:1])
-    seen = _timed_launches()
-    started = time.perf_counter()
-    launcher.trusted(groups, 5)
-    warp().synchronize_device(launcher.device)
-    seconds = time.perf_counter() - started
-    count = sum(len(some) for _, some in groups)
-    for finer, whiskers, slices, spent in seen:
+    seen, count = _timed_launches(), sum(len(some) for _, some in groups)
+    aheads = [_tries(word) for word in args.ahead.split(",")] if args.ahead else [launcher.ahead]
+    rooms = [int(word) for word in args.room.split(",")] if args.room else [scheduling.ROOM]
+    for launcher.ahead, scheduling.ROOM in itertools.product(aheads, rooms):
+        print(f"ahead {launcher.ahead}, room {scheduling.ROOM:,}")
+        seen.clear()
+        started = time.perf_counter()
+        batch = launcher.trusted(groups, 5)
+        seconds = time.perf_counter() - started
+        for steps, whiskers, slices, spent in seen:
+            print(
+                f"{count:,} sweeps, steps / {steps}: {whiskers:,} whiskers, {slices:,} slices"
+                f" of {1e3 * spent['kernel'] / max(slices, 1):.3f} ms, "
+                + ", ".join(f"{name} {each:.2f} s" for name, each in spent.items()),
+                flush=True,
+            )
+        first = seen[0][-1]["kernel"]
+        every = sum(spent["kernel"] for *_, spent in seen)
         print(
-            f"{count:,} sweeps, steps / {finer}: {whiskers:,} whiskers, {slices:,} slices, "
-            + ", ".join(f"{name} {each:.2f} s" for name, each in spent.items()),
+            f"kernels {count / first:,.0f} sweeps/s; with whiskers again {count / every:,.0f}; "
+            f"all {count / seconds:,.0f}; hash {content_hash([batch.wrench, batch.reasons, batch.steps])}",
             flush=True,
         )
-    first = seen[0][-1]["kernel"]
-    every = sum(spent["kernel"] for *_, spent in seen)
-    print(
-        f"kernels {count / first:,.0f} sweeps/s; with whiskers again, one launch after the other, "
-        f"{count / every:,.0f}; all {count / seconds:,.0f}",
-        flush=True,
-    )
     if args.whole:
         _few_at_once(launcher, groups, fidelity, args.device)
+
+
+def _tries(word: str) -> tuple[tuple[int, ...], tuple[int, ...]]:
+    first, then = word.split(":")
+    return tuple(map(int, first)), tuple(map(int, then))
 
 
 def _few_at_once(sliced: Any, groups: Any, fidelity: Any, device: str) -> None:
@@ -164,38 +180,38 @@ def _few_at_once(sliced: Any, groups: Any, fidelity: Any, device: str) -> None:
     from brainbench.stimuli.engines.rod.sweeps import SweepLauncher
 
     which = sliced.launch(groups).verdict.retryable
+    one = which & (which.cumsum().reshape(which.shape) == 1)
     whole = SweepLauncher(sliced.scenes, fidelity, device, sliced=False)
     for block in (1, 64):
         whole.solver.block = {"block_dim": block}
         started = time.perf_counter()
-        one = which & (which.cumsum().reshape(which.shape) == 1)
-        whole.launch(groups, one, 5)
+        whole.launch(groups, [(one, 5)])
         seconds = time.perf_counter() - started
         print(f"one kernel, blocks of {block}: first whisker {seconds:.1f} s, with compiling", flush=True)
-        whole.launch(groups, one, 5)
+        whole.launch(groups, [(one, 5)])
         print(f"  again {whole.seconds['kernel']:.2f} s, in slices ", end="")
-        sliced.launch(groups, one, 5)
+        sliced.launch(groups, [(one, 5)])
         print(f"{sliced.seconds['kernel']:.2f} s", flush=True)
-        found = whole.launch(groups, which, 5)
+        found = whole.launch(groups, [(which, 5)])
         print(f"  all {which.sum():,} whiskers {whole.seconds['kernel']:.2f} s, in slices ", end="", flush=True)
-        other = sliced.launch(groups, which, 5)
+        other = sliced.launch(groups, [(which, 5)])
         same = (found.wrench == other.wrench).all()
         print(f"{sliced.seconds['kernel']:.2f} s; same to the last digit: {same}", flush=True)
 
 
-def _timed_launches() -> list[tuple[int, int, int, dict[str, float]]]:
-    """Return a list to which every launch from now on adds its divisor, whiskers, slices and seconds by stage."""
+def _timed_launches() -> list[tuple[str, int, int, dict[str, float]]]:
+    """Return a list to which every launch from now on adds its divisors, whiskers, slices and seconds by stage."""
     from brainbench.stimuli.engines.rod.sweeps import SweepLauncher
 
-    seen: list[tuple[int, int, int, dict[str, float]]] = []
+    seen: list[tuple[str, int, int, dict[str, float]]] = []
     launch = SweepLauncher.launch
 
-    def timed(self: Any, objects: Any, only: Any = None, finer: int = 1) -> Any:
+    def timed(self: Any, objects: Any, tries: Any = ()) -> Any:
         started = time.perf_counter()
-        result = launch(self, objects, only, finer)
+        result = launch(self, objects, tries)
         spent = {**self.seconds, "all": time.perf_counter() - started}
-        whiskers = result.verdict.until.size if only is None else int(only.sum())
-        seen.append((finer, whiskers, self.solver.slices, spent))
+        steps = " and ".join(str(finer) for _, finer in tries) or "1"
+        seen.append((steps, result.verdict.until.size, self.solver.slices, spent))
         return result
 
     SweepLauncher.launch = timed  # type: ignore[method-assign]
@@ -205,9 +221,14 @@ def _timed_launches() -> list[tuple[int, int, int, dict[str, float]]]:
 def stages(args: argparse.Namespace) -> None:
     """Run the command in this process, and print when each shard was where and what its stages took."""
     from brainbench.cli import app
+    from brainbench.stimuli.engines.rod import limits, scheduling
     from brainbench.stimuli.sweeps import running
 
     seen, moments, lock = _timed_launches(), [], threading.Lock()
+    if args.ahead:
+        limits.AHEAD[True] = _tries(args.ahead)
+    if args.room:
+        scheduling.ROOM = int(args.room)
     if args.side_by_side:
         running.SIDE_BY_SIDE = args.side_by_side
     totals: dict[str, float] = {}
@@ -246,11 +267,11 @@ def stages(args: argparse.Namespace) -> None:
         shutil.rmtree(folder)
     for what, name, begun, ended in sorted(moments, key=lambda moment: moment[2]):
         print(f"  {what:15s} {name:16s} {begun:7.2f} to {ended:7.2f} s")
-    for finer in sorted({finer for finer, *_ in seen}):
-        some = [item for item in seen if item[0] == finer]
+    for steps in dict.fromkeys(steps for steps, *_ in seen):
+        some = [item for item in seen if item[0] == steps]
         spent = sum((Counter(item[-1]) for item in some), Counter())
         print(
-            f"  steps / {finer}: {len(some)} launches, {sum(item[1] for item in some):,} whiskers, "
+            f"  steps / {steps}: {len(some)} launches, {sum(item[1] for item in some):,} whiskers, "
             f"{sum(item[2] for item in some):,} slices; thread seconds: "
             + ", ".join(f"{name} {seconds:.2f}" for name, seconds in spent.items())
         )

@@ -65,7 +65,7 @@ def free(
     motions.add_straight(still_knots(np.zeros(3), np.array([1.0, 0, 0, 0])))
     shapes.first.append(0)
     which, zeros = np.sort(np.arange(lanes, dtype=np.int32) % len(chains)), np.zeros(lanes, dtype=np.int32)
-    jobs = PackedJobs(which, zeros, zeros, np.arange(lanes, dtype=np.int32), zeros)
+    jobs = PackedJobs(which, zeros, zeros, np.arange(lanes, dtype=np.int32), zeros, zeros + 1)
     kernels = []
     for _ in range(4):
         result = solver.launch(jobs, motions, shapes, np.array([steps * step]), (lanes, 1), gravity=(0.0, 0.0, -9.81))

@@ -47,9 +47,11 @@ def run(recipe: str, placing: str, fidelity: str, objects: int, each: int) -> li
     for name, result in first.items():
         verdict, touching = result.verdict, result.counts["touching"] > 0
         good = touching & ~verdict.unstable
-        half = launcher.launch([(name, picked[name])], good, 2)
-        change = force_change(result.wrench[..., :3], half.wrench[..., :3])
-        changed = good & ~((change <= LARGEST_CHANGE) & ~half.verdict.unstable)
+        half = launcher.launch([(name, picked[name])], [(good, 2)])
+        row, column = good.nonzero()
+        change = force_change(result.wrench[row, :, column, None, :3], half.wrench[..., :3])
+        changed = good.copy()
+        changed[good] = ~((change <= LARGEST_CHANGE) & ~half.verdict.unstable)[:, 0]
         found += Counter(
             {
                 "whiskers": touching.size,

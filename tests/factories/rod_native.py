@@ -91,6 +91,10 @@ def pass_joint(_children, joints, joint, twists, step, _each, unit):
     pass_on(2, u[1])
 
 
+def joint_rate(_children, unit, hinge, row):
+    return unit.joint_rate.values[hinge, row]
+
+
 def _columns(matrix, rows, contact):
     return matrix.values.reshape(-1, rows)[3 * contact : 3 * contact + 3]
 
@@ -113,6 +117,6 @@ def add_rates(_children, own, matrix, contact, force, _each):
 
 NATIVES = {
     function.__name__: function
-    for function in (measure_triangles, bound_boxes, nearest_child, pass_joint, add_joint, clear, add_rates)
+    for function in (measure_triangles, bound_boxes, nearest_child, pass_joint, joint_rate, add_joint, clear, add_rates)
 }
 """By the name of the kernels' function; the first argument is the number of children that one thread looks at."""

@@ -22,7 +22,7 @@ from brainbench.stimuli.engines.protocol import Job, Progress, Trace, WhiskerEng
 from brainbench.stimuli.engines.reach import Reach, reachable
 from brainbench.stimuli.engines.rod.compilation import load_kernels
 from brainbench.stimuli.engines.rod.launch import LaunchResult, WhiskerSolver, real_type
-from brainbench.stimuli.engines.rod.limits import FINEST, WIDEST
+from brainbench.stimuli.engines.rod.limits import AHEAD, FINEST, WIDEST
 from brainbench.stimuli.engines.rod.packing import (
     GRID,
     PackedJobs,
@@ -36,7 +36,7 @@ from brainbench.stimuli.engines.rod.packing import (
 from brainbench.stimuli.engines.rod.shapes import PackedShapes, PackedSurface, TrackedObstacle
 from brainbench.stimuli.engines.stepping import is_silent, silent_trace
 from brainbench.stimuli.engines.sweep_batch import SweepBatch
-from brainbench.stimuli.engines.trust import check_jobs, run_with_retries, step_travel
+from brainbench.stimuli.engines.trust import Try, check_jobs, run_with_retries, step_travel
 from brainbench.stimuli.engines.units import MILLI
 from brainbench.stimuli.objects.solid import Solid
 from brainbench.stimuli.sweeps.sweep_scenes import SweepScenes
@@ -201,13 +201,15 @@ def _simulate_alike(
     """Run tasks of which all or none twist in one launch; ``seconds`` [task] is the processor time of each so far."""
     given = list(tasks.values())
 
-    def launch(which: NDArray[np.bool_] | None, finer: int) -> LaunchResult:
-        rows = np.arange(len(given)) if which is None else np.flatnonzero(which[:, 0])
+    def launch(tries: Sequence[Try]) -> list[LaunchResult]:
+        parts = [np.arange(len(given)) if which is None else np.flatnonzero(which[:, 0]) for which, _ in tries]
+        rows, counts = np.concatenate(parts), [len(part) for part in parts]
+        finer = np.repeat([divisor for _, divisor in tries], counts)
         result, spent = _launch([given[row] for row in rows], fidelity, device, record_shape, finer)
-        seconds[rows] += spent / len(rows)
-        return result
+        np.add.at(seconds, rows, spent / len(rows))
+        return result.split(counts)
 
-    result = run_with_retries(launch, retry)
+    result = run_with_retries(launch, retry, ahead=AHEAD[device.is_cuda])
     found = (_trace(result, row, task.job, fidelity, seconds[row]) for row, task in enumerate(given))
     return dict(zip(tasks, found, strict=True))
 
@@ -263,9 +265,12 @@ def _task(job: Job, fidelity: Fidelity, bodies: dict[Any, tuple[NDArray, Track]]
 
 
 def _launch(
-    tasks: Sequence[_Task], fidelity: Fidelity, device: Any, record_shape: bool, finer: int
+    tasks: Sequence[_Task], fidelity: Fidelity, device: Any, record_shape: bool, finer: NDArray[np.integer]
 ) -> tuple[LaunchResult, float]:
-    """Simulate tasks and return their results, a row each, with the processor time (s) that it took."""
+    """Simulate tasks and return their results, a row each, with the processor time (s) that it took.
+
+    ``finer`` [task] divides their steps.
+    """
     started = time.thread_time()
     first = tasks[0].job
     motions, shapes = PackedMotions(), PackedShapes()
@@ -281,7 +286,7 @@ def _launch(
     count = len(tasks)
     row = np.arange(count, dtype=np.int32)
     loads, limits = [task.job.loads for task in tasks], [task.limit for task in tasks]
-    packed = PackedJobs(whisker, scene, base, row, np.zeros_like(row), loads, limits)
+    packed = PackedJobs(whisker, scene, base, row, np.zeros_like(row), finer, loads, limits)
     # Compiling is done once; it is no cost of a whisker.
     paused = time.thread_time()
     solver = WhiskerSolver(list(chains.values()), fidelity, device, shapes.needs, twists=tasks[0].twists)
@@ -295,7 +300,6 @@ def _launch(
         (count, 1),
         start=first.start,
         gravity=first.gravity,
-        finer=finer,
         fast_at=fast[:, :1],
         travel=fast[:, 1:],
         record_shape=record_shape,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -58,35 +58,42 @@ class LaunchResult:
         """[row, column] steps computed, in all simulations of the whisker."""
         return self.counts["steps"]
 
+    def split(self, counts: Sequence[int]) -> list[LaunchResult]:
+        """Return so many rows of these results each, in order."""
+        which = np.repeat(np.arange(len(counts)), counts)
+        return [self] if len(counts) == 1 else [self.picked(which == part) for part in range(len(counts))]
+
+    def picked(self, which: NDArray[np.bool_]) -> LaunchResult:
+        """Return some rows [row] of these results; their steps count for the first who asks."""
+        arrays = {name: values[which] for name, values in vars(self).items() if isinstance(values, np.ndarray)}
+        counts = {name: values[which] for name, values in self.counts.items()}
+        verdict = Verdict(**{name: values[which] for name, values in vars(self.verdict).items()})
+        self.counts["steps"][which] = 0
+        return replace(self, counts=counts, verdict=verdict, **arrays)
+
     def replaced(self, which: NDArray[np.bool_], finer: LaunchResult) -> LaunchResult:
-        """Return these results with those of some jobs [row, column] from another launch, of their rows alone."""
-        rows = np.flatnonzero(which.any(axis=1))
-        some = which[rows]
-
-        def take(mine: NDArray, theirs: NDArray, mask: NDArray[np.bool_] = some) -> None:
-            mine[rows] = np.where(mask, theirs, mine[rows])
-
-        take(self.wrench, finer.wrench, some[:, None, :, None])
-        take(self.contact, finer.contact, some[:, None])
-        finer.counts["steps"] += self.steps[rows]
-        for mine, theirs in ((self.counts, finer.counts), (vars(self.verdict), vars(finer.verdict))):
-            for name in mine:
-                take(mine[name], theirs[name])
-        for name in ("depth", "residual"):
-            take(getattr(self, name), getattr(finer, name))
+        """Return these results with some whiskers [row, column] from a launch of them alone."""
+        row, column = np.nonzero(which)
+        self.wrench[row, :, column], self.contact[row, :, column] = finer.wrench[:, :, 0], finer.contact[:, :, 0]
+        finer.counts["steps"] += self.steps[which][:, None]
+        mine, theirs = (
+            [*one.counts.values(), *vars(one.verdict).values(), one.depth, one.residual] for one in (self, finer)
+        )
+        for values, new in zip(mine, theirs, strict=True):
+            values[which] = new[:, 0]
         if self.points is not None and self.contact_wrench is not None:
-            self.points[rows], self.contact_wrench[rows] = finer.points, finer.contact_wrench
+            self.points[row], self.contact_wrench[row] = finer.points, finer.contact_wrench
         self.retried |= which
         return self
 
     def compared(self, which: NDArray[np.bool_], half: LaunchResult) -> LaunchResult:
-        """Return these results, some jobs [row, column] judged by another launch, of their rows alone."""
-        rows = np.flatnonzero(which.any(axis=1))
+        """Return these results, some whiskers [row, column] judged by a launch of them alone."""
+        row, column = np.nonzero(which)
         change = np.full(which.shape, np.nan)
-        found = force_change(self.wrench[rows, ..., :3], half.wrench[..., :3])
-        change[rows] = np.where(half.verdict.unstable, np.nan, found)
+        found = force_change(self.wrench[row, :, column, None, :3], half.wrench[..., :3])
+        change[which] = np.where(half.verdict.unstable, np.nan, found)[:, 0]
         self.verdict = halved(self.verdict, change, which)
-        self.counts["steps"][rows] += np.where(which[rows], half.steps, 0)
+        self.counts["steps"][which] += half.steps[:, 0]
         return self
 
 
@@ -153,7 +160,6 @@ class WhiskerSolver:
         start: float = 0.0,
         gravity: Sequence[float] = (0.0, 0.0, 0.0),
         axes: NDArray[np.float64] | None = None,
-        finer: int = 1,
         travel: NDArray[np.float64] | None = None,
         fast_at: NDArray[np.float64] | None = None,
         record_shape: bool = False,
@@ -166,7 +172,6 @@ class WhiskerSolver:
             size: rows and columns of the results; jobs that stand in none of them are as if at rest.
             start, gravity: beginning of the simulation (s), acceleration [3] (m/s²).
             axes: rotation [3, 3] of the results; none when None.
-            finer: divides the time steps.
             travel, fast_at: [row, column] as in :class:`brainbench.stimuli.engines.trust.RunFacts`; never when None.
             record_shape: also return shapes and contact wrenches; jobs then stand in their rows in order.
         """
@@ -183,7 +188,7 @@ class WhiskerSolver:
         given = (
             (structs.MotionArrays, motions.arrays()),
             (structs.ShapeArrays, shapes.arrays()),
-            (structs.JobArrays, jobs.arrays(self.chains, self.steps[jobs.whisker], start, finer)),
+            (structs.JobArrays, jobs.arrays(self.chains, self.steps[jobs.whisker], start)),
             (structs.ReadingArrays, _readings(readings - start)),
         )
         shapes_of = dict.fromkeys((*_NUMBERS, *_COUNTS), count) | {
@@ -199,7 +204,8 @@ class WhiskerSolver:
             problems = make_problems(self.kernels, self.capacity, count, device)
             inputs = [self.chain_arrays, *scene, options, reading, out, problems]
             if self.sliced:
-                slices = Slices(self.kernels, self.capacity, count, device, urgent=finer > 1, **self.tuning)
+                urgent = bool((jobs.finer > 1).all())
+                slices = Slices(self.kernels, self.capacity, count, device, urgent=urgent, **self.tuning)
         clock.append(time.perf_counter())
         if slices is not None:
             self.slices = slices.run(inputs, self.block["block_dim"])

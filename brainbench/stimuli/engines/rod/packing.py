@@ -237,6 +237,8 @@ class PackedJobs:
     """[job] first index of the results."""
     column: NDArray[np.int32]
     """[job] second index of the results."""
+    finer: NDArray[np.integer]
+    """[job] what divides the time steps."""
     loads: Sequence[Sequence[Load]] = ()
     """[job] point forces; none for any when empty."""
     limits: Sequence[NDArray[np.float64] | None] = ()
@@ -245,12 +247,10 @@ class PackedJobs:
     def __len__(self) -> int:
         return len(self.whisker)
 
-    def arrays(
-        self, chains: Sequence[Chain], step: NDArray[np.float64], start: float, finer: int
-    ) -> dict[str, NDArray]:
+    def arrays(self, chains: Sequence[Chain], step: NDArray[np.float64], start: float) -> dict[str, NDArray]:
         """Return what the kernel's ``JobArrays`` hold.
 
-        ``step`` [job] (ms) is the longest of each job, ``finer`` divides it; the launch begins at ``start`` (s).
+        ``step`` [job] (ms) is the longest of each job, before it is divided; the launch begins at ``start`` (s).
         """
         counts = [len(loads) for loads in self.loads] or [0] * len(self)
         loads = [(load, chains[which]) for which, some in zip(self.whisker, self.loads, strict=False) for load in some]
@@ -260,12 +260,12 @@ class PackedJobs:
             (load.arc - c.nodes[link]) / (c.nodes[link + 1] - c.nodes[link])
             for (load, c), link in zip(loads, links, strict=True)
         ]
-        limits = [np.zeros(0) if limit is None else limit * MILLI / finer for limit in self.limits] or [
-            np.zeros(0)
-        ] * len(self)
+        some = zip(self.limits, self.finer, strict=True) if self.limits else ()
+        limits = [np.zeros(0) if limit is None else limit * MILLI / finer for limit, finer in some]
+        limits = limits or [np.zeros(0)] * len(self)
         return {
             **{name: getattr(self, name) for name in ("whisker", "scene", "base", "row", "column")},
-            "step": step / finer,
+            "step": step / self.finer,
             "limit_first": np.cumsum([0, *map(len, limits)], dtype=np.int32),
             "limit": np.concatenate(limits),
             "load_first": np.cumsum([0, *counts], dtype=np.int32),

@@ -18,18 +18,22 @@ from brainbench.stimuli.engines.rod.limits import AFTER_OTHERS, WARP, contacts_f
 from brainbench.stimuli.engines.rod.streams import AHEAD, streams_of, turn, wait_for
 
 BUDGET = 4
-"""Steps of a whisker in one slice."""
+"""Steps that a whisker begins in one slice."""
 FEW = 2**14
-"""Whiskers below which a slice is one step: a kernel then takes as long as its slowest thread, and whiskers in contact,
-which need two slices a step, would wait for others' four."""
+"""Whiskers below which one step begins in a slice: a kernel then takes as long as its slowest thread, and whiskers in
+contact, which need two slices a step, would wait for others' four."""
 SMALL = 2**10
 """Whiskers below which a recorded graph is kept as it is: threads without a whisker cost it nothing then."""
 SLICES_PER_CHECK = 8
 """Slices (an even number) after which the host counts the whiskers that are left."""
 MOST_THREADS = 2**19
 """Most threads that find distances at once: a few times as many as a GPU runs side by side."""
-REPEATS = 4
-"""Times that a recorded graph is launched for each count: the host has many launches to look after."""
+ROOM = 2**15
+"""Threads over which few whiskers are spread, as many as a GPU runs side by side: each then has a warp, in which it
+waits for no neighbour that is elsewhere in its step."""
+REPEATS, RARELY = (4, 64), 256
+"""Least and most times that a recorded graph is launched for each count, and slices so far for one time more: the host
+has many launches to look after."""
 
 
 class Slices:
@@ -43,18 +47,22 @@ class Slices:
         device: Any,
         budget: int | None = None,
         recorded: bool | None = None,
+        room: int | None = None,
         urgent: bool = False,
     ) -> None:
         """Make room for ``lanes`` whiskers on the device.
 
         Args:
             kernels, capacity, lanes, device: as of the launch.
-            budget: steps of a whisker in one slice; by the number of whiskers when None.
+            budget: steps that a whisker begins in one slice; by the number of whiskers that are left when None.
             recorded: False when a GPU is given kernel after kernel instead of CUDA graphs.
+            room: threads over which few whiskers are spread; :data:`ROOM` on a GPU when None.
             urgent: True when these go first among all that the GPU could do.
         """
         wp = warp()
         self.kernels, self.device, self.lanes, self.capacity = kernels, device, lanes, capacity
+        self.budget = budget
+        self.room = (ROOM if device.is_cuda else 0) if room is None else room
         self.recorded = device.is_cuda if recorded is None else recorded
         # Distances and contact forces of a slice need not wait for each other.
         self.stream: Any = None
@@ -75,7 +83,6 @@ class Slices:
             link=links,
             **dict.fromkeys(("query", "answer"), self.queries),
         )
-        on.budget = budget or (1 if lanes < FEW else BUDGET)
         queue = np.zeros(queues, dtype=np.int32)
         # All whiskers begin in the queue that waits for nothing.
         queue[AFTER_OTHERS] = np.arange(lanes)
@@ -109,9 +116,10 @@ class Slices:
                             self._several(inputs, left, block)
                         fits = left
                         graphs.append(capture.graph)
-                    for _ in range(REPEATS):
+                    repeats = min(max(REPEATS[0], slices // RARELY), REPEATS[1])
+                    for _ in range(repeats):
                         wp.capture_launch(graphs[-1], stream=self.stream)
-                    slices += (REPEATS - 1) * SLICES_PER_CHECK
+                    slices += (repeats - 1) * SLICES_PER_CHECK
                 if self.stream is None:
                     left = int(self.struct.queue_size.numpy().sum())
                 else:
@@ -134,14 +142,18 @@ class Slices:
     def _several(self, inputs: list[Any], left: int, block: int) -> None:
         """Launch some slices for at most ``left`` whiskers."""
         wp, on, device, kernels = warp(), self.struct, self.device, self.kernels
+        on.budget = self.budget or (1 if left < FEW else BUDGET)
+        # The largest power of two for which all have room.
+        on.spread = 2 ** (min(max(self.room // left, 1), WARP).bit_length() - 1)
         for _ in range(SLICES_PER_CHECK):
-            wp.launch(kernels.run, left + 3 * WARP, [*inputs, on], device=device, stream=self.stream, block_dim=block)
+            many = (left + 3 * WARP) * on.spread
+            wp.launch(kernels.run, many, [*inputs, on], device=device, stream=self.stream, block_dim=block)
             # After an even number of slices both arrays are back in place, so a recorded graph can be repeated.
             on.queue, on.next_queue = on.next_queue, on.queue
             wp.launch(kernels.swap_queues, 1, [on], device=device, stream=self.stream)
             for (kernel, threads), stream in zip(kernels.solve_contacts, self.streams, strict=True):
                 # Whole warps: the threads of a group speak with each other.
-                many = -(-left * threads // WARP) * WARP
+                many = -(-left * min(threads * on.spread, WARP) // WARP) * WARP
                 if stream is not None:
                     stream.wait_stream(self.stream)
                 wp.launch(
@@ -152,7 +164,7 @@ class Slices:
                     stream=stream or self.stream,
                     block_dim=limits.CONTACT_BOUNDS[0],
                 )
-            many = min(self.queries, self.capacity * left) * kernels.distance_group
+            many = min(self.queries, self.capacity * left) * min(kernels.distance_group * on.spread, WARP)
             many = min(-(-many // WARP) * WARP, MOST_THREADS)
             wp.launch(
                 kernels.measure_distances,

@@ -10,7 +10,6 @@ from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
 from itertools import groupby
-from operator import itemgetter
 from typing import Any
 
 import numpy as np
@@ -22,11 +21,11 @@ from brainbench.core.rotations import euler_matrix, from_matrices
 from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.engines.protocol import base_rotation
 from brainbench.stimuli.engines.rod.launch import LaunchResult, WhiskerSolver
-from brainbench.stimuli.engines.rod.limits import MESHES, WIDEST
+from brainbench.stimuli.engines.rod.limits import AHEAD, MESHES, WIDEST
 from brainbench.stimuli.engines.rod.packing import PackedJobs, PackedMotions, still_knots
 from brainbench.stimuli.engines.rod.shapes import PackedShapes, PackedSurface
 from brainbench.stimuli.engines.sweep_batch import SweepBatch, describe_unstable, join_batches
-from brainbench.stimuli.engines.trust import run_with_retries
+from brainbench.stimuli.engines.trust import Try, run_with_retries
 from brainbench.stimuli.engines.units import MILLI
 from brainbench.stimuli.objects.solid import Solid
 from brainbench.stimuli.sweeps.sweep_scenes import SweepScenes
@@ -63,6 +62,8 @@ class SweepLauncher:
         sliced = bool(against == MESHES and self.device.is_cuda) if sliced is None else sliced
         bounds = bounds or (SLICED_BOUNDS if sliced else BOUNDS)
         self.scenes, self.grid = scenes, grid
+        self.ahead = AHEAD[self.device.is_cuda]
+        """As in :func:`brainbench.stimuli.engines.trust.run_with_retries`."""
         self.seconds: dict[str, float] = {}
         """Elapsed time of the last launch for placing objects, uploading, and computing."""
         mounts = list(scenes.array)
@@ -81,14 +82,14 @@ class SweepLauncher:
         self._steps_in_full = sum(int(np.ceil(spans / step - 1e-3).clip(1).sum()) for step in steps)
 
     def launch(
-        self, objects: Sequence[tuple[str, Sequence[Any]]], only: NDArray[np.bool_] | None = None, finer: int = 1
+        self, objects: Sequence[tuple[str, Sequence[Any]]], tries: Sequence[tuple[NDArray[np.bool_], int]] = ()
     ) -> LaunchResult:
-        """Simulate sweeps, object by object.
+        """Simulate sweeps, object by object: all whiskers, [sweep, whisker], or some of them, one a row.
 
         Args:
-            objects: (name, its sweeps) in the order of the result's rows.
-            only: [sweep, whisker] which whiskers; all when None. Nothing is computed for the others.
-            finer: divides the time steps.
+            objects: (name, its sweeps) in order.
+            tries: which whiskers [sweep, whisker] and what divides their time steps. Rows of the result are those of
+                the first try in their order, then those of the next.
         """
         started = time.perf_counter()
         motions, shapes = PackedMotions(), PackedShapes()
@@ -97,24 +98,27 @@ class SweepLauncher:
         for name, sweeps in objects:
             if len(sweeps):
                 self._add(shapes, motions, *prepared[name], sweeps)
-        size = count, whiskers = len(shapes.first) - 1, len(bases)
-        # Neighbouring threads take the same whisker past the same object.
-        whisker, row = (
-            grid.ravel().astype(np.int32) for grid in np.meshgrid(np.arange(whiskers), np.arange(count), indexing="ij")
-        )
-        if only is not None:
-            whisker, row = (some[only[row, whisker]] for some in (whisker, row))
+        count, whiskers = len(shapes.first) - 1, len(bases)
         speed = np.array([sweep.speed for _, sweeps in objects for sweep in sweeps])
-        travel = speed[:, None] * self.solver.shortest
+        if tries:
+            sweep, whisker = np.concatenate([which.nonzero() for which, _ in tries], axis=1, dtype=np.int32)
+            finer = np.repeat([divisor for _, divisor in tries], [which.sum() for which, _ in tries])
+            row, column = np.arange(len(sweep), dtype=np.int32), np.zeros_like(sweep)
+            size = len(sweep), 1
+        else:
+            # Neighbouring threads take the same whisker past the same object.
+            whisker, sweep = np.indices((whiskers, count), dtype=np.int32).reshape(2, -1)
+            row, column, finer, size = sweep, whisker, np.ones_like(sweep), (count, whiskers)
+        travel = np.empty(size)
+        travel[row, column] = speed[sweep] * self.solver.shortest[whisker]
         placed = time.perf_counter() - started
         result = self.solver.launch(
-            PackedJobs(whisker, row, bases[whisker], row, whisker),
+            PackedJobs(whisker, sweep, bases[whisker], row, column, finer),
             motions,
             shapes,
             self.grid.frames.readings,
             size,
             axes=self._head,
-            finer=finer,
             travel=travel,
             fast_at=np.where(travel > WIDEST / MILLI, 0.0, np.inf),
         )
@@ -148,16 +152,13 @@ class SweepLauncher:
 
     def trusted(self, objects: Sequence[tuple[str, Sequence[Any]]], retry: int) -> SweepBatch:
         """Simulate sweeps as :meth:`launch` takes them, and whiskers that cannot be trusted again with finer steps."""
-        flat = [(name, sweep) for name, sweeps in objects for sweep in sweeps]
 
-        def launch(which: NDArray[np.bool_] | None, finer: int) -> LaunchResult:
-            if which is None:
-                return self.launch(objects)
-            rows = np.flatnonzero(which.any(axis=1))
-            groups = groupby([flat[row] for row in rows], key=itemgetter(0))
-            return self.launch([(name, [sweep for _, sweep in some]) for name, some in groups], which[rows], finer)
+        def launch(tries: Sequence[Try]) -> list[LaunchResult]:
+            some = [(which, finer) for which, finer in tries if which is not None]
+            result = self.launch(objects, some)
+            return result.split([int(which.sum()) for which, _ in some] or [len(result.wrench)])
 
-        return self.batch(run_with_retries(launch, retry))
+        return self.batch(run_with_retries(launch, retry, ahead=self.ahead))
 
     def run(self, indices: Sequence[int], retry: int, workers: int) -> SweepBatch:
         """Simulate sweeps of the grid; on a processor ``workers`` threads each take one object at a time."""

@@ -2,6 +2,8 @@
 
 import threading
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import fields
+from itertools import groupby
 from types import SimpleNamespace
 
 import numpy as np
@@ -12,6 +14,7 @@ from brainbench.core.files import content_hash, portable
 from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.engines.rod import launch, scheduling, streams, sweeps
 from brainbench.stimuli.engines.rod.sweeps import SweepLauncher
+from brainbench.stimuli.engines.sweep_batch import SweepBatch
 from brainbench.stimuli.objects.collections import resolve_objects
 from brainbench.stimuli.sweeps.grid import SweepGrid
 from brainbench.stimuli.sweeps.sweep_scenes import GRIDS, SweepScenes
@@ -77,7 +80,7 @@ def test_threads_that_take_turns_on_a_gpu_get_what_one_alone_gets(as_a_gpu):
         together = dict(
             zip(
                 scenes.objects,
-                pool.map(lambda name: _launch(scenes, name, recorded=True, budget=1), scenes.objects),
+                pool.map(lambda name: _launch(scenes, name, recorded=True, budget=1, room=256), scenes.objects),
                 strict=True,
             )
         )
@@ -103,9 +106,8 @@ def test_sweeps_are_placed_as_ever(monkeypatch):
         return SimpleNamespace(seconds={})
 
     monkeypatch.setattr(launch.WhiskerSolver, "launch", record)
-    monkeypatch.setattr(sweeps, "run_with_retries", lambda simulate, retry: simulate(None, 1))
     monkeypatch.setattr(sweeps, "join_batches", list)
-    monkeypatch.setattr(launcher, "batch", lambda result: result)
+    monkeypatch.setattr(launcher, "trusted", lambda groups, retry: launcher.launch(groups))
     launcher.run([*range(0, 208, 16), *range(208, 416, 16)], 1, 1)
     # Made by commit a79787b0.
     assert (len(placed), content_hash(portable(placed))) == (26, "1de2c1bec32592d6")
@@ -125,3 +127,38 @@ def test_whiskers_that_are_simulated_again_do_not_depend_on_what_comes_with_them
     np.testing.assert_array_equal(together.wrench, np.concatenate([one.wrench for one in alone]))
     assert together.reasons == tuple(reason for one in alone for reason in one.reasons)
     assert together.steps == sum(one.steps for one in alone)
+
+
+@pytest.mark.parametrize("sliced", [False, True])
+def test_tries_at_the_same_time_give_the_bytes_of_tries_one_after_the_other(sliced):
+    picked = {"brick-0": 72, "chair-0": 24, "gear-0": 24, "gear-1": 36, "brick-1": 24}
+    objects = resolve_objects(list(picked), surfaces=True)
+    array = "C1,C2,D2,B1,A1"
+    scenes = SweepScenes(GRIDS["thesis-high"], {name: item.load for name, item in objects.items()}, whiskers=array)
+    chosen = [(name, [scenes.grid.sweeps(name)[index]]) for name, index in picked.items()]
+    launcher = SweepLauncher(scenes, Fidelity(links=12, time_step=1e-3), sliced=sliced)
+    batches, launches = [], []
+    launch = launcher.launch
+
+    def seen(objects, tries=()):
+        launches.append({finer: int(which.sum()) for which, finer in tries})
+        return launch(objects, tries)
+
+    launcher.launch = seen
+    for launcher.ahead in (((), (2,)), ((1,), (2, 4)), ((1, 2, 4), ())):
+        batches.append(launcher.trusted(chosen, 5))
+        launches.append(None)
+    one, two, all_ = (list(some) for which, some in groupby(launches, lambda seen: seen is not None) if which)
+    one_by_one, *others = batches
+    (suspicious, doubtful), tenths = two[1].values(), sum(launch.get(10, 0) for launch in one)
+    # Of the suspicious some are confirmed by half the step and some are not; of those that are simulated again some are
+    # mended by the first try, others by the second, one by none, and one is suspicious after the second.
+    changed = one[2][5] - (doubtful - suspicious)
+    assert 0 < changed < suspicious
+    assert 0 < tenths < one[2][5]
+    assert any(20 in launch for launch in one)
+    assert one_by_one.unstable.any()
+    assert (two[2:], all_[2:]) == ([{10: tenths, 20: tenths}], [])
+    for batch in others:
+        for field in fields(SweepBatch):
+            np.testing.assert_array_equal(getattr(batch, field.name), getattr(one_by_one, field.name))

@@ -283,13 +283,19 @@ def add_rates(own: wp.ref[ThreadContacts], matrix: wp.ref[DelassusRows], contact
     ...
 
 
+@wp.func_native("return unit.joint_rate.data[hinge][r];")
+def joint_rate(unit: wp.ref[UnitForces], hinge: int, r: int) -> real:
+    """Return what the unit force of a row does to a hinge; an index of Warp would copy all of them first."""
+    ...
+
+
 @wp.func(inline=True)
 def joint_rates(unit: wp.ref[UnitForces], hinge: int, r: int, contact: int) -> vec3:
     """Return what the three unit forces of a contact, from row r of its thread on, do to a hinge of the joint."""
     return vec3(
-        broadcast(unit.joint_rate[hinge, r], contact),
-        broadcast(unit.joint_rate[hinge, r + 1], contact),
-        broadcast(unit.joint_rate[hinge, r + 2], contact),
+        broadcast(joint_rate(unit, hinge, r), contact),
+        broadcast(joint_rate(unit, hinge, r + 1), contact),
+        broadcast(joint_rate(unit, hinge, r + 2), contact),
     )
 
 

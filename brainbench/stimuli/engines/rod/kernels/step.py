@@ -202,10 +202,12 @@ def run(
         while last == 0:
             if wp.static(sliced):
                 state.time_left = left
-                if used >= paused.budget:
-                    wait = WAIT_SLICE
-                    break
-                used = used + 1
+                # A step for which distances or forces were found meanwhile began in an earlier slice.
+                if state.waiting_for != WAIT_DISTANCES and state.waiting_for != WAIT_FORCES:
+                    if used >= paused.budget:
+                        wait = WAIT_SLICE
+                        break
+                    used = used + 1
             now = instant(until.tick, until.part - left)
             # Equal steps up to the next reading.
             # The thousandth keeps rounding from adding a step.
