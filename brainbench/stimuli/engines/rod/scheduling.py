@@ -28,9 +28,9 @@ SLICES_PER_CHECK = 8
 """Slices (an even number) after which the host counts the whiskers that are left."""
 MOST_THREADS = 2**19
 """Most threads that find distances at once: a few times as many as a GPU runs side by side."""
-ROOM = 2**15
-"""Threads over which few whiskers are spread, as many as a GPU runs side by side: each then has a warp, in which it
-waits for no neighbour that is elsewhere in its step."""
+ROOM = 0
+"""Threads over which few whiskers are spread: with 2^15, as many as a GPU runs side by side, each has a warp, in which it
+waits for no neighbour that is elsewhere in its step. Off until ``public_rate --room`` has measured it on a GPU."""
 REPEATS, RARELY = (4, 64), 256
 """Least and most times that a recorded graph is launched for each count, and slices so far for one time more: the host
 has many launches to look after."""
