@@ -29,8 +29,8 @@ SLICES_PER_CHECK = 8
 MOST_THREADS = 2**19
 """Most threads that find distances at once: a few times as many as a GPU runs side by side."""
 ROOM = 0
-"""Threads over which few whiskers are spread: with 2^15, as many as a GPU runs side by side, each has a warp, in which it
-waits for no neighbour that is elsewhere in its step. Off until ``public_rate --room`` has measured it on a GPU."""
+"""Threads over which few whiskers are spread: with 2^15, as many as a GPU runs side by side, each has a warp, in which
+it waits for no neighbour elsewhere in its step. Off until ``public_rate --room`` has measured it on a GPU."""
 REPEATS, RARELY = (4, 64), 256
 """Least and most times that a recorded graph is launched for each count, and slices so far for one time more: the host
 has many launches to look after."""
