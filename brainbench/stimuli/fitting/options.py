@@ -1,0 +1,53 @@
+"""Options of a fit."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+from brainbench.core.errors import check_name
+from brainbench.core.reading.ranges import check_number
+from brainbench.core.statistics import LEVEL, check_level
+from brainbench.stimuli.engines import DEFAULT_ENGINE
+
+LOSSES = ("linear", "soft_l1", "huber", "cauchy")
+INTERVALS = ("laplace", "profile")
+PRIORS = ("none", "published")
+
+
+@dataclass(frozen=True)
+class FitOptions:
+    """How a fit simulates, weighs and judges; a value outside its range is a :class:`UsageError`."""
+
+    priors: str = "none"
+    """Prior of the parameters: none, or published (means and spreads of measured whiskers)."""
+    intervals: str = "laplace"
+    """Confidence intervals: laplace (from the curvature at the best fit), or profile (of the likelihood; takes longer)."""
+    level: float = LEVEL
+    """Coverage of the confidence intervals."""
+    loss: str = "linear"
+    """Loss of a residual: linear (least squares), or soft_l1, huber or cauchy, which outliers pull less."""
+    most_iterations: int = 50
+    """Iterations after which a fit counts as not converged."""
+    links: int = 12
+    """Links of each simulated whisker."""
+    steps_per_period: float = 60.0
+    """Time steps in one period of the whisker's first mode at the start of the fit."""
+    time_step: float = 1e-4
+    """Longest time step [s]."""
+    solver: Literal["dynamic", "quasistatic"] = "dynamic"
+    """quasistatic leaves out inertia and damping, for slow contact."""
+    twist: bool = True
+    """Whether whiskers may twist."""
+    backend: str = DEFAULT_ENGINE
+    """Physics engine."""
+    workers: int | None = 1
+    """Threads of the simulation; all usable processors when None."""
+
+    def __post_init__(self) -> None:
+        check_name("priors of a fit", self.priors, PRIORS)
+        check_name("intervals of a fit", self.intervals, INTERVALS)
+        check_name("loss of a fit", self.loss, LOSSES)
+        check_level(self.level)
+        check_number("most_iterations of a fit", self.most_iterations, least=1, whole=True)
+        check_number("steps_per_period of a fit", self.steps_per_period, least=4)
