@@ -28,13 +28,22 @@ def normal_offsets(nodes: Array, joints: Array, points: Array) -> Array:
     """
     from scipy.interpolate import CubicSpline
 
-    flat = points.shape[-1] == 2
     spline = CubicSpline(nodes, joints[..., : points.shape[-1]], axis=1)
     s = np.linspace(nodes[0], nodes[-1], PER_LINK * (len(nodes) - 1) + 1)
     # Arc lengths of the nodes parametrise the curve nearly by arc: derivatives are normalised below all the same.
     place, along, bend = spline(s), spline(s, 1), spline(s, 2)
+    return offsets_of_samples(place, along, bend, points)
+
+
+def offsets_of_samples(place: Array, along: Array, bend: Array, points: Array) -> Array:
+    """Return the signed distances [n, k, d] (m) of dense samples of a curve from points, across the curve.
+
+    ``place``, ``along`` and ``bend`` [n, m, 2 or 3] are positions and their first and second derivatives by any
+    parameter that runs along the curve; ``points`` are as for :func:`normal_offsets`.
+    """
     between = points[:, :, None, :] - place[:, None]
-    nearest = np.argmin(np.nan_to_num(np.einsum("nkmi,nkmi->nkm", between, between), nan=np.inf), axis=-1)[..., None]
+    squares = np.nan_to_num(np.einsum("nkmi,nkmi->nkm", between, between), nan=np.inf)
+    nearest = np.argmin(squares, axis=-1)[..., None]
     q, t, c = (np.take_along_axis(values, nearest, axis=1) for values in (place, along, bend))
     gap = points - q
     # Newton step on (p − r(s))·r′(s) = 0 with r ≈ q + t σ + c σ²/2.
@@ -42,7 +51,7 @@ def normal_offsets(nodes: Array, joints: Array, points: Array) -> Array:
     foot, tangent = q + t * step + c * step**2 / 2, t + c * step
     tangent = tangent / np.sqrt(_dot(tangent, tangent))
     gap = foot - points
-    if flat:
+    if points.shape[-1] == 2:
         return (tangent[..., :1] * gap[..., 1:]) - (tangent[..., 1:] * gap[..., :1])
     first, second = _normals(tangent)
     return np.concatenate([_dot(gap, first), _dot(gap, second)], axis=-1)
