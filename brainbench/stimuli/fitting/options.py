@@ -29,10 +29,11 @@ class FitOptions:
     """Loss of a residual: linear (least squares), or soft_l1, huber or cauchy, which outliers pull less."""
     most_iterations: int = 50
     """Iterations after which a fit counts as not converged."""
-    links: int = 12
+    links: int = 20
     """Links of each simulated whisker."""
-    steps_per_period: float = 60.0
-    """Time steps in one period of the whisker's first mode at the start of the fit."""
+    steps_per_period: float = 400.0
+    """Time steps in one period of the whisker's first mode at the start of the fit. Few steps damp higher modes, which
+    biases stiffness and taper by more than the noise of a good sensor."""
     time_step: float = 1e-4
     """Longest time step [s]."""
     solver: Literal["dynamic", "quasistatic"] = "dynamic"

@@ -29,8 +29,9 @@ if TYPE_CHECKING:
 
     from brainbench.stimuli.scenes.scene import Scene
 
-SETTLING = 5.0
-"""Time for which a plucked whisker is held, in decay times 1/(ζ ω) of its first mode."""
+SETTLING = 4.0
+"""Time for which a plucked whisker is held, in decay times 1/(ζ ω) of its first mode; it is held in a way that hardly
+swings."""
 
 
 @dataclass(frozen=True)
@@ -43,6 +44,27 @@ class Pluck:
     """Arc length of the held point [m]."""
     direction: Vector = (0.0, 1.0, 0.0)
     """Direction of the deflection, in the frame of the job."""
+
+    def loads(self, condition: Condition, start: float) -> tuple[Load, Load]:
+        """Return the loads that hold the whisker aside from ``start`` (s) to the release.
+
+        A load that comes at once makes the first mode swing. Half a period at 1/(1 + K) of it, with the mode's decay K in
+        that time, carries the mode to its rest under the whole load (input shaping, Singer & Seering 1990, J. Dyn. Syst.
+        Meas. Control 112, 76).
+        """
+        whisker = condition.whisker
+        arc = min(self.arc, whisker.arc_length)
+        # The small-bending closed form is that of the straight whisker; curvature changes it by second order.
+        straight = replace(whisker, curvature=0.0)
+        force = condition.deflection / references.point_load_deflection(straight, 1.0, arc)
+        whole = force * np.asarray(self.direction, dtype=float)
+        ratio, omega = min(whisker.damping_ratio, 0.9), float(build_chain(whisker, 16).frequencies()[0])
+        damped = math.sqrt(1 - ratio**2)
+        decay = math.exp(-math.pi * ratio / damped)
+        part = -whole * decay / (1 + decay)
+        x, y, z = whole.tolist()
+        a, b, c = part.tolist()
+        return Load(arc, (x, y, z), stop=0.0), Load(arc, (a, b, c), stop=start + math.pi / (omega * damped))
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,7 +120,8 @@ class Trial:
 
         Args:
             whisker: the whisker that the fit starts from; its base is the origin and it leaves along +x.
-            measured: wrenches or shapes; times count from the release.
+            measured: wrenches or shapes; times count from the release. A reading at 0 itself is left out: there the
+                force jumps, and what a sensor shows depends on how fast it is.
             deflection: deflection of the held point (m), roughly; the parameter ``deflection`` refines it.
             arc: arc length of the held point (m); near the tip when None.
             direction: direction of the deflection.
@@ -108,8 +131,10 @@ class Trial:
             raise UsageError(
                 f"The times of a ring-down count from the release; the first is {times[0]:g} s: cut the frames before."
             )
+        if times[0] == 0:
+            measured, times = measured.isel(time=slice(1, None)), times[1:]
         omega = 2 * math.pi * float(references.natural_frequencies(whisker, 1)[0])
-        settling = SETTLING / (max(whisker.damping_ratio, 0.02) * omega)
+        settling = SETTLING / (max(whisker.damping_ratio, 0.05) * omega) + math.pi / omega
         job = Job(whisker, StillFollicle(), (), times, start=-settling)
         return cls(job, measured, Pluck(deflection, arc or 0.95 * whisker.arc_length, direction))
 
@@ -132,11 +157,7 @@ class Trial:
         """Return the job that simulates the trial under a condition."""
         loads = self.job.loads
         if self.pluck is not None:
-            arc = min(self.pluck.arc, condition.whisker.arc_length)
-            # The small-bending closed form is that of the straight whisker; curvature changes it by second order.
-            straight = replace(condition.whisker, curvature=0.0)
-            force = condition.deflection / references.point_load_deflection(straight, 1.0, arc)
-            loads = (*loads, Load(arc, tuple(force * np.asarray(self.pluck.direction)), stop=0.0))
+            loads = (*loads, *self.pluck.loads(condition, self.job.start))
         return replace(
             self.job,
             whisker=condition.whisker,
