@@ -36,7 +36,11 @@ PER_PERIOD = {"wrench": 24, "shape": 12}
 PERIODS, POINTS = 5, 30
 
 
-def one(kind: str, species: str, seed: int, options: FitOptions) -> dict:
+QUICK = FitOptions(links=10, steps_per_period=100.0)
+"""Setting of the simulations that count coverage, of truth and fit alike: it cancels."""
+
+
+def one(kind: str, species: str, seed: int, finer: bool) -> dict:
     """Draw a whisker, let it ring down, measure it, and fit it with the right and with a cylindrical model."""
     rng = np.random.default_rng([seed, len(species), len(kind)])
     known = replace(WhiskerArray.of(species)["C2"].whisker, damping_ratio=0.15)
@@ -50,17 +54,17 @@ def one(kind: str, species: str, seed: int, options: FitOptions) -> dict:
     period = 1 / float(references.natural_frequencies(known, 1)[0])
     times = np.arange(1, PERIODS * PER_PERIOD[kind] + 1) * period / PER_PERIOD[kind]
     trial = Trial.ringdown(truth, blank_wrenches(times), deflection)
-    if options.steps_per_period == FitOptions().steps_per_period:
-        # Truth and fit share the time step, which the fit takes from the whisker that it starts from.
-        options = replace(options, steps_per_period=4.0, time_step=period / options.steps_per_period)
-    trace = simulate_trial(trial, options=options)
+    options = FitOptions() if finer else QUICK
+    # Truth and fit share the time step, which the fit takes from the whisker that it starts from.
+    same = replace(options, steps_per_period=4.0, time_step=min(period / options.steps_per_period, options.time_step))
+    trace = simulate_trial(trial, options=FINE if finer else same)
     if kind == "wrench":
         measured = measure_wrenches(trial, trace, WRENCH_NOISE, rng).measured
     else:
         measured = measure_shapes(trial, trace, truth, SHAPE_NOISE, rng, points=POINTS).measured
     started = time.process_time()
     start = 0.08 * known.arc_length
-    result = fit(Trial.ringdown(known, measured, start), NAMES)
+    result = fit(Trial.ringdown(known, measured, start), NAMES, options=options)
     seconds = time.process_time() - started
     truths = {"young_modulus": truth.young_modulus, "tip_radius": truth.tip_radius,
               "damping_ratio": truth.damping_ratio, "deflection": deflection}  # fmt: skip
@@ -69,7 +73,9 @@ def one(kind: str, species: str, seed: int, options: FitOptions) -> dict:
     error["taper"] = (result.whisker.base_radius - result.whisker.tip_radius) / truth.arc_length / slope - 1
     radius = (known.base_radius + known.tip_radius) / 2
     cylinder = replace(known, base_radius=radius, tip_radius=radius)
-    wrong = fit(Trial.ringdown(cylinder, measured, start), ("young_modulus", "damping_ratio", "deflection"))
+    wrong = fit(
+        Trial.ringdown(cylinder, measured, start), ("young_modulus", "damping_ratio", "deflection"), options=options
+    )
     return {
         "species": species,
         "status": result.status,
@@ -116,9 +122,8 @@ def main() -> None:
     parser.add_argument("--simulations", type=int, default=200)
     parser.add_argument("--keep", type=Path, default=Path("build/fitting.json"), help="Fits that were made so far.")
     options = parser.parse_args()
-    own = FitOptions()
     cases = [
-        ("wrench", "own", own), ("shape", "own", own), ("wrench", "finer", FINE), ("shape", "finer", FINE),
+        ("wrench", False), ("shape", False), ("wrench", True), ("shape", True),
     ]  # fmt: skip
     kept = read_json(options.keep) if options.keep.is_file() else {}
     parts = [
@@ -129,20 +134,22 @@ def main() -> None:
         "published whisker; the base radius and density are known. Errors in %; coverage of the 95 % intervals (Laplace) with "
         "Wilson intervals. `taper` is the slope of the radius, (base radius − tip radius)/length. Derivatives: central differences in double precision."
     ]
-    for kind, setting, fidelity in cases:
-        name = f"{kind}-{setting}"
+    for kind, finer in cases:
+        name = f"{kind}-{'finer' if finer else 'own'}"
         found = kept.get(name, [])
-        count = options.simulations if setting == "own" else options.simulations // 4
+        count = options.simulations // 4 if finer else options.simulations
         for seed in range(len(found), count):
-            found.append(one(kind, ("mouse", "rat")[seed % 2], seed, fidelity))
+            found.append(one(kind, ("mouse", "rat")[seed % 2], seed, finer))
             if len(found) % 10 == 0 or len(found) == count:
                 kept[name] = found
                 write_json(options.keep, kept)
                 print(name, len(found), flush=True)
-        title = {
-            "own": "truth at the fit's own setting",
-            "finer": f"truth with {FINE.links} links and {FINE.steps_per_period:g} steps a period",
-        }[setting]
+        title = (
+            f"truth with {FINE.links} links and {FINE.steps_per_period:g} steps a period, fit at its default "
+            f"({FitOptions().links} and {FitOptions().steps_per_period:g})"
+            if finer
+            else f"truth and fit with {QUICK.links} links and {QUICK.steps_per_period:g} steps a period"
+        )
         heading = {"wrench": "Base wrench", "shape": "Traced shape"}[kind]
         columns = ["parameter", "median error", "90 %", f"within {100 * GOAL:g} %", "coverage", "deviation told"]
         parts.append(f"#### {heading}, {title} ({len(found)} simulations)")

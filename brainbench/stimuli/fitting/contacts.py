@@ -246,20 +246,29 @@ class ContactSolver:
         if found.status <= 0:
             status, reason = "undefined", "The fit of the shape did not converge."
         elif abs(force) < NO_FORCE * deviation:
-            status, reason = "undefined", (
-                f"No sign of a contact: the force is {abs(force) / max(deviation, 1e-300):.1f} standard deviations from 0."
+            status, reason = (
+                "undefined",
+                (
+                    f"No sign of a contact: the force is {abs(force) / max(deviation, 1e-300):.1f} standard deviations from 0."
+                ),
             )
         elif options.noise and spread > MISFIT * options.noise:
-            status, reason = "unreliable", (
-                f"The shape fits no whisker with one contact: points lie {1e6 * spread:.0f} µm from it, the noise is "
-                f"{1e6 * options.noise:.0f} µm."
+            status, reason = (
+                "unreliable",
+                (
+                    f"The shape fits no whisker with one contact: points lie {1e6 * spread:.0f} µm from it, the noise is "
+                    f"{1e6 * options.noise:.0f} µm."
+                ),
             )
         elif not NEAREST + 1e-3 < found.x[3] < FARTHEST - 1e-3:
             status, reason = "unreliable", "The contact lies at the end of the range that is looked for."
         elif deviation > VAGUE * abs(force):
-            status, reason = "unreliable", (
-                f"The shape tells the force to {100 * deviation / abs(force):.0f} % only; give the contact point, or trace "
-                "more of the whisker."
+            status, reason = (
+                "unreliable",
+                (
+                    f"The shape tells the force to {100 * deviation / abs(force):.0f} % only; give the contact point, or trace "
+                    "more of the whisker."
+                ),
             )
         return Contact(
             force=force,

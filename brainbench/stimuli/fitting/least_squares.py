@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -121,9 +120,9 @@ class _Problem:
                 jac=self.jacobian,
                 bounds=(low, high),
                 loss=self.model.options.loss,
-                # Far from the solution residuals are many times the noise, and costs large: only the step tells.
-                ftol=1e-9,
-                xtol=1e-6,
+                # A change of the cost by this share moves no coordinate by a hundredth of its standard deviation.
+                ftol=1e-7,
+                xtol=1e-5,
                 gtol=1e-9,
                 max_nfev=self.model.options.most_iterations,
             )
@@ -192,9 +191,7 @@ def _judge(problem: _Problem, u: Array, converged: bool, iterations: int, began:
         directions=found,
         tests=tests,
         whisker=whisker,
-        residuals=tuple(
-            trial.residuals(trace, whisker) for trial, trace in zip(model.trials, traces, strict=True)
-        ),
+        residuals=tuple(trial.residuals(trace, whisker) for trial, trace in zip(model.trials, traces, strict=True)),
         predicted=predicted,
         covariance=covariance,
         iterations=iterations,

@@ -75,9 +75,7 @@ class Readings:
         for kind in ("F", "M", "s"):
             same = [i for i, name in enumerate(names) if name.startswith(kind)]
             size[same] = np.maximum(size[same], 0.1 * size[same].max(initial=0.0))
-        return cls(
-            np.concatenate(owners), np.concatenate(rows).astype(int), np.concatenate(groups), names, noise, size
-        )
+        return cls(np.concatenate(owners), np.concatenate(rows).astype(int), np.concatenate(groups), names, noise, size)
 
     def __len__(self) -> int:
         return len(self.trial)
@@ -147,9 +145,7 @@ class FitModel:
 
     def evaluate(self, points: Sequence[Array]) -> list[Array]:
         """Return the whitened residuals [m] at each of some coordinates [p]; NaN where a simulation is not trusted."""
-        return [
-            self.whitened(traces, u) for traces, u in zip(self.traces(points), points, strict=True)
-        ]
+        return [self.whitened(traces, u) for traces, u in zip(self.traces(points), points, strict=True)]
 
     def whitened(self, traces: Sequence[Trace], u: Array) -> Array:
         """Return the residuals [m] of traces simulated at coordinates u [p], divided by the noise."""

@@ -37,16 +37,19 @@ PUBLISHED: Mapping[str, Prior] = {
         3.34e9, _log_spread(3.34, 1.48), "Quist et al. (2011), J. Biomech. 44, 2775-2781: 3.34 ± 1.48 GPa"
     ),
     "density": Prior(
-        1260.0, 0.15, "Yang, Belli & Hartmann (2019), J. Neurophysiol. 121, 1879-1895: 1260 (base) to 1690 kg/m³ (tip); "
-        "the spread is half of that range"
+        1260.0,
+        0.15,
+        "Yang, Belli & Hartmann (2019), J. Neurophysiol. 121, 1879-1895: 1260 (base) to 1690 kg/m³ (tip); "
+        "the spread is half of that range",
     ),
     "damping_ratio": Prior(
-        math.sqrt(0.11 * 0.17), math.log(0.17 / 0.11) / 2, "isolated whiskers ring with .11 to .17, taken as ± 1 "
-        "standard deviation; a whisker in its follicle may be damped more"
+        math.sqrt(0.11 * 0.17),
+        math.log(0.17 / 0.11) / 2,
+        "isolated whiskers ring with .11 to .17, taken as ± 1 "
+        "standard deviation; a whisker in its follicle may be damped more",
     ),
     "friction": Prior(
         0.48, 0.15, "rat whisker on stainless steel, IEEE Trans. Haptics (2017), PMC5753595: .48; the spread is ours"
     ),
 }
 """Priors by parameter; others have none."""
-

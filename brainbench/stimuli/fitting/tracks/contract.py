@@ -120,5 +120,7 @@ def check_times(times: ArrayLike, count: int) -> NDArray[np.float64]:
 
 def _positive(value: Any) -> float:
     if not (math.isfinite(value) and value > 0):
-        raise UsageError(f"The noise of a measurement is a positive standard deviation in SI units; received {value!r}.")
+        raise UsageError(
+            f"The noise of a measurement is a positive standard deviation in SI units; received {value!r}."
+        )
     return float(value)
