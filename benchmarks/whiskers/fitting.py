@@ -36,7 +36,7 @@ PER_PERIOD = {"wrench": 24, "shape": 12}
 PERIODS, POINTS = 5, 30
 
 
-QUICK = FitOptions(links=10, steps_per_period=100.0)
+QUICK = FitOptions(links=8, steps_per_period=80.0, time_step=1e-3)
 """Setting of the simulations that count coverage, of truth and fit alike: it cancels."""
 
 
@@ -73,9 +73,10 @@ def one(kind: str, species: str, seed: int, finer: bool) -> dict:
     error["taper"] = (result.whisker.base_radius - result.whisker.tip_radius) / truth.arc_length / slope - 1
     radius = (known.base_radius + known.tip_radius) / 2
     cylinder = replace(known, base_radius=radius, tip_radius=radius)
-    wrong = fit(
-        Trial.ringdown(cylinder, measured, start), ("young_modulus", "damping_ratio", "deflection"), options=options
-    )
+    wrong = None
+    if seed % 4 < 2:  # half of them, of both species
+        names = ("young_modulus", "damping_ratio", "deflection")
+        wrong = fit(Trial.ringdown(cylinder, measured, start), names, options=options)
     return {
         "species": species,
         "status": result.status,
@@ -87,8 +88,7 @@ def one(kind: str, species: str, seed: int, finer: bool) -> dict:
             name: bool(result[name].interval.low <= truths[name] <= result[name].interval.high) for name in truths
         },
         "width": {name: result[name].relative_deviation for name in truths},
-        "wrong_status": wrong.status,
-        "wrong_alarm": any(not test.passed for test in wrong.tests),
+        "wrong_alarm": None if wrong is None else any(not test.passed for test in wrong.tests),
     }
 
 
@@ -112,9 +112,10 @@ def rows_of(found: list[dict]) -> list[list[str]]:
 
 def share(found: list[dict], name: str) -> str:
     """Return how many of the fits raised an alarm."""
-    count = sum(item[name] for item in found)
-    interval = wilson_interval(count, len(found))
-    return f"{count} of {len(found)} ({100 * count / len(found):.1f} % [{100 * interval.low:.1f}, {100 * interval.high:.1f}])"
+    asked = [item[name] for item in found if item[name] is not None]
+    interval = wilson_interval(sum(asked), len(asked))
+    percent, low, high = (100 * one for one in (sum(asked) / len(asked), interval.low, interval.high))
+    return f"{sum(asked)} of {len(asked)} ({percent:.1f} % [{low:.1f}, {high:.1f}])"
 
 
 def main() -> None:
@@ -127,17 +128,21 @@ def main() -> None:
     ]  # fmt: skip
     kept = read_json(options.keep) if options.keep.is_file() else {}
     parts = [
-        "Whiskers C2 of mouse and rat in turn, Young's modulus and tip radius drawn with a spread of 25 %, damping ratio .08 "
-        f"to .25, let go from a deflection of 5 to 10 % of the length and read over five periods. Base wrench 24 times a period "
-        f"with {100 * WRENCH_NOISE:g} % noise of the largest force or moment, or shapes of {POINTS} points 12 times a period "
-        f"with {1e6 * SHAPE_NOISE:g} µm. Fits start from the "
-        "published whisker; the base radius and density are known. Errors in %; coverage of the 95 % intervals (Laplace) with "
-        "Wilson intervals. `taper` is the slope of the radius, (base radius − tip radius)/length. Derivatives: central differences in double precision."
+        "Whiskers C2 of mouse and rat in turn, Young's modulus and tip radius drawn with a spread of 25 %, damping "
+        "ratio .08 "
+        "to .25, let go from a deflection of 5 to 10 % of the length and read over five periods. Base wrench 24 "
+        "times a period "
+        f"with {100 * WRENCH_NOISE:g} % noise of the largest force or moment, or shapes of {POINTS} points 12 times a "
+        f"period with {1e6 * SHAPE_NOISE:g} µm. Fits start from the "
+        "published whisker; the base radius and density are known. Errors in %; coverage of the 95 % intervals "
+        "(Laplace) with "
+        "Wilson intervals. `taper` is the slope of the radius, (base radius − tip radius)/length. Derivatives: "
+        "central differences in double precision."
     ]
     for kind, finer in cases:
         name = f"{kind}-{'finer' if finer else 'own'}"
         found = kept.get(name, [])
-        count = options.simulations // 4 if finer else options.simulations
+        count = options.simulations // 8 if finer else options.simulations
         for seed in range(len(found), count):
             found.append(one(kind, ("mouse", "rat")[seed % 2], seed, finer))
             if len(found) % 10 == 0 or len(found) == count:
@@ -155,8 +160,8 @@ def main() -> None:
         parts.append(f"#### {heading}, {title} ({len(found)} simulations)")
         parts.append(table(columns, rows_of(found)))
         parts.append(
-            f"Residuals of the right model are called structured in {share(found, 'alarm')} (asked for: 1 %), those of a "
-            f"cylinder of the mean radius in {share(found, 'wrong_alarm')}. A fit simulates "
+            f"Residuals of the right model are called structured in {share(found, 'alarm')} (asked for: 1 %), those "
+            f"of a cylinder of the mean radius in {share(found, 'wrong_alarm')}. A fit simulates "
             f"{np.median([item['whiskers'] for item in found]):.0f} whiskers in "
             f"{np.median([item['seconds'] for item in found]):.2f} s of processor time (median)."
         )

@@ -11,19 +11,40 @@ from typing import TYPE_CHECKING
 from brainbench.core.lazy import lazy_exports
 
 if TYPE_CHECKING:
+    from brainbench.stimuli.fitting.contacts import ContactOptions, find_contacts
     from brainbench.stimuli.fitting.least_squares import fit
     from brainbench.stimuli.fitting.options import FitOptions
     from brainbench.stimuli.fitting.result import Estimate, FitResult
     from brainbench.stimuli.fitting.tracks.contract import new_shapes, new_wrenches
+    from brainbench.stimuli.fitting.tracks.options import TrackOptions
+    from brainbench.stimuli.fitting.tracks.readers import read_shapes
+    from brainbench.stimuli.fitting.tracks.wrenches import read_wrenches
     from brainbench.stimuli.fitting.trials import Trial
 
-__all__ = ["Estimate", "FitOptions", "FitResult", "Trial", "fit", "new_shapes", "new_wrenches"]
+__all__ = [
+    "ContactOptions",
+    "Estimate",
+    "FitOptions",
+    "FitResult",
+    "TrackOptions",
+    "Trial",
+    "find_contacts",
+    "fit",
+    "new_shapes",
+    "new_wrenches",
+    "read_shapes",
+    "read_wrenches",
+]
 
 _MODULES = {
+    ".contacts": ("ContactOptions", "find_contacts"),
     ".least_squares": ("fit",),
     ".options": ("FitOptions",),
     ".result": ("Estimate", "FitResult"),
     ".tracks.contract": ("new_shapes", "new_wrenches"),
+    ".tracks.options": ("TrackOptions",),
+    ".tracks.readers": ("read_shapes",),
+    ".tracks.wrenches": ("read_wrenches",),
     ".trials": ("Trial",),
 }
 __getattr__, __dir__ = lazy_exports(__name__, {name: module for module, names in _MODULES.items() for name in names})

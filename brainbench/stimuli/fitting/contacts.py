@@ -141,8 +141,8 @@ def find_contacts(
 class ContactSolver:
     """Least squares on the quasi-static shape of one whisker.
 
-    Unknowns, all near one: x and y of the base over the length L, its direction (rad), the contact's arc over L, and the
-    deflection d over L that the force f would make in small bending, f = 3 E I(0) r(a)/r(0) d/a³.
+    Unknowns, all near one: x and y of the base over the length L, its direction (rad), the contact's arc over L, and
+    the deflection d over L that the force f would make in small bending, f = 3 E I(0) r(a)/r(0) d/a³.
     """
 
     def __init__(self, whisker: Whisker, options: ContactOptions) -> None:
@@ -249,15 +249,16 @@ class ContactSolver:
             status, reason = (
                 "undefined",
                 (
-                    f"No sign of a contact: the force is {abs(force) / max(deviation, 1e-300):.1f} standard deviations from 0."
+                    f"No sign of a contact: the force is {abs(force) / max(deviation, 1e-300):.1f} standard "
+                    "deviations from 0."
                 ),
             )
         elif options.noise and spread > MISFIT * options.noise:
             status, reason = (
                 "unreliable",
                 (
-                    f"The shape fits no whisker with one contact: points lie {1e6 * spread:.0f} µm from it, the noise is "
-                    f"{1e6 * options.noise:.0f} µm."
+                    f"The shape fits no whisker with one contact: points lie {1e6 * spread:.0f} µm from it, the noise "
+                    f"is {1e6 * options.noise:.0f} µm."
                 ),
             )
         elif not NEAREST + 1e-3 < found.x[3] < FARTHEST - 1e-3:
@@ -266,8 +267,8 @@ class ContactSolver:
             status, reason = (
                 "unreliable",
                 (
-                    f"The shape tells the force to {100 * deviation / abs(force):.0f} % only; give the contact point, or trace "
-                    "more of the whisker."
+                    f"The shape tells the force to {100 * deviation / abs(force):.0f} % only; give the contact point, "
+                    "or trace more of the whisker."
                 ),
             )
         return Contact(

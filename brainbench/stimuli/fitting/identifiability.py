@@ -90,7 +90,8 @@ def _listed(names: Sequence[str]) -> str:
 
 
 def unknown_parameters(found: Sequence[Direction]) -> dict[str, Direction]:
-    """Return the parameters that take part in a direction that is not identified, each with the worst such direction."""
+    """Return the parameters that take part in a direction that is not identified, each with the worst such "
+    "direction."""
     worst: dict[str, Direction] = {}
     for direction in found:
         if not direction.identified:

@@ -212,8 +212,8 @@ def _judge_one(problem: _Problem, index: int, u: Array, unknown: Direction | Non
         return "unreliable", f"{name} is at its {end} bound, so that its interval means nothing; widen the bounds."
     if name == "damping_ratio" and (value := model.free.values(u)[index]) < 1.2 * model.least_damping:
         return "unreliable", (
-            f"damping_ratio is {value:.3g}, and the time step alone damps with {model.least_damping:.3g}; fit with more "
-            "steps_per_period."
+            f"damping_ratio is {value:.3g}, and the time step alone damps with {model.least_damping:.3g}; fit with "
+            "more steps_per_period."
         )
     return "ok", ""
 

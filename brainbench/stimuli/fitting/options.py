@@ -7,7 +7,7 @@ from typing import Literal
 
 from brainbench.core.errors import check_name
 from brainbench.core.reading.ranges import check_number
-from brainbench.core.statistics import LEVEL, check_level
+from brainbench.core.statistics import check_level
 from brainbench.stimuli.engines import DEFAULT_ENGINE
 
 LOSSES = ("linear", "soft_l1", "huber", "cauchy")
@@ -22,8 +22,8 @@ class FitOptions:
     priors: str = "none"
     """Prior of the parameters: none, or published (means and spreads of measured whiskers)."""
     intervals: str = "laplace"
-    """Confidence intervals: laplace (from the curvature at the best fit), or profile (of the likelihood; takes longer)."""
-    level: float = LEVEL
+    """Confidence intervals: laplace (curvature of the likelihood at the best fit), or profile (takes longer)."""
+    level: float = 0.95
     """Coverage of the confidence intervals."""
     loss: str = "linear"
     """Loss of a residual: linear (least squares), or soft_l1, huber or cauchy, which outliers pull less."""
@@ -35,7 +35,7 @@ class FitOptions:
     """Time steps in one period of the whisker's first mode at the start of the fit. Few steps damp higher modes, which
     biases stiffness and taper by more than the noise of a good sensor."""
     time_step: float = 1e-4
-    """Longest time step [s]."""
+    """Longest time step (s)."""
     solver: Literal["dynamic", "quasistatic"] = "dynamic"
     """quasistatic leaves out inertia and damping, for slow contact."""
     twist: bool = True

@@ -1,4 +1,5 @@
-"""Priors of whisker parameters from published measurements: normal laws, of logarithms where a parameter is positive."""
+"""Priors of whisker parameters from published measurements: normal laws, of logarithms where a parameter is "
+"positive."""
 
 from __future__ import annotations
 

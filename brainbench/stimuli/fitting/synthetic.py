@@ -77,7 +77,8 @@ def measure_shapes(
     traced: float = 0.95,
     axes: int = 2,
 ) -> Trial:
-    """Return a trial with traced shapes of a simulation: points evenly spaced on a share of the whisker, with noise (m)."""
+    """Return a trial with traced shapes of a simulation: points evenly spaced on a share of the whisker, with noise "
+    "(m)."""
     places = sample_shape(trace, whisker, np.linspace(0.0, traced * whisker.arc_length, points))[..., :axes]
     return replace(trial, measured=new_shapes(trial.job.times, places + rng.normal(size=places.shape) * noise))
 

@@ -48,9 +48,9 @@ class Pluck:
     def loads(self, condition: Condition, start: float) -> tuple[Load, Load]:
         """Return the loads that hold the whisker aside from ``start`` (s) to the release.
 
-        A load that comes at once makes the first mode swing. Half a period at 1/(1 + K) of it, with the mode's decay K in
-        that time, carries the mode to its rest under the whole load (input shaping, Singer & Seering 1990, J. Dyn. Syst.
-        Meas. Control 112, 76).
+        A load that comes at once makes the first mode swing. Half a period at 1/(1 + K) of it, with the mode's decay K
+        in that time, carries the mode to its rest under the whole load (input shaping, Singer & Seering 1990, J. Dyn.
+        Syst. Meas. Control 112, 76).
         """
         whisker = condition.whisker
         arc = min(self.arc, whisker.arc_length)

@@ -100,7 +100,7 @@ def _frames(values: Array, path: str | os.PathLike[str]) -> NDArray[np.int_]:
     return values.astype(int)
 
 
-def pickled_names(data: bytes, name: str) -> list[tuple[str, ...]]:
+def pickled_names(data: bytes, name: str) -> list[tuple[str, ...]]:  # noqa: PLR0912 — a branch for each word
     """Return the list of tuples of texts that a pickle spells out, without loading it.
 
     Raises:

@@ -16,9 +16,9 @@ class TrackOptions:
     """Scale, frame rate and identity of a track; a value that cannot be is a :class:`UsageError`."""
 
     metres_per_pixel: float | None = None
-    """Length of a pixel (or of the unit of the file) [m]."""
+    """Length of a pixel (or of the unit of the file) in m."""
     frame_rate: float | None = None
-    """Frames per second of the video [Hz]."""
+    """Frames per second of the video (Hz)."""
     track: str | None = None
     """Which whisker of the file: a label of whisk, a number of WhiskerMan (from 1), or an individual of DeepLabCut."""
     layout: str = "auto"
@@ -48,13 +48,13 @@ class TrackOptions:
             check_number(name, value, above=0)
         if not 1e-8 <= float(self.metres_per_pixel or math.nan) <= 1e-2:
             raise UsageError(
-                f"metres_per_pixel is {self.metres_per_pixel:g} m; a pixel of a whisker video is between 1e-8 and 1e-2 m "
-                "(50 µm = 5e-5)."
+                f"metres_per_pixel is {self.metres_per_pixel:g} m; a pixel of a whisker video is between 1e-8 and "
+                "1e-2 m (50 µm = 5e-5)."
             )
         if not 10 <= float(self.frame_rate or math.nan) <= 1e6:
             raise UsageError(
-                f"frame_rate is {self.frame_rate:g} Hz; videos of whiskers have 10 to 1e6 frames per second: give frames "
-                "per second, not the time of a frame."
+                f"frame_rate is {self.frame_rate:g} Hz; videos of whiskers have 10 to 1e6 frames per second: give "
+                "frames per second, not the time of a frame."
             )
         check_number("least_likelihood", self.least_likelihood, least=0, most=1)
         check_number("points of a trace", self.points, least=2, whole=True)

@@ -24,7 +24,8 @@ LONGER = 1.1
 UNITS = 5.0
 """The same ratio, or its inverse, from which the unit is wrong and not the whisker."""
 JUMP = 8.0
-"""Step of the base over the usual step from which it is a jump; a jump must also be a share :data:`FAR` of the length."""
+"""Step of the base over the usual step from which it is a jump; a jump must also be a share :data:`FAR` of the "
+"length."""
 FAR = 0.1
 
 
@@ -88,8 +89,8 @@ def check_track(shapes: xr.Dataset) -> TrackQuality:
     found = inspect_track(shapes)
     if found.missing_frames > MOST_GAPS * found.frames:
         raise DataError(
-            f"{found.missing_frames} of {found.frames} frames have no shape (the longest gap is {found.longest_gap}); a "
-            f"track is used up to {100 * MOST_GAPS:g} %: trace it again, or cut it to frames in which it was seen."
+            f"{found.missing_frames} of {found.frames} frames have no shape (the longest gap is {found.longest_gap}); "
+            f"a track is used up to {100 * MOST_GAPS:g} %: trace it again, or cut it to frames in which it was seen."
         )
     if len(found.jumps):
         raise DataError(f"{_swap_words(found.jumps)} Correct the identities, or cut the track there.")
@@ -162,6 +163,6 @@ def _jumps(points: NDArray[np.float64], seen: NDArray[np.bool_], length: float) 
 def _swap_words(jumps: NDArray[np.int_]) -> str:
     shown = ", ".join(map(str, jumps[:5].tolist())) + (" …" if len(jumps) > 5 else "")
     return (
-        f"The base jumps or the shape turns into its mirror image at {len(jumps)} frames ({shown}), as when the whisker "
-        "changes places with its neighbour or with that of the other side."
+        f"The base jumps or the shape turns into its mirror image at {len(jumps)} frames ({shown}), as when the "
+        "whisker changes places with its neighbour or with that of the other side."
     )

@@ -28,13 +28,13 @@ def read_shapes(path: str | os.PathLike[str], options: TrackOptions):  # noqa: A
 
     Args:
         path: a track of DeepLabCut (``.csv``, ``.h5``), whisk (``.whiskers``, ``.hdf5`` of WhiskiWrap), WhiskerMan
-            (``.tr4``, ``.mat``), or a table of points (``.csv`` with the columns frame, x, y, and perhaps z and whisker;
-            points of a frame in order from the base).
+            (``.tr4``, ``.mat``), or a table of points (``.csv`` with the columns frame, x, y, and perhaps z and
+            whisker; points of a frame in order from the base).
         options: scale, frame rate, and which whisker.
 
     Returns:
-        The data set of :mod:`brainbench.stimuli.fitting.tracks.contract`; its attributes ``faults`` say, a sentence each,
-        what is missing.
+        The data set of :mod:`brainbench.stimuli.fitting.tracks.contract`; its attributes ``faults`` say, a sentence
+        each, what is missing.
 
     Raises:
         UsageError: the whisker, or an option, is unknown.
@@ -57,6 +57,19 @@ def read_shapes(path: str | os.PathLike[str], options: TrackOptions):  # noqa: A
     )
     shapes.attrs["faults"] = list(check_track(shapes).words)
     return shapes
+
+
+def holds_shapes(path: str | os.PathLike[str]) -> bool:
+    """Return True for a file of traced shapes, False for one of wrenches, as far as its ending and first names tell."""
+    suffix = Path(path).suffix.lower()
+    if suffix == ".csv":
+        first = read_rows(path, "track or table of wrenches")[:1]
+        return bool(first) and (first[0][0] == "scorer" or {"x", "y"} <= set(first[0]))
+    if suffix in (".h5", ".hdf5"):
+        with open_hdf5(path, "track or file of wrenches") as file:
+            groups = [item for item in file.values() if hasattr(item, "keys")]
+            return "pixels_x" in file or any("table" in item or "block0_values" in item for item in groups)
+    return suffix not in (".nwb", ".nc")
 
 
 def detect_layout(path: str | os.PathLike[str]) -> str:
@@ -82,8 +95,8 @@ def detect_layout(path: str | os.PathLike[str]) -> str:
         if first and {"frame", "x", "y"} <= set(first[0]):
             return "points"
         raise DataError(
-            f"{name} is no track: a table of DeepLabCut begins with scorer, one of points with frame, x and y; this one "
-            f"begins with {listing(first[0] if first else [])}."
+            f"{name} is no track: a table of DeepLabCut begins with scorer, one of points with frame, x and y; this "
+            f"one begins with {listing(first[0] if first else [])}."
         )
     if suffix == ".measurements":
         raise UsageError(

@@ -41,7 +41,8 @@ def numbers_of(
     for index, row in enumerate(rows):
         if len(row) != columns:
             raise DataError(
-                f"{shown(os.fspath(path))} is no {kind}: line {index + first} has {len(row)} cells, its first {columns}."
+                f"{shown(os.fspath(path))} is no {kind}: line {index + first} has {len(row)} cells, its first "
+                f"{columns}."
             )
         for column, cell in enumerate(row):
             if cell and cell.lower() not in ("nan", "na"):

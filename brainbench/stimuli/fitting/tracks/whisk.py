@@ -2,8 +2,8 @@
 
 Read are ``.whiskers`` files, binary (``bwhiskbin1``) and text (``whisker1``), and the HDF5 files that WhiskiWrap makes
 of them (``summary`` with ``pixels_x`` and ``pixels_y``). Which trace of a frame is which whisker stands in the
-measurements, read as the CSV table (columns ``fid``, ``wid``, ``label`` and perhaps ``follicle_x``, ``follicle_y``) that
-whisk's Python and MATLAB interfaces export; binary ``.measurements`` files are not read.
+measurements, read as the CSV table (columns ``fid``, ``wid``, ``label`` and perhaps ``follicle_x``, ``follicle_y``)
+that whisk's Python and MATLAB interfaces export; binary ``.measurements`` files are not read.
 """
 
 from __future__ import annotations
@@ -55,8 +55,8 @@ def read_whisk(path: str | os.PathLike[str], options: TrackOptions) -> tuple[NDA
         frames = [frame for frame, _ in chosen]
         if len(set(frames)) < len(frames):
             raise UsageError(
-                f"Frames of {name} hold several traces; give the table of whisk's measurements (CSV) as identities, and "
-                "the whisker's label as track."
+                f"Frames of {name} hold several traces; give the table of whisk's measurements (CSV) as identities, "
+                "and the whisker's label as track."
             )
     traces = {key[0]: segments[key] for key in chosen}
     if not traces:
@@ -79,7 +79,8 @@ def _read_segments(path: str | os.PathLike[str]) -> Segments:
 
 
 def _parse_binary(data: bytes, name: str) -> Segments:
-    """Return the traces of records of three int32 (number, frame, length) and four float32 lists: x, y, width, score."""
+    """Return the traces of records of three int32 (number, frame, length) and four float32 lists: x, y, width, "
+    "score."""
     found: Segments = {}
     place, end = len(_HEADER), len(data) - 4
     while place < end:

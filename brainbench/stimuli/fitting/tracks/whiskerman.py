@@ -1,9 +1,9 @@
 """Tracks of WhiskerMan (Petersen et al. 2020, PLoS Comput. Biol. 16, e1007402): ``.tr4``, ``.tr4_2D`` and ``.mat``.
 
 The struct array ``whisker`` holds, for each whisker, the control points of a Bézier curve in every frame, ``r3all``
-[frame, 3, control point], whether it was ``tracked``, and its follicle ``fp3_all`` [frame, 3] (pixels). Read are MATLAB's
-formats up to 7, and 7.3, which is HDF5. As many points are taken of a curve as it has control points: more would repeat
-the same numbers.
+[frame, 3, control point], whether it was ``tracked``, and its follicle ``fp3_all`` [frame, 3] (pixels). Read are
+MATLAB's formats up to 7, and 7.3, which is HDF5. As many points are taken of a curve as it has control points: more
+would repeat the same numbers.
 """
 
 from __future__ import annotations

@@ -33,7 +33,8 @@ def read_wrenches(
     """Read the forces and moments at the base of one whisker.
 
     Args:
-        path: a table (``.csv``) with a column of times (``time`` or ``time_s``, ``time_ms``) and columns ``Fx`` … ``Mz``
+        path: a table (``.csv``) with a column of times (``time`` or ``time_s``, ``time_ms``) and columns ``Fx`` …
+        ``Mz``
             in N and N·m, or with a unit as in ``Fy_mN`` and ``Mz_uNm``; an HDF5 file with ``wrench`` [n, channel] and
             ``time``, or with a time series as NWB stores it (``data`` with ``timestamps``, or ``starting_time`` and its
             rate); or a stimulus set of ours.
@@ -71,8 +72,8 @@ def _read_csv(path: str | os.PathLike[str]) -> xr.Dataset:
             columns.append(table[:, index] * _SCALES[unit])
     if not channels:
         raise DataError(
-            f"{shown(os.fspath(path))} has no column of forces or moments; they are called Fx … Mz, or Fy_mN, Mz_uNm. It "
-            f"has {listing(names)}."
+            f"{shown(os.fspath(path))} has no column of forces or moments; they are called Fx … Mz, or Fy_mN, Mz_uNm. "
+            f"It has {listing(names)}."
         )
     return new_wrenches(times, np.stack(columns, axis=1), channels, source=os.fspath(path))
 
@@ -81,8 +82,8 @@ def _read_hdf5(file: Any, path: str | os.PathLike[str]) -> xr.Dataset:
     series = _find_series(file)
     if series is None:
         raise DataError(
-            f"{shown(os.fspath(path))} holds no wrenches: neither 'wrench' [n, channel] nor a time series whose 'data' has "
-            "six columns."
+            f"{shown(os.fspath(path))} holds no wrenches: neither 'wrench' [n, channel] nor a time series whose "
+            "'data' has six columns."
         )
     data, group = series
     values = np.asarray(data[()], dtype=float)
