@@ -16,7 +16,9 @@ def bent_shapes(frames=12, points=10, length=0.015, *, bend=0.2, axes=2):
     y = bend * s**2 / length
     x = s
     shapes = np.stack([np.cos(angle) * x - np.sin(angle) * y, np.sin(angle) * x + np.cos(angle) * y], axis=-1)
-    return shapes if axes == 2 else np.concatenate([shapes, 0.1 * s[None, :, None] * np.ones_like(angle)[..., None]], -1)
+    return (
+        shapes if axes == 2 else np.concatenate([shapes, 0.1 * s[None, :, None] * np.ones_like(angle)[..., None]], -1)
+    )
 
 
 def write_points(path, shapes, *, scale=5e-5, frames=None):

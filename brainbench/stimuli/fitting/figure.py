@@ -27,7 +27,7 @@ def draw_fit(trial: Trial, result: FitResult, path: str | os.PathLike[str], *, i
         path: ``.png``, ``.svg`` or ``.pdf``.
         index: which of the trials of the result it is.
     """
-    figure, axes = panels(2, 2 if trial.of_shapes else 1, (9.5, 6.2), squeeze=False)
+    figure, axes = panels(2, 2 if trial.of_shapes else 1, (9.5, 6.2))
     if trial.of_shapes:
         _draw_shapes(axes, trial, result, index)
     else:

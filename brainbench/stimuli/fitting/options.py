@@ -8,7 +8,6 @@ from typing import Literal
 from brainbench.core.errors import check_name
 from brainbench.core.reading.ranges import check_number
 from brainbench.core.statistics import check_level
-from brainbench.stimuli.engines import DEFAULT_ENGINE
 
 LOSSES = ("linear", "soft_l1", "huber", "cauchy")
 INTERVALS = ("laplace", "profile")
@@ -40,7 +39,7 @@ class FitOptions:
     """quasistatic leaves out inertia and damping, for slow contact."""
     twist: bool = True
     """Whether whiskers may twist."""
-    backend: str = DEFAULT_ENGINE
+    backend: str = "rod"
     """Physics engine."""
     workers: int | None = 1
     """Threads of the simulation; all usable processors when None."""

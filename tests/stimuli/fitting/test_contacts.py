@@ -109,7 +109,8 @@ def test_shapes_in_a_tilted_plane_give_the_same_force():
     space = np.pad(points, ((0, 0), (0, 1))) @ tilt.T
     flat, tilted = (find_contacts(new_shapes(np.zeros(1), one[None]), MOUSE) for one in (points, space))
     assert float(tilted["force"][0]) == pytest.approx(float(flat["force"][0]), rel=1e-2)
-    helix = points[:, :1] * [1, 0, 0] + 2e-3 * np.stack([0 * points[:, 0], *(np.sin(3e2 * points[:, 0] + a) for a in (0, 1.5))], 1)
+    x = points[:, 0]
+    helix = np.stack([x, *(2e-3 * np.sin(300 * x + phase) for phase in (0, 1.5))], axis=1)
     with pytest.raises(DataError, match="no plane"):
         find_contacts(new_shapes(np.arange(3.0), np.tile(helix, (3, 1, 1))), MOUSE)
 

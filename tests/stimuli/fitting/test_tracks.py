@@ -79,7 +79,7 @@ def _two_whiskers():
     """Two traces a frame whose numbers change places, half of them written tip first."""
     traces, labels, follicles = {}, {}, {}
     for frame, points in enumerate(PIXELS):
-        for label, trace in enumerate((points, points + [0, 40])):
+        for label, trace in enumerate((points, points + np.array([0, 40]))):
             key = (frame, (label + frame) % 2)
             traces[key], labels[key], follicles[key] = (trace[::-1] if frame % 2 else trace), label, trace[0]
     return traces, labels, follicles
