@@ -1,6 +1,8 @@
 """Truth of fitted whiskers: errors, coverage of intervals, and whether a wrong model is noticed.
 
-``python -m benchmarks.whiskers.fitting [--simulations 200] [--keep FILE]``. Whiskers of random stiffness, taper and
+``python -m benchmarks.whiskers.fitting [--simulations 200] [--keep FOLDER] [--only wrench-own]``.
+
+Whiskers of random stiffness, taper and
 damping ring down; their base wrench or their shape is read with noise and fitted from the published whisker. Truths
 are simulated at the setting of the fit, and others with twice the links and a step of two fifths.
 """
@@ -33,7 +35,7 @@ NAMES = ("young_modulus", "tip_radius", "damping_ratio", "deflection")
 GOAL = 0.05
 WRENCH_NOISE, SHAPE_NOISE = 0.01, 20e-6
 PER_PERIOD = {"wrench": 24, "shape": 12}
-PERIODS, POINTS = 5, 30
+PERIODS, POINTS = 5, 20
 
 
 QUICK = FitOptions(links=8, steps_per_period=80.0, time_step=1e-3)
@@ -121,12 +123,13 @@ def share(found: list[dict], name: str) -> str:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--simulations", type=int, default=200)
-    parser.add_argument("--keep", type=Path, default=Path("build/fitting.json"), help="Fits that were made so far.")
+    parser.add_argument("--keep", type=Path, default=Path("build/fitting"), help="Folder of the fits made so far.")
+    parser.add_argument("--only", help="Make the fits of one case and write no section: wrench-own, shape-finer, …")
     options = parser.parse_args()
     cases = [
         ("wrench", False), ("shape", False), ("wrench", True), ("shape", True),
     ]  # fmt: skip
-    kept = read_json(options.keep) if options.keep.is_file() else {}
+    options.keep.mkdir(parents=True, exist_ok=True)
     parts = [
         "Whiskers C2 of mouse and rat in turn, Young's modulus and tip radius drawn with a spread of 25 %, damping "
         "ratio .08 "
@@ -141,13 +144,15 @@ def main() -> None:
     ]
     for kind, finer in cases:
         name = f"{kind}-{'finer' if finer else 'own'}"
-        found = kept.get(name, [])
+        file = options.keep / f"{name}.json"
+        found = read_json(file) if file.is_file() else []
+        if options.only not in (None, name):
+            continue
         count = options.simulations // 8 if finer else options.simulations
         for seed in range(len(found), count):
             found.append(one(kind, ("mouse", "rat")[seed % 2], seed, finer))
             if len(found) % 10 == 0 or len(found) == count:
-                kept[name] = found
-                write_json(options.keep, kept)
+                write_json(file, found)
                 print(name, len(found), flush=True)
         title = (
             f"truth with {FINE.links} links and {FINE.steps_per_period:g} steps a period, fit at its default "
@@ -165,7 +170,8 @@ def main() -> None:
             f"{np.median([item['whiskers'] for item in found]):.0f} whiskers in "
             f"{np.median([item['seconds'] for item in found]):.2f} s of processor time (median)."
         )
-    write_section(TITLE, "python -m benchmarks.whiskers.fitting", "\n\n".join(parts), subject="whiskers")
+    if options.only is None:
+        write_section(TITLE, "python -m benchmarks.whiskers.fitting", "\n\n".join(parts), subject="whiskers")
 
 
 if __name__ == "__main__":

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from brainbench.stimuli.fitting.contacts import ContactOptions, find_contacts
     from brainbench.stimuli.fitting.least_squares import fit
     from brainbench.stimuli.fitting.options import FitOptions
-    from brainbench.stimuli.fitting.result import Estimate, FitResult
+    from brainbench.stimuli.fitting.result import FitResult, FittedParameter
     from brainbench.stimuli.fitting.tracks.contract import new_shapes, new_wrenches
     from brainbench.stimuli.fitting.tracks.options import TrackOptions
     from brainbench.stimuli.fitting.tracks.readers import read_shapes
@@ -23,9 +23,9 @@ if TYPE_CHECKING:
 
 __all__ = [
     "ContactOptions",
-    "Estimate",
     "FitOptions",
     "FitResult",
+    "FittedParameter",
     "TrackOptions",
     "Trial",
     "find_contacts",
@@ -40,7 +40,7 @@ _MODULES = {
     ".contacts": ("ContactOptions", "find_contacts"),
     ".least_squares": ("fit",),
     ".options": ("FitOptions",),
-    ".result": ("Estimate", "FitResult"),
+    ".result": ("FittedParameter", "FitResult"),
     ".tracks.contract": ("new_shapes", "new_wrenches"),
     ".tracks.options": ("TrackOptions",),
     ".tracks.readers": ("read_shapes",),

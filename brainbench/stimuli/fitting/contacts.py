@@ -61,7 +61,7 @@ class ContactOptions:
 
 
 @dataclass(frozen=True)
-class Contact:
+class ContactEstimate:
     """Contact of one frame, as its shape tells."""
 
     force: float = math.nan
@@ -179,13 +179,15 @@ class ContactSolver:
             rows.append((shapes.contact - place) / options.contact_noise)
         return np.concatenate(rows, axis=1)
 
-    def solve(self, frame: Array, place: Array, before: Array | None = None) -> tuple[Contact, Array]:
+    def solve(self, frame: Array, place: Array, before: Array | None = None) -> tuple[ContactEstimate, Array]:
         """Return the contact of one frame's points [k, 2] (m), and the unknowns [5]; ``before`` is another start."""
         from scipy.optimize import least_squares
 
         points = frame[np.isfinite(frame).all(axis=-1)]
         if len(points) < FEWEST_POINTS:
-            return Contact(reason=f"{len(points)} points were traced; {FEWEST_POINTS} are needed."), np.full(5, np.nan)
+            return ContactEstimate(reason=f"{len(points)} points were traced; {FEWEST_POINTS} are needed."), np.full(
+                5, np.nan
+            )
         noise = self.options.noise or 1e-3 * self.whisker.arc_length
         low = np.array([-np.inf, -np.inf, -np.inf, NEAREST, -3.0])
         high = np.array([np.inf, np.inf, np.inf, FARTHEST, 3.0])
@@ -200,9 +202,8 @@ class ContactSolver:
 
         best = None
         for start in self._starts(points, place, noise, before):
-            found = least_squares(
-                residual, np.clip(start, low + 1e-3, high - 1e-3), jac=jacobian, bounds=(low, high), max_nfev=60
-            )
+            began = np.clip(start, low + 1e-3, high - 1e-3)
+            found = least_squares(residual, began, jac=jacobian, bounds=(low, high), max_nfev=60)  # type: ignore[arg-type]
             if best is None or found.cost < best.cost:
                 best = found
         assert best is not None
@@ -226,7 +227,7 @@ class ContactSolver:
         order = np.argsort(np.nan_to_num(cost, nan=np.inf))[:3]
         return [*grid[order], *([] if before is None else [before])]
 
-    def _judge(self, found, residual, jacobian, points: Array, noise: float) -> Contact:  # noqa: ANN001
+    def _judge(self, found, residual, jacobian, points: Array, noise: float) -> ContactEstimate:  # noqa: ANN001
         """Return the contact of a solution, with standard deviations and a status."""
         length, options = self.whisker.arc_length, self.options
         rows = residual(found.x)
@@ -271,7 +272,7 @@ class ContactSolver:
                     "or trace more of the whisker."
                 ),
             )
-        return Contact(
+        return ContactEstimate(
             force=force,
             arc=float(arc[0]),
             moment=float(shape.moment[0]),

@@ -56,7 +56,7 @@ def _direction(deviation: float, row: Array, names: Sequence[str]) -> Direction:
     order = np.argsort(-np.abs(row))
     order = order[np.abs(row[order]) > MEMBER * np.abs(row).max()]
     components = row[order] / row[order[0]]
-    members = tuple(names[index] for index in order)
+    members = tuple(names[int(index)] for index in order)
     known = deviation < UNKNOWN
     return Direction(deviation, members, tuple(components.tolist()), known, _words(deviation, members, components))
 

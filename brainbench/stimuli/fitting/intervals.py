@@ -45,8 +45,8 @@ def _interval(free: FreeParameters, index: int, low: float, high: float, level: 
             return parameter.value(start, end, free.start.whisker)
         return (0.0 if end < 0 else math.inf) if parameter.kind == "log" else end
 
-    ends = sorted((value(low), value(high)))
-    return Interval(*ends, level, method)
+    one, other = value(low), value(high)
+    return Interval(min(one, other), max(one, other), level, method)
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,7 +117,7 @@ class Profile:
             found = least_squares(
                 lambda rest: self.residual(full(rest)),
                 u[others],
-                jac=lambda rest: self.jacobian(full(rest))[:, others],
+                jac=lambda rest: self.jacobian(full(rest))[:, others],  # type: ignore[arg-type]
                 bounds=(self.limits[0][others], self.limits[1][others]),
                 max_nfev=8,
                 ftol=1e-6,

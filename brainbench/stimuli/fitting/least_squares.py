@@ -21,7 +21,7 @@ from brainbench.stimuli.fitting.options import FitOptions
 from brainbench.stimuli.fitting.parameters import FreeParameters, read_value, with_value
 from brainbench.stimuli.fitting.priors import PUBLISHED, Prior
 from brainbench.stimuli.fitting.residual_tests import check_residuals, failed_words
-from brainbench.stimuli.fitting.result import Estimate, FitResult
+from brainbench.stimuli.fitting.result import FitResult, FittedParameter
 from brainbench.stimuli.fitting.trials import Trial
 
 Array = NDArray[np.float64]
@@ -117,7 +117,7 @@ class _Problem:
             found = least_squares(
                 self.residual,
                 np.clip(u, low + 1e-6, high - 1e-6),
-                jac=self.jacobian,
+                jac=self.jacobian,  # type: ignore[arg-type]
                 bounds=(low, high),
                 loss=self.model.options.loss,
                 # A change of the cost by this share moves no coordinate by a hundredth of its standard deviation.
@@ -156,7 +156,7 @@ def _judge(problem: _Problem, u: Array, converged: bool, iterations: int, began:
         deviation = math.sqrt(covariance[index, index]) if covariance[index, index] >= 0 else math.inf
         status, reason = _judge_one(problem, index, u, unknown.get(name))
         estimates.append(
-            Estimate(
+            FittedParameter(
                 name,
                 _unit(name),
                 value,

@@ -47,14 +47,14 @@ class Readings:
     def of(cls, trials: Sequence[Trial]) -> Readings:
         """Return the readings of some trials: every finite number that was measured."""
         names = tuple(dict.fromkeys(name for trial in trials for name in trial.channels))
-        rows: list[Array] = []
+        rows: list[NDArray[np.int_]] = []
         owners, groups = [], []
         noise, squares, counts = np.full(len(names), np.nan), np.zeros(len(names)), np.zeros(len(names))
         for index, trial in enumerate(trials):
             values = trial.measured["shape" if trial.of_shapes else "wrench"].values
             if trial.of_shapes:
                 directions = values.shape[-1] - 1
-                known = np.repeat(np.isfinite(values).all(axis=-1)[..., None], directions, axis=-1)
+                known = np.repeat(np.isfinite(values).all(axis=-1, keepdims=True), directions, axis=-1)
                 group = np.full(known.shape, names.index("shape"))
                 sizes = np.full(known.shape, trial.job.whisker.arc_length / 100)
             else:

@@ -15,12 +15,15 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_array
 
 from brainbench.stimuli.fitting.model import Readings
+
+if TYPE_CHECKING:
+    from scipy.sparse import coo_array
 
 Array = NDArray[np.float64]
 LAGS = 3
@@ -80,6 +83,8 @@ def _deviate(residual: Array, basis: Array, weights: coo_array, variance: float)
 
 def _neighbours(readings: Readings, column: int) -> coo_array:
     """Return W [m, m], ½ where two readings differ by up to :data:`LAGS` in one place and agree in all else."""
+    from scipy.sparse import coo_array
+
     count = len(readings)
     fixed = [readings.trial, *(readings.place[:, other] for other in range(3) if other != column)]
     # Sorted, readings of one series stand together in order of the place.

@@ -18,7 +18,7 @@ from brainbench.stimuli.whiskers.whisker import Whisker
 
 
 @dataclass(frozen=True)
-class Estimate:
+class FittedParameter:
     """One fitted parameter."""
 
     name: str
@@ -52,7 +52,7 @@ class FitResult:
     ``undefined``: it did not converge, or a parameter cannot be told."""
     reasons: tuple[str, ...]
     """One sentence for each thing that is wrong."""
-    estimates: tuple[Estimate, ...]
+    estimates: tuple[FittedParameter, ...]
     noise: Mapping[str, float]
     """Standard deviation of a reading of each kind (N, N·m, m)."""
     directions: tuple[Direction, ...]
@@ -70,7 +70,7 @@ class FitResult:
     provenance: Mapping[str, Any] = field(default_factory=dict)
     """How derivatives were computed, with what simulation, how often, versions and machine."""
 
-    def __getitem__(self, name: str) -> Estimate:
+    def __getitem__(self, name: str) -> FittedParameter:
         """Return the estimate of a parameter."""
         from brainbench.core.errors import check_name
 
@@ -99,5 +99,5 @@ def _finite(value: float) -> float | None:
     return value if math.isfinite(value) else None
 
 
-def _plain(one: Estimate) -> dict[str, Any]:
+def _plain(one: FittedParameter) -> dict[str, Any]:
     return {**vars(one), "relative_deviation": _finite(one.relative_deviation)}

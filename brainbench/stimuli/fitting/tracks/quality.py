@@ -64,7 +64,7 @@ class TrackQuality:
 def inspect_track(shapes: xr.Dataset) -> TrackQuality:
     """Return what is wrong with traced shapes."""
     points = shapes["shape"].values
-    known = np.isfinite(points).all(axis=-1)
+    known: NDArray[np.bool_] = np.asarray(np.isfinite(points).all(axis=-1))
     seen = known.sum(axis=1) >= min(2, points.shape[1])
     edges = np.flatnonzero(np.diff(np.concatenate([[0], ~seen, [0]]).astype(int)))
     gaps = np.diff(edges.reshape(-1, 2), axis=1)

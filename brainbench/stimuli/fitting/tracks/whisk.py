@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -135,13 +136,14 @@ def _read_whiskiwrap(
     with open_hdf5(path, "HDF5 file of WhiskiWrap") as file:
         if missing := [name for name in ("summary", "pixels_x", "pixels_y") if name not in file]:
             raise DataError(f"{shown(os.fspath(path))} is no file of WhiskiWrap: {missing[0]!r} is missing.")
-        summary = file["summary"][()]
+        arrays = {name: cast("Any", file[name])[()] for name in ("summary", "pixels_x", "pixels_y")}
+        summary = arrays["summary"]
         # Older files call frame, number and follicle otherwise.
         known = {"time": "fid", "id": "wid", "fol_x": "follicle_x", "fol_y": "follicle_y"}
-        columns = {known.get(name, name): summary[name].astype(float) for name in summary.dtype.names or ()}
+        columns = {str(known.get(name, name)): summary[name].astype(float) for name in summary.dtype.names or ()}
         if not {"fid", "wid"} <= set(columns):
             raise DataError(f"The summary of {shown(os.fspath(path))} has no frame and no number of each trace.")
-        pairs = zip(file["pixels_x"][()], file["pixels_y"][()], strict=True)
+        pairs = zip(arrays["pixels_x"], arrays["pixels_y"], strict=True)
         points = [np.stack([np.asarray(x, dtype=float), np.asarray(y, dtype=float)], axis=1) for x, y in pairs]
     keys = [(int(frame), int(number)) for frame, number in zip(columns["fid"], columns["wid"], strict=True)]
     return dict(zip(keys, points, strict=True)), *_identities(columns)

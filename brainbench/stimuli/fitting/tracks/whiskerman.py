@@ -92,11 +92,13 @@ def _read_hdf5(path: str | os.PathLike[str]) -> list[dict[str, Any]]:
         if not isinstance(group, h5py.Group):
             raise DataError(f"{shown(os.fspath(path))} is no track of WhiskerMan: the struct 'whisker' is missing.")
         _need(tuple(group), path)
-        columns = {}
+        columns: dict[str, list[Any]] = {}
         for name in _FIELDS:
             dataset: Any = group[name]
             # A struct array of several elements stores references; MATLAB's axes stand in reverse order.
-            cells = [file[one] for one in dataset[()].ravel()] if dataset.dtype == h5py.ref_dtype else [dataset]
+            cells: list[Any] = (
+                [file[one] for one in dataset[()].ravel()] if dataset.dtype == h5py.ref_dtype else [dataset]
+            )
             columns[name] = [np.asarray(cell[()]).T for cell in cells]
     counts = {len(cells) for cells in columns.values()}
     if len(counts) > 1:
