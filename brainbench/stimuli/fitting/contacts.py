@@ -203,7 +203,8 @@ class ContactSolver:
         best = None
         for start in self._starts(points, place, noise, before):
             began = np.clip(start, low + 1e-3, high - 1e-3)
-            found = least_squares(residual, began, jac=jacobian, bounds=(low, high), max_nfev=60)  # type: ignore[arg-type]
+            limits = (low, high)
+            found = least_squares(residual, began, jac=jacobian, bounds=limits, max_nfev=60)  # type: ignore[arg-type]
             if best is None or found.cost < best.cost:
                 best = found
         assert best is not None
