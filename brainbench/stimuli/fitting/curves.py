@@ -28,11 +28,14 @@ def normal_offsets(nodes: Array, joints: Array, points: Array) -> Array:
     """
     from scipy.interpolate import CubicSpline
 
-    spline = CubicSpline(nodes, joints[..., : points.shape[-1]], axis=1)
+    # Frames behind the failure of a simulation are missing; a straight line stands for their curve.
+    lost = ~np.asarray(np.isfinite(joints).all(axis=(1, 2)))[:, None, None]
+    straight = np.outer(nodes, np.eye(points.shape[-1])[0])
+    spline = CubicSpline(nodes, np.where(lost, straight, joints[..., : points.shape[-1]]), axis=1)
     s = np.linspace(nodes[0], nodes[-1], PER_LINK * (len(nodes) - 1) + 1)
     # Arc lengths of the nodes parametrise the curve nearly by arc: derivatives are normalised below all the same.
     place, along, bend = spline(s), spline(s, 1), spline(s, 2)
-    return offsets_of_samples(place, along, bend, points)
+    return np.where(lost, np.nan, offsets_of_samples(place, along, bend, points))
 
 
 def offsets_of_samples(place: Array, along: Array, bend: Array, points: Array) -> Array:

@@ -18,7 +18,6 @@ from brainbench.core.errors import DataError, UsageError, check_name
 from brainbench.stimuli.engines.protocol import Follicle, Job, Load, StillFollicle, Trace
 from brainbench.stimuli.fitting.curves import normal_offsets
 from brainbench.stimuli.fitting.parameters import Condition, Vector
-from brainbench.stimuli.fitting.tracked_base import track_base
 from brainbench.stimuli.fitting.tracks.quality import check_length
 from brainbench.stimuli.objects.obstacle import Obstacle
 from brainbench.stimuli.validation import references
@@ -30,7 +29,6 @@ if TYPE_CHECKING:
 
     from brainbench.stimuli.scenes.scene import Scene
 
-FEWEST_FRAMES = 3
 SETTLING = 4.0
 """Time for which a plucked whisker is held, in decay times 1/(ζ ω) of its first mode; it is held in a way that hardly
 swings."""
@@ -85,8 +83,8 @@ class Trial:
 
     def __post_init__(self) -> None:
         count = self.measured.sizes["time"]
-        if count < FEWEST_FRAMES:
-            raise DataError(f"The measurement has {count} frames; a fit over time needs at least {FEWEST_FRAMES}.")
+        if count < 3:
+            raise DataError(f"The measurement has {count} frames; a fit over time needs at least 3.")
         if self.of_shapes:
             check_length(self.measured, self.job.whisker.arc_length)
 
@@ -139,31 +137,6 @@ class Trial:
         settling = SETTLING / (max(whisker.damping_ratio, 0.05) * omega) + math.pi / omega
         job = Job(whisker, StillFollicle(), (), times, start=-settling)
         return cls(job, measured, Pluck(deflection, arc or 0.95 * whisker.arc_length, direction))
-
-    @classmethod
-    def of_track(cls, whisker: Whisker, shapes: xr.Dataset, objects: Sequence[Obstacle] = ()) -> Trial:
-        """Return the trial of a whisker whose base moves as its own track shows (:mod:`.tracked_base`).
-
-        The whisker starts at rest with the first frame; frames within :data:`SETTLING` decay times of that are left
-        out.
-
-        Args:
-            whisker: the whisker that the fit starts from.
-            shapes: traced shapes with two axes, from the base on.
-            objects: what it may touch, in the plane of the video.
-        """
-        follicle = track_base(shapes, whisker)
-        omega = 2 * math.pi * float(references.natural_frequencies(whisker, 1)[0])
-        settled = follicle.begin + SETTLING / (max(whisker.damping_ratio, 0.05) * omega)
-        times = shapes["time"].values.astype(float)
-        kept = shapes.isel(time=np.flatnonzero((times > settled) & (times <= follicle.end)))
-        if kept.sizes["time"] < FEWEST_FRAMES:
-            raise DataError(
-                f"{kept.sizes['time']} frames are left behind the {1e3 * (settled - follicle.begin):.0f} ms in which "
-                f"the whisker settles; at least {FEWEST_FRAMES} are needed: give a longer track."
-            )
-        job = Job(whisker, follicle, tuple(objects), kept["time"].values.astype(float), start=follicle.begin)
-        return cls(job, kept)
 
     @property
     def of_shapes(self) -> bool:
