@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -64,6 +65,11 @@ def fit(
     condition = trials[0].condition
     for name, value in (start or {}).items():
         condition = with_value(condition, FreeParameters((name,), condition).names[0], value)
+    if "deflection" in (start or {}):
+        trials = [
+            replace(trial, pluck=replace(trial.pluck, deflection=condition.deflection)) if trial.pluck else trial
+            for trial in trials
+        ]
     free = FreeParameters(tuple(parameters), condition, bounds or {})
     model = FitModel(trials, free, options, provider or CentralDifferences())
     problem = _Problem(model, _chosen_priors(free, options, priors or {}))

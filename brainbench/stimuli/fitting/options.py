@@ -41,7 +41,7 @@ class FitOptions:
     """Whether whiskers may twist."""
     backend: str = "rod"
     """Physics engine."""
-    workers: int | None = 1
+    workers: int | None = None
     """Threads of the simulation; all usable processors when None."""
 
     def __post_init__(self) -> None:

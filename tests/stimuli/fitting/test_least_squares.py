@@ -112,6 +112,9 @@ def test_profile_intervals_agree_with_laplace_where_the_model_is_nearly_linear(r
         start={"deflection": 1e-3},
         options=replace(QUICK, intervals="profile"),
     )
+    # The deflection that is not fitted is the given one, not that of the trial.
+    assert result["damping_ratio"].value == pytest.approx(0.2, rel=0.02)
+    assert result["young_modulus"].value == pytest.approx(3.5e9, rel=0.02)
     for one in result.estimates:
         assert one.profile is not None
         width = one.laplace.high - one.laplace.low
@@ -223,3 +226,31 @@ def test_the_cost_is_a_batch_for_each_jacobian(rung):
     object.__setattr__(model.engine, "run", count)
     model.jacobian(np.zeros(2))
     assert runs == [4]
+
+
+@pytest.mark.parametrize("kind", ["wrench", "shape"])
+def test_a_fit_is_drawn(rung, tmp_path, kind):
+    from PIL import Image
+
+    from brainbench.stimuli.fitting.figure import draw_fit
+
+    trial = Trial.ringdown(KNOWN, _wrenches(rung) if kind == "wrench" else _shapes(rung), 1e-3)
+    result = fit(trial, ["young_modulus", "damping_ratio", "deflection"], options=QUICK)
+    path = draw_fit(trial, result, tmp_path / "fit.png")
+    pixels = np.asarray(Image.open(path).convert("RGB")).reshape(-1, 3)
+    # The colour of the first series is on it, and most of it is white.
+    assert (np.abs(pixels.astype(int) - [0, 114, 178]).sum(axis=1) < 40).sum() > 50
+    assert 0.5 < np.mean(pixels.min(axis=1) > 250) < 0.99
+
+
+def test_the_summary_is_plain(rung):
+    import json
+
+    from brainbench.core.files import to_json
+
+    trial = Trial.ringdown(KNOWN, _shapes(rung), 1e-3)
+    result = fit(trial, ["young_modulus", "density"], options=QUICK)
+    data = json.loads(to_json(result.summary()))
+    assert data["status"] == "undefined"
+    assert data["directions"][0]["deviation"] is None or data["directions"][0]["deviation"] > 1
+    assert data["provenance"]["simulated_whiskers"] > 5
