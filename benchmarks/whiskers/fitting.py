@@ -148,7 +148,7 @@ def main() -> None:
         found = read_json(file) if file.is_file() else []
         if options.only not in (None, name):
             continue
-        count = options.simulations // (8 if finer else 2 if kind == "shape" else 1)
+        count = options.simulations // (8 if finer else 1)
         for seed in range(len(found), count):
             found.append(one(kind, ("mouse", "rat")[seed % 2], seed, finer))
             if len(found) % 10 == 0 or len(found) == count:
