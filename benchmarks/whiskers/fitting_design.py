@@ -59,13 +59,14 @@ def main() -> None:
             )
             print(rows[-1], flush=True)
     kept = sum(float(row[5]) <= GOAL for row in rows)
+    sensor = f"{1e6 * options.force_noise:g} µN and {1e9 * options.moment_noise:g} nN·m at {options.rate:g} readings"
     body = (
         f"Mouse whiskers C1 to C3, posts at {PLACE} m, default motion 10 Hz, 30° forward and 10° backward of rest. "
-        f"Sensor noise {1e6 * options.force_noise:g} µN and {1e9 * options.moment_noise:g} nN·m at {options.rate:g} "
-        "readings per second. D² of the closest pair in one whisk, and whisks and time over those of the default motion "
-        f"for the same D², at `{options.check}`. Goal: {GOAL:g} of the whisks or fewer; reached in {kept} of {len(rows)}."
-        "\n\n" + table(["objects", "chosen", "motion", "D² before", "D² after", "whisks", "time", "status"], rows)
+        f"Sensor noise {sensor} per second. D² of the closest pair in one whisk, and whisks and time over those of the "
+        f"default motion for the same D², at `{options.check}`. Goal: {GOAL:g} of the whisks or less; reached in {kept} "
+        f"of {len(rows)}. `unreliable`: no better motion was found.\n\n"
     )
+    body += table(["objects", "chosen", "motion", "D² before", "D² after", "whisks", "time", "status"], rows)
     write_section(TITLE, "python -m benchmarks.whiskers.fitting_design", body, subject="whiskers")
 
 

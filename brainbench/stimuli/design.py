@@ -89,7 +89,7 @@ class DesignOptions:
     """Standard deviation of a moment reading (N·m)."""
     rate: float = 1000.0
     """Readings per second."""
-    fidelity: str = "fast"
+    fidelity: str = "balanced"
     """Setting of the search; the result is measured again with `check`."""
     check: str = "accurate"
     """Setting with which default and design are compared at the end."""
@@ -178,18 +178,21 @@ def design(
     first = [_soft_least(d) for d in evaluator.distances([limits[:, 0] + x * width for x in tried])]
     if not np.isfinite(first[0]):
         raise DataError("Whiskers are unstable with the given motion; simulate the scenes more finely.")
+    order = np.argsort(-np.nan_to_num(first, nan=-math.inf))
     found = minimize(
         cost,
-        tried[int(np.nanargmax(first))],
+        tried[order[0]],
         jac=True,
         bounds=[(0, 1)] * len(at),
         method="L-BFGS-B",
         options={"maxiter": options.iterations, "maxls": 8},
     )
-    chosen = limits[:, 0] + found.x * width
+    # What is best at the coarse setting need not be at the finer one, which has the last word.
+    finalists = [begin, *(limits[:, 0] + x * width for x in (found.x, *(tried[index] for index in order[:3])))]
     fine = _Evaluator(scenes, tuple(variables), replace(options, fidelity=options.check), backend)
-    before, after = fine.distances([begin, chosen])
-    return _result(fine, variables, (begin, chosen), (before, after), evaluator.count)
+    measured = fine.distances(finalists)
+    best = int(np.argmax(np.nan_to_num([_soft_least(one) for one in measured[1:]], nan=-math.inf))) + 1
+    return _result(fine, variables, (begin, finalists[best]), (measured[0], measured[best]), evaluator.count)
 
 
 def _result(

@@ -86,3 +86,22 @@ def test_a_track_without_scale_is_refused(run, tmp_path):
     result = run("stimuli", "fit", str(path))
     assert result.status == 2
     assert "metres_per_pixel" in result.err
+
+
+def test_a_design_is_printed(run, tmp_path):
+    path = tmp_path / "posts.toml"
+    posts = "".join(
+        f'[[scene]]\nlabel = "r{radius}"\n[[scene.object]]\nshape = "cylinder"\nradius_mm = {radius}\nheight_mm = 20\n'
+        "position_mm = [10.5, 2, 3]\n"
+        for radius in (0.3, 0.6)
+    )
+    path.write_text(f'[array]\nwhiskers = "C2"\n{posts}')
+    words = ["--variables", "protraction", "--iterations", "1", "--starts", "1", "--check", "fast"]
+    result = run("stimuli", "design", str(path), *words, "--json")
+    assert result.status == 0, result.err
+    data = json.loads(result.out)
+    assert data["whisks"] < 1
+    assert list(data["distances"]) == ["r0.3 – r0.6"]
+    wrong = run("stimuli", "design", str(path), "--variables", "protracton")
+    assert wrong.status == 2
+    assert "protraction" in wrong.err
