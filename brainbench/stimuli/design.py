@@ -95,7 +95,7 @@ class DesignOptions:
     """Setting with which default and design are compared at the end."""
     iterations: int = 12
     """Iterations of the search."""
-    starts: int = 6
+    starts: int = 16
     """Other motions that are tried before, spread over the bounds; the search goes on from the best."""
     seed: int = 0
     """Of these."""
