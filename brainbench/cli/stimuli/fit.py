@@ -1,0 +1,220 @@
+"""``brainbench stimuli fit``: parameters of a whisker, or its contact forces, from measurements."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from brainbench.cli.destinations import out_file, picture_file
+from brainbench.cli.options import items, option, with_options
+from brainbench.cli.output import JsonOption, emit, progress_bar, table_of
+from brainbench.cli.stimuli import scenes
+from brainbench.cli.stimuli.scenes import StimulusOption
+from brainbench.core.errors import UsageError, shown
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+    from brainbench.stimuli.fitting import FitOptions, FitResult
+    from brainbench.stimuli.whiskers.whisker import Whisker
+
+_FIT = "brainbench.stimuli.fitting.options:FitOptions"
+_TRACK = "brainbench.stimuli.fitting.tracks.options:TrackOptions"
+
+
+@with_options(_FIT)
+def fit(
+    file: Annotated[
+        Path,
+        typer.Argument(
+            help="Track (.csv, .h5, .hdf5, .mat, .tr4, .whiskers) or base wrenches (.csv, .h5, .nwb) of one whisker."
+        ),
+    ],
+    options: FitOptions,
+    whisker: Annotated[str, typer.Option(help="Whisker: mouse:C2, or C2 of the scene.")] = "mouse:C2",
+    parameters: Annotated[
+        str, typer.Option(help="Parameters to estimate, with commas between them.")
+    ] = "young_modulus,damping_ratio",
+    scene: Annotated[
+        str | None, typer.Option(help="Scene file (.toml) with the motion and the objects. [default: a ring-down]")
+    ] = None,
+    stimulus: StimulusOption = None,
+    deflection: Annotated[float, typer.Option(help="Deflection of a ring-down before the release, mm, roughly.")] = 1.0,
+    contacts: Annotated[
+        bool, typer.Option("--contacts", help="Estimate contact point and force in each frame of a track instead.")
+    ] = False,
+    known: Annotated[
+        str,
+        typer.Option(help="Properties of the whisker that were measured, as arc_length=0.02,base_radius=5e-5 (SI)."),
+    ] = "",
+    bounds: Annotated[
+        str, typer.Option(help="Bounds of parameters, as young_modulus=1e9:9e9,damping_ratio=0.05:0.5 (SI).")
+    ] = "",
+    noise: Annotated[
+        float | None, typer.Option(help="Standard deviation of a traced coordinate, µm, when repeats tell it.")
+    ] = None,
+    metres_per_pixel: Annotated[float | None, option(_TRACK, "metres_per_pixel")] = None,
+    frame_rate: Annotated[float | None, option(_TRACK, "frame_rate")] = None,
+    track: Annotated[str | None, option(_TRACK, "track")] = None,
+    layout: Annotated[str, option(_TRACK, "layout")] = "auto",
+    zero_frame: Annotated[int, option(_TRACK, "zero_frame")] = 0,
+    identities: Annotated[str | None, option(_TRACK, "identities")] = None,
+    parts: Annotated[str, option(_TRACK, "parts")] = "",
+    least_likelihood: Annotated[float, option(_TRACK, "least_likelihood")] = 0.6,
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", callback=out_file, help="Write the result as JSON.")
+    ] = None,
+    picture: Annotated[
+        Path | None, typer.Option(callback=picture_file, help="Draw fit and residuals (.png, .svg or .pdf).")
+    ] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Estimate parameters of a whisker, with intervals, from traced shapes or base wrenches."""
+    from brainbench.stimuli.fitting.tracks.options import TrackOptions
+    from brainbench.stimuli.fitting.tracks.readers import holds_shapes, read_shapes
+    from brainbench.stimuli.fitting.tracks.wrenches import read_wrenches
+
+    chosen = None if scene is None else scenes.choose_scene(scenes.open_recipe(scene, "all"), stimulus)
+    start = _whisker(whisker, chosen, _pairs(known, "--known"))
+    if holds_shapes(file):
+        told = TrackOptions(
+            metres_per_pixel, frame_rate, track, layout, zero_frame, identities, tuple(items(parts)), least_likelihood
+        )
+        measured = read_shapes(file, told)
+        if noise is not None:
+            measured["noise"] = 1e-6 * noise
+    elif contacts:
+        raise UsageError(f"--contacts takes a track; {shown(str(file))} holds wrenches.")
+    else:
+        measured = read_wrenches(file, whisker=None if scene is None else whisker, stimulus=stimulus)
+    if contacts:
+        data, text = _contacts(measured, start, noise)
+    else:
+        result = _fit(measured, start, whisker, chosen, parameters, bounds, deflection, options, picture)
+        data, text = result.summary(), _text(result, measured)
+    if out is not None:
+        from brainbench.core.files import write_json
+
+        write_json(out, data)
+    emit(data, text, as_json=as_json)
+
+
+def _fit(
+    measured: xr.Dataset,
+    start: Whisker,
+    name: str,
+    scene: Any,
+    parameters: str,
+    bounds: str,
+    deflection: float,
+    options: FitOptions,
+    picture: Path | None,
+) -> FitResult:
+    from brainbench.stimuli.fitting import Trial
+    from brainbench.stimuli.fitting import fit as run
+    from brainbench.stimuli.fitting.figure import draw_fit
+
+    if scene is None:
+        trial = Trial.ringdown(start, measured, 1e-3 * deflection)
+    else:
+        trial = Trial.of_scene(scene, measured, name, start=start)
+    limits = {key: _span(value) for key, value in _pairs(bounds, "--bounds", text=True).items()}
+    with progress_bar("fitting"):
+        result = run(trial, items(parameters), bounds=limits, options=options)
+    if picture is not None:
+        draw_fit(trial, result, picture)
+    return result
+
+
+def _contacts(measured: xr.Dataset, whisker: Whisker, noise: float | None) -> tuple[dict[str, Any], str]:
+    """Return the contacts of a track as data and as a table."""
+    from brainbench.stimuli.fitting import ContactOptions, find_contacts
+
+    with progress_bar("finding contacts"):
+        found = find_contacts(measured, whisker, options=ContactOptions(noise=None if noise is None else 1e-6 * noise))
+    frames = [
+        {
+            "time": float(found["time"].values[index]),
+            **{
+                name: found[name].values[index].tolist() for name in found.data_vars if name not in ("status", "reason")
+            },
+            "status": str(found["status"].values[index]),
+            "reason": str(found["reason"].values[index]),
+        }
+        for index in range(found.sizes["time"])
+    ]
+    columns = {
+        ">ms": lambda one: f"{1e3 * one['time']:.2f}",
+        ">force µN": lambda one: f"{1e6 * one['force']:.2f} ± {1e6 * one['force_deviation']:.2f}",
+        ">arc mm": lambda one: f"{1e3 * one['arc']:.2f} ± {1e3 * one['arc_deviation']:.2f}",
+        ">moment nN·m": lambda one: f"{1e9 * one['moment']:.3g}",
+        "status": "{0[status]}",
+        "": "{0[reason]}",
+    }
+    return {"frames": frames, "faults": measured.attrs.get("faults", [])}, table_of("", frames, columns)
+
+
+def _text(result: FitResult, measured: xr.Dataset) -> str:
+    columns = {
+        "parameter": "{0.name}",
+        ">estimate": lambda one: f"{one.value:.4g} {one.unit}",
+        ">interval": lambda one: f"[{one.interval.low:.4g}, {one.interval.high:.4g}]",
+        ">start": "{0.start:.4g}",
+        "status": "{0.status}",
+    }
+    lines = [table_of("", result.estimates, columns), "", f"status  {result.status}"]
+    lines += [f"  {reason}" for reason in (*result.reasons, *measured.attrs.get("faults", []))]
+    noise = ", ".join(f"{name} {level:.2g}" for name, level in result.noise.items())
+    lines += ["", f"noise   {noise} (SI)", *(f"  {one.words}" for one in result.directions if one.identified)]
+    return "\n".join(lines)
+
+
+def _whisker(name: str, scene: Any, known: dict[str, Any]) -> Whisker:
+    """Return the whisker that a fit starts from."""
+    from dataclasses import fields, replace
+
+    from brainbench.core.errors import check_name
+    from brainbench.stimuli import Whisker, WhiskerArray
+
+    if scene is not None:
+        check_name("whisker of the scene", name, scene.names)
+        whisker = scene.mounts[scene.names.index(name)].whisker
+    else:
+        species, colon, label = name.partition(":")
+        if not colon:
+            raise UsageError(
+                f"Without a scene --whisker names species and whisker, as mouse:{name}; received {name!r}."
+            )
+        array = WhiskerArray.of(species)
+        check_name(f"whisker of the {species}", label, array.names)
+        whisker = array[label].whisker
+    for key in known:
+        check_name("property of a whisker", key, [item.name for item in fields(Whisker)])
+    return replace(whisker, **known)
+
+
+def _pairs(given: str, flag: str, *, text: bool = False) -> dict[str, Any]:
+    """Return NAME=VALUE pairs with commas between them; values are numbers, or texts."""
+    found: dict[str, Any] = {}
+    for item in items(given):
+        name, sign, value = item.partition("=")
+        try:
+            found[name.strip()] = value.strip() if text else float(value)
+        except ValueError:
+            sign = ""
+        if not sign:
+            raise UsageError(f"{flag} takes NAME=VALUE pairs with commas between them; received {shown(item)}.")
+    return found
+
+
+def _span(text: str) -> tuple[float, float]:
+    low, colon, high = text.partition(":")
+    try:
+        ends = float(low), float(high)
+    except ValueError:
+        ends = (0.0, 0.0)
+    if not colon or not ends[0] < ends[1]:
+        raise UsageError(f"--bounds takes LOW:HIGH for each parameter, the lower first; received {shown(text)}.")
+    return ends

@@ -1,0 +1,272 @@
+"""Choose how to whisk, or where to hold objects, so that the base wrenches tell the objects apart in few whisks.
+
+Two objects a, b that are felt with white noise of standard deviation σ in each reading are apart by Mahalanobis'
+distance D, D² = Σ ((wₐ − w_b)/σ)² over the readings, whiskers and components of a whisk. D² of n whisks is n times that
+of one, so a motion with twice the D² needs half the whisks. The smallest D² of all pairs is raised by its gradient
+(central differences, all whiskers of a point in one run of the engine).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from brainbench.core.errors import DataError, UsageError, check_name
+from brainbench.core.records import Status
+from brainbench.stimuli.engines import DEFAULT_ENGINE, get_engine
+from brainbench.stimuli.engines.fidelity import Fidelity
+from brainbench.stimuli.motion.trajectories import Whisking
+from brainbench.stimuli.scenes.scene import Scene
+
+Array = NDArray[np.float64]
+STEP = 0.02
+"""Step of the differences as a share of a variable's range: contacts come and go, and finer ones would see each."""
+NOTHING = -50.0
+"""Log D² where nothing is felt."""
+SOFTNESS = 0.15
+"""Width of the soft minimum over pairs, in log D²."""
+
+
+@dataclass(frozen=True)
+class DesignVariable:
+    """One thing that may be chosen."""
+
+    unit: str
+    low: float
+    high: float
+    """Usual bounds: those of whisking mice and rats, or a shift of objects (m) against the scenes'."""
+    read: Callable[[Scene], float]
+    change: Callable[[Scene, float], Scene]
+
+
+def _whisking(name: str, unit: str, low: float, high: float) -> DesignVariable:
+    def change(scene: Scene, value: float) -> Scene:
+        return replace(scene, whisking=replace(_sinusoid(scene), **{name: value}))
+
+    return DesignVariable(unit, low, high, lambda scene: getattr(_sinusoid(scene), name), change)
+
+
+def _sinusoid(scene: Scene) -> Whisking:
+    if not isinstance(scene.whisking, Whisking):
+        raise UsageError(
+            f"The scene {scene.label!r} does not whisk in a sinusoid; only the place of objects can be chosen."
+        )
+    return scene.whisking
+
+
+def _shift(axis: int) -> DesignVariable:
+    def change(scene: Scene, value: float) -> Scene:
+        def moved(position: Sequence[float]) -> Any:
+            return tuple(one + value * (index == axis) for index, one in enumerate(position))
+
+        return replace(scene, objects=tuple(replace(item, position=moved(item.position)) for item in scene.objects))
+
+    return DesignVariable("m", -0.003, 0.003, lambda scene: 0.0, change)
+
+
+VARIABLES: Mapping[str, DesignVariable] = {
+    "frequency": _whisking("frequency", "Hz", 4.0, 25.0),
+    "protraction": _whisking("protraction", "rad", math.radians(5), math.radians(45)),
+    "retraction": _whisking("retraction", "rad", math.radians(0), math.radians(25)),
+    **{f"object_{name}": _shift(axis) for axis, name in enumerate("xyz")},
+}
+"""What can be chosen, by name."""
+
+
+@dataclass(frozen=True)
+class DesignOptions:
+    """Sensor, simulation and search of a design."""
+
+    force_noise: float = 2e-6
+    """Standard deviation of a force reading (N)."""
+    moment_noise: float = 1e-8
+    """Standard deviation of a moment reading (N·m)."""
+    rate: float = 1000.0
+    """Readings per second."""
+    fidelity: str = "balanced"
+    """Setting of the search; the result is measured again with `check`."""
+    check: str = "accurate"
+    """Setting with which default and design are compared at the end."""
+    iterations: int = 12
+    """Iterations of the search."""
+    starts: int = 16
+    """Other motions that are tried before, spread over the bounds; the search goes on from the best."""
+    seed: int = 0
+    """Of these."""
+
+
+@dataclass(frozen=True)
+class DesignResult:
+    """The chosen motion, and what it is worth."""
+
+    status: Status
+    """``unreliable``: at the finer setting it is not better, or whiskers were unstable; ``undefined``: no whisker
+    touches anything at the start, so there is nothing to compare with."""
+    reason: str
+    values: Mapping[str, float]
+    """Chosen values, in their units."""
+    start: Mapping[str, float]
+    distances: Mapping[str, tuple[float, float]]
+    """D² of one whisk for each pair of objects: before, after (at the setting `check`)."""
+    whisks: float
+    """Whisks that the chosen motion needs over those of the given one, for the same distance of the closest pair."""
+    time: float
+    """The same of the time that these whisks take: slow whisks are long, and have more readings."""
+    scenes: tuple[Scene, ...]
+    """The scenes with the chosen motion."""
+    evaluations: int
+    """Motions that were simulated."""
+
+
+def design(
+    scenes: Sequence[Scene],
+    variables: Sequence[str],
+    *,
+    bounds: Mapping[str, tuple[float, float]] | None = None,
+    options: DesignOptions | None = None,
+    backend: str = DEFAULT_ENGINE,
+) -> DesignResult:
+    """Choose the motion that tells the objects of some scenes apart in the fewest whisks.
+
+    Args:
+        scenes: the same whiskers and motion, each with another object; at least two.
+        variables: names of :data:`VARIABLES`.
+        bounds: bounds of single variables, in their units.
+        options: sensor, simulation and search.
+        backend: physics engine.
+
+    Raises:
+        UsageError: there is one scene only, or a variable is unknown or starts outside its bounds.
+        DataError: whiskers are unstable with the given motion.
+    """
+    from scipy.optimize import minimize
+
+    options = options or DesignOptions()
+    if len(scenes) < 2:
+        raise UsageError("A design needs at least two scenes, each with an object to tell from the others.")
+    for name in (*variables, *(bounds or {})):
+        check_name("variable of a design", name, VARIABLES)
+    limits = np.array([(bounds or {}).get(name, (VARIABLES[name].low, VARIABLES[name].high)) for name in variables])
+    begin = np.array([VARIABLES[name].read(scenes[0]) for name in variables])
+    if (begin < limits[:, 0]).any() or (begin > limits[:, 1]).any():
+        raise UsageError(f"The given motion lies outside the bounds of {', '.join(variables)}; widen them.")
+    width = limits[:, 1] - limits[:, 0]
+    evaluator = _Evaluator(scenes, tuple(variables), options, backend)
+
+    def cost(x: Array) -> tuple[float, Array]:
+        points = [x, *(np.clip(x + sign * STEP * e, 0, 1) for e in np.eye(len(x)) for sign in (1, -1))]
+        values = [_soft_least(d) for d in evaluator.distances([limits[:, 0] + p * width for p in points])]
+        if math.isnan(values[0]):  # unstable: the line search turns back
+            return -NOTHING, np.zeros(len(x))
+        slopes = np.zeros(len(x))
+        for j in range(len(x)):
+            # One-sided where the other side is unstable or beyond a bound.
+            ends = [(points[k][j], values[k]) for k in (1 + 2 * j, 0, 2 + 2 * j) if not math.isnan(values[k])]
+            if (span := ends[0][0] - ends[-1][0]) > 0:
+                slopes[j] = (ends[0][1] - ends[-1][1]) / span
+        return -values[0], -slopes
+
+    at = (begin - limits[:, 0]) / width
+    others = np.random.default_rng(options.seed).uniform(size=(options.starts, len(at)))
+    tried = [at, *others]
+    first = [_soft_least(d) for d in evaluator.distances([limits[:, 0] + x * width for x in tried])]
+    if not np.isfinite(first[0]):
+        raise DataError("Whiskers are unstable with the given motion; simulate the scenes more finely.")
+    order = np.argsort(-np.nan_to_num(first, nan=-math.inf))
+    found = minimize(
+        cost,
+        tried[order[0]],
+        jac=True,
+        bounds=[(0, 1)] * len(at),
+        method="L-BFGS-B",
+        options={"maxiter": options.iterations, "maxls": 8},
+    )
+    # What is best at the coarse setting need not be at the finer one, which has the last word.
+    finalists = [begin, *(limits[:, 0] + x * width for x in (found.x, *(tried[index] for index in order[:3])))]
+    fine = _Evaluator(scenes, tuple(variables), replace(options, fidelity=options.check), backend)
+    measured = fine.distances(finalists)
+    best = int(np.argmax(np.nan_to_num([_soft_least(one) for one in measured[1:]], nan=-math.inf))) + 1
+    return _result(fine, variables, (begin, finalists[best]), (measured[0], measured[best]), evaluator.count)
+
+
+def _result(
+    fine: _Evaluator, variables: Sequence[str], values: tuple[Array, Array], distances: tuple[Array, Array], count: int
+) -> DesignResult:
+    before, after = distances
+    pairs = [f"{a} – {b}" for a, b in combinations([scene.label for scene in fine.scenes], 2)]
+    ratio, status, reason = math.nan, "ok", ""
+    if not np.isfinite(after).all() or not np.isfinite(before).all():
+        status, reason = "unreliable", "Whiskers are unstable at the finer setting."
+    elif not before.min() > 0:
+        status, reason = "undefined", "With the given motion some objects are not felt, or are felt alike."
+    else:
+        ratio = float(before.min() / after.min())
+        if ratio >= 1:
+            status, reason = "unreliable", "At the finer setting the chosen motion is no better than the given one."
+    return DesignResult(
+        status=status,  # type: ignore[arg-type]
+        reason=reason,
+        values=dict(zip(variables, values[1].tolist(), strict=True)),
+        start=dict(zip(variables, values[0].tolist(), strict=True)),
+        distances={pair: (float(a), float(b)) for pair, a, b in zip(pairs, before, after, strict=True)},
+        whisks=ratio,
+        time=ratio * fine.period(values[1]) / fine.period(values[0]),
+        scenes=tuple(fine.changed(scene, values[1]) for scene in fine.scenes),
+        evaluations=count,
+    )
+
+
+def _soft_least(distances: Array) -> float:
+    """Return a smooth lower bound of the smallest log D²; NaN with unstable whiskers."""
+    if np.isnan(distances).any():
+        return math.nan
+    logs = np.log(np.maximum(distances, math.exp(NOTHING)))
+    least = float(logs.min())
+    return least - SOFTNESS * math.log(float(np.sum(np.exp(-(logs - least) / SOFTNESS))))
+
+
+class _Evaluator:
+    """Distances between the objects of scenes, at values of the variables."""
+
+    def __init__(self, scenes: Sequence[Scene], names: tuple[str, ...], options: DesignOptions, backend: str) -> None:
+        self.scenes, self.names, self.options = list(scenes), names, options
+        self.engine = get_engine(backend)
+        self.fidelity = Fidelity.of(options.fidelity).resolved(self.engine.twists and any(s.twist for s in scenes))
+        self.noise = np.repeat([options.force_noise, options.moment_noise], 3)
+        self.count = 0
+
+    def changed(self, scene: Scene, values: Array) -> Scene:
+        """Return a scene with the variables at some values."""
+        for name, value in zip(self.names, values, strict=True):
+            scene = VARIABLES[name].change(scene, float(value))
+        return scene
+
+    def period(self, values: Array) -> float:
+        """Return the time [s] of one whisk at some values."""
+        return 1 / getattr(self.changed(self.scenes[0], values).whisking, "frequency", 1.0)
+
+    def distances(self, points: Sequence[Array]) -> list[Array]:
+        """Return D² [pair] of one whisk, after the onset, at each of some values; NaN with unstable whiskers."""
+        jobs, sizes = [], []
+        for values in points:
+            some = [self.changed(scene, values) for scene in self.scenes]
+            frequency, onset = getattr(some[0].whisking, "frequency", 1.0), getattr(some[0].whisking, "onset", 0.0)
+            times = onset + np.arange(1, max(int(self.options.rate / frequency), 2) + 1) / self.options.rate
+            jobs += [replace(job, times=times) for scene in some for job in scene.jobs()]
+            sizes.append(len(times))
+        self.count += len(points)
+        traces = self.engine.run(jobs, self.fidelity)
+        whiskers = len(self.scenes[0].mounts)
+        found = []
+        for index in range(len(points)):
+            begin = index * whiskers * len(self.scenes)
+            rows = [traces[begin + k * whiskers : begin + (k + 1) * whiskers] for k in range(len(self.scenes))]
+            felt = [np.stack([trace.wrench for trace in row]) / self.noise for row in rows]
+            found.append(np.array([float(np.sum((a - b) ** 2)) for a, b in combinations(felt, 2)]))
+        return found

@@ -1,0 +1,50 @@
+"""Fit whiskers to measurements: traced shapes or base wrenches in, parameters with intervals out.
+
+``tracks`` reads measurements, ``trials`` join them with the motion and the objects, :func:`fit` estimates parameters,
+and :func:`find_contacts` takes contact point and force from shapes alone.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from brainbench.core.lazy import lazy_exports
+
+if TYPE_CHECKING:
+    from brainbench.stimuli.fitting.contacts import ContactOptions, find_contacts
+    from brainbench.stimuli.fitting.least_squares import fit
+    from brainbench.stimuli.fitting.options import FitOptions
+    from brainbench.stimuli.fitting.result import FitResult, FittedParameter
+    from brainbench.stimuli.fitting.tracks.contract import new_shapes, new_wrenches
+    from brainbench.stimuli.fitting.tracks.options import TrackOptions
+    from brainbench.stimuli.fitting.tracks.readers import read_shapes
+    from brainbench.stimuli.fitting.tracks.wrenches import read_wrenches
+    from brainbench.stimuli.fitting.trials import Trial
+
+__all__ = [
+    "ContactOptions",
+    "FitOptions",
+    "FitResult",
+    "FittedParameter",
+    "TrackOptions",
+    "Trial",
+    "find_contacts",
+    "fit",
+    "new_shapes",
+    "new_wrenches",
+    "read_shapes",
+    "read_wrenches",
+]
+
+_MODULES = {
+    ".contacts": ("ContactOptions", "find_contacts"),
+    ".least_squares": ("fit",),
+    ".options": ("FitOptions",),
+    ".result": ("FittedParameter", "FitResult"),
+    ".tracks.contract": ("new_shapes", "new_wrenches"),
+    ".tracks.options": ("TrackOptions",),
+    ".tracks.readers": ("read_shapes",),
+    ".tracks.wrenches": ("read_wrenches",),
+    ".trials": ("Trial",),
+}
+__getattr__, __dir__ = lazy_exports(__name__, {name: module for module, names in _MODULES.items() for name in names})

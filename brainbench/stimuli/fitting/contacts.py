@@ -1,0 +1,306 @@
+"""Contact point and contact force from traced shapes alone: the classical inverse problem, one frame at a time.
+
+A whisker of known rest shape and stiffness is pressed by one frictionless point contact while its base is clamped; the
+base's pose, the arc of the contact and the force are those whose quasi-static shape (:mod:`.elastica`) lies nearest to
+the traced points (Solomon & Hartmann 2006, Nature 443, 525; Pammer et al. 2013, J. Neurosci. 33, 6726). Forces are
+proportional to the bending stiffness that is assumed.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from brainbench.core.errors import DataError
+from brainbench.core.reading.ranges import check_number
+from brainbench.stimuli.fitting.curves import offsets_of_samples
+from brainbench.stimuli.fitting.elastica import STEPS, LoadedShapes, LoadedWhisker
+from brainbench.stimuli.fitting.tracks.quality import check_length, check_track
+from brainbench.stimuli.whiskers.whisker import Whisker
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+Array = NDArray[np.float64]
+NEAREST, FARTHEST = 0.05, 0.995
+"""Contact arcs that are looked for, as shares of the whisker's length."""
+NO_FORCE = 3.0
+"""Force over its standard deviation below which there is no sign of a contact."""
+VAGUE = 0.15
+"""Relative standard deviation of the force from which it is unreliable."""
+MISFIT = 1.5
+"""Residuals over the stated noise from which the model does not fit."""
+FEWEST_POINTS = 6
+_STEP = 1e-5
+_ARCS = (0.15, 0.3, 0.45, 0.6, 0.75, 0.9)
+_DEFLECTIONS = (0.02, 0.06, 0.15, 0.3)
+
+
+@dataclass(frozen=True)
+class ContactOptions:
+    """What is known of the traced shapes beside the whisker."""
+
+    noise: float | None = None
+    """Standard deviation of a traced coordinate [m]; estimated from each shape when None."""
+    first_arc: float | None = 0.0
+    """Arc length of the first traced point [m]; None when the trace begins anywhere."""
+    tip_traced: bool = False
+    """True when the last traced point is the tip of the whisker."""
+    contact_noise: float = 5e-5
+    """Standard deviation of the contact points that are given [m]."""
+
+    def __post_init__(self) -> None:
+        if self.noise is not None:
+            check_number("noise of a shape (m)", self.noise, above=0)
+        check_number("contact_noise (m)", self.contact_noise, above=0)
+
+
+@dataclass(frozen=True)
+class ContactEstimate:
+    """Contact of one frame, as its shape tells."""
+
+    force: float = math.nan
+    """Force on the whisker [N], along the normal on its left where positive."""
+    arc: float = math.nan
+    """Arc length of the contact [m]."""
+    moment: float = math.nan
+    """Moment of the whisker on its base about the base point [N·m]."""
+    point: tuple[float, float] = (math.nan, math.nan)
+    """Contact point on the centre line [m]."""
+    vector: tuple[float, float] = (math.nan, math.nan)
+    """Force on the whisker [N]."""
+    base_angle: float = math.nan
+    """Direction of the whisker at its base [rad]."""
+    force_deviation: float = math.nan
+    arc_deviation: float = math.nan
+    """Standard deviations [N, m]."""
+    residual: float = math.nan
+    """Root mean square distance of the traced points from the fitted shape [m]."""
+    status: str = "undefined"
+    reason: str = ""
+
+
+def find_contacts(
+    shapes: xr.Dataset,
+    whisker: Whisker,
+    *,
+    contact_points: ArrayLike | None = None,
+    options: ContactOptions | None = None,
+) -> xr.Dataset:
+    """Estimate contact point and force in every frame of a track.
+
+    Args:
+        shapes: traced shapes in the plane of bending; three axes are projected on the plane that holds them best.
+        whisker: its length, radii, curvature and Young's modulus; the others do not matter.
+        contact_points: [n, 2] where the object touches the whisker (m), when it was tracked too; NaN where unknown.
+        options: what else is known.
+
+    Returns:
+        ``force`` [time] (N, positive on the left of the whisker), ``force_vector`` [time, axis], ``arc``, ``point``
+        [time, axis] (m), ``moment`` (N·m), ``base_angle``, their standard deviations ``force_deviation`` and
+        ``arc_deviation``, ``residual`` (m), ``status`` and ``reason``. ``undefined``: no sign of a contact, or no fit.
+
+    Raises:
+        DataError: the shapes are not those of a whisker of this length, change places, or bend in no plane.
+    """
+    import xarray as xr
+
+    options = options or ContactOptions()
+    check_track(shapes)
+    check_length(shapes, whisker.arc_length)
+    points = _in_plane(shapes["shape"].values)
+    known = np.full((len(points), 2), np.nan) if contact_points is None else np.asarray(contact_points, dtype=float)
+    if known.shape != (len(points), 2):
+        raise DataError(f"{len(points)} frames take contact points [{len(points)}, 2]; received {known.shape}.")
+    solver, found = ContactSolver(whisker, options), []
+    before: Array | None = None
+    for frame, place in zip(points, known, strict=True):
+        contact, solution = solver.solve(frame, place, before)
+        found.append(contact)
+        before = solution if contact.status == "ok" else None
+    scalars = ("force", "arc", "moment", "base_angle", "force_deviation", "arc_deviation", "residual")
+    units = dict.fromkeys(scalars, "m") | {"force": "N", "force_deviation": "N", "moment": "N m", "base_angle": "rad"}
+    return xr.Dataset(
+        {
+            **{name: ("time", [getattr(one, name) for one in found], {"units": units[name]}) for name in scalars},
+            "force_vector": (("time", "axis"), [one.vector for one in found], {"units": "N"}),
+            "point": (("time", "axis"), [one.point for one in found], {"units": "m"}),
+            "status": ("time", np.array([one.status for one in found], dtype=object)),
+            "reason": ("time", np.array([one.reason for one in found], dtype=object)),
+        },
+        coords={"time": shapes["time"], "axis": np.array(["x", "y"], dtype=object)},
+        attrs={"young_modulus": whisker.young_modulus, "arc_length": whisker.arc_length},
+    )
+
+
+class ContactSolver:
+    """Least squares on the quasi-static shape of one whisker.
+
+    Unknowns, all near one: x and y of the base over the length L, its direction (rad), the contact's arc over L, and
+    the deflection d over L that the force f would make in small bending, f = 3 E I(0) r(a)/r(0) d/a³.
+    """
+
+    def __init__(self, whisker: Whisker, options: ContactOptions) -> None:
+        self.whisker, self.options, self.rod = whisker, options, LoadedWhisker(whisker)
+
+    def force(self, arc: Array, deflection: Array) -> Array:
+        """Return the force (N) of a small-bending deflection (m) at an arc (m)."""
+        whisker = self.whisker
+        stiffness = 3 * float(whisker.bending_stiffness(0.0)) * whisker.radius(arc) / whisker.base_radius
+        return stiffness * deflection / arc**3
+
+    def shapes(self, unknowns: Array) -> LoadedShapes:
+        """Return the shapes of unknowns [b, 5]."""
+        length = self.whisker.arc_length
+        arc = unknowns[:, 3] * length
+        base = unknowns[:, :3] * np.array([length, length, 1.0])
+        return self.rod.shapes(base, arc, self.force(arc, unknowns[:, 4] * length))
+
+    def residuals(self, unknowns: Array, points: Array, place: Array, noise: float) -> Array:
+        """Return residuals [b, m] over the noise: distances across the shape, and what is known along it."""
+        shapes, options, length = self.shapes(unknowns), self.options, self.whisker.arc_length
+        traced = np.broadcast_to(points, (len(unknowns), *points.shape))
+        rows = [offsets_of_samples(shapes.place, shapes.along, shapes.bend, traced)[..., 0] / noise]
+        if options.first_arc is not None:
+            where = np.clip(options.first_arc / (unknowns[:, 3] * length), 0, 1) * STEPS
+            low = np.minimum(where.astype(int), STEPS - 1)
+            share, pick = (where - low)[:, None], np.arange(len(unknowns))
+            start = (1 - share) * shapes.place[pick, low] + share * shapes.place[pick, low + 1]
+            rows.append(np.sum((start - points[0]) * shapes.along[pick, low], axis=-1)[:, None] / noise)
+        if options.tip_traced:
+            gap = shapes.place[:, -1] - points[-1]
+            rows.append(np.sum(gap * shapes.along[:, -1], axis=-1)[:, None] / noise)
+        if np.isfinite(place).all():
+            rows.append((shapes.contact - place) / options.contact_noise)
+        return np.concatenate(rows, axis=1)
+
+    def solve(self, frame: Array, place: Array, before: Array | None = None) -> tuple[ContactEstimate, Array]:
+        """Return the contact of one frame's points [k, 2] (m), and the unknowns [5]; ``before`` is another start."""
+        from scipy.optimize import least_squares
+
+        points = frame[np.isfinite(frame).all(axis=-1)]
+        if len(points) < FEWEST_POINTS:
+            return ContactEstimate(reason=f"{len(points)} points were traced; {FEWEST_POINTS} are needed."), np.full(
+                5, np.nan
+            )
+        noise = self.options.noise or 1e-3 * self.whisker.arc_length
+        low = np.array([-np.inf, -np.inf, -np.inf, NEAREST, -3.0])
+        high = np.array([np.inf, np.inf, np.inf, FARTHEST, 3.0])
+
+        def residual(unknowns: Array) -> Array:
+            return self.residuals(unknowns[None], points, place, noise)[0]
+
+        def jacobian(unknowns: Array) -> Array:
+            moves = np.concatenate([np.eye(5), -np.eye(5)]) * _STEP
+            values = self.residuals(unknowns + moves, points, place, noise)
+            return (values[:5] - values[5:]).T / (2 * _STEP)
+
+        best = None
+        for start in self._starts(points, place, noise, before):
+            began = np.clip(start, low + 1e-3, high - 1e-3)
+            limits = (low, high)
+            found = least_squares(residual, began, jac=jacobian, bounds=limits, max_nfev=60)  # type: ignore[arg-type]
+            if best is None or found.cost < best.cost:
+                best = found
+        assert best is not None
+        return self._judge(best, residual, jacobian, points, noise), best.x
+
+    def _starts(self, points: Array, place: Array, noise: float, before: Array | None) -> Sequence[Array]:
+        """Return unknowns [5] to start from: the three best of a grid of arcs and forces, turned onto the points."""
+        length = self.whisker.arc_length
+        arcs, pushes = np.meshgrid(_ARCS, [0.0, *(s * d for d in _DEFLECTIONS for s in (1, -1))])
+        chord = points[-1] - points[0]
+        grid = np.zeros((arcs.size, 5))
+        grid[:, :2], grid[:, 3], grid[:, 4] = points[0] / length, arcs.ravel(), pushes.ravel()
+        trial = self.shapes(grid)
+        # Each is turned about its base so that it points where the trace points.
+        sample = trial.place[:, :: max(1, (STEPS + 1) // 8)] - trial.place[:, :1]
+        size = np.linalg.norm(sample, axis=-1)
+        reach = np.argmin(np.abs(size - np.linalg.norm(chord)), axis=1)
+        tip = sample[np.arange(len(grid)), reach]
+        grid[:, 2] = math.atan2(chord[1], chord[0]) - np.arctan2(tip[:, 1], tip[:, 0])
+        cost = np.sum(self.residuals(grid, points, place, noise) ** 2, axis=1)
+        order = np.argsort(np.nan_to_num(cost, nan=np.inf))[:3]
+        return [*grid[order], *([] if before is None else [before])]
+
+    def _judge(self, found, residual, jacobian, points: Array, noise: float) -> ContactEstimate:  # noqa: ANN001
+        """Return the contact of a solution, with standard deviations and a status."""
+        length, options = self.whisker.arc_length, self.options
+        rows = residual(found.x)
+        across = rows[: len(points)] * noise
+        spread = math.sqrt(float(np.sum(across**2)) / max(len(points) - 4, 1))
+        matrix = jacobian(found.x) * (1.0 if options.noise else noise / spread)
+        covariance = np.linalg.pinv(matrix.T @ matrix, rcond=1e-14)
+        arc = np.array([found.x[3] * length])
+        force = float(self.force(arc, np.array([found.x[4] * length]))[0])
+        ends = found.x + np.concatenate([np.eye(5), -np.eye(5)]) * _STEP
+        sizes = self.force(ends[:, 3] * length, ends[:, 4] * length)
+        slope = (sizes[:5] - sizes[5:]) / (2 * _STEP)
+        deviation = math.sqrt(max(float(slope @ covariance @ slope), 0.0))
+        arc_deviation = length * math.sqrt(max(float(covariance[3, 3]), 0.0))
+        shape = self.shapes(found.x[None])
+        status, reason = "ok", ""
+        if found.status <= 0:
+            status, reason = "undefined", "The fit of the shape did not converge."
+        elif abs(force) < NO_FORCE * deviation:
+            status, reason = (
+                "undefined",
+                (
+                    f"No sign of a contact: the force is {abs(force) / max(deviation, 1e-300):.1f} standard "
+                    "deviations from 0."
+                ),
+            )
+        elif options.noise and spread > MISFIT * options.noise:
+            status, reason = (
+                "unreliable",
+                (
+                    f"The shape fits no whisker with one contact: points lie {1e6 * spread:.0f} µm from it, the noise "
+                    f"is {1e6 * options.noise:.0f} µm."
+                ),
+            )
+        elif not NEAREST + 1e-3 < found.x[3] < FARTHEST - 1e-3:
+            status, reason = "unreliable", "The contact lies at the end of the range that is looked for."
+        elif deviation > VAGUE * abs(force):
+            status, reason = (
+                "unreliable",
+                (
+                    f"The shape tells the force to {100 * deviation / abs(force):.0f} % only; give the contact point, "
+                    "or trace more of the whisker."
+                ),
+            )
+        return ContactEstimate(
+            force=force,
+            arc=float(arc[0]),
+            moment=float(shape.moment[0]),
+            point=tuple(shape.contact[0].tolist()),
+            vector=tuple((force * shape.force[0]).tolist()),
+            base_angle=float(found.x[2]),
+            force_deviation=deviation,
+            arc_deviation=arc_deviation,
+            residual=math.sqrt(float(np.mean(across**2))),
+            status=status,
+            reason=reason,
+        )
+
+
+def _in_plane(points: Array) -> Array:
+    """Return points [n, k, 2] in the plane that holds them best; shapes in no plane are a :class:`DataError`."""
+    if points.shape[-1] == 2:
+        return points
+    known = points[np.isfinite(points).all(axis=-1)]
+    _, spread, axes = np.linalg.svd(known - known.mean(axis=0), full_matrices=False)
+    if spread[2] > 0.1 * spread[1] and spread[2] / math.sqrt(len(known)) > 0.02 * np.ptp(known @ axes[0]):
+        raise DataError(
+            "The traced shapes lie in no plane, and the contact force is found in the plane of bending alone; choose "
+            "frames in which the whisker bends in one plane, or fit a scene with the object in it."
+        )
+    # Axes of the plane nearest to x and y, so that left stays left.
+    normal = axes[2] * (1 if axes[2][2] >= 0 else -1)
+    first = np.array([1.0, 0.0, 0.0]) - normal * normal[0]
+    first = first / np.linalg.norm(first) if np.linalg.norm(first) > 1e-6 else axes[0]
+    return points @ np.stack([first, np.cross(normal, first)], axis=-1)

@@ -1,0 +1,247 @@
+"""Fit parameters of whiskers to measurements by nonlinear least squares."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from brainbench.core.errors import DataError, UsageError
+from brainbench.core.files import provenance
+from brainbench.core.records import Status
+from brainbench.stimuli.fitting.identifiability import Direction, directions, unknown_parameters
+from brainbench.stimuli.fitting.intervals import Profile, laplace_interval, quantile
+from brainbench.stimuli.fitting.jacobians import CentralDifferences, JacobianProvider
+from brainbench.stimuli.fitting.model import FitModel
+from brainbench.stimuli.fitting.options import FitOptions
+from brainbench.stimuli.fitting.parameters import FreeParameters, read_value, with_value
+from brainbench.stimuli.fitting.priors import PUBLISHED, Prior
+from brainbench.stimuli.fitting.residual_tests import check_residuals, failed_words
+from brainbench.stimuli.fitting.result import FitResult, FittedParameter
+from brainbench.stimuli.fitting.trials import Trial
+
+Array = NDArray[np.float64]
+_ROUNDS = 3
+"""Fits with the noise of each channel estimated anew; it settles in two."""
+
+
+def fit(
+    trials: Trial | Sequence[Trial],
+    parameters: Sequence[str],
+    *,
+    start: Mapping[str, float] | None = None,
+    bounds: Mapping[str, tuple[float, float]] | None = None,
+    priors: Mapping[str, Prior] | None = None,
+    options: FitOptions | None = None,
+    provider: JacobianProvider | None = None,
+) -> FitResult:
+    """Estimate parameters of a whisker from one or several trials of it.
+
+    Args:
+        trials: what was measured, with motion and objects; the fit starts from the whisker of the first.
+        parameters: names of :data:`brainbench.stimuli.fitting.parameters.PARAMETERS`.
+        start: start values of parameters, free or not, in place of the trials'.
+        bounds: bounds of single parameters, in their units.
+        priors: priors of single parameters, beside those that the options name.
+        options: how the fit simulates, weighs and judges.
+        provider: what computes Jacobians; central differences when None.
+
+    Returns:
+        Estimates with intervals, noise, tests of the residuals, and a status with reasons.
+
+    Raises:
+        UsageError: a parameter is unknown, or a start value lies outside its bounds.
+        DataError: there are fewer readings than parameters, or the whisker is unstable at the start values.
+    """
+    began = time.perf_counter()
+    trials, options = [trials] if isinstance(trials, Trial) else list(trials), options or FitOptions()
+    if not trials:
+        raise UsageError("There is no trial to fit.")
+    condition = trials[0].condition
+    for name, value in (start or {}).items():
+        condition = with_value(condition, FreeParameters((name,), condition).names[0], value)
+    if "deflection" in (start or {}):
+        trials = [
+            replace(trial, pluck=replace(trial.pluck, deflection=condition.deflection)) if trial.pluck else trial
+            for trial in trials
+        ]
+    free = FreeParameters(tuple(parameters), condition, bounds or {})
+    model = FitModel(trials, free, options, provider or CentralDifferences())
+    problem = _Problem(model, _chosen_priors(free, options, priors or {}))
+    first = model.residual(np.zeros(len(free)))
+    if not np.isfinite(first).all():
+        raise DataError(
+            f"The whisker is unstable at the start values ({model.reason or 'no reading'}); start nearer to the truth, "
+            "or with a shorter time step."
+        )
+    u, converged, iterations = problem.solve()
+    return _judge(problem, u, converged, iterations, began)
+
+
+def _chosen_priors(free: FreeParameters, options: FitOptions, given: Mapping[str, Prior]) -> dict[int, Prior]:
+    """Return the prior of each parameter that has one, by its index."""
+    chosen = {**(PUBLISHED if options.priors == "published" else {}), **given}
+    return {index: chosen[name] for index, name in enumerate(free.names) if name in chosen}
+
+
+class _Problem:
+    """Residuals with priors as more of them, and their minimum."""
+
+    def __init__(self, model: FitModel, priors: Mapping[int, Prior]) -> None:
+        self.model, self.priors = model, priors
+        free = model.free
+        rows = [
+            prior.row(free.names[i], read_value(free.start, free.names[i]), free.start.whisker)
+            for i, prior in priors.items()
+        ]
+        self.mean, self.spread = np.array(rows).reshape(-1, 2).T
+        self.prior_jacobian = np.zeros((len(rows), len(free)))
+        for row, index in enumerate(priors):
+            self.prior_jacobian[row, index] = 1 / self.spread[row]
+
+    def residual(self, u: Array) -> Array:
+        """Return the whitened residuals [m + priors] at coordinates u [p]."""
+        return np.concatenate([self.model.residual(u), (u[list(self.priors)] - self.mean) / self.spread])
+
+    def jacobian(self, u: Array) -> Array:
+        """Return their derivatives."""
+        return np.concatenate([self.model.jacobian(u), self.prior_jacobian])
+
+    def solve(self) -> tuple[Array, bool, int]:
+        """Return the best coordinates [p], whether they converged, and the iterations."""
+        from scipy.optimize import least_squares
+
+        u, iterations, found = np.zeros(len(self.model.free)), 0, None
+        known = bool(np.isfinite(self.model.readings.noise).all())
+        for _ in range(1 if known else _ROUNDS):
+            low, high = self.model.limits
+            found = least_squares(
+                self.residual,
+                np.clip(u, low + 1e-6, high - 1e-6),
+                jac=self.jacobian,  # type: ignore[arg-type]
+                bounds=(low, high),
+                loss=self.model.options.loss,
+                # A change of the cost by this share moves no coordinate by a hundredth of its standard deviation.
+                ftol=1e-7,
+                xtol=1e-5,
+                gtol=1e-9,
+                max_nfev=self.model.options.most_iterations,
+            )
+            step = float(np.abs(found.x - u).max())
+            u, iterations = found.x, iterations + int(found.njev)
+            before = self.model.sigma.copy()
+            self.model.update_noise(self.model.residual(u), before)
+            if found.status <= 0 or (step < 1e-3 and np.allclose(before, self.model.sigma, rtol=0.05)):
+                break
+        return u, found is not None and found.status > 0, iterations
+
+
+def _judge(problem: _Problem, u: Array, converged: bool, iterations: int, began: float) -> FitResult:
+    """Return the result at the best coordinates u [p]."""
+    model, free, options = problem.model, problem.model.free, problem.model.options
+    residual, jacobian = model.residual(u), model.jacobian(u)
+    freedom = len(residual) - len(free)
+    known = bool(np.isfinite(model.readings.noise).all())
+    scale = 1.0 if known else float(residual @ residual) / freedom
+    found = directions(jacobian, free.names, math.sqrt(scale))
+    information = jacobian.T @ jacobian / scale + problem.prior_jacobian.T @ problem.prior_jacobian
+    covariance = _inverse(information)
+    t = quantile(options.level, math.inf if known else freedom)
+    profile = None
+    if options.intervals == "profile":
+        least = float(np.sum(problem.residual(u) ** 2))
+        profile = Profile(problem.residual, problem.jacobian, model.limits, u, covariance, least, scale)
+    unknown = unknown_parameters(found)
+    estimates = []
+    for index, (name, value) in enumerate(zip(free.names, free.values(u), strict=True)):
+        deviation = math.sqrt(covariance[index, index]) if covariance[index, index] >= 0 else math.inf
+        status, reason = _judge_one(problem, index, u, unknown.get(name))
+        estimates.append(
+            FittedParameter(
+                name,
+                _unit(name),
+                value,
+                read_value(free.start, name),
+                deviation,
+                laplace_interval(free, index, u, deviation, options.level, t),
+                profile.interval(free, index, options.level, t) if profile and status != "undefined" else None,
+                problem.priors.get(index),
+                status,
+                reason,
+            )
+        )
+    tests = check_residuals(residual, jacobian, model.readings)
+    reasons = [
+        *(() if converged else (f"The fit did not converge within {options.most_iterations} iterations.",)),
+        *dict.fromkeys(one.reason for one in estimates if one.reason),
+        *failed_words(tests),
+    ]
+    worst = {one.status for one in estimates} | ({"unreliable"} if reasons else {"ok"})
+    status: Status = "undefined" if not converged or "undefined" in worst else "unreliable" if reasons else "ok"
+    (traces,) = model.traces([u])
+    whisker = free.condition(u).whisker
+    predicted = tuple(
+        trace.link_positions if trial.of_shapes and trace.link_positions is not None else _wrench(trial, trace)
+        for trial, trace in zip(model.trials, traces, strict=True)
+    )
+    return FitResult(
+        status=status,
+        reasons=tuple(reasons),
+        estimates=tuple(estimates),
+        noise={name: float(level) for name, level in zip(model.readings.groups, model.sigma, strict=True)},
+        directions=found,
+        tests=tests,
+        whisker=whisker,
+        residuals=tuple(trial.residuals(trace, whisker) for trial, trace in zip(model.trials, traces, strict=True)),
+        predicted=predicted,
+        covariance=covariance,
+        iterations=iterations,
+        provenance=provenance(options=options, seconds=time.perf_counter() - began, **model.describe()),
+    )
+
+
+def _judge_one(problem: _Problem, index: int, u: Array, unknown: Direction | None) -> tuple[Status, str]:
+    """Return the status of one parameter, and why."""
+    model, name = problem.model, problem.model.free.names[index]
+    if unknown is not None:
+        if index in problem.priors:
+            return "unreliable", f"{unknown.words} {name} is known by its prior."
+        return "undefined", unknown.words
+    low, high = (float(limit[index]) for limit in model.limits)
+    if min(u[index] - low, high - u[index]) < 1e-3 * min(high - low, 1.0):
+        end = "lower" if u[index] - low < high - u[index] else "upper"
+        return "unreliable", f"{name} is at its {end} bound, so that its interval means nothing; widen the bounds."
+    if name == "damping_ratio" and (value := model.free.values(u)[index]) < 1.2 * model.least_damping:
+        return "unreliable", (
+            f"damping_ratio is {value:.3g}, and the time step alone damps with {model.least_damping:.3g}; fit with "
+            "more steps_per_period."
+        )
+    return "ok", ""
+
+
+def _unit(name: str) -> str:
+    from brainbench.stimuli.fitting.parameters import PARAMETERS
+
+    return PARAMETERS[name].unit
+
+
+def _wrench(trial: Trial, trace: Any) -> Array:
+    return trial.residuals(trace, trial.job.whisker) + trial.measured["wrench"].values
+
+
+def _inverse(information: Array) -> Array:
+    """Return the inverse [p, p] of the information; infinite variances where it is singular."""
+    values, vectors = np.linalg.eigh(information)
+    least = values.max(initial=0.0) * 1e-14
+    if (values > least).all() and values.max(initial=0.0) > 0:
+        return (vectors / values) @ vectors.T
+    good = values > least
+    covariance = (vectors[:, good] / values[good]) @ vectors[:, good].T
+    lost = (vectors[:, ~good] ** 2).sum(axis=1) > 1e-6
+    covariance[lost, lost] = math.inf
+    return covariance

@@ -1,0 +1,191 @@
+"""The model of a fit: coordinates of the parameters → residuals over all trials, whitened by the noise.
+
+Letters: m reading, p parameter, g noise group (a channel of a wrench, or shapes).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from brainbench.core.errors import DataError
+from brainbench.stimuli.engines import get_engine
+from brainbench.stimuli.engines.fidelity import Fidelity
+from brainbench.stimuli.engines.protocol import Job, Trace
+from brainbench.stimuli.fitting.jacobians import CentralDifferences, JacobianProvider
+from brainbench.stimuli.fitting.options import FitOptions
+from brainbench.stimuli.fitting.parameters import Condition, FreeParameters
+from brainbench.stimuli.fitting.trials import Trial
+from brainbench.stimuli.validation import references
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Readings:
+    """Where each reading of the residuals comes from."""
+
+    trial: NDArray[np.int_]
+    """[m] trial it belongs to."""
+    place: NDArray[np.int_]
+    """[m, 3] instant, point (0 for wrenches) and channel or direction."""
+    group: NDArray[np.int_]
+    """[m] noise group."""
+    groups: tuple[str, ...]
+    """[g] name of each noise group: Fx … Mz, or shape."""
+    noise: Array
+    """[g] standard deviation that repeats tell (N, N·m, m); NaN where it is estimated."""
+    size: Array
+    """[g] root mean square of the readings, or of shapes a hundredth of the whisker's length."""
+
+    @classmethod
+    def of(cls, trials: Sequence[Trial]) -> Readings:
+        """Return the readings of some trials: every finite number that was measured."""
+        names = tuple(dict.fromkeys(name for trial in trials for name in trial.channels))
+        rows: list[NDArray[np.int_]] = []
+        owners, groups = [], []
+        noise, squares, counts = np.full(len(names), np.nan), np.zeros(len(names)), np.zeros(len(names))
+        for index, trial in enumerate(trials):
+            values = trial.measured["shape" if trial.of_shapes else "wrench"].values
+            if trial.of_shapes:
+                directions = values.shape[-1] - 1
+                known = np.repeat(np.isfinite(values).all(axis=-1, keepdims=True), directions, axis=-1)
+                group = np.full(known.shape, names.index("shape"))
+                sizes = np.full(known.shape, trial.job.whisker.arc_length / 100)
+            else:
+                # A component that is zero throughout was not measured, or is zero by symmetry: it tells nothing.
+                known = (np.isfinite(values) & np.any(np.nan_to_num(values) != 0, axis=0))[:, None, :]
+                channel = np.array([names.index(name) for name in trial.channels])
+                group, sizes = np.broadcast_to(channel, known.shape), np.nan_to_num(values)[:, None, :]
+            rows.append(np.argwhere(known))
+            owners.append(np.full(len(rows[-1]), index))
+            groups.append(group[known])
+            np.add.at(squares, group[known], sizes[known] ** 2)
+            np.add.at(counts, group[known], 1)
+            if "noise" in trial.measured:
+                stated = np.broadcast_to(trial.measured["noise"].values, len(trial.channels))
+                noise[[names.index(name) for name in trial.channels]] = stated
+        size = np.sqrt(squares / np.maximum(counts, 1))
+        # Small components are no more reliable than large ones of the same kind.
+        for kind in ("F", "M", "s"):
+            same = [i for i, name in enumerate(names) if name.startswith(kind)]
+            size[same] = np.maximum(size[same], 0.1 * size[same].max(initial=0.0))
+        return cls(np.concatenate(owners), np.concatenate(rows).astype(int), np.concatenate(groups), names, noise, size)
+
+    def __len__(self) -> int:
+        return len(self.trial)
+
+
+@dataclass(eq=False)
+class FitModel:
+    """Simulates the trials of a fit; counts the whiskers that it simulated."""
+
+    trials: Sequence[Trial]
+    free: FreeParameters
+    options: FitOptions
+    provider: JacobianProvider = field(default_factory=CentralDifferences)
+
+    def __post_init__(self) -> None:
+        self.readings = Readings.of(self.trials)
+        if len(self.readings) <= len(self.free):
+            raise DataError(
+                f"{len(self.readings)} measured numbers cannot tell {len(self.free)} parameters; measure longer or fit "
+                "fewer parameters."
+            )
+        self.sigma = np.where(np.isfinite(self.readings.noise), self.readings.noise, self.readings.size)
+        """[g] standard deviation by which residuals are divided (N, N·m, m)."""
+        self.limits = self.free.limits()
+        self.fidelity = self._fidelity()
+        self.engine = get_engine(self.options.backend)
+        self.simulated = 0
+        self.reason = ""
+        """Why a simulation could not be trusted, of the last that was not."""
+
+    def _fidelity(self) -> Fidelity:
+        """Return the fidelity of all simulations: a step that stays, so that differences do not see it change."""
+        whisker = self.free.start.whisker
+        first = float(references.natural_frequencies(whisker, 1)[0])
+        options = self.options
+        step = min(options.time_step, 1 / (options.steps_per_period * first))
+        return Fidelity(
+            links=options.links,
+            time_step=max(step, 1e-7),
+            precision="double",
+            solver=options.solver,
+            twist=options.twist,
+        )
+
+    @property
+    def least_damping(self) -> float:
+        """Damping ratio that the time step alone gives the first mode at the start; smaller ones cannot be told."""
+        if self.options.solver == "quasistatic":
+            return 0.0
+        first = float(references.natural_frequencies(self.free.start.whisker, 1)[0])
+        return math.pi * first * self.fidelity.time_step
+
+    def traces(self, points: Sequence[Array]) -> list[list[Trace]]:
+        """Simulate every trial under each of some coordinates [p], all in one run of the engine."""
+        conditions = [self.free.condition(u) for u in points]
+        jobs = [self._job(trial, condition) for condition in conditions for trial in self.trials]
+        shapes = any(trial.of_shapes for trial in self.trials)
+        found = self.engine.run(jobs, self.fidelity, workers=self.options.workers, record_shape=shapes)
+        self.simulated += len(jobs)
+        count = len(self.trials)
+        return [found[i : i + count] for i in range(0, len(found), count)]
+
+    def _job(self, trial: Trial, condition: Condition) -> Job:
+        if "deflection" not in self.free.names:  # each trial keeps its own
+            condition = replace(condition, deflection=trial.condition.deflection)
+        return trial.job_of(condition)
+
+    def evaluate(self, points: Sequence[Array]) -> list[Array]:
+        """Return the whitened residuals [m] at each of some coordinates [p]; NaN where a simulation is not trusted."""
+        return [self.whitened(traces, u) for traces, u in zip(self.traces(points), points, strict=True)]
+
+    def whitened(self, traces: Sequence[Trace], u: Array) -> Array:
+        """Return the residuals [m] of traces simulated at coordinates u [p], divided by the noise."""
+        whisker, readings = self.free.condition(u).whisker, self.readings
+        parts = []
+        for index, (trial, trace) in enumerate(zip(self.trials, traces, strict=True)):
+            if trace.status != "ok":
+                self.reason = trace.reason
+            values = trial.residuals(trace, whisker)
+            values = values if trial.of_shapes else values[:, None, :]
+            parts.append(values[tuple(readings.place[readings.trial == index].T)])
+        return np.concatenate(parts) / self.sigma[readings.group]
+
+    def residual(self, u: Array) -> Array:
+        """Return the whitened residuals [m] at coordinates u [p]."""
+        return self.evaluate([u])[0]
+
+    def jacobian(self, u: Array) -> Array:
+        """Return the derivatives [m, p] of the whitened residuals."""
+        return self.provider.jacobian(self.evaluate, u, self.limits)
+
+    def update_noise(self, residual: Array, sigma: Array) -> None:
+        """Estimate the noise of each group from residuals [m] that were divided by ``sigma`` [g], where none is known.
+
+        Of the squares of n readings with p free parameters, n − p are noise; each group is taken to give up its share.
+        """
+        readings, total = self.readings, len(self.readings)
+        share = 1 - len(self.free) / total
+        for index in np.flatnonzero(~np.isfinite(readings.noise)):
+            some = residual[readings.group == index] * sigma[index]
+            if len(some):
+                level = math.sqrt(float(np.mean(some**2)) / share)
+                # Without any noise the numbers of the simulation are exact to about this.
+                self.sigma[index] = max(level, 1e-6 * readings.size[index], 1e-300)
+
+    def describe(self) -> dict[str, Any]:
+        """Return what the provenance of a result says of the model."""
+        return {
+            "jacobian": self.provider.name,
+            "backend": self.options.backend,
+            "fidelity": self.fidelity,
+            "simulated_whiskers": self.simulated,
+        }

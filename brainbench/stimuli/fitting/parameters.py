@@ -1,0 +1,196 @@
+"""Parameters that a fit can estimate: how each changes a trial, its unit, its bounds and its scale.
+
+A fit works on one dimensionless coordinate u a parameter: the logarithm of its value over the start value where it is
+positive by nature, else its difference from the start value over :attr:`Parameter.scale`. u is 0 at the start.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal
+
+import numpy as np
+
+from brainbench.core.errors import UsageError, check_name
+from brainbench.stimuli.whiskers.whisker import Whisker
+
+Vector = tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class Condition:
+    """Everything about a trial that a fit may change."""
+
+    whisker: Whisker
+    base_offset: Vector = (0.0, 0.0, 0.0)
+    """Displacement of the base against the trial's [m, frame of the job]."""
+    base_angle: float = 0.0
+    """Turn of the base about the z axis of the job's frame against the trial's [rad]."""
+    object_offset: Vector = (0.0, 0.0, 0.0)
+    """Displacement of all objects against the trial's [m, frame of the job]."""
+    deflection: float = math.nan
+    """Deflection of the plucked point before its release [m]; NaN without a pluck."""
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """One parameter that a fit can estimate."""
+
+    name: str
+    unit: str
+    kind: Literal["log", "linear"]
+    """``log``: positive, fitted as the logarithm of its ratio to the start value."""
+    low: float
+    """Lower bound: a ratio to the start value for ``log``, else in multiples of the scale around the start value."""
+    high: float
+    what: str
+    """What it is, in words."""
+    scale: float = 1.0
+    """Length of one unit of u: a value for ``linear`` (for ``length`` and ``curvature`` scaled by the whisker)."""
+    of_length: int = 0
+    """Power of the arc length that ``scale`` is multiplied by."""
+
+    def unit_of(self, whisker: Whisker) -> float:
+        """Return what one unit of u is worth, in the parameter's unit; of ``log`` parameters 1."""
+        return self.scale * whisker.arc_length**self.of_length
+
+    def value(self, start: float, u: float, whisker: Whisker) -> float:
+        """Return the value at coordinate u of a fit that began at ``start``."""
+        return start * math.exp(u) if self.kind == "log" else start + u * self.unit_of(whisker)
+
+    def coordinate(self, start: float, value: float, whisker: Whisker) -> float:
+        """Return the coordinate u of a value."""
+        return math.log(value / start) if self.kind == "log" else (value - start) / self.unit_of(whisker)
+
+
+def _positive(name: str, unit: str, what: str, low: float = 0.1, high: float = 10.0) -> Parameter:
+    return Parameter(name, unit, "log", low, high, what)
+
+
+def _shift(name: str, what: str) -> Parameter:
+    return Parameter(name, "m", "linear", -4.0, 4.0, what, scale=0.05, of_length=1)
+
+
+PARAMETERS: Mapping[str, Parameter] = {
+    item.name: item
+    for item in (
+        _positive("young_modulus", "Pa", "Young's modulus"),
+        _positive("density", "kg/m³", "density at the base; the ratio of tip to base is kept", 0.2, 5.0),
+        _positive("damping_ratio", "", "damping ratio of the first mode"),
+        _positive("base_radius", "m", "radius at the base", 0.2, 5.0),
+        _positive("tip_radius", "m", "radius at the tip, which sets the taper", 0.05, 20.0),
+        _positive("arc_length", "m", "length along the whisker", 0.5, 2.0),
+        Parameter("curvature", "1/m", "linear", -30.0, 30.0, "coefficient A of the rest shape y = A x²", 0.1, -1),
+        Parameter("friction", "", "linear", -10.0, 10.0, "Coulomb coefficient of the whisker", 0.3),
+        Parameter("base_angle", "rad", "linear", -10.0, 10.0, "turn of the base about z", 0.05),
+        *(_shift(f"base_{axis}", f"displacement of the base along {axis}") for axis in "xyz"),
+        *(_shift(f"object_{axis}", f"displacement of the objects along {axis}") for axis in "xyz"),
+        _positive("deflection", "m", "deflection of the plucked point before its release", 0.05, 20.0),
+    )
+}
+"""Parameters by name."""
+_OF_WHISKER = ("young_modulus", "damping_ratio", "base_radius", "tip_radius", "arc_length", "curvature", "friction")
+
+
+def read_value(condition: Condition, name: str) -> float:
+    """Return the value of a parameter in a condition."""
+    if name in _OF_WHISKER:
+        return float(getattr(condition.whisker, name))
+    if name == "density":
+        return condition.whisker.densities[0]
+    if name[:-1] in ("base_", "object_"):
+        return getattr(condition, f"{name[:-2]}_offset")["xyz".index(name[-1])]
+    return float(getattr(condition, name))
+
+
+def with_value(condition: Condition, name: str, value: float) -> Condition:
+    """Return a condition with one parameter changed."""
+    whisker = condition.whisker
+    if name in _OF_WHISKER:
+        return replace(condition, whisker=replace(whisker, **{name: value}))
+    if name == "density":
+        base, tip = whisker.densities
+        density = (value, value * tip / base) if isinstance(whisker.density, tuple) else value
+        return replace(condition, whisker=replace(whisker, density=density))
+    if name[:-1] in ("base_", "object_"):
+        field = f"{name[:-2]}_offset"
+        offset = list(getattr(condition, field))
+        offset["xyz".index(name[-1])] = value
+        changes: dict[str, Any] = {field: tuple(offset)}
+        return replace(condition, **changes)
+    changes = {name: value}
+    return replace(condition, **changes)
+
+
+@dataclass(frozen=True)
+class FreeParameters:
+    """The parameters of one fit, with their start values and bounds.
+
+    Raises:
+        UsageError: a name is unknown or stands twice, or a start value is not possible.
+    """
+
+    names: tuple[str, ...]
+    start: Condition
+    """Condition whose values the fit starts from."""
+    bounds: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    """Bounds of single parameters, in their units; others as in :data:`PARAMETERS`."""
+
+    def __post_init__(self) -> None:
+        for name in (*self.names, *self.bounds):
+            check_name("parameter of a fit", name, PARAMETERS)
+        if not self.names or len(set(self.names)) < len(self.names):
+            raise UsageError(f"A fit needs at least one parameter, each once; received {list(self.names)}.")
+        for name in self.names:
+            value = read_value(self.start, name)
+            if math.isnan(value):
+                raise UsageError(f"{name!r} is a parameter of a ring-down, and no trial here is one; leave it out.")
+            if PARAMETERS[name].kind == "log" and not value > 0:
+                raise UsageError(f"The fit of {name!r} starts at {value:g}; give a positive start value.")
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    def values(self, u: Any) -> tuple[float, ...]:
+        """Return the values at coordinates u [p]."""
+        whisker = self.start.whisker
+        return tuple(
+            PARAMETERS[name].value(read_value(self.start, name), float(one), whisker)
+            for name, one in zip(self.names, u, strict=True)
+        )
+
+    def condition(self, u: Any) -> Condition:
+        """Return the condition at coordinates u [p]."""
+        condition = self.start
+        for name, value in zip(self.names, self.values(u), strict=True):
+            condition = with_value(condition, name, value)
+        return condition
+
+    def limits(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return the lower and upper bounds of u [p]; a start value outside its bounds is a :class:`UsageError`."""
+        rows = [self._limits(name) for name in self.names]
+        low, high = np.array(rows).T
+        return low, high
+
+    def _limits(self, name: str) -> tuple[float, float]:
+        parameter, start = PARAMETERS[name], read_value(self.start, name)
+        low, high = parameter.low, parameter.high
+        if parameter.kind == "log":
+            low, high = math.log(low), math.log(high)
+        if name == "friction":
+            low = parameter.coordinate(start, 0.0, self.start.whisker)
+        if name in self.bounds:
+            ends = self.bounds[name]
+            if not ends[0] < start < ends[1]:
+                raise UsageError(
+                    f"The start value of {name!r}, {start:g}, does not lie between its bounds {ends[0]:g} and "
+                    f"{ends[1]:g}; change one of them."
+                )
+            # A logarithm has no bound at 0.
+            low, high = (
+                parameter.coordinate(start, end, self.start.whisker) if end > 0 or parameter.kind == "linear" else -12.0
+                for end in ends
+            )
+        return low, high

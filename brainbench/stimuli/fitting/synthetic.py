@@ -1,0 +1,92 @@
+"""Synthetic measurements: what sensors and trackers would have written of a simulated whisker, with noise.
+
+For tests, benchmarks and the planning of an experiment: a trial is simulated at a finer setting than a fit uses, and
+read with white noise.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from brainbench.core.contracts import CHANNELS
+from brainbench.core.errors import DataError
+from brainbench.stimuli.fitting.model import FitModel
+from brainbench.stimuli.fitting.options import FitOptions
+from brainbench.stimuli.fitting.parameters import FreeParameters
+from brainbench.stimuli.fitting.tracks.contract import new_shapes, new_wrenches
+from brainbench.stimuli.fitting.trials import Trial
+from brainbench.stimuli.whiskers.chain import build_chain
+from brainbench.stimuli.whiskers.whisker import Whisker
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+    from brainbench.stimuli.engines.protocol import Trace
+
+FINE = FitOptions(links=40, steps_per_period=1000.0)
+"""Setting of the simulated truth."""
+
+
+def blank_wrenches(times: ArrayLike) -> xr.Dataset:
+    """Return wrenches of ones at times [n] (s): the place of a measurement in a trial that is still to be simulated."""
+    times = np.asarray(times, dtype=float)
+    return new_wrenches(times, np.ones((len(times), 6)))
+
+
+def simulate_trial(trial: Trial, *, options: FitOptions = FINE) -> Trace:
+    """Simulate a trial as it stands, with its shapes.
+
+    Raises:
+        DataError: the whisker is unstable.
+    """
+    model = FitModel([trial], FreeParameters(("young_modulus",), trial.condition), options)
+    job = trial.job_of(trial.condition)
+    (trace,) = model.engine.run([job], model.fidelity, workers=options.workers, record_shape=True)
+    if trace.status != "ok":
+        raise DataError(f"The simulated trial is unstable: {trace.reason}.")
+    return trace
+
+
+def measure_wrenches(trial: Trial, trace: Trace, relative_noise: float, rng: np.random.Generator) -> Trial:
+    """Return a trial with the base wrenches of a simulation, read with white noise.
+
+    ``relative_noise`` is the standard deviation over the largest force, or moment, of the whole trace; components that
+    stay below a thousandth of it are not measured.
+    """
+    wrench = trace.wrench
+    sizes = np.abs(wrench).max(axis=0)
+    scale = np.repeat([sizes[:3].max(), sizes[3:].max()], 3)
+    kept = np.flatnonzero(sizes > 1e-3 * scale)
+    values = wrench[:, kept] + rng.normal(size=(len(wrench), len(kept))) * relative_noise * scale[kept]
+    channels = [CHANNELS[index] for index in kept]
+    return replace(trial, measured=new_wrenches(trial.job.times, values, channels))
+
+
+def measure_shapes(
+    trial: Trial,
+    trace: Trace,
+    whisker: Whisker,
+    noise: float,
+    rng: np.random.Generator,
+    *,
+    points: int = 12,
+    traced: float = 0.95,
+    axes: int = 2,
+) -> Trial:
+    """Return a trial with traced shapes of a simulation: points evenly spaced on a share of the whisker, with noise "
+    "(m)."""
+    places = sample_shape(trace, whisker, np.linspace(0.0, traced * whisker.arc_length, points))[..., :axes]
+    return replace(trial, measured=new_shapes(trial.job.times, places + rng.normal(size=places.shape) * noise))
+
+
+def sample_shape(trace: Trace, whisker: Whisker, arcs: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the points [n, k, 3] (m) of a simulated shape at arc lengths [k] (m)."""
+    from scipy.interpolate import CubicSpline
+
+    assert trace.link_positions is not None
+    nodes = build_chain(whisker, trace.link_positions.shape[1] - 1).nodes
+    return CubicSpline(nodes, trace.link_positions, axis=1)(arcs)

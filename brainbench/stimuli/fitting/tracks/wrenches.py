@@ -1,0 +1,147 @@
+"""Read base wrenches over time: CSV tables, HDF5 files and time series as of NWB, and our own stimulus sets."""
+
+from __future__ import annotations
+
+import os
+import re
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from brainbench.core.contracts import CHANNELS
+from brainbench.core.errors import DataError, UsageError, check_name, listing, shown
+from brainbench.core.reading.hdf5 import open_hdf5
+from brainbench.stimuli.fitting.tracks.contract import new_wrenches
+from brainbench.stimuli.fitting.tracks.tables import read_table
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+Array = NDArray[np.float64]
+TIMES = {"time": 1.0, "time_s": 1.0, "t": 1.0, "timestamps": 1.0, "time_ms": 1e-3, "time_us": 1e-6}
+"""Names of a column of times, and their unit in s."""
+_SCALES = {"N": 1.0, "mN": 1e-3, "uN": 1e-6, "nN": 1e-9, "Nm": 1.0, "mNm": 1e-3, "uNm": 1e-6, "nNm": 1e-9, "Nmm": 1e-3,
+           "mNmm": 1e-6, "uNmm": 1e-9}  # fmt: skip
+_COLUMN = re.compile(r"([FM][xyz])(?:[_ \[(]+([munµ]?N(?:\.?m{1,2})?)[\])]?)?")
+
+
+def read_wrenches(
+    path: str | os.PathLike[str], *, whisker: str | None = None, stimulus: str | None = None
+) -> xr.Dataset:
+    """Read the forces and moments at the base of one whisker.
+
+    Args:
+        path: a table (``.csv``) with a column of times (``time`` or ``time_s``, ``time_ms``) and columns ``Fx`` …
+        ``Mz``
+            in N and N·m, or with a unit as in ``Fy_mN`` and ``Mz_uNm``; an HDF5 file with ``wrench`` [n, channel] and
+            ``time``, or with a time series as NWB stores it (``data`` with ``timestamps``, or ``starting_time`` and its
+            rate); or a stimulus set of ours.
+        whisker, stimulus: which of a stimulus set; the only one when None.
+
+    Raises:
+        UsageError: the whisker or the stimulus is unknown, or several are there and none is named.
+        DataError: the file holds no wrenches, or no time stamps.
+    """
+    suffix = Path(path).suffix.lower()
+    if suffix == ".csv":
+        return _read_csv(path)
+    if suffix not in (".h5", ".hdf5", ".nwb", ".nc"):
+        raise UsageError(f"{shown(os.fspath(path))} is no file of wrenches; these end in .csv, .h5, .hdf5 or .nwb.")
+    with open_hdf5(path, "file of wrenches") as file:
+        ours = "wrench" in file and {"stimulus", "whisker", "channel"} <= set(file)
+        if not ours:
+            return _read_hdf5(file, path)
+    return _read_stimulus_set(path, whisker, stimulus)
+
+
+def _read_csv(path: str | os.PathLike[str]) -> xr.Dataset:
+    names, table = read_table(path, "table of wrenches")
+    clock = next((name for name in names if name.lower() in TIMES), None)
+    if clock is None:
+        raise _no_times(path, names)
+    times = table[:, names.index(clock)] * TIMES[clock.lower()]
+    channels, columns = [], []
+    for index, name in enumerate(names):
+        if found := _COLUMN.fullmatch(name):
+            unit = (found[2] or ("N" if name[0] == "F" else "Nm")).replace("µ", "u").replace(".", "")
+            if ("m" in unit.partition("N")[2]) != (name[0] == "M"):
+                raise DataError(f"The column {name!r} of {shown(os.fspath(path))} has the unit of the other kind.")
+            channels.append(found[1])
+            columns.append(table[:, index] * _SCALES[unit])
+    if not channels:
+        raise DataError(
+            f"{shown(os.fspath(path))} has no column of forces or moments; they are called Fx … Mz, or Fy_mN, Mz_uNm. "
+            f"It has {listing(names)}."
+        )
+    return new_wrenches(times, np.stack(columns, axis=1), channels, source=os.fspath(path))
+
+
+def _read_hdf5(file: Any, path: str | os.PathLike[str]) -> xr.Dataset:
+    series = _find_series(file)
+    if series is None:
+        raise DataError(
+            f"{shown(os.fspath(path))} holds no wrenches: neither 'wrench' [n, channel] nor a time series whose "
+            "'data' has six columns."
+        )
+    data, group = series
+    values = np.asarray(data[()], dtype=float)
+    stated = data.attrs.get("channels")
+    channels = [one.decode() if isinstance(one, bytes) else str(one) for one in stated] if stated is not None else []
+    if not channels:
+        if values.shape[1] != len(CHANNELS):
+            raise DataError(
+                f"The wrenches of {shown(os.fspath(path))} have {values.shape[1]} columns; name them in the attribute "
+                "'channels', or give all six (Fx, Fy, Fz, Mx, My, Mz)."
+            )
+        channels = list(CHANNELS)
+    factor = float(data.attrs.get("conversion", 1.0))
+    for name in ("time", "timestamps", "time_s"):
+        if name in group:
+            times = np.asarray(group[name][()], dtype=float)
+            break
+    else:
+        start = group.get("starting_time")
+        if start is None or "rate" not in start.attrs:
+            raise _no_times(path, list(group))
+        times = float(start[()]) + np.arange(len(values)) / float(start.attrs["rate"])
+    return new_wrenches(times, values * factor, channels, source=os.fspath(path))
+
+
+def _find_series(file: Any) -> tuple[Any, Any] | None:
+    """Return the data set of wrenches and the group that holds its times."""
+    if "wrench" in file:
+        return file["wrench"], file
+    found: list[tuple[Any, Any]] = []
+
+    def look(name: str, item: Any) -> None:
+        if name.rpartition("/")[2] == "data" and getattr(item, "ndim", 0) == 2:
+            named = item.attrs.get("channels") is not None
+            if named or item.shape[1] == len(CHANNELS):
+                found.append((item, item.parent))
+
+    file.visititems(look)
+    return found[0] if found else None
+
+
+def _read_stimulus_set(path: str | os.PathLike[str], whisker: str | None, stimulus: str | None) -> xr.Dataset:
+    from brainbench.stimuli.stimulus_set import read_stimulus_set
+
+    dataset, chosen = read_stimulus_set(path), {}
+    for kind, name in (("whisker", whisker), ("stimulus", stimulus)):
+        present = [str(one) for one in dataset[kind].values]
+        if name is None and len(present) > 1:
+            raise UsageError(f"Name one {kind} of {shown(os.fspath(path))}; it holds {listing(present)}.")
+        if name is not None:
+            check_name(kind, name, present)
+        chosen[kind] = present.index(name or present[0])
+    one = dataset["wrench"].isel(chosen)
+    return new_wrenches(dataset["time"].values, one.values, source=os.fspath(path), axes=dataset.attrs.get("axes", ""))
+
+
+def _no_times(path: str | os.PathLike[str], names: list[str]) -> DataError:
+    return DataError(
+        f"The wrenches of {shown(os.fspath(path))} have no time stamps; add a column or data set 'time' (s), or "
+        f"'time_ms'. There are {listing(names)}."
+    )

@@ -1,0 +1,236 @@
+"""Trials of a fit: what moved and what was touched, what was measured, and how far a simulation is from it.
+
+Letters: n instant, k traced point, c channel of a wrench, d = 1 or 2 directions across a shape.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from brainbench.core.contracts import CHANNELS
+from brainbench.core.errors import DataError, UsageError, check_name
+from brainbench.stimuli.engines.protocol import Follicle, Job, Load, StillFollicle, Trace
+from brainbench.stimuli.fitting.curves import normal_offsets
+from brainbench.stimuli.fitting.parameters import Condition, Vector
+from brainbench.stimuli.fitting.tracks.quality import check_length
+from brainbench.stimuli.objects.obstacle import Obstacle
+from brainbench.stimuli.validation import references
+from brainbench.stimuli.whiskers.chain import build_chain
+from brainbench.stimuli.whiskers.whisker import Whisker
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+    from brainbench.stimuli.scenes.scene import Scene
+
+SETTLING = 4.0
+"""Time for which a plucked whisker is held, in decay times 1/(ζ ω) of its first mode; it is held in a way that hardly
+swings."""
+
+
+@dataclass(frozen=True)
+class Pluck:
+    """A whisker held aside and let go at t = 0."""
+
+    deflection: float
+    """Deflection of the held point before the release [m]."""
+    arc: float
+    """Arc length of the held point [m]."""
+    direction: Vector = (0.0, 1.0, 0.0)
+    """Direction of the deflection, in the frame of the job."""
+
+    def loads(self, condition: Condition, start: float) -> tuple[Load, Load]:
+        """Return the loads that hold the whisker aside from ``start`` (s) to the release.
+
+        A load that comes at once makes the first mode swing. Half a period at 1/(1 + K) of it, with the mode's decay K
+        in that time, carries the mode to its rest under the whole load (input shaping, Singer & Seering 1990, J. Dyn.
+        Syst. Meas. Control 112, 76).
+        """
+        whisker = condition.whisker
+        arc = min(self.arc, whisker.arc_length)
+        # The small-bending closed form is that of the straight whisker; curvature changes it by second order.
+        straight = replace(whisker, curvature=0.0)
+        force = condition.deflection / references.point_load_deflection(straight, 1.0, arc)
+        whole = force * np.asarray(self.direction, dtype=float)
+        ratio, omega = min(whisker.damping_ratio, 0.9), float(build_chain(whisker, 16).frequencies()[0])
+        damped = math.sqrt(1 - ratio**2)
+        decay = math.exp(-math.pi * ratio / damped)
+        part = -whole * decay / (1 + decay)
+        x, y, z = whole.tolist()
+        a, b, c = part.tolist()
+        return Load(arc, (x, y, z), stop=0.0), Load(arc, (a, b, c), stop=start + math.pi / (omega * damped))
+
+
+@dataclass(frozen=True, eq=False)
+class Trial:
+    """One recording of one whisker, with the motion and the objects that belong to it.
+
+    Raises:
+        DataError: the measurement holds fewer than three instants, or a shape is longer than the whisker.
+    """
+
+    job: Job
+    """Whisker, motion of its base, objects; it is read at the times of the measurement."""
+    measured: xr.Dataset
+    """``wrench`` [time, channel] or ``shape`` [time, point, axis], see :mod:`brainbench.stimuli.fitting.tracks`."""
+    pluck: Pluck | None = None
+
+    def __post_init__(self) -> None:
+        count = self.measured.sizes["time"]
+        if count < 3:
+            raise DataError(f"The measurement has {count} frames; a fit over time needs at least 3.")
+        if self.of_shapes:
+            check_length(self.measured, self.job.whisker.arc_length)
+
+    @classmethod
+    def of_scene(cls, scene: Scene, measured: xr.Dataset, whisker: str, *, start: Whisker | None = None) -> Trial:
+        """Return the trial of one whisker of a scene, whose base motion and objects are known.
+
+        Args:
+            scene: what was done; its frames do not matter.
+            measured: wrenches or shapes in world axes; its times count from the scene's t = 0.
+            whisker: a whisker of the scene, such as ``C2``.
+            start: the whisker that the fit starts from; that of the scene when None.
+        """
+        check_name("whisker of the scene", whisker, scene.names)
+        which = scene.names.index(whisker)
+        job, axes = scene.jobs()[which], scene.axes[which]
+        origin = [part.head.position for part in scene.split() for _ in part.array][which]
+        times = measured["time"].values.astype(float)
+        local = to_frame(measured, axes, np.asarray(origin, dtype=float))
+        return cls(replace(job, whisker=start or job.whisker, times=times), local)
+
+    @classmethod
+    def ringdown(
+        cls,
+        whisker: Whisker,
+        measured: xr.Dataset,
+        deflection: float,
+        *,
+        arc: float | None = None,
+        direction: Vector = (0.0, 1.0, 0.0),
+    ) -> Trial:
+        """Return the trial of a whisker on a still base that is held aside and let go at t = 0.
+
+        Args:
+            whisker: the whisker that the fit starts from; its base is the origin and it leaves along +x.
+            measured: wrenches or shapes; times count from the release. A reading at 0 itself is left out: there the
+                force jumps, and what a sensor shows depends on how fast it is.
+            deflection: deflection of the held point (m), roughly; the parameter ``deflection`` refines it.
+            arc: arc length of the held point (m); near the tip when None.
+            direction: direction of the deflection.
+        """
+        times = measured["time"].values.astype(float)
+        if times[0] < 0:
+            raise UsageError(
+                f"The times of a ring-down count from the release; the first is {times[0]:g} s: cut the frames before."
+            )
+        if times[0] == 0:
+            measured, times = measured.isel(time=slice(1, None)), times[1:]
+        omega = 2 * math.pi * float(references.natural_frequencies(whisker, 1)[0])
+        settling = SETTLING / (max(whisker.damping_ratio, 0.05) * omega) + math.pi / omega
+        job = Job(whisker, StillFollicle(), (), times, start=-settling)
+        return cls(job, measured, Pluck(deflection, arc or 0.95 * whisker.arc_length, direction))
+
+    @property
+    def of_shapes(self) -> bool:
+        """True when shapes were measured, False for wrenches."""
+        return "shape" in self.measured
+
+    @property
+    def condition(self) -> Condition:
+        """What the trial states, unchanged."""
+        return Condition(self.job.whisker, deflection=self.pluck.deflection if self.pluck else math.nan)
+
+    @property
+    def channels(self) -> tuple[str, ...]:
+        """Name of each noise group: the channels of a wrench, or ``shape``."""
+        return ("shape",) if self.of_shapes else tuple(str(name) for name in self.measured["channel"].values)
+
+    def job_of(self, condition: Condition) -> Job:
+        """Return the job that simulates the trial under a condition."""
+        loads = self.job.loads
+        if self.pluck is not None:
+            loads = (*loads, *self.pluck.loads(condition, self.job.start))
+        return replace(
+            self.job,
+            whisker=condition.whisker,
+            loads=loads,
+            follicle=_moved_base(self.job.follicle, condition),
+            obstacles=tuple(_moved_object(item, condition.object_offset) for item in self.job.obstacles),
+        )
+
+    def residuals(self, trace: Trace, whisker: Whisker) -> NDArray[np.float64]:
+        """Return predicted minus measured: [n, c] (N, N·m), or [n, k, d] (m) across the predicted shape; NaN: missing.
+
+        Points of a shape have no names along the whisker, so only their distance across it counts.
+        """
+        if not self.of_shapes:
+            columns = [CHANNELS.index(name) for name in self.channels]
+            return trace.wrench[:, columns] - self.measured["wrench"].values
+        assert trace.link_positions is not None
+        nodes = build_chain(whisker, trace.link_positions.shape[1] - 1).nodes
+        return normal_offsets(nodes, trace.link_positions, self.measured["shape"].values)
+
+
+@dataclass(frozen=True, eq=False)
+class _OffsetFollicle:
+    """A base displaced and turned by constant amounts against another."""
+
+    follicle: Follicle
+    offset: Vector
+    angle: float
+
+    @property
+    def finest(self) -> float | None:
+        return getattr(self.follicle, "finest", None)
+
+    def pose(self, times: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        position, euler = self.follicle.pose(times)
+        # θ turns about the z axis last, so that its change is a turn about z of the whole base.
+        return position + np.asarray(self.offset), euler + np.array([self.angle, 0.0, 0.0])
+
+
+def _moved_base(follicle: Follicle, condition: Condition) -> Follicle:
+    if not any(condition.base_offset) and not condition.base_angle:
+        return follicle
+    return _OffsetFollicle(follicle, condition.base_offset, condition.base_angle)
+
+
+def _moved_object(obstacle: Obstacle, offset: Sequence[float]) -> Obstacle:
+    shift, same = np.asarray(offset, dtype=float), np.eye(3)
+    if not shift.any():
+        return obstacle
+    if (motion := obstacle.motion) is not None:
+
+        def moved(times: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+            position, turn = motion(times)
+            return np.asarray(position) + shift, turn
+
+        return replace(obstacle, motion=moved)
+    surface = None if obstacle.surface is None else obstacle.surface.moved(same, shift)
+    return replace(obstacle, parts=tuple(part.moved(same, shift) for part in obstacle.parts), surface=surface)
+
+
+def to_frame(measured: xr.Dataset, axes: NDArray[np.float64], origin: NDArray[np.float64]) -> xr.Dataset:
+    """Return a measurement in the frame of a job, whose axes [3, 3] (columns, world) and origin [3] (m) are given."""
+    if np.allclose(axes, np.eye(3)) and not origin.any():
+        return measured
+    name = "shape" if "shape" in measured else "wrench"
+    values = measured[name].values
+    if values.shape[-1] not in (3, 6):
+        raise UsageError(
+            f"The head of this scene is turned or displaced, which needs all three axes of what was measured; "
+            f"received {values.shape[-1]} columns."
+        )
+    if name == "shape":
+        turned: Any = (values - origin) @ axes
+    else:
+        turned = np.concatenate([values[..., :3] @ axes, values[..., 3:] @ axes], axis=-1)
+    return measured.assign({name: (measured[name].dims, turned)})

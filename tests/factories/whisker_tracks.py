@@ -1,0 +1,132 @@
+"""Files as whisker trackers write them."""
+
+from __future__ import annotations
+
+import csv
+import struct
+
+import h5py
+import numpy as np
+
+
+def bent_shapes(frames=12, points=10, length=0.015, *, bend=0.2, axes=2):
+    """Return shapes [frame, point, axis] (m) of a whisker that swings about its base at the origin."""
+    s = np.linspace(0, length, points)
+    angle = 0.3 * np.sin(np.arange(frames) / 4)[:, None]
+    y = bend * s**2 / length
+    x = s
+    shapes = np.stack([np.cos(angle) * x - np.sin(angle) * y, np.sin(angle) * x + np.cos(angle) * y], axis=-1)
+    return (
+        shapes if axes == 2 else np.concatenate([shapes, 0.1 * s[None, :, None] * np.ones_like(angle)[..., None]], -1)
+    )
+
+
+def write_points(path, shapes, *, scale=5e-5, frames=None):
+    """Write a table of points in pixels, whose y runs down."""
+    with path.open("w", newline="") as stream:
+        table = csv.writer(stream)
+        table.writerow(["frame", "x", "y", "z"][: 1 + shapes.shape[-1]])
+        for frame, shape in zip(frames or range(len(shapes)), shapes, strict=True):
+            for point in shape:
+                cells = [*(point / scale)]
+                cells[1] = -cells[1]
+                table.writerow([frame, *("" if np.isnan(one) else f"{one:.6f}" for one in cells)])
+    return path
+
+
+def write_deeplabcut_csv(path, values, likelihood, *, individuals=None):
+    """Write DeepLabCut's table of points [frame, part, 2] (pixels) with their likelihoods [frame, part]."""
+    parts = [f"p{index}" for index in range(values.shape[1])]
+    heads = [("scorer", "net")] if individuals is None else [("scorer", "net"), ("individuals", individuals)]
+    with path.open("w", newline="") as stream:
+        table = csv.writer(stream)
+        for name, word in heads:
+            table.writerow([name, *[word] * (3 * len(parts))])
+        table.writerow(["bodyparts", *(part for part in parts for _ in range(3))])
+        table.writerow(["coords", *["x", "y", "likelihood"] * len(parts)])
+        for frame, (points, good) in enumerate(zip(values, likelihood, strict=True)):
+            cells = [cell for point, one in zip(points, good, strict=True) for cell in (*point, one)]
+            table.writerow([frame, *cells])
+    return path
+
+
+def write_deeplabcut_table(path, values, likelihood, kind=None):
+    """Write DeepLabCut's HDF5 table as pandas does: the names stand in a pickle of protocol 0, or in ``kind``."""
+    parts = [f"p{index}" for index in range(values.shape[1])]
+    if kind is None:
+        rows, memo = [], 1
+        for part in parts:
+            for coord in ("x", "y", "likelihood"):
+                rows.append(f"(Vnet\np{memo}\nV{part}\np{memo + 1}\nV{coord}\np{memo + 2}\ntp{memo + 3}\na")
+                memo += 4
+        kind = ("(lp0\n" + "".join(rows) + ".").encode()
+    block = np.concatenate([values, likelihood[..., None]], axis=-1).reshape(len(values), -1)
+    table = np.zeros(len(values), dtype=[("index", "<i8"), ("values_block_0", "<f8", (block.shape[1],))])
+    table["index"], table["values_block_0"] = np.arange(len(values)), block
+    with h5py.File(path, "w") as file:
+        file.create_dataset("df_with_missing/table", data=table).attrs["values_block_0_kind"] = np.bytes_(kind)
+    return path
+
+
+def write_whiskers(path, traces):
+    """Write whisk's binary file of traces: (frame, number) → points [k, 2] (pixels)."""
+    with path.open("wb") as stream:
+        stream.write(b"bwhiskbin1\0\0")
+        for (frame, number), points in traces.items():
+            stream.write(struct.pack("<iii", number, frame, len(points)))
+            for column in (points[:, 0], points[:, 1], np.ones(len(points)), np.ones(len(points))):
+                stream.write(column.astype("<f4").tobytes())
+        stream.write(struct.pack("<i", len(traces)))
+    return path
+
+
+def write_whiskers_text(path, traces):
+    """Write whisk's text file of traces."""
+    lines = ["whisker1 (frame,id,time,n,x1,y1,thick1,score1...,xn,yn,thickn,scoren)"]
+    for (frame, number), points in traces.items():
+        cells = [frame, number, frame, len(points), *(cell for x, y in points for cell in (x, y, 1, 1))]
+        lines.append(",".join(map(str, cells)))
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
+def write_measurements(path, labels, follicles):
+    """Write the table of whisk's measurements: labels and follicles (pixels) by (frame, number)."""
+    with path.open("w", newline="") as stream:
+        table = csv.writer(stream)
+        table.writerow(["fid", "wid", "label", "follicle_x", "follicle_y"])
+        for key, label in labels.items():
+            table.writerow([*key, label, *follicles[key]])
+    return path
+
+
+def write_whiskiwrap(path, traces, follicles):
+    """Write the HDF5 file of WhiskiWrap."""
+    kind = [("time", "<u4"), ("id", "<u2"), ("fol_x", "<f4"), ("fol_y", "<f4")]
+    summary = np.array([(frame, number, *follicles[frame, number]) for frame, number in traces], dtype=kind)
+    with h5py.File(path, "w") as file:
+        file["summary"] = summary
+        for axis, name in enumerate(("pixels_x", "pixels_y")):
+            rows = file.create_dataset(name, (len(traces),), dtype=h5py.vlen_dtype(np.float32))
+            for index, points in enumerate(traces.values()):
+                rows[index] = points[:, axis]
+    return path
+
+
+def write_whiskerman(path, control, follicle, tracked):
+    """Write WhiskerMan's MATLAB file of one whisker and another that was never tracked."""
+    from scipy.io import savemat
+
+    whisker = np.zeros((1, 2), dtype=[("r3all", object), ("fp3_all", object), ("tracked", object)])
+    whisker[0, 0] = (control, follicle, tracked[:, None])
+    whisker[0, 1] = (control, follicle, 0 * tracked[:, None])
+    savemat(path, {"whisker": whisker}, appendmat=False)
+    return path
+
+
+def write_whiskerman_hdf5(path, control, follicle, tracked):
+    """Write the same of one whisker in MATLAB's format 7.3, whose axes are reversed."""
+    with h5py.File(path, "w", userblock_size=512) as file:
+        for name, values in (("r3all", control), ("fp3_all", follicle), ("tracked", tracked[:, None])):
+            file[f"whisker/{name}"] = np.asarray(values, dtype=float).T
+    return path

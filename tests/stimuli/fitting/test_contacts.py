@@ -1,0 +1,122 @@
+"""Contact point and force from shapes, against the elastica of the references and the rod engine's shapes."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from brainbench.core.errors import DataError
+from brainbench.stimuli import WhiskerArray, references
+from brainbench.stimuli.fitting import ContactOptions, find_contacts, new_shapes
+from brainbench.stimuli.fitting.elastica import STEPS, LoadedWhisker
+from brainbench.stimuli.validation import peg
+from brainbench.stimuli.whiskers.chain import build_chain
+
+MOUSE, RAT = (WhiskerArray.of(species)["C2"].whisker for species in ("mouse", "rat"))
+
+
+def _truth(whisker, at, depth):
+    length = whisker.arc_length
+    contact = references.elastica(whisker, at * length, depth * length + whisker.curvature * (at * length) ** 2)
+    return contact, float(np.hypot(*contact.force) * np.sign(contact.moment))
+
+
+def _shape(whisker, contact, force, *, points=60, turn=0.3, traced=0.97):
+    """Return points of the loaded whisker, turned as a whole."""
+    shape = LoadedWhisker(whisker).shapes(np.array([[1e-3, 2e-3, turn]]), np.array([contact.arc]), np.array([force]))
+    length = whisker.arc_length
+    beyond = np.linspace(0, 1, len(shape.place[0]) - STEPS)[1:]
+    arcs = np.concatenate([np.linspace(0, contact.arc, STEPS + 1), contact.arc + (length - contact.arc) * beyond])
+    s = np.linspace(0, traced * length, points)
+    return np.stack([np.interp(s, arcs, column) for column in shape.place[0].T], axis=1), shape.contact[0]
+
+
+@pytest.mark.parametrize("whisker", [MOUSE, RAT])
+@pytest.mark.parametrize(("at", "depth"), [(0.3, 0.1), (0.5, -0.05), (0.8, 0.15)])
+def test_shapes_are_those_of_the_elastica(whisker, at, depth):
+    contact, force = _truth(whisker, at, depth)
+    found = LoadedWhisker(whisker).shapes(np.zeros((1, 3)), np.array([contact.arc]), np.array([force]))
+    np.testing.assert_allclose(found.contact[0], contact.point, atol=2e-8)
+    assert found.moment[0] == pytest.approx(contact.moment, rel=1e-5)
+    np.testing.assert_allclose(found.force[0] * force, contact.force, rtol=1e-5, atol=1e-10)
+
+
+@pytest.mark.parametrize("whisker", [MOUSE, RAT])
+@pytest.mark.parametrize(("at", "depth"), [(0.4, 0.12), (0.6, -0.1), (0.8, 0.15)])
+def test_force_and_place_come_back_within_a_tenth_at_20_micrometres(whisker, at, depth):
+    contact, force = _truth(whisker, at, depth)
+    points, place = _shape(whisker, contact, force)
+    rng = np.random.default_rng(3)
+    noisy = points + rng.normal(size=(8, *points.shape)) * 20e-6
+    found = find_contacts(new_shapes(np.arange(8) / 500, noisy), whisker, options=ContactOptions(noise=20e-6))
+    assert np.median(np.abs(found["force"] / force - 1)) < 0.1
+    assert np.median(np.abs(found["arc"] - contact.arc)) < 0.02 * whisker.arc_length
+    np.testing.assert_allclose(np.median(found["point"], axis=0), place, atol=0.02 * whisker.arc_length)
+    # The deviation that is told is that of the errors.
+    z = (found["force"] - force) / found["force_deviation"]
+    assert 0.3 < np.sqrt(np.mean(z**2)) < 2
+
+
+def test_a_known_contact_point_makes_the_force_more_certain():
+    contact, force = _truth(MOUSE, 0.5, 0.08)
+    points, place = _shape(MOUSE, contact, force)
+    shapes = new_shapes(np.arange(4) / 500, points + np.random.default_rng(0).normal(size=(4, *points.shape)) * 2e-5)
+    options = ContactOptions(noise=2e-5)
+    free = find_contacts(shapes, MOUSE, options=options)
+    held = find_contacts(shapes, MOUSE, contact_points=np.tile(place, (4, 1)), options=options)
+    assert np.median(held["force_deviation"]) < 0.7 * np.median(free["force_deviation"])
+    assert np.median(np.abs(held["force"] / force - 1)) < 0.05
+
+
+def test_a_free_whisker_shows_no_contact():
+    points = np.tile(MOUSE.centre_line(np.linspace(0, 0.95 * MOUSE.arc_length, 50)), (6, 1, 1))
+    noisy = points + np.random.default_rng(1).normal(size=points.shape) * 20e-6
+    found = find_contacts(new_shapes(np.arange(6) / 500, noisy), MOUSE, options=ContactOptions(noise=20e-6))
+    assert (found["status"] == "undefined").sum() >= 5
+    assert "No sign of a contact" in str(found["reason"].values[0])
+
+
+def test_another_whiskers_stiffness_or_taper_is_noticed_or_scales_the_force():
+    contact, force = _truth(MOUSE, 0.6, 0.15)
+    points, _ = _shape(MOUSE, contact, force)
+    noisy = points + np.random.default_rng(2).normal(size=(4, *points.shape)) * 20e-6
+    shapes, options = new_shapes(np.arange(4) / 500, noisy), ContactOptions(noise=20e-6)
+    right = find_contacts(shapes, MOUSE, options=options)
+    soft = find_contacts(shapes, replace(MOUSE, young_modulus=MOUSE.young_modulus / 2), options=options)
+    np.testing.assert_allclose(soft["force"], right["force"] / 2, rtol=1e-3)
+    cylinder = find_contacts(shapes, replace(MOUSE, tip_radius=MOUSE.base_radius), options=options)
+    assert (cylinder["status"] != "ok").all()
+    assert "fits no whisker" in str(cylinder["reason"].values[0])
+
+
+def test_the_shape_of_the_rod_engine_tells_its_own_force():
+    whisker = replace(MOUSE, curvature=0.0)
+    test = peg(whisker, 0.5 * whisker.arc_length, 0.15 * whisker.arc_length, fidelity="accurate")
+    joints = test.trace.link_positions[-1:, :, :2]
+    # Each joint lies on the curve; the polygon between them does not.
+    assert build_chain(whisker, joints.shape[1] - 1).nodes[-1] == pytest.approx(whisker.arc_length)
+    found = find_contacts(new_shapes(np.zeros(1), joints), whisker)
+    assert abs(float(found["moment"][0])) == pytest.approx(abs(test.wrench[5]), rel=0.05)
+    assert float(found["arc"][0]) == pytest.approx(test.contact_arc, rel=0.03)
+
+
+def test_shapes_in_a_tilted_plane_give_the_same_force():
+    contact, force = _truth(MOUSE, 0.6, 0.15)
+    points, _ = _shape(MOUSE, contact, force)
+    tilt = np.array([[1, 0, 0], [0, np.cos(0.5), -np.sin(0.5)], [0, np.sin(0.5), np.cos(0.5)]])
+    space = np.pad(points, ((0, 0), (0, 1))) @ tilt.T
+    flat, tilted = (find_contacts(new_shapes(np.zeros(1), one[None]), MOUSE) for one in (points, space))
+    assert float(tilted["force"][0]) == pytest.approx(float(flat["force"][0]), rel=1e-2)
+    x = points[:, 0]
+    helix = np.stack([x, *(2e-3 * np.sin(300 * x + phase) for phase in (0, 1.5))], axis=1)
+    with pytest.raises(DataError, match="no plane"):
+        find_contacts(new_shapes(np.arange(3.0), np.tile(helix, (3, 1, 1))), MOUSE)
+
+
+def test_few_points_are_refused_in_words():
+    points = np.tile(MOUSE.centre_line(np.linspace(0, 0.01, 4)), (3, 1, 1))
+    found = find_contacts(new_shapes(np.arange(3.0), points), MOUSE)
+    assert (found["status"] == "undefined").all()
+    assert "4 points" in str(found["reason"].values[0])

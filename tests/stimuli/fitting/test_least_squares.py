@@ -1,0 +1,256 @@
+"""Fits find the truth of simulated measurements, and say what they cannot tell."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from brainbench.core.errors import DataError, UsageError
+from brainbench.stimuli import WhiskerArray, references
+from brainbench.stimuli.fitting import FitOptions, Trial, fit, new_shapes, new_wrenches
+from brainbench.stimuli.fitting.model import FitModel
+from brainbench.stimuli.fitting.parameters import PARAMETERS, FreeParameters, read_value, with_value
+from brainbench.stimuli.fitting.synthetic import blank_wrenches, measure_shapes, measure_wrenches, simulate_trial
+
+KNOWN = replace(WhiskerArray.of("mouse")["C2"].whisker, damping_ratio=0.15)
+TRUTH = replace(KNOWN, young_modulus=3.5e9, damping_ratio=0.2)
+PERIOD = 1 / float(references.natural_frequencies(KNOWN, 1)[0])
+QUICK = FitOptions(links=8, steps_per_period=80.0)
+SAME = FitOptions(links=8, steps_per_period=4.0, time_step=PERIOD / 80)
+"""The setting of QUICK for a truth whose period is another: the same time step."""
+
+
+@pytest.fixture(scope="module")
+def rung():
+    """A plucked whisker and its simulation."""
+    times = np.arange(1, 61) * PERIOD / 15
+    trial = Trial.ringdown(TRUTH, blank_wrenches(times), 1e-3)
+    return trial, simulate_trial(trial, options=SAME)
+
+
+def _wrenches(rung, noise=0.01, seed=0):
+    trial, trace = rung
+    return measure_wrenches(trial, trace, noise, np.random.default_rng(seed)).measured
+
+
+def _shapes(rung, seed=0):
+    trial, trace = rung
+    return measure_shapes(trial, trace, TRUTH, 20e-6, np.random.default_rng(seed)).measured
+
+
+def test_stiffness_and_damping_of_a_ring_down_come_back(rung):
+    result = fit(
+        Trial.ringdown(KNOWN, _wrenches(rung), 8e-4), ["young_modulus", "damping_ratio", "deflection"], options=QUICK
+    )
+    assert result.status == "ok"
+    assert result["young_modulus"].value == pytest.approx(3.5e9, rel=0.02)
+    assert result["damping_ratio"].value == pytest.approx(0.2, rel=0.02)
+    assert result["deflection"].value == pytest.approx(1e-3, rel=0.05)
+    assert result["young_modulus"].interval.low < 3.5e9 < result["young_modulus"].interval.high
+    assert "central differences" in result.provenance["jacobian"]
+    assert result.noise["Mz"] == pytest.approx(0.01 * np.abs(rung[1].wrench[:, 5]).max(), rel=0.2)
+
+
+def test_traced_shapes_tell_stiffness_over_density_and_not_both(rung):
+    trial = Trial.ringdown(KNOWN, _shapes(rung), 8e-4)
+    result = fit(trial, ["young_modulus", "density", "damping_ratio", "deflection"], options=QUICK)
+    assert result.status == "undefined"
+    assert {result[name].status for name in ("young_modulus", "density")} == {"undefined"}
+    assert result["damping_ratio"].status == "ok"
+    assert any("young_modulus" in reason and "density" in reason for reason in result.reasons)
+    ratio = result["young_modulus"].value / result["density"].value
+    assert ratio == pytest.approx(TRUTH.young_modulus / 1260, rel=0.03)
+
+
+def test_a_prior_makes_an_estimate_of_what_the_data_do_not_tell_and_says_so(rung):
+    trial = Trial.ringdown(KNOWN, _shapes(rung), 8e-4)
+    names = ["young_modulus", "density", "damping_ratio", "deflection"]
+    result = fit(trial, names, options=replace(QUICK, priors="published"))
+    assert result.status == "unreliable"
+    assert "prior" in result["density"].reason
+    assert result["density"].value == pytest.approx(1260, rel=0.3)
+    assert np.isfinite(result["density"].interval.high)
+
+
+def test_a_cylinder_in_place_of_a_cone_is_noticed(rung):
+    cylinder = replace(KNOWN, base_radius=3e-5, tip_radius=3e-5)
+    result = fit(
+        Trial.ringdown(cylinder, _shapes(rung), 8e-4), ["young_modulus", "damping_ratio", "deflection"], options=QUICK
+    )
+    assert result.status == "unreliable"
+    assert any(not test.passed for test in result.tests)
+    assert any("does not fit" in reason for reason in result.reasons)
+
+
+def test_a_parameter_at_its_bound_is_unreliable(rung):
+    result = fit(
+        Trial.ringdown(KNOWN, _wrenches(rung), 8e-4),
+        ["young_modulus", "damping_ratio"],
+        bounds={"young_modulus": (4e9, 6e9)},
+        options=QUICK,
+    )
+    assert result["young_modulus"].status == "unreliable"
+    assert "lower bound" in result["young_modulus"].reason
+
+
+def test_a_fit_that_is_stopped_has_not_converged(rung):
+    result = fit(
+        Trial.ringdown(KNOWN, _wrenches(rung), 8e-4),
+        ["young_modulus", "damping_ratio", "deflection"],
+        options=replace(QUICK, most_iterations=2),
+    )
+    assert result.status == "undefined"
+    assert "did not converge" in result.reasons[0]
+
+
+def test_profile_intervals_agree_with_laplace_where_the_model_is_nearly_linear(rung):
+    result = fit(
+        Trial.ringdown(KNOWN, _wrenches(rung), 8e-4),
+        ["young_modulus", "damping_ratio"],
+        start={"deflection": 1e-3},
+        options=replace(QUICK, intervals="profile"),
+    )
+    # The deflection that is not fitted is the given one, not that of the trial.
+    assert result["damping_ratio"].value == pytest.approx(0.2, rel=0.02)
+    assert result["young_modulus"].value == pytest.approx(3.5e9, rel=0.02)
+    for one in result.estimates:
+        assert one.profile is not None
+        width = one.laplace.high - one.laplace.low
+        assert one.profile.low == pytest.approx(one.laplace.low, abs=0.1 * width)
+        assert one.profile.high == pytest.approx(one.laplace.high, abs=0.1 * width)
+
+
+def test_gaps_are_left_out(rung):
+    measured = _wrenches(rung).copy(deep=True)
+    measured["wrench"].values[10:15] = np.nan
+    result = fit(Trial.ringdown(KNOWN, measured, 1e-3), ["young_modulus", "damping_ratio", "deflection"], options=QUICK)
+    assert result["young_modulus"].value == pytest.approx(3.5e9, rel=0.02)
+    assert np.isnan(result.residuals[0][10:15]).all()
+
+
+def test_an_outlier_pulls_a_robust_fit_less(rung):
+    measured = _wrenches(rung).copy(deep=True)
+    measured["wrench"].values[::9] *= -2
+    names = ["young_modulus", "damping_ratio", "deflection"]
+    trial = Trial.ringdown(KNOWN, measured, 1e-3)
+    fits = [fit(trial, names, options=replace(QUICK, loss=loss)) for loss in ("linear", "cauchy")]
+    errors = [abs(one["damping_ratio"].value - 0.2) for one in fits]
+    assert errors[1] < 0.5 * errors[0]
+
+
+def test_two_trials_are_more_certain_than_one(rung):
+    names = ["young_modulus", "damping_ratio", "deflection"]
+    one = fit(Trial.ringdown(KNOWN, _wrenches(rung), 1e-3), names, options=QUICK)
+    both = fit([Trial.ringdown(KNOWN, _wrenches(rung, seed=seed), 1e-3) for seed in (0, 1)], names, options=QUICK)
+    ratio = both["young_modulus"].relative_deviation / one["young_modulus"].relative_deviation
+    assert ratio == pytest.approx(np.sqrt(0.5), rel=0.15)
+
+
+def test_a_pole_is_found_by_the_forces_on_the_base():
+    from brainbench.stimuli import Frames, PlacedObject, Scene, Whisking
+    from brainbench.stimuli.objects.primitives import cylinder
+
+    array = WhiskerArray.of("mouse", whiskers="C2")
+    pole = PlacedObject(cylinder(0.0005, 0.02), position=(0.0115, -0.0005, 0.003))
+    scene = Scene(
+        "pole", array, (pole,), whisking=Whisking(frequency=10, onset=0.05), frames=Frames(count=30, interval=2e-3)
+    )
+    times = 0.01 + np.arange(30) * 2e-3
+    trial = Trial.of_scene(scene, blank_wrenches(times), "C2")
+    trace = simulate_trial(trial, options=QUICK)
+    assert trace.contact.any()
+    measured = measure_wrenches(trial, trace, 0.01, np.random.default_rng(0))
+    start = Trial.of_scene(scene, measured.measured, "C2")
+    result = fit(start, ["young_modulus", "object_y"], start={"object_y": 2e-4, "young_modulus": 4e9}, options=QUICK)
+    assert abs(result["object_y"].value) < 5e-5
+    assert result["young_modulus"].value == pytest.approx(5e9, rel=0.03)
+
+
+@pytest.mark.parametrize("name", [name for name in PARAMETERS if name != "deflection"])
+def test_every_parameter_is_set_and_read(name):
+    trial = Trial.ringdown(KNOWN, blank_wrenches(np.arange(1, 9) * 1e-3), 1e-3)
+    value = read_value(trial.condition, name) * 1.1 + (0.0 if PARAMETERS[name].kind == "log" else 1e-4)
+    assert read_value(with_value(trial.condition, name, value), name) == pytest.approx(value)
+    free = FreeParameters((name,), trial.condition)
+    assert read_value(free.condition([0.3]), name) == pytest.approx(free.values([0.3])[0])
+    low, high = free.limits()
+    assert low[0] < 0 < high[0]
+
+
+def test_unknown_names_and_bad_starts_are_refused():
+    trial = Trial.ringdown(KNOWN, blank_wrenches(np.arange(1, 9) * 1e-3), 1e-3)
+    with pytest.raises(UsageError, match="young_modulus"):
+        fit(trial, ["young_moduls"])
+    with pytest.raises(UsageError, match="between its bounds"):
+        FreeParameters(("young_modulus",), trial.condition, {"young_modulus": (6e9, 9e9)}).limits()
+    with pytest.raises(UsageError, match="laplace"):
+        FitOptions(intervals="laplac")
+    still = Trial(replace(trial.job, loads=()), trial.measured)
+    with pytest.raises(UsageError, match="ring-down"):
+        FreeParameters(("deflection",), still.condition)
+
+
+def test_too_few_frames_readings_and_long_shapes_are_refused():
+    with pytest.raises(DataError, match="at least 3"):
+        Trial.ringdown(KNOWN, new_wrenches([1e-3, 2e-3], np.ones((2, 1)), ["Mz"]), 1e-3)
+    trial = Trial.ringdown(KNOWN, new_wrenches(np.arange(1, 4) * 1e-3, np.ones((3, 1)), ["Mz"]), 1e-3)
+    with pytest.raises(DataError, match="cannot tell"):
+        fit(trial, ["young_modulus", "density", "damping_ratio", "deflection"])
+    shapes = np.tile(np.linspace(0, 0.02, 5)[None, :, None] * [1, 0], (4, 1, 1))
+    with pytest.raises(DataError, match="20 mm long"):
+        Trial.ringdown(KNOWN, new_shapes(np.arange(1, 5) * 1e-3, shapes), 1e-3)
+
+
+def test_the_jacobian_is_that_of_finer_differences(rung):
+    trial = Trial.ringdown(KNOWN, _wrenches(rung), 1e-3)
+    model = FitModel([trial], FreeParameters(("young_modulus", "damping_ratio", "tip_radius"), trial.condition), QUICK)
+    u = np.array([-0.2, 0.1, 0.05])
+    jacobian = model.jacobian(u)
+    for column, step in enumerate(5e-4 * np.eye(3)):
+        above, below = model.evaluate([u + step, u - step])
+        fine = (above - below) / 1e-3
+        assert np.linalg.norm(jacobian[:, column] - fine) < 2e-3 * np.linalg.norm(fine)
+
+
+def test_the_cost_is_a_batch_for_each_jacobian(rung):
+    trial = Trial.ringdown(KNOWN, _wrenches(rung), 1e-3)
+    model = FitModel([trial], FreeParameters(("young_modulus", "damping_ratio"), trial.condition), QUICK)
+    runs, run = [], model.engine.run
+
+    def count(jobs, *rest, **more):
+        runs.append(len(jobs))
+        return run(jobs, *rest, **more)
+
+    object.__setattr__(model.engine, "run", count)
+    model.jacobian(np.zeros(2))
+    assert runs == [4]
+
+
+@pytest.mark.parametrize("kind", ["wrench", "shape"])
+def test_a_fit_is_drawn(rung, tmp_path, kind):
+    from PIL import Image
+
+    from brainbench.stimuli.fitting.figure import draw_fit
+
+    trial = Trial.ringdown(KNOWN, _wrenches(rung) if kind == "wrench" else _shapes(rung), 1e-3)
+    result = fit(trial, ["young_modulus", "damping_ratio", "deflection"], options=QUICK)
+    path = draw_fit(trial, result, tmp_path / "fit.png")
+    pixels = np.asarray(Image.open(path).convert("RGB")).reshape(-1, 3)
+    # The colour of the first series is on it, and most of it is white.
+    assert (np.abs(pixels.astype(int) - [0, 114, 178]).sum(axis=1) < 40).sum() > 50
+    assert 0.5 < np.mean(pixels.min(axis=1) > 250) < 0.99
+
+
+def test_the_summary_is_plain(rung):
+    import json
+
+    from brainbench.core.files import to_json
+
+    trial = Trial.ringdown(KNOWN, _shapes(rung), 1e-3)
+    result = fit(trial, ["young_modulus", "density"], options=QUICK)
+    data = json.loads(to_json(result.summary()))
+    assert data["status"] == "undefined"
+    assert data["directions"][0]["deviation"] is None or data["directions"][0]["deviation"] > 1
+    assert data["provenance"]["simulated_whiskers"] > 5

@@ -1,0 +1,58 @@
+"""Designs tell objects apart in fewer whisks, and say when they cannot."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from brainbench.core.errors import UsageError
+from brainbench.stimuli import PlacedObject, Scene, WhiskerArray, Whisking
+from brainbench.stimuli.design import DesignOptions, design
+from brainbench.stimuli.objects.primitives import cylinder
+
+QUICK = DesignOptions(iterations=2, starts=2, check="fast")
+
+
+def _scenes(*radii, place=(0.0105, 0.002, 0.003), frequency=20.0):
+    array = WhiskerArray.of("mouse", whiskers="C2")
+    return [
+        Scene(
+            f"r{radius}", array, (PlacedObject(cylinder(radius, 0.02), position=place),), Whisking(frequency=frequency)
+        )
+        for radius in radii
+    ]
+
+
+def test_a_chosen_motion_needs_fewer_whisks():
+    found = design(_scenes(3e-4, 6e-4), ["protraction", "retraction"], options=QUICK)
+    (before, after), *_ = found.distances.values()
+    assert found.status == "ok"
+    assert found.whisks == pytest.approx(before / after)
+    assert found.whisks == pytest.approx(found.time)
+    assert found.whisks < 0.8
+    assert found.scenes[0].whisking.protraction == found.values["protraction"]
+
+
+def test_distances_are_those_of_the_wrenches_over_the_noise():
+    options = replace(QUICK, iterations=1, starts=1)
+    one, other = (design(_scenes(3e-4, 6e-4), ["object_x"], options=replace(options, force_noise=f, moment_noise=m))
+                  for f, m in ((2e-6, 1e-8), (4e-6, 2e-8)))  # fmt: skip
+    np.testing.assert_allclose(next(iter(one.distances.values()))[0], 4 * next(iter(other.distances.values()))[0])
+
+
+def test_equal_objects_cannot_be_told_apart():
+    array = _scenes(3e-4)[0]
+    found = design([array, replace(array, label="twin")], ["protraction"], options=QUICK)
+    assert found.status == "undefined"
+    assert "felt alike" in found.reason
+
+
+def test_wrong_requests_are_refused():
+    with pytest.raises(UsageError, match="at least two scenes"):
+        design(_scenes(3e-4), ["protraction"])
+    with pytest.raises(UsageError, match="protraction"):
+        design(_scenes(3e-4, 6e-4), ["protracton"])
+    with pytest.raises(UsageError, match="outside the bounds"):
+        design(_scenes(3e-4, 6e-4), ["frequency"], bounds={"frequency": (4.0, 8.0)})
