@@ -18,9 +18,10 @@ from numpy.typing import NDArray
 
 from brainbench.core.errors import UsageError
 from brainbench.core.progress import Progress
+from robotics_bridge.hands.layouts import active_count
 from robotics_bridge.policies.readouts.arms import traces
 from robotics_bridge.policies.readouts.regression import FARTHEST, Readout, read_targets
-from robotics_bridge.policies.readouts.rollout import TARGETS, TouchRollout
+from robotics_bridge.policies.readouts.rollout import TouchRollout
 from robotics_bridge.sensors.probes.placement import Probes
 
 HALVES = 2
@@ -63,11 +64,9 @@ def choose_taxels(
         count: Taxels that are chosen.
 
     Raises:
-        UsageError: the hand has fewer taxels, or there are fewer environments than folds.
+        UsageError: there are fewer environments than folds.
     """
     taxels, width = features.shape[2:]
-    if not 1 <= count <= taxels:
-        raise UsageError(f"Between 1 and {taxels} taxels can be chosen of this hand; received {count}.")
     if features.shape[1] < _INNER:
         raise UsageError(f"Taxels are chosen on at least {_INNER} environments; received {features.shape[1]}.")
     first = proprio.shape[-1]
@@ -132,15 +131,15 @@ def _blocks(gram: torch.Tensor, taxels: int, width: int) -> torch.Tensor:
     return gram.unflatten(0, (taxels, width)).unflatten(2, (taxels, width)).diagonal(dim1=0, dim2=2).movedim(-1, 0)
 
 
-def even_taxels(layout: Mapping[str, Probes], count: int) -> list[int]:
-    """Return taxels spread over a hand: of every link its share of the count, of a link those farthest apart.
+def check_count(layout: Mapping[str, Probes], count: int) -> None:
+    """Raise UsageError unless so many taxels can be chosen of a layout."""
+    if not 1 <= count <= (total := active_count(layout)):
+        raise UsageError(f"Between 1 and {total} taxels can be chosen of this hand; received {count}.")
 
-    Raises:
-        UsageError: the hand has fewer taxels.
-    """
+
+def even_taxels(layout: Mapping[str, Probes], count: int) -> list[int]:
+    """Return taxels spread over a hand: of every link its share of the count, of a link those farthest apart."""
     sizes = np.array([int(probes.active.sum()) for probes in layout.values()])
-    if not 1 <= count <= sizes.sum():
-        raise UsageError(f"Between 1 and {sizes.sum()} taxels can be chosen of this hand; received {count}.")
     # Largest remainders: shares are whole and add up.
     share = count * sizes / sizes.sum()
     whole = np.floor(share).astype(int)
@@ -187,7 +186,7 @@ def read_placements(
     :func:`~robotics_bridge.policies.readouts.regression.read_targets`, whose folds lie within the half.
 
     Args:
-        rollout: What a policy felt.
+        rollout: What a policy felt, and what is read where it is valid.
         layout: The hand's, whose active taxels are those of the rollout.
         count: Taxels of a placement.
         others: Further placements, name → taxels.
@@ -198,8 +197,8 @@ def read_placements(
     Raises:
         UsageError: the hand has fewer taxels, or a half too few environments.
     """
-    wanted = torch.cat([rollout.targets[name] for name in TARGETS], -1)
-    valid = rollout.valid & ~wanted.isnan().any(-1)
+    check_count(layout, count)
+    wanted, valid = rollout.wanted, rollout.valid
     features, every = taxel_features(rollout), range(rollout.taxels.shape[3])
     half = torch.arange(features.shape[1]) // -(-features.shape[1] // HALVES)
     random = np.random.default_rng(seed)

@@ -69,8 +69,8 @@ class Readout:
             value, left = value - less.r2(target), left - less._without_each(target)
         count = len(left)
         parts = [((count - 1) / count * float(((left - left.mean()) ** 2).sum()), count - 1)]
-        for draws in (one.per_draw(target) for one in (self, less) if one is not None and len(one.errors) > 1):
-            parts.append((float(np.var(draws, ddof=1)) / len(draws), len(draws) - 1))
+        drawn = (one.per_draw(target) for one in (self, less) if one is not None and len(one.errors) > 1)
+        parts += [(float(np.var(draws, ddof=1)) / len(draws), len(draws) - 1) for draws in drawn]
         total = sum(part for part, _ in parts)
         if total == 0:
             return value, value

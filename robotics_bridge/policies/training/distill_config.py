@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
 from typing import Any
 
 from brainbench.core.errors import check_name
@@ -42,7 +43,7 @@ class DistillConfig:
     placement: str = "hand"
     """Place of the taxels: ``tips``, ``fingers``, ``palm`` or ``hand``."""
     resolution: str = "med"
-    """Number of taxels: ``low``, ``med`` or ``high``."""
+    """Number of taxels: ``low``, ``med`` or ``high``; or a probe file (``.json``)."""
     noisy: bool = False
     """Taxels with the published noise (table 4.12)."""
     twist: float | None = None
@@ -161,7 +162,12 @@ class DistillConfig:
         if self.tactile is not None:
             learning = f"-{self.tactile.learning}" if "learning" in self.encoder_settings else ""
             arm = self.tactile.arm.replace("/", "-").replace(":", "-")
-            parts += [self.placement, self.resolution, "noisy" if self.noisy else "clean", f"{arm}{learning}"]
+            parts += [
+                self.placement,
+                Path(self.resolution).stem,
+                "noisy" if self.noisy else "clean",
+                f"{arm}{learning}",
+            ]
         parts += [] if self.contacts in (None, "firm") else [self.contacts]
         parts.append(f"seed{self.seed}")
         drawn = self.encoder_settings.get("pretrained") or self.encoder_settings.get("seed", self.seed)
