@@ -69,8 +69,12 @@ def network_of(name: str, seed: int) -> EncoderAttenderDecoder:
     return network.eval().requires_grad_(False)
 
 
-def stream(network: EncoderAttenderDecoder, stimulus: torch.Tensor, begun: torch.Tensor) -> torch.Tensor:
-    """Return features [T, B, F] of steps [T, B, 30, 5, 7] in SI, memory forgotten where an episode begins [T, B]."""
+def stream(network: EncoderAttenderDecoder, stimulus: torch.Tensor, rollout: TouchRollout) -> torch.Tensor:
+    """Return features [T, B, F] of steps [T, B, 30, 5, 7] in SI, memory forgotten where an episode begins.
+
+    Those of a transformer are zero where nothing is read.
+    """
+    begun = rollout.begun
     gpt = network.spec.max_steps is not None
     # The encoder alone; a transformer then reads the last steps of it.
     step = StreamingStep(EncoderAttenderDecoder(network.encoder, normaliser=network.normaliser, unroll=network.unroll)
@@ -89,7 +93,7 @@ def stream(network: EncoderAttenderDecoder, stimulus: torch.Tensor, begun: torch
     seen = torch.zeros(*begun.shape, network.features)
     length = (age + 1).clamp(max=WINDOW)
     for size in length.unique().tolist():
-        when, who = (length == size).nonzero(as_tuple=True)
+        when, who = ((length == size) & rollout.valid).nonzero(as_tuple=True)
         for times, rows_of in zip(when.split(_CHUNK), who.split(_CHUNK), strict=True):
             window = torch.stack([found[times - back, rows_of] for back in range(size - 1, -1, -1)], 1)
             seen[times, rows_of] = network.attender(window)[:, -1]
@@ -195,8 +199,11 @@ def gains(found: list[dict[str, Any]]) -> list[list[str]]:
 
 def measure(options: argparse.Namespace) -> list[dict[str, Any]]:
     """Return score, whisker accuracy and read-outs of every network."""
-    names = [name for name, one in board().items()
-             if one["seed"] < options.seeds and (Architecture.parse(one["model"]).small or options.large)]  # fmt: skip
+    known = board()
+    # Every network once before any of them again, slow ones last: an interrupted run has most of them.
+    names = sorted((name for name, one in known.items() if one["seed"] < options.seeds
+                    and (Architecture.parse(one["model"]).small or options.large)),
+                   key=lambda name: (known[name]["seed"], "+gpt" in name))  # fmt: skip
     sweeps = read_sweeps(options.sweeps)
     env = World(TASK, config=CONFIG).make([AGENT], num_envs=options.envs, observe="force_torque")
     policy, grid = agent_of(AGENT, env), TaxelGrid(env.hand)
@@ -211,7 +218,7 @@ def measure(options: argparse.Namespace) -> list[dict[str, Any]]:
 def _one(name: str, rollout: TouchRollout, stimulus: torch.Tensor, sweeps: Any) -> dict[str, Any]:
     known = board()[name]
     network = network_of(known["model"], known["seed"])
-    read = plain(read_arm(name, rollout, [stream(network, stimulus, rollout.begun)]))
+    read = plain(read_arm(name, rollout, [stream(network, stimulus, rollout)]))
     row = {**known, "accuracy": accuracy(network, sweeps), **{target: read[target]["r2"] for target in TARGETS}}
     row["intervals"] = {target: [read[target]["low"], read[target]["high"]] for target in TARGETS}
     print(name, {key: round(row[key], 3) for key in ("score", "accuracy", *TARGETS)}, flush=True)

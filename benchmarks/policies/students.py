@@ -107,7 +107,7 @@ def train(options: argparse.Namespace) -> None:
     )  # fmt: skip
     began = time.time()
     left = None if options.end is None else max(options.end - began - options.reserve, 1.0)
-    folder = options.out / options.arm / config.name[config.name.rindex("_seed") + 1 :]
+    folder = options.out / options.arm / folder_name(options)
 
     def tell(done: int, total: int, what: str) -> None:
         if what == "evaluating" or done == 1 or done % options.every == 0:
@@ -159,6 +159,8 @@ def together(options: argparse.Namespace) -> None:
     while waiting or running:
         while waiting and places:
             name = waiting.pop(0)
+            if done(options, name):
+                continue
             if options.end is not None and time.time() > options.end - options.reserve - 20:
                 put(options.out, {"arm": name, "status": "no time"})
                 continue
@@ -175,6 +177,20 @@ def together(options: argparse.Namespace) -> None:
             if process.returncode:
                 put(options.out, {"arm": name, "status": "failed", "code": process.returncode})
             pack(options.out, options.tar or options.out, options.arms, options.tars)
+
+
+def done(options: argparse.Namespace, arm: str) -> bool:
+    """Return whether an arm was evaluated after all its iterations, with this seed and draw."""
+    if arm == "agents":
+        return (options.out / "agents.json").is_file()
+    path = options.out / arm / folder_name(options) / "evaluation.json"
+    return path.is_file() and all(one["iterations"] >= options.iterations for one in json.loads(path.read_text()))
+
+
+def folder_name(options: argparse.Namespace) -> str:
+    """Return the name of a student's folder in that of its arm."""
+    drawn = options.pretrained.parent.name if options.pretrained else options.draw
+    return f"seed{options.seed}" + (f"_draw-{drawn}" if drawn is not None else "")
 
 
 def pack(out: Path, to: Path, arms: list[str], most: int) -> None:
