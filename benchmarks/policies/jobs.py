@@ -8,8 +8,8 @@
 A call of the GPU machine lasts 10 minutes at most, a session 30. A job works in ``/tmp/run/NAME``, which the calls of a
 session share; each call also leaves it in ``$OUT`` as ``NAME.tar.gz.00``, …, without the weights of what is finished.
 The next session goes on from there: ``keep`` puts the parts into ``.run/NAME`` (ignored by git), the call names
-``.run`` in ``carry``, and ``run`` unpacks it. Teachers and students then go on exactly, environments and random numbers included
-(37 MB for 8,192 environments). The tree that travels has to stay below 64 MiB with ``.run``: make the calls from a
+``.run`` in ``carry``, and ``run`` unpacks it. Teachers and students then go on exactly, with environments and random
+numbers (37 MB for 8,192 environments). The tree has to stay below 64 MiB with ``.run``: make the calls from a
 commit without ``leaderboards/*/records``, ``leaderboards/results`` and ``docs/images``.
 
 Wheels that policies need on that machine: ``../shared/device/pack.sh msgspec h5netcdf manifold3d platformdirs gitpython
@@ -44,7 +44,7 @@ PIECE = 8.5
 _PART, _MOST = 15 << 20, 4
 """Bytes of a file that comes back, and so many of them."""
 SMALL = (
-    (r"--device cuda", "--device cpu"), (r"--envs \d+", "--envs 4"), (r"--(iterations|stop-at) \d+", r"--\1 1"),
+    (r"--device cuda", "--device cpu"), (r"--minutes \d+", "--minutes 0.05"), (r"--envs \d+", "--envs 4"), (r"--(iterations|stop-at) \d+", r"--\1 1"),
     (r"--episodes \d+", "--episodes 4"), (r"--seconds [\d.]+", "--seconds 0.5"), (r"--precision bf16", ""),
     (r"--(untrained|reservoirs|draws|seeds|together) \d+", r"--\1 1"), (r"--place \d+", "--place 2"),
     (r"probe in_palm_rotate(.*)--envs 4", r"probe in_palm_rotate\1--envs 20"),
@@ -84,10 +84,9 @@ def find(name: str) -> dict[str, Any]:
 
 def shell(command: str, run: Path, minutes: float) -> int:
     """Run a command with ``$RUN``, ``$MINUTES`` and ``$END`` set and return its status; it is ended 30 s later."""
-    python = f"{sys.executable} -m "
-    words = re.sub(
-        r"\bpython -m ", python, re.sub(r"\bbrainbench (?=(policy|stimuli|train) )", f"{python}brainbench ", command)
-    )
+    # The GPU machine has no command `brainbench`.
+    words = re.sub(r"\b(?:(brainbench) (?=policy |stimuli |train )|python -m )",
+                   lambda found: f"{sys.executable} -m {'brainbench ' * bool(found[1])}", command)  # fmt: skip
     given = {**os.environ, "RUN": str(run), "MINUTES": f"{minutes:g}", "END": str(int(time.time() + 60 * minutes))}
     process = subprocess.Popen(["bash", "-ec", words], env=given, start_new_session=True)
     try:

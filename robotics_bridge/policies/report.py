@@ -95,8 +95,8 @@ class StudentResult:
     """Iterations that each of the students learned, in the order of their seeds; None where it is not said."""
     left_out: tuple[LeftOut, ...] = ()
     """Evaluated students of this group that do not count, and why."""
-    draws: tuple[str | None, ...] = ()
-    """What was drawn for the encoder of each student (:attr:`DistillConfig.draw`)."""
+    configs: tuple[DistillConfig, ...] = ()
+    """Configuration of each student."""
 
     @property
     def name(self) -> str:
@@ -162,9 +162,9 @@ def mixed_model(results: Sequence[StudentResult]) -> MixedModel:
         UsageError: no student has two training seeds.
     """
     found = [
-        TrainedPolicy(result.name, share, seed, draw)
+        TrainedPolicy(result.name, share, config.seed, config.draw)
         for result in results
-        for share, seed, draw in zip(result.success, result.seeds, result.draws, strict=True)
+        for share, config in zip(result.success, result.configs, strict=True)
     ]
     return MixedModel(tuple(found))
 
@@ -232,7 +232,7 @@ def _result(members: Sequence[_Member], left_out: tuple[LeftOut, ...]) -> Studen
         note = "; ".join(filter(None, (note, f"{_STOPPED} {_learned(learned)} of {first.iterations} iterations")))
     return StudentResult(
         first, seeds, tuple(shares), episodes, metric, interval, note, graded=graded, iterations=fewest,
-        learned=learned, left_out=left_out, draws=tuple(member.config.draw for member in members),
+        learned=learned, left_out=left_out, configs=tuple(member.config for member in members),
     )  # fmt: skip
 
 
@@ -415,9 +415,10 @@ def records(results: Sequence[StudentResult]) -> list[ResultRecord]:
             source = f"{source}, {config.contacts} contacts"
         name = result.name
         commands = [
-            command(replace(config, seed=seed), stop_at=learned)
-            for seed, learned in zip(result.seeds, result.learned, strict=True)
+            command(replace(one, teacher=config.teacher), stop_at=learned)
+            for one, learned in zip(result.configs, result.learned, strict=True)
         ]
+        crossed = len(set(result.seeds)) < len(result.seeds)
         settings = {
             "episodes": result.episodes, "metric": result.metric, "iterations_learned": result.iterations,
             "seeds": list(result.seeds), **{f"mean_{name}": mean for name, (mean, _) in result.graded.items()},
@@ -435,8 +436,8 @@ def records(results: Sequence[StudentResult]) -> list[ResultRecord]:
             reasons=(result.note,) if result.note else (),
             interval=result.interval,
             subjects=tuple(
-                SubjectScore(f"seed {seed}", share, math.nan, math.nan)
-                for seed, share in zip(result.seeds, result.success, strict=True)
+                SubjectScore(f"seed {one.seed}{f', {one.draw}' * crossed}", share, math.nan, math.nan)
+                for one, share in zip(result.configs, result.success, strict=True)
             ),
             estimator="policy-success",
             metric="share of successful episodes",
