@@ -52,6 +52,7 @@ SMALL = (
     (r"--seconds [\d.]+", "--seconds 0.5"),
     (r"--precision bf16", ""),
     (r"--(untrained|reservoirs|draws|seeds|together) \d+", r"--\1 1"),
+    (r"--shard (\d)/\d+", r"--shard \1/40"),
     (r"(policy probe .*)--envs 4", r"\1--envs 20"),
 )
 """What makes a command small enough for a processor."""
