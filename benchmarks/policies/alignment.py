@@ -204,6 +204,8 @@ def measure(options: argparse.Namespace) -> list[dict[str, Any]]:
     names = sorted((name for name, one in known.items() if one["seed"] < options.seeds
                     and (Architecture.parse(one["model"]).small or options.large)),
                    key=lambda name: (known[name]["seed"], "+gpt" in name))  # fmt: skip
+    if options.known:
+        return list(measure_once(options.out, names, _unmeasured, known=True).values())
     sweeps = read_sweeps(options.sweeps)
     env = World(TASK, config=CONFIG).make([AGENT], num_envs=options.envs, observe="force_torque")
     policy, grid = agent_of(AGENT, env), TaxelGrid(env.hand)
@@ -212,6 +214,10 @@ def measure(options: argparse.Namespace) -> list[dict[str, Any]]:
     gain = torch.tensor(calibration.gains(rollout.taxels.shape[2]))[:, None, None]
     stimulus = (grid(rollout.taxels.flatten(0, 1)) * gain).unflatten(0, rollout.taxels.shape[:2])
     return list(measure_once(options.out, names, lambda name: _one(name, rollout, stimulus, sweeps)).values())
+
+
+def _unmeasured(name: str) -> dict[str, Any]:
+    raise AssertionError(name)
 
 
 @torch.no_grad()
@@ -241,7 +247,8 @@ def draw(found: list[dict[str, Any]]) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--sweeps", type=Path, required=True, help="folder of brainbench stimuli sweep")
+    parser.add_argument("--sweeps", type=Path, help="folder of brainbench stimuli sweep")
+    parser.add_argument("--known", action="store_true", help="lay out what stands in the folder, measure nothing")
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--envs", type=int, default=64)
     parser.add_argument("--seconds", type=float, default=8.0)
@@ -250,16 +257,18 @@ def main() -> None:
     parser.add_argument("--notes", type=Path, help="text that follows the tables")
     parser.add_argument("--write", action="store_true")
     options = parser.parse_args()
+    if options.sweeps is None and not options.known:
+        parser.error("--sweeps names the folder of sweeps on which the whisker accuracy is measured")
     found = sorted(points(measure(options)), key=lambda one: -one["score"])
     keys = ("score", "accuracy", *TARGETS)
     heads = ["score", "whisker accuracy", *TARGETS]
     rows = [[one["model"], str(one["seeds"]), *(f"{one[key]:.3f}" for key in keys)] for one in found]
     spread = [one["seed_spread"] for one in found if one["seed_spread"] is not None]
+    others = np.std([one["score"] for one in found if not one["truth"]], ddof=1)
+    again = f"; of seeds of one untrained network by {np.mean(spread):.3f}" if spread else ""
     parts = [
         f"{len(found)} networks of the default board, {options.envs} environments of {TASK} for {options.seconds:g} s "
-        f"under `{AGENT}`. Scores of seeds of one untrained network differ by {np.mean(spread):.3f} (standard "
-        f"deviation), of these networks by {np.std([o['score'] for o in found if not o['truth']], ddof=1):.3f} without "
-        "the hidden one.",
+        f"under `{AGENT}`. Without the hidden network, scores differ by {others:.3f} (standard deviation){again}.",
         table(["network", "seeds", *heads], rows),
         "Spearman's correlation of score and read-out over networks, two-sided p of permuted networks:",
         table(["networks", "count", "given", *TARGETS, "score with whisker accuracy"], correlations(found)),
