@@ -200,9 +200,9 @@ class _Fit:
 
     parts: dict[str, NDArray[np.float64]]
     """Name → V_k [n, n]: 1 where two policies share a level; the residual is first."""
-    variances: NDArray[np.float64]
+    variances: NDArray[np.floating]
     """σ²_k [K]."""
-    uncertain: NDArray[np.float64]
+    uncertain: NDArray[np.floating]
     """[K, K]: covariance of the variances."""
     inverse: NDArray[np.float64]
     """[n, n]: that of V = Σ σ²_k V_k."""
@@ -232,7 +232,7 @@ def _reml(y: NDArray[np.float64], x: NDArray[np.float64], parts: dict[str, NDArr
     return _Fit(parts, variances, 2 * np.linalg.inv(information), inverse)
 
 
-def _inverse(variances: NDArray[np.float64], parts: Sequence[NDArray[np.float64]]) -> NDArray[np.float64] | None:
+def _inverse(variances: NDArray[np.floating], parts: Sequence[NDArray[np.float64]]) -> NDArray[np.float64] | None:
     """Return the inverse of Σ σ²_k V_k; None where that is no covariance."""
     values, vectors = np.linalg.eigh(np.tensordot(variances, np.stack(parts), 1))
     if values[0] <= 1e-6 * values[-1]:

@@ -76,7 +76,7 @@ def choose_taxels(
         part.take(slice(0, first))
     chosen: list[int] = []
     for _ in range(count):
-        score = sum(part.gains(first, taxels, width) for part in parts)
+        score = torch.stack([part.gains(first, taxels, width) for part in parts]).mean(0)
         score[chosen] = -torch.inf
         best = int(score.argmax())
         for part in parts:
