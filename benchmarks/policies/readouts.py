@@ -1,10 +1,11 @@
 """Lay out the read-outs of tactile encoders that ``brainbench policy probe --out FILE`` measured.
 
     brainbench policy probe in_palm_rotate --agent in_palm_rotate.firm --config careful --seconds 8 --out FILE
+    brainbench policy probe … --place 50 --out FILE
     python -m benchmarks.policies.readouts --record FILE [FILE …] [--device "one NVIDIA H100"] [--notes FILE] [--write]
 
-Prints the tables; with ``--write`` keeps them as a section of RESULTS.md, draws ``docs/images/policy-readouts.png``,
-and keeps the record as ``benchmarks/policies/records/``.
+Prints the tables; with ``--write`` keeps them as a section of RESULTS.md, draws ``docs/images/policy-readouts.png`` or
+``policy-placement.png``, and keeps the record in ``benchmarks/policies/records``. Files are of one kind.
 """
 
 from __future__ import annotations
@@ -20,22 +21,21 @@ from brainbench.core.files import read_json, write_json
 from robotics_bridge.policies.readouts.rollout import TARGETS
 
 _ROOT = Path(__file__).resolve().parents[2]
-PICTURE = _ROOT / "docs" / "images" / "policy-readouts.png"
+IMAGES = _ROOT / "docs" / "images"
 RECORDS = Path(__file__).with_name("records")
 
 
 def body(record: Mapping[str, Any]) -> str:
     """Return both tables."""
+    size = "taxels" if "place" in record else "features"
     arms = [
-        [one["arm"], str(one["features"]), str(one["draws"]), *(_cell(one[name], "") for name in TARGETS)]
+        [one["arm"], str(one[size]), str(one["draws"]), *(_cell(one[name], "") for name in TARGETS)]
         for one in record["arms"]
     ]
     pairs = [[one["arm"], one["less"], *(_cell(one[name], "+") for name in TARGETS)] for one in record["differences"]]
     extent = f"{record['environments']} environments of {record['task']} for {record['seconds']:g} s"
     head = f"**{extent} under `{record['agent']}`, {record['contacts']} contacts**"
-    return "\n\n".join(
-        [head, table(["arm", "features", "draws", *TARGETS], arms), table(["arm", "less", *TARGETS], pairs)]
-    )
+    return "\n\n".join([head, table(["arm", size, "draws", *TARGETS], arms), table(["arm", "less", *TARGETS], pairs)])
 
 
 def _cell(one: Mapping[str, float], sign: str) -> str:
@@ -49,15 +49,20 @@ def draw(record: Mapping[str, Any]) -> None:
     for panel, name in zip(axes[0], TARGETS, strict=True):
         for height, one in enumerate(arms):
             value = one[name]
-            random = one["arm"].startswith(("reservoir", "untrained"))
-            trained = one["arm"].startswith(("simclr", "supervised"))
+            random = one["arm"].startswith(("reservoir", "untrained", "random"))
+            trained = one["arm"].startswith(("simclr", "supervised", "chosen"))
             color = COLORS[0] if trained else COLORS[1] if random else PALE
             error = [[max(value["r2"] - value["low"], 0)], [max(value["high"] - value["r2"], 0)]]
             panel.errorbar(value["r2"], height, xerr=error, fmt="o", markersize=4, color=color, capsize=2)
         panel.axvline(0, color=PALE, linewidth=0.8)
         panel.set(title=name, xlabel="R² on environments left out")
     axes[0, 0].set_yticks(range(len(arms)), [one["arm"] for one in arms])
-    save_figure(figure, PICTURE, dpi=120)
+    save_figure(figure, IMAGES / f"policy-{kind(record)}.png", dpi=120)
+
+
+def kind(record: Mapping[str, Any]) -> str:
+    """Return what a record is of."""
+    return "placement" if "place" in record else "readouts"
 
 
 def command(record: Mapping[str, Any]) -> str:
@@ -65,6 +70,7 @@ def command(record: Mapping[str, Any]) -> str:
     words = [record["task"], "--agent", record["agent"], "--config", record["config"]]
     words += [word for change in record["change"] for word in ("--change", change)]
     words += ["--envs", str(record["environments"]), "--seconds", f"{record['seconds']:g}"]
+    words += ["--place", str(record["place"])] if "place" in record else []
     return f"brainbench policy probe {' '.join(words)} --out FILE"
 
 
@@ -83,11 +89,10 @@ def main() -> None:
     if options.write:
         draw(records[0])
         for record in records:
-            write_json(RECORDS / f"readouts-{record['task']}-{record['contacts']}.json", record)
+            write_json(RECORDS / f"{kind(record)}-{record['task']}-{record['contacts']}.json", record)
         commands = [*map(command, records), "python -m benchmarks.policies.readouts --record FILE … --write"]
-        write_section(
-            "Read-outs of tactile encoders", "; ".join(commands), text, where=options.device, subject="policies"
-        )
+        title = "Placement of few taxels" if kind(records[0]) == "placement" else "Read-outs of tactile encoders"
+        write_section(title, "; ".join(commands), text, where=options.device, subject="policies")
 
 
 if __name__ == "__main__":

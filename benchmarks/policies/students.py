@@ -33,6 +33,7 @@ from typing import TYPE_CHECKING, Any
 from robotics_bridge.tasks.contact_model import CONTACTS
 
 if TYPE_CHECKING:
+    from brainbench.core.records import Interval
     from robotics_bridge.policies.report import StudentResult
     from robotics_bridge.policies.training.distill_config import DistillConfig
 
@@ -61,9 +62,12 @@ ARMS: dict[str, dict[str, Any]] = {
 CONTRASTS = (
     ("ft_hand", "ft_tips"), ("bool_hand", "bool_tips"), ("ft_tips", "bool_tips"), ("ft_hand", "bool_hand"),
     ("ead_simclr", "ead_supervised"), ("ead_simclr", "ead_untrained"), ("ead_supervised", "ead_untrained"),
-    ("ft_hand", "ead_simclr"), ("bool_tips", "none"), ("ead_untrained", "none"),
+    ("ead_simclr", "reservoir"), ("ead_supervised", "reservoir"), ("ft_hand", "ead_simclr"), ("bool_tips", "none"),
+    ("ead_untrained", "none"),
 )  # fmt: skip
 """Arms whose differences are tested."""
+RANDOM, TRAINED = ("reservoir", "ead_untrained"), ("ead_simclr", "ead_supervised")
+"""Frozen arms that learned nothing, and those that are said to help only beyond the best of them."""
 _TAR = 15 << 20
 _SMOOTH = 8
 """Last iterations over which a loss and a success are averaged."""
@@ -91,6 +95,8 @@ def train(options: argparse.Namespace) -> None:
         own = {"seed": options.draw if options.draw is not None else options.seed}
         if settings["encoder"].startswith(NETWORK):
             own |= {"learning": "frozen", "options": {"unroll": "full"}}
+        if options.pretrained is not None and settings["encoder"].startswith(f"{NETWORK}."):
+            own["pretrained"] = str(options.pretrained)
         settings["encoder_settings"] = own | settings.get("encoder_settings", {})
     precision = "bf16" if options.device != "cpu" and settings["observe"] != "none" else "float32"
     config = DistillConfig(
@@ -101,7 +107,7 @@ def train(options: argparse.Namespace) -> None:
     )  # fmt: skip
     began = time.time()
     left = None if options.end is None else max(options.end - began - options.reserve, 1.0)
-    folder = options.out / options.arm / f"seed{options.seed}"
+    folder = options.out / options.arm / folder_name(options)
 
     def tell(done: int, total: int, what: str) -> None:
         if what == "evaluating" or done == 1 or done % options.every == 0:
@@ -153,6 +159,8 @@ def together(options: argparse.Namespace) -> None:
     while waiting or running:
         while waiting and places:
             name = waiting.pop(0)
+            if done(options, name):
+                continue
             if options.end is not None and time.time() > options.end - options.reserve - 20:
                 put(options.out, {"arm": name, "status": "no time"})
                 continue
@@ -169,6 +177,20 @@ def together(options: argparse.Namespace) -> None:
             if process.returncode:
                 put(options.out, {"arm": name, "status": "failed", "code": process.returncode})
             pack(options.out, options.tar or options.out, options.arms, options.tars)
+
+
+def done(options: argparse.Namespace, arm: str) -> bool:
+    """Return whether an arm was evaluated after all its iterations, with this seed and draw."""
+    if arm == "agents":
+        return (options.out / "agents.json").is_file()
+    path = options.out / arm / folder_name(options) / "evaluation.json"
+    return path.is_file() and all(one["iterations"] >= options.iterations for one in json.loads(path.read_text()))
+
+
+def folder_name(options: argparse.Namespace) -> str:
+    """Return the name of a student's folder in that of its arm."""
+    drawn = options.pretrained.parent.name if options.pretrained else options.draw
+    return f"seed{options.seed}" + (f"_draw-{drawn}" if drawn is not None else "")
 
 
 def pack(out: Path, to: Path, arms: list[str], most: int) -> None:
@@ -286,27 +308,36 @@ def every_student(named: dict[str, StudentResult], logs: dict[tuple[str, int], l
 
 
 def differences(named: dict[str, StudentResult]) -> str:
-    """Return the table of :data:`CONTRASTS`, and of what spread they were held against."""
+    """Return the table of :data:`CONTRASTS`, what spread they were held against, and whether trained networks help."""
     from benchmarks.report import table
     from brainbench.metrics.inference.multiple import adjust
-    from robotics_bridge.policies.contrasts import contrast, pooled_spread
+    from robotics_bridge.policies.report import mixed_model
 
-    spread, freedom = pooled_spread([result.success for result in named.values()])
+    model = mixed_model(list(named.values()))
     pairs = [(one, other) for one, other in CONTRASTS if one in named and other in named]
-    found = [contrast(named[one].success, named[other].success, spread, freedom) for one, other in pairs]
+    found = [model.contrast(named[one].name, named[other].name) for one, other in pairs]
     held = adjust([item.p for item in found], "holm")
     rows = [
         [
             f"{one} – {other}", f"{len(named[one].seeds)}, {len(named[other].seeds)}", f"{item.difference:+.3f}",
-            f"[{item.interval.low:+.3f}, {item.interval.high:+.3f}]", f"{p:.2g}",
+            _span(item.interval), f"{p:.2g}",
         ]
         for (one, other), item, p in zip(pairs, found, held, strict=True)
     ]  # fmt: skip
-    said = (
-        f"Training seeds spread success by {spread:.3f} (standard deviation pooled over {len(named)} arms, {freedom} "
-        "degrees of freedom). Differences of arms against it:"
-    )
-    return f"{said}\n\n{table(['arms', 'seeds', 'success', '95 % interval', 'p (Holm)'], rows)}"
+    parts = ", ".join(f"{name} {value:.3f}" for name, value in model.spread.items())
+    said = f"Mixed model of all {len(named)} arms; standard deviations of success: {parts}. Differences of arms:"
+    lines = [said, table(["arms", "students", "success", "95 % interval", "p (Holm)"], rows)]
+    random = {named[arm].name: arm for arm in RANDOM if arm in named}
+    for arm in (arm for arm in TRAINED if arm in named and random):
+        held = model.judge(named[arm].name, random)
+        gain = f"{held.contrast.difference:+.3f} {_span(held.contrast.interval)}"
+        word = "helps" if held.helps else "is not shown to help"
+        lines.append(f"`{arm}` {word}: {gain} over `{random[held.best]}`, the best random arm.")
+    return "\n\n".join(lines)
+
+
+def _span(interval: Interval | None) -> str:
+    return "–" if interval is None else f"[{interval.low:+.3f}, {interval.high:+.3f}]"
 
 
 def seen(log: list[dict[str, Any]], iteration: int) -> float:
@@ -327,6 +358,7 @@ def main() -> None:
     parser.add_argument("--config", default="default", help="configuration of the task; that of the teacher")
     parser.add_argument("--contacts", choices=list(CONTACTS), help="by default those of the teacher")
     parser.add_argument("--draw", type=int, help="seed of untrained networks and reservoirs; by default the student's")
+    parser.add_argument("--pretrained", type=Path, help="weights of one training, for arms with a trained network")
     parser.add_argument("--arms", nargs="+", default=list(ARMS), choices=list(ARMS))
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--gpus", type=int, default=1)

@@ -30,7 +30,7 @@ class EnvOptions:
     placement: str = "hand"
     """Place of the taxels: ``hand``, ``fingers``, ``tips`` or ``palm``."""
     resolution: str = "med"
-    """Number of taxels: ``low``, ``med`` or ``high``."""
+    """Number of taxels: ``low``, ``med`` or ``high``; or a probe file (``.json``)."""
     noisy: bool = False
     """Tactile readings with the published imperfections."""
     seed: int = 0

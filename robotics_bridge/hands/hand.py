@@ -88,12 +88,14 @@ class Hand:
 
         Our hands have exactly the counts of the thesis (table 4.11). On any other hand, grids are cast onto the
         palmar side of the links, which is where they move when their joints flex or jaws close; see
-        :meth:`with_probes` for a layout of your own.
+        :meth:`with_probes` for a layout of your own, which may also be named as a probe file in place of a resolution.
 
         Raises:
             UsageError: resolution or placement are unknown, or no link of the placement gets a probe (it says why).
         """
         links = self.links(placement)
+        if resolution.endswith(".json"):
+            return self.with_probes(resolution).layout("custom", placement)
         if resolution in self.probes:
             return select(self.probes[resolution], links)
         check_names(resolution, placement)

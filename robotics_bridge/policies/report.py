@@ -25,6 +25,7 @@ from brainbench.core.provenance import Provenance
 from brainbench.core.reading.regular import reason
 from brainbench.core.records import Interval, ModelCard, ResultRecord, Score, SubjectScore
 from brainbench.core.statistics import newcombe_interval, t_interval, wilson_interval
+from robotics_bridge.policies.contrasts import MixedModel, TrainedPolicy
 from robotics_bridge.policies.evaluate import mean_of_episodes
 from robotics_bridge.policies.training.distill_config import DistillConfig
 
@@ -70,9 +71,9 @@ class StudentResult:
     config: DistillConfig
     """Configuration of the first of them."""
     seeds: tuple[int, ...]
-    """Training seeds."""
+    """Training seed of each student; several may have the same, with another draw of their encoder."""
     success: tuple[float, ...]
-    """Share of successful episodes, per training seed."""
+    """Share of successful episodes of each student."""
     episodes: int
     """In all."""
     metric: float
@@ -94,6 +95,13 @@ class StudentResult:
     """Iterations that each of the students learned, in the order of their seeds; None where it is not said."""
     left_out: tuple[LeftOut, ...] = ()
     """Evaluated students of this group that do not count, and why."""
+    configs: tuple[DistillConfig, ...] = ()
+    """Configuration of each student."""
+
+    @property
+    def name(self) -> str:
+        """Name without the seed."""
+        return self.config.name.rpartition("_seed")[0]
 
     @property
     def value(self) -> float:
@@ -109,9 +117,10 @@ class StudentResult:
 def read_results(folders: Iterable[str | Path], *, at_least: int = 0) -> list[StudentResult]:
     """Return the results of all evaluated students below some folders, best first within each task, hand and contacts.
 
-    Where a student was trained more than once with the same training seed, the one that learned longest counts: two
-    runs of one seed are no two seeds. Students that learned fewer iterations than ``at_least`` are left out; those that
-    do not say how many stay.
+    Where a student was trained more than once with the same training seed and draw of its encoder, the one that learned
+    longest counts: two runs of one seed are no two seeds. Students that learned fewer iterations than ``at_least`` are
+    left out; those that do not say how many stay. Where draws and seeds are crossed, intervals are those of
+    :func:`mixed_model`.
 
     Raises:
         DataFileNotFoundError: no student was evaluated there, or none of them learned so long.
@@ -135,9 +144,29 @@ def read_results(folders: Iterable[str | Path], *, at_least: int = 0) -> list[St
         raise DataFileNotFoundError(
             f"None of the students learned {at_least} iterations; the longest that any did is {longest}."
         )
+    crossed = {result.world for result in results if len(set(result.seeds)) < len(result.seeds)}
+    models = {world: mixed_model([r for r in results if r.world == world]) for world in crossed}
+    results = [
+        r if r.world not in models else replace(r, interval=models[r.world].mean(r.name).interval or r.interval)
+        for r in results
+    ]
     bare = {r.world: r for r in results if r.config.observe == "none"}
     found = [_against(result, bare.get(result.world)) for result in results]
     return sorted(found, key=lambda r: (r.world, -r.value, r.config.name))
+
+
+def mixed_model(results: Sequence[StudentResult]) -> MixedModel:
+    """Return the model of students of one task, hand and contacts, whose arms are their names without the seed.
+
+    Raises:
+        UsageError: no student has two training seeds.
+    """
+    found = [
+        TrainedPolicy(result.name, share, config.seed, config.draw)
+        for result in results
+        for share, config in zip(result.success, result.configs, strict=True)
+    ]
+    return MixedModel(tuple(found))
 
 
 @dataclass(frozen=True)
@@ -154,18 +183,18 @@ class _Member:
 
 
 def _counted(members: Sequence[_Member], at_least: int) -> tuple[list[_Member], tuple[LeftOut, ...]]:
-    """Return one student per training seed, by seed, and the others."""
-    best: dict[int, _Member] = {}
+    """Return one student per training seed and draw, by seed, and the others."""
+    best: dict[tuple[int, str], _Member] = {}
     others = []
     for member in sorted(members, key=lambda member: -(member.learned or 0)):
         seed, learned = member.config.seed, member.learned
         if learned is not None and learned < at_least:
             others.append(LeftOut(seed, learned, f"fewer than {at_least}"))
-        elif seed in best:
-            others.append(LeftOut(seed, learned, f"trained once more, for {best[seed].learned}"))
+        elif (cell := (seed, member.config.draw or "")) in best:
+            others.append(LeftOut(seed, learned, f"trained once more, for {best[cell].learned}"))
         else:
-            best[seed] = member
-    return [best[seed] for seed in sorted(best)], tuple(others)
+            best[cell] = member
+    return [best[cell] for cell in sorted(best)], tuple(others)
 
 
 def _evaluations(path: Path) -> list[dict[str, Any]]:
@@ -189,13 +218,13 @@ def _result(members: Sequence[_Member], left_out: tuple[LeftOut, ...]) -> Studen
     graded = {name: found for name in GRADED if (found := _grade(members, name)) is not None}
     episodes = sum(len(item["success"]) for member in members for item in member.evaluations)
     interval = t_interval(shares, over="training seeds")
-    note = "" if len(members) >= FEWEST_SEEDS else f"only {len(members)} training seeds"
+    first, seeds = members[0].config, tuple(member.config.seed for member in members)
+    note = "" if len(set(seeds)) >= FEWEST_SEEDS else f"only {len(set(seeds))} training seeds"
     if len(members) == 1:
         note = "one training seed: the interval covers chance in evaluation alone"
     if interval is None or len(set(shares)) == 1:
         # Equal shares, such as no success at all, tell nothing of their spread.
         interval = wilson_interval(float(np.mean(shares)) * episodes, episodes, over="episodes")
-    first, seeds = members[0].config, tuple(member.config.seed for member in members)
     metric = graded.get("metric", (math.nan, math.nan))[0]
     learned = tuple(member.learned for member in members)
     fewest = min((number for number in learned if number is not None), default=None)
@@ -203,7 +232,7 @@ def _result(members: Sequence[_Member], left_out: tuple[LeftOut, ...]) -> Studen
         note = "; ".join(filter(None, (note, f"{_STOPPED} {_learned(learned)} of {first.iterations} iterations")))
     return StudentResult(
         first, seeds, tuple(shares), episodes, metric, interval, note, graded=graded, iterations=fewest,
-        learned=learned, left_out=left_out,
+        learned=learned, left_out=left_out, configs=tuple(member.config for member in members),
     )  # fmt: skip
 
 
@@ -229,7 +258,7 @@ def _grade(members: Sequence[_Member], name: str) -> tuple[float, float] | None:
 def _against(result: StudentResult, bare: StudentResult | None) -> StudentResult:
     if bare is None or bare is result:
         return result
-    own, other = (dict(zip(r.seeds, r.success, strict=True)) for r in (result, bare))
+    own, other = (_by_seed(r) for r in (result, bare))
     common = sorted(set(own) & set(other))
     if not common:
         return result
@@ -240,6 +269,12 @@ def _against(result: StudentResult, bare: StudentResult | None) -> StudentResult
         share, bare_share = own[common[0]], other[common[0]]
         interval = newcombe_interval(share * count, count, bare_share * others, others, over="episodes")
     return replace(result, gain=float(np.mean(gains)), difference=interval)
+
+
+def _by_seed(result: StudentResult) -> dict[int, float]:
+    """Return the mean success of each training seed, over the draws of the encoder."""
+    pairs = list(zip(result.seeds, result.success, strict=True))
+    return {seed: float(np.mean([share for other, share in pairs if other == seed])) for seed in result.seeds}
 
 
 COLUMNS = (
@@ -333,7 +368,7 @@ def remarks(results: Sequence[StudentResult]) -> list[str]:
         wanted = ", ".join(str(number) for number in sorted({result.config.iterations or 0 for result in early}))
         found.append(f"{_STOPPED} {_learned(n for result in early for n in result.learned)} of {wanted} iterations")
     return found + [
-        f"left out: {result.config.name.rpartition('_seed')[0]}, seed {item.seed}, after "
+        f"left out: {result.name}, seed {item.seed}, after "
         f"{'unknown' if item.iterations is None else item.iterations} iterations ({item.reason})"
         for result in results
         for item in result.left_out
@@ -378,11 +413,12 @@ def records(results: Sequence[StudentResult]) -> list[ResultRecord]:
         if config.contacts not in (None, "published"):  # records of versions before know no other contacts
             protocol["contacts"] = config.contacts
             source = f"{source}, {config.contacts} contacts"
-        name = config.name.rpartition("_seed")[0]
+        name = result.name
         commands = [
-            command(replace(config, seed=seed), stop_at=learned)
-            for seed, learned in zip(result.seeds, result.learned, strict=True)
+            command(replace(one, teacher=config.teacher), stop_at=learned)
+            for one, learned in zip(result.configs, result.learned, strict=True)
         ]
+        crossed = len(set(result.seeds)) < len(result.seeds)
         settings = {
             "episodes": result.episodes, "metric": result.metric, "iterations_learned": result.iterations,
             "seeds": list(result.seeds), **{f"mean_{name}": mean for name, (mean, _) in result.graded.items()},
@@ -400,8 +436,8 @@ def records(results: Sequence[StudentResult]) -> list[ResultRecord]:
             reasons=(result.note,) if result.note else (),
             interval=result.interval,
             subjects=tuple(
-                SubjectScore(f"seed {seed}", share, math.nan, math.nan)
-                for seed, share in zip(result.seeds, result.success, strict=True)
+                SubjectScore(f"seed {one.seed}{f', {one.draw}' * crossed}", share, math.nan, math.nan)
+                for one, share in zip(result.configs, result.success, strict=True)
             ),
             estimator="policy-success",
             metric="share of successful episodes",

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import inspect
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from functools import wraps
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -13,14 +16,6 @@ if TYPE_CHECKING:
 
 TaskArgument = Annotated[str, typer.Argument(help="A task: in_palm_rotate, in_hand_repose, screwdriver, hot_ball.")]
 HandOption = Annotated[str, typer.Option(help="xhand1, sharpa, or a URDF or MJCF file.")]
-ConfigOption = Annotated[str, typer.Option("--config", help="Configuration of the task: default, published, …")]
-TaskFileOption = Annotated[
-    Path | None, typer.Option("--task-file", help="Python file that registers a task of your own.")
-]
-ChangeOption = Annotated[
-    list[str] | None,
-    typer.Option("--change", help="Another number of the task: contacts=firm, is_dropped=-300, entropy=0, …"),
-]
 EnvsOption = Annotated[int, typer.Option("--envs", help="Environments at once.")]
 DeviceOption = Annotated[str, typer.Option(help="cpu, or cuda for MuJoCo Warp.")]
 ENV = "robotics_bridge.envs.options:EnvOptions"
@@ -28,55 +23,71 @@ TOUCH = ("observe", "placement", "resolution", "noisy")
 """Fields of the options of an environment that a student fixes."""
 
 
-def make_env(
-    name: str,
-    *,
-    config: str = "default",
-    change: list[str] | None = None,
-    task_file: Path | None = None,
-    agents: Iterable[str] = (),
-    **options: Any,
-) -> Env:
-    """Return the environment of a command; a task of the user's own is read first, then changed.
+@dataclass(frozen=True)
+class World:
+    """A task on a hand, as a command names it."""
 
-    Trained ``agents`` find the contacts in which they were trained, unless ``change`` names others or ``config`` is
-    ``published``, which defines them.
-    """
-    from robotics_bridge import tasks
-    from robotics_bridge.policies.fit import with_contacts_of
-    from robotics_bridge.tasks.overrides import apply_overrides
+    task: TaskArgument
+    hand: HandOption = "xhand1"
+    config: Annotated[str, typer.Option(help="Configuration of the task: default, published, …")] = "default"
+    change: Annotated[
+        list[str] | None,
+        typer.Option(help="Another number of the task: contacts=firm, is_dropped=-300, entropy=0, …"),
+    ] = None
+    task_file: Annotated[Path | None, typer.Option(help="Python file that registers a task of your own.")] = None
 
-    read_task_file(task_file)
-    task, change = tasks.load(name, config), change or []
-    if config != "published" and not any(word.startswith("contacts") for word in change):
-        task = with_contacts_of(task, agents)
-    return tasks.make(apply_overrides(task, change), **options)
+    def check(self, agents: Iterable[str]) -> None:
+        """Raise UsageError for an unknown task or agent, before anything slow is imported.
+
+        Raises:
+            UsageError: there is no such task, or no such agent or folder.
+        """
+        from brainbench.core.errors import check_name, unknown_name
+        from robotics_bridge import tasks
+        from robotics_bridge.policies import shipped
+
+        if self.task_file is None:  # else the file may register the task
+            check_name("task", self.task, tasks.list_tasks())
+        known = (*shipped.AGENTS, *shipped.list_policies("teacher"), *shipped.list_policies("student"))
+        for name in agents:
+            if name not in known and not Path(name).exists():
+                raise unknown_name("agent", name, known, hint="Or give the folder of a training run.")
+
+    def make(self, agents: Iterable[str] = (), **options: Any) -> Env:
+        """Return its environment; a task of the user's own is read first, then changed.
+
+        Trained ``agents`` find the contacts in which they were trained, unless ``change`` names others or ``config`` is
+        ``published``, which defines them.
+        """
+        from brainbench.core.plugins import load_module
+        from robotics_bridge import tasks
+        from robotics_bridge.policies.fit import with_contacts_of
+        from robotics_bridge.tasks.overrides import apply_overrides
+
+        if self.task_file is not None:
+            load_module(str(self.task_file.absolute()))
+        task, change = tasks.load(self.task, self.config), self.change or []
+        if self.config != "published" and not any(word.startswith("contacts") for word in change):
+            task = with_contacts_of(task, agents)
+        return tasks.make(apply_overrides(task, change), hand=self.hand, **options)
 
 
-def read_task_file(path: Path | None) -> None:
-    """Run a Python file that registers tasks, if there is one."""
-    from brainbench.core.plugins import load_module
+def in_world(command: Callable[..., None]) -> Callable[..., None]:
+    """Decorate a command so that its parameter ``world`` is filled from an argument and options."""
+    own = list(inspect.signature(World, eval_str=True).parameters.values())
+    names = {item.name for item in own}
+    parameters = []
+    for item in inspect.signature(command, eval_str=True).parameters.values():
+        several = own if item.name == "world" else [item]
+        parameters += [one.replace(kind=inspect.Parameter.KEYWORD_ONLY) for one in several]
 
-    if path is not None:
-        load_module(str(path.absolute()))
+    @wraps(command)
+    def run(**values: Any) -> None:
+        rest = {name: value for name, value in values.items() if name not in names}
+        command(world=World(**{name: values[name] for name in names}), **rest)
 
-
-def check_names(task: str, agents: Iterable[str], task_file: Path | None = None) -> None:
-    """Raise UsageError for an unknown task or agent, before anything slow is imported.
-
-    Raises:
-        UsageError: there is no such task, or no such agent or folder.
-    """
-    from brainbench.core.errors import check_name, unknown_name
-    from robotics_bridge import tasks
-    from robotics_bridge.policies import shipped
-
-    if task_file is None:  # else the file may register the task
-        check_name("task", task, tasks.list_tasks())
-    known = (*shipped.AGENTS, *shipped.list_policies("teacher"), *shipped.list_policies("student"))
-    for name in agents:
-        if name not in known and not Path(name).exists():
-            raise unknown_name("agent", name, known, hint="Or give the folder of a training run.")
+    run.__signature__ = inspect.Signature(parameters)  # pyright: ignore[reportAttributeAccessIssue]
+    return run
 
 
 def check_paths(video: Path | None, strip: Path | None) -> None:

@@ -14,17 +14,12 @@ from brainbench.cli.output import JsonOption, emit, facts, progress_bar, table_o
 from brainbench.cli.policy.options import (
     ENV,
     TOUCH,
-    ChangeOption,
-    ConfigOption,
     DeviceOption,
     EnvsOption,
-    HandOption,
-    TaskArgument,
-    TaskFileOption,
+    World,
     agent_of,
-    check_names,
     check_paths,
-    make_env,
+    in_world,
     touch_of,
 )
 
@@ -73,8 +68,9 @@ def list_tasks(as_json: JsonOption = False) -> None:
 
 
 @with_options(ENV, (*TOUCH, "device", "seed"), build=False)
+@in_world
 def play(
-    task: TaskArgument,
+    world: World,
     options: dict[str, Any],
     agent: Annotated[str, typer.Option(help="zero, random, a shipped policy, or a run's folder.")] = "random",
     video: Annotated[Path | None, typer.Option(callback=out_file, help="Write a film here (.mp4 or .gif).")] = None,
@@ -84,10 +80,6 @@ def play(
     seconds: Annotated[float, typer.Option(help="Simulated time.")] = 4.0,
     rate: Annotated[float, typer.Option(help="Frames per simulated second of a film.")] = 20.0,
     width: Annotated[int, typer.Option(help="Of a frame [pixels].")] = 480,
-    hand: HandOption = "xhand1",
-    config: ConfigOption = "default",
-    change: ChangeOption = None,
-    task_file: TaskFileOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Run an agent in one environment of a task and show what happens, as numbers and as a film."""
@@ -99,16 +91,13 @@ def play(
             f"A film has a positive length and rate, and 64 pixels or more across; received {seconds} s, "
             f"{rate} frames/s and {width} pixels."
         )
-    check_names(task, [agent], task_file)
+    world.check([agent])
     pictures = [path for path in (video, strip) if path is not None]
     if pictures:
         check_paths(video, strip)
         from brainbench.cli.policy import pictures as drawing
     options |= touch_of([agent])
-    env = make_env(
-        task, config=config, change=change, task_file=task_file, agents=[agent], num_envs=1, hand=hand, threads=1,
-        **options,
-    )  # fmt: skip
+    env = world.make([agent], num_envs=1, threads=1, **options)
     contacts = contacts_name(env.task.contacts)
     act = agent_of(agent, env, seed=options["seed"])
     steps = max(round(seconds / env.step_dt), 1)
@@ -157,8 +146,9 @@ def play(
     emit(told, f"{env.task.text}\n\n{facts(shown)}", as_json=as_json)
 
 
+@in_world
 def evaluate(
-    task: TaskArgument,
+    world: World,
     agents: Annotated[
         list[str] | None,
         typer.Argument(help="Shipped policies, or folders of teachers or students; zero and random always run."),
@@ -166,10 +156,6 @@ def evaluate(
     episodes: Annotated[int, typer.Option(help="Per agent and seed.")] = 100,
     seeds: Annotated[int, typer.Option(help="Evaluation seeds.")] = 3,
     envs: EnvsOption = 32,
-    hand: HandOption = "xhand1",
-    config: ConfigOption = "default",
-    change: ChangeOption = None,
-    task_file: TaskFileOption = None,
     device: DeviceOption = "cpu",
     out: Annotated[Path | None, out_file_option("Write the result as JSON here too.")] = None,
     as_json: JsonOption = False,
@@ -187,12 +173,9 @@ def evaluate(
 
     if seeds < 1:
         raise UsageError(f"An evaluation needs at least one seed; received {seeds}.")
-    check_names(task, agents or [], task_file)
+    world.check(agents or [])
     touch = touch_of(list(agents or []))
-    env = make_env(
-        task, config=config, change=change, task_file=task_file, agents=agents or (), num_envs=envs, hand=hand,
-        device=device, **touch,
-    )  # fmt: skip
+    env = world.make(agents or (), num_envs=envs, device=device, **touch)
     contacts = contacts_name(env.task.contacts)
     names = ["zero", "random", *(name for name in agents or [] if name not in ("zero", "random"))]
     found: list[dict[str, Any]] = []

@@ -37,8 +37,9 @@ def report(
     Goals reached, rotation about the commanded axis (rad/s, while anything touched the object), seconds until the
     object dropped and the return follow. Intervals are t intervals over training seeds, with one training seed
     intervals over episodes. Of several runs of one training seed the longest counts. Agents in agents.json files,
-    which brainbench policy evaluate --out writes, stand beside the students. Differences are held against the spread
-    between training seeds pooled over all students of a task and hand, p corrected for the pairs (Holm).
+    which brainbench policy evaluate --out writes, stand beside the students. Differences are those of a mixed model of
+    all students of a task and hand, with draws of encoders and training seeds as random factors; p is corrected for the
+    pairs (Holm).
     """
     from robotics_bridge.policies import report as students
 
@@ -56,7 +57,7 @@ def report(
         written = [str(write_record(record, records)) for record in students.records(results)]
     data = [
         {
-            "student": result.config.name.rpartition("_seed")[0], "success": result.value, "seeds": result.seeds,
+            "student": result.name, "success": result.value, "seeds": result.seeds,
             "interval": result.interval, "over_none": result.difference, "gain": result.gain,
             "episodes": result.episodes, "metric": result.metric, "note": result.note, "iterations": result.iterations,
             "per_seed": [
@@ -75,7 +76,7 @@ def report(
             "first": "{0[first]}",
             "second": "{0[second]}",
             ">success": "{0[difference]:+.3f}",
-            ">95 % interval": lambda item: "[{:+.3f}, {:+.3f}]".format(*item["interval"]),
+            ">95 % interval": lambda item: "–" if (i := item["interval"]) is None else f"[{i[0]:+.3f}, {i[1]:+.3f}]",
             ">p (Holm)": "{0[p]:.2g}",
         }
         lines.append("\n" + table_of("First less second", pairs, shown))
@@ -88,25 +89,25 @@ def _pairs(results: Sequence[StudentResult]) -> list[dict[str, Any]]:
     from itertools import combinations, groupby
 
     from brainbench.metrics.inference.multiple import adjust
-    from robotics_bridge.policies.contrasts import contrast, pooled_spread
+    from robotics_bridge.policies.report import mixed_model
 
     found = []
     for place, members in groupby(results, key=lambda result: result.world):
         group = list(members)
-        spread, freedom = pooled_spread([result.success for result in group])
-        pairs = list(combinations(group, 2))
-        tested = [contrast(one.success, other.success, spread, freedom) for one, other in pairs]
+        model, pairs = mixed_model(group), list(combinations(group, 2))
+        tested = [model.contrast(one.name, other.name) for one, other in pairs]
         for (one, other), item, p in zip(pairs, tested, adjust([item.p for item in tested], "holm"), strict=True):
             names = [_short(result, place) for result in (one, other)]
+            interval = None if item.interval is None else (item.interval.low, item.interval.high)
             found.append(
                 {
                     "task": place[0], "hand": place[1], "contacts": place[2], "first": names[0], "second": names[1],
-                    "difference": item.difference, "interval": (item.interval.low, item.interval.high), "p": float(p),
-                    "spread": spread, "degrees_of_freedom": freedom,
+                    "difference": item.difference, "interval": interval, "p": float(p), "spread": model.spread,
+                    "degrees_of_freedom": item.freedom,
                 }
             )  # fmt: skip
     return found
 
 
 def _short(result: StudentResult, place: tuple[str, str, str]) -> str:
-    return result.config.name.rpartition("_seed")[0].removeprefix("_".join(place[:2]) + "_")
+    return result.name.removeprefix("_".join(place[:2]) + "_")

@@ -12,13 +12,10 @@ from brainbench.cli.destinations import out_folder, out_folder_option
 from brainbench.cli.options import part_of, with_options
 from brainbench.cli.output import JsonOption, emit, facts, progress_bar, table
 from brainbench.cli.policy.options import (
-    ChangeOption,
-    ConfigOption,
     DeviceOption,
-    HandOption,
     TaskArgument,
-    TaskFileOption,
-    make_env,
+    World,
+    in_world,
 )
 
 
@@ -26,21 +23,18 @@ from brainbench.cli.policy.options import (
     "robotics_bridge.policies.training.teacher:TeacherRun",
     ("iterations", "minutes", "start", "start_std", "observe", "loggers", "save_every", "seed"),
 )
+@in_world
 def train(
-    task: TaskArgument,
+    world: World,
     options: Any,
     out: Annotated[Path | None, out_folder_option("Folder of the run; started again, it goes on.")] = None,
     envs: Annotated[int | None, typer.Option("--envs", help="Environments at once (published: 8192).")] = None,
-    hand: HandOption = "xhand1",
-    config: ConfigOption = "default",
-    task_file: TaskFileOption = None,
     steps: Annotated[int | None, typer.Option(help="Control steps per environment and iteration.")] = None,
     curiosity: Annotated[float | None, typer.Option(help="Weight of the RND reward (published: 100).")] = None,
     touch: Annotated[str, typer.Option(help="Tactile observation type of touch.")] = "agg_bool",
     placement: Annotated[str, typer.Option(help="Place of the taxels: hand, fingers, tips or palm.")] = "hand",
     resolution: Annotated[str, typer.Option(help="Number of taxels: low, med or high.")] = "med",
     initial_std: Annotated[float | None, typer.Option(help="Of the first policy's actions (published: 1).")] = None,
-    change: ChangeOption = None,
     device: DeviceOption = "cpu",
     as_json: JsonOption = False,
 ) -> None:
@@ -54,14 +48,11 @@ def train(
 
     count = envs or (8192 if device != "cpu" else 64)
     senses = {"observe": touch, "placement": placement, "resolution": resolution} if "touch" in options.observe else {}
-    env = make_env(
-        task, config=config, change=change, task_file=task_file, num_envs=count, hand=hand, device=device,
-        seed=options.seed, **senses,
-    )  # fmt: skip
+    env = world.make(num_envs=count, device=device, seed=options.seed, **senses)
     given: dict[str, Any] = {"steps_per_env": steps, "rnd_weight": curiosity, "initial_std": initial_std}
     chosen = {name: value for name, value in given.items() if value is not None}
     settings = replace(env.task.teacher, num_envs=count, **chosen)
-    run = out or Path("runs") / f"{task}-{env.hand.name}-{options.seed}"
+    run = out or Path("runs") / f"{world.task}-{env.hand.name}-{options.seed}"
     with progress_bar() as progress:
         result = teacher.train(env, run, options, settings=settings, progress=progress)
     last = dict(result.history[-1]) if result.history else {}

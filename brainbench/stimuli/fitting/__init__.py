@@ -36,15 +36,4 @@ __all__ = [
     "read_wrenches",
 ]
 
-_MODULES = {
-    ".contacts": ("ContactOptions", "find_contacts"),
-    ".least_squares": ("fit",),
-    ".options": ("FitOptions",),
-    ".result": ("FittedParameter", "FitResult"),
-    ".tracks.contract": ("new_shapes", "new_wrenches"),
-    ".tracks.options": ("TrackOptions",),
-    ".tracks.readers": ("read_shapes",),
-    ".tracks.wrenches": ("read_wrenches",),
-    ".trials": ("Trial",),
-}
-__getattr__, __dir__ = lazy_exports(__name__, {name: module for module, names in _MODULES.items() for name in names})
+__getattr__, __dir__ = lazy_exports(__name__)

@@ -401,8 +401,7 @@ class _Reservoir(TactileEncoder):
 
     def forward(self, taxels: torch.Tensor, h_in: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         felt = self.scale(self._sites(taxels)).flatten(1)
-        # A quarter of the cells or fewer are touched at a time, so the drive is of the order of 1.
-        h_out = self.echo(2.0 * felt.shape[1] ** -0.5 * (felt @ self.echo.inputs), h_in)
+        h_out = self.echo(self.echo.drive(felt), h_in)
         return self.project(self.norm(h_out)), h_out
 
 

@@ -37,6 +37,13 @@ class EchoState(nn.Module):
             # Not weights: they follow from the seed, so files of weights need not hold them.
             self.register_buffer(name, value, persistent=False)
 
+    def drive(self, x: torch.Tensor) -> torch.Tensor:
+        """Return the drive u [B, U] of inputs [B, I] of which those that are not silent have an rms of 1.
+
+        A quarter of a hand's sites or fewer are touched at a time, so that it is of the order of 1.
+        """
+        return 2.0 * x.shape[-1] ** -0.5 * (x @ self.inputs)
+
     def forward(self, drive: torch.Tensor, state: torch.Tensor) -> torch.Tensor:
         """Return the state [B, U] after one step of a drive u [B, U]."""
         return (1 - _LEAK) * state + _LEAK * torch.tanh(drive + state @ self.inner + self.offset)

@@ -75,8 +75,7 @@ def reservoir(rollout: TouchRollout, grid: TaxelGrid, calibration: HandCalibrati
     unit = [calibration.force if name.startswith("F") else calibration.moment for name in CHANNELS] * slots
     felt = (grid(rollout.taxels.flatten(0, 1)).cpu() / torch.tensor(unit).view(-1, 1, 1)).flatten(1)
     echo = EchoState(felt.shape[1], seed=seed)
-    drive = felt @ echo.inputs
-    drive = (drive / drive.square().mean().sqrt().clamp(min=1e-12)).unflatten(0, rollout.taxels.shape[:2])
+    drive = echo.drive(felt).unflatten(0, rollout.taxels.shape[:2])
     state, found = drive.new_zeros(drive.shape[1:]), []
     for now, first in zip(drive, rollout.begun.cpu(), strict=True):
         state = echo(now, torch.where(first[:, None], 0.0, state))
@@ -91,6 +90,7 @@ class Subject:
     rollout: TouchRollout
     grid: TaxelGrid
     calibration: HandCalibration
+    """Of other episodes (:func:`~robotics_bridge.policies.readouts.rollout.calibrate`)."""
     links: tuple[int, ...]
     """Taxels of each link."""
     reservoirs: int

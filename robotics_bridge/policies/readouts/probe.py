@@ -1,4 +1,4 @@
-"""A probe: one rollout, every arm, and the differences between arms.
+"""A probe: one rollout, every arm or placement, and their differences.
 
 Letters: T control step, B environment, S sub-step, N taxel, F feature, D number of a target, K draw.
 """
@@ -6,7 +6,7 @@ Letters: T control step, B environment, S sub-step, N taxel, F feature, D number
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -15,12 +15,21 @@ import torch
 from brainbench.core.errors import UsageError, check_name
 from brainbench.core.progress import Progress
 from robotics_bridge.envs.env import Env
-from robotics_bridge.policies.encoders.calibration import HandCalibration
+from robotics_bridge.hands.layouts import PLACEMENTS, Layout
 from robotics_bridge.policies.encoders.taxel_grid import TaxelGrid
 from robotics_bridge.policies.evaluate import Acting
-from robotics_bridge.policies.readouts.arms import ARMS, Subject
+from robotics_bridge.policies.readouts.arms import ARMS, Features, Subject
+from robotics_bridge.policies.readouts.placement import (
+    HALVES,
+    Placed,
+    check_count,
+    choose_taxels,
+    part_of_layout,
+    read_placements,
+    taxel_features,
+)
 from robotics_bridge.policies.readouts.regression import FOLDS, Readout, read_targets
-from robotics_bridge.policies.readouts.rollout import TARGETS, collect
+from robotics_bridge.policies.readouts.rollout import TARGETS, TouchRollout, calibrate, collect
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -34,18 +43,47 @@ class ProbeOptions:
     untrained: int = 5
     """Initial states of the untrained network."""
     seed: int = 0
-    """Seed of the bootstrap and of the reservoirs."""
+    """Seed of the episodes, of the reservoirs and of random placements."""
     arms: tuple[str, ...] = ()
     """Arms of :data:`ARMS`; all by default."""
+    place: int | None = None
+    """Choose so many taxels, and compare them with all and with others, in place of the arms."""
+    draws: int = 10
+    """Random placements of so many taxels."""
 
     def __post_init__(self) -> None:
         for name in self.arms:
             check_name("arm of a probe", name, ARMS)
-        if not (0.5 <= self.seconds <= 600 and self.reservoirs >= 1 and self.untrained >= 1):
+        if self.place is not None and self.arms:
+            raise UsageError("A probe either compares arms or places taxels; received both.")
+        if not (0.5 <= self.seconds <= 600 and min(self.reservoirs, self.untrained, self.draws) >= 1):
             raise UsageError(
-                "A probe takes 0.5 to 600 seconds and at least one draw of each random arm; received "
-                f"{self.seconds:g} s, {self.reservoirs} reservoirs and {self.untrained} untrained networks."
+                "A probe takes 0.5 to 600 seconds and at least one draw of what is random; received "
+                f"{self.seconds:g} s, {self.reservoirs} reservoirs, {self.untrained} untrained networks and "
+                f"{self.draws} placements."
             )
+
+
+def check_environments(env: Env, parts: int = 1) -> int:
+    """Return the fewest environments of a probe in so many parts; raise UsageError if there are fewer."""
+    least = 2 * FOLDS * parts
+    if env.num_envs < least:
+        raise UsageError(f"A probe needs at least {least} environments; received {env.num_envs}.")
+    return least
+
+
+def roll_out(env: Env, policy: Acting, options: ProbeOptions, parts: int = 1) -> TouchRollout:
+    """Roll a policy out once; what is read is known wherever ``valid`` is.
+
+    Raises:
+        UsageError: each of so many parts of the environments needs at least twice :data:`FOLDS` that touch the object.
+    """
+    least = check_environments(env, parts)
+    found = collect(env, policy, options.seconds)
+    valid = found.valid & ~found.wanted.isnan().any(-1)
+    if int((valid.sum(0) > 0).sum()) < least:
+        raise UsageError("The object is touched in too few environments; take a policy that holds it, or more of them.")
+    return replace(found, valid=valid)
 
 
 @torch.no_grad()
@@ -53,31 +91,60 @@ def probe(env: Env, policy: Acting, options: ProbeOptions, progress: Progress | 
     """Roll a policy out once and read the targets from every arm.
 
     Raises:
-        UsageError: the environment does not fit, or fewer environments than :data:`FOLDS` touch the object.
+        UsageError: the environment does not fit, or too few environments touch the object.
         DataError: nothing is touched.
     """
-    if env.num_envs < 2 * FOLDS:
-        raise UsageError(f"A probe needs at least {2 * FOLDS} environments; received {env.num_envs}.")
+    check_environments(env)
     say = progress or (lambda done, total, what: None)
     names = options.arms or tuple(ARMS)
     say(0, len(names) + 1, "rolling out")
-    rollout = collect(env, policy, options.seconds)
-    touch, kind = env.options, env.hand.layout(env.options.resolution, env.options.placement)
+    touch, layout = env.options, env.hand.layout(env.options.resolution, env.options.placement)
     grid = TaxelGrid(env.hand, placement=touch.placement, resolution=touch.resolution).to(env.device)
-    calibration = HandCalibration.fit(grid(rollout.taxels.flatten(0, 1)).cpu())
-    links = tuple(int(probes.active.sum()) for probes in kind.values())
+    calibration = calibrate(env, policy, grid, options.seed)
+    rollout = roll_out(env, policy, options)
+    links = tuple(int(probes.active.sum()) for probes in layout.values())
     subject = Subject(rollout, grid, calibration, links, options.reservoirs, options.untrained, options.seed)
-    wanted = torch.cat([rollout.targets[name] for name in TARGETS], -1)
-    valid = rollout.valid & ~wanted.isnan().any(-1)
-    if int((valid.sum(0) > 0).sum()) < 2 * FOLDS:
-        raise UsageError("The object is touched in too few environments; take a policy that holds it, or more of them.")
     found = []
     for index, name in enumerate(names):
         say(index + 1, len(names) + 1, f"reading {name}")
-        draws = ARMS[name](subject)
-        solved = [read_targets(rollout.proprio, draw, wanted, valid) for draw in draws]
-        found.append(Readout(name, draws[0].shape[-1], np.stack([one for one, _ in solved]), solved[0][1]))
+        found.append(read_arm(name, rollout, ARMS[name](subject)))
     return found
+
+
+def read_arm(name: str, rollout: TouchRollout, draws: Sequence[Features]) -> Readout:
+    """Return what is read from an arm's features, once for each draw."""
+    solved = [read_targets(rollout.proprio, draw, rollout.wanted, rollout.valid) for draw in draws]
+    return Readout(name, draws[0].shape[-1], np.stack([one for one, _ in solved]), solved[0][1])
+
+
+@torch.no_grad()
+def place(
+    env: Env, policy: Acting, options: ProbeOptions, progress: Progress | None = None
+) -> tuple[list[Placed], Layout]:
+    """Roll a policy out once, read the targets from placements of taxels, and return the layout chosen on all of it.
+
+    Beside all, chosen, random and evenly spread taxels stand the hand's own placements (fingers, tips, palm).
+
+    Raises:
+        UsageError: as for :func:`probe`, or the hand has fewer taxels.
+    """
+    count, layout = options.place, env.hand.layout(env.options.resolution, env.options.placement)
+    if count is None:
+        raise UsageError("Say how many taxels are to be placed.")
+    check_count(layout, count)
+    say = progress or (lambda done, total, what: None)
+    say(0, 1, "rolling out")
+    rollout = roll_out(env, policy, options, HALVES)
+    owner = np.repeat(list(layout), [int(probes.active.sum()) for probes in layout.values()])
+    own = {name: np.flatnonzero(np.isin(owner, env.hand.links(name))).tolist() for name in PLACEMENTS}
+    others = {name: taxels for name, taxels in own.items() if 0 < len(taxels) < len(owner)}
+    found = read_placements(
+        rollout, layout, count, others=others, draws=options.draws, seed=options.seed, progress=progress
+    )
+    say(1, 1, "choosing taxels on all environments")
+    features = taxel_features(rollout)
+    best = choose_taxels(rollout.proprio, features, rollout.wanted, rollout.valid, count)
+    return found, part_of_layout(layout, best)
 
 
 CONTRASTS = (
@@ -105,3 +172,10 @@ def differences(readouts: Sequence[Readout]) -> list[dict[str, Any]]:
     """Return the differences of :data:`CONTRASTS` whose two arms are there."""
     by_name = {one.arm: one for one in readouts}
     return [plain(by_name[a], by_name[b]) for a, b in CONTRASTS if a in by_name and b in by_name]
+
+
+def placements(found: Sequence[Placed]) -> dict[str, Any]:
+    """Return placements and their differences from all taxels as plain numbers."""
+    every = next(one for one in found if one.name == "all")
+    rows = [plain(one.readout) | {"taxels": len(one.taxels[0]), "indices": one.taxels} for one in found]
+    return {"arms": rows, "differences": [plain(one.readout, every.readout) for one in found if one is not every]}

@@ -6,20 +6,22 @@ these alone. Letters: T control step, B environment, F feature, D number of a ta
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.special import stdtrit
 
 from robotics_bridge.policies.readouts.rollout import TARGETS
 
 FOLDS = 5
+FARTHEST = 10.0
+"""Standard deviations to which features are cut."""
 PENALTIES = (1e-3, 1e-2, 1e-1, 1.0, 10.0, 100.0)
 """Ridge penalties that are tried, per sample."""
-_DRAWS = 2000
-"""Bootstrap draws of an interval."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,33 +38,45 @@ class Readout:
 
     def r2(self, target: str) -> float:
         """Return R², the mean of the target's three axes and of the draws."""
-        return float(self._r2(target, np.arange(len(self.errors)), np.arange(self.spread.shape[0])))
+        return float(np.mean(self.per_draw(target)))
 
     def per_draw(self, target: str) -> list[float]:
         """Return R² of each draw."""
-        every = np.arange(self.spread.shape[0])
-        return [float(self._r2(target, np.array([draw]), every)) for draw in range(len(self.errors))]
+        return [float(value) for value in self._r2(self._of(target, self.errors).sum(1), self._of(target).sum(0))]
 
-    def _r2(self, target: str, draws: NDArray[np.int64], rows: NDArray[np.int64]) -> float:
+    def _of(self, target: str, values: NDArray[np.float64] | None = None) -> NDArray[np.float64]:
         first = 3 * TARGETS.index(target)
-        columns = slice(first, first + 3)
-        lost = self.errors[draws][:, rows, columns].sum(axis=1)
-        return float((1 - lost / self.spread[rows, columns].sum(axis=0)).mean())
+        return (self.spread if values is None else values)[..., first : first + 3]
 
-    def interval(self, target: str, *, less: Readout | None = None, seed: int = 0) -> tuple[float, float]:
+    @staticmethod
+    def _r2(lost: NDArray[np.float64], spread: NDArray[np.float64]) -> NDArray[np.float64]:
+        return (1 - lost / spread).mean(-1)
+
+    def _without_each(self, target: str) -> NDArray[np.float64]:
+        """Return R² [B] of all draws without each environment in turn."""
+        lost, spread = self._of(target, self.errors).mean(0), self._of(target)
+        return self._r2(lost.sum(0) - lost, spread.sum(0) - spread)
+
+    def interval(self, target: str, *, less: Readout | None = None) -> tuple[float, float]:
         """Return the 95 % interval of R², or of the difference from another arm of the same rollout.
 
-        Bootstrap over environments and draws; both arms of a difference keep the same environments.
+        Environments and draws are both sampled: the variances over environments (jackknife; both arms of a difference
+        keep the same ones) and over the draws of each arm are added, with Welch and Satterthwaite's degrees of freedom.
+        An arm of one draw is that network alone, whatever others would give.
         """
-        rng, found = np.random.default_rng(seed), []
-        for _ in range(_DRAWS):
-            rows = rng.integers(self.spread.shape[0], size=self.spread.shape[0])
-            value = self._r2(target, rng.integers(len(self.errors), size=len(self.errors)), rows)
-            if less is not None:
-                value -= less._r2(target, rng.integers(len(less.errors), size=len(less.errors)), rows)
-            found.append(value)
-        low, high = np.quantile(found, (0.025, 0.975))
-        return float(low), float(high)
+        value, left = self.r2(target), self._without_each(target)
+        if less is not None:
+            value, left = value - less.r2(target), left - less._without_each(target)
+        count = len(left)
+        parts = [((count - 1) / count * float(((left - left.mean()) ** 2).sum()), count - 1)]
+        drawn = (one.per_draw(target) for one in (self, less) if one is not None and len(one.errors) > 1)
+        parts += [(float(np.var(draws, ddof=1)) / len(draws), len(draws) - 1) for draws in drawn]
+        total = sum(part for part, _ in parts)
+        if total == 0:
+            return value, value
+        freedom = total**2 / sum(part**2 / own for part, own in parts)
+        half = float(stdtrit(freedom, 0.975)) * math.sqrt(total)
+        return value - half, value + half
 
 
 def read_targets(
@@ -103,7 +117,7 @@ def _ridge(x: torch.Tensor, y: torch.Tensor, valid: torch.Tensor) -> Callable[[t
 
     def standard(values: torch.Tensor) -> torch.Tensor:
         # A taxel that was hardly ever touched would otherwise throw a prediction where it is.
-        return ((values[..., used] - mean[used]) / scale[used]).clamp(-10, 10)
+        return ((values[..., used] - mean[used]) / scale[used]).clamp(-FARTHEST, FARTHEST)
 
     z = standard(rows)
     gram, products = z.T @ z / len(z), z.T @ (aim - centre) / len(z)

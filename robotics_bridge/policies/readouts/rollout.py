@@ -13,10 +13,14 @@ import torch
 
 from brainbench.core.errors import UsageError
 from robotics_bridge.envs.env import Env
+from robotics_bridge.policies.encoders.calibration import HandCalibration
+from robotics_bridge.policies.encoders.taxel_grid import TaxelGrid
 from robotics_bridge.policies.evaluate import Acting
 
 TARGETS = ("position", "velocity", "spin", "contact")
 """Object (m, m/s, rad/s), and the centre of the contact forces on it (m), [3] each, world axes."""
+CALIBRATION_SECONDS = 2.0
+"""Length of the episodes of a calibration."""
 _SETTLING = 10
 """Control steps after an episode's start that are left out: the object falls onto the palm."""
 
@@ -35,6 +39,11 @@ class TouchRollout:
     """Name → [T, B, 3]; NaN where undefined."""
     valid: torch.Tensor
     """[T, B] bool: past the settling of its episode."""
+
+    @property
+    def wanted(self) -> torch.Tensor:
+        """All targets side by side [T, B, D], in the order of :data:`TARGETS`."""
+        return torch.cat([self.targets[name] for name in TARGETS], -1)
 
 
 @torch.no_grad()
@@ -65,6 +74,21 @@ def collect(env: Env, policy: Acting, seconds: float) -> TouchRollout:
     stacked = {name: torch.stack(rows) for name, rows in kept.items()}
     targets = {name: stacked.pop(name) for name in TARGETS}
     return TouchRollout(targets=targets, **stacked)
+
+
+@torch.no_grad()
+def calibrate(env: Env, policy: Acting, grid: TaxelGrid, seed: int) -> HandCalibration:
+    """Return the unit of force and moment of episodes of another seed, in which nothing is read; then begin anew.
+
+    As students, encoders know their unit before the episodes in which they are tried.
+
+    Raises:
+        DataError: nothing is touched.
+    """
+    env.seed(seed + 1)
+    felt = collect(env, policy, CALIBRATION_SECONDS).taxels
+    env.seed(seed)
+    return HandCalibration.fit(grid(felt.flatten(0, 1)).cpu())
 
 
 def _centre(env: Env, age: torch.Tensor) -> torch.Tensor:

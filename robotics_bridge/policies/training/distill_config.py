@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
 from typing import Any
 
 from brainbench.core.errors import check_name
 from brainbench.core.reading.ranges import check_number
+from brainbench.models.architecture import Architecture
 from robotics_bridge.hands.observations import observation_type
 from robotics_bridge.policies.contract import MOST_TWIST
-from robotics_bridge.policies.encoders.arms import AUTO, EncoderConfig
+from robotics_bridge.policies.encoders.arms import ARMS, AUTO, EncoderConfig
 from robotics_bridge.policies.student import EMBEDDERS
 from robotics_bridge.sensors.taxels.sensors import PUBLISHED_TWIST
 from robotics_bridge.tasks.contact_model import CONTACTS
@@ -40,7 +43,7 @@ class DistillConfig:
     placement: str = "hand"
     """Place of the taxels: ``tips``, ``fingers``, ``palm`` or ``hand``."""
     resolution: str = "med"
-    """Number of taxels: ``low``, ``med`` or ``high``."""
+    """Number of taxels: ``low``, ``med`` or ``high``; or a probe file (``.json``)."""
     noisy: bool = False
     """Taxels with the published noise (table 4.12)."""
     twist: float | None = None
@@ -144,15 +147,32 @@ class DistillConfig:
         return EncoderConfig.of({"seed": self.seed, **self.encoder_settings, "name": self.encoder, **shared})
 
     @property
+    def draw(self) -> str | None:
+        """What was drawn for the encoder: weights, or a seed; None for encoders that are learned with the policy."""
+        tactile = self.tactile
+        if tactile is None or (tactile.arm in ARMS and tactile.arm != "reservoir"):
+            return None
+        tagged = tactile.arm if ":" in tactile.arm or Architecture.parse(tactile.arm).tag else None
+        return tactile.pretrained or tagged or f"seed {tactile.seed}"
+
+    @property
     def name(self) -> str:
         """Name that distinguishes the student from its neighbours, for folders and reports."""
         parts = [self.task, self.hand, self.observe]
         if self.tactile is not None:
             learning = f"-{self.tactile.learning}" if "learning" in self.encoder_settings else ""
             arm = self.tactile.arm.replace("/", "-").replace(":", "-")
-            parts += [self.placement, self.resolution, "noisy" if self.noisy else "clean", f"{arm}{learning}"]
+            parts += [
+                self.placement,
+                Path(self.resolution).stem,
+                "noisy" if self.noisy else "clean",
+                f"{arm}{learning}",
+            ]
         parts += [] if self.contacts in (None, "firm") else [self.contacts]
-        return "_".join([*parts, f"seed{self.seed}"])
+        parts.append(f"seed{self.seed}")
+        drawn = self.encoder_settings.get("pretrained") or self.encoder_settings.get("seed", self.seed)
+        parts += [f"draw-{re.sub(r'[^A-Za-z0-9]+', '-', str(drawn)).strip('-')}"] if drawn != self.seed else []
+        return "_".join(parts)
 
     def share(self, iteration: int) -> float:
         """Return the teacher's share of the actions in an iteration (from 0)."""

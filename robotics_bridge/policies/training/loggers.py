@@ -34,11 +34,13 @@ def check_loggers(names: Iterable[str]) -> None:
 
 
 class Loggers:
-    """Writes the numbers of each iteration of the run in a folder; ``facts`` describe the run."""
+    """Writes the numbers of each iteration of the run in a folder; ``facts`` describe the run.
+
+    Names are those that :func:`check_loggers` lets through.
+    """
 
     def __init__(self, run: Path, names: Iterable[str], facts: Mapping[str, Any]) -> None:
         self._run, self._names = run, tuple(names)
-        check_loggers(self._names)
         self._board: Any = None
         self._wandb: Any = None
         if "tensorboard" in self._names:

@@ -53,7 +53,7 @@ class StudentSweep:
     extra_types: tuple[str, ...] = ()
     """Types beyond the published ones."""
     resolutions: tuple[str, ...] = ("med",)
-    """Resolutions of the taxels, in the subset ``all`` and in that of one type."""
+    """Resolutions of the taxels, or probe files, in the subset ``all`` and in that of one type."""
     noisy: tuple[bool, ...] = (False,)
     """Without noise, with it, or both; in the same subsets."""
     seeds: tuple[int, ...] = (0,)
@@ -154,7 +154,7 @@ def _sweep(path: Path, document: Mapping[str, Any]) -> StudentSweep:
         observation_type(kind)
     for entry in entries:
         for placement, resolution in product(entry.placements, (*sweep.resolutions, sweep.pinned_resolution)):
-            check_names(resolution, placement)
+            check_names("med" if resolution.endswith(".json") else resolution, placement)
     for arm in sweep.arms:
         if "encoder" not in arm:
             raise UsageError(f"An arm of the sweep {path.name!r} names no 'encoder': {shown(dict(arm))}.")

@@ -14,7 +14,7 @@ from robotics_bridge.policies.evaluate import agent
 from robotics_bridge.policies.readouts import arms
 from robotics_bridge.policies.readouts.probe import ProbeOptions, probe
 from robotics_bridge.policies.readouts.regression import Readout, read_targets
-from robotics_bridge.policies.readouts.rollout import TARGETS, TouchRollout
+from robotics_bridge.policies.readouts.rollout import TARGETS, TouchRollout, calibrate, collect
 
 
 def _made(seed: int = 0, steps: int = 40, envs: int = 20) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
@@ -116,3 +116,18 @@ def test_options_of_a_probe_name_the_culprit() -> None:
         ProbeOptions(arms=("resevoir",))
     with pytest.raises(UsageError, match=r"received 0\.1 s"):
         ProbeOptions(seconds=0.1)
+
+
+def test_what_is_read_does_not_set_the_unit_of_the_encoders() -> None:
+    env = tasks.make(
+        "in_palm_rotate", num_envs=4, observe="force_torque", placement="tips", resolution="low", threads=1, seed=3
+    )
+    policy, grid = agent("random", env), TaxelGrid("xhand1", placement="tips", resolution="low")
+    first = collect(env, agent("random", env), 0.5)
+    found = calibrate(env, policy, grid, 3)
+    assert found != HandCalibration.fit(grid(first.taxels.flatten(0, 1)))
+    # The episodes that follow are those of the seed, as if nothing had been calibrated.
+    env.seed(3)
+    again = collect(env, agent("random", env), 0.5)
+    env.seed(3)
+    torch.testing.assert_close(collect(env, agent("random", env), 0.5).taxels, again.taxels)

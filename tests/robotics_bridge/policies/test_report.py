@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 import pytest
 from scipy import stats
@@ -246,3 +248,42 @@ def test_missing_and_damaged_evaluations_are_named(tmp_path) -> None:
     path.write_text('[{"seed": 0}]')
     with pytest.raises(DataError, match=r"evaluation\.json' .*success"):
         read_results([tmp_path])
+
+
+def test_draws_of_an_encoder_are_crossed_with_training_seeds(tmp_path) -> None:
+    rng = np.random.default_rng(0)
+    for number, seed in itertools.product(range(3), range(3)):
+        share = round(20 * (0.5 + 0.1 * (number - 1) + rng.normal(0, 0.01))) / 20
+        settings = {"encoder": "reservoir", "encoder_settings": {"seed": number}}
+        _write(tmp_path / str(number), [share] * 3, seed=seed, **settings)
+    for seed in range(3):
+        _write(tmp_path, [0.4], seed=seed, observe="none")
+    drawn, bare = read_results([tmp_path])
+    # One student for each cell, none of them "trained once more", and three training seeds for the gain over no touch.
+    assert (len(drawn.success), drawn.left_out) == (9, ())
+    assert len({config.name for config in drawn.configs}) == 9
+    assert drawn.gain == pytest.approx(drawn.value - bare.value)
+    # Nine students of three networks tell as much as three networks do.
+    assert drawn.interval is not None
+    assert "draw" in drawn.interval.method
+    assert drawn.interval.high - drawn.interval.low > 0.25
+    (subjects, _) = (record.score.subjects for record in records([drawn, bare]))
+    assert [one.subject for one in subjects][:2] == ["seed 0, seed 0", "seed 0, seed 1"]
+
+
+@pytest.mark.parametrize(
+    ("settings", "draw"),
+    [
+        ({"encoder": "mlp"}, None),
+        ({"observe": "none"}, None),
+        ({"encoder": "reservoir"}, "seed 2"),
+        ({"encoder": "zhuang-small", "encoder_settings": {"seed": 7}}, "seed 7"),
+        ({"encoder": "zhuang-small.simclr"}, "zhuang-small.simclr"),
+        ({"encoder": "zhuang-small.simclr", "encoder_settings": {"pretrained": "runs/b/model.safetensors"}}, "runs/b/"),
+    ],
+)
+def test_what_was_drawn_for_a_student(settings, draw) -> None:
+    config = DistillConfig(task="in_palm_rotate", seed=2, **settings)
+    assert (config.draw or "").startswith(draw or "")
+    assert (config.draw is None) == (draw is None)
+    assert ("draw-" in config.name) == ("encoder_settings" in settings)

@@ -78,3 +78,11 @@ def test_a_file_of_ones_own_expands_and_its_faults_are_named(tmp_path) -> None:
         read_sweep(tmp_path / "none.toml")
     with pytest.raises(UsageError, match="did you mean 'types'"):
         read_sweep().students("type")
+
+
+def test_a_sweep_may_name_a_probe_file_in_place_of_a_resolution(tmp_path) -> None:
+    path = tmp_path / "s.toml"
+    path.write_text('types = ["force_torque"]\nresolutions = ["med", "some/fifty.json"]\n' + ENTRY)
+    _, one, other = read_sweep(path).students("force_torque")
+    assert (one.resolution, other.resolution) == ("med", "some/fifty.json")
+    assert "_fifty_" in other.name
