@@ -19,6 +19,7 @@ def load_kernels(
     needs: int = MESHES,
     *,
     hinges: int = 2,
+    recorded: bool = False,
     compiling: Callable[[bool], None] | None = None,
     **options: Any,
 ) -> Any:
@@ -35,9 +36,10 @@ def load_kernels(
 
     with BUILDING:
         if device.is_cuda:
-            kernels = build_kernels(real, capacity, needs, cuda=True, hinges=hinges, **options)
+            kernels = build_kernels(real, capacity, needs, cuda=True, hinges=hinges, recorded=recorded, **options)
         else:
-            kernels = build_kernels(real, capacity, sliced=options.get("sliced", False), hinges=hinges)
+            sliced = options.get("sliced", False)
+            kernels = build_kernels(real, capacity, sliced=sliced, hinges=hinges, recorded=recorded)
     if device.is_cuda and options.get("sliced"):
         with kernels.loading, turn(device):
             _load_together(kernels, options["bounds"][0], device)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -16,31 +15,18 @@ from brainbench.core.devices import pick_device, usable_processors, warp
 from brainbench.core.progress import Progress as NamedProgress
 from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.engines.job_pool import run_groups
-from brainbench.stimuli.engines.motion_pieces import KNOT, Cutting
-from brainbench.stimuli.engines.planarity import stays_in_plane
 from brainbench.stimuli.engines.protocol import Job, Progress, Trace, WhiskerEngine
-from brainbench.stimuli.engines.reach import Reach, reachable
 from brainbench.stimuli.engines.rod.compilation import load_kernels
 from brainbench.stimuli.engines.rod.launch import LaunchResult, WhiskerSolver, real_type
-from brainbench.stimuli.engines.rod.limits import AHEAD, FINEST, WIDEST
-from brainbench.stimuli.engines.rod.packing import (
-    GRID,
-    PackedJobs,
-    PackedMotions,
-    Track,
-    body_track,
-    capacity_for,
-    follicle_track,
-    still_track,
-)
-from brainbench.stimuli.engines.rod.shapes import PackedShapes, PackedSurface, TrackedObstacle
-from brainbench.stimuli.engines.stepping import is_silent, silent_trace
+from brainbench.stimuli.engines.rod.limits import AHEAD
+from brainbench.stimuli.engines.rod.packing import Track, capacity_for
+from brainbench.stimuli.engines.rod.shapes import PackedSurface
+from brainbench.stimuli.engines.rod.tasks import JobTask, PackedTasks, make_task
+from brainbench.stimuli.engines.stepping import silent_trace
 from brainbench.stimuli.engines.sweep_batch import SweepBatch
-from brainbench.stimuli.engines.trust import Try, check_jobs, run_with_retries, step_travel
-from brainbench.stimuli.engines.units import MILLI
+from brainbench.stimuli.engines.trust import Try, check_jobs, run_with_retries
 from brainbench.stimuli.objects.solid import Solid
 from brainbench.stimuli.sweeps.sweep_scenes import SweepScenes
-from brainbench.stimuli.whiskers.chain import Chain
 
 SLICE = 65_536
 """Whiskers of one launch on a GPU: bounds the memory of a run."""
@@ -152,37 +138,17 @@ class RodEngine(WhiskerEngine):
         return batch
 
 
-@dataclass(frozen=True, eq=False)
-class _Task:
-    """A job that must be simulated."""
-
-    job: Job
-    chain: Chain
-    base: Track
-    bodies: tuple[TrackedObstacle, ...]
-    """What is in reach."""
-    names: tuple[int, ...]
-    """What tells these from other bodies."""
-    limit: NDArray[np.float64] | None
-    """[cell] longest step from each cell of the motions on (s); None for any."""
-    fast: tuple[float, float]
-    """When (s) an object first moves further against the whisker in the shortest step than contacts are looked for, inf
-    if never, and how far (m)."""
-    twists: bool
-    """Whether it may leave its plane, and may twist at this fidelity."""
-
-
 def _simulate(
     jobs: dict[int, Job], retry: int, fidelity: Fidelity, device: Any, record_shape: bool
 ) -> dict[int, Trace]:
     """Run jobs that share their readings and their capacity in one launch, and return their traces."""
-    tasks: dict[int, _Task] = {}
+    tasks: dict[int, JobTask] = {}
     traces: dict[int, Trace] = {}
     bodies: dict[Any, tuple[NDArray, Track]] = {}
     spent: dict[int, float] = {}
     for index, job in jobs.items():
         started = time.thread_time()
-        task = _task(job, fidelity, bodies)
+        task = make_task(job, fidelity, bodies)
         if task is None:
             traces[index] = silent_trace(job, fidelity, record_shape, time.thread_time() - started)
         else:
@@ -196,7 +162,7 @@ def _simulate(
 
 
 def _simulate_alike(
-    tasks: dict[int, _Task], seconds: NDArray, retry: int, fidelity: Fidelity, device: Any, record_shape: bool
+    tasks: dict[int, JobTask], seconds: NDArray, retry: int, fidelity: Fidelity, device: Any, record_shape: bool
 ) -> dict[int, Trace]:
     """Run tasks of which all or none twist in one launch; ``seconds`` [task] is the processor time of each so far."""
     given = list(tasks.values())
@@ -210,120 +176,27 @@ def _simulate_alike(
         return result.split(counts)
 
     result = run_with_retries(launch, retry, ahead=AHEAD[device.is_cuda])
-    found = (_trace(result, row, task.job, fidelity, seconds[row]) for row, task in enumerate(given))
+    found = (trace_of(result, row, task.job, fidelity, seconds[row]) for row, task in enumerate(given))
     return dict(zip(tasks, found, strict=True))
 
 
-def _task(job: Job, fidelity: Fidelity, bodies: dict[Any, tuple[NDArray, Track]]) -> _Task | None:
-    """Return what a job needs of its scene, None when it feels nothing.
-
-    ``bodies`` keeps anchor and track of obstacles that move by their id, of what stands still by its place.
-    """
-    start, stop = job.start, float(job.times[-1])
-    chain = fidelity.chain(job.whisker)
-    step = fidelity.step_of(chain)
-    cutting = Cutting(start, stop, step, fidelity.time_step)
-    base = follicle_track(job.follicle, job.whisker.arc_length, cutting)
-
-    # All that stands still is one body, near the base of the whisker and of its neighbours.
-    place = tuple((np.round(base.knots[0, :3] / GRID) * GRID / MILLI).tolist())
-    if place not in bodies:
-        bodies[place] = np.array(place), still_track(np.array(place))
-    moving = [obstacle for obstacle in job.obstacles if obstacle.motion is not None]
-    for obstacle in moving:
-        if id(obstacle) not in bodies:
-            anchor = obstacle.bounds.mean(axis=0)
-            bodies[id(obstacle)] = anchor, body_track(obstacle, anchor, cutting)
-    # What moves is looked at wherever its motion, or that of the base, has a knot.
-    ends = np.array([start, stop])
-    seen = np.unique(
-        np.concatenate([track.times for track in (base, *(bodies[id(item)][1] for item in moving))] + [ends])
-    )
-    position, euler = (np.asarray(values, dtype=float) for values in job.follicle.pose(seen))
-    reach = reachable(job.whisker, position, job.obstacles, seen, surfaces=True)
-    if is_silent(job, reach, position, euler):
-        return None
-    near = tuple(
-        TrackedObstacle(obstacle, *bodies[place if obstacle.motion is None else id(job.obstacles[which])])
-        for which, obstacle in zip(reach.indices, reach.obstacles, strict=True)
-    )
-    names = tuple(
-        id(part)
-        for body in near
-        for part in (body.track, body.obstacle.friction, body.obstacle.surface, *body.obstacle.parts)
-    )
-    per_period = fidelity.steps_per_period if fidelity.solver == "dynamic" else None
-    pieces = [track.pieces for track in (base, *(body.track for body in near)) if track.pieces is not None]
-    limits = [some.longest_steps(step, per_period) for some in pieces if some.needed.max() > 1]
-    limit = np.min(limits, axis=0) if limits else None
-    shortest = np.full(len(seen) - 1, step)
-    if limit is not None:
-        shortest = limit[np.clip(((seen[:-1] - start) / KNOT).astype(int), 0, len(limit) - 1)]
-    fast = _too_fast(job, reach, (position, euler), seen, shortest / FINEST)
-    twists = fidelity.twist is not False and not stays_in_plane(job, reach, position, euler, seen)
-    return _Task(job, chain, base, near, names, limit, fast, twists)
-
-
 def _launch(
-    tasks: Sequence[_Task], fidelity: Fidelity, device: Any, record_shape: bool, finer: NDArray[np.integer]
+    tasks: Sequence[JobTask], fidelity: Fidelity, device: Any, record_shape: bool, finer: NDArray[np.integer]
 ) -> tuple[LaunchResult, float]:
     """Simulate tasks and return their results, a row each, with the processor time (s) that it took.
 
     ``finer`` [task] divides their steps.
     """
     started = time.thread_time()
-    first = tasks[0].job
-    motions, shapes = PackedMotions(), PackedShapes()
-    chains: dict[Any, Chain] = {}
-    scenes: dict[Any, int] = {}
-    places = []
-    for task in tasks:
-        chains.setdefault(task.job.whisker, task.chain)
-        if task.names not in scenes:
-            scenes[task.names] = shapes.add_scene(task.bodies, motions)
-        places.append((list(chains).index(task.job.whisker), scenes[task.names], motions.add(task.base)))
-    whisker, scene, base = np.array(places, dtype=np.int32).T
-    count = len(tasks)
-    row = np.arange(count, dtype=np.int32)
-    loads, limits = [task.job.loads for task in tasks], [task.limit for task in tasks]
-    packed = PackedJobs(whisker, scene, base, row, np.zeros_like(row), finer, loads, limits)
+    packed = PackedTasks.of(tasks, finer)
     # Compiling is done once; it is no cost of a whisker.
     paused = time.thread_time()
-    solver = WhiskerSolver(list(chains.values()), fidelity, device, shapes.needs, twists=tasks[0].twists)
+    solver = WhiskerSolver(packed.chains, fidelity, device, packed.shapes.needs, twists=tasks[0].twists)
     started += time.thread_time() - paused
-    fast = np.array([task.fast for task in tasks])
-    result = solver.launch(
-        packed,
-        motions,
-        shapes,
-        first.times,
-        (count, 1),
-        start=first.start,
-        gravity=first.gravity,
-        fast_at=fast[:, :1],
-        travel=fast[:, 1:],
-        record_shape=record_shape,
-    )
-    return result, time.thread_time() - started
+    return packed.launch(solver, record_shape=record_shape), time.thread_time() - started
 
 
-def _too_fast(
-    job: Job, reach: Reach, pose: tuple[NDArray, NDArray], times: NDArray, shortest: NDArray
-) -> tuple[float, float]:
-    """Return :attr:`_Task.fast` from the base's ``pose`` at ``times`` [n] (s) and the shortest steps [n − 1] (s)."""
-    share = shortest / np.diff(times)
-    still = [obstacle for obstacle in reach.obstacles if obstacle.motion is None]
-    # Against all that stands still the whisker moves alike.
-    for obstacle in [*still[:1], *(obstacle for obstacle in reach.obstacles if obstacle.motion is not None)]:
-        # Ways between knots, scaled to the shortest step that a retry may take.
-        travel = step_travel(job.whisker, *pose, obstacle, times) * share
-        if (travel > WIDEST / MILLI).any():
-            first = int(np.argmax(travel > WIDEST / MILLI))
-            return float(times[first]), float(travel[first])
-    return math.inf, 0.0
-
-
-def _trace(result: LaunchResult, row: int, job: Job, fidelity: Fidelity, seconds: float) -> Trace:
+def trace_of(result: LaunchResult, row: int, job: Job, fidelity: Fidelity, seconds: float) -> Trace:
     """Return the trace of a job, NaN from where it cannot be trusted."""
     # Readings at the very moment of failure are not trusted either.
     good = job.times < result.verdict.until[row, 0] - 1e-9

@@ -175,49 +175,17 @@ class WhiskerSolver:
             travel, fast_at: [row, column] as in :class:`brainbench.stimuli.engines.trust.RunFacts`; never when None.
             record_shape: also return shapes and contact wrenches; jobs then stand in their rows in order.
         """
-        wp, structs, device = warp(), self.kernels.structs, self.device
+        device = self.device
         clock = [time.perf_counter()]
-        count, frames = len(jobs), len(readings)
-        options = structs.StepOptions()
-        options.quasistatic = int(self.quasistatic)
-        weight = LIGHT if self.quasistatic else 1.0
-        # Quasistatic whiskers have masses that are scaled by LIGHT; gravity is scaled back, so that their weight stays.
-        options.gravity = structs.vec3(*np.divide(gravity, MILLI * weight).tolist())
-        options.axes = structs.mat33(*(np.eye(3) if axes is None else axes).ravel().tolist())
-        options.shape = int(record_shape)
-        given = (
-            (structs.MotionArrays, motions.arrays()),
-            (structs.ShapeArrays, shapes.arrays()),
-            (structs.JobArrays, jobs.arrays(self.chains, self.steps[jobs.whisker], start)),
-            (structs.ReadingArrays, _readings(readings - start)),
-        )
-        shapes_of = dict.fromkeys((*_NUMBERS, *_COUNTS), count) | {
-            "wrench": (size[0], frames, size[1], 6),
-            "points": (frames, self.capacity + 1, count) if record_shape else (1, 1, 1),
-            "contact_wrench": (frames, 2, count) if record_shape else (1, 1, 1),
-        }
-        slices = None
-        with turn(device):
-            out = allocate(structs.ResultArrays, device, **shapes_of)
-            out.contact = wp.full((size[0], frames, size[1]), -1.0, dtype=self.real, device=device)
-            *scene, reading = [to_struct(kind, values, device) for kind, values in given]
-            problems = make_problems(self.kernels, self.capacity, count, device)
-            inputs = [self.chain_arrays, *scene, options, reading, out, problems]
-            if self.sliced:
-                urgent = bool((jobs.finer > 1).all())
-                slices = Slices(self.kernels, self.capacity, count, device, urgent=urgent, **self.tuning)
+        count = len(jobs)
+        inputs, out, shapes_of = self._upload(jobs, motions, shapes, readings, size, start, gravity, axes, record_shape)
         clock.append(time.perf_counter())
-        if slices is not None:
-            self.slices = slices.run(inputs, self.block["block_dim"])
-        else:
-            with turn(device):
-                wp.launch(self.kernels.run, count, [*inputs, structs.PausedWhiskers()], device=device, **self.block)
-                wp.synchronize_device(device)
+        slices = self._take_steps(inputs, count, urgent=bool((jobs.finer > 1).all()))
         clock.append(time.perf_counter())
         found = download({name: getattr(out, name) for name in (*shapes_of, "contact")}, slices and slices.stream)
         with turn(device):
             # What a GPU holds of this launch is given back in a turn too.
-            del out, scene, reading, problems, inputs, slices
+            del out, inputs, slices
         clock.append(time.perf_counter())
 
         def table(values: NDArray) -> NDArray:
@@ -247,8 +215,63 @@ class WhiskerSolver:
         if record_shape:
             result.points = np.moveaxis(found["points"].astype(float) / MILLI, 2, 0)
             forces = found["contact_wrench"].astype(float)
-            result.contact_wrench = np.moveaxis(forces, 2, 0).reshape(count, frames, 6)
+            result.contact_wrench = np.moveaxis(forces, 2, 0).reshape(count, len(readings), 6)
         return result
+
+    def _upload(
+        self,
+        jobs: PackedJobs,
+        motions: PackedMotions,
+        shapes: PackedShapes,
+        readings: NDArray[np.float64],
+        size: tuple[int, int],
+        start: float,
+        gravity: Sequence[float],
+        axes: NDArray[np.float64] | None,
+        record_shape: bool,
+    ) -> tuple[list[Any], Any, dict[str, Any]]:
+        """Return the arguments of the kernel but for the last, the results among them, and their shapes."""
+        wp, structs, device = warp(), self.kernels.structs, self.device
+        count, frames = len(jobs), len(readings)
+        options = structs.StepOptions()
+        options.quasistatic = int(self.quasistatic)
+        weight = LIGHT if self.quasistatic else 1.0
+        # Quasistatic whiskers have masses that are scaled by LIGHT; gravity is scaled back, so that their weight stays.
+        options.gravity = structs.vec3(*np.divide(gravity, MILLI * weight).tolist())
+        options.axes = structs.mat33(*(np.eye(3) if axes is None else axes).ravel().tolist())
+        options.shape = int(record_shape)
+        given = (
+            (structs.MotionArrays, motions.arrays()),
+            (structs.ShapeArrays, shapes.arrays()),
+            (structs.JobArrays, jobs.arrays(self.chains, self.steps[jobs.whisker], start)),
+            (structs.ReadingArrays, _readings(readings - start)),
+        )
+        shapes_of = dict.fromkeys((*_NUMBERS, *_COUNTS), count) | {
+            "wrench": (size[0], frames, size[1], 6),
+            "points": (frames, self.capacity + 1, count) if record_shape else (1, 1, 1),
+            "contact_wrench": (frames, 2, count) if record_shape else (1, 1, 1),
+        }
+        with turn(device):
+            out = allocate(structs.ResultArrays, device, **shapes_of)
+            out.contact = wp.full((size[0], frames, size[1]), -1.0, dtype=self.real, device=device)
+            *scene, reading = [to_struct(kind, values, device) for kind, values in given]
+            problems = make_problems(self.kernels, self.capacity, count, device)
+        return [self.chain_arrays, *scene, options, reading, out, problems], out, shapes_of
+
+    def _take_steps(self, inputs: list[Any], count: int, *, urgent: bool) -> Slices | None:
+        """Take all whiskers to their last reading; return the slices, if these are what it was done in."""
+        wp, device = warp(), self.device
+        if self.sliced:
+            with turn(device):
+                slices = Slices(self.kernels, self.capacity, count, device, urgent=urgent, **self.tuning)
+            self.slices = slices.run(inputs, self.block["block_dim"])
+            return slices
+        with turn(device):
+            wp.launch(
+                self.kernels.run, count, [*inputs, self.kernels.structs.PausedWhiskers()], device=device, **self.block
+            )
+            wp.synchronize_device(device)
+        return None
 
 
 def real_type(fidelity: Fidelity) -> type:

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from brainbench.core import rotations
+from brainbench.core.errors import UsageError
 from brainbench.stimuli.engines.motion_pieces import Cutting, MotionPieces, side_of
 from brainbench.stimuli.engines.protocol import Follicle, Load, base_rotation
 from brainbench.stimuli.engines.rod.limits import LIGHT
@@ -132,17 +133,56 @@ def still_track(place: NDArray[np.float64], quaternion: ArrayLike = (1.0, 0.0, 0
     return Track(still_knots(place, quaternion), np.zeros(1, dtype=np.int32), np.zeros(0))
 
 
+def knots_alike(
+    track: Track, pose: Pose, to_matrices: Callable[[NDArray], NDArray], span: tuple[float, float], what: str
+) -> NDArray[np.float64]:
+    """Return the knots [knot, 16] of another pose, where a track that begins and ends at ``span`` (s) has its own.
+
+    Raises:
+        UsageError: the track stands still or moves straight and the pose does not; ``what`` names it.
+    """
+    if track.pieces is None:
+        seen = np.linspace(*span, 17)
+        place, turn = pose(seen)
+        place, turn = np.asarray(place, dtype=float), to_matrices(np.asarray(turn, dtype=float))
+        if max(np.ptp(place, axis=0).max(), np.ptp(turn, axis=0).max()) > 1e-12:
+            raise UsageError(
+                f"A parameter moves {what}, which stands still at the given values; give values at which it moves."
+            )
+        knots = still_knots(place[0], rotations.from_matrices(turn[:1])[0])
+    else:
+        times, _ = track.pieces.times(span[0])
+        knots = _knots(pose, to_matrices, times, _sides(track.pieces))
+        if len(track.knots) == 1:
+            if not _is_straight(knots):
+                raise UsageError(
+                    f"A parameter bends the way of {what}, which is straight at the given values; give others."
+                )
+            knots = knots[:1]
+    # Both signs of a quaternion are the same turn.
+    return knots * np.where((knots[0, 6:10] @ track.knots[0, 6:10] < 0) & _QUATERNION, -1.0, 1.0)
+
+
+_QUATERNION = (np.arange(16) >= 6) & (np.arange(16) < 10)
+
+
+def _sides(pieces: MotionPieces) -> NDArray[np.float64]:
+    return side_of(np.append(np.repeat(pieces.count, pieces.count), pieces.count[-1]))
+
+
+def _is_straight(knots: NDArray[np.float64]) -> bool:
+    straight = np.abs(np.diff(knots[:, 3:6], axis=0)).max() < 1e-9 and not knots[:, 10:13].any()
+    # Further away one straight piece would lose digits.
+    return bool(straight and np.linalg.norm(knots[-1, :3] - knots[0, :3]) < 10 * GRID)
+
+
 def _track(pose: Pose, to_matrices: Callable[[NDArray], NDArray], pieces: MotionPieces, start: float) -> Track:
     times, cells = pieces.times(start)
     if not pieces.moves:
         place, turn = (np.asarray(values, dtype=float) for values in pose(times[:1]))
         return still_track(place[0], rotations.from_matrices(to_matrices(turn))[0])
-    sides = side_of(np.append(np.repeat(pieces.count, pieces.count), pieces.count[-1]))
-    knots = _knots(pose, to_matrices, times, sides)
-    straight = np.abs(np.diff(knots[:, 3:6], axis=0)).max() < 1e-9 and not knots[:, 10:13].any()
-    # Further away one straight piece would lose digits.
-    straight = straight and np.linalg.norm(knots[-1, :3] - knots[0, :3]) < 10 * GRID
-    return Track(knots[:1] if straight else knots, cells, times, pieces)
+    knots = _knots(pose, to_matrices, times, _sides(pieces))
+    return Track(knots[:1] if _is_straight(knots) else knots, cells, times, pieces)
 
 
 def _knots(

@@ -4,7 +4,7 @@
 accelerations without contact, ``broad_phase`` and ``narrow_phase`` (with ``distances`` and ``mesh_bvh``) where it may
 touch something, ``contact_problem``, ``delassus`` and ``contact_solver`` the contact forces. ``sleeping`` skips
 whiskers at rest; on a GPU ``scheduling`` pauses whiskers while kernels of ``narrow_phase`` and ``contact_solver`` find
-the distances and forces that they wait for.
+the distances and forces that they wait for. ``adjoint`` writes steps down and goes back over them.
 
 The modules are ordinary Warp code for the types and sizes in ``parameters``. :func:`specialize` loads them once for
 each precision and size, like a template.
@@ -39,6 +39,8 @@ class Kernels:
     """Threads that answer one distance query."""
     solve_contacts: tuple[tuple[Any, int], ...] = ()
     """Kernel and threads for one whisker, of each queue of contact problems."""
+    parameters: dict[str, Any] = field(default_factory=dict)
+    """What they were built for."""
     loading: threading.Lock = field(default_factory=threading.Lock)
 
 
@@ -65,6 +67,7 @@ def build_kernels(
     sliced: bool = False,
     cuda: bool = False,
     hinges: int = 2,
+    recorded: bool = False,
 ) -> Kernels:
     """Return the kernels for chains of at most ``capacity`` links in one precision; each is compiled by itself.
 
@@ -76,13 +79,16 @@ def build_kernels(
             done for all whiskers by kernels of their own; results are the same. One shape a scene.
         cuda: compile for a GPU: with approximate divisions and roots, and groups of threads that find contact forces.
         hinges: hinges of a joint, 2 for bending alone or 3 for bending and twist.
+        recorded: whether whiskers pause after some steps, which are written down for the adjoint; not with ``sliced``.
     """
     most = contacts_for(capacity)
     common = {"real": real, "capacity": capacity, "against": against, "sliced": sliced, "cuda": cuda, "hinges": hinges}
     whole = {"max_contacts": most, "bounds": bounds, **common}
+    if recorded:
+        whole["recorded"] = True
     run, structs = specialize("step", **whole).run, specialize("state", **whole)
     if not sliced:
-        return Kernels(run, structs)
+        return Kernels(run, structs, parameters=whole)
     # Threads of a group: for few contacts, for some and for many. A processor takes them one by one.
     sizes = (*GROUPS, (most, 8 if most <= 8 else 16)) if cuda else ((most, 1),)
     group = DISTANCE_GROUP if cuda else 1
@@ -97,3 +103,8 @@ def build_kernels(
             for rank, (held, size) in enumerate(sizes)
         ),
     )
+
+
+def build_adjoint(kernels: Kernels) -> ModuleType:
+    """Return the module ``adjoint.chain`` for kernels that record their steps."""
+    return specialize("adjoint.chain", **kernels.parameters)

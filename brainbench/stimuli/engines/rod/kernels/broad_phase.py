@@ -28,7 +28,7 @@ from .articulated_body import ChainState, ProximityState, hinge_direction
 from .distances import segments
 from .motion import BodyMotion, elapsed, instant, pose_from
 from .narrow_phase import link_shape_distance
-from .parameters import hinges, real, sliced
+from .parameters import hinges, real, recorded, sliced
 from .state import (
     WAIT_DISTANCES,
     WAIT_SLICE,
@@ -414,6 +414,9 @@ def find_candidates(
                             candidates.arc[slot] = taper.arc + taper.arc_length * share
                             candidates.object_velocity[slot] = object_velocity
                             candidates.normal[slot] = normal
+                            if wp.static(recorded):
+                                candidates.shape[slot] = s
+                                candidates.share[slot] = share
             proximity.clearance[i] = closest
     judge_overlap(state, deepest, crossing, base_gap, elapsed(now))
     return count

@@ -32,9 +32,12 @@ from .delassus import (
     store_forces,
     stride,
 )
-from .parameters import group_size, max_contacts, module_options, queue, real
+from .parameters import group_size, max_contacts, module_options, queue, real, recorded
 from .state import ContactProblems, PausedWhiskers, PerLinkJoint
 from .thread_groups import broadcast, group_max, group_or, group_sum, warp_max
+
+tolerance, tries, sweeps = (1e-12, 400, 400) if recorded else (1e-4, 8, SWEEPS)
+"""Steps that are recorded are solved to rounding: the adjoint is that of the solution."""
 
 
 @wp.func
@@ -99,7 +102,7 @@ def solve_single_contact(own6: vec6, bn: real, b1: real, b2: real, p0: real, q0:
                     moved_by = wp.abs(f1 - slip1) + wp.abs(f2 - slip2)
                     f1 = slip1
                     f2 = slip2
-                    if moved_by <= real(1e-4) * bound:
+                    if moved_by <= real(wp.static(tolerance)) * bound:
                         break
                 fn = wp.max(zero, -(bn + n1 * f1 + n2 * f2) / nn)
     # Two contacts at one point may leave nothing to divide by.
@@ -184,7 +187,7 @@ def gauss_seidel_sweep(
         solver.force_change = force_change
         solver.force_sum = force_sum
         # A tenth of a micrometre, or one part in ten thousand of the forces.
-        if gap_error <= real(1e-4) or force_change <= real(1e-4) * force_sum:
+        if gap_error <= real(wp.static(tolerance)) or force_change <= real(wp.static(tolerance)) * force_sum:
             solver.converged = 1
 
 
@@ -355,9 +358,9 @@ def iterate_forces(
     active: int,
 ):
     """Sweep until the forces hold, with all normal forces solved for at once after every other sweep."""
-    slip_tries = int(8) + solver.unknown_zero
+    slip_tries = int(wp.static(tries)) + solver.unknown_zero
     guess_tries = int(10) + solver.unknown_zero
-    sweeps_most = int(wp.static(SWEEPS)) + solver.unknown_zero
+    sweeps_most = int(wp.static(sweeps)) + solver.unknown_zero
     solver.converged = 1 - active
     refresh = active
     solver.gap_error = real(0.0)

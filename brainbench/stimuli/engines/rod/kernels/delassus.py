@@ -14,7 +14,7 @@ from brainbench.stimuli.engines.rod.limits import CLOSED, CREVICE
 
 from .algebra import JointVector, reader, vec3, vec6
 from .distances import NUMBERS
-from .parameters import capacity, group_size, hinges, max_contacts, real
+from .parameters import capacity, group_size, hinges, max_contacts, real, recorded
 from .state import ContactProblems, JointRecord, PerLinkJoint, most_candidates
 from .thread_groups import broadcast, group_sum, warp_max
 
@@ -55,6 +55,8 @@ class ThreadContacts:
     """Rate with them, less what just closes the gap."""
     self_compliance: PerContact6
     """Compliance to the contact's own forces."""
+    if recorded:
+        slot: PerContactInt
 
 
 @wp.struct
@@ -121,6 +123,8 @@ def add_contact(problems: ContactProblems, solver: wp.ref[SolverState], own: wp.
         tangent = e2 - normal * wp.dot(e2, normal)
     tangent = wp.normalize(tangent)
     own.link[k] = i
+    if wp.static(recorded):
+        own.slot[k] = slot
     own.arc[k] = candidate.arc
     own.friction[k] = candidate.friction
     own.point[k] = candidate.point
@@ -381,6 +385,8 @@ def store_forces(problems: ContactProblems, solver: wp.ref[SolverState], own: wp
             arc = row(own.arc, k)
             problems.held[solver.job, solver.thread + k].arc = arc
             problems.held[solver.job, solver.thread + k].force = force_k
+            if wp.static(recorded):
+                problems.held[solver.job, solver.thread + k].slot = row(own.slot, k)
             force = force + force_k
             moment = moment + wp.cross(row(own.point, k), force_k)
             fn = row(own.force, 3 * k)
@@ -513,5 +519,7 @@ def apply_forces(
                 problems.given[index].tip_acceleration + av + wp.cross(aw, problems.given[index].tip)
             )
             problems.solution[index].miss = miss
+            if wp.static(recorded):
+                problems.solution[index].inexact = 1 - solver.converged
             problems.solution[index].load = solver.force_sum * solver.force_sum
     return more

@@ -22,6 +22,16 @@ class Instant:
 
 
 @wp.struct
+class ReadingArrays:
+    """Times at which whiskers are read, ascending, and some between them so that none are far apart."""
+
+    time: wp.array(dtype=Instant)
+    """[reading]"""
+    row: wp.array(dtype=wp.int32)
+    """[reading] where the results go; negative for none."""
+
+
+@wp.struct
 class MotionArrays:
     """Motions of bases and objects, see ``motion``: knots of all tracks one behind the other."""
 

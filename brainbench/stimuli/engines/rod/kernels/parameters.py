@@ -15,6 +15,8 @@ against = MESHES
 """Kinds of shapes that there are to touch, see ``limits``."""
 sliced = False
 """True: whiskers pause for distances and contact forces."""
+recorded = False
+"""True: whiskers pause after some steps, whose states and contacts are written down (``adjoint.recording``)."""
 cuda = False
 """True: the code is for a GPU."""
 bounds: tuple[int, int] | None = None

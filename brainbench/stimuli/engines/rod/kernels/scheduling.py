@@ -48,7 +48,7 @@ def resume(
 
 
 @wp.func(inline=True)
-def pause(
+def keep(
     paused: PausedWhiskers,
     index: int,
     links: int,
@@ -56,13 +56,18 @@ def pause(
     proximity: wp.ref[ProximityState],
     state: WhiskerState,
 ):
-    """Keep all that the next slice needs, and queue for it."""
+    """Keep all that the next slice needs."""
     paused.state[index] = state
     for i in range(links):
         paused.link[i, index].angle = row(chain.angle, i)
         paused.link[i, index].rate = row(chain.rate, i)
         paused.link[i, index].clearance = row(proximity.clearance, i)
         paused.link[i, index].leaf = row(proximity.leaf, i)
+
+
+@wp.func(inline=True)
+def stand_in_queue(paused: PausedWhiskers, index: int, state: WhiskerState):
+    """Queue for the next slice."""
     # Whiskers that continue at the same place of the step go into one queue.
     queue = wp.static(AFTER_DISTANCES)
     if state.waiting_for == WAIT_FORCES:

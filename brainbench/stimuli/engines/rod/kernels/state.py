@@ -15,11 +15,14 @@ from brainbench.stimuli.engines.rod.limits import LISTED, SPARE, contacts_for
 from brainbench.stimuli.engines.rod.mesh_bvh import WIDE
 
 from .algebra import JointInverse, JointVector, mat33, reader, vec3, vec4
-from .motion import Instant, MotionArrays  # noqa: F401 — launches take all arrays from here
-from .parameters import capacity, hinges, real
+from .motion import Instant, MotionArrays, ReadingArrays  # noqa: F401 — launches take all arrays from here
+from .parameters import capacity, hinges, real, recorded
 
-WAIT_DISTANCES, WAIT_SLICE, WAIT_FORCES, WAIT_REST = 1, 2, 3, 4
-"""Reasons to pause: distances of near links, its next slice, contact forces, distances at rest."""
+if recorded:
+    from .adjoint.records import StepRecords
+
+WAIT_DISTANCES, WAIT_SLICE, WAIT_FORCES, WAIT_REST, ENDED = range(1, 6)
+"""Reasons to pause: distances of near links, its next slice, contact forces, distances at rest, its end."""
 
 most_candidates = contacts_for(capacity) + SPARE
 PerLink1: Any = wp.types.vector(capacity, real)
@@ -182,16 +185,6 @@ class StepOptions:
 
 
 @wp.struct
-class ReadingArrays:
-    """Times at which whiskers are read, ascending, and some between them so that none are far apart."""
-
-    time: wp.array(dtype=Instant)
-    """[reading]"""
-    row: wp.array(dtype=wp.int32)
-    """[reading] where the results go; negative for none."""
-
-
-@wp.struct
 class ResultArrays:
     """Results of all jobs."""
 
@@ -312,6 +305,9 @@ class ContactCandidates:
     normal: PerCandidate3
     free_velocity: PerCandidate3
     """Velocity against the object without contact forces."""
+    if recorded:
+        shape: PerCandidateInt
+        share: PerCandidate1  # place along the link, 0 to 1
 
 
 @wp.struct
@@ -400,6 +396,8 @@ class HeldContact:
 
     arc: real
     force: vec3
+    if recorded:
+        slot: wp.int32  # its candidate
 
 
 @wp.struct
@@ -422,6 +420,8 @@ class ContactSolution:
     arc_sum: real
     contact_force: vec3
     contact_moment: vec3
+    if recorded:
+        inexact: wp.int32  # 1: the forces were not solved to rounding
 
 
 @wp.struct
@@ -515,3 +515,7 @@ class PausedWhiskers:
     """[query]"""
     answer: wp.array(dtype=LinkDistance)
     """[query]"""
+    if recorded:
+        ended: wp.array(dtype=wp.int32)  # [job] 1: it came to its end
+        keep: wp.int32  # 1: the steps of this slice are written down
+        records: StepRecords

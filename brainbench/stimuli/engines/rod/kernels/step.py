@@ -23,10 +23,11 @@ from .broad_phase import NearShapes, count_near_links, find_candidates, lower_cl
 from .contact_problem import any_gap_closes, queue_problem, read_solution, write_problem
 from .contact_solver import solve_contacts
 from .motion import cell_at, elapsed, instant, pose_at
-from .parameters import against, bounds, module_options, real, sliced
-from .scheduling import next_job, pause, resume
+from .parameters import against, bounds, module_options, real, recorded, sliced
+from .scheduling import keep, next_job, resume, stand_in_queue
 from .sleeping import check_rest
 from .state import (
+    ENDED,
     WAIT_DISTANCES,
     WAIT_FORCES,
     WAIT_SLICE,
@@ -45,6 +46,9 @@ from .state import (
     WhiskerState,
     row,
 )
+
+if recorded:
+    from .adjoint.recording import record_accelerations, record_contacts, record_state
 
 
 @wp.func(inline=True)
@@ -143,7 +147,7 @@ def run(
     """Take each whisker to its last reading, or to where it pauses.
 
     Without slices thread and job have one number and ``problems`` is each thread's room; with slices threads follow the
-    queues of ``paused``.
+    queues of ``paused``. A run that is recorded pauses as well, but has no queues.
     """
     index = wp.tid()
     if wp.static(sliced):
@@ -158,9 +162,13 @@ def run(
     near = NearShapes()
     candidates = ContactCandidates()
     state = WhiskerState()
-    if wp.static(sliced):
+    if wp.static(sliced or recorded):
         state = paused.state[index]
+        if wp.static(recorded):
+            if state.waiting_for == ENDED:
+                return
         resume(paused, index, job.links, chain, proximity)
+    first_step = state.steps
     if state.waiting_for == 0:
         state.at_rest = job.can_rest
         # A reading takes the wrench of the step that begins at its time, so one more step follows the last.
@@ -200,7 +208,7 @@ def run(
             state.time_left = zero
         last = int(0)
         while last == 0:
-            if wp.static(sliced):
+            if wp.static(sliced or recorded):
                 state.time_left = left
                 # A step for which distances or forces were found meanwhile began in an earlier slice.
                 if state.waiting_for != WAIT_DISTANCES and state.waiting_for != WAIT_FORCES:
@@ -271,7 +279,7 @@ def run(
                             chains, motions, shapes, job, paused, chain, proximity, near, candidates, state, pose,
                             reach.margin, now, h
                         )  # fmt: skip
-                if wp.static(sliced):
+                if wp.static(sliced or recorded):
                     state.waiting_for = 0
                     state.time_left = zero
                 # Steps are split only for what is about to be touched: whatever else stands near changes nothing.
@@ -291,6 +299,9 @@ def run(
                         state.split_time = wp.max(state.split_time - h, zero)
                         if state.split_time == zero:
                             state.near_speed = zero
+                if wp.static(recorded):
+                    if paused.keep == 1:
+                        record_state(paused, job, chain, state, state.steps - first_step, now, h)
                 base_wrench = articulated_inertia(
                     chains, jobs, job, chain, proximity, tip, base, elapsed(now), h, count
                 )
@@ -317,6 +328,12 @@ def run(
                             break
                         else:
                             solve_contacts(problems, index, 0, 1)
+                if wp.static(recorded):
+                    if paused.keep == 1:
+                        record_contacts(
+                            chains, motions, shapes, paused, problems, job, chain, pose, state.steps - first_step, now,
+                            count, solved, candidates
+                        )  # fmt: skip
             state.contacts = int(0)
             touched = int(0)
             arc_sum = zero
@@ -341,12 +358,15 @@ def run(
                     force_sum, arc_sum, solved
                 )  # fmt: skip
                 state.pending_reading = int(-1)
-            state.steps = state.steps + 1
             if count > 0:
                 for i in range(job.links):
                     integrate_joint(
                         chain, state, i, row(chain.acceleration, i), h, elapsed(now) + h, options.quasistatic
                     )
+            if wp.static(recorded):
+                if paused.keep == 1:
+                    record_accelerations(paused, job, chain, state.steps - first_step, h)
+            state.steps = state.steps + 1
             state.at_rest = int(0)
             if touched == 0 and state.largest_change < real(wp.static(REST)) and job.can_rest == 1:
                 state.at_rest = 1
@@ -364,7 +384,15 @@ def run(
     if wp.static(sliced):
         if wait != 0:
             state.waiting_for = wait
-            pause(paused, index, job.links, chain, proximity, state)
+            keep(paused, index, job.links, chain, proximity, state)
+            stand_in_queue(paused, index, state)
+    if wp.static(recorded):
+        state.waiting_for = ENDED
+        paused.ended[index] = 1
+        if wait != 0:
+            state.waiting_for = wait
+            paused.ended[index] = 0
+        keep(paused, index, job.links, chain, proximity, state)
     results.depth[index] = state.depth
     results.status[index] = state.status
     results.failed[index] = state.failed_at

@@ -1,0 +1,174 @@
+"""Adjoint of the ``rod`` solver: derivatives of what it reads with respect to everything that is packed for it.
+
+**One step**, as the kernels solve it. State: joint angles q and rates q̇, 2 or 3 hinges a joint; step length h. With the
+spatial inertia I of each link, its twist V and acceleration A (of the base as its track moves within the step, less
+gravity), the joint springs k, lag = max(β, h), and the contact forces f at points p of the skin, it finds a and f with
+
+    H(q) a + C(q, q̇) + k (q + lag (q̇ + h a)) = Σ loads + Σ Jᵀf                              (the chain)
+
+which is (M + h D + h² K) q̇⁺ = M q̇ + h (…) with the damping D = (lag − h) K: linearly implicit springs. Behind a bend of
+``limits.FOLD`` a joint is stiffer. Then q̇⁺ = q̇ + h a and q⁺ = q + h q̇⁺; a quasi-static step forgets q̇⁺. A contact has a
+gap g, a normal n and the closing rate κ = min(−g, ``limits.CREVICE``)/h; with the velocity v of the skin against the
+object at the end of the step (the object's is that in the middle of the step, at the contact's present place), the
+Coulomb problem has one of three solutions at each:
+
+    open       f = 0
+    sticking   v = κ n,                                                            |f − n (n·f)| ≤ μ n·f
+    sliding    n·v = κ,  f − n (n·f) = −μ (n·f) u,  u the direction of v − n (n·v)
+
+A reading is the wrench at the base of the step that begins at its time, and the joints' places at its beginning.
+
+**Adjoint.** The step solves R(a, f; q, q̇, θ) = 0, so by the implicit function theorem the derivative of any output L is
+that of L + μ·R at fixed a and f, where the multipliers μ solve the transposed system (∂R/∂(a, f))ᵀ μ = −∂L/∂(a, f). How
+the forces were iterated plays no part; contacts keep the state that the solution has. The chain's part of the system is
+symmetric: the factorised chain solves it in O(links), with the derivative by the base wrench as the motion of the base.
+The contacts' part is a dense system of 3 × contacts. What is left, the derivative of μ·R by q, q̇ and θ at fixed a and
+f, is that of a virtual power, one pass down the chain and one up (``kernels.adjoint.chain``). Contact points move over
+spheres, cylinders, faces, edges and corners by the second derivatives of the distance (``kernels.adjoint.contacts``).
+Forces of recorded steps are solved to rounding, which those of the ordinary engine are not: the theorem holds at the
+solution.
+
+**Memory.** The run pauses after every √steps steps, where the state is kept; going back, each segment is run again from
+there and written down, the same steps to the digit. Step lengths are those that the run took: derivatives are at a
+fixed sequence of steps.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from brainbench.core.devices import warp
+from brainbench.stimuli.engines.fidelity import Fidelity
+from brainbench.stimuli.engines.rod.launch import WhiskerSolver
+from brainbench.stimuli.engines.rod.limits import contacts_for
+from brainbench.stimuli.engines.rod.scheduling import allocate
+from brainbench.stimuli.engines.rod.streams import turn
+from brainbench.stimuli.engines.units import MICRO, MILLI
+from brainbench.stimuli.whiskers.chain import Chain
+
+
+@dataclass(frozen=True, eq=False)
+class OutputDerivatives:
+    """Derivatives of a number with respect to the results of a launch, whose shapes they have. SI units."""
+
+    wrench: NDArray[np.float64]
+    """[job, reading, 6]"""
+    points: NDArray[np.float64] | None = None
+    """[job, reading, node, 3] from the base point."""
+    contact_wrench: NDArray[np.float64] | None = None
+    """[job, reading, 6]"""
+
+
+class RecordingSolver(WhiskerSolver):
+    """A solver whose launches can be gone back over. In double precision."""
+
+    def __init__(self, chains: Sequence[Chain], fidelity: Fidelity, device: Any, needs: int, *, twists: bool) -> None:
+        """Load kernels; arguments as for :class:`.launch.WhiskerSolver`."""
+        super().__init__(chains, fidelity, device, needs, twists=twists, recorded=True)
+        self.inputs: list[Any] = []
+        """Arguments of the last launch."""
+        self.checkpoints: list[tuple[Any, Any, Any]] = []
+        """States of whiskers, their links and their contacts at the beginning of each segment."""
+
+    def _take_steps(self, inputs: list[Any], count: int, *, urgent: bool) -> None:
+        wp, device, structs = warp(), self.device, self.kernels.structs
+        jobs, readings = inputs[3], inputs[5]
+        time = readings.time.numpy()[-1]
+        steps = (time["tick"] + time["part"]) / jobs.step.numpy().min()
+        with turn(device):
+            links = (self.capacity, count)
+            self.paused = allocate(structs.PausedWhiskers, device, state=count, ended=count, link=links)
+            self.paused.budget = max(8, math.ceil(math.sqrt(steps)))
+            self.inputs, self.checkpoints = inputs, []
+            while not self.checkpoints or not self.paused.ended.numpy().all():
+                held = inputs[-1].held
+                self.checkpoints.append((wp.clone(self.paused.state), wp.clone(self.paused.link), wp.clone(held)))
+                self._run()
+            wp.synchronize_device(device)
+
+    def _run(self) -> None:
+        warp().launch(self.kernels.run, self.count, [*self.inputs, self.paused], device=self.device)
+
+    @property
+    def count(self) -> int:
+        """Jobs of the last launch."""
+        return self.paused.state.shape[0]
+
+    def reverse(self, outputs: OutputDerivatives) -> dict[str, NDArray[Any]]:
+        """Go back over the last launch; return the derivatives by what was packed.
+
+        They have the names of ``kernels.adjoint.chain.PackedGradients``, those of shapes ``shape_…``.
+        """
+        from brainbench.stimuli.engines.rod.kernels import BUILDING, build_adjoint
+
+        wp, device, structs = warp(), self.device, self.kernels.structs
+        with BUILDING:
+            adjoint = build_adjoint(self.kernels)
+        chains, motions, shapes, jobs, options, *_ = self.inputs
+        count, contacts = self.count, contacts_for(self.capacity)
+        budget = self.paused.budget
+        with turn(device):
+            records = allocate(
+                structs.StepRecords,
+                device,
+                step=(budget, count),
+                **dict.fromkeys(("angle", "rate", "acceleration"), (budget, self.capacity, count)),
+                contact=(budget, contacts, count),
+                count=count,
+            )
+            given = adjoint.OutputCotangents()
+            for name, values in self._kernel_units(outputs).items():
+                setattr(given, name, wp.array(values, dtype=structs.vec3, device=device))
+            system = allocate(
+                adjoint.ContactSystem,
+                device,
+                unit=(3 * contacts, self.capacity, count),
+                matrix=(3 * contacts, 3 * contacts + 2, count),
+            )
+            gradients = allocate(
+                adjoint.PackedGradients,
+                device,
+                **dict.fromkeys(("angle", "rate"), (self.capacity, count)),
+                link=(10, self.capacity, count),
+                **dict.fromkeys(("beta", "friction", "gravity", "contacts", "reading"), count),
+                knots=(int(motions.place.shape[0]), 16),
+                **dict.fromkeys(("load_force", "load_share"), int(jobs.load_force.shape[0])),
+            )
+            places = dict.fromkeys(("place", "turn", "size", "friction"), int(shapes.kind.shape[0]))
+            gradients.shape = allocate(adjoint.ShapeGradients, device, **places)
+            for state, link, held in reversed(self.checkpoints):
+                self.paused.keep, self.paused.records = 1, records
+                for kept, now in ((state, self.paused.state), (link, self.paused.link), (held, self.inputs[-1].held)):
+                    wp.copy(now, kept)
+                records.count.zero_()
+                self._run()
+                # Going back needs no trees of meshes, nor what else only contact searches read.
+                arguments = [chains, motions, shapes, jobs, options, records, given, system, gradients]
+                wp.launch(adjoint.reverse_segment, count, arguments, device=device)
+            self.paused.keep = 0
+            names = ("link", "beta", "friction", "gravity", "contacts", "knots", "load_force", "load_share")
+            found = {name: getattr(gradients, name).numpy() for name in names}
+            found |= {f"shape_{name}": getattr(gradients.shape, name).numpy() for name in places}
+        return found
+
+    def _kernel_units(self, outputs: OutputDerivatives) -> dict[str, NDArray[np.float64]]:
+        """Return what the kernel's ``OutputCotangents`` hold."""
+        jobs, readings, _ = outputs.wrench.shape
+        wrench = np.moveaxis(outputs.wrench.reshape(jobs, readings, 2, 3), 0, 2)
+        # The kernels find the wrench of the base on the whisker, in mN and µN·m, moment first.
+        whole = {"wrench": -wrench[:, ::-1] / np.array([MICRO, MILLI])[None, :, None, None]}
+        contact = np.zeros((readings, 2, jobs, 3))
+        points = np.zeros((readings, self.capacity + 1, jobs, 3))
+        if outputs.contact_wrench is not None:
+            felt = np.moveaxis(outputs.contact_wrench.reshape(jobs, readings, 2, 3), 0, 2)
+            contact = felt / np.array([MILLI, MICRO])[None, :, None, None]
+        if outputs.points is not None:
+            nodes = outputs.points.shape[2]
+            points[:, :nodes] = np.moveaxis(outputs.points, 0, 2) / MILLI
+        return whole | {"contact": contact, "points": points}

@@ -1,0 +1,317 @@
+"""Adjoint of the contacts of a step: the solved conditions, and the system of their multipliers.
+
+With the velocity v at the end of the step, the closing rate κ = min(−g, crevice)/h, the force f, the normal n and the
+direction of slip u, a pressing contact obeys c = 0 with
+
+    sticking   c = v − κ n,
+    sliding    c = n (n·v − κ) + σ (f − n (n·f) + μ (n·f) u),
+
+three equations for the three components of f in world axes (σ only makes the units alike; frictionless: μ = 0). Their
+multipliers ν solve (G A + Bᵀ) ν = w − f̄ with A = ∂c/∂v (symmetric), B = ∂c/∂f, the Delassus matrix G, the velocity w
+that the virtual motion without contacts has there, and the derivative f̄ of the outputs by the force.
+"""
+
+import warp as wp
+
+from ..algebra import JointVector, first_axis, mat33, vec3
+from ..articulated_body import ChainState, ProximityState, hinge_direction
+from ..delassus import PerContact1, PerContact3, PerContactInt
+from ..delassus import row as contact_row
+from ..parameters import hinges, real
+from ..state import WhiskerJob, row
+from .records import ContactRecord
+
+SLIDING = 1 - 1e-6
+"""Share of the friction cone from which a contact slides: forces of recorded steps are solved to rounding."""
+
+
+@wp.struct
+class AdjointContacts:
+    """Contacts of a step, in order of the record."""
+
+    count: wp.int32
+    link: PerContactInt
+    slides: PerContactInt
+    point: PerContact3
+    normal: PerContact3
+    force: PerContact3
+    velocity: PerContact3
+    """Against the object at the end of the step."""
+    slip: PerContact3
+    """Direction of slip."""
+    coefficient: PerContact1
+    """Coefficient of friction."""
+    friction: PerContact1
+    """Friction times normal force over the speed of slip."""
+    scale: PerContact1
+    """σ"""
+    multiplier: PerContact3
+    """ν"""
+    push: PerContact3
+    """Force −h A ν that the multipliers exert on the virtual motion."""
+
+
+@wp.struct
+class ContactSystem:
+    """Room for the systems of the contacts."""
+
+    unit: wp.array3d(dtype=JointVector)
+    """[3 · contact, link, job] what the joints feel of a unit force at a contact."""
+    matrix: wp.array3d(dtype=real)
+    """[3 · contact, 3 · contact + 2, job] with the right-hand side, and which columns have a pivot."""
+
+
+@wp.struct
+class ContactSummary:
+    """Contacts of all steps of a run, gathered from its end on: what changed, and how near they came to a change."""
+
+    contacts: wp.int32
+    """Contacts of the step before which it stands, and how many of them slide."""
+    sliding: wp.int32
+    begun: wp.int32
+    """Steps with more contacts than the one before, with fewer, and with as many of which others slide."""
+    ended: wp.int32
+    slipped: wp.int32
+    degenerate: wp.int32
+    """Steps whose contacts had no unique derivative, or whose forces were not solved to rounding."""
+    largest_force: real
+    """Normal force (mN)."""
+    least_force: real
+    fastest_slip: real
+    """Speed of sliding contacts (mm/ms)."""
+    slowest_slip: real
+    fullest_cone: real
+    """Largest share of the friction cone that a sticking contact used."""
+    least_gap: real
+    """Least distance (mm) from closing, of what did not press."""
+    steps: wp.int32
+
+
+@wp.func
+def summarize(
+    summary: wp.ref[ContactSummary],
+    contacts: wp.ref[AdjointContacts],
+    open_gap: real,
+):
+    """Add a step, which comes before those in the summary."""
+    if summary.steps == 0:
+        summary.least_force = real(1e30)
+        summary.slowest_slip = real(1e30)
+        summary.least_gap = real(1e30)
+    sliding = int(0)
+    for k in range(contacts.count):
+        n = contact_row(contacts.normal, k)
+        f = contact_row(contacts.force, k)
+        v = contact_row(contacts.velocity, k)
+        fn = wp.dot(n, f)
+        summary.largest_force = wp.max(summary.largest_force, fn)
+        summary.least_force = wp.min(summary.least_force, fn)
+        if contact_row(contacts.slides, k) == 0:
+            bound = fn * contact_row(contacts.coefficient, k)
+            summary.fullest_cone = wp.max(summary.fullest_cone, wp.length(f - n * fn) / bound)
+        elif contact_row(contacts.coefficient, k) > real(0.0):
+            sliding = sliding + 1
+            speed = wp.length(v - n * wp.dot(n, v))
+            summary.fastest_slip = wp.max(summary.fastest_slip, speed)
+            summary.slowest_slip = wp.min(summary.slowest_slip, speed)
+    summary.least_gap = wp.min(summary.least_gap, wp.abs(open_gap))
+    if summary.steps > 0:
+        if summary.contacts > contacts.count:
+            summary.begun = summary.begun + 1
+        elif summary.contacts < contacts.count:
+            summary.ended = summary.ended + 1
+        elif summary.sliding != sliding:
+            summary.slipped = summary.slipped + 1
+    summary.contacts = contacts.count
+    summary.sliding = sliding
+    summary.steps = summary.steps + 1
+
+
+@wp.func
+def unit(d: int) -> vec3:
+    """Return a unit vector of the world axes."""
+    axis = vec3(real(0.0), real(0.0), real(0.0))
+    axis[d] = real(1.0)
+    return axis
+
+
+@wp.func
+def set_state(contacts: wp.ref[AdjointContacts], k: int, contact: ContactRecord, velocity: vec3):
+    """Find whether a contact sticks or slides, and where to."""
+    n = contact.normal
+    f = contact.force
+    fn = wp.dot(n, f)
+    ft = f - n * fn
+    vt = velocity - n * wp.dot(n, velocity)
+    contacts.normal[k] = n
+    contacts.force[k] = f
+    contacts.velocity[k] = velocity
+    contacts.slides[k] = 1
+    contacts.coefficient[k] = contact.friction
+    contacts.friction[k] = real(0.0)
+    contacts.slip[k] = vec3(real(0.0), real(0.0), real(0.0))
+    if contact.friction > real(0.0):
+        if wp.length(ft) < real(wp.static(SLIDING)) * contact.friction * fn:
+            contacts.slides[k] = 0
+        else:
+            # Friction is against the slip; its own direction is known also where hardly anything slips.
+            contacts.slip[k] = -wp.normalize(ft)
+            contacts.friction[k] = contact.friction * fn / wp.max(wp.length(vt), real(1e-9))
+
+
+@wp.func
+def velocity_block(contacts: wp.ref[AdjointContacts], k: int) -> mat33:
+    """Return A = ∂c/∂v of a contact."""
+    zero = real(0.0)
+    one = real(1.0)
+    whole = mat33(one, zero, zero, zero, one, zero, zero, zero, one)
+    if contact_row(contacts.slides, k) == 0:
+        return whole
+    n = contact_row(contacts.normal, k)
+    u = contact_row(contacts.slip, k)
+    turning = contact_row(contacts.scale, k) * contact_row(contacts.friction, k)
+    across = whole - wp.outer(n, n) - wp.outer(u, u)
+    return wp.outer(n, n) + across * turning
+
+
+@wp.func
+def force_block(contacts: wp.ref[AdjointContacts], k: int) -> mat33:
+    """Return Bᵀ = (∂c/∂f)ᵀ of a contact."""
+    zero = real(0.0)
+    one = real(1.0)
+    if contact_row(contacts.slides, k) == 0:
+        return mat33(zero, zero, zero, zero, zero, zero, zero, zero, zero)
+    n = contact_row(contacts.normal, k)
+    whole = mat33(one, zero, zero, zero, one, zero, zero, zero, one)
+    coefficient = contact_row(contacts.coefficient, k)
+    sliding = whole - wp.outer(n, n) + wp.outer(n, contact_row(contacts.slip, k)) * coefficient
+    return sliding * contact_row(contacts.scale, k)
+
+
+@wp.func
+def carry_units(job: WhiskerJob, chain: wp.ref[ChainState], contacts: wp.ref[AdjointContacts], system: ContactSystem):
+    """Carry unit forces at the contacts up the factorised chain, as ``delassus.build_delassus`` does."""
+    for k in range(contacts.count):
+        for d in range(3):
+            tv = unit(d)
+            tw = wp.cross(contact_row(contacts.point, k), tv)
+            for back in range(contact_row(contacts.link, k) + 1):
+                i = contact_row(contacts.link, k) - back
+                at = row(chain.node, i)
+                felt = JointVector()
+                if wp.static(hinges == 3):
+                    if i % 2 == 1:
+                        s3 = row(chain.axis3, i)
+                        u3 = wp.dot(s3, tw) + wp.dot(wp.cross(at, s3), tv)
+                        tw = tw - row(chain.gain3_w, i) * u3
+                        tv = tv - row(chain.gain3_v, i) * u3
+                        felt[2] = u3
+                s2 = row(chain.axis2, i)
+                s1 = first_axis(s2, hinge_direction(chain, i), row(chain.angle, i)[1])
+                u1 = wp.dot(s1, tw) + wp.dot(wp.cross(at, s1), tv)
+                u2 = wp.dot(s2, tw) + wp.dot(wp.cross(at, s2), tv)
+                tw = tw - row(chain.gain1_w, i) * u1 - row(chain.gain2_w, i) * u2
+                tv = tv - row(chain.gain1_v, i) * u1 - row(chain.gain2_v, i) * u2
+                felt[0] = u1
+                felt[1] = u2
+                system.unit[3 * k + d, i, job.index] = felt
+
+
+@wp.func
+def compliance(
+    job: WhiskerJob,
+    proximity: wp.ref[ProximityState],
+    contacts: wp.ref[AdjointContacts],
+    system: ContactSystem,
+    k: int,
+    e: int,
+    h: real,
+) -> mat33:
+    """Return the block of the Delassus matrix G = h J H⁻¹ Jᵀ of two contacts."""
+    block = mat33()
+    for i in range(wp.min(contact_row(contacts.link, k), contact_row(contacts.link, e)) + 1):
+        inverse = row(proximity.inverse_inertia, i)
+        for a in range(3):
+            one = system.unit[3 * k + a, i, job.index]
+            i1 = h * (inverse[0] * one[0] + inverse[1] * one[1])
+            i2 = h * (inverse[1] * one[0] + inverse[2] * one[1])
+            for b in range(3):
+                other = system.unit[3 * e + b, i, job.index]
+                shared = i1 * other[0] + i2 * other[1]
+                if wp.static(hinges == 3):
+                    shared = shared + h * inverse[3] * one[2] * other[2]
+                block[a, b] = block[a, b] + shared
+    return block
+
+
+@wp.func
+def solve_multipliers(
+    job: WhiskerJob,
+    chain: wp.ref[ChainState],
+    proximity: wp.ref[ProximityState],
+    contacts: wp.ref[AdjointContacts],
+    system: ContactSystem,
+    asked: wp.ref[PerContact3],
+    h: real,
+) -> int:
+    """Find the multipliers and what they push with; return 1 where contacts share a load in more than one way.
+
+    ``asked`` is w − f̄ of each contact.
+    """
+    index = job.index
+    size = 3 * contacts.count
+    carry_units(job, chain, contacts, system)
+    for k in range(contacts.count):
+        own = compliance(job, proximity, contacts, system, k, k, h)
+        contacts.scale[k] = (own[0, 0] + own[1, 1] + own[2, 2]) / real(3.0)
+    largest = real(0.0)
+    for k in range(contacts.count):
+        for e in range(contacts.count):
+            block = compliance(job, proximity, contacts, system, k, e, h) * velocity_block(contacts, e)
+            if k == e:
+                block = block + force_block(contacts, k)
+            for a in range(3):
+                for b in range(3):
+                    system.matrix[3 * k + a, 3 * e + b, index] = block[a, b]
+                    largest = wp.max(largest, wp.abs(block[a, b]))
+        for a in range(3):
+            system.matrix[3 * k + a, size, index] = contact_row(asked, k)[a]
+    # Gauss-Jordan with pivots; a column without one has no multiplier.
+    degenerate = int(0)
+    used = int(0)
+    for c in range(size):
+        best = used
+        for r in range(used, size):
+            if wp.abs(system.matrix[r, c, index]) > wp.abs(system.matrix[best, c, index]):
+                best = r
+        pivot = real(0.0)
+        if used < size:
+            pivot = system.matrix[best, c, index]
+        if wp.abs(pivot) <= real(1e-11) * largest:
+            degenerate = 1
+            system.matrix[c, size + 1, index] = real(0.0)
+        else:
+            system.matrix[c, size + 1, index] = real(1.0)
+            for e in range(size + 1):
+                kept = system.matrix[used, e, index]
+                system.matrix[used, e, index] = system.matrix[best, e, index] / pivot
+                system.matrix[best, e, index] = wp.where(best == used, system.matrix[used, e, index], kept)
+            for r in range(size):
+                if r != used:
+                    factor = system.matrix[r, c, index]
+                    if factor != real(0.0):
+                        for e in range(size + 1):
+                            system.matrix[r, e, index] = (
+                                system.matrix[r, e, index] - factor * system.matrix[used, e, index]
+                            )
+            used = used + 1
+    r = int(0)
+    for c in range(size):
+        value = real(0.0)
+        if system.matrix[c, size + 1, index] == real(1.0):
+            value = system.matrix[r, size, index]
+            r = r + 1
+        contacts.multiplier[c // 3, c % 3] = value
+    for k in range(contacts.count):
+        contacts.push[k] = velocity_block(contacts, k) * contact_row(contacts.multiplier, k) * (-h)
+    return degenerate

@@ -1,0 +1,289 @@
+"""Record of a whisker's steps, for the adjoint: state, length and pressing contacts of each.
+
+A run that is recorded pauses after some steps (``PausedWhiskers.budget``), so that the host keeps its state there as a
+checkpoint; from a checkpoint the same steps are taken again and written down. Recorded steps are the ordinary ones, to
+the digit.
+"""
+
+import warp as wp
+
+from brainbench.stimuli.engines.rod.limits import ANYWHERE, CAPSULE, CYLINDER, MESH, SPHERE
+from brainbench.stimuli.engines.rod.mesh_bvh import WIDE
+
+from ..algebra import rotate, unrotate, vec3, vec6
+from ..articulated_body import ChainState
+from ..mesh_bvh import corner, nearest_triangles
+from ..motion import BodyMotion, pose_from
+from ..parameters import real
+from ..state import (
+    ChainArrays,
+    ContactCandidates,
+    ContactProblems,
+    Instant,
+    MotionArrays,
+    PausedWhiskers,
+    ShapeArrays,
+    WhiskerJob,
+    WhiskerState,
+    most_candidates,
+    row,
+)
+from .records import ContactRecord, StepRecord
+
+
+@wp.struct
+class PrincipalCurvature:
+    """Principal curvatures of the surface that lies at the distance of a point, in the frame of the shape."""
+
+    first: real
+    """Along ``direction``."""
+    second: real
+    """Across it."""
+    direction: vec3
+
+
+@wp.func
+def any_tangent(normal: vec3) -> vec3:
+    """Return some unit vector normal to a unit vector."""
+    other = vec3(real(1.0), real(0.0), real(0.0))
+    if wp.abs(normal[0]) > real(0.7):
+        other = vec3(real(0.0), real(1.0), real(0.0))
+    return wp.normalize(wp.cross(normal, other))
+
+
+@wp.func
+def primitive_curvature(kind: int, size: vec3, x: vec3, normal: vec3) -> PrincipalCurvature:
+    """Return the curvatures of the distance from a primitive at a point; the cases of ``distances.primitive``."""
+    zero = real(0.0)
+    one = real(1.0)
+    found = PrincipalCurvature()
+    found.direction = any_tangent(normal)
+    axis = vec3(zero, zero, one)
+    radial = wp.sqrt(x[0] * x[0] + x[1] * x[1])
+    if kind == wp.static(SPHERE):
+        found.first = one / wp.length(x)
+        found.second = found.first
+    elif kind == wp.static(CAPSULE):
+        z = x[2] - wp.clamp(x[2], -size[1], size[1])
+        if z == zero:
+            found.direction = axis
+            found.second = one / radial
+        else:
+            found.first = one / wp.sqrt(radial * radial + z * z)
+            found.second = found.first
+    elif kind == wp.static(CYLINDER):
+        side = radial - size[0]
+        end = wp.abs(x[2]) - size[1]
+        if side > zero and end > zero:
+            # The rim: a circle, so that the surface around it is a torus.
+            far = wp.sqrt(side * side + end * end)
+            found.direction = vec3(-x[1] / radial, x[0] / radial, zero)
+            found.first = side / (far * radial)
+            found.second = one / far
+        elif side > end:
+            found.direction = axis
+            found.second = one / radial
+    else:
+        beyond = vec3(
+            wp.max(wp.abs(x[0]) - size[0], zero),
+            wp.max(wp.abs(x[1]) - size[1], zero),
+            wp.max(wp.abs(x[2]) - size[2], zero),
+        )
+        count = int(0)
+        for d in range(3):
+            if beyond[d] > zero:
+                count = count + 1
+        if count >= 2:
+            found.second = one / wp.length(beyond)
+            found.first = found.second
+        if count == 2:
+            found.first = zero
+            edge = vec3(zero, zero, zero)
+            for d in range(3):
+                if beyond[d] == zero:
+                    edge[d] = one
+            found.direction = edge
+    return found
+
+
+@wp.func
+def mesh_curvature(
+    shapes: ShapeArrays, s: int, a: vec3, b: vec3, share: real, normal: vec3, distance: real
+) -> PrincipalCurvature:
+    """Return the curvatures of the distance from a mesh at a point of the link a–b, by the feature found for it.
+
+    Between the ends of a link that is an edge or a corner, as ``narrow_phase`` looks for it; elsewhere what is nearest.
+    """
+    found = PrincipalCurvature()
+    found.direction = any_tangent(normal)
+    start = a
+    if share == real(1.0):
+        start = b
+    got = nearest_triangles(shapes, s, start, b, real(wp.static(ANYWHERE)), real(1.01) * wp.abs(distance), -1, 0, 1)
+    which = got.end_face
+    v = got.end_v
+    w = got.end_w
+    if share < real(1.0):
+        which = got.face
+        v = got.v
+        w = got.w
+    if which >= 0:
+        face = shapes.face[s] + which
+        low = real(1e-4)
+        on_p = int(1)
+        on_q = int(1)
+        on_r = int(1)
+        if real(1.0) - v - w <= low:
+            on_p = int(0)
+        if v <= low:
+            on_q = int(0)
+        if w <= low:
+            on_r = int(0)
+        # On an edge between coplanar faces the surface is flat.
+        flat = share == real(1.0) and wp.abs(wp.dot(normal, shapes.outward[face, 0])) > real(0.99999)
+        if on_p + on_q + on_r < 3 and not flat:
+            leaf = face // wp.static(WIDE)
+            rank = face % wp.static(WIDE)
+            p = corner(shapes.corners, leaf, 0, rank)
+            q = corner(shapes.corners, leaf, 1, rank)
+            r = corner(shapes.corners, leaf, 2, rank)
+            found.second = real(1.0) / distance
+            if on_p + on_q + on_r == 1:
+                found.first = found.second
+            elif on_p == 0:
+                found.direction = wp.normalize(r - q)
+            elif on_q == 0:
+                found.direction = wp.normalize(r - p)
+            else:
+                found.direction = wp.normalize(q - p)
+    return found
+
+
+@wp.func
+def curvature_at(
+    shapes: ShapeArrays, s: int, body: BodyMotion, start: vec3, stop: vec3, share: real, normal: vec3, distance: real
+) -> vec6:
+    """Return the second derivatives of the distance from a shape at a place of a link, in world axes.
+
+    ``normal`` is its gradient there and ``distance`` its value; places count from the base.
+    """
+    turn_s = shapes.turn[s]
+    scale = shapes.scale[s]
+    a = unrotate(turn_s, unrotate(body.turn, start - body.place) - shapes.place[s]) / scale
+    b = unrotate(turn_s, unrotate(body.turn, stop - body.place) - shapes.place[s]) / scale
+    n = unrotate(turn_s, unrotate(body.turn, normal))
+    found = PrincipalCurvature()
+    if shapes.kind[s] == wp.static(MESH):
+        found = mesh_curvature(shapes, s, a, b, share, n, distance / scale)
+    else:
+        found = primitive_curvature(shapes.kind[s], shapes.size[s] / scale, a + (b - a) * share, n)
+    k1 = found.first / scale
+    k2 = found.second / scale
+    t = rotate(body.turn, rotate(turn_s, found.direction))
+    u = wp.cross(normal, t)
+    return vec6(
+        k1 * t[0] * t[0] + k2 * u[0] * u[0],
+        k1 * t[1] * t[1] + k2 * u[1] * u[1],
+        k1 * t[2] * t[2] + k2 * u[2] * u[2],
+        k1 * t[0] * t[1] + k2 * u[0] * u[1],
+        k1 * t[0] * t[2] + k2 * u[0] * u[2],
+        k1 * t[1] * t[2] + k2 * u[1] * u[2],
+    )
+
+
+@wp.func
+def record_state(
+    paused: PausedWhiskers,
+    job: WhiskerJob,
+    chain: wp.ref[ChainState],
+    state: wp.ref[WhiskerState],
+    place: int,
+    now: Instant,
+    h: real,
+):
+    """Write a step's beginning as the ``place``-th of the segment."""
+    record = StepRecord()
+    record.time = now
+    record.length = h
+    record.reading = state.pending_reading
+    record.open_gap = real(1e30)
+    for i in range(job.links):
+        paused.records.angle[place, i, job.index] = row(chain.angle, i)
+        paused.records.rate[place, i, job.index] = row(chain.rate, i)
+    paused.records.step[place, job.index] = record
+    paused.records.count[job.index] = place + 1
+
+
+@wp.func
+def record_contacts(
+    chains: ChainArrays,
+    motions: MotionArrays,
+    shapes: ShapeArrays,
+    paused: PausedWhiskers,
+    problems: ContactProblems,
+    job: WhiskerJob,
+    chain: wp.ref[ChainState],
+    pose: BodyMotion,
+    place: int,
+    now: Instant,
+    count: int,
+    solved: int,
+    candidates: wp.ref[ContactCandidates],
+):
+    """Write the contacts of the step that press, and how far the others are from closing."""
+    index = job.index
+    first = index * wp.static(most_candidates)
+    pressing = int(0)
+    taken = int(0)
+    if solved == 1:
+        paused.records.step[place, index].inexact = problems.solution[index].inexact
+        for k in range(problems.solution[index].contacts):
+            held = problems.held[index, k]
+            taken = taken + (1 << held.slot)
+            given = problems.candidate[first + held.slot]
+            shape = row(candidates.shape, held.slot)
+            share = row(candidates.share, held.slot)
+            if wp.dot(held.force, given.normal) > real(0.0):
+                i = problems.candidate_link[first + held.slot]
+                taper = chains.taper[i, job.whisker]
+                radius = taper.start_radius + (taper.end_radius - taper.start_radius) * share
+                start = row(chain.node, i)
+                record = ContactRecord()
+                record.link = i
+                record.shape = shape
+                record.share = share
+                record.gap = given.gap
+                record.friction = given.friction
+                record.normal = given.normal
+                record.force = held.force
+                body = pose_from(motions, shapes.track[shape], now, pose)
+                record.curvature = curvature_at(
+                    shapes,
+                    shape,
+                    body,
+                    start,
+                    row(chain.node, i + 1),
+                    share,
+                    given.normal,
+                    given.gap + radius,
+                )
+                paused.records.contact[place, pressing, index] = record
+                pressing = pressing + 1
+    least = real(1e30)
+    for j in range(count):
+        if (taken >> j) % 2 == 0:
+            ahead = row(candidates.predicted_gap, j)
+            if solved == 1:
+                ahead = problems.predicted_gap[first + j]
+            least = wp.min(least, ahead)
+    paused.records.step[place, index].contacts = pressing
+    paused.records.step[place, index].open_gap = least
+
+
+@wp.func
+def record_accelerations(paused: PausedWhiskers, job: WhiskerJob, chain: wp.ref[ChainState], place: int, h: real):
+    """Write the accelerations that took the joints from the step's beginning to where they are now."""
+    for i in range(job.links):
+        before = paused.records.angle[place, i, job.index]
+        rate = (row(chain.angle, i) - before) / h
+        paused.records.acceleration[place, i, job.index] = (rate - paused.records.rate[place, i, job.index]) / h

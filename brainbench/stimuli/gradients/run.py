@@ -1,0 +1,256 @@
+"""Simulation of jobs that can be gone back over: results, then the gradient of any number made of them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from brainbench.core.devices import pick_device
+from brainbench.core.errors import UsageError
+from brainbench.stimuli.engines.fidelity import Fidelity
+from brainbench.stimuli.engines.protocol import Job, Trace, base_rotation
+from brainbench.stimuli.engines.rod.adjoint import OutputDerivatives, RecordingSolver
+from brainbench.stimuli.engines.rod.differences import (
+    Numbers,
+    PackedPlaces,
+    contract,
+    packed_change,
+)
+from brainbench.stimuli.engines.rod.engine import RodEngine, trace_of
+from brainbench.stimuli.engines.rod.packing import capacity_for, knots_alike
+from brainbench.stimuli.engines.rod.tasks import JobTask, PackedTasks, make_task
+from brainbench.stimuli.engines.trust import check_jobs
+from brainbench.stimuli.gradients.events import ContactEvents, contact_events
+from brainbench.stimuli.whiskers.chain import build_chain
+
+Build = Callable[[NDArray[np.float64]], Sequence[Job]]
+"""Values of the parameters [p] → jobs, of the same kind and number for all values."""
+Given = Sequence[NDArray[np.float64] | None]
+"""Derivatives of a number by one output of each job; None for zeros."""
+
+
+@dataclass(frozen=True, eq=False)
+class Gradient:
+    """Derivatives of one number, and where they hold."""
+
+    values: NDArray[np.float64]
+    """[p] derivative by each parameter; NaN when a whisker that counts is not ``ok``."""
+    by_job: NDArray[np.float64]
+    """[job, p] the part that each whisker has in it."""
+    events: tuple[ContactEvents, ...]
+    """[job] changes of contact in the run, and whether any was so near that the derivative is one-sided."""
+
+    @property
+    def smooth(self) -> bool:
+        """True when no contact was close to another state: the gradient holds on both sides."""
+        return all(event.status == "smooth" for event in self.events)
+
+
+@dataclass(frozen=True, eq=False)
+class _Group:
+    """Jobs of one launch."""
+
+    indices: tuple[int, ...]
+    packed: PackedTasks
+    solver: RecordingSolver
+    places: list[PackedPlaces]
+
+
+class GradientRun:
+    """Jobs built from parameters, simulated, and ready to be gone back over."""
+
+    def __init__(
+        self,
+        build: Build,
+        values: Sequence[float] | NDArray[np.float64],
+        *,
+        scales: Sequence[float] | NDArray[np.float64] | None = None,
+        fidelity: Fidelity | str = "balanced",
+        device: str = "auto",
+    ) -> None:
+        """Simulate.
+
+        Args:
+            build: jobs from the values [p] of the parameters.
+            values: at which to simulate and differentiate.
+            scales: [p] size of a change of each parameter that is small and not tiny; a ten-thousandth of it is the
+                difference with which packing is differentiated. The values themselves when None.
+            fidelity: as for :func:`brainbench.stimuli.simulate`; precision is always double here, and steps have the
+                length that the given values ask for.
+            device: as for the engine ``rod``.
+
+        Raises:
+            UsageError: a value or scale is not finite, a scale is 0, or jobs cannot be simulated.
+        """
+        self.values = np.array(values, dtype=float)
+        self.scales = np.abs(self.values if scales is None else np.array(scales, dtype=float))
+        _check_values(self.values, self.scales)
+        self.build = build
+        self.fidelity = replace(Fidelity.of(fidelity), precision="double")
+        self.jobs = tuple(build(self.values.copy()))
+        self.device = pick_device(device)
+        check_jobs(RodEngine(device), self.jobs, self.fidelity, None)
+        self._changed = [
+            tuple(tuple(build(self.values + sign * width * (np.arange(len(self.values)) == p))) for sign in (-1, 1))
+            for p, width in enumerate(self._widths)
+        ]
+        for pair in self._changed:
+            for jobs in pair:
+                if len(jobs) != len(self.jobs):
+                    raise UsageError(
+                        f"build must return the same number of jobs for all values; received {len(self.jobs)} and "
+                        f"{len(jobs)}."
+                    )
+        self.traces, self._groups = self._simulate()
+
+    @property
+    def _widths(self) -> NDArray[np.float64]:
+        return 1e-4 * self.scales
+
+    def traces_at(self, values: Sequence[float] | NDArray[np.float64]) -> list[Trace]:
+        """Return what the jobs of other values give, computed as :attr:`traces` are: for differences and line searches.
+
+        Contacts are solved to rounding here, which the ordinary engine does not do. Links, steps, knots of the bases
+        and whether whiskers twist are those of the run's own values.
+        """
+        tasks, steps = [], []
+        for job, (group, row) in zip(self.build(np.array(values, dtype=float)), self._rows, strict=True):
+            own = group.packed.tasks[row]
+            task = make_task(job, self.fidelity, {}, silent=True)
+            assert task is not None
+            knots = knots_alike(own.base, job.follicle.pose, base_rotation, _span(job), "the base of a whisker")
+            base, chain = replace(own.base, knots=knots), build_chain(job.whisker, own.chain.links)
+            tasks.append(replace(task, chain=chain, base=base, limit=own.limit, twists=own.twists))
+            steps.append(group.solver.steps[group.packed.jobs.whisker[row]])
+        return self._launch(tasks, steps)[0]
+
+    @cached_property
+    def _rows(self) -> list[tuple[_Group, int]]:
+        """Group of each job, and its row there."""
+        found = {index: (group, row) for group in self._groups for row, index in enumerate(group.indices)}
+        return [found[index] for index in range(len(self.jobs))]
+
+    def _simulate(self) -> tuple[list[Trace], list[_Group]]:
+        tasks: list[JobTask] = []
+        for index, job in enumerate(self.jobs):
+            task = make_task(job, self.fidelity, {}, silent=True)
+            assert task is not None
+            near = [jobs[index] for pair in self._changed for jobs in pair]
+            # A parameter may take a whisker out of its plane, or move a base, where the run itself stays.
+            if not task.twists and self.fidelity.twist is not False:
+                twists = any(one.twists for one in (make_task(j, self.fidelity, {}, silent=True) for j in near) if one)
+                task = replace(task, twists=twists)
+            if task.base.pieces is None:
+                task = self._with_knots(task, near)
+            tasks.append(task)
+        return self._launch(tasks)
+
+    def _with_knots(self, task: JobTask, near: Sequence[Job]) -> JobTask:
+        """Return a task whose base stands still with the knots of a job near it that moves, if there is one."""
+        seen = np.linspace(*_span(task.job), 17)
+        for job in near:
+            if max(np.ptp(np.asarray(part), axis=0).max() for part in job.follicle.pose(seen)) > 0:
+                moving = make_task(job, self.fidelity, {}, silent=True)
+                assert moving is not None
+                pose = task.job.follicle.pose
+                knots = knots_alike(moving.base, pose, base_rotation, _span(job), "the base of a whisker")
+                return replace(task, base=replace(moving.base, knots=knots), limit=moving.limit)
+        return task
+
+    def _launch(
+        self, tasks: Sequence[JobTask], steps: Sequence[float] | None = None
+    ) -> tuple[list[Trace], list[_Group]]:
+        """Simulate tasks; ``steps`` [task] (ms) are their longest time steps, as the fidelity says when None."""
+        alike: dict[Any, list[int]] = {}
+        for index, task in enumerate(tasks):
+            job = task.job
+            key = (capacity_for(task.chain.links), job.times.tobytes(), job.start, tuple(job.gravity), task.twists)
+            alike.setdefault(key, []).append(index)
+        traces: dict[int, Trace] = {}
+        groups = []
+        for indices in alike.values():
+            some = [tasks[index] for index in indices]
+            packed = PackedTasks.of(some, shared=False)
+            needs = packed.shapes.needs
+            solver = RecordingSolver(packed.chains, self.fidelity, self.device, needs, twists=some[0].twists)
+            if steps is not None:
+                solver.steps[packed.jobs.whisker] = [steps[index] for index in indices]
+            result = packed.launch(solver, record_shape=True)
+            for row, index in enumerate(indices):
+                traces[index] = trace_of(result, row, some[row].job, self.fidelity, 0.0)
+            groups.append(_Group(tuple(indices), packed, solver, PackedPlaces.of(packed)))
+        return [traces[index] for index in range(len(tasks))], groups
+
+    @cached_property
+    def changes(self) -> list[list[Numbers]]:
+        """Derivatives of the packed numbers of each job by each parameter, [p][job]."""
+        found = []
+        for (low, high), width in zip(self._changed, self._widths, strict=True):
+            row = []
+            for index, (group, place) in enumerate(self._rows):
+                task, ends = group.packed.tasks[place], (low[index], high[index])
+                row.append(packed_change(task, *ends, 2 * width, group.solver.quasistatic))
+            found.append(row)
+        return found
+
+    def gradient(
+        self,
+        wrench: Given | None = None,
+        link_positions: Given | None = None,
+        contact_wrench: Given | None = None,
+    ) -> Gradient:
+        """Return the gradient of a number from its derivatives by what :attr:`traces` hold.
+
+        Args:
+            wrench: [job] of arrays [n, 6]; None for zeros.
+            link_positions: [job] of arrays [n, links + 1, 3].
+            contact_wrench: [job] of arrays [n, 6].
+        """
+        count = len(self.jobs)
+        outputs = (wrench, link_positions, contact_wrench)
+        given: list[Given] = [[None] * count if some is None else some for some in outputs]
+        by_job = np.zeros((count, len(self.values)))
+        events: dict[int, ContactEvents] = {}
+        for group in self._groups:
+            found = group.solver.reverse(self._outputs(group, given))
+            for row, index in enumerate(group.indices):
+                trace = self.traces[index]
+                events[index] = contact_events(found["contacts"][row], trace.reason)
+                points = given[1][index]
+                for p, change in enumerate(of_jobs[index] for of_jobs in self.changes):
+                    value = contract(found, change, group.places[row], row)
+                    if points is not None and "positions" in change:
+                        value += float(np.vdot(np.sum(points, axis=1), change["positions"]))
+                    by_job[index, p] = value
+                if trace.status != "ok":
+                    by_job[index] = np.nan if any(some[index] is not None for some in given) else 0.0
+        return Gradient(by_job.sum(axis=0), by_job, tuple(events[index] for index in range(count)))
+
+    def _outputs(self, group: _Group, given: Sequence[Given]) -> OutputDerivatives:
+        frames, nodes = len(group.packed.tasks[0].job.times), group.solver.capacity + 1
+        shapes = ((frames, 6), (frames, nodes, 3), (frames, 6))
+        arrays = [np.zeros((len(group.indices), *shape)) for shape in shapes]
+        for row, index in enumerate(group.indices):
+            for array, some in zip(arrays, given, strict=True):
+                value = some[index]
+                if value is not None:
+                    array[row][tuple(slice(n) for n in np.shape(value))] = value
+        return OutputDerivatives(*arrays)
+
+
+def _span(job: Job) -> tuple[float, float]:
+    return job.start, float(job.times[-1])
+
+
+def _check_values(values: NDArray[np.float64], scales: NDArray[np.float64]) -> None:
+    if values.ndim != 1 or not len(values) or not np.isfinite(values).all():
+        raise UsageError(f"Parameters are one list of finite values; received shape {values.shape}.")
+    if scales.shape != values.shape or not (np.isfinite(scales) & (scales > 0)).all():
+        raise UsageError(
+            "Every parameter needs a positive scale, the size of a small change of it; give scales where a value is 0."
+        )

@@ -1,0 +1,70 @@
+"""Gradients of a run beside central differences of the same run."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from brainbench.stimuli.engines.fidelity import Fidelity
+from brainbench.stimuli.engines.protocol import Job, StillFollicle, Trace
+from brainbench.stimuli.gradients import GradientRun, JobParameters
+from brainbench.stimuli.objects.obstacle import Obstacle, Part, TriangleMesh
+from brainbench.stimuli.whiskers.whisker import Whisker
+
+COARSE = Fidelity(links=8, time_step=1e-4)
+WHISKER = Whisker(0.02, 5e-5, 5e-6, 3e9, 1300.0, 0.3, curvature=10.0, friction=0.0)
+
+
+class Swing:
+    """A base that swings by .35 rad at 10 Hz about its rest, in all three angles."""
+
+    finest = 0.05
+
+    def pose(self, times: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return positions [n, 3] (m) and angles [n, 3] (rad)."""
+        position, euler = StillFollicle().pose(times)
+        return position, euler + 0.35 * np.sin(20 * np.pi * times)[:, None] * [1.0, 0.3, 0.4]
+
+
+def touching_job(solid: Part | TriangleMesh, *, friction: float = 0.0, frames: int = 30) -> Job:
+    """Return the job of a whisker that swings onto a solid, which stands beside its middle."""
+    whole = ((), solid) if isinstance(solid, TriangleMesh) else ((solid,), None)
+    obstacle = Obstacle(whole[0], surface=whole[1])
+    whisker = replace(WHISKER, friction=friction)
+    return Job(whisker, Swing(), (obstacle,), np.linspace(1e-3, frames * 1e-3, frames))
+
+
+def gradient_errors(
+    job: Job, names: tuple[str, ...], *, fidelity: Fidelity = COARSE, change: float = 1e-5, **options: object
+) -> tuple[NDArray[np.float64], GradientRun]:
+    """Return the errors [output, parameter] of derivatives beside central differences, relative to the latter.
+
+    Outputs are random sums of wrenches, shapes and contact forces; NaN where one does not depend on a parameter.
+    """
+    parameters = JobParameters([job], names, **options)  # pyright: ignore[reportArgumentType]
+    run = GradientRun(parameters.build, parameters.values, scales=parameters.scales, fidelity=fidelity)
+    trace = run.traces[0]
+    assert trace.status == "ok", trace.reason
+    random = np.random.default_rng(0)
+    weights = [random.normal(size=values.shape) / (np.abs(values).max() or 1.0) for values in outputs_of(trace)]
+    exact = [
+        run.gradient(*[[weight if k == output else None] for k in range(3)]) for output, weight in enumerate(weights)
+    ]
+    errors = np.full((3, len(names)), np.nan)
+    for p, scale in enumerate(parameters.scales):
+        shift = change * scale * (np.arange(len(names)) == p)
+        ends = [outputs_of(run.traces_at(parameters.values + sign * shift)[0]) for sign in (1, -1)]
+        for output, weight in enumerate(weights):
+            expected = np.vdot(weight, ends[0][output] - ends[1][output]) / (2 * shift[p])
+            if abs(expected * scale) > 1e-6:
+                errors[output, p] = abs(exact[output].values[p] / expected - 1)
+    return errors, run
+
+
+def outputs_of(trace: Trace) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Return what a gradient run differentiates."""
+    assert trace.link_positions is not None
+    assert trace.contact_wrench is not None
+    return trace.wrench, trace.link_positions, trace.contact_wrench

@@ -1,0 +1,97 @@
+"""Named parameters of jobs."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from brainbench.core.errors import UsageError
+from brainbench.stimuli.engines.protocol import Job, StillFollicle
+from brainbench.stimuli.gradients import JobParameters
+from brainbench.stimuli.objects.obstacle import Sphere
+from tests.factories.gradients import WHISKER, Swing, gradient_errors, touching_job
+
+BALL = touching_job(Sphere((11e-3, 2.2e-3, 0.0), 1e-3))
+
+
+def _build(job: Job, **given: float) -> Job:
+    parameters = JobParameters([job], list(given))
+    return parameters.build(np.array(list(given.values())))[0]
+
+
+def test_values_are_those_of_the_jobs_and_shifts_begin_at_zero():
+    parameters = JobParameters([BALL], ("young_modulus", "density", "base.theta", "object.x"))
+    assert parameters.values.tolist() == [3e9, 1300.0, 0.0, 0.0]
+    assert (parameters.scales > 0).all()
+    same = parameters.build(parameters.values)[0]
+    assert same.whisker == replace(WHISKER, density=(1300.0, 1300.0))
+    assert same.obstacles[0].parts == BALL.obstacles[0].parts
+
+
+def test_density_keeps_the_proportion_of_the_tip():
+    job = replace(BALL, whisker=replace(WHISKER, density=(1000.0, 1500.0)))
+    assert _build(job, density=1100.0).whisker.density == pytest.approx((1100.0, 1650.0))
+
+
+def test_an_object_is_shifted_and_turned_about_its_middle():
+    moved = _build(BALL, **{"object.y": 1e-3, "object.rz": 0.5, "object.friction": 0.2}).obstacles[0]
+    assert moved.parts[0].centre == pytest.approx((11e-3, 3.2e-3, 0.0))
+    assert moved.friction == 0.2
+
+
+def test_an_object_that_moves_is_shifted_along_its_whole_way():
+    def motion(times):
+        return np.outer(times, [1.0, 0.0, 0.0]), np.tile([1.0, 0.0, 0.0, 0.0], (len(times), 1))
+
+    job = replace(BALL, obstacles=(replace(BALL.obstacles[0], motion=motion),))
+    moved = _build(job, **{"object.z": 2e-3, "object.rz": np.pi / 2}).obstacles[0].motion
+    places, turns = moved(np.array([0.0, 0.01]))
+    # The middle of the ball is 11 mm from the body's origin, about which nothing turns.
+    middle = np.array([11e-3, 2.2e-3, 0.0])
+    turned = np.array([-middle[1], middle[0], 0.0])
+    np.testing.assert_allclose(places[0] + turned, middle + np.array([0.0, 0.0, 2e-3]), atol=1e-12)
+    np.testing.assert_allclose(places[1] - places[0], [0.0, 0.01, 0.0], atol=1e-12)
+    np.testing.assert_allclose(np.abs(turns[:, 3]), np.sqrt(0.5))
+
+
+def test_the_base_is_shifted_at_knots_in_time_and_differentiated_there():
+    job = replace(BALL, follicle=StillFollicle(), obstacles=(), times=np.linspace(1e-3, 0.03, 30))
+    names = ("base.theta[1]", "base.y[2]")
+    errors, run = gradient_errors(job, names, knots=(0.0, 0.01, 0.02, 0.03), change=1e-3)
+    assert np.isfinite(errors[0, 1])
+    assert np.isfinite(errors[1]).all()
+    assert np.nanmax(errors) < 1e-3
+    assert np.abs(run.traces[0].wrench).max() < 1e-12
+
+
+def test_what_two_parameters_share_is_not_built_twice():
+    parameters = JobParameters([replace(BALL, follicle=Swing())], ("curvature", "base.x", "object.y"))
+    first = parameters.build(np.array([11.0, 0.0, 0.0]))[0]
+    second = parameters.build(np.array([12.0, 0.0, 0.0]))[0]
+    assert first.follicle is second.follicle
+    assert first.obstacles[0] is second.obstacles[0]
+    assert first.whisker.curvature == 11.0
+
+
+@pytest.mark.parametrize(
+    ("names", "said"),
+    [
+        (["young_modulas"], "young_modulus"),
+        (["base.thetta"], "base.theta"),
+        (["object.q"], "object.z"),
+        (["object3.x"], "the jobs have 1"),
+        (["base.x[0]"], "give their times as knots"),
+        (["curvature", "curvature"], "once"),
+        ([], "at least one"),
+    ],
+)
+def test_unknown_parameters_are_refused(names, said):
+    with pytest.raises(UsageError, match=said):
+        JobParameters([BALL], names)
+
+
+def test_whiskers_that_differ_in_a_parameter_are_refused():
+    other = replace(BALL, whisker=replace(WHISKER, curvature=20.0))
+    with pytest.raises(UsageError, match="curvature"):
+        JobParameters([BALL, other], ["curvature"])
+    assert JobParameters([BALL, other], ["young_modulus"]).values[0] == 3e9

@@ -1,0 +1,173 @@
+"""Gradients beside central differences in double precision: free, loaded and touching whiskers."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from brainbench.core.errors import UsageError
+from brainbench.core.rotations import euler_matrix
+from brainbench.stimuli.engines.fidelity import Fidelity
+from brainbench.stimuli.engines.protocol import Job, Load, StillFollicle
+from brainbench.stimuli.gradients import GradientRun, JobParameters
+from brainbench.stimuli.objects.obstacle import Box, Capsule, Cylinder, Obstacle, Sphere, TriangleMesh
+from brainbench.stimuli.validation.contact_scenes import contact_jobs
+from tests.factories.gradients import COARSE, WHISKER, Swing, gradient_errors, touching_job
+
+MATERIAL = ("young_modulus", "density", "damping_ratio", "base_radius", "tip_radius", "curvature", "arc_length")
+BASE = ("base.x", "base.y", "base.theta", "base.phi", "base.zeta")
+OBJECT = ("object.x", "object.y", "object.z", "object.rx", "object.ry", "object.rz")
+EDGE = (np.cos(np.pi / 8), 0.0, 0.0, np.sin(np.pi / 8))
+
+
+def _prism() -> TriangleMesh:
+    corners = np.array([[x, y, z] for x in (-1e-3, 1e-3) for y in (-1e-3, 1e-3) for z in (-8e-3, 8e-3)])
+    faces = np.array(
+        [[0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1], [2, 3, 7], [2, 7, 6], [0, 2, 6], [0, 6, 4],
+         [1, 5, 7], [1, 7, 3]]
+    )  # fmt: skip
+    turn = euler_matrix((0.1, 0.0, np.pi / 4))
+    return TriangleMesh(corners @ turn.T + [11e-3, 3e-3, 0.3e-3], faces.astype(np.int32))
+
+
+SOLIDS = {
+    "sphere": Sphere((11e-3, 2.3e-3, 0.3e-3), 1e-3),
+    "post": Capsule((11e-3, 2.2e-3, -8e-3), (11e-3, 2.7e-3, 8e-3), 5e-4),
+    "rim": Cylinder((11e-3, 3.8e-3, 1.3e-3), (11e-3, 3.2e-3, 0.7e-3), 2e-3),
+    "edge": Box((11e-3, 3e-3, 0.3e-3), (1e-3, 1e-3, 8e-3), EDGE),
+    "mesh": _prism(),
+}
+
+
+def test_free_and_loaded_motion_has_the_gradients_of_central_differences():
+    load = Load(0.0143, (0.0, 1e-5, 5e-6), stop=0.0153)
+    job = Job(WHISKER, Swing(), (), np.linspace(1e-3, 0.024, 24), gravity=(0.0, 5.0, -5.0), loads=(load,))
+    errors, _ = gradient_errors(job, (*MATERIAL, "poisson_ratio", *BASE), change=1e-4)
+    assert np.nanmax(errors) < 1e-5
+
+
+def test_quasistatic_motion_has_the_gradients_of_central_differences():
+    job = touching_job(SOLIDS["post"], friction=0.4)
+    errors, _ = gradient_errors(job, ("young_modulus", "curvature", "friction", "object.y"), fidelity=_quasistatic())
+    assert np.nanmax(errors) < 1e-3
+
+
+def _quasistatic() -> Fidelity:
+    return Fidelity(links=8, time_step=1e-3, solver="quasistatic")
+
+
+@pytest.mark.parametrize("friction", [0.0, 0.4])
+@pytest.mark.parametrize("kind", ["post", pytest.param("mesh", marks=pytest.mark.slow)])
+def test_contact_has_the_gradients_of_central_differences(kind, friction):
+    _check_contact(kind, friction)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("friction", [0.0, 0.4])
+@pytest.mark.parametrize("kind", ["sphere", "rim", "edge"])
+def test_contact_with_every_feature_has_the_gradients_of_central_differences(kind, friction):
+    _check_contact(kind, friction)
+
+
+def _check_contact(kind: str, friction: float) -> None:
+    names = (*MATERIAL, *BASE[:4], *OBJECT, *(("friction",) if friction else ()))
+    errors, run = gradient_errors(touching_job(SOLIDS[kind], friction=friction), names)
+    assert run.traces[0].contact.sum() > 5
+    assert np.nanmax(errors) < 1e-3
+
+
+def test_sizes_of_a_primitive_and_its_own_friction_have_gradients():
+    job = touching_job(SOLIDS["post"])
+
+    def build(values):
+        post = replace(SOLIDS["post"], radius=values[0])
+        return [replace(job, obstacles=(Obstacle((post,), friction=values[1]),))]
+
+    run = GradientRun(build, [5e-4, 0.3], fidelity=COARSE)
+    gradient = run.gradient([np.ones((30, 6)) * [0, 0, 0, 1, 1, 1]]).values
+    for p, value in enumerate((5e-4, 0.3)):
+        shift = 1e-5 * value * (np.arange(2) == p)
+        high, low = (run.traces_at([5e-4, 0.3] + sign * shift)[0].wrench[:, 3:].sum() for sign in (1, -1))
+        assert gradient[p] == pytest.approx((high - low) / (2 * shift[p]), rel=1e-3)
+
+
+def test_an_object_that_moves_has_gradients_by_its_place_and_turn():
+    job = touching_job(SOLIDS["post"], friction=0.3)
+
+    def motion(times):
+        angle = 0.3 * np.sin(50 * times)
+        turn = np.stack([np.cos(angle / 2), 0.6 * np.sin(angle / 2), 0 * angle, 0.8 * np.sin(angle / 2)], axis=1)
+        return np.outer(np.sin(40 * times), [0, -1e-3, 3e-4]), turn
+
+    job = replace(job, obstacles=(replace(job.obstacles[0], motion=motion),))
+    errors, run = gradient_errors(job, OBJECT)
+    assert run.traces[0].contact.any()
+    assert np.nanmax(errors) < 1e-3
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("scene", range(12))
+def test_random_contact_scenes_have_the_gradients_of_central_differences(scene):
+    job = contact_jobs(29, each=1)[scene]
+    names = ("young_modulus", "base_radius", "curvature", "base.theta", "object.x", "object.y")
+    try:
+        errors, run = gradient_errors(job, names, change=1e-6)
+    except AssertionError as error:
+        pytest.skip(f"not simulated: {error}")
+    assert run.traces[0].contact.any()
+    if run.gradient([np.ones_like(run.traces[0].wrench)]).events[0].status == "degenerate":
+        pytest.skip("its contact forces have no unique solution, and the run says so")
+    # A change of contact between the two differences is no error of the gradient: at most one parameter has one.
+    assert np.sort(np.nan_to_num(errors).max(axis=0))[-2] < 1e-2
+
+
+def test_whiskers_of_different_frames_and_lengths_share_parameters():
+    first = touching_job(SOLIDS["post"])
+    second = Job(replace(WHISKER, arc_length=0.015), StillFollicle(), (), np.array([0.01, 0.02]), gravity=(0, 0, -9.8))
+    parameters = JobParameters([first, second], ("young_modulus", "density"))
+    run = GradientRun(parameters.build, parameters.values, fidelity=COARSE)
+    weights = [np.ones((30, 6)), np.ones((2, 6))]
+    gradient = run.gradient(weights)
+    for index, job in enumerate((first, second)):
+        alone = JobParameters([job], ("young_modulus", "density"))
+        run = GradientRun(alone.build, alone.values, fidelity=COARSE)
+        np.testing.assert_allclose(gradient.by_job[index], run.gradient([weights[index]]).values, rtol=1e-9)
+    np.testing.assert_allclose(gradient.values, gradient.by_job.sum(axis=0))
+
+
+def test_a_whisker_that_nothing_bends_has_the_shape_gradient_of_its_rest():
+    job = Job(WHISKER, StillFollicle(), (), np.array([1e-3, 2e-3]))
+    parameters = JobParameters([job], ("curvature", "base.x"))
+    run = GradientRun(parameters.build, parameters.values, scales=parameters.scales, fidelity=COARSE)
+    positions = np.zeros((2, 9, 3))
+    positions[1, -1, 1] = 1.0
+    tips = [replace(WHISKER, curvature=value).centre_line(0.02)[1] for value in (9.99, 10.01)]
+    gradient = run.gradient(link_positions=[positions])
+    assert gradient.values[0] == pytest.approx((tips[1] - tips[0]) / 0.02, rel=1e-5)
+    positions[1, -1] = [1.0, 0.0, 0.0]
+    assert run.gradient(link_positions=[positions]).values[1] == pytest.approx(1.0)
+
+
+def test_an_unstable_whisker_has_no_gradient():
+    job = touching_job(Sphere((11e-3, 5e-4, 0.0), 1e-3))
+    parameters = JobParameters([job], ("young_modulus",))
+    gradient = GradientRun(parameters.build, parameters.values, fidelity=COARSE).gradient([np.ones((30, 6))])
+    assert np.isnan(gradient.values).all()
+    assert gradient.events[0].status == "unstable"
+    assert not gradient.smooth
+
+
+def test_what_cannot_be_differentiated_is_refused():
+    job = touching_job(_prism())
+
+    def scaled(values):
+        return [replace(job, obstacles=(Obstacle((), surface=_prism().scaled(values[0])),))]
+
+    with pytest.raises(UsageError, match="deforms or scales a mesh"):
+        GradientRun(scaled, [1.0], fidelity=COARSE).gradient([np.ones((30, 6))])
+    with pytest.raises(UsageError, match="same number of jobs"):
+        GradientRun(lambda values: [job] * (1 + (values[0] > 1)), [1.0], fidelity=COARSE)
+    with pytest.raises(UsageError, match="positive scale"):
+        GradientRun(lambda values: [job], [0.0], fidelity=COARSE)
+    with pytest.raises(UsageError, match="finite"):
+        GradientRun(lambda values: [job], [np.nan], fidelity=COARSE)
