@@ -154,7 +154,7 @@ def test_hands_of_no_or_too_many_joints_are_refused(joints, fingers) -> None:
     with pytest.raises(UsageError, match=f"{joints} and {fingers}"):
         UdpDriver(("", 9), ("j",) * joints, ("f",) * fingers, new_key())
     for age in (*NOT_FINITE, 0.0, 100.0):
-        with pytest.raises(UsageError, match="oldest"):
+        with pytest.raises(UsageError, match="max_age"):
             UdpDriver(("", 9), ("j",), (), new_key(), max_age=age)
 
 

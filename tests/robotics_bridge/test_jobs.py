@@ -16,7 +16,7 @@ def test_every_job_has_a_command_that_exists_and_minutes() -> None:
     jobs = read_jobs()
     assert len(jobs) > 5
     words = [shlex.split(job["command"].replace(";", " ; ")) for job in jobs]
-    known = {"train", "distill", "probe", "evaluate"}
+    known = {"train", "distill", "probe", "evaluate", "sweep"}
     for line in words:
         named = [line[at + 2] for at, word in enumerate(line[:-2]) if (word, line[at + 1]) == ("brainbench", "policy")]
         assert set(named) <= known
