@@ -51,7 +51,7 @@ def test_a_reduced_network_is_scored_like_the_network():
 def test_wrong_settings_are_refused():
     with pytest.raises(UsageError, match="precision 'int4'"):
         ModelSetting("int4")
-    with pytest.raises(UsageError, match="steps must .*received 0"):
+    with pytest.raises(UsageError, match=r"steps must .*received 0"):
         ModelSetting(steps=0)
     with pytest.raises(UsageError, match=r"'s4-small' .*'full'"):
         Reduced("s4-small", ModelSetting(unroll="full"))

@@ -25,11 +25,11 @@ from .delassus import (
     add_rates,
     apply_forces,
     build_delassus,
+    contact_force,
     own_contacts,
     own_rows,
     row,
     select_contacts,
-    store_forces,
     stride,
 )
 from .parameters import group_size, max_contacts, module_options, queue, real, recorded
@@ -377,6 +377,39 @@ def iterate_forces(
                 guessing = 1
             if warp_max(guessing) == 1:
                 refresh = share_normal_forces(solver, own, matrix, normals, work, guessing, guess_tries)
+
+
+@wp.func(inline=True)
+def store_forces(problems: ContactProblems, solver: wp.ref[SolverState], own: wp.ref[ThreadContacts]):
+    """Write what the contacts do together, and their forces for the next step."""
+    zero = real(0.0)
+    force = vec3(zero, zero, zero)
+    moment = vec3(zero, zero, zero)
+    normal_sum = zero
+    arc_sum = zero
+    for k in range(solver.own_count):
+        if solver.thread + k < solver.contacts and solver.live == 1:
+            force_k = contact_force(own, k)
+            arc = row(own.arc, k)
+            problems.held[solver.job, solver.thread + k].arc = arc
+            problems.held[solver.job, solver.thread + k].force = force_k
+            if wp.static(recorded):
+                problems.held[solver.job, solver.thread + k].slot = row(own.slot, k)
+            force = force + force_k
+            moment = moment + wp.cross(row(own.point, k), force_k)
+            fn = row(own.force, 3 * k)
+            if fn > zero:
+                normal_sum += fn
+                arc_sum += fn * arc
+    normal_sum = group_sum(normal_sum)
+    arc_sum = group_sum(arc_sum)
+    force = vec3(group_sum(force[0]), group_sum(force[1]), group_sum(force[2]))
+    moment = vec3(group_sum(moment[0]), group_sum(moment[1]), group_sum(moment[2]))
+    if solver.thread == 0 and solver.live == 1:
+        problems.solution[solver.job].normal_sum = normal_sum
+        problems.solution[solver.job].arc_sum = arc_sum
+        problems.solution[solver.job].contact_force = force
+        problems.solution[solver.job].contact_moment = moment
 
 
 @wp.func

@@ -493,12 +493,9 @@ class PausedWhiskers:
     """[3, job] the same for the next slice."""
     problem_queue: wp.array2d(dtype=wp.int32)
     """[3, job] whiskers whose contact forces are to be found: of few, some and many candidates."""
-    queue_size: wp.array(dtype=wp.int32)
-    """[3]"""
-    problem_size: wp.array(dtype=wp.int32)
-    """[3]"""
-    query_count: wp.array(dtype=wp.int32)
-    """[1]"""
+    queue_size: wp.array(dtype=wp.int32)  # [3]
+    problem_size: wp.array(dtype=wp.int32)  # [3]
+    query_count: wp.array(dtype=wp.int32)  # [1]
     next_queue_size: wp.array(dtype=wp.int32)
     """[3] the same three for the next slice."""
     next_problem_size: wp.array(dtype=wp.int32)
