@@ -22,7 +22,7 @@ def _record(job, fidelity=FINE):
     task = make_task(job, fidelity, {}, silent=True)
     packed = PackedTasks.of([task], shared=False)
     solver = RecordingSolver(packed.chains, fidelity, pick_device("cpu"), packed.shapes.needs, twists=task.twists)
-    return solver, packed.launch(solver, finer=1, record_shape=True)
+    return solver, packed.launch(solver, record_shape=True)
 
 
 def test_a_recorded_run_takes_the_steps_of_the_ordinary_one():
