@@ -6,7 +6,6 @@ Letters: n instant, k traced point, c channel of a wrench, d = 1 or 2 directions
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
@@ -15,11 +14,11 @@ from numpy.typing import NDArray
 
 from brainbench.core.contracts import CHANNELS
 from brainbench.core.errors import DataError, UsageError, check_name
+from brainbench.stimuli.engines.displaced import MovedFollicle, move_obstacle
 from brainbench.stimuli.engines.protocol import Follicle, Job, Load, StillFollicle, Trace
 from brainbench.stimuli.fitting.curves import normal_offsets
 from brainbench.stimuli.fitting.parameters import Condition, Vector
 from brainbench.stimuli.fitting.tracks.quality import check_length
-from brainbench.stimuli.objects.obstacle import Obstacle
 from brainbench.stimuli.validation import references
 from brainbench.stimuli.whiskers.chain import build_chain
 from brainbench.stimuli.whiskers.whisker import Whisker
@@ -27,6 +26,7 @@ from brainbench.stimuli.whiskers.whisker import Whisker
 if TYPE_CHECKING:
     import xarray as xr
 
+    from brainbench.stimuli.objects.obstacle import Obstacle
     from brainbench.stimuli.scenes.scene import Scene
 
 SETTLING = 4.0
@@ -163,8 +163,13 @@ class Trial:
             whisker=condition.whisker,
             loads=loads,
             follicle=_moved_base(self.job.follicle, condition),
-            obstacles=tuple(_moved_object(item, condition.object_offset) for item in self.job.obstacles),
+            obstacles=self._obstacles(condition.object_offset),
         )
+
+    def _obstacles(self, offset: Vector) -> tuple[Obstacle, ...]:
+        if not any(offset):
+            return self.job.obstacles
+        return tuple(move_obstacle(item, offset, start=self.job.start) for item in self.job.obstacles)
 
     def residuals(self, trace: Trace, whisker: Whisker) -> NDArray[np.float64]:
         """Return predicted minus measured: [n, c] (N, N·m), or [n, k, d] (m) across the predicted shape; NaN: missing.
@@ -179,43 +184,11 @@ class Trial:
         return normal_offsets(nodes, trace.link_positions, self.measured["shape"].values)
 
 
-@dataclass(frozen=True, eq=False)
-class _OffsetFollicle:
-    """A base displaced and turned by constant amounts against another."""
-
-    follicle: Follicle
-    offset: Vector
-    angle: float
-
-    @property
-    def finest(self) -> float | None:
-        return getattr(self.follicle, "finest", None)
-
-    def pose(self, times: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        position, euler = self.follicle.pose(times)
-        # θ turns about the z axis last, so that its change is a turn about z of the whole base.
-        return position + np.asarray(self.offset), euler + np.array([self.angle, 0.0, 0.0])
-
-
 def _moved_base(follicle: Follicle, condition: Condition) -> Follicle:
     if not any(condition.base_offset) and not condition.base_angle:
         return follicle
-    return _OffsetFollicle(follicle, condition.base_offset, condition.base_angle)
-
-
-def _moved_object(obstacle: Obstacle, offset: Sequence[float]) -> Obstacle:
-    shift, same = np.asarray(offset, dtype=float), np.eye(3)
-    if not shift.any():
-        return obstacle
-    if (motion := obstacle.motion) is not None:
-
-        def moved(times: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-            position, turn = motion(times)
-            return np.asarray(position) + shift, turn
-
-        return replace(obstacle, motion=moved)
-    surface = None if obstacle.surface is None else obstacle.surface.moved(same, shift)
-    return replace(obstacle, parts=tuple(part.moved(same, shift) for part in obstacle.parts), surface=surface)
+    # θ turns about the z axis last, so that its change is a turn about z of the whole base.
+    return MovedFollicle(follicle, np.array([*condition.base_offset, condition.base_angle, 0.0, 0.0]))
 
 
 def to_frame(measured: xr.Dataset, axes: NDArray[np.float64], origin: NDArray[np.float64]) -> xr.Dataset:

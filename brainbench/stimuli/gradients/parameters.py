@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from brainbench.core import rotations
 from brainbench.core.errors import UsageError, unknown_name
+from brainbench.stimuli.engines.displaced import MovedFollicle, move_obstacle
 from brainbench.stimuli.engines.protocol import Follicle, Job
 from brainbench.stimuli.objects.obstacle import Obstacle
 from brainbench.stimuli.whiskers.whisker import Whisker
@@ -32,36 +32,6 @@ _SHARE = 0.05
 """Scale of a shift as a share of the arc length."""
 _BASE_NAME = re.compile(r"base\.(\w+)(?:\[(\d+)\])?")
 _OBJECT_NAME = re.compile(r"object(\d*)\.(\w+)")
-
-
-@dataclass(frozen=True, eq=False)
-class MovedFollicle:
-    """A follicle with shifts of its pose: constant ones, or a cubic spline through knots."""
-
-    follicle: Follicle
-    offsets: NDArray[np.float64]
-    """[6] or [knot, 6] of x, y, z (m), θ, φ, ζ (rad)."""
-    knots: NDArray[np.float64] | None = None
-    """[knot] times (s); before the first and after the last their values hold."""
-
-    @property
-    def finest(self) -> float | None:
-        """Shortest period (s) of the motion, as the follicle's own says; None when it says nothing."""
-        own = getattr(self.follicle, "finest", None)
-        if self.knots is None or own is None:
-            return own
-        return min(own, 2 * float(np.diff(self.knots).min()))
-
-    def pose(self, times: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return positions [n, 3] (m) and angles [n, 3] (rad)."""
-        position, euler = self.follicle.pose(times)
-        shift = self.offsets
-        if self.knots is not None:
-            from scipy.interpolate import CubicSpline
-
-            spline = CubicSpline(self.knots, self.offsets, bc_type="clamped")
-            shift = spline(np.clip(times, self.knots[0], self.knots[-1]))
-        return np.asarray(position) + shift[..., :3], np.asarray(euler) + shift[..., 3:]
 
 
 class JobParameters:
@@ -203,35 +173,6 @@ def _whisker(whisker: Whisker, given: dict[str, float]) -> Whisker:
     return replace(whisker, **changes) if changes else whisker
 
 
-def _moved(obstacle: Obstacle, move: dict[str, float], start: float) -> Obstacle:
-    shift = np.array([move.get(name, 0.0) for name in ("x", "y", "z")])
-    vector = np.array([move.get(name, 0.0) for name in ("rx", "ry", "rz")])
-    angle = float(np.linalg.norm(vector))
-    half = np.append(np.cos(angle / 2), np.sinc(angle / (2 * np.pi)) / 2 * vector)
-    turn = rotations.to_matrices(half)
-    friction = move.get("friction", obstacle.friction)
-    middle = obstacle.bounds.mean(axis=0)
-    motion = obstacle.motion
-    if motion is None:
-        about = middle - turn @ middle + shift
-        parts = tuple(part.moved(turn, about) for part in obstacle.parts)
-        surface = obstacle.surface and obstacle.surface.moved(turn, about)
-        return replace(obstacle, parts=parts, surface=surface, friction=friction)
-    return replace(obstacle, motion=_MovedMotion(motion, turn, shift, middle, start), friction=friction)
-
-
-class _MovedMotion:
-    """A motion of an object, turned about where its middle is at the start and shifted."""
-
-    def __init__(self, motion: Any, turn: NDArray, shift: NDArray, middle: NDArray, start: float) -> None:
-        self.motion, self.turn, self.shift = motion, turn, shift
-        place, quaternion = motion(np.array([start]))
-        self.middle = np.asarray(place)[0] + rotations.to_matrices(np.asarray(quaternion, dtype=float))[0] @ middle
-        if hasattr(motion, "finest"):
-            self.finest = motion.finest
-
-    def __call__(self, times: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        place, quaternion = self.motion(times)
-        turns = self.turn @ rotations.to_matrices(np.asarray(quaternion, dtype=float))
-        moved = (np.asarray(place) - self.middle) @ self.turn.T + self.middle + self.shift
-        return moved, rotations.from_matrices(turns)
+def _moved(obstacle: Obstacle, move: Mapping[str, float], start: float) -> Obstacle:
+    shift, turn = ([move.get(name, 0.0) for name in names] for names in (OBJECT[:3], OBJECT[3:6]))
+    return replace(move_obstacle(obstacle, shift, turn, start=start), friction=move.get("friction", obstacle.friction))
