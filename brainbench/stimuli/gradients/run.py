@@ -188,7 +188,7 @@ class GradientRun:
 
     @cached_property
     def changes(self) -> list[list[Numbers]]:
-        """Derivatives of the packed numbers of each job by each parameter, [p][job]."""
+        """Derivatives of the packed numbers of each job by each parameter: a row a parameter, a column a job."""
         found = []
         for (low, high), width in zip(self._changed, self._widths, strict=True):
             row = []
