@@ -1,0 +1,60 @@
+#!/usr/bin/env bash
+# What has to be seen on a GPU, on a machine that is lent for minutes and reaches no network: tests marked gpu, golden
+# wrenches, and measurements. Prepared here, so that no minute there goes into finding out how.
+#
+#   here:       ../shared/device/pack.sh msgspec h5netcdf manifold3d platformdirs hypothesis pytest-timeout gitpython \
+#                 gitdb smmap pyvers importlib_metadata orjson
+#               bash benchmarks/gpu_session.sh prepare                code, weights and inputs into .session (ignored)
+#               git checkout -b device && git rm -rqf . && git commit -qm device --allow-empty    a small tree travels
+#   device, 1:  carry .gpu/a            mkdir -p /w /opt/w && date +%s >/w/t0 && cp .gpu/a/* /opt/w/
+#   device, 2:  carry .gpu/b            cp .gpu/b/* /opt/w/
+#   device, 3:  carry .gpu/c .session   bash .gpu/c/install.sh && bash .session/gpu_session.sh start && bash /w/gpu.sh run tests
+#   device, 4…: bash /w/gpu.sh run PART …                             each at most as long as it says; all below 600 s
+#   here:       git checkout -f main && git branch -D device; python -m benchmarks.report after copying results/*.json
+#
+# Calls follow one another within 30 s, or the machine goes back with all that is on it. `models/campaign_session.sh`
+# shares these three calls: its training may run while `tests` does, never while something is timed.
+set -eu
+
+# Part, its limit in seconds, its command.
+parts() { cat <<'TABLE'
+tests     420  python3 -m pytest -q -n 0 -m gpu tests -p no:cacheprovider
+golden    420  python3 -m pytest -q -n 0 -p no:cacheprovider tests/stimuli/engines/test_golden_wrenches.py -k rod
+sweeps-1  100  python3 -m benchmarks.whiskers.public_rate --objects procedural-24:1 --limit 8 $P --parts kernels --ahead :2,1:24 --room 0,32768
+sweeps-2   60  python3 -m benchmarks.whiskers.public_rate --objects procedural-24:1 --limit 2 $P --parts stages
+sweeps-3  150  python3 -m benchmarks.whiskers.public_rate --objects procedural-24:2 $P --parts kernels --room 0,32768 --ahead :2,1:24,124:
+sweeps-4  240  python3 -m benchmarks.whiskers.public_rate --objects procedural-24:2 $P --parts command --write
+free      120  python3 -m benchmarks.whiskers.throughput --only free --links 20 --blocks 64,128 --bounds 0,64x6,64x8
+touch     240  python3 -m benchmarks.tactile.throughput --device cuda --part sensors --input inputs/pyramid.npz --write
+friction  150  python3 -m benchmarks.tactile.friction_cost --device cuda --input inputs/friction.npz --write
+gradients 200  python3 -m benchmarks.whiskers.gradients --device cuda --scenes 10
+TABLE
+}
+
+prepare() {
+  local top out tree; top=$(git rev-parse --show-toplevel); out=$top/.session; tree=$(mktemp -d); rm -rf "$out"; mkdir -p "$out"
+  grep -qx '/.session/' "$top/.git/info/exclude" || echo '/.session/' >>"$top/.git/info/exclude"
+  git -C "$top" archive HEAD brainbench robotics_bridge leaderboards benchmarks tests pyproject.toml | tar x -C "$tree"
+  rm -rf "$tree"/leaderboards/{reproduction/records,results}/*.json "$tree"/benchmarks/results/*
+  mkdir "$tree/inputs"
+  (cd "$top" && python -m benchmarks.tactile.throughput --device cpu --write-input "$tree/inputs/pyramid.npz" &&
+    python -m benchmarks.tactile.friction_cost --write-input "$tree/inputs/friction.npz")
+  tar cJf "$out/head.tar.xz" -C "$tree" . && cp "$0" "$out/gpu_session.sh"; rm -rf "$tree"; ls -la "$out"
+}
+
+start() { mkdir -p /w/head && tar xJf .session/head.tar.xz -C /w/head && cp "$0" /w/gpu.sh; }
+
+run() {
+  cd /w/head && export PYTHONPATH=/opt/w:/w/head PYTHONUNBUFFERED=1 BRAINBENCH_CACHE=/w/cache
+  local P="--fidelity fast,links=12,time_step=1e-3,steps_per_period=none" name limit command
+  for wanted in "$@"; do
+    while read -r name limit command; do
+      [ "$name" = "$wanted" ] || continue
+      echo "== $name, $(($(date +%s) - $(cat /w/t0))) s"
+      eval "timeout $limit $command" 2>&1 | tee "$OUT/$name.log" | tail -n 25 | cut -c1-200
+    done < <(parts)
+  done
+  tar czf "$OUT/results.tar.gz" benchmarks/results; nvidia-smi --query-gpu=name,memory.used --format=csv,noheader
+}
+
+"$@"
