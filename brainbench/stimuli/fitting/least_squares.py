@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -14,20 +14,24 @@ from numpy.typing import NDArray
 from brainbench.core.errors import DataError, UsageError
 from brainbench.core.files import provenance
 from brainbench.core.records import Status
-from brainbench.stimuli.fitting.identifiability import Direction, directions, unknown_parameters
+from brainbench.stimuli.fitting.identifiability import directions, unknown_parameters
 from brainbench.stimuli.fitting.intervals import Profile, laplace_interval, quantile
 from brainbench.stimuli.fitting.jacobians import CentralDifferences, JacobianProvider
 from brainbench.stimuli.fitting.model import FitModel
 from brainbench.stimuli.fitting.options import FitOptions
 from brainbench.stimuli.fitting.parameters import FreeParameters, read_value, with_value
+from brainbench.stimuli.fitting.plausibility import check_wrenches, dead_channels
 from brainbench.stimuli.fitting.priors import PUBLISHED, Prior
 from brainbench.stimuli.fitting.residual_tests import check_residuals, failed_words
 from brainbench.stimuli.fitting.result import FitResult, FittedParameter
+from brainbench.stimuli.fitting.starts import find_starts, scanned
 from brainbench.stimuli.fitting.trials import Trial
 
 Array = NDArray[np.float64]
 _ROUNDS = 3
 """Fits with the noise of each channel estimated anew; it settles in two."""
+ALIKE = 16.0
+"""Difference of the deviance (−2 log likelihood) up to which two minima fit alike: odds of 3,000 to one."""
 
 
 def fit(
@@ -56,7 +60,8 @@ def fit(
 
     Raises:
         UsageError: a parameter is unknown, or a start value lies outside its bounds.
-        DataError: there are fewer readings than parameters, or the whisker is unstable at the start values.
+        DataError: there are fewer readings than parameters, wrenches have the wrong unit or sign, or the whisker is
+            unstable at the start values.
     """
     began = time.perf_counter()
     trials, options = [trials] if isinstance(trials, Trial) else list(trials), options or FitOptions()
@@ -73,20 +78,36 @@ def fit(
     free = FreeParameters(tuple(parameters), condition, bounds or {})
     model = FitModel(trials, free, options, provider or CentralDifferences())
     problem = _Problem(model, _chosen_priors(free, options, priors or {}))
-    first = model.residual(np.zeros(len(free)))
-    if not np.isfinite(first).all():
+    begin = np.zeros(len(free))
+    (traces,) = model.traces([begin])
+    if not np.isfinite(model.whitened(traces, begin)).all():
         raise DataError(
             f"The whisker is unstable at the start values ({model.reason or 'no reading'}); start nearer to the truth, "
             "or with a shorter time step."
         )
-    u, converged, iterations = problem.solve()
-    return _judge(problem, u, converged, iterations, began)
+    check_wrenches(trials, traces)
+    solutions = sorted((problem.solve(u) for u in find_starts(model)), key=lambda one: one.deviance)
+    return _judge(problem, solutions, began)
 
 
 def _chosen_priors(free: FreeParameters, options: FitOptions, given: Mapping[str, Prior]) -> dict[int, Prior]:
     """Return the prior of each parameter that has one, by its index."""
     chosen = {**(PUBLISHED if options.priors == "published" else {}), **given}
     return {index: chosen[name] for index, name in enumerate(free.names) if name in chosen}
+
+
+@dataclass(frozen=True, eq=False)
+class _Solution:
+    """A minimum."""
+
+    u: Array
+    """[p] coordinates."""
+    sigma: Array
+    """[g] noise of each group (N, N·m, m)."""
+    deviance: float
+    """−2 log likelihood, but for a constant."""
+    converged: bool
+    iterations: int
 
 
 class _Problem:
@@ -112,19 +133,21 @@ class _Problem:
         """Return their derivatives."""
         return np.concatenate([self.model.jacobian(u), self.prior_jacobian])
 
-    def solve(self) -> tuple[Array, bool, int]:
-        """Return the best coordinates [p], whether they converged, and the iterations."""
+    def solve(self, start: Array) -> _Solution:
+        """Return the minimum that is reached from coordinates [p]."""
         from scipy.optimize import least_squares
 
-        u, iterations, found = np.zeros(len(self.model.free)), 0, None
+        u, iterations, found = start, 0, None
         known = bool(np.isfinite(self.model.readings.noise).all())
+        self.model.reset_noise()
         for _ in range(1 if known else _ROUNDS):
             low, high = self.model.limits
+            # Counted from −1: SciPy's first step is as long as the start is far from 0, where the coordinates begin.
             found = least_squares(
-                self.residual,
-                np.clip(u, low + 1e-6, high - 1e-6),
-                jac=self.jacobian,  # type: ignore[arg-type]
-                bounds=(low, high),
+                lambda moved: self.residual(moved - 1),
+                np.clip(u, low + 1e-6, high - 1e-6) + 1,
+                jac=lambda moved: self.jacobian(moved - 1),  # type: ignore[arg-type]
+                bounds=(low + 1, high + 1),
                 loss=self.model.options.loss,
                 # A change of the cost by this share moves no coordinate by a hundredth of its standard deviation.
                 ftol=1e-7,
@@ -132,18 +155,21 @@ class _Problem:
                 gtol=1e-9,
                 max_nfev=self.model.options.most_iterations,
             )
-            step = float(np.abs(found.x - u).max())
-            u, iterations = found.x, iterations + int(found.njev)
+            step = float(np.abs(found.x - 1 - u).max())
+            u, iterations = found.x - 1, iterations + int(found.njev)
             before = self.model.sigma.copy()
             self.model.update_noise(self.model.residual(u), before)
             if found.status <= 0 or (step < 1e-3 and np.allclose(before, self.model.sigma, rtol=0.05)):
                 break
-        return u, found is not None and found.status > 0, iterations
+        deviance = self.model.deviance(self.residual(u))
+        return _Solution(u, self.model.sigma.copy(), deviance, found is not None and found.status > 0, iterations)
 
 
-def _judge(problem: _Problem, u: Array, converged: bool, iterations: int, began: float) -> FitResult:
-    """Return the result at the best coordinates u [p]."""
+def _judge(problem: _Problem, solutions: Sequence[_Solution], began: float) -> FitResult:
+    """Return the result at the first of the minima; the others, in order of their deviance, may fit as well."""
     model, free, options = problem.model, problem.model.free, problem.model.options
+    best = solutions[0]
+    u, model.sigma = best.u, best.sigma
     residual, jacobian = model.residual(u), model.jacobian(u)
     freedom = len(residual) - len(free)
     known = bool(np.isfinite(model.readings.noise).all())
@@ -156,7 +182,8 @@ def _judge(problem: _Problem, u: Array, converged: bool, iterations: int, began:
     if options.intervals == "profile":
         least = float(np.sum(problem.residual(u) ** 2))
         profile = Profile(problem.residual, problem.jacobian, model.limits, u, covariance, least, scale)
-    unknown = unknown_parameters(found)
+    unknown = {name: direction.words for name, direction in unknown_parameters(found).items()}
+    unknown |= _rivals(problem, solutions, covariance)
     estimates = []
     for index, (name, value) in enumerate(zip(free.names, free.values(u), strict=True)):
         deviation = math.sqrt(covariance[index, index]) if covariance[index, index] >= 0 else math.inf
@@ -176,14 +203,15 @@ def _judge(problem: _Problem, u: Array, converged: bool, iterations: int, began:
             )
         )
     tests = check_residuals(residual, jacobian, model.readings)
+    (traces,) = model.traces([u])
     reasons = [
-        *(() if converged else (f"The fit did not converge within {options.most_iterations} iterations.",)),
+        *(() if best.converged else (f"The fit did not converge within {options.most_iterations} iterations.",)),
         *dict.fromkeys(one.reason for one in estimates if one.reason),
         *failed_words(tests),
+        *dead_channels(model.trials, traces),
     ]
     worst = {one.status for one in estimates} | ({"unreliable"} if reasons else {"ok"})
-    status: Status = "undefined" if not converged or "undefined" in worst else "unreliable" if reasons else "ok"
-    (traces,) = model.traces([u])
+    status: Status = "undefined" if not best.converged or "undefined" in worst else "unreliable" if reasons else "ok"
     whisker = free.condition(u).whisker
     predicted = tuple(
         trace.link_positions if trial.of_shapes and trace.link_positions is not None else _wrench(trial, trace)
@@ -200,25 +228,43 @@ def _judge(problem: _Problem, u: Array, converged: bool, iterations: int, began:
         residuals=tuple(trial.residuals(trace, whisker) for trial, trace in zip(model.trials, traces, strict=True)),
         predicted=predicted,
         covariance=covariance,
-        iterations=iterations,
+        iterations=sum(one.iterations for one in solutions),
         provenance=provenance(options=options, seconds=time.perf_counter() - began, **model.describe()),
     )
 
 
-def _judge_one(problem: _Problem, index: int, u: Array, unknown: Direction | None) -> tuple[Status, str]:
+def _rivals(problem: _Problem, solutions: Sequence[_Solution], covariance: Array) -> dict[str, str]:
+    """Return why the scanned parameter cannot be told, by its name, where another minimum fits as well as the best."""
+    model, index, best = problem.model, scanned(problem.model), solutions[0]
+    if index is None:
+        return {}
+    # Two searches that end in one minimum differ by far less than its standard deviation.
+    apart = math.sqrt(max(float(covariance[index, index]), 0.0))
+    for other in solutions[1:]:
+        if other.deviance < best.deviance + ALIKE and abs(other.u[index] - best.u[index]) > max(apart, 0.01):
+            name, unit = model.free.names[index], _unit(model.free.names[index])
+            values = sorted(model.free.values(one.u)[index] for one in (best, other))
+            return {
+                name: f"{name} of {values[0]:.4g} and of {values[1]:.4g} {unit} fit alike: the readings are too rare "
+                "or too few to tell how often the whisker swings; read more often, or give narrower bounds."
+            }
+    return {}
+
+
+def _judge_one(problem: _Problem, index: int, u: Array, unknown: str | None) -> tuple[Status, str]:
     """Return the status of one parameter, and why."""
     model, name = problem.model, problem.model.free.names[index]
     if unknown is not None:
         if index in problem.priors:
-            return "unreliable", f"{unknown.words} {name} is known by its prior."
-        return "undefined", unknown.words
+            return "unreliable", f"{unknown} {name} is known by its prior."
+        return "undefined", unknown
     low, high = (float(limit[index]) for limit in model.limits)
     if min(u[index] - low, high - u[index]) < 1e-3 * min(high - low, 1.0):
         end = "lower" if u[index] - low < high - u[index] else "upper"
         return "unreliable", f"{name} is at its {end} bound, so that its interval means nothing; widen the bounds."
-    if name == "damping_ratio" and (value := model.free.values(u)[index]) < 1.2 * model.least_damping:
+    if name == "damping_ratio" and (value := model.free.values(u)[index]) < 1.2 * (least := model.least_damping(u)):
         return "unreliable", (
-            f"damping_ratio is {value:.3g}, and the time step alone damps with {model.least_damping:.3g}; fit with "
+            f"damping_ratio is {value:.3g}, and the time step alone damps with {least:.3g}; fit with "
             "more steps_per_period."
         )
     return "ok", ""

@@ -97,14 +97,22 @@ class FitModel:
                 f"{len(self.readings)} measured numbers cannot tell {len(self.free)} parameters; measure longer or fit "
                 "fewer parameters."
             )
-        self.sigma = np.where(np.isfinite(self.readings.noise), self.readings.noise, self.readings.size)
-        """[g] standard deviation by which residuals are divided (N, N·m, m)."""
+        self.reset_noise()
         self.limits = self.free.limits()
         self.fidelity = self._fidelity()
         self.engine = get_engine(self.options.backend)
         self.simulated = 0
         self.reason = ""
         """Why a simulation could not be trusted, of the last that was not."""
+
+    def reset_noise(self) -> None:
+        """Take the noise that repeats tell, or the size of the readings where there is none."""
+        self.sigma = np.where(np.isfinite(self.readings.noise), self.readings.noise, self.readings.size)
+        """[g] standard deviation by which residuals are divided (N, N·m, m)."""
+
+    def deviance(self, residual: Array) -> float:
+        """Return −2 log likelihood, but for a constant, of residuals [m, or more: priors] divided by the noise."""
+        return float(residual @ residual) + 2 * float(np.log(self.sigma[self.readings.group]).sum())
 
     def _fidelity(self) -> Fidelity:
         """Return the fidelity of all simulations: a step that stays, so that differences do not see it change."""
@@ -120,12 +128,11 @@ class FitModel:
             twist=options.twist,
         )
 
-    @property
-    def least_damping(self) -> float:
-        """Damping ratio that the time step alone gives the first mode at the start; smaller ones cannot be told."""
+    def least_damping(self, u: Array) -> float:
+        """Return the damping ratio that the time step alone gives the first mode at coordinates u [p]."""
         if self.options.solver == "quasistatic":
             return 0.0
-        first = float(references.natural_frequencies(self.free.start.whisker, 1)[0])
+        first = float(references.natural_frequencies(self.free.condition(u).whisker, 1)[0])
         return math.pi * first * self.fidelity.time_step
 
     def traces(self, points: Sequence[Array]) -> list[list[Trace]]:

@@ -18,6 +18,7 @@ from brainbench.stimuli.engines.displaced import MovedFollicle, move_obstacle
 from brainbench.stimuli.engines.protocol import Follicle, Job, Load, StillFollicle, Trace
 from brainbench.stimuli.fitting.curves import normal_offsets
 from brainbench.stimuli.fitting.parameters import Condition, Vector
+from brainbench.stimuli.fitting.plausibility import check_clock
 from brainbench.stimuli.fitting.tracks.quality import check_length
 from brainbench.stimuli.validation import references
 from brainbench.stimuli.whiskers.chain import build_chain
@@ -125,6 +126,9 @@ class Trial:
             deflection: deflection of the held point (m), roughly; the parameter ``deflection`` refines it.
             arc: arc length of the held point (m); near the tip when None.
             direction: direction of the deflection.
+
+        Raises:
+            DataError: the readings are too rare or too late to follow the swing.
         """
         times = measured["time"].values.astype(float)
         if times[0] < 0:
@@ -133,7 +137,10 @@ class Trial:
             )
         if times[0] == 0:
             measured, times = measured.isel(time=slice(1, None)), times[1:]
-        omega = 2 * math.pi * float(references.natural_frequencies(whisker, 1)[0])
+        frequency = float(references.natural_frequencies(whisker, 1)[0])
+        if len(times) > 1:
+            check_clock(times, frequency, whisker.damping_ratio)
+        omega = 2 * math.pi * frequency
         settling = SETTLING / (max(whisker.damping_ratio, 0.05) * omega) + math.pi / omega
         job = Job(whisker, StillFollicle(), (), times, start=-settling)
         return cls(job, measured, Pluck(deflection, arc or 0.95 * whisker.arc_length, direction))
