@@ -114,7 +114,7 @@ class SweepFolder:
         whole = self._open("all", batch_size=1)
         if os.environ.get("RANK", "0") == "0":
             whole.verify(again=False, progress=progress)
-        self.classes = whole.classes
+        self.classes, self.summary = whole.classes, whole.summary
         self.manifest = whole.manifest
 
     def _open(self, split: str, **options: Any) -> WhiskingDataset:

@@ -49,6 +49,9 @@ class Data(Protocol):
 
     classes: tuple[str, ...]
     """Names of the classes; labels are indices into them."""
+    summary: Mapping[str, Any]
+    """Facts for the card of what is trained: ``hash``, ``left_out``, and the sweeps of ``train``, ``validation`` and
+    ``test``; empty where they are unknown."""
 
     def batches(self, split: str, options: BatchOptions) -> Batches | None:
         """Return the batches of ``train``, ``validation`` or ``test``; None if there is no such split."""
