@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from itertools import product
+from typing import Any
 
 from brainbench.core.errors import UsageError, check_name
 from brainbench.core.plugins import load_entry_points, load_module
@@ -157,8 +158,10 @@ def _known() -> dict[str, RecordingLayout]:
     """Return the registry with the layouts of other packages."""
     if ENTRY_POINTS not in _loaded:
         _loaded.append(ENTRY_POINTS)
-        # An entry point may also be a module, whose import has registered its layouts.
-        load_entry_points(
-            ENTRY_POINTS, lambda _, found: register_layout(found) if isinstance(found, RecordingLayout) else None
-        )
+        load_entry_points(ENTRY_POINTS, _take)
     return _LAYOUTS
+
+
+def _take(_: str, found: Any) -> None:
+    if isinstance(found, RecordingLayout):
+        register_layout(found)
