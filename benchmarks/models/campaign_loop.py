@@ -308,8 +308,9 @@ def _published(job: Job, trainer: Trainer, model: Any, known: dict[str, Any], ou
             best_epoch=trainer.best_epoch,
             evaluation=found.get("evaluation"),
             twin=trainer.twin,
+            data=known["data"],
         )
-        info |= {"data": known["data"], "search": known["search"]}
+        info |= {"search": known["search"]}
         save_checkpoint(
             out / BEST, model, architecture=job.model, options=trainer.options, info=to_plain(info),
             card=model_card(trainer.config, info), dtype=trainer.config.weights_dtype,

@@ -19,10 +19,10 @@ from pathlib import Path
 import torch
 
 from brainbench.datasets import WhiskingDataset
-from brainbench.models.training.batches import ArrayData
 from brainbench.models.training.config import TrainingConfig
 from brainbench.models.training.run_folder import read_log
 from brainbench.models.training.trainer import train
+from tests.factories.array_data import ArrayData
 
 NETWORKS = ("zhuang-intersection-ln+gpt.supervised", "zhuang-intersection-ln.simclr", "zhuang-gru-small.supervised")
 SWEEPS, BATCH, EPOCHS = 20_480, 1024, 4

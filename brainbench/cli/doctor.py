@@ -53,6 +53,8 @@ def doctor(as_json: JsonOption = False) -> None:
 
 def diagnose() -> dict[str, Any]:
     """Collect what :func:`doctor` shows."""
+    import torch
+
     from brainbench.core.devices import usable_processors
     from brainbench.core.files import cache_dir, provenance
 
@@ -60,7 +62,7 @@ def diagnose() -> dict[str, Any]:
     return {
         **{name: made[name] for name in ("version", "python", "machine")},
         "processors": usable_processors(),
-        "cuda": _cuda(),
+        "cuda": [torch.cuda.get_device_name(index) for index in range(torch.cuda.device_count())],
         "cache": str(cache),
         "cache_bytes": sum(item.stat().st_size for item in cache.rglob("*") if item.is_file()),
         "required": {name: _version(name) for name in _required()},
@@ -89,9 +91,3 @@ def _version(package: str) -> str | None:
         return metadata.version(package)
     except metadata.PackageNotFoundError:
         return None
-
-
-def _cuda() -> list[str]:
-    import torch
-
-    return [torch.cuda.get_device_name(index) for index in range(torch.cuda.device_count())]

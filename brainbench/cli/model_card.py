@@ -23,7 +23,7 @@ def model_card(name: str, model: ModelDescription, recipe: PublishedTraining | N
         recipe: How it was trained in the published study, where its weights are not here.
         twin: Sentence about the untrained twin of trained weights.
     """
-    from brainbench.models.user_registry import FAMILY
+    from brainbench.models.user_models import FAMILY
 
     rows: dict[str, object] = {}
     if model.trained is not None:

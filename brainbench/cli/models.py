@@ -31,7 +31,7 @@ def list_(
     from brainbench.models.recipes import list_recipes
     from brainbench.models.registry import describe_model, list_models
     from brainbench.models.training.checkpoints import shipped
-    from brainbench.models.user_registry import FAMILY
+    from brainbench.models.user_models import FAMILY
 
     here = shipped()
     names = [*list_models(pattern), *(name for name in here if fnmatchcase(name, pattern))]
@@ -118,7 +118,7 @@ def add(
 ) -> None:
     """Give a model of your own a name; it is kept in your settings, and the code stays where it is."""
     from brainbench.models.registry import list_models
-    from brainbench.models.user_registry import add_user_model, settings_file
+    from brainbench.models.user_models import add_user_model, settings_file
 
     made = add_user_model(target, name, taken=list_models())
     shown = {"model": made.name, "code": made.target, "kept in": settings_file()}
@@ -131,7 +131,7 @@ def remove(
     as_json: JsonOption = False,
 ) -> None:
     """Take the name of a model of your own away; its code stays."""
-    from brainbench.models.user_registry import remove_user_model
+    from brainbench.models.user_models import remove_user_model
 
     made = remove_user_model(name)
     emit(made, f"{made.name} is no longer a name of {made.target}; the code was not touched.", as_json=as_json)

@@ -165,7 +165,11 @@ def _details(statistics: Mapping[str, Any]) -> list[str]:
 
 def _over_time(course: Mapping[str, Any]) -> str:
     """Lay out the best time and the latency of each layer that matches at some lag."""
-    known = [(_scaled(point), point["time"]) for point in course["points"] if _is_known(point)]
+    known = []
+    for point in course["points"]:
+        value, chance = point["value"], point["chance"]
+        if value is not None and chance is not None and chance < 1:
+            known.append(((value - chance) / (1 - chance), point["time"]))
     clear = sum(point["p"] is not None and point["p"] <= 0.05 for point in course["points"])
     text = f"Over time, {len(course['points'])} bins of {course['bin']:g} s: "
     if known:
@@ -185,15 +189,6 @@ def _over_time(course: Mapping[str, Any]) -> str:
     }
     rows = table_of("Neurons follow the model by", course["latencies"], columns)
     return "\n".join([text, *course["reasons"], "", rows])
-
-
-def _is_known(point: Mapping[str, Any]) -> bool:
-    return point["value"] is not None and point["chance"] is not None and point["chance"] < 1
-
-
-def _scaled(point: Mapping[str, Any]) -> float:
-    """Return the score at one time between chance (0) and all that is reliable (1)."""
-    return (point["value"] - point["chance"]) / (1 - point["chance"])
 
 
 def _p(value: float) -> str:

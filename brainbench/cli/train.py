@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -115,6 +116,7 @@ class SweepFolder:
         if os.environ.get("RANK", "0") == "0":
             whole.verify(again=False, progress=progress)
         self.classes = whole.classes
+        self.summary: Mapping[str, Any] = whole.summary
         self.manifest = whole.manifest
 
     def _open(self, split: str, **options: Any) -> WhiskingDataset:

@@ -15,7 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brainbench.core.errors import BrainbenchError, DataError
-from brainbench.core.files import to_json
 from brainbench.core.progress import Progress, track
 from brainbench.datasets import hdf5
 from brainbench.datasets.layouts.published_npz import LAYOUT, is_published, open_published
@@ -133,10 +132,6 @@ class Inspection:
     """Conditions that can be scored, the likeliest first."""
     skipped: tuple[str, ...] = ()
     """Reason for each file that holds no recordings and is not described."""
-
-    def to_json(self) -> str:
-        """Serialise deterministically."""
-        return to_json(self)
 
     def __str__(self) -> str:
         return "\n".join(self._lines())

@@ -54,6 +54,8 @@ def read_nwb(file: h5py.File, path: Path) -> Session:
     # Licks are processed data with their own times.
     processed = (item for _, module in _groups(file.get("processing")) for item in _series(module))
     licks = [item for item in processed if item[0].rpartition("/")[2] == LICKS]
+    acquired = [_type(group) for _, group in _groups(file.get("acquisition"))]
+    stimuli = _string(file, "general/stimulus")
     return Session(
         subject=subject,
         session=session,
@@ -64,16 +66,12 @@ def read_nwb(file: h5py.File, path: Path) -> Session:
         start=_string(file, "session_start_time"),
         format=f"NWB {version}",
         synthetic=description.lower().startswith("synthetic") or "synthetic" in _words(keywords),
-        intracellular=_intracellular(file),
+        intracellular={kind: acquired.count(kind) for kind in _INTRACELLULAR if kind in acquired},
         modules={name: tuple(module) for name, module in _groups(file.get("processing"))},
         notes=tuple(notes),
         series=dict([*_series(file.get("acquisition")), *licks]),
-        stimuli=_recipe(_string(file, "general/stimulus")),
+        stimuli=stimuli.removeprefix(STIMULI) if stimuli.startswith(STIMULI) else "",
     )
-
-
-def _recipe(notes: str) -> str:
-    return notes.removeprefix(STIMULI) if notes.startswith(STIMULI) else ""
 
 
 def _interval_tables(file: h5py.File, path: Path) -> dict[str, SessionTable]:
@@ -93,11 +91,6 @@ def _table(group: h5py.Group, name: str, path: Path) -> SessionTable:
     declared = [text(key) for key in group.attrs.get("colnames", ())]
     order = [key for key in declared if key in columns] + [key for key in columns if key not in declared]
     return SessionTable(name, {key: columns[key] for key in order}, str(path))
-
-
-def _intracellular(file: h5py.File) -> dict[str, int]:
-    kinds = [_type(group) for _, group in _groups(file.get("acquisition"))]
-    return {kind: kinds.count(kind) for kind in _INTRACELLULAR if kind in kinds}
 
 
 def _series(parent: Any) -> Iterator[tuple[str, Series]]:

@@ -139,14 +139,10 @@ def each_session(
     Raises:
         DataError: the file is neither NWB 2.x nor our layout, or holds responses that are already counted.
     """
-    for session in _sessions(file, path):
+    _check_kind(file, path)
+    for session in hdf5.read_sessions(file, path) if hdf5.is_ours(file) else [nwb.read_nwb(file, path)]:
         found = layout or detect_layout(session)
         yield (session if found is None else found.adapted(session)), found
-
-
-def _sessions(file: h5py.File, path: Path) -> list[Session]:
-    _check_kind(file, path)
-    return hdf5.read_sessions(file, path) if hdf5.is_ours(file) else [nwb.read_nwb(file, path)]
 
 
 def _check_kind(file: h5py.File, path: Path) -> None:

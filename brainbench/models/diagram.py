@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from brainbench.core.records import GraphEdge, GraphNode, ModelGraph
-from brainbench.models.graph.spec import Convolution, Dense, Memory, Node
+from brainbench.models.graph.spec import Convolution, Dense, Node
 
 if TYPE_CHECKING:
     from torch import nn
@@ -65,9 +65,8 @@ def _temporal(encoder: TemporalGraph, nodes: list[GraphNode], edges: list[GraphE
     for name in spec.order:
         node = spec.by_name[name]
         count = sum(parameter.numel() for parameter in modules[name].parameters())
-        nodes.append(
-            GraphNode(f"encoder.{name}", "encoder", _operation(node), _memory(node.memory), tuple(shapes[name]), count)
-        )
+        memory = _CELLS[node.memory.kind] + ", LN" * node.memory.layer_norm if node.memory else ""
+        nodes.append(GraphNode(f"encoder.{name}", "encoder", _operation(node), memory, tuple(shapes[name]), count))
     edges += [GraphEdge("input", f"encoder.{name}") for name in spec.inputs]
     edges += [GraphEdge(f"encoder.{e.source}", f"encoder.{e.target}", e.feedback) for e in spec.edges]
     return f"encoder.{spec.output}"
@@ -95,7 +94,3 @@ def _operation(node: Node) -> str:
     if isinstance(node.operation, Convolution):
         return f"convolution {node.operation.kernel_size[0]}×{node.operation.kernel_size[1]}"
     return "linear" if isinstance(node.operation, Dense) else "join"
-
-
-def _memory(memory: Memory | None) -> str:
-    return "" if memory is None else _CELLS[memory.kind] + (", LN" if memory.layer_norm else "")

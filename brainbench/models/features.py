@@ -70,7 +70,7 @@ def read_features(path: str | Path) -> Features:
                 f"{str(path)!r} holds {listing(file)}; a file of activations needs a dataset 'labels' [K] and a "
                 "group 'activations' with one dataset [K, F] or [K, T, F] per layer."
             )
-        labels = tuple(_text(label) for label in np.ravel(labels[()]))
+        labels = tuple(label.decode() if isinstance(label, bytes) else str(label) for label in np.ravel(labels[()]))
         repeated = sorted({label for label in labels if labels.count(label) > 1})
         if repeated:
             raise DataError(f"{str(path)!r} has the label {repeated[0]!r} more than once; labels must be unique.")
@@ -108,7 +108,3 @@ def _check_shape(layer: str, shape: tuple[int, ...], rows: int, path: str) -> No
         raise DataError(
             f"Layer {layer!r} of {path!r} has shape {list(shape)}; expected [K, F] or [K, T, F] with K = {rows} labels."
         )
-
-
-def _text(label: object) -> str:
-    return label.decode() if isinstance(label, bytes) else str(label)

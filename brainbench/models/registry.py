@@ -4,7 +4,7 @@ A name is ``<encoder>[-<cell>][-ln][-small][+<attender>][.<tag>]``. Without a ta
 its weights follow from the seed alone. ``local-dir:PATH`` and ``hf-hub:OWNER/NAME`` name a folder of trained
 weights (:mod:`~brainbench.models.training.checkpoints`). Other packages add models through the entry point group
 ``brainbench.models``: an entry point names a module (or an object in it) whose import runs
-:func:`register_model`; the user adds models for the command line (:mod:`~brainbench.models.user_registry`).
+:func:`register_model`; the user adds models for the command line (:mod:`~brainbench.models.user_models`).
 Importing this module imports no framework.
 """
 
@@ -24,8 +24,7 @@ from brainbench.core.errors import UsageError, unknown_name
 from brainbench.core.plugins import load_entry_points
 from brainbench.models.architecture import OBJECTIVES, Architecture, check_new_name
 from brainbench.models.training.checkpoints import PREFIXES, WEIGHTS, find_folder, load_weights, read_config, shipped
-from brainbench.models.user_models import check_module
-from brainbench.models.user_registry import FAMILY, read_user_models
+from brainbench.models.user_models import FAMILY, check_module, read_user_models
 
 if TYPE_CHECKING:
     from torch import nn

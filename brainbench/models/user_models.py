@@ -1,15 +1,70 @@
-"""A user's own model, from a file or an installed module, without registering it."""
+"""Models of the user's own: built from a file or an installed module, and known by name to the command line.
+
+``brainbench models add FILE.py:NAME --name still`` writes the name, the place of the code and its hash into one JSON
+file. The code stays where it is and is read whenever the model is built. Models of packages arrive by entry points
+instead (:mod:`~brainbench.models.registry`).
+"""
 
 from __future__ import annotations
 
+import logging
+import os
+from collections.abc import Collection
+from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from brainbench.core.errors import DataError, UsageError
+from brainbench.core.errors import DataError, DataFileNotFoundError, UsageError, check_name
+from brainbench.core.files import check_folder, file_hash, read_json, write_json
 from brainbench.core.plugins import load_object
+from brainbench.models.architecture import check_new_name
 from brainbench.models.ops.seeding import seeded
 
 if TYPE_CHECKING:
     from torch import nn
+
+FAMILY = "user module"
+"""Family of models whose code is not in the registry of a package; boards set them apart."""
+CONFIG_VARIABLE = "BRAINBENCH_CONFIG"
+"""Environment variable that overrides the platform's folder of settings."""
+_LOG = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class UserModel:
+    """A model that the user added."""
+
+    name: str
+    target: str
+    """``/path/to/FILE.py:NAME`` or ``package.module:NAME``."""
+    hash: str = ""
+    """Hash of the file when it was added; empty for a module."""
+
+    @property
+    def path(self) -> Path | None:
+        """The file; None for a module."""
+        place = self.target.rpartition(":")[0]
+        return Path(place) if place.endswith(".py") else None
+
+    def build(self, **options: Any) -> nn.Module:
+        """Build the model from its code as it is today; a changed file is told in a warning.
+
+        Raises:
+            DataFileNotFoundError: the file is gone.
+            UsageError: the code gives no module.
+            DataError: the code fails.
+        """
+        if self.path is not None:
+            if not self.path.is_file():
+                raise DataFileNotFoundError(
+                    f"The model {self.name!r} was added from {str(self.path)!r}, which is gone; put the file back, or "
+                    f"take the name away with: brainbench models remove {self.name}"
+                )
+            if file_hash(self.path) != self.hash:
+                _LOG.warning(
+                    "%s has changed since the model %r was added; the file is used as it is now.", self.path, self.name
+                )
+        return build_user_model(self.target, **options)
 
 
 def load_user_model(target: str, *, seed: int = 0) -> nn.Module:
@@ -53,3 +108,72 @@ def check_module(made: Any, target: str) -> nn.Module:
     if not isinstance(made, nn.Module):
         raise UsageError(f"{target!r} gave a {type(made).__name__}, not a torch.nn.Module; return the model itself.")
     return made
+
+
+def settings_file() -> Path:
+    """Return the file of the added models, in ``$BRAINBENCH_CONFIG`` or the platform's folder of settings."""
+    folder = os.environ.get(CONFIG_VARIABLE)
+    if folder is None:
+        import platformdirs
+
+        folder = platformdirs.user_config_dir("brainbench", appauthor=False)
+    return Path(folder).expanduser() / "models.json"
+
+
+def read_user_models() -> dict[str, UserModel]:
+    """Return the added models by name.
+
+    Raises:
+        DataError: the file of settings is damaged.
+    """
+    path = settings_file()
+    stored = read_json(path) if path.is_file() else {}
+    fields = {"target", "hash"}
+    if not isinstance(stored, dict) or not all(
+        isinstance(item, dict) and item.keys() == fields and all(isinstance(text, str) for text in item.values())
+        for item in stored.values()
+    ):
+        raise DataError(
+            f"{str(path)!r} does not hold models as brainbench models add writes them; remove it and add them again."
+        )
+    return {name: UserModel(name, **item) for name, item in stored.items()}
+
+
+def add_user_model(target: str, name: str, *, taken: Collection[str]) -> UserModel:
+    """Store a model of the user's own under a name; nothing is stored unless it can be built.
+
+    ``target`` is ``path/to/FILE.py:NAME`` or ``package.module:NAME``; ``taken`` are the names of the registry. Raises
+    UsageError: the name is taken or breaks the grammar, or the target gives no module; DataFileNotFoundError: there is
+    no such file or module; DataError: the code fails, or the settings cannot be written.
+    """
+    check_new_name(name)
+    known = read_user_models()
+    if name in known or name in taken:
+        hint = f"; or first: brainbench models remove {name}" if name in known else ""
+        raise UsageError(f"There is already a model named {name!r}; choose another name{hint}.")
+    place, _, part = target.rpartition(":")
+    if place.endswith(".py"):
+        place = str(Path(place).expanduser().resolve())
+        target = f"{place}:{part}"
+    check_folder(settings_file().parent, CONFIG_VARIABLE)
+    load_user_model(target)
+    made = UserModel(name, target, file_hash(place) if place.endswith(".py") else "")
+    _write({**known, name: made})
+    return made
+
+
+def remove_user_model(name: str) -> UserModel:
+    """Take a stored name away and return what it stood for; the file with the code stays.
+
+    Raises:
+        UsageError: no model was added under this name.
+    """
+    known = read_user_models()
+    check_name("model of your own", name, known)
+    made = known.pop(name)
+    _write(known)
+    return made
+
+
+def _write(models: dict[str, UserModel]) -> None:
+    write_json(settings_file(), {item.name: {"target": item.target, "hash": item.hash} for item in models.values()})

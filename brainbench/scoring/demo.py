@@ -32,8 +32,8 @@ def demo_recordings(name: str = "demo", *, progress: Progress | None = None) -> 
     ``truth.json`` beside the files says what their neurons encode.
     """
     from brainbench.datasets.synthetic import PopulationDesign
-    from brainbench.datasets.synthetic.cache import ensure_recordings
     from brainbench.datasets.synthetic.rodgers_demo import ensure_rodgers_demo
+    from brainbench.datasets.synthetic.truth import ensure_recordings
     from brainbench.models.registry import locate_model
     from brainbench.stimuli import load_stimuli
 

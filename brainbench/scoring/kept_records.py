@@ -7,8 +7,7 @@ from pathlib import Path
 
 from brainbench.core.errors import UsageError
 from brainbench.core.files import cache_dir, content_hash, read_json, write_text
-from brainbench.core.reading.code_stamp import code_stamp
-from brainbench.core.reading.sealed import keeping, read_entry
+from brainbench.core.reading.sealed import code_stamp, keeping, read_entry
 from brainbench.core.records import ResultRecord
 from brainbench.scoring.demo import DEMOS
 from brainbench.scoring.options import ScoreOptions

@@ -85,8 +85,7 @@ class NeuralResponses:
 
     def zero_filled(self, kept: tuple[str, ...]) -> dict[str, NDArray[np.float64]] | None:
         """Return each animal's rates [R, K, U] as a published file holds them; None for other recordings."""
-        from brainbench.datasets.layouts.npz_arrays import read_arrays
-        from brainbench.datasets.layouts.published_npz import LAYOUT
+        from brainbench.datasets.layouts.published_npz import LAYOUT, read_arrays
 
         if self.dataset.attrs.get("layout") != LAYOUT.name:
             return None

@@ -132,7 +132,15 @@ class ScoreOptions:
     def stated_in(cls, settings: Mapping[str, Any], **others: Any) -> ScoreOptions:
         """Return the options that the settings of a provenance state, and others that they do not hold."""
         known = {item.name for item in fields(cls)} - {*_ELSEWHERE}
-        return cls.of({name: value for name, value in settings.items() if name in known and value is not None} | others)
+        stated = {name: value for name, value in settings.items() if name in known and value is not None}
+        if isinstance(stated.get("fidelity"), Mapping):  # of the caller's own: its fields, as JSON states a dataclass
+            from brainbench.stimuli import Fidelity
+
+            before = {item.name: item.metadata["before"] for item in fields(Fidelity) if "before" in item.metadata}
+            values = before | dict(stated["fidelity"])
+            changes = (f"{name}={str(value).lower()}" for name, value in values.items())
+            stated["fidelity"] = ",".join(["balanced", *changes])
+        return cls.of(stated | others)
 
     @property
     def model_seed(self) -> int:

@@ -13,7 +13,7 @@ from pathlib import Path
 
 from brainbench.core.errors import DataError
 from brainbench.core.files import cache_dir, content_hash, file_hash, read_json, write_json
-from brainbench.core.reading.code_stamp import code_stamp
+from brainbench.core.reading.sealed import code_stamp
 from brainbench.stimuli.engines import DEFAULT_ENGINE, PHYSICS_VERSION
 from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.scenes.recipes import describe_recipe, recipe_file

@@ -1,6 +1,7 @@
 import json
 import os
 import shutil
+from pathlib import Path
 
 import h5py
 import pytest
@@ -30,6 +31,10 @@ def test_a_model_is_trained_scored_by_its_folder_and_exported(run, folder, tmp_p
     shown = json.loads(run("models", "show", f"local-dir:{tmp_path / 'run' / 'best'}", "--json").out)
     assert shown["trained"]["classes"] == ["brick", "cone"]
     assert "s4-small with seed 0, drawn here" in shown["twin"]
+    data, manifest = shown["trained"]["data"], json.loads(Path(folder, "manifest.json").read_text())
+    used = sum(data[name] for name in ("train", "validation", "test"))
+    assert (data["hash"], used + data["left_out"]) == (manifest["content_hash"], manifest["sweeps"])
+    assert f"{data['train']:,} sweeps to train" in (tmp_path / "run" / "best" / "README.md").read_text()
     file = tmp_path / "s4.pt2"
     exported = run(
         "export", f"local-dir:{tmp_path / 'run' / 'best'}", "--format", "torch", "--out", str(file), "--json"

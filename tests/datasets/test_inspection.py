@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 from brainbench.core.errors import DataError
+from brainbench.core.files import to_json
 from brainbench.datasets import inspect, open_recordings, write_recordings
 from tests.factories.recording_files import detection, write_nwb, write_rodgers
 from tests.factories.recordings import make_simple_session
@@ -45,7 +46,7 @@ def test_an_inspection_is_text_and_json(tmp_path):
         "processing/behavior",
     ):
         assert expected in text
-    data = json.loads(report.to_json())
+    data = json.loads(to_json(report))
     assert data["sessions"][0]["units"]["spikes"] == 120
     assert data["proposals"] == []
 

@@ -2,7 +2,7 @@
 
 import torch
 
-from brainbench.models.training.batches import ArrayData
+from tests.factories.array_data import ArrayData
 
 CLASSES = ("front", "middle", "back")
 SCALE = torch.tensor(([1e-4] * 3 + [1e-6] * 3) * 5)[:, None, None]

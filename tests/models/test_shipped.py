@@ -8,8 +8,9 @@ from safetensors.torch import load_file
 
 from brainbench.models.architecture import Architecture
 from brainbench.models.registry import describe_model, load_model
-from brainbench.models.training.batches import ArrayBatches, BatchOptions
+from brainbench.models.training.batches import BatchOptions
 from brainbench.models.training.checkpoints import CARD, WEIGHTS, read_config, shipped
+from tests.factories.array_data import ArrayBatches
 from tests.factories.training_sweeps import sweeps
 
 NAMES = sorted(shipped())

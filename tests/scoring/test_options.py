@@ -9,7 +9,9 @@ import brainbench
 from brainbench.cli import app
 from brainbench.cli.options import SCORE, SCORE_FLAGS, as_flags, option_fields
 from brainbench.core.errors import UsageError
+from brainbench.core.files import to_plain
 from brainbench.scoring import ScoreOptions
+from brainbench.stimuli import Fidelity
 
 NAMES = [item.name for item in fields(ScoreOptions)]
 ELSEWHERE = {
@@ -57,3 +59,11 @@ def test_options_are_written_as_flags():
     told = ["--layers", "a,b", "--no-normalize", "--weights-seed", "1", "--explain-estimator"]
     assert as_flags(SCORE, options, SCORE_FLAGS) == told
     assert set(option_fields(SCORE)) == set(NAMES)
+
+
+@pytest.mark.parametrize(
+    "fidelity", [Fidelity.preset("balanced"), replace(Fidelity.preset("fast"), links=9, twist=False)]
+)
+def test_a_fidelity_of_the_callers_own_comes_back_from_the_settings_of_a_record(fidelity: Fidelity):
+    stated = to_plain(ScoreOptions(fidelity=fidelity).settings)
+    assert Fidelity.of(ScoreOptions.stated_in(stated).fidelity) == fidelity

@@ -7,11 +7,11 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
 from pathlib import Path
-from typing import Annotated, Any, TypedDict
+from typing import Any
 
 import msgspec
 
-from brainbench.cli.options import SCORE, SCORE_FLAGS, as_flags
+from brainbench.cli.options import SCORE, SCORE_FLAGS, as_flags, option_fields
 from brainbench.core.errors import DataError, UsageError, listing, shown, unknown_name
 from brainbench.core.files import to_json, to_plain
 from brainbench.core.progress import Progress
@@ -22,37 +22,6 @@ from brainbench.scoring.options import ScoreOptions
 
 _IN_HASHES = ("stimuli", "conditions", "select", "window", "bin", "fidelity", "whiskers")
 """Settings that the hashes of recordings and stimuli hold."""
-
-
-_Text = str | None
-_Width = Annotated[float, msgspec.Meta(gt=0, le=1e6)] | None
-_Seed = Annotated[int, msgspec.Meta(ge=0)] | None
-
-
-class _StatedSettings(TypedDict, total=False):
-    """Kinds of the settings that a record may state: anyone may have written it."""
-
-    model: _Text
-    stimuli: _Text
-    conditions: _Text
-    select: _Text
-    window: _Text
-    whiskers: _Text
-    fidelity: str | dict[str, Any] | None
-    layers: list[str] | None
-    layer: _Text
-    time: _Text
-    bin: _Width
-    over_time: bool | None
-    estimator: _Text
-    metric: _Text
-    units_reliability: float | None
-    normalize: bool | None
-    seed: _Seed
-    weights_seed: _Seed
-    readout: _Text
-    pairs: dict[str, str | None]
-    source: _Text | list[str]
 
 
 @dataclass(frozen=True)
@@ -108,10 +77,7 @@ def score_again(
 
     origin = record.score.provenance
     model, source = origin.settings.get("model"), origin.recordings.get("source")
-    try:
-        msgspec.convert({**origin.settings, "pairs": origin.pairs, "source": source}, _StatedSettings)
-    except msgspec.ValidationError as error:
-        raise DataError(f"The settings of the record of {record.score.name[:80]!r} cannot be used: {error}.") from error
+    _check_kinds(record, model, source)
     if not isinstance(model, str):
         raise DataError(
             f"The record of {record.score.name!r} does not name a model that can be loaded (a module in memory or a "
@@ -124,6 +90,28 @@ def score_again(
         )
     options = ScoreOptions.stated_in(origin.settings, recordings=recordings or source, match=origin.pairs or None)
     return score_record(model, options, progress=progress)
+
+
+def _check_kinds(record: ResultRecord, model: Any, source: Any) -> None:
+    """Raise DataError for settings of other kinds than the options of a score: anyone may have written the record."""
+    origin = record.score.provenance
+    stated: dict[str, tuple[Any, Any]] = {
+        "model": (model, str),
+        "source": (source, str | list[str]),
+        "pairs": (origin.pairs, dict[str, str | None]),
+        # Presets are texts, other fidelities their fields.
+        "fidelity": (origin.settings.get("fidelity"), str | dict[str, Any]),
+    }
+    for name, option in option_fields(SCORE).items():
+        kind = list[str] if option.several else str if option.kind is Path else option.kind
+        stated.setdefault(name, (origin.settings.get(name), kind))
+    for name, (value, kind) in stated.items():
+        try:
+            msgspec.convert(value, kind | None)
+        except msgspec.ValidationError as error:
+            raise DataError(
+                f"The settings of the record of {record.score.name[:80]!r} cannot be used: {name}: {error}."
+            ) from error
 
 
 def refuse_foreign_code(record: ResultRecord, *, trusted: bool) -> None:

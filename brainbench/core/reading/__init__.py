@@ -2,5 +2,5 @@
 
 ``regular`` (what may be opened, and how failures are told) → ``texts`` (JSON, TOML, YAML), ``tables``, ``hdf5``,
 ``archives`` (npz) and ``tensors`` (safetensors, PyTorch) → ``ranges`` (finite, within bounds). ``sealed`` keeps the
-entries of the cache with their hashes.
+entries of the cache with their hashes, some of them named by a stamp of the installed code.
 """

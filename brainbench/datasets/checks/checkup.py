@@ -13,7 +13,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from brainbench.core.errors import DataError
-from brainbench.core.files import to_json
 from brainbench.core.progress import Progress, track
 from brainbench.datasets import hdf5
 from brainbench.datasets.checks.clock import check_clock
@@ -50,10 +49,6 @@ class Checkup:
     def count(self, severity: str) -> int:
         """Return the number of findings of one severity."""
         return sum(item.severity == severity for item in self.findings)
-
-    def to_json(self) -> str:
-        """Serialise deterministically."""
-        return to_json(self)
 
     def __str__(self) -> str:
         return "\n".join(self._lines())

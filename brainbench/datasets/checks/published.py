@@ -11,8 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brainbench.datasets.checks.findings import Finding, share
-from brainbench.datasets.layouts.npz_arrays import SLOTS, read_arrays
-from brainbench.datasets.layouts.published_npz import ZeroFilledSession, recover_sessions
+from brainbench.datasets.layouts.published_npz import SLOTS, ZeroFilledSession, read_arrays, recover_sessions
 
 _FEW = 4
 """Trials of every stimulus that unbiased distances need."""

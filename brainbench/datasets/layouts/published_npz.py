@@ -12,16 +12,16 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from brainbench.core.errors import UsageError
-from brainbench.datasets.layouts.npz_arrays import SLOTS, read_arrays
+from brainbench.core.errors import DataError, UsageError, listing
+from brainbench.core.reading.archives import read_npz
 from brainbench.datasets.layouts.registry import RecordingLayout
 from brainbench.datasets.trials.conditions import Conditions
-from brainbench.datasets.trials.counting import UNIT_COLUMNS, ReadingOptions, SessionCounts
+from brainbench.datasets.trials.counting import UNIT_COLUMNS, ReadingOptions, SessionCounts, missing_column
 from brainbench.datasets.trials.joining import join_sessions
 from brainbench.datasets.trials.selection import Selection, Tally
 from brainbench.datasets.trials.windows import FIRST_CONTACT, Window
@@ -29,6 +29,13 @@ from brainbench.datasets.trials.windows import FIRST_CONTACT, Window
 if TYPE_CHECKING:
     import xarray as xr
 
+STRAY = "allow_pickle"
+"""Entry without meaning: numpy before 2.2 stored this keyword of ``savez`` as an array."""
+SLOTS = tuple(f"slot-{number}" for number in range(1, 7))
+"""Places along axis 1, in the order of the file."""
+MOST_RATE = 1e6
+"""Spikes per second beyond those of any neuron, even in the shortest window."""
+RATES = f"rates [trials, {len(SLOTS)}, units]"
 SILENT = "trials: no rate above 0 in any slot, so the stimulus cannot be known"
 
 LAYOUT = RecordingLayout(
@@ -74,6 +81,52 @@ class ZeroFilledSession:
 def is_published(path: Path, layout: RecordingLayout | None = None) -> bool:
     """Return whether a file is one of these, by its ending or by the layout that was named."""
     return layout is LAYOUT or (layout is None and path.suffix.lower() == ".npz")
+
+
+def read_arrays(path: Path) -> tuple[dict[str, NDArray[np.float64]], bool]:
+    """Return rates [trials, 6, units] by animal, as the file holds them, and whether :data:`STRAY` is there.
+
+    Raises:
+        DataError: the file is no ``.npz`` of plain arrays, holds something else, or rates that cannot be.
+    """
+    arrays = read_npz(path, "file of published recordings (.npz)")
+    if {"data", "label"} <= arrays.keys():
+        raise DataError(
+            f"{path} is a whisker sweep (arrays {listing(sorted(arrays))}), not recordings of neurons; a "
+            "folder of sweeps is what `brainbench train MODEL --data FOLDER` takes."
+        )
+    if {"r_xy", "r_yy"} <= arrays.keys():
+        raise DataError(
+            f"{path} holds split halves of a score, not recordings; try `brainbench score {path} --explain-estimator`."
+        )
+    stray = STRAY in arrays and not arrays[STRAY].ndim
+    animals = {name: array for name, array in arrays.items() if not (stray and name == STRAY)}
+    if not animals:
+        raise DataError(f"{path} holds no animal: expected one array of {RATES} for each.")
+    for name, array in animals.items():
+        if fault := _fault(array):
+            raise DataError(f"The array {name!r} of {path} {fault}.")
+    return {name: array.astype(np.float64) for name, array in animals.items()}, stray
+
+
+def _fault(array: NDArray[Any]) -> str:
+    """Return why an array holds no rates; empty where it does."""
+    if array.dtype.kind not in "fiu":
+        return f"holds {array.dtype}, not numbers; expected {RATES}"
+    if array.ndim != 3 or array.shape[1] != len(SLOTS) or not array.size:
+        return f"has shape {list(array.shape)}; expected {RATES} with {len(SLOTS)} stimuli on axis 1"
+    missing = np.isnan(array)
+    gone: NDArray[np.bool_] = np.asarray(missing.all(axis=1))
+    if missing.all():
+        return "holds no rate: every value is NaN; leave this animal out"
+    if (array > MOST_RATE).any() or (array < 0).any():
+        return f"holds infinite, negative or impossible rates; rates are 0 to {MOST_RATE:,.0f} spikes/s"
+    if np.any(gone[:-1] & ~gone[1:]) or np.any(gone[0]):
+        return "has trials of NaN inside a session; they may only pad a unit's trials at the end"
+    if len(several := np.argwhere((array > 0).sum(axis=1) > 1)):
+        trial, unit = several[0]
+        return f"has rates in several slots of one trial (trial {trial}, unit {unit}); the other slots hold zeros"
+    return ""
 
 
 def recover_sessions(subject: str, array: NDArray[np.float64]) -> list[ZeroFilledSession]:
@@ -137,7 +190,6 @@ def open_published(path: Path, **options: object) -> xr.Dataset:
 def _session_counts(item: ZeroFilledSession, path: Path) -> SessionCounts:
     kept = np.flatnonzero(item.slots >= 0)
     labels = tuple(SLOTS[slot] for slot in item.slots[kept].tolist())
-    lost = {name: np.nan if kind is float else "" for name, kind in UNIT_COLUMNS.items()}
     return SessionCounts(
         subject=item.subject,
         session=item.session,
@@ -149,7 +201,7 @@ def _session_counts(item: ZeroFilledSession, path: Path) -> SessionCounts:
         edges=np.full((len(kept), 2), np.nan),
         counts=item.rates[kept][:, None].astype(np.float32),
         duration=np.ones((len(kept), 1)),
-        columns={name: np.full(item.units, value) for name, value in lost.items()},
+        columns={name: missing_column(kind, item.units) for name, kind in UNIT_COLUMNS.items()},
         covariates={},
         tally=Tally(removed={SILENT: len(item.slots) - len(kept)}),
         trials=len(item.slots),

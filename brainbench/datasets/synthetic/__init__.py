@@ -2,7 +2,7 @@
 
 A ``geometry`` (from a network's features) and a ``design`` give ``populations``: expected rates, trials and
 counts. ``animals`` keeps them as arrays with their truth, ``sessions`` writes files (``spikes`` places their spikes),
-``truth`` what the neurons encode beside them, ``cache`` makes files once per machine. ``rodgers_demo`` puts the same
+``truth`` what the neurons encode beside them, and makes files once per machine. ``rodgers_demo`` puts the same
 neurons into the task and file layout of Rodgers 2022 (``rodgers_task``).
 """
 

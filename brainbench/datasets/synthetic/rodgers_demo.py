@@ -23,7 +23,6 @@ from brainbench.core.files import content_hash
 from brainbench.core.progress import Progress
 from brainbench.core.reading.ranges import check_number
 from brainbench.datasets.layouts import rodgers
-from brainbench.datasets.synthetic.cache import ensure_recordings
 from brainbench.datasets.synthetic.geometry import ResponseGeometry
 from brainbench.datasets.synthetic.populations import expected_rates
 from brainbench.datasets.synthetic.rodgers_task import (
@@ -37,6 +36,7 @@ from brainbench.datasets.synthetic.rodgers_task import (
 from brainbench.datasets.synthetic.truth import (
     SyntheticSession,
     correlation_rdm,
+    ensure_recordings,
     write_synthetic_nwb,
     write_with_truth,
 )

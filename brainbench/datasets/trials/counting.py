@@ -95,7 +95,9 @@ def count_session(session: Session, options: ReadingOptions) -> SessionCounts:
     kept = tally.apply(kept, ~(edges[:, 1] <= edges[:, 0]), "trials: window of no length")
     invalid = session.tables.get("invalid_times")
     if invalid is not None:
-        kept = tally.apply(kept, ~_overlaps(edges, invalid), "trials: overlap with invalid_times")
+        begin, end = invalid.times("start_time"), invalid.times("stop_time")
+        overlap = ((edges[:, :1] < end) & (edges[:, 1:] > begin)).any(axis=1)
+        kept = tally.apply(kept, ~overlap, "trials: overlap with invalid_times")
 
     spikes = read_spikes(session.units, tally.notes)
     # A window outside the recorded span is missing data, not silence: zero counts there would lower every mean.
@@ -282,11 +284,6 @@ def _merged(spans: NDArray[np.float64]) -> list[tuple[float, float]]:
         else:
             merged.append((low, high))
     return merged
-
-
-def _overlaps(edges: NDArray[np.float64], invalid: SessionTable) -> NDArray[np.bool_]:
-    begin, end = invalid.times("start_time"), invalid.times("stop_time")
-    return np.asarray(((edges[:, :1] < end) & (edges[:, 1:] > begin)).any(axis=1))
 
 
 def _rows_in_order(rows: NDArray[np.int64], table: SessionTable) -> NDArray[np.int64]:

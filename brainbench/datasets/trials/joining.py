@@ -83,6 +83,7 @@ def join_sessions(
     dataset = xr.Dataset(
         {"counts": (("trial", "time", "unit"), counts), "duration": (("trial", "time"), duration)}, coordinates
     )
+    recipes = {part.stimuli for part in everything}
     dataset.attrs = {
         "vocabulary": list(vocabulary),
         "conditions": str(options.conditions),
@@ -95,17 +96,12 @@ def join_sessions(
         "notes": [*notes, *(note for part in everything for note in part.tally.notes)],
         "source": source,
         "synthetic": any(part.synthetic for part in everything),
-        "stimuli": _one_recipe(everything),
+        # The recipe that all sessions name; "" where they name none, or different ones.
+        "stimuli": recipes.pop() if len(recipes) == 1 else "",
         "content_hash": content_hash(vocabulary, *(item for part in parts for item in _content(part))),
     }
     dataset.attrs["missing"] = missing_labels(dataset)
     return dataset
-
-
-def _one_recipe(parts: list[SessionCounts]) -> str:
-    """Return the recipe that all sessions name; "" where they name none, or different ones."""
-    named = {part.stimuli for part in parts}
-    return named.pop() if len(named) == 1 else ""
 
 
 def _covariate(parts: list[SessionCounts], name: str) -> NDArray[np.float64]:

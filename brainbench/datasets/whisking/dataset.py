@@ -124,6 +124,7 @@ class WhiskingDataset:
         self.manifest: Mapping[str, Any] = read_manifest(self.folder) if tree is None else tree.manifest()
         self.classes = tuple(str(name) for name in self.manifest["classes"])
         entries = [item for item in self.manifest["shards"] if split in ("all", item["split"])]
+        self._splits = np.array([item["split"] for item in entries])
         if tree is None:
             self._shards = [open_shard(self.folder / item["name"], item, self.manifest) for item in entries]
         else:
@@ -182,6 +183,15 @@ class WhiskingDataset:
     def indices(self) -> NDArray[np.int64]:
         """[N] number of each sweep in the whole grid of sweeps and objects."""
         return self._gathered([shard.indices for shard in self._shards])
+
+    @property
+    def summary(self) -> dict[str, Any]:
+        """Hash, number of classes, and the sweeps of each split that are used and in all left out: for a card."""
+        used = self._splits[self._where].tolist()
+        sizes = {name: used.count(name) for name in SPLITS[:3]}
+        return {
+            "hash": self.manifest["content_hash"], "classes": len(self.classes), "left_out": self.skipped, **sizes,
+        }  # fmt: skip
 
     def __len__(self) -> int:
         """Count the batches of an epoch."""

@@ -8,8 +8,7 @@ from __future__ import annotations
 
 from brainbench.metrics.measures.decoding import LabelDecoding
 from brainbench.metrics.measures.nuisance import PartialRSA
-from brainbench.metrics.measures.patterns import LinearCKA
-from brainbench.metrics.measures.procrustes import Procrustes
+from brainbench.metrics.measures.patterns import LinearCKA, Procrustes
 from brainbench.metrics.measures.registry import register_metric
 from brainbench.metrics.measures.ridge import RidgeEncoding
 from brainbench.metrics.measures.rsa import RSA

@@ -12,10 +12,9 @@ from typing import TYPE_CHECKING
 from brainbench.core.lazy import lazy_exports
 
 if TYPE_CHECKING:
-    from brainbench.models.training.batches import ArrayData
     from brainbench.models.training.config import TrainingConfig
     from brainbench.models.training.trainer import TrainingResult, train
 
-__all__ = ["ArrayData", "TrainingConfig", "TrainingResult", "train"]
+__all__ = ["TrainingConfig", "TrainingResult", "train"]
 
 __getattr__, __dir__ = lazy_exports(__name__)

@@ -21,11 +21,13 @@ def checkpoint_info(
     evaluation: Evaluation | None,
     twin: Mapping[str, Any] | None = None,
     controls: Mapping[str, Evaluation] | None = None,
+    data: Mapping[str, Any] | None = None,
 ) -> dict[str, Any]:
     """Return what a checkpoint's configuration says beside the architecture, in plain values.
 
     ``twin`` is what :func:`~brainbench.models.training.twins.describe_twin` told of the network before its training,
-    ``controls`` are evaluations of :data:`~brainbench.models.training.evaluation.CONTROLS`.
+    ``controls`` are evaluations of :data:`~brainbench.models.training.evaluation.CONTROLS`, ``data`` the
+    :attr:`~brainbench.models.training.batches.Data.summary` of the sweeps.
     """
     compared = {name: to_plain(found) for name, found in (controls or {}).items()}
     return {
@@ -41,6 +43,7 @@ def checkpoint_info(
         "twin": dict(twin or {"name": config.model, "seed": config.seed}),
         "licence": "MIT",
         "provenance": provenance(),
+        **({"data": dict(data)} if data else {}),
     } | ({"twin_evaluation": compared.pop(TWIN, None), "baselines": compared} if compared else {})
 
 

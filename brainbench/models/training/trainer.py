@@ -376,6 +376,7 @@ class _Run:
             evaluation=result,
             twin=self.twin,
             controls=self.controls,
+            data=self.data.summary,
         )
         save_checkpoint(
             self.out / BEST,

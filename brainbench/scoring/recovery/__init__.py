@@ -2,8 +2,8 @@
 
 ``candidates`` runs the networks on the stimuli, ``boards`` draws animals from one of them and scores all (``design``
 says how many and how noisy), ``study`` does so for many boards, and ``confusion`` counts how often the true network
-wins. ``selection`` picks the stimuli of a larger pool that separate the candidates best, ``cheapest`` looks for the
-smallest design that suffices, and ``figure`` draws the confusion matrix.
+wins, as numbers and as a picture. ``selection`` picks the stimuli of a larger pool that separate the candidates best,
+``cheapest`` looks for the smallest design that suffices.
 """
 
 from __future__ import annotations
@@ -15,9 +15,8 @@ from brainbench.core.lazy import lazy_exports
 if TYPE_CHECKING:
     from brainbench.scoring.recovery.candidates import Candidate, open_candidates
     from brainbench.scoring.recovery.cheapest import find_cheapest
-    from brainbench.scoring.recovery.confusion import Recovery
+    from brainbench.scoring.recovery.confusion import Recovery, plot_confusion
     from brainbench.scoring.recovery.design import RecoveryDesign
-    from brainbench.scoring.recovery.figure import plot_confusion
     from brainbench.scoring.recovery.selection import select_stimuli
     from brainbench.scoring.recovery.study import recover
 

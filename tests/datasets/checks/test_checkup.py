@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from brainbench.core.errors import DataFileNotFoundError, UsageError
+from brainbench.core.files import to_json
 from brainbench.datasets import check, write_recordings
 from brainbench.datasets.checks.spikes import coincidences
 from brainbench.datasets.exports import subset
@@ -56,7 +57,7 @@ def test_a_healthy_session_is_told_so(tmp_path):
     assert (checkup.verdict, checkup.count("error"), checkup.count("warning")) == ("note", 0, 0)
     assert re.search(r"touch \(first-contact\) .*5 to 30 ms", str(checkup))
     assert str(checkup).startswith(f"{path}: 1 session, 0 errors, 0 warnings, ")
-    assert json.loads(checkup.to_json())["findings"][0]["check"] == "clock"
+    assert json.loads(to_json(checkup))["findings"][0]["check"] == "clock"
 
 
 # Clock

@@ -6,8 +6,9 @@ from torch import nn
 
 from brainbench.core.errors import DataError, UsageError
 from brainbench.models.registry import load_model
-from brainbench.models.training.batches import ArrayBatches, BatchOptions
+from brainbench.models.training.batches import BatchOptions
 from brainbench.models.training.evaluation import RawInput, baselines, collapse, evaluate, fit_probe, topk
+from tests.factories.array_data import ArrayBatches
 from tests.factories.training_sweeps import sweeps
 
 
