@@ -19,7 +19,7 @@ from brainbench.core.progress import Progress, track
 from brainbench.datasets import hdf5
 from brainbench.datasets.layouts.published_npz import LAYOUT, is_published, open_published
 from brainbench.datasets.layouts.registry import RecordingLayout
-from brainbench.datasets.reading import each_session, find_files, open_file, suitable_files
+from brainbench.datasets.reading import each_session, find_recordings, open_file, suitable_files
 from brainbench.datasets.sessions import SPIKES, Session, SessionTable, as_labels, natural_key
 from brainbench.datasets.trials.conditions import natural_vocabulary
 from brainbench.datasets.trials.counting import has_units, no_units, read_spikes, recorded_span
@@ -159,26 +159,28 @@ def inspect(path: str | os.PathLike[str], *, strict: bool = False, progress: Pro
     file can still be looked into.
 
     Args:
-        path: What is described.
+        path: What is described; ``LAYOUT:PATH`` names a layout, which is detected otherwise.
         strict: Refuse files among several that hold no recordings; they are skipped and named by default.
         progress: Called with (files read, files, what).
 
     Raises:
         DataFileNotFoundError: there is no such file.
+        UsageError: the layout is unknown.
         DataError: a file is not HDF5, is truncated, or has none of the known layouts.
     """
     summaries: list[SessionSummary] = []
     proposals: list[Proposal] = []
     formats: dict[str, None] = {}
     layouts: set[str | None] = set()
-    paths, skipped = suitable_files(find_files(path), strict=strict)
+    named, files = find_recordings(path)
+    paths, skipped = suitable_files(files, strict=strict)
     for file_path in track(paths, "reading recordings", progress):
         if is_published(file_path):
             return _counted(open_published(file_path), file_path, f"published .npz, layout {LAYOUT.name}")
         with open_file(file_path) as file:
             if hdf5.holds_counts(file, file_path):
                 return _counted(hdf5.read_counts(file, file_path), file_path)
-            for session, found in each_session(file, file_path):
+            for session, found in each_session(file, file_path, named):
                 layouts.add(found.name if found else None)
                 formats[session.format] = None
                 own = propose(session, found)

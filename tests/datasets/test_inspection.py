@@ -4,7 +4,7 @@ import h5py
 import numpy as np
 import pytest
 
-from brainbench.core.errors import DataError
+from brainbench.core.errors import DataError, UsageError
 from brainbench.core.files import to_json
 from brainbench.datasets import inspect, open_recordings, write_recordings
 from tests.factories.recording_files import detection, write_nwb, write_rodgers
@@ -79,6 +79,13 @@ def test_proposals_count_only_the_trials_that_the_layout_selects(tmp_path):
     assert "trials:stimulus" not in [item.conditions for item in report.proposals]
     recordings = open_recordings(tmp_path / "a.h5")
     assert report.proposals[0].fewest == min(np.unique(recordings["stimulus"], return_counts=True)[1])
+
+
+def test_a_layout_can_be_named_before_the_path(tmp_path):
+    path = write_rodgers(tmp_path / "a.h5", **detection())
+    assert inspect(f"rodgers-detection:{path}").layout == "rodgers-detection"
+    with pytest.raises(UsageError, match="write 'demo' without"):
+        inspect("rodgers-detection:demo")
 
 
 def test_a_folder_is_inspected_as_a_whole(tmp_path):
