@@ -25,6 +25,8 @@ OPPOSITE = -0.8
 """Correlation with the wrenches at the start from which the sign is wrong."""
 RARE = 10.0
 """Periods of the first mode between two readings from which the clock is wrong."""
+SHORT = 0.02
+"""Share of a period of the first mode that the readings last from which the clock or the whisker is wrong."""
 SPENT = 25.0
 """Decay times of the first mode after which nothing is left of a swing: e⁻²⁵."""
 DEAD = 0.05
@@ -35,13 +37,18 @@ def check_clock(times: NDArray[np.float64], frequency: float, damping_ratio: flo
     """Refuse times [n] (s) at which a whisker of this frequency (Hz) cannot be followed as it rings down.
 
     Raises:
-        DataError: readings are many periods apart, or begin when nothing is left of the swing.
+        DataError: readings are many periods apart, end at the start of the first, or begin when nothing is left of it.
     """
     gap, period = float(np.median(np.diff(times))), 1 / frequency
     if gap > RARE * period:
         raise DataError(
             f"Readings are {gap:.3g} s apart, and this whisker swings with a period of {period:.3g} s; times are in "
             "seconds: call a column of milliseconds time_ms, or correct the frame rate."
+        )
+    if times[-1] < SHORT * period:
+        raise DataError(
+            f"The readings end {times[-1]:.3g} s after the release, and this whisker swings with a period of "
+            f"{period:.3g} s; times are in seconds and properties of the whisker in SI units (lengths in m)."
         )
     spent = SPENT / (2 * math.pi * frequency * max(damping_ratio, 0.02))
     if times[0] > spent:
