@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -162,6 +163,7 @@ def evaluate(
 ) -> None:
     """Compare agents over whole episodes: success rate with its 95 % interval, and what it does not tell.
 
+    The last column is the success by kind of object; ``--out`` and ``--json`` say it for each object.
     Beside success stand the task's metric, the return, the rate of rotation about the commanded axis while anything
     touched the object (rad/s), the mean duration (s) and the share of episodes that a drop (or another ending of the
     task) ended.
@@ -198,5 +200,15 @@ def evaluate(
         ">s": "{0[seconds]:.3g}",
         ">dropped": "{0[dropped]:.3f}",
         ">diverged": "{0[diverged]}",
+        ">by object": lambda item: _by_kind(item["objects"]),
     }
     emit(found, table_of(f"{env.task.text}; contacts: {contacts}", found, columns), as_json=as_json)
+
+
+def _by_kind(objects: Mapping[str, Mapping[str, float]]) -> str:
+    """Return the success with each kind of object, the first word of its name."""
+    found: dict[str, list[float]] = {}
+    for name, item in objects.items():
+        won, of = found.setdefault(name.partition(" ")[0], [0.0, 0.0])
+        found[name.partition(" ")[0]] = [won + item["success_rate"] * item["episodes"], of + item["episodes"]]
+    return ", ".join(f"{kind} {won / of:.2f}" for kind, (won, of) in found.items())
