@@ -132,7 +132,7 @@ def read_results(folders: Iterable[str | Path], *, at_least: int = 0) -> list[St
             described = read_json(path.parent / "config.json")
             if not isinstance(described, dict) or not isinstance(described.get("distill"), dict):
                 continue
-            member = _Member(DistillConfig.of_run(described["distill"]), tuple(_evaluations(path)))
+            member = _Member(DistillConfig.of(described["distill"]), tuple(_evaluations(path)))
             groups[member.config.name.rpartition("_seed")[0]].append(member)
     if not groups:
         raise DataFileNotFoundError(

@@ -29,7 +29,7 @@ def list_tasks(as_json: JsonOption = False) -> None:
     """List the tasks with their success, length, observation groups, and the policies that come with the package."""
     from robotics_bridge import tasks
     from robotics_bridge.policies.fit import trained_contacts
-    from robotics_bridge.policies.shipped import list_policies, stored, unmeasured_inputs
+    from robotics_bridge.policies.shipped import list_policies, stored
     from robotics_bridge.tasks.contact_model import contacts_name
 
     found = []
@@ -48,7 +48,6 @@ def list_tasks(as_json: JsonOption = False) -> None:
                 "teacher": list(task.groups["actor"]),
                 "shipped": shipped,
                 "contacts": {policy: contacts_name(trained_contacts(stored(policy))) for policy in shipped},
-                "unmeasured": {policy: read for policy in shipped if (read := unmeasured_inputs(stored(policy)))},
             }
         )
     columns = {
@@ -58,12 +57,8 @@ def list_tasks(as_json: JsonOption = False) -> None:
         "success": "{0[metric]} ≥ {0[success_from]:.3g}",
         "student sees": lambda item: ", ".join(item["student"]),
     }
-    policies = [
-        (name, row["task"], row["contacts"][name], ", ".join(row["unmeasured"].get(name, ())))
-        for row in found
-        for name in row["shipped"]
-    ]
-    heads = ("trained policy", "task", "contacts", "reads what no hand measures")
+    policies = [(name, row["task"], row["contacts"][name]) for row in found for name in row["shipped"]]
+    heads = ("trained policy", "task", "contacts")
     trained = table_of("", policies, {head: f"{{0[{index}]}}" for index, head in enumerate(heads)})
     emit(found, f"{table_of('', found, columns)}\n\n{trained}", as_json=as_json)
 

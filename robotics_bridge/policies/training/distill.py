@@ -30,7 +30,7 @@ from robotics_bridge.policies.encoders.arms import perceptron
 from robotics_bridge.policies.evaluate import Policy
 from robotics_bridge.policies.student import TACTILE, TactilePolicy
 from robotics_bridge.policies.training.cuda_graph_step import ChunkStep
-from robotics_bridge.policies.training.distill_config import EARLIER, DistillConfig
+from robotics_bridge.policies.training.distill_config import DistillConfig
 from robotics_bridge.policies.training.rollouts import Recorder, Rollout
 from robotics_bridge.policies.training.state_tree import write_tensors
 from robotics_bridge.policies.training.student_files import CONFIG, MODEL, build_student
@@ -284,7 +284,6 @@ class _Run:
         mine = to_plain(self.config.plain())
         if path.is_file():
             found = read_mapping(path).get("distill")
-            found = {**EARLIER, **found} if isinstance(found, dict) else found
             differing = sorted(key for key in mine if not isinstance(found, dict) or found.get(key) != mine[key])
             if differing:
                 raise UsageError(
@@ -353,7 +352,7 @@ def describe_run(config: DistillConfig, student: TactilePolicy, env: Any) -> dic
             "rate": 1 / env.step_dt,
             "sub_steps": env.decimation,
             "action_limit": env.task.action_limit,
-            "twist": env.task.taxel_twist if config.twist is None else config.twist,
+            "twist": env.task.taxel_twist,
             "contacts": asdict(env.task.contacts),
             "joints": list(env.joint_names),
             "action_map": {key: getattr(actions, key) for key in ("names", "default", "scale", "low", "high")},
