@@ -64,7 +64,8 @@ def test_report_tests_students_against_each_other_beyond_the_spread_of_seeds(tmp
         _run("report", next(tmp_path.glob("*none_seed0")), "--differences")
 
 
-SHORT = ("--seconds", 2, "--goal", 0.5)
+TOLD = ("--input", "command=1")
+SHORT = ("--seconds", 2, *TOLD)
 
 
 @pytest.mark.slow
@@ -72,7 +73,7 @@ def test_deploy_runs_on_the_simulated_hand_and_stops_it_when_readings_are_absurd
     path = export_small(tmp_path)
     found = json.loads(_run("deploy", path, *SHORT, "--timeout", 1, "--record", tmp_path / "ep", "--json"))
     assert found["status"] == "finished", found["reason"]
-    assert list(found["unmeasured"]) == ["goal"]
+    assert list(found["unmeasured"]) == ["command"]
     assert found["ticks"] > 40
     info = json.loads((tmp_path / "ep" / "meta" / "info.json").read_text())
     assert info["total_frames"] == found["ticks"]
@@ -102,19 +103,19 @@ def test_deploy_asks_for_what_is_missing_before_a_hand_is_started(tmp_path, monk
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "file").touch()
     refused = [
-        ((), r"goal \("),
-        (("--input", "gaol=1"), "'goal'"),
-        (("--input", "goal"), "'goal'"),
-        (("--input", "goal=nan"), "nan"),
-        (("--goal", "inf"), "inf"),
-        (("--goal", 1, "--goal", 2), "2.0"),
-        (("--goal", 1, "--seconds", "nan"), "nan"),
-        (("--goal", 1, "--seconds", -1), "-1"),
-        (("--goal", 1, "--record", tmp_path / "full"), "full"),
-        (("--goal", 1, "--driver", "hand"), "'hand'"),
-        (("--goal", 1, "--driver", "hand:99999999"), "99999999"),
-        (("--goal", 1, "--driver", ":5000"), "--key"),
-        (("--goal", 1, "--driver", ":5000", "--key", tmp_path / "none.key"), r"none\.key"),
+        ((), r"command \("),
+        (("--input", "comand=1"), "'command'"),
+        (("--input", "command"), "'command'"),
+        (("--input", "command=nan"), "nan"),
+        (("--input", "command=inf"), "inf"),
+        (("--input", "command=1,2"), "2.0"),
+        ((*TOLD, "--seconds", "nan"), "nan"),
+        ((*TOLD, "--seconds", -1), "-1"),
+        ((*TOLD, "--record", tmp_path / "full"), "full"),
+        ((*TOLD, "--driver", "hand"), "'hand'"),
+        ((*TOLD, "--driver", "hand:99999999"), "99999999"),
+        ((*TOLD, "--driver", ":5000"), "--key"),
+        ((*TOLD, "--driver", ":5000", "--key", tmp_path / "none.key"), r"none\.key"),
     ]
     for words, culprit in refused:
         with pytest.raises(BrainbenchError, match=culprit):
