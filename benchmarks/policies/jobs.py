@@ -14,8 +14,8 @@ numbers (37 MB for 8,192 environments). The tree has to stay below 64 MiB with `
 commit without ``leaderboards/*/records``, ``leaderboards/results`` and ``docs/images``.
 
 Wheels that policies need on that machine: ``../shared/device/pack.sh`` with :data:`PACKED` (rsl-rl-lib and tensordict
-are the script's own). There is no gymnasium and no tensorboard: commands log with ``--loggers csv``. ``run`` checks
-first, so that no minute goes into a job that ends for want of a package.
+are the script's own). There is no gymnasium; commands log with ``--loggers csv``. ``run`` checks first, so that no
+minute goes into a job that ends for want of a package.
 """
 
 from __future__ import annotations
@@ -40,7 +40,8 @@ from brainbench.core.files import read_json
 
 FILE = Path(__file__).with_name("jobs.toml")
 PACKED = "msgspec h5netcdf manifold3d platformdirs gitpython gitdb smmap pyvers importlib_metadata orjson"
-"""Wheels beside those of ``pack.sh``, as its arguments."""
+"""Wheels beside those of ``pack.sh``, as its arguments. Of TensorBoard, which rsl-rl-lib 5.5.1 imports at once, the
+machine had its own; else also pack tensorboard, protobuf and absl-py (6 MB)."""
 NEEDED = (
     "torch", "warp", "mujoco", "mujoco_warp", "tensordict", "rsl_rl.algorithms", "rsl_rl.models", "typer", "rich",
     "msgspec", "safetensors", "scipy", "xarray", "h5netcdf", "manifold3d", "platformdirs", "trimesh",

@@ -22,7 +22,7 @@ from typing import Any, Literal
 import torch
 from torch import nn
 
-from brainbench.core.errors import UsageError
+from brainbench.core.errors import UsageError, missing_dependency
 from brainbench.core.files import provenance, read_mapping, to_plain, write_json
 from brainbench.core.progress import Progress
 from brainbench.models.training.run_folder import RunLog, load_state, save_state
@@ -86,7 +86,12 @@ def distill(
     Raises:
         UsageError: the folder holds another run, or the environment does not fit.
         DataError: a file of the run is damaged.
+        MissingDependencyError: rsl-rl-lib is not installed.
     """
+    try:
+        import rsl_rl.models  # noqa: F401
+    except ImportError as error:  # without it a student can act, but not learn
+        raise missing_dependency("rsl-rl-lib", extra="policies", purpose="Training policies") from error
     devices = [env.device] if torch.device(env.device).type == "cuda" else []
     with torch.random.fork_rng(devices=devices):
         torch.manual_seed(config.seed)
