@@ -60,6 +60,8 @@ SMALL = (
     (r"--envs \d+", "--envs 4"),
     (r"--(iterations|stop-at) \d+", r"--\1 1"),
     (r"--episodes \d+", "--episodes 4"),
+    (r"--epochs \d+", "--epochs 1"),
+    (r"procedural:\d+", "brick:2 bowl:2"),
     (r"--seconds [\d.]+", "--seconds 0.5"),
     (r"--precision bf16", ""),
     (r"--(untrained|reservoirs|draws|seeds|together) \d+", r"--\1 1"),
