@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import pytest
 import torch
 
-from robotics_bridge.policies.encoders.arms import EncoderConfig
 from robotics_bridge.policies.encoders.reservoir import EchoState, FeatureNorm
 from robotics_bridge.policies.training.distill_config import DistillConfig
 
