@@ -28,6 +28,7 @@ from brainbench.core.progress import Progress
 from brainbench.models.training.run_folder import RunLog, load_state, save_state
 from robotics_bridge.policies.encoders.arms import perceptron
 from robotics_bridge.policies.evaluate import Policy
+from robotics_bridge.policies.fit import check_version
 from robotics_bridge.policies.student import TACTILE, TactilePolicy
 from robotics_bridge.policies.training.cuda_graph_step import ChunkStep
 from robotics_bridge.policies.training.distill_config import DistillConfig
@@ -288,7 +289,9 @@ class _Run:
         path = self.out / CONFIG
         mine = to_plain(self.config.plain())
         if path.is_file():
-            found = read_mapping(path).get("distill")
+            known = read_mapping(path)
+            check_version(known, str(self.out))
+            found = known.get("distill")
             differing = sorted(key for key in mine if not isinstance(found, dict) or found.get(key) != mine[key])
             if differing:
                 raise UsageError(
