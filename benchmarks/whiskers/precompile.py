@@ -6,8 +6,9 @@
 
 The program runs here with a device that calls itself CUDA but computes nothing: arrays lie in host memory, and a
 launch compiles its kernel and returns. A kernel for the processor is refused, as by the Warp of a GPU machine that
-lacks the compiler for processors (../shared/device/README.md). What depends on computed numbers therefore does not happen; programs to be
-run so need a small number of environments and repeats. Modules that are in the folder already are not compiled again.
+lacks the compiler for processors (../shared/device/README.md). What depends on computed numbers therefore does not
+happen; programs to be run so need a small number of environments and repeats. Modules that are in the folder already
+are not compiled again.
 Binaries fit one architecture (``--arch 90``: H100, H200) and one version of Warp, and need a driver of the same major
 version as the toolkit that this Warp was built with.
 """

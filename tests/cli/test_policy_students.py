@@ -11,6 +11,7 @@ from brainbench.cli import app
 from brainbench.core.errors import BrainbenchError, UsageError
 from brainbench.core.files import write_json
 from robotics_bridge.policies.training.distill_config import DistillConfig
+from robotics_bridge.tasks.task import TASK_VERSION
 from tests.factories.policies import export_small
 
 
@@ -35,7 +36,7 @@ def test_sweep_counts_table_4_10() -> None:
 def test_report_prints_a_table_and_writes_records(tmp_path) -> None:
     for seed in range(3):
         config = DistillConfig(task="screwdriver", observe="bool", seed=seed)
-        write_json(tmp_path / config.name / "config.json", {"distill": config.plain()})
+        write_json(tmp_path / config.name / "config.json", {"distill": config.plain(), "task_version": TASK_VERSION})
         found = [{"seed": 0, "success": [1.0, 0.0, 1.0 * (seed > 0), 1.0], "metric": [1.0] * 4}]
         write_json(tmp_path / config.name / "evaluation.json", found)
     text = _run("report", tmp_path, "--records", tmp_path / "records", "--picture", tmp_path / "report.png")
@@ -49,7 +50,9 @@ def test_report_tests_students_against_each_other_beyond_the_spread_of_seeds(tmp
     for observe, shares in given.items():
         for seed, share in enumerate(shares):
             config = DistillConfig(task="screwdriver", observe=observe, seed=seed)
-            write_json(tmp_path / config.name / "config.json", {"distill": config.plain()})
+            write_json(
+                tmp_path / config.name / "config.json", {"distill": config.plain(), "task_version": TASK_VERSION}
+            )
             found = [{"seed": 0, "success": [float(index < 20 * share) for index in range(20)]}]
             write_json(tmp_path / config.name / "evaluation.json", found)
     pairs = json.loads(_run("report", tmp_path, "--differences", "--json"))["differences"]
