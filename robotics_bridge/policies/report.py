@@ -124,8 +124,7 @@ def read_results(folders: Iterable[str | Path], *, at_least: int = 0) -> list[St
     Where a student was trained more than once with the same training seed and draw of its encoder, the one that learned
     longest counts: two runs of one seed are no two seeds. Students of another version of the tasks are left out, and
     those that learned fewer iterations than ``at_least``; those that do not say how many stay. Where draws and seeds
-    are crossed, intervals are those of
-    :func:`mixed_model`.
+    are crossed, intervals are those of :func:`mixed_model`.
 
     Raises:
         DataFileNotFoundError: no student was evaluated there, or none of them learned so long.
