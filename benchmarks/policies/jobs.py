@@ -2,7 +2,8 @@
 
     python -m benchmarks.policies.jobs                          list what is open
     python -m benchmarks.policies.jobs try [NAME …]             here: every command, with four environments and one step
-    python -m benchmarks.policies.jobs run NAME … [--minutes 8.5]   on the GPU machine: one piece of each
+    python -m benchmarks.policies.jobs check                    on the GPU machine: what it lacks, in a few seconds
+    python -m benchmarks.policies.jobs run NAME … [--minutes 8.5]   there: one piece of each
     python -m benchmarks.policies.jobs keep NAME FOLDER         here: keep what came back, for the next piece
 
 A call of the GPU machine lasts 10 minutes at most, a session 30. A job works in ``/tmp/run/NAME``, which the calls of a
@@ -12,14 +13,15 @@ The next session goes on from there: ``keep`` puts the parts into ``.run/NAME`` 
 numbers (37 MB for 8,192 environments). The tree has to stay below 64 MiB with ``.run``: make the calls from a
 commit without ``leaderboards/*/records``, ``leaderboards/results`` and ``docs/images``.
 
-Wheels that policies need on that machine: ``../shared/device/pack.sh msgspec h5netcdf manifold3d platformdirs gitpython
-gitdb smmap pyvers importlib_metadata orjson`` (rsl-rl-lib and tensordict are the script's own). There is no gymnasium
-and no tensorboard: commands log with ``--loggers csv``.
+Wheels that policies need on that machine: ``../shared/device/pack.sh`` with :data:`PACKED` (rsl-rl-lib and tensordict
+are the script's own). There is no gymnasium; commands log with ``--loggers csv``. ``run`` checks first, so that no
+minute goes into a job that ends for want of a package.
 """
 
 from __future__ import annotations
 
 import argparse
+import importlib
 import math
 import os
 import re
@@ -29,7 +31,7 @@ import sys
 import tarfile
 import time
 import tomllib
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -37,6 +39,15 @@ from brainbench.core.errors import UsageError, unknown_name
 from brainbench.core.files import read_json
 
 FILE = Path(__file__).with_name("jobs.toml")
+PACKED = "msgspec h5netcdf manifold3d platformdirs gitpython gitdb smmap pyvers importlib_metadata orjson"
+"""Wheels beside those of ``pack.sh``, as its arguments. Of TensorBoard, which rsl-rl-lib 5.5.1 imports at once, the
+machine had its own; else also pack tensorboard, protobuf and absl-py (6 MB)."""
+NEEDED = (
+    "torch", "warp", "mujoco", "mujoco_warp", "tensordict", "rsl_rl.algorithms", "rsl_rl.models", "typer", "rich",
+    "msgspec", "safetensors", "scipy", "xarray", "h5netcdf", "manifold3d", "platformdirs", "trimesh",
+    "robotics_bridge.policies.training.teacher", "robotics_bridge.policies.training.students", "brainbench.cli",
+)  # fmt: skip
+"""Modules that the commands import, at once or late."""
 KEYS = {"name", "why", "minutes", "command", "each", "stop_at", "then", "result"}
 CARRIED, WORK = Path(".run"), Path("/tmp/run")
 PIECE = 8.5
@@ -49,6 +60,8 @@ SMALL = (
     (r"--envs \d+", "--envs 4"),
     (r"--(iterations|stop-at) \d+", r"--\1 1"),
     (r"--episodes \d+", "--episodes 4"),
+    (r"--epochs \d+", "--epochs 1"),
+    (r"procedural:\d+", "brick:2 bowl:2"),
     (r"--seconds [\d.]+", "--seconds 0.5"),
     (r"--precision bf16", ""),
     (r"--(untrained|reservoirs|draws|seeds|together) \d+", r"--\1 1"),
@@ -101,6 +114,27 @@ def shell(command: str, run: Path, minutes: float) -> int:
         # What was saved last is where the next piece goes on.
         os.killpg(process.pid, 15)
         return process.wait()
+
+
+def check_machine(needed: Iterable[str] = NEEDED) -> None:
+    """Check that this machine has a GPU and all packages of the jobs.
+
+    Raises:
+        UsageError: something is missing.
+    """
+    missing = []
+    for name in needed:
+        try:
+            importlib.import_module(name)
+        except ImportError as error:
+            missing.append(str(error.name or name).partition(".")[0])
+    if missing:
+        names = ", ".join(dict.fromkeys(missing))
+        raise UsageError(f"This machine lacks {names}; pack it here: ../shared/device/pack.sh {PACKED}, and that.")
+    import torch
+
+    if not torch.cuda.is_available():
+        raise UsageError("This machine has no GPU; `jobs try` runs the commands small on a processor.")
 
 
 def run_piece(name: str, minutes: float) -> int:
@@ -209,6 +243,7 @@ def list_jobs() -> None:
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parts = parser.add_subparsers(dest="what")
+    parts.add_parser("check")
     tried = parts.add_parser("try")
     tried.add_argument("names", nargs="*")
     running = parts.add_parser("run")
@@ -220,6 +255,11 @@ def main() -> int:
     options = parser.parse_args()
     if options.what == "try":
         return try_all(options.names)
+    if options.what in ("check", "run"):
+        check_machine()
+    if options.what == "check":
+        print("nothing is missing")
+        return 0
     if options.what == "run":
         return max(run_piece(name, options.minutes / len(options.names)) for name in options.names)
     if options.what == "keep":
@@ -230,4 +270,7 @@ def main() -> int:
 
 
 if __name__ == "__main__":
-    raise SystemExit(main())
+    try:
+        raise SystemExit(main())
+    except UsageError as error:
+        raise SystemExit(str(error)) from None

@@ -274,7 +274,7 @@ def found_logs(folders: list[Path], named: dict[str, StudentResult]) -> dict[tup
 
     logs = {}
     for path in (path for folder in folders for path in sorted(folder.rglob("log.jsonl"))):
-        config = DistillConfig.of_run(read_json(path.parent / "config.json")["distill"])
+        config = DistillConfig.of(read_json(path.parent / "config.json")["distill"])
         arm = arm_of(config)
         if arm not in named or config.seed not in named[arm].seeds:
             continue

@@ -260,7 +260,7 @@ def train(options: argparse.Namespace, out: Path) -> None:
 
     settings = replace(task.teacher, num_envs=envs)
     extent = teacher.TeacherRun(
-        iterations=options.iterations, minutes=options.minutes, seed=options.seed, keep_env=envs <= 256,
+        iterations=options.iterations, minutes=options.minutes, seed=options.seed,
         start=options.start, start_std=options.start_std,
     )  # fmt: skip
     result = teacher.train(env, run, extent, settings=settings, progress=tell)

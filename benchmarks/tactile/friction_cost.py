@@ -3,8 +3,7 @@
     python -m benchmarks.tactile.friction_cost --write
     python -m benchmarks.tactile.friction_cost --device cuda --write
 
-A machine whose Warp has no processor compiler takes the state along: ``--write-input FILE`` here, ``--input FILE``
-there. ``--from FILE`` lays out what ``--out FILE`` kept elsewhere.
+``--from FILE`` lays out what ``--out FILE`` kept elsewhere.
 """
 
 from __future__ import annotations
@@ -17,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.report import table, write_section
-from benchmarks.tactile.scene import read_input, restore, snapshot
+from benchmarks.tactile.scene import restore, snapshot
 from benchmarks.tactile.throughput import measure
 from brainbench.cli.tactile.scenes import Grip
 from brainbench.core.devices import pick_device
@@ -41,18 +40,13 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--device", choices=list(CASES), default="cpu")
     parser.add_argument("--write", action="store_true", help="put the table into RESULTS.md")
-    parser.add_argument("--write-input", type=Path)
-    parser.add_argument("--input", type=Path)
     parser.add_argument("--from", type=Path, dest="records")
     parser.add_argument("--out", type=Path)
     args = parser.parse_args()
-    if args.write_input:
-        np.savez_compressed(args.write_input, allow_pickle=False, **settled())
-        return
     if args.records:
         found = json.loads(args.records.read_text("utf-8"))
     else:
-        state = read_input(args.input) if args.input else settled()
+        state = settled(args.device)
         where = pick_device(args.device)
         rows = [row for density, envs in CASES[args.device] for row in cost(state, density, envs, args.device)]
         found = {"device": where.name if where.is_cuda else "", "rows": rows, "rounds": ROUNDS[args.device]}
@@ -71,9 +65,9 @@ def main() -> None:
         write_section(title, command, body, where=where, subject="tactile")
 
 
-def settled() -> dict[str, np.ndarray]:
-    """Return the state of one hand that has closed around the ball."""
-    grip = Grip(HAND)
+def settled(device: str) -> dict[str, np.ndarray]:
+    """Return the state of one hand that has closed around the ball, on the engine of a device."""
+    grip = Grip(HAND, device=device)
     grip.run(260)
     return snapshot(grip.engine.state)
 

@@ -5,8 +5,10 @@
     tar xJf kernels.tar.xz -C ~/.cache/warp          # there; then run the program as usual
 
 The program runs here with a device that calls itself CUDA but computes nothing: arrays lie in host memory, and a
-launch compiles its kernel and returns. What depends on computed numbers therefore does not happen; programs to be
-run so need a small number of environments and repeats. Modules that are in the folder already are not compiled again.
+launch compiles its kernel and returns. A kernel for the processor is refused, as by the Warp of a GPU machine that
+lacks the compiler for processors (../shared/device/README.md). What depends on computed numbers therefore does not
+happen; programs to be run so need a small number of environments and repeats. Modules that are in the folder already
+are not compiled again.
 Binaries fit one architecture (``--arch 90``: H100, H200) and one version of Warp, and need a driver of the same major
 version as the toolkit that this Warp was built with.
 """
@@ -14,6 +16,7 @@ version as the toolkit that this Warp was built with.
 from __future__ import annotations
 
 import argparse
+import copy
 import os
 import runpy
 import sys
@@ -40,7 +43,7 @@ class Recording:
 
 
 def pretend(folder: Path, arch: int, sm_count: int) -> list[tuple[str, float]]:
-    """Make Warp's processor a device that outside of Warp looks like CUDA and compiles instead of launching.
+    """Add a device to Warp that lies in host memory, looks like CUDA from outside and compiles instead of launching.
 
     Returns:
         A list that fills with (module, seconds) as modules are compiled.
@@ -51,20 +54,20 @@ def pretend(folder: Path, arch: int, sm_count: int) -> list[tuple[str, float]]:
     wp.config.log_level = wp.LOG_ERROR
     wp.config.kernel_cache_dir = str(folder)
     wp.init()
-    processor = wp.get_device("cpu")
-    processor.sm_count = sm_count
-    processor.max_shared_memory_per_block = 227 * 1024
+    fake = copy.copy(wp.get_device("cpu"))
+    fake.alias, fake.sm_count, fake.max_shared_memory_per_block = "cuda:0", sm_count, 227 * 1024
     compiled: list[tuple[str, float]] = []
 
     def seen_from_outside(truth: bool) -> property:
         def answer(device: Any) -> bool:
             inside = sys._getframe(1).f_globals.get("__name__", "").split(".")[0] == "warp"
-            return truth == inside if device is processor else not truth
+            return truth == inside if device is fake else truth
 
         return property(answer)
 
     def load(module: Any, device: Any, block_dim: int | None = None, **_named: Any) -> None:
-        del device
+        if device is not fake:
+            raise RuntimeError(f"A kernel of {module.name} is launched on the processor, which compiles nothing there.")
         threads = block_dim or module.options["block_dim"]
         module.get_module_hash(threads)
         options = module.resolved_options[threads]
@@ -86,13 +89,13 @@ def pretend(folder: Path, arch: int, sm_count: int) -> list[tuple[str, float]]:
             if body is not None:
                 body(**named)
 
-    context.runtime.device_map["cuda:0"] = processor
+    context.runtime.device_map["cuda:0"] = fake
     inner: dict[tuple[Any, str], Any] = {
         (context.Device, "is_cuda"): seen_from_outside(False),
         (context.Device, "is_cpu"): seen_from_outside(True),
         (context.Module, "load"): load,
         (context, "_resolve_launch_block_dim"): lambda _device, threads: threads if threads and threads > 0 else 256,
-        (context.runtime, "get_current_cuda_device"): lambda: processor,
+        (context.runtime, "get_current_cuda_device"): lambda: fake,
     }
     outer = {
         "ScopedCapture": Recording,
@@ -100,6 +103,7 @@ def pretend(folder: Path, arch: int, sm_count: int) -> list[tuple[str, float]]:
         "capture_while": loop,
         "capture_if": branch,
         "is_cuda_available": lambda: True,
+        "is_cpu_available": lambda: False,
         "is_conditional_graph_supported": lambda: True,
     }
     for (owner, name), replacement in inner.items():

@@ -146,6 +146,21 @@ def twist_and_swing(q: torch.Tensor, axis: torch.Tensor) -> tuple[torch.Tensor, 
     return twist, swing
 
 
+def twist_of(q: torch.Tensor, axis: torch.Tensor) -> torch.Tensor:
+    """Return the part [..., 4] of turns that lies about a unit axis [..., 3]; no turn where the axis is zero.
+
+    Without it a turn is the smallest that differs from the whole by a turn about that axis.
+    """
+    import torch
+
+    along = (q[..., 1:] * axis).sum(dim=-1, keepdim=True)
+    twist = torch.cat((q[..., :1], along * axis), dim=-1)
+    length = twist.norm(dim=-1, keepdim=True)
+    none = constant((1.0, 0.0, 0.0, 0.0), q).expand_as(twist)
+    # A half turn across the axis has no twist of its own.
+    return torch.where((length > 1e-6) & axis.any(dim=-1, keepdim=True), twist / length.clamp(min=1e-6), none)
+
+
 def six_numbers(q: torch.Tensor) -> torch.Tensor:
     """Return the first two columns of the rotation matrices as [..., 6] (Zhou et al. 2019)."""
     import torch

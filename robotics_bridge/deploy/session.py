@@ -24,7 +24,6 @@ from robotics_bridge.tasks.task import check_measured
 LARGEST_INPUT = 1e6
 """Largest magnitude of a constant in place of an observation."""
 _MEANINGS = {
-    "goal": "in training the object's angle to the goal, which changed with every step",
     "thermal": "temperatures of the skin",
     "command": "what the hand is told",
     "link_pose": "poses of the tactile links",
@@ -70,8 +69,7 @@ class DeployedPolicy:
             UsageError: one of them is not among the groups that something else gives, or is privileged: no constant
                 stands for what only the simulation knows.
         """
-        # A goal may be held constant; the contract of a student of earlier versions has one.
-        check_measured((name for name in self.groups if name != "goal"), "A policy on a hand")
+        check_measured(self.groups, "A policy on a hand")
         found = self.unmeasured(fingers)
         if missing := [f"{name} ({what})" for name, what in found.items() if name not in given]:
             raise UsageError(
@@ -147,7 +145,7 @@ def read_deployed(path: str | Path) -> DeployedPolicy:
 
 
 def constant(name: str, values: Sequence[float], shape: tuple[int, ...]) -> Source:
-    """Return a source that always gives the same numbers, such as a goal that does not change.
+    """Return a source that always gives the same numbers, such as a command.
 
     Args:
         name: The group, for errors.

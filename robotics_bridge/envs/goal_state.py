@@ -7,18 +7,22 @@ from typing import Any
 import torch
 from torch import nn
 
-from brainbench.core.rotations import angle_of, conjugate, multiply, rotate, twist_and_swing
+from brainbench.core.rotations import angle_of, conjugate, multiply, rotate, twist_and_swing, twist_of
 from robotics_bridge.tasks.task import Task
 
 
 class GoalState:
-    """Buffers of goals, of rotation since the start, and of what happened in the last step."""
+    """Buffers of goals, of rotation since the start, and of what happened in the last step.
 
-    def __init__(self, task: Task, num_envs: int, device: torch.device) -> None:
+    ``round_about`` [B, 3] are the axes of the objects about which a turn does not show, zero for those without.
+    """
+
+    def __init__(self, task: Task, num_envs: int, device: torch.device, round_about: torch.Tensor) -> None:
         def zeros(*shape: int, dtype: torch.dtype = torch.float32) -> torch.Tensor:
             return torch.zeros(num_envs, *shape, dtype=dtype, device=device)
 
         self.goal, self._dt = task.goal, task.step_dt
+        self._round_about = round_about if self.goal is not None and self.goal.by_looks else None
         self._least = 0.0 if task.goal is None else task.goal.threshold
         self.threshold = torch.full((), self._least, device=device)
         """Angle [] below which a goal counts as reached now (rad)."""
@@ -54,6 +58,12 @@ class GoalState:
         if self.goal is not None:
             self._set(mask, self.goal.first(quat, draw(2, 0.0, 1.0)), quat, draw)
 
+    def looks(self, quat: torch.Tensor) -> torch.Tensor:
+        """Return the orientations [B, 4] nearest to the goals in which the objects look as in ``quat`` [B, 4]."""
+        if self._round_about is None:
+            return quat
+        return multiply(quat, twist_of(multiply(conjugate(quat), self.quat), self._round_about))
+
     def update(self, quat: torch.Tensor, held: torch.Tensor) -> None:
         """Judge the orientations [B, 4] after a control step, in which objects [B] bool were touched or not."""
         step = multiply(quat, conjugate(self.previous))
@@ -70,7 +80,7 @@ class GoalState:
             self._step += 1
         if self.goal is None:
             return
-        error = multiply(self.quat, conjugate(quat))
+        error = multiply(self.quat, conjugate(self.looks(quat)))
         self.angle_before.copy_(self.angle)
         self.angle.copy_(angle_of(error))
         if self._axis is not None:
@@ -118,7 +128,7 @@ class GoalState:
 
     def _set(self, mask: torch.Tensor, goal: torch.Tensor, quat: torch.Tensor, draw: Any) -> None:
         self.quat.copy_(torch.where(mask.unsqueeze(1), goal, self.quat))
-        angle = angle_of(multiply(self.quat, conjugate(quat)))
+        angle = angle_of(multiply(self.quat, conjugate(self.looks(quat))))
         self.angle.copy_(torch.where(mask, angle, self.angle))
         deadline = None if self.goal is None else self.goal.deadline
         if deadline is None:

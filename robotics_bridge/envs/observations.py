@@ -42,14 +42,14 @@ def _command(state: EnvState) -> torch.Tensor:
 def _goal(state: EnvState) -> torch.Tensor:
     goals = state.goals
     # Rotation from the object to its goal, g q⁻¹, in world axes.
-    difference = multiply(goals.quat, conjugate(state.target_pose[:, 3:]))
+    difference = multiply(goals.quat, conjugate(goals.looks(state.target_pose[:, 3:])))
     parts = {"orientation": goals.quat, "difference": six_numbers(difference), "angle": goals.angle.unsqueeze(1)}
     return torch.cat([parts[name] for name in state.task.goal_terms], dim=1)
 
 
 def _object(state: EnvState) -> torch.Tensor:
     pose, (velocity, spin) = state.target_pose, state.target_velocity
-    parts = [pose[:, :3], six_numbers(pose[:, 3:]), velocity, VELOCITY * spin]
+    parts = [pose[:, :3], six_numbers(state.goals.looks(pose[:, 3:])), velocity, VELOCITY * spin]
     if state.task.distances_in == "priv_obj_state":
         parts.append(state.contacts.surface_distance)
     return torch.cat(parts, dim=1)

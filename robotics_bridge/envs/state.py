@@ -108,7 +108,9 @@ class EnvState:
         self.actuators = Actuators(
             self.simulation, self.model, task.actuators, substeps=self.substeps, seed=options.seed
         )
-        self.goals = GoalState(task, self.num_envs, self.device)
+        axes = [shape.round_about or (0.0, 0.0, 0.0) for shape in self.model.shapes]
+        round_about = torch.tensor([axes[shape] for shape in self.simulation.shape_of], device=self.device)
+        self.goals = GoalState(task, self.num_envs, self.device, round_about)
         self.touch: TactileObservation | None = None
         if options.observe != "none":
             from robotics_bridge.envs.tactile import TactileObservation

@@ -17,7 +17,6 @@ from brainbench.core.files import to_json
 from robotics_bridge.hands.observations import OBSERVATIONS
 from robotics_bridge.policies.fit import trained_contacts
 from robotics_bridge.policies.schema import Values
-from robotics_bridge.sensors.taxels.sensors import PUBLISHED_TWIST
 
 RATE = (1.0, 1000.0)
 """Control steps per second [Hz]."""
@@ -31,7 +30,7 @@ JOINTS = 255
 """Most joints; a frame counts them in one byte."""
 MOST_NUMBERS = 10_000_000
 """Most numbers of all observations, and of a policy's memory."""
-REQUIRED = ("action_map", "frozen", "hand", "joints", "rate")
+REQUIRED = ("action_map", "contacts", "frozen", "hand", "joints", "rate", "twist")
 """What ``deployment`` must say before a hand can run the policy."""
 
 
@@ -119,10 +118,7 @@ class PolicyContract:
             more["command"] = given.numbers("command", math.prod(inputs["command"]), -1e6, 1e6)
         if given.values.get("action_limit") is not None:
             more["action_limit"] = given.number("action_limit", 1e-6, 1e6)
-        # Contracts of earlier versions say nothing of it: they have the published law.
-        more["twist"] = PUBLISHED_TWIST
-        if "twist" in given.values:
-            more["twist"] = None if given.values["twist"] is None else given.number("twist", 0.0, MOST_TWIST)
+        more["twist"] = None if given.values["twist"] is None else given.number("twist", 0.0, MOST_TWIST)
         more["contacts"] = trained_contacts(given.values, found.where)
         return cls(
             inputs, given.number("rate", *RATE), given.text("hand"), joints, moved,

@@ -52,6 +52,8 @@ class PolicyEvaluation:
     """Duration of each episode: until the object was dropped, or the longest there is."""
     dropped: tuple[bool, ...] = ()
     """True where an ending of the task (not time, divergence or the last goal) ended the episode."""
+    objects: tuple[str, ...] = ()
+    """Name of the object of each episode."""
 
     @property
     def success_rate(self) -> float:
@@ -76,7 +78,16 @@ class PolicyEvaluation:
         facts |= {"success_per_seed": list(self.per_seed), "diverged": self.diverged}
         for name in (name for name in QUANTITIES if getattr(self, name)):
             facts[name], facts[f"{name}_half_width"] = self.mean(name)
+        if self.objects:
+            facts["objects"] = {name: self._of(name) for name in sorted(set(self.objects))}
         return facts
+
+    def _of(self, name: str) -> dict[str, float]:
+        """Return what :meth:`summary` says of the episodes with one object."""
+        rows = [index for index, other in enumerate(self.objects) if other == name]
+        told = {"success_rate": self.success, "goals": self.goals, "dropped": self.dropped}
+        means = {key: sum(values[row] for row in rows) / len(rows) for key, values in told.items()}
+        return {"episodes": len(rows), **means}
 
 
 def mean_of_episodes(values: ArrayLike) -> tuple[float, float]:
@@ -161,7 +172,7 @@ def evaluate(
             columns = [info[name].float() for name in ("metric", "return", "steps", "diverged", "goals", "turned")]
             full = info["goals"] >= (limit or math.inf)
             dropped = terminated & ~info["diverged"] & ~full
-            table = torch.stack((*columns, dropped.float()), dim=1)
+            table = torch.stack((*columns, dropped.float(), env.state.shape_of.float()), dim=1)
             found += table[done & (left > 0)].tolist()
             # Episodes beyond an environment's share are not counted: fast failures would otherwise be counted more
             # often.
@@ -170,11 +181,12 @@ def evaluate(
         rows += found
         if progress:
             progress(index + 1, len(seeds), f"evaluating {name}")
-    metric, returns, lengths, diverged, goals, turned, dropped = zip(*rows, strict=True)
+    metric, returns, lengths, diverged, goals, turned, dropped, shapes = zip(*rows, strict=True)
     seconds = tuple(n * env.step_dt for n in lengths)
     return PolicyEvaluation(
         agent=name, task=env.task.name, seeds=seeds, success=tuple(m >= env.task.success.threshold for m in metric),
         metric=metric, returns=returns, lengths=tuple(int(n) for n in lengths), diverged=int(sum(diverged)),
         per_seed=tuple(rates), goals=goals, seconds=seconds, dropped=tuple(map(bool, dropped)),
         turn_rate=tuple(angle / time for angle, time in zip(turned, seconds, strict=True)),
+        objects=tuple(env.model.shapes[int(shape)].name for shape in shapes),
     )  # fmt: skip

@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Any
 
 from brainbench.core.errors import DataError, UsageError
 from robotics_bridge.policies.schema import Values
-from robotics_bridge.policies.shipped import stored, unmeasured_inputs
+from robotics_bridge.policies.shipped import stored
 from robotics_bridge.tasks.contact_model import CONTACTS, ContactModel, contacts_name
-from robotics_bridge.tasks.task import TASK_VERSION, Task
+from robotics_bridge.tasks.task import MEASURED, TASK_VERSION, Task
 
 if TYPE_CHECKING:
     from robotics_bridge.envs.env import Env
@@ -57,16 +57,8 @@ def with_contacts_of(task: Task, policies: Iterable[str]) -> Task:
     return replace(task, contacts=models.pop())
 
 
-def check_fit(described: Mapping[str, Any], env: Env, name: str) -> None:
-    """Check what the ``config.json`` of a teacher or student says against an environment.
-
-    Other contacts than those of training are told as a warning: how a policy bears them is a question one may ask.
-
-    Raises:
-        DataError: the policy is of another version of the tasks.
-        UsageError: it was trained for another hand.
-    """
-    # Runs of versions that did not state it are of version 1, and had the published contacts.
+def check_version(described: Mapping[str, Any], name: str) -> None:
+    """Check that a policy is of this version of the tasks, by its ``config.json``; raise DataError for another."""
     version = described.get("task_version", 1)
     if version != TASK_VERSION:
         made = described.get("provenance")
@@ -75,6 +67,19 @@ def check_fit(described: Mapping[str, Any], env: Env, name: str) -> None:
             f"The policy {name!r} is of version {str(version)[:20]} of the tasks, and this package has version "
             f"{TASK_VERSION}: train it again, or use the package of that version{made}."
         )
+
+
+def check_fit(described: Mapping[str, Any], env: Env, name: str) -> None:
+    """Check what the ``config.json`` of a teacher or student says against an environment.
+
+    Other contacts than those of training are told as a warning: how a policy bears them is a question one may ask. So
+    is a student that reads the goal, as published ones do.
+
+    Raises:
+        DataError: the policy is of another version of the tasks.
+        UsageError: it was trained for another hand.
+    """
+    check_version(described, name)
     student = described.get("distill")
     hand = str(described.get("hand") or (student.get("hand", "") if isinstance(student, dict) else ""))
     if hand and hand != env.hand.name and Path(hand).stem != Path(str(env.hand.path or env.hand.name)).stem:
@@ -82,11 +87,8 @@ def check_fit(described: Mapping[str, Any], env: Env, name: str) -> None:
             f"The policy {name!r} was trained for the hand {hand[:80]!r}; received {env.hand.name!r}: make the "
             "environment with that hand."
         )
-    if unmeasured := unmeasured_inputs(described):
-        _LOG.warning(
-            "The student %r reads %s, which only the simulation knows: on a hand it does worse.", name,
-            ", ".join(unmeasured),
-        )  # fmt: skip
+    if unmeasured := [group for group, _ in described.get("groups", ()) if group not in MEASURED]:
+        _LOG.warning("The student %r reads %s, which only the simulation knows.", name, ", ".join(unmeasured))
     if (own := trained_contacts(described)) != env.task.contacts:
         _LOG.warning(
             "The policy %r was trained with contacts %s; these are %s.", name, contacts_name(own),

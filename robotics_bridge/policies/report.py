@@ -8,6 +8,7 @@ only in their training seed belong together.
 
 from __future__ import annotations
 
+import logging
 import math
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
@@ -28,6 +29,9 @@ from brainbench.core.statistics import newcombe_interval, t_interval, wilson_int
 from robotics_bridge.policies.contrasts import MixedModel, TrainedPolicy
 from robotics_bridge.policies.evaluate import mean_of_episodes
 from robotics_bridge.policies.training.distill_config import DistillConfig
+from robotics_bridge.tasks.task import TASK_VERSION
+
+_LOG = logging.getLogger(__name__)
 
 EVALUATION, AGENTS = "evaluation.json", "agents.json"
 """Of a student; of the teacher and the agents that do nothing and anything, as ``policy evaluate --out`` writes it."""
@@ -118,9 +122,9 @@ def read_results(folders: Iterable[str | Path], *, at_least: int = 0) -> list[St
     """Return the results of all evaluated students below some folders, best first within each task, hand and contacts.
 
     Where a student was trained more than once with the same training seed and draw of its encoder, the one that learned
-    longest counts: two runs of one seed are no two seeds. Students that learned fewer iterations than ``at_least`` are
-    left out; those that do not say how many stay. Where draws and seeds are crossed, intervals are those of
-    :func:`mixed_model`.
+    longest counts: two runs of one seed are no two seeds. Students of another version of the tasks are left out, and
+    those that learned fewer iterations than ``at_least``; those that do not say how many stay. Where draws and seeds
+    are crossed, intervals are those of :func:`mixed_model`.
 
     Raises:
         DataFileNotFoundError: no student was evaluated there, or none of them learned so long.
@@ -132,7 +136,10 @@ def read_results(folders: Iterable[str | Path], *, at_least: int = 0) -> list[St
             described = read_json(path.parent / "config.json")
             if not isinstance(described, dict) or not isinstance(described.get("distill"), dict):
                 continue
-            member = _Member(DistillConfig.of_run(described["distill"]), tuple(_evaluations(path)))
+            if described.get("task_version", 1) != TASK_VERSION:
+                _LOG.warning("%s is of another version of the tasks, and left out.", path.parent)
+                continue
+            member = _Member(DistillConfig.of(described["distill"]), tuple(_evaluations(path)))
             groups[member.config.name.rpartition("_seed")[0]].append(member)
     if not groups:
         raise DataFileNotFoundError(
@@ -413,6 +420,9 @@ def records(results: Sequence[StudentResult]) -> list[ResultRecord]:
         if config.contacts not in (None, "published"):  # records of versions before know no other contacts
             protocol["contacts"] = config.contacts
             source = f"{source}, {config.contacts} contacts"
+        # Records of version 1 do not state it.
+        protocol["task_version"] = str(TASK_VERSION)
+        source = f"{source}, version {TASK_VERSION} of the tasks"
         name = result.name
         commands = [
             command(replace(one, teacher=config.teacher), stop_at=learned)

@@ -3,19 +3,29 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from brainbench.core.errors import check_name
 from brainbench.core.files import read_json
 from robotics_bridge.policies.schema import Values
-from robotics_bridge.tasks.task import MEASURED
 
 AGENTS = ("zero", "random")
 """Agents that every trained one is held against."""
 FOLDER = Path(__file__).parent / "trained"
 """A run's folder per policy, with a model card."""
+
+
+RETIRED = {
+    "in_palm_rotate.force-torque-hand": "is no longer shipped: it read the object's angle to the goal, which no hand "
+    "measures",
+}
+"""Policy that used to ship → why it does not any more."""
+
+
+def hint(name: str) -> str:
+    """Return what to do instead where there is no policy of a name."""
+    return f"{name!r} {RETIRED[name]}." if name in RETIRED else "Or give the folder of a training run."
 
 
 def list_policies(kind: str, task: str | None = None) -> list[str]:
@@ -32,16 +42,10 @@ def stored(name: str | os.PathLike[str]) -> dict[str, Any]:
     return dict(Values.read(path).values) if path.is_file() else {}
 
 
-def unmeasured_inputs(described: Mapping[str, Any]) -> tuple[str, ...]:
-    """Return the groups that a student of this ``config.json`` reads and no hand has; none for a teacher."""
-    groups = described.get("groups", ()) if "brainbench_student" in described else ()
-    return tuple(name for name, _ in groups if name not in MEASURED)
-
-
 def policy_path(kind: str, name: str | os.PathLike[str]) -> Path:
     """Return the folder of a teacher or student by name, or a path that exists; UsageError where neither is there."""
     path = Path(name)
     if path.exists():
         return path
-    check_name(kind, str(name), list_policies(kind), hint="Or give the folder of a training run.")
+    check_name(kind, str(name), list_policies(kind), hint=hint(str(name)))
     return FOLDER / str(name)

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 from brainbench.core.errors import UsageError
 from brainbench.core.reading.ranges import check_number
-from brainbench.core.rotations import about, constant, multiply, tilted
+from brainbench.core.rotations import about, constant, multiply, tilted, twist_of
 
 if TYPE_CHECKING:
     import torch
@@ -34,6 +34,9 @@ class Goal(abc.ABC):
     """Range of the time after which another goal is proposed [s]; None waits for ever."""
     axis: tuple[float, float, float] | None = None
     """World axis of the commanded rotation; None for goals about any axis."""
+    by_looks: bool = False
+    """Orientations in which the object looks the same are the same: of a cylinder, all turns about its own axis. False
+    (published) tells them apart."""
     start_threshold: float | None = None
     """Wider threshold with which a teacher begins to learn [rad]; None learns with ``threshold`` from the start.
 
@@ -74,7 +77,15 @@ class SteppingRotation(Goal):
     """Angle from goal to goal [rad]."""
     allowed_off_axis: float = math.pi / 6
     """Tilt against the axis up to which rotation counts [rad]."""
+    lying_flat: bool = False
+    """Goals are those of an object that begins straight, in which it lies flat on the palm. False (published) keeps the
+    random yaw of the start in all of them: from the first goal on it is a tilt at which the object cannot lie."""
     limit: int | None = 15
+
+    def first(self, quat: torch.Tensor, draw: torch.Tensor) -> torch.Tensor:
+        """Return the goals one step from the start."""
+        axis = constant(self.axis or (0.0, 0.0, 1.0), quat)
+        return super().first(twist_of(quat, axis.expand_as(quat[..., 1:])) if self.lying_flat else quat, draw)
 
     def following(self, quat: torch.Tensor, goal: torch.Tensor, draw: torch.Tensor) -> torch.Tensor:
         """Return the goals one step further."""

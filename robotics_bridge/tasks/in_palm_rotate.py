@@ -19,6 +19,9 @@ from robotics_bridge.tasks.task import Ending, ObjectRandomisation, ObservationN
 PALM_UP = (0.7071067811865476, 0.0, -0.7071067811865475, 0.0)
 """The palm faces up, the fingers point along −x."""
 GOALS = 15
+PUBLISHED_GOAL = SteppingRotation(axis=(-1.0, 0.0, 0.0), step=1.570795, threshold=0.1, allowed_off_axis=0.5235983333)
+FLAT_GOAL = replace(PUBLISHED_GOAL, lying_flat=True, by_looks=True)
+"""Goals at which every object can lie on the palm."""
 CUPPED = {
     "right_hand_thumb_bend_joint": 1.2, "right_hand_thumb_rota_joint1": 0.25, "right_hand_thumb_rota_joint2": 0.8,
     "right_hand_mid_joint1": 0.5, "right_hand_mid_joint2": 0.8,
@@ -36,7 +39,7 @@ def published() -> Task:
         placement=Placement(height=0.5, x=(-0.02, 0.02), y=(-0.02, 0.02), yaw=(-0.2617991666, 0.2617991666)),
         hand_poses={"xhand1": ((0.07, 0.0, 0.475), PALM_UP), "sharpa": ((0.07, -0.015, 0.48), PALM_UP)},
         moves=("thumb", "mid"),
-        goal=SteppingRotation(axis=(-1.0, 0.0, 0.0), step=1.570795, threshold=0.1, allowed_off_axis=0.5235983333),
+        goal=PUBLISHED_GOAL,
         taxel_twist=PUBLISHED_TWIST,
         rewards={
             "success_bonus": Reward(150.0, terms.goal_reached),
@@ -82,10 +85,11 @@ def default() -> Task:
     """Return the task on which we train; it differs from the published one in these points.
 
     Actions are counted from a cupped hand instead of a flat one: from there random actions turn the block now and
-    then. Rotation weighs more, but only slow turns count, and so does coming nearer to the goal in every direction;
-    reaching it pays; the goal begins wide. The block's place is where it lies, 2 cm higher, so that lying still costs
-    nothing. Without the approach to the goal, teachers threw the block round and lost it. Contacts, actions and taxels
-    are those of :func:`~robotics_bridge.tasks.registry.bounded`.
+    then. Goals are orientations in which an object lies flat on the palm. Rotation weighs more, but only slow turns
+    count, and so does coming nearer to the goal in every direction; reaching it pays; the goal begins wide. The block's
+    place is where it lies, 2 cm higher, so that lying still costs nothing. Without the approach to the goal, teachers
+    threw the block round and lost it. Contacts, actions and taxels are those of
+    :func:`~robotics_bridge.tasks.registry.bounded`.
     """
     task = bounded(published())
     rewards = {
@@ -97,7 +101,7 @@ def default() -> Task:
         "obj_dist_penalty": Reward(-100.0, terms.far_from, {"target": (0.0, 0.0, 0.52), "margin": 0.04}),
     }
     settings = replace(task.teacher, std_range=(0.2, 1.2))
-    goal = task.goal and replace(task.goal, start_threshold=0.4)
+    goal = replace(FLAT_GOAL, start_threshold=0.4)
     return replace(task, joints={"xhand1": CUPPED}, rewards=rewards, teacher=settings, goal=goal)
 
 
@@ -117,4 +121,4 @@ def careful() -> Task:
     settings = replace(
         task.teacher, rnd_weight=50.0, learning_rate=3e-4, learning_rate_range=(1e-4, 3e-3), std_range=(0.2, 1.0)
     )
-    return replace(task, rewards=rewards, teacher=settings, goal=published().goal)
+    return replace(task, rewards=rewards, teacher=settings, goal=FLAT_GOAL)

@@ -52,6 +52,8 @@ class ObjectShape:
     """Edges of the box around it, along the body's axes [m]."""
     bottom: float
     """Depth below the body's origin to which it reaches when upright [m]."""
+    round_about: tuple[float, float, float] | None = None
+    """Axis of the body about which the shape looks the same from everywhere; None without one."""
 
     def scaled(self, factor: float) -> ObjectShape:
         """Return the shape with all lengths multiplied."""
@@ -61,7 +63,8 @@ class ObjectShape:
 
         # Lengths grow by the factor, the density stays: mass grows with its cube.
         solids = tuple(replace(one, size=longer(one.size), position=longer(one.position)) for one in self.solids)
-        return ObjectShape(f"{self.name}×{factor:.3g}", solids, longer(self.extent), factor * self.bottom)
+        name = f"{self.name}×{factor:.3g}"
+        return replace(self, name=name, solids=solids, extent=longer(self.extent), bottom=factor * self.bottom)
 
 
 def box(x: float, y: float, z: float) -> ObjectShape:
@@ -72,7 +75,8 @@ def box(x: float, y: float, z: float) -> ObjectShape:
 def cylinder(radius: float, height: float) -> ObjectShape:
     """Return an upright cylinder [m]."""
     solid = ObjectPrimitive("cylinder", (radius, height / 2))
-    return ObjectShape(f"cylinder {radius:g} {height:g}", (solid,), (2 * radius, 2 * radius, height), height / 2)
+    extent = (2 * radius, 2 * radius, height)
+    return ObjectShape(f"cylinder {radius:g} {height:g}", (solid,), extent, height / 2, round_about=(0.0, 0.0, 1.0))
 
 
 def ball(radius: float) -> ObjectShape:

@@ -19,7 +19,8 @@ def apply_overrides(task: Task, words: Iterable[str]) -> Task:
     a field of :class:`~robotics_bridge.tasks.settings.TeacherSettings`, or a field of the task, by dots into its parts:
     ``is_dropped=-300``, ``rotation_progress.clip=2``, ``obj_dropped.height=0.44``, ``entropy=0``,
     ``learning_rate_range=1e-4,1e-3``, ``episode=15``, ``goal.start_threshold=0.4``, ``object_changes.friction=0.8,1``,
-    ``contacts=firm``, ``contacts.time_constant=0.01``.
+    ``contacts=firm``, ``contacts.time_constant=0.01``, ``objects=box,cylinder,cylinder`` (all the task's objects whose
+    names begin so; named twice, they are twice as many).
 
     Raises:
         UsageError: a word is not of this form, names nothing of the task, or the value is not of its kind.
@@ -65,6 +66,13 @@ def set_field(subject: Any, path: list[str], value: str) -> Any:
     if isinstance(present, ContactModel):
         check_name("contacts of a task", value, CONTACTS)
         return replace(subject, **{first: CONTACTS[value]})
+    if first == "objects":
+        kinds: dict[str, list[Any]] = {}
+        for shape in present:
+            kinds.setdefault(shape.name.partition(" ")[0], []).append(shape)
+        for kind in (named := value.split(",")):
+            check_name("kind of object of the task", kind, kinds)
+        return replace(subject, objects=tuple(shape for kind in named for shape in kinds[kind]))
     if value == "none" and any(field.name == first and field.default is None for field in fields(subject)):
         return replace(subject, **{first: None})
     return replace(subject, **{first: _read(first, value, present)})

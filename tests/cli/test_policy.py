@@ -63,7 +63,14 @@ def test_what_a_shipped_policy_did_is_told_in_goals_turns_and_drops() -> None:
     assert told["dropped"].startswith("0")
 
 
-def test_playing_needs_no_package_for_training_and_checks_names_first() -> None:
+def _student(folder: Path) -> Path:
+    """Return an untrained student of in_palm_rotate, as ``distill`` leaves it."""
+    words = ("--teacher", "in_palm_rotate.firm", "--observe", "force_torque", "--envs", "1", "--stop-at", "1")
+    _run("distill", "in_palm_rotate", *words, "--iterations", "1", "--episodes", "0", "--out", str(folder / "felt"))
+    return folder / "felt"
+
+
+def test_playing_needs_no_package_for_training_and_checks_names_first(tmp_path: Path) -> None:
     code = (
         "import sys\n"
         "for name in ('rsl_rl', 'tensordict', 'tensorboard', 'gymnasium'): sys.modules[name] = None\n"
@@ -75,7 +82,7 @@ def test_playing_needs_no_package_for_training_and_checks_names_first() -> None:
         words = ["policy", "play", "in_palm_rotate", "--agent", agent, "--seconds", "0.1", *more]
         return subprocess.run([sys.executable, "-c", code, *words], capture_output=True, text=True, check=False)
 
-    for agent in ("in_palm_rotate.firm", "in_palm_rotate.force-torque-hand"):
+    for agent in ("in_palm_rotate.firm", str(_student(tmp_path))):
         done = play(agent)
         assert done.returncode == 0, done.stderr
         assert "CUDA" not in done.stderr
@@ -88,7 +95,7 @@ def test_playing_needs_no_package_for_training_and_checks_names_first() -> None:
 
 def test_shipped_policies_are_listed_with_the_contacts_that_they_were_trained_in() -> None:
     found = {row["task"]: row["contacts"] for row in json.loads(_run("tasks", "--json"))}["in_palm_rotate"]
-    contacts = {"careful": "published", "firm": "firm", "force-torque-hand": "published"}
+    contacts = {"careful": "published", "firm": "firm"}
     assert found == {f"in_palm_rotate.{name}": model for name, model in contacts.items()}
     told = [line.split() for line in _run("tasks").splitlines() if line.startswith("in_palm_rotate.")]
     assert [(name, model) for name, _, model, *_ in told] == list(found.items())
@@ -101,26 +108,28 @@ def test_a_policy_plays_in_the_contacts_that_it_was_trained_in_unless_told_other
 
     firm = ("--change", "contacts=firm")
     assert contacts("random") == contacts("in_palm_rotate.firm") == contacts("in_palm_rotate.careful", *firm) == "firm"
-    for name in ("careful", "force-torque-hand"):
-        assert contacts(f"in_palm_rotate.{name}") == "published"
+    assert contacts("in_palm_rotate.careful") == "published"
     assert contacts("in_palm_rotate.firm", "--config", "published") == "published"
     both = ("evaluate", "in_palm_rotate", "in_palm_rotate.careful", "in_palm_rotate.firm")
     with pytest.raises(UsageError, match="different contacts"):
         _run(*both)
 
 
-def test_a_shipped_student_plays_with_its_own_touch_and_is_exported_here(tmp_path: Path, monkeypatch) -> None:
+def test_a_student_plays_with_its_own_touch_and_is_exported(tmp_path: Path) -> None:
     from robotics_bridge.deploy.session import read_deployed
     from robotics_bridge.tasks.contact_model import CONTACTS
 
-    monkeypatch.chdir(tmp_path)
-    name = "in_palm_rotate.force-torque-hand"
-    out = json.loads(_run("play", "in_palm_rotate", "--agent", name, "--seconds", "0.2", "--json"))
-    assert out["agent"] == name
-    _run("export", name)
-    assert (tmp_path / f"{name}.onnx").is_file()
-    contract = read_deployed(tmp_path / f"{name}.onnx").contract
-    assert (contract.observe, contract.more["contacts"]) == ("force_torque", CONTACTS["published"])
+    run = str(_student(tmp_path))
+    out = json.loads(_run("play", "in_palm_rotate", "--agent", run, "--seconds", "0.2", "--json"))
+    assert (out["agent"], out["contacts"]) == (run, "firm")
+    _run("export", run)
+    deployed = read_deployed(Path(run) / "policy.onnx")
+    assert (deployed.contract.observe, deployed.contract.more["contacts"]) == ("force_torque", CONTACTS["firm"])
+    # What a hand measures or is told is all that it reads: nothing but touch is asked for.
+    assert list(deployed.groups) == ["proprio", "command", "tactile"]
+    assert list(deployed.require({"tactile"})) == ["tactile"]
+    with pytest.raises(UsageError, match="no longer shipped"):
+        _run("play", "in_palm_rotate", "--agent", "in_palm_rotate.force-torque-hand")
 
 
 def test_a_task_of_ones_own_is_trained_and_evaluated(tmp_path: Path, quick: Path) -> None:

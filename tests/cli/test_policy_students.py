@@ -11,6 +11,7 @@ from brainbench.cli import app
 from brainbench.core.errors import BrainbenchError, UsageError
 from brainbench.core.files import write_json
 from robotics_bridge.policies.training.distill_config import DistillConfig
+from robotics_bridge.tasks.task import TASK_VERSION
 from tests.factories.policies import export_small
 
 
@@ -35,7 +36,7 @@ def test_sweep_counts_table_4_10() -> None:
 def test_report_prints_a_table_and_writes_records(tmp_path) -> None:
     for seed in range(3):
         config = DistillConfig(task="screwdriver", observe="bool", seed=seed)
-        write_json(tmp_path / config.name / "config.json", {"distill": config.plain()})
+        write_json(tmp_path / config.name / "config.json", {"distill": config.plain(), "task_version": TASK_VERSION})
         found = [{"seed": 0, "success": [1.0, 0.0, 1.0 * (seed > 0), 1.0], "metric": [1.0] * 4}]
         write_json(tmp_path / config.name / "evaluation.json", found)
     text = _run("report", tmp_path, "--records", tmp_path / "records", "--picture", tmp_path / "report.png")
@@ -49,7 +50,9 @@ def test_report_tests_students_against_each_other_beyond_the_spread_of_seeds(tmp
     for observe, shares in given.items():
         for seed, share in enumerate(shares):
             config = DistillConfig(task="screwdriver", observe=observe, seed=seed)
-            write_json(tmp_path / config.name / "config.json", {"distill": config.plain()})
+            write_json(
+                tmp_path / config.name / "config.json", {"distill": config.plain(), "task_version": TASK_VERSION}
+            )
             found = [{"seed": 0, "success": [float(index < 20 * share) for index in range(20)]}]
             write_json(tmp_path / config.name / "evaluation.json", found)
     pairs = json.loads(_run("report", tmp_path, "--differences", "--json"))["differences"]
@@ -64,7 +67,8 @@ def test_report_tests_students_against_each_other_beyond_the_spread_of_seeds(tmp
         _run("report", next(tmp_path.glob("*none_seed0")), "--differences")
 
 
-SHORT = ("--seconds", 2, "--goal", 0.5)
+TOLD = ("--input", "command=1")
+SHORT = ("--seconds", 2, *TOLD)
 
 
 @pytest.mark.slow
@@ -72,7 +76,7 @@ def test_deploy_runs_on_the_simulated_hand_and_stops_it_when_readings_are_absurd
     path = export_small(tmp_path)
     found = json.loads(_run("deploy", path, *SHORT, "--timeout", 1, "--record", tmp_path / "ep", "--json"))
     assert found["status"] == "finished", found["reason"]
-    assert list(found["unmeasured"]) == ["goal"]
+    assert list(found["unmeasured"]) == ["command"]
     assert found["ticks"] > 40
     info = json.loads((tmp_path / "ep" / "meta" / "info.json").read_text())
     assert info["total_frames"] == found["ticks"]
@@ -102,19 +106,19 @@ def test_deploy_asks_for_what_is_missing_before_a_hand_is_started(tmp_path, monk
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "file").touch()
     refused = [
-        ((), r"goal \("),
-        (("--input", "gaol=1"), "'goal'"),
-        (("--input", "goal"), "'goal'"),
-        (("--input", "goal=nan"), "nan"),
-        (("--goal", "inf"), "inf"),
-        (("--goal", 1, "--goal", 2), "2.0"),
-        (("--goal", 1, "--seconds", "nan"), "nan"),
-        (("--goal", 1, "--seconds", -1), "-1"),
-        (("--goal", 1, "--record", tmp_path / "full"), "full"),
-        (("--goal", 1, "--driver", "hand"), "'hand'"),
-        (("--goal", 1, "--driver", "hand:99999999"), "99999999"),
-        (("--goal", 1, "--driver", ":5000"), "--key"),
-        (("--goal", 1, "--driver", ":5000", "--key", tmp_path / "none.key"), r"none\.key"),
+        ((), r"command \("),
+        (("--input", "comand=1"), "'command'"),
+        (("--input", "command"), "'command'"),
+        (("--input", "command=nan"), "nan"),
+        (("--input", "command=inf"), "inf"),
+        (("--input", "command=1,2"), "2.0"),
+        ((*TOLD, "--seconds", "nan"), "nan"),
+        ((*TOLD, "--seconds", -1), "-1"),
+        ((*TOLD, "--record", tmp_path / "full"), "full"),
+        ((*TOLD, "--driver", "hand"), "'hand'"),
+        ((*TOLD, "--driver", "hand:99999999"), "99999999"),
+        ((*TOLD, "--driver", ":5000"), "--key"),
+        ((*TOLD, "--driver", ":5000", "--key", tmp_path / "none.key"), r"none\.key"),
     ]
     for words, culprit in refused:
         with pytest.raises(BrainbenchError, match=culprit):

@@ -51,3 +51,23 @@ def test_tilting_turns_about_x_first_then_about_the_fixed_y() -> None:
     expected = Rotation.from_euler("xy", [0.3, -0.5]).as_matrix()
     found = Rotation.from_quat(r.tilted(x, y).double().numpy(), scalar_first=True).as_matrix()[0]
     np.testing.assert_allclose(found, expected, atol=1e-6)
+
+
+def test_the_twist_of_a_turn_is_what_lies_about_an_axis() -> None:
+    generator = torch.Generator().manual_seed(1)
+    q = torch.nn.functional.normalize(torch.randn(200, 4, generator=generator), dim=1)
+    axis = torch.nn.functional.normalize(torch.randn(200, 3, generator=generator), dim=1)
+    twist = r.twist_of(q, axis)
+    angle, swing = r.twist_and_swing(q, axis)
+    torch.testing.assert_close(r.rotate(twist, axis), axis, atol=1e-5, rtol=0)
+    torch.testing.assert_close(r.angle_of(twist), angle.abs(), atol=1e-3, rtol=0)
+    # The rest is the swing, and no other turn about the axis leaves less.
+    rest = r.angle_of(r.multiply(q, r.conjugate(twist)))
+    torch.testing.assert_close(rest, swing, atol=2e-3, rtol=0)
+    for more in (-0.2, 0.2):
+        other = r.multiply(twist, r.about(axis, torch.full((200,), more)))
+        assert bool((r.angle_of(r.multiply(q, r.conjugate(other))) > rest - 1e-4).all())
+    # Without an axis, and for a half turn across it, there is none.
+    still = torch.tensor([1.0, 0.0, 0.0, 0.0])
+    assert torch.equal(r.twist_of(q, torch.zeros(200, 3)), still.expand(200, 4))
+    assert torch.equal(r.twist_of(torch.tensor([0.0, 1.0, 0.0, 0.0]), torch.tensor([0.0, 0.0, 1.0])), still)

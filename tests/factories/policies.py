@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import torch
 from tensordict import TensorDict
 
-from brainbench.core.files import write_json
+from brainbench.core.files import to_plain, write_json
 from robotics_bridge import hands
 from robotics_bridge.policies.export import export_policy
 from robotics_bridge.policies.student import TactilePolicy
 from robotics_bridge.policies.training.distill_config import DistillConfig
 from robotics_bridge.policies.training.state_tree import write_tensors
 from robotics_bridge.policies.training.student_files import build_student
+from robotics_bridge.tasks.contact_model import CONTACTS
+from robotics_bridge.tasks.task import TASK_VERSION
 
 
 def contract_of() -> dict[str, Any]:
@@ -24,9 +27,10 @@ def contract_of() -> dict[str, Any]:
     }  # fmt: skip
     deployment = {
         "rate": 40, "hand": "xhand1", "joints": ["a", "b", "c"], "action_map": mapping, "frozen": {"b": 0.3},
-        "links": ["l", "m"], "observe": "agg_force", "task": "hold", "sub_steps": 5,
+        "links": ["l", "m"], "observe": "agg_force", "task": "hold", "sub_steps": 5, "twist": None,
+        "contacts": to_plain(asdict(CONTACTS["published"])),
     }  # fmt: skip
-    inputs = [["proprio", [8]], ["goal", [1]], ["tactile", [5, 2, 3]]]
+    inputs = [["proprio", [8]], ["command", [1]], ["tactile", [5, 2, 3]]]
     return {"format": "onnx", "file": "policy.onnx", "inputs": inputs, "state": 0, "deployment": deployment}
 
 
@@ -34,7 +38,7 @@ def export_small(folder: Path) -> Path:
     """Write an untrained policy of the XHand1, all of whose joints move, as ``brainbench policy export`` does."""
     hand = hands.load("xhand1")
     joints = hand.joints
-    shapes = {"proprio": (36,), "goal": (1,), "tactile": (5, 5, 3)}
+    shapes = {"proprio": (36,), "command": (1,), "tactile": (5, 5, 3)}
     obs = TensorDict({name: torch.zeros(1, *shape) for name, shape in shapes.items()}, [1])
     with torch.random.fork_rng():
         torch.manual_seed(0)
@@ -44,7 +48,8 @@ def export_small(folder: Path) -> Path:
     mapping = {"names": joints, "default": [0.3] * 12, "scale": [0.1] * 12, "low": limits[:, 0], "high": limits[:, 1]}
     deployment = {
         "rate": 40, "hand": "xhand1", "observe": "agg_force", "joints": joints, "action_map": mapping, "frozen": {},
-        "links": list(hand.layout("med", "tips")), "task": "hold",
+        "links": list(hand.layout("med", "tips")), "task": "hold", "twist": None,
+        "contacts": asdict(CONTACTS["published"]),
     }  # fmt: skip
     return export_policy(policy, folder / "policy", deployment=deployment).path
 
@@ -54,12 +59,12 @@ def student_folder(folder: Path) -> Path:
     config = DistillConfig(
         task="in_palm_rotate", observe="agg_force", placement="tips", encoder="mlp", hidden=(8,), num_envs=2
     )
-    shapes = {"proprio": (8,), "goal": (1,), "tactile": (5, 5, 3)}
+    shapes = {"proprio": (8,), "command": (1,), "tactile": (5, 5, 3)}
     with torch.random.fork_rng():
         torch.manual_seed(0)
         student = build_student(config, shapes, list(shapes), 2)
     described = {
-        "brainbench_student": 1, "distill": config.plain(), "network": student.config,
+        "brainbench_student": 1, "task_version": TASK_VERSION, "distill": config.plain(), "network": student.config,
         "groups": [[name, list(shape)] for name, shape in shapes.items()], "actions": 2,
         "deployment": contract_of()["deployment"],
     }  # fmt: skip

@@ -21,6 +21,7 @@ from robotics_bridge.policies.training.sweep import StudentSweep, read_sweep
 from robotics_bridge.sensors.calibration.log import read_log
 from robotics_bridge.sensors.noise.model import Noise
 from robotics_bridge.tasks.overrides import apply_overrides
+from robotics_bridge.tasks.task import TASK_VERSION
 from tests.factories.policies import contract_of, student_folder
 from tests.factories.reading_trials import Surface, not_finite, numbers, typed, written, written_json
 
@@ -157,7 +158,7 @@ def _bad_sweep(sweep: StudentSweep) -> bool:
 
 def _evaluation(folder: Path) -> Path:
     config = DistillConfig(task="in_palm_rotate")
-    write_json(folder / "config.json", {"distill": config.plain()})
+    write_json(folder / "config.json", {"distill": config.plain(), "task_version": TASK_VERSION})
     found = {"seed": 0, "success": [1.0, 0.0, 1.0], "goals": [2.0, None, 3.5], "iterations": 30}
     return write_json(folder / EVALUATION, [found, {**found, "seed": 1}])
 

@@ -1,3 +1,7 @@
+import math
+from fractions import Fraction
+from itertools import combinations
+
 import numpy as np
 import pytest
 import trimesh
@@ -44,6 +48,59 @@ def test_the_distance_from_a_triangle_is_that_of_its_nearest_point(corners):
     size = np.ptp(triangle, axis=0).max()
     assert exact <= sampled + 1e-9
     assert exact >= sampled - size / 20
+
+
+def _exact_distance(point, triangle):
+    """Distance in rational arithmetic: the nearest of the feet on corners, edges and plane that lie in the triangle."""
+    p = [Fraction(x) for x in point]
+    corners = [[Fraction(x) for x in corner] for corner in triangle]
+
+    def dot(u, v):
+        return sum(x * y for x, y in zip(u, v, strict=True))
+
+    def less(u, v):
+        return [x - y for x, y in zip(u, v, strict=True)]
+
+    squares = []
+    for count in (1, 2, 3):
+        for first, *others in combinations(corners, count):
+            span, there = [less(other, first) for other in others], less(p, first)
+            gram = [[dot(u, v) for v in span] for u in span]
+            right = [dot(u, there) for u in span]
+            # Cramer's rule for the foot's coordinates in the span of the edges.
+            if count == 1:
+                shares = []
+            elif count == 2:
+                if gram[0][0] == 0:
+                    continue
+                shares = [right[0] / gram[0][0]]
+            else:
+                whole = gram[0][0] * gram[1][1] - gram[0][1] ** 2
+                if whole == 0:
+                    continue
+                shares = [
+                    (right[0] * gram[1][1] - right[1] * gram[0][1]) / whole,
+                    (right[1] * gram[0][0] - right[0] * gram[0][1]) / whole,
+                ]
+            if min([*shares, 1 - sum(shares)]) >= 0:
+                for share, edge in zip(shares, span, strict=True):
+                    there = less(there, [share * x for x in edge])
+                squares.append(dot(there, there))
+    return math.sqrt(min(squares))
+
+
+@pytest.mark.parametrize("size", [1.0, 1e-3, 1e-5, 1e-8])
+def test_triangles_of_any_size_are_as_far_as_exact_arithmetic_says(size):
+    rng = np.random.default_rng(3)
+    triangles = rng.normal(size=(400, 3, 3))
+    # Slivers, and triangles that lie somewhere else than at the origin.
+    triangles[:100, 2] = triangles[:100, 0] + rng.normal(size=(100, 1)) * (triangles[:100, 1] - triangles[:100, 0])
+    triangles[:100, 2] += 10.0 ** rng.uniform(-12, -2, (100, 1)) * rng.normal(size=(100, 3))
+    triangles = size * triangles + rng.choice([0.0, 0.1], (400, 1, 1))
+    points = triangles.mean(axis=1) + size * 10 ** rng.uniform(-3, 1, (400, 1)) * rng.normal(size=(400, 3))
+    exact = [_exact_distance(point, triangle) for point, triangle in zip(points, triangles, strict=True)]
+    # Coordinates of a decimetre are rounded to 1e-17 m.
+    np.testing.assert_allclose(point_triangle_distance(points, triangles), exact, rtol=1e-6, atol=1e-15 + 1e-11 * size)
 
 
 def test_of_a_triangle_without_an_area_the_nearest_corner_counts():

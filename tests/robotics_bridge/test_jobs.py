@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import importlib.util
 import shlex
 from pathlib import Path
 
 import pytest
 
+from brainbench.core.errors import UsageError
 from tests.factories.benchmark_programs import benchmark_program
 
-read_jobs = benchmark_program("policies/jobs.py").read_jobs
+JOBS = benchmark_program("policies/jobs.py")
+read_jobs = JOBS.read_jobs
 
 
 def test_every_job_has_a_command_that_exists_and_minutes() -> None:
@@ -30,3 +33,14 @@ def test_a_list_with_a_job_twice_or_an_unknown_key_is_refused(tmp_path: Path) ->
         read_jobs(tmp_path / "twice.toml")
     with pytest.raises(ValueError, match="'minuts'"):
         read_jobs(tmp_path / "odd.toml")
+
+
+def test_a_machine_that_lacks_a_package_is_told_before_a_minute_is_spent(monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(UsageError, match=r"lacks no_such_package, nor_this; .*pack\.sh msgspec"):
+        JOBS.check_machine(("torch", "no_such_package.part", "nor_this"))
+    monkeypatch.setattr("torch.cuda.is_available", lambda: False)
+    with pytest.raises(UsageError, match="no GPU"):
+        JOBS.check_machine(("torch",))
+    monkeypatch.setattr("torch.cuda.is_available", lambda: True)
+    JOBS.check_machine(("torch",))
+    assert all(importlib.util.find_spec(name.partition(".")[0]) for name in JOBS.NEEDED if name != "mujoco_warp")

@@ -53,7 +53,6 @@ def deploy(
     fault: Annotated[
         list[str] | None, typer.Option(help="Of the simulated hand: drop=0.2, jitter=0.03, silent-after=2, …")
     ] = None,
-    goal: Annotated[list[float] | None, typer.Option(help="Numbers of the group 'goal', once for each.")] = None,
     inputs: Annotated[
         list[str] | None,
         typer.Option("--input", help="Constant for what the hand cannot measure: NAME=NUMBER or NAME=NUMBER,…"),
@@ -88,7 +87,7 @@ def deploy(
     if record is not None:
         check_folder(record, contract.rate)
     faults = Faults.parse(fault or [])
-    given = _inputs(deployed, goal, inputs or [])
+    given = _inputs(deployed, inputs or [])
     contacts = contract.more["contacts"]
     remote = None if driver == "sim" else _remote(driver, key, deployed)
     # What is missing is said before a hand is started or greeted.
@@ -132,13 +131,13 @@ def deploy(
         raise typer.Exit(1)
 
 
-def _inputs(deployed: DeployedPolicy, goal: list[float] | None, words: list[str]) -> dict[str, Any]:
-    """Return group → its constant, as --goal and --input give them."""
+def _inputs(deployed: DeployedPolicy, words: list[str]) -> dict[str, Any]:
+    """Return group → its constant, as --input gives them."""
     from brainbench.core.errors import UsageError, check_name
     from robotics_bridge.deploy.session import constant
 
     wanted = [name for name in deployed.groups if name != "proprio"]
-    found: dict[str, Any] = {} if goal is None else {"goal": goal}
+    found: dict[str, Any] = {}
     for word in words:
         name, _, text = word.partition("=")
         try:

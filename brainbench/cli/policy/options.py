@@ -51,7 +51,7 @@ class World:
         known = (*shipped.AGENTS, *shipped.list_policies("teacher"), *shipped.list_policies("student"))
         for name in agents:
             if name not in known and not Path(name).exists():
-                raise unknown_name("agent", name, known, hint="Or give the folder of a training run.")
+                raise unknown_name("agent", name, known, hint=shipped.hint(name))
 
     def make(self, agents: Iterable[str] = (), **options: Any) -> Env:
         """Return its environment; a task of the user's own is read first, then changed.
@@ -144,9 +144,6 @@ def touch_of(names: list[str]) -> dict[str, Any]:
 
             kept = Values("config.json", facts).part("distill").fields(DistillConfig)
             found[name] = {key: kept[key] for key in TOUCH if key in kept}
-            config = DistillConfig.of_run(kept)
-            if config.knobs and config.observe in ("force", "force_torque"):
-                found[name]["knobs"] = config.knobs
     if any(senses != next(iter(found.values())) for senses in found.values()):
         raise UsageError(f"The students {', '.join(found)} feel differently; evaluate them one at a time.")
     return next(iter(found.values()), {})

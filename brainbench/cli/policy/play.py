@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -28,7 +29,7 @@ def list_tasks(as_json: JsonOption = False) -> None:
     """List the tasks with their success, length, observation groups, and the policies that come with the package."""
     from robotics_bridge import tasks
     from robotics_bridge.policies.fit import trained_contacts
-    from robotics_bridge.policies.shipped import list_policies, stored, unmeasured_inputs
+    from robotics_bridge.policies.shipped import list_policies, stored
     from robotics_bridge.tasks.contact_model import contacts_name
 
     found = []
@@ -47,7 +48,6 @@ def list_tasks(as_json: JsonOption = False) -> None:
                 "teacher": list(task.groups["actor"]),
                 "shipped": shipped,
                 "contacts": {policy: contacts_name(trained_contacts(stored(policy))) for policy in shipped},
-                "unmeasured": {policy: read for policy in shipped if (read := unmeasured_inputs(stored(policy)))},
             }
         )
     columns = {
@@ -57,12 +57,8 @@ def list_tasks(as_json: JsonOption = False) -> None:
         "success": "{0[metric]} ≥ {0[success_from]:.3g}",
         "student sees": lambda item: ", ".join(item["student"]),
     }
-    policies = [
-        (name, row["task"], row["contacts"][name], ", ".join(row["unmeasured"].get(name, ())))
-        for row in found
-        for name in row["shipped"]
-    ]
-    heads = ("trained policy", "task", "contacts", "reads what no hand measures")
+    policies = [(name, row["task"], row["contacts"][name]) for row in found for name in row["shipped"]]
+    heads = ("trained policy", "task", "contacts")
     trained = table_of("", policies, {head: f"{{0[{index}]}}" for index, head in enumerate(heads)})
     emit(found, f"{table_of('', found, columns)}\n\n{trained}", as_json=as_json)
 
@@ -162,6 +158,7 @@ def evaluate(
 ) -> None:
     """Compare agents over whole episodes: success rate with its 95 % interval, and what it does not tell.
 
+    The last column is the success by kind of object; ``--out`` and ``--json`` say it for each object.
     Beside success stand the task's metric, the return, the rate of rotation about the commanded axis while anything
     touched the object (rad/s), the mean duration (s) and the share of episodes that a drop (or another ending of the
     task) ended.
@@ -198,5 +195,15 @@ def evaluate(
         ">s": "{0[seconds]:.3g}",
         ">dropped": "{0[dropped]:.3f}",
         ">diverged": "{0[diverged]}",
+        ">by object": lambda item: _by_kind(item["objects"]),
     }
     emit(found, table_of(f"{env.task.text}; contacts: {contacts}", found, columns), as_json=as_json)
+
+
+def _by_kind(objects: Mapping[str, Mapping[str, float]]) -> str:
+    """Return the success with each kind of object, the first word of its name."""
+    found: dict[str, list[float]] = {}
+    for name, item in objects.items():
+        won, of = found.setdefault(name.partition(" ")[0], [0.0, 0.0])
+        found[name.partition(" ")[0]] = [won + item["success_rate"] * item["episodes"], of + item["episodes"]]
+    return ", ".join(f"{kind} {won / of:.2f}" for kind, (won, of) in found.items())

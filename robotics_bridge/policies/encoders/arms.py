@@ -64,9 +64,6 @@ class EncoderConfig:
     """Learning of a network: ``frozen`` or ``finetuned``."""
     seed: int = 0
     """Seed of an untrained network or of a reservoir."""
-    standardise: str = "feature"
-    """Standardisation of a network's features: one by one (``feature``), or across each step (``layer``), which leaves
-    what never changes; earlier students have that."""
     pretrained: str | None = None
     """Weights of a network with a tag."""
     options: Mapping[str, Any] = field(default_factory=dict)
@@ -75,7 +72,6 @@ class EncoderConfig:
     """Force and moment that are one unit to a network."""
 
     def __post_init__(self) -> None:
-        check_name("standardisation of features", self.standardise, ("feature", "layer"))
         check_number("'slots' of a tactile encoder", self.slots, least=1, most=1000, whole=True)
         check_number("'features' of a tactile encoder", self.features, least=1, most=8192, whole=True)
 
@@ -365,9 +361,8 @@ class _Network(TactileEncoder):
             seed=config.seed, pretrained=config.pretrained, options=config.options,
         )  # fmt: skip
         self.state_size = self.front.state_size
-        # Features of untrained and trained networks differ by orders of magnitude; the head should not care.
-        layer = nn.LayerNorm(self.front.features, elementwise_affine=False, eps=1e-12)
-        self.norm: nn.Module = layer if config.standardise == "layer" else FeatureNorm(self.front.features)
+        # One by one: layer norm would leave what never changes, 98 % of the energy of trained features.
+        self.norm: FeatureNorm = FeatureNorm(self.front.features)
         self.project: nn.Linear = nn.Linear(self.front.features, self.features)
 
     @property

@@ -22,15 +22,16 @@ from typing import Any, Literal
 import torch
 from torch import nn
 
-from brainbench.core.errors import UsageError
+from brainbench.core.errors import UsageError, missing_dependency
 from brainbench.core.files import provenance, read_mapping, to_plain, write_json
 from brainbench.core.progress import Progress
 from brainbench.models.training.run_folder import RunLog, load_state, save_state
 from robotics_bridge.policies.encoders.arms import perceptron
 from robotics_bridge.policies.evaluate import Policy
+from robotics_bridge.policies.fit import check_version
 from robotics_bridge.policies.student import TACTILE, TactilePolicy
 from robotics_bridge.policies.training.cuda_graph_step import ChunkStep
-from robotics_bridge.policies.training.distill_config import EARLIER, DistillConfig
+from robotics_bridge.policies.training.distill_config import DistillConfig
 from robotics_bridge.policies.training.rollouts import Recorder, Rollout
 from robotics_bridge.policies.training.state_tree import write_tensors
 from robotics_bridge.policies.training.student_files import CONFIG, MODEL, build_student
@@ -86,7 +87,12 @@ def distill(
     Raises:
         UsageError: the folder holds another run, or the environment does not fit.
         DataError: a file of the run is damaged.
+        MissingDependencyError: rsl-rl-lib is not installed.
     """
+    try:
+        import rsl_rl.models  # noqa: F401
+    except ImportError as error:  # without it a student can act, but not learn
+        raise missing_dependency("rsl-rl-lib", extra="policies", purpose="Training policies") from error
     devices = [env.device] if torch.device(env.device).type == "cuda" else []
     with torch.random.fork_rng(devices=devices):
         torch.manual_seed(config.seed)
@@ -283,8 +289,9 @@ class _Run:
         path = self.out / CONFIG
         mine = to_plain(self.config.plain())
         if path.is_file():
-            found = read_mapping(path).get("distill")
-            found = {**EARLIER, **found} if isinstance(found, dict) else found
+            known = read_mapping(path)
+            check_version(known, str(self.out))
+            found = known.get("distill")
             differing = sorted(key for key in mine if not isinstance(found, dict) or found.get(key) != mine[key])
             if differing:
                 raise UsageError(
@@ -353,7 +360,7 @@ def describe_run(config: DistillConfig, student: TactilePolicy, env: Any) -> dic
             "rate": 1 / env.step_dt,
             "sub_steps": env.decimation,
             "action_limit": env.task.action_limit,
-            "twist": env.task.taxel_twist if config.twist is None else config.twist,
+            "twist": env.task.taxel_twist,
             "contacts": asdict(env.task.contacts),
             "joints": list(env.joint_names),
             "action_map": {key: getattr(actions, key) for key in ("names", "default", "scale", "low", "high")},

@@ -12,17 +12,13 @@ from brainbench.core.errors import check_name
 from brainbench.core.reading.ranges import check_number
 from brainbench.models.architecture import Architecture
 from robotics_bridge.hands.observations import observation_type
-from robotics_bridge.policies.contract import MOST_TWIST
 from robotics_bridge.policies.encoders.arms import ARMS, AUTO, EncoderConfig
 from robotics_bridge.policies.student import EMBEDDERS
-from robotics_bridge.sensors.taxels.sensors import PUBLISHED_TWIST
 from robotics_bridge.tasks.contact_model import CONTACTS
 from robotics_bridge.tasks.settings import StudentSettings
 
 LOSSES = ("mse", "inv_var_mse")
 """``inv_var_mse``: each action's squared error over the variance of the teacher's action in the rollout."""
-EARLIER = {"twist": PUBLISHED_TWIST, "contacts": "published"}
-"""What stored students had where they do not state it."""
 MOST = {"learning_rate": 1.0, "clip": 100.0, "max_grad_norm": 1e6}
 """Largest value of settings that are numbers above 0."""
 
@@ -46,12 +42,8 @@ class DistillConfig:
     """Number of taxels: ``low``, ``med`` or ``high``; or a probe file (``.json``)."""
     noisy: bool = False
     """Taxels with the published noise (table 4.12)."""
-    twist: float | None = None
-    """Torsional friction of the force taxels [N·m·s]; by default the task's own. Runs of versions that did not state
-    it had the published 2 (:data:`EARLIER`)."""
     contacts: str | None = None
-    """Contact model, ``firm`` or ``published``; by default that in which the teacher was trained. Runs state it; those
-    of versions that did not had the published one."""
+    """Contact model, ``firm`` or ``published``; by default that in which the teacher was trained."""
     encoder: str = AUTO
     """Tactile encoder: an arm of :data:`~robotics_bridge.policies.encoders.arms.ARMS`, or a network's name."""
     encoder_settings: Mapping[str, Any] = field(default_factory=dict)
@@ -100,8 +92,6 @@ class DistillConfig:
         check_name("loss", self.loss or "mse", LOSSES)
         check_name("precision", self.precision, ("float32", "bf16"))
         check_number("teacher_share", self.teacher_share, least=0, most=1)
-        if self.twist is not None:
-            check_number("twist (N·m·s)", self.twist, least=0, most=MOST_TWIST)
         for name, most in MOST.items():
             if (value := getattr(self, name)) is not None:
                 check_number(name, value, above=0, most=most)
@@ -117,11 +107,6 @@ class DistillConfig:
             check_name("setting of a student", name, cls.__dataclass_fields__)
         return cls(**value)
 
-    @classmethod
-    def of_run(cls, value: Mapping[str, Any]) -> DistillConfig:
-        """Return the configuration of a stored run, which may be of a version that had fewer fields."""
-        return cls.of({**EARLIER, **value})
-
     def plain(self) -> dict[str, Any]:
         """Return the fields as JSON types; :meth:`of` undoes it."""
         return asdict(self)
@@ -131,11 +116,6 @@ class DistillConfig:
         open_fields = ("iterations", "learning_rate", "epochs", "gradient_length", "clip", "max_grad_norm", "loss")
         own = {name: getattr(settings, name) for name in open_fields if getattr(self, name) is None}
         return replace(self, **own)
-
-    @property
-    def knobs(self) -> dict[str, Any]:
-        """Settings of the tactile sensors that differ from the task's."""
-        return {} if self.twist is None else {"twist": self.twist}
 
     @property
     def tactile(self) -> EncoderConfig | None:

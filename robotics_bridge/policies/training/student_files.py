@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +14,7 @@ from brainbench.core.reading.regular import readable
 from brainbench.core.reading.tensors import read_tensors
 from robotics_bridge.policies.contract import JOINTS, MOST_NUMBERS
 from robotics_bridge.policies.encoders.arms import EncoderConfig
+from robotics_bridge.policies.fit import check_version
 from robotics_bridge.policies.schema import Values
 from robotics_bridge.policies.shipped import policy_path
 from robotics_bridge.policies.student import TACTILE, TactilePolicy
@@ -54,11 +54,9 @@ def load_student(folder: str | Path, *, device: str = "cpu") -> tuple[TactilePol
         raise DataError(f"{str(folder)!r} holds no student; brainbench policy distill makes one.")
     if not (folder / MODEL).is_file():
         raise DataError(f"The student in {str(folder)!r} has no weights yet; its run was interrupted early.")
+    check_version(described.values, str(folder))
     given = described.part("distill")
-    config = DistillConfig.of_run(given.fields(DistillConfig))
-    if "task_version" not in described.values:
-        # Students of earlier versions do not state it.
-        config = replace(config, encoder_settings={"standardise": "layer", **config.encoder_settings})
+    config = DistillConfig.of(given.fields(DistillConfig))
     if config.encoder_settings:
         given.part("encoder_settings").fields(EncoderConfig)
     shapes, actions = described.shapes("groups", MOST_NUMBERS), described.whole("actions", 1, JOINTS)

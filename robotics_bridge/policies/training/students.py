@@ -82,7 +82,7 @@ def train_student(
     env = tasks.make(
         task, num_envs=config.num_envs, device=device, hand=config.hand, observe=config.observe,
         placement=config.placement, resolution=config.resolution, noisy=config.noisy,
-        seed=config.seed, knobs=config.knobs,
+        seed=config.seed,
     )  # fmt: skip
     named = contacts_name(task.contacts)
     config = replace(config, contacts=named if named in CONTACTS else None)

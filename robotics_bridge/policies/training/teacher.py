@@ -29,7 +29,7 @@ from brainbench.models.training.run_folder import LOG, RESTART, trim_log
 from robotics_bridge.envs.rsl_rl import RslRlEnv
 from robotics_bridge.policies.acting import ActingModel
 from robotics_bridge.policies.evaluate import Policy
-from robotics_bridge.policies.fit import check_fit
+from robotics_bridge.policies.fit import check_fit, check_version
 from robotics_bridge.policies.schema import Values
 from robotics_bridge.policies.shipped import policy_path
 from robotics_bridge.policies.training import state_tree
@@ -38,7 +38,6 @@ from robotics_bridge.policies.training.loggers import Loggers, check_loggers
 from robotics_bridge.policies.training.sensing import POLICY, sensed_groups, sensing_policy
 from robotics_bridge.policies.training.state_tree import write_tensors
 from robotics_bridge.policies.training.student_files import CONFIG, MODEL
-from robotics_bridge.tasks.contact_model import ContactModel
 from robotics_bridge.tasks.settings import TeacherSettings
 from robotics_bridge.tasks.task import TASK_VERSION
 
@@ -226,9 +225,6 @@ class TeacherRun:
     """Seed of weights and actions."""
     save_every: int = 50
     """Iterations between checkpoints."""
-    keep_env: bool = True
-    """Keep the environments' state too, which makes resuming exact; large batches may save without and go on with new
-    episodes."""
     start: Path | None = None
     """Another run, one of its models, or a shipped teacher, whose actor and critic a new run begins with."""
     start_std: float | None = None
@@ -301,7 +297,7 @@ def _train(
             progress(trainer.iteration, total, "training")
         over = options.minutes is not None and time.monotonic() - began > 60 * options.minutes
         if over or trainer.iteration % options.save_every == 0 or trainer.iteration == total:
-            _save(trainer, run, keep_env=options.keep_env)
+            _save(trainer, run)
             writer.save()
     writer.close()
     steps = trainer.iteration * settings.steps_per_env * env.num_envs
@@ -314,11 +310,10 @@ def _resume(trainer: Trainer, run: Path, facts: dict[str, Any]) -> None:
         write_json(config, facts | {"provenance": provenance()})
         return
     known = read_mapping(config)
+    check_version(known, str(run))
     with readable(config, "configuration of a run"):
         # Settings that came later than the run had their defaults in it.
         known["settings"] = asdict(TeacherSettings(**_plain(known["settings"])))
-    known.setdefault("observe", [])
-    known.setdefault("contacts", asdict(ContactModel()))
     for name in ("task", "hand", "num_envs", "seed", "settings", "observe", "contacts"):
         if json.loads(json.dumps(facts[name])) != json.loads(json.dumps(known.get(name))):
             raise UsageError(
@@ -329,16 +324,13 @@ def _resume(trainer: Trainer, run: Path, facts: dict[str, Any]) -> None:
         trim_log(run / LOG, "iteration", 0)
         return
     state = state_tree.load(run / RESUME)
-    if "env" not in state:
-        _LOG.warning("The run was saved without its environments: it goes on with new episodes.")
-        state["env"] = trainer.env.unwrapped.state_dict()
     with readable(run / RESUME, "training state", RESTART):
         trainer.load(state)
     # Iterations after the last checkpoint are done again.
     trim_log(run / LOG, "iteration", trainer.iteration)
 
 
-def _save(trainer: Trainer, run: Path, *, keep_env: bool) -> None:
+def _save(trainer: Trainer, run: Path) -> None:
     models = {name: trainer.algorithm.save()[f"{name}_state_dict"] for name in ("actor", "critic")}
     state_tree.save(run / f"model_{trainer.iteration}.safetensors", models)
     if trainer.sensing is not None:
@@ -346,10 +338,7 @@ def _save(trainer: Trainer, run: Path, *, keep_env: bool) -> None:
         weights = {name: value for name, value in actor.state_dict().items() if not name.startswith("distribution.")}
         write_tensors(run / POLICY / MODEL, weights)
         write_json(run / POLICY / CONFIG, describe_run(trainer.sensing, actor, trainer.env.unwrapped))
-    state = trainer.state()
-    if not keep_env:
-        del state["env"]
-    state_tree.save(run / RESUME, state)
+    state_tree.save(run / RESUME, trainer.state())
 
 
 def newest(run: Path) -> Path:

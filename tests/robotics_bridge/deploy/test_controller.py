@@ -221,8 +221,8 @@ def test_real_values_fill_all_slots_and_simulated_ones_the_rest() -> None:
 
 
 def test_what_does_not_fit_is_refused_before_anything_moves() -> None:
-    with pytest.raises(UsageError, match="group 'goal'"):
-        _control(groups=("proprio", "goal"))
+    with pytest.raises(UsageError, match="group 'command'"):
+        _control(groups=("proprio", "command"))
     with pytest.raises(UsageError, match=r"'timeout' .* -1"):
         _limits(timeout=-1)
     hand = hands.load("xhand1")
@@ -230,8 +230,8 @@ def test_what_does_not_fit_is_refused_before_anything_moves() -> None:
     assert limits.speed.max() == pytest.approx(14.38)
     with pytest.raises(UsageError, match=r"'xhand1' .*'knee'"):
         SafetyLimits.of_hand(hand, ("knee",))
-    report, _, _ = _control(groups=("proprio", "goal"), sources={"goal": lambda r: np.array([np.nan])})
-    assert report.reason == "the observation 'goal' holds values that are no numbers"
+    report, _, _ = _control(groups=("proprio", "command"), sources={"command": lambda r: np.array([np.nan])})
+    assert report.reason == "the observation 'command' holds values that are no numbers"
 
 
 def test_histogram_and_rate() -> None:

@@ -36,7 +36,7 @@ def _read(folder, contract):
 def test_a_contract_is_read_as_it_was_written(tmp_path) -> None:
     found = _read(tmp_path, contract_of())
     assert (found.rate, found.joints, found.moved, found.frozen) == (40.0, ("a", "b", "c"), ("a", "c"), {"b": 0.3})
-    assert found.inputs == {"proprio": (8,), "goal": (1,), "tactile": (5, 2, 3)}
+    assert found.inputs == {"proprio": (8,), "command": (1,), "tactile": (5, 2, 3)}
     assert found.action_map["scale"] == (0.5, -0.5)
     assert found.more["contacts"] == CONTACTS["published"]
     firm = _set(contract_of(), "deployment.contacts", asdict(CONTACTS["firm"]))
@@ -49,7 +49,7 @@ def test_a_contract_is_read_as_it_was_written(tmp_path) -> None:
         ("format", ["pickle", 1, None, ["onnx"]]),
         ("inputs", [[], {}, "proprio", [["proprio"]], [["proprio", [8]], ["proprio", [8]]], [[1, [8]]]]),
         ("inputs", [[["proprio", shape]] for shape in ([7], [0], [-8], [8.0], [True], [], [1, 1, 1, 8], "8")]),
-        ("inputs", [[["goal", [9_000_000]], ["thermal", [9_000_000]]]]),
+        ("inputs", [[["command", [9_000_000]], ["thermal", [9_000_000]]]]),
         ("inputs", [[["tactile", shape]] for shape in ([5, 2], [5, 3, 3], [5, 2, 1], [5, 2, 10**9])]),
         ("deployment.rate", [NAN, INF, -INF, 0, -40, 1e9, 10**400, "40", True, None, [40]]),
         ("deployment.hand", ["", 1, None, "x" * 5000]),
@@ -77,7 +77,7 @@ def test_values_out_of_range_are_refused_with_their_place(tmp_path, place, value
         assert "\n" not in text
 
 
-@pytest.mark.parametrize("name", ["rate", "hand", "joints", "action_map", "frozen"])
+@pytest.mark.parametrize("name", ["rate", "hand", "joints", "action_map", "frozen", "twist", "contacts"])
 def test_what_a_hand_needs_must_stand_in_it(tmp_path, name) -> None:
     contract = contract_of()
     del contract["deployment"][name]

@@ -36,6 +36,19 @@ def test_every_environment_contributes_equally_many_episodes_of_every_seed() -> 
     assert found.summary()["episodes"] == 18
 
 
+def test_success_is_told_for_each_object() -> None:
+    names = ("a", "b", "a", "a")
+    found = replace(_made(2, 4), goals=(3.0, 1.0, 0.0, 0.0), dropped=(True, False, False, True), objects=names)
+    told = found.summary()["objects"]
+    assert told["a"] == {"episodes": 3, "success_rate": 1 / 3, "goals": 1.0, "dropped": 2 / 3}
+    assert told["b"] == {"episodes": 1, "success_rate": 1.0, "goals": 1.0, "dropped": 0.0}
+    env = tasks.make(replace(tasks.load("in_palm_rotate"), episode=0.05), num_envs=18, threads=1)
+    counts = {name: item["episodes"] for name, item in evaluate(env, agent("zero", env)).summary()["objects"].items()}
+    # Seventeen objects in turn on eighteen environments: the first comes twice as often, in six rounds of three seeds.
+    assert sum(counts.values()) == 18 * 6 * 3
+    assert counts[env.model.shapes[0].name] == 2 * counts[env.model.shapes[-1].name]
+
+
 def test_what_success_does_not_tell_is_graded() -> None:
     env = _env()
     found = evaluate(env, agent("zero", env), episodes=3, seed=0)

@@ -26,9 +26,11 @@ def _env(contacts: str = "published") -> Any:
 def test_another_version_of_the_tasks_or_another_hand_is_refused() -> None:
     with pytest.raises(DataError, match=r"'old'.*version 99.*brainbench 0\.0\.7"):
         check_fit({"task_version": 99, "provenance": {"version": "0.0.7"}}, _env(), "old")
+    with pytest.raises(DataError, match="'unstated' is of version 1 of the tasks"):
+        check_fit({}, _env(), "unstated")
     for described in ({"hand": "sharpa"}, {"distill": {"hand": "sharpa"}}):
         with pytest.raises(UsageError, match="'sharpa'; received 'xhand1'"):
-            check_fit(described, _env(), "other")
+            check_fit({"task_version": TASK_VERSION, **described}, _env(), "other")
 
 
 def test_other_contacts_are_told(caplog: pytest.LogCaptureFixture) -> None:
@@ -36,7 +38,7 @@ def test_other_contacts_are_told(caplog: pytest.LogCaptureFixture) -> None:
         check_fit({"task_version": TASK_VERSION, "hand": "xhand1"}, _env(), "mine")
     assert not caplog.records
     with caplog.at_level(logging.WARNING):
-        check_fit({"hand": "xhand1"}, _env("firm"), "mine")
+        check_fit({"task_version": TASK_VERSION, "hand": "xhand1"}, _env("firm"), "mine")
     assert "published" in caplog.text
     assert "firm" in caplog.text
 
@@ -59,7 +61,7 @@ def test_a_policy_says_in_which_contacts_it_was_trained_and_earlier_ones_had_the
 def test_policies_act_in_the_contacts_that_they_were_trained_in(tmp_path: Path) -> None:
     task = tasks.load("in_palm_rotate")
     assert with_contacts_of(task, ("zero", "random")) == task
-    for name, contacts in (("careful", "published"), ("force-torque-hand", "published"), ("firm", "firm")):
+    for name, contacts in (("careful", "published"), ("firm", "firm")):
         assert with_contacts_of(task, ("zero", f"in_palm_rotate.{name}")).contacts == CONTACTS[contacts]
     own = ContactModel(time_constant=0.011)
     write_json(tmp_path / "config.json", {"contacts": asdict(own)})

@@ -27,11 +27,12 @@ from robotics_bridge.policies.report import (
     rows,
 )
 from robotics_bridge.policies.training.distill_config import DistillConfig
+from robotics_bridge.tasks.task import TASK_VERSION
 
 
 def _write(folder, shares, *, seed=0, **changes) -> None:
     config = DistillConfig(task="in_palm_rotate", seed=seed, **changes)
-    write_json(folder / config.name / "config.json", {"distill": config.plain()})
+    write_json(folder / config.name / "config.json", {"distill": config.plain(), "task_version": TASK_VERSION})
     found = [
         {"seed": index, "success": [float(i < round(20 * share)) for i in range(20)], "metric": [share] * 20}
         for index, share in enumerate(shares)
@@ -100,7 +101,7 @@ def test_students_of_other_contacts_are_not_compared(tmp_path) -> None:
     assert [result.world[2] for result in results] == ["firm", "firm", "published", "published"]
     assert [result.gain for result in results] == pytest.approx([0.3, None, 0.6, None])
     firm, _, published, _ = records(results)
-    protocol = {"task": "in_palm_rotate", "hand": "xhand1", "variant": "default"}
+    protocol = {"task": "in_palm_rotate", "hand": "xhand1", "variant": "default", "task_version": str(TASK_VERSION)}
     hashes = [record.score.provenance.recordings["content_hash"] for record in (firm, published)]
     assert hashes == [content_hash({**protocol, "contacts": "firm"}), content_hash(protocol)]
 
@@ -185,7 +186,7 @@ def test_what_happened_beside_success_stands_in_the_table_and_in_records(tmp_pat
         {"seed": seed, "success": [0.0] * 50, "turn_rate": rate, "goals": [0.0] * 50, "iterations": 40}
         for seed, rate in enumerate(rates)
     ]
-    write_json(tmp_path / config.name / "config.json", {"distill": config.plain()})
+    write_json(tmp_path / config.name / "config.json", {"distill": config.plain(), "task_version": TASK_VERSION})
     write_json(tmp_path / config.name / "evaluation.json", found)
     agent = {"agent": "runs/teacher", "task": "in_palm_rotate", "success_rate": 0.1, "success_interval": [0.05, 0.2]}
     write_json(tmp_path / "agents.json", [agent | {"turn_rate": 0.5, "turn_rate_half_width": 0.01}])
@@ -213,7 +214,7 @@ def test_records_make_a_board_of_the_leaderboard(tmp_path) -> None:
     found = records(read_results([tmp_path / "runs"]))
     stored = [read_record(write_record(record, tmp_path / "records")) for record in found]
     (board,) = rank(stored)
-    assert board.recordings == "in_palm_rotate on xhand1 (default)"
+    assert board.recordings == f"in_palm_rotate on xhand1 (default), version {TASK_VERSION} of the tasks"
     assert "force_torque" in board.entries[0].name
     assert "stimuli" in board.entries[0].unranked_because
 
@@ -287,3 +288,13 @@ def test_what_was_drawn_for_a_student(settings, draw) -> None:
     assert (config.draw or "").startswith(draw or "")
     assert (config.draw is None) == (draw is None)
     assert ("draw-" in config.name) == ("encoder_settings" in settings)
+
+
+def test_students_of_another_version_of_the_tasks_are_left_out(tmp_path, caplog) -> None:
+    _write(tmp_path, [0.8] * 3, observe="bool")
+    _write(tmp_path, [0.6] * 3, observe="none")
+    (path,) = tmp_path.glob("*_none_*/config.json")
+    write_json(path, {**read_json(path), "task_version": 1})
+    (found,) = read_results([tmp_path])
+    assert found.config.observe == "bool"
+    assert "another version of the tasks" in caplog.text

@@ -18,7 +18,7 @@ from tests.factories.mutations import mutate_text
 from tests.factories.policies import contract_of, export_small
 from tests.factories.reading_trials import time_limit
 
-SHAPES = {"proprio": (36,), "goal": (1,), "tactile": (5, 5, 3)}
+SHAPES = {"proprio": (36,), "command": (1,), "tactile": (5, 5, 3)}
 
 
 @pytest.fixture(scope="module")
@@ -117,7 +117,7 @@ def test_a_program_is_not_deployed(tmp_path) -> None:
 def test_files_that_fit_another_contract_are_refused(exported, tmp_path) -> None:
     with pytest.raises(DataError, match=r"\(12,\)"):
         read_policy(exported, SHAPES, actions=5)
-    for shapes in ({**SHAPES, "goal": (2,)}, {**SHAPES, "tactile": (5, 5)}, {"proprio": (36,)}):
+    for shapes in ({**SHAPES, "command": (2,)}, {**SHAPES, "tactile": (5, 5)}, {"proprio": (36,)}):
         with pytest.raises(DataError, match=exported.name):
             read_policy(exported, shapes)
     with pytest.raises(DataError, match="'thermal'"):

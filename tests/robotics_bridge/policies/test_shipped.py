@@ -10,10 +10,8 @@ import torch
 from brainbench.core.errors import UsageError
 from brainbench.core.files import read_json
 from robotics_bridge import tasks
-from robotics_bridge.policies.evaluate import Policy
 from robotics_bridge.policies.fit import with_contacts_of
 from robotics_bridge.policies.shipped import FOLDER, list_policies, policy_path
-from robotics_bridge.policies.training.student_files import load_student
 from robotics_bridge.policies.training.teacher import Trainer, load_teacher
 
 
@@ -31,43 +29,11 @@ def test_every_teacher_fits_its_task_and_has_a_card(name: str) -> None:
     assert torch.isfinite(action).all()
 
 
-@pytest.mark.parametrize("name", list_policies("student"))
-def test_every_student_feels_what_its_task_gives_and_exports(name: str, tmp_path: Path) -> None:
-    from robotics_bridge.policies.export import export_policy
-
-    student, facts = load_student(name)
-    kept = facts["distill"]
-    assert (kept["task"], kept["teacher"]) == (name.partition(".")[0], "in_palm_rotate.careful")
-    assert f"# {name}\n" in (FOLDER / name / "README.md").read_text(encoding="utf-8")
-    assert sum(path.stat().st_size for path in (FOLDER / name).iterdir()) < 1.7e6
-    senses = {key: kept[key] for key in ("observe", "placement", "resolution", "noisy")}
-    env = tasks.make(kept["task"], num_envs=2, hand=kept["hand"], threads=1, **senses)
-    assert torch.isfinite(Policy(student)(env.reset())).all()
-    assert export_policy(student, tmp_path / "policy", deployment=facts["deployment"]).difference < 1e-5
-
-
-def test_students_keep_the_force_law_that_they_learned_with(tmp_path: Path) -> None:
-    """Those of versions that did not state it had the published 2 N·m·s; new ones feel what holds the object."""
-    from brainbench.cli.policy.options import touch_of
-    from brainbench.core.files import write_json
-    from robotics_bridge.policies.contract import PolicyContract
-    from robotics_bridge.policies.schema import Values
-
-    facts = read_json(FOLDER / "in_palm_rotate.force-torque-hand" / "config.json")
-    for stated in (True, False):
-        if not stated:
-            del facts["distill"]["twist"], facts["deployment"]["twist"]
-        write_json(tmp_path / "config.json", facts)
-        touch = touch_of([str(tmp_path)])
-        assert touch["knobs"] == {"twist": 2.0}
-        contract = {"inputs": [["proprio", [29]]], "format": "onnx", "deployment": facts["deployment"]}
-        assert PolicyContract.of(Values("c", contract)).more["twist"] == 2.0
-    env = tasks.make("in_palm_rotate", num_envs=1, threads=1, **touch)
-    assert {(sensor.twist, sensor.total) for sensor in env.touch.suite.sensors.values()} == {(2.0, "law")}
+def test_taxels_hold_what_they_touch_but_in_published_tasks() -> None:
     env = tasks.make("in_palm_rotate", num_envs=1, threads=1, observe="force_torque")
     assert {(sensor.total, sensor.friction) for sensor in env.touch.suite.sensors.values()} == {("engine", 1.0)}
     env = tasks.make("in_palm_rotate", config="published", num_envs=1, threads=1, observe="force_torque")
-    assert {sensor.twist for sensor in env.touch.suite.sensors.values()} == {2.0}
+    assert {(sensor.twist, sensor.total) for sensor in env.touch.suite.sensors.values()} == {(2.0, "law")}
 
 
 def test_a_name_stands_for_its_folder_and_paths_for_themselves(tmp_path: Path) -> None:
@@ -75,9 +41,8 @@ def test_a_name_stands_for_its_folder_and_paths_for_themselves(tmp_path: Path) -
     assert policy_path("teacher", tmp_path) == tmp_path
     with pytest.raises(UsageError, match=r"'in_palm_rotate\.careful'.*folder"):
         policy_path("teacher", "in_palm_rotate.carefull")
-    assert policy_path("student", "in_palm_rotate.force-torque-hand").parent == FOLDER
-    with pytest.raises(UsageError, match=r"did you mean 'in_palm_rotate.force-torque-hand'"):
-        policy_path("student", "in_palm_rotate.force-torque-tips")
+    with pytest.raises(UsageError, match="no longer shipped: it read the object's angle to the goal"):
+        policy_path("student", "in_palm_rotate.force-torque-hand")
 
 
 def test_learning_goes_on_from_a_shipped_teacher() -> None:
@@ -97,7 +62,7 @@ def test_a_shipped_teacher_turns_the_block_on_c_mujoco(name: str) -> None:
 
     env = tasks.make(with_contacts_of(tasks.load("in_palm_rotate"), [name]), num_envs=32, seed=5)
     found = evaluate(env, load_teacher(name, env), episodes=64, seed=7)
-    # Measured: 0.672 of 384 episodes and of 192 (firm); agents that know nothing reach the goal in 0 to 2 %.
+    # Measured: 0.866 of 306 episodes (firm), under published contacts 0.67 of 384 with goals of earlier versions.
     assert found.interval()[0] > 0.4
     assert found.interval()[1] > 0.6
     assert found.mean("goals")[0] > 1

@@ -34,6 +34,8 @@ def test_words_reach_rewards_their_parameters_endings_learning_and_the_task() ->
     none = apply_overrides(new, ["goal.start_threshold=none"]).goal
     assert none is not None
     assert none.start_threshold is None
+    mixed = apply_overrides(TASK, ["objects=cylinder,box,cylinder"]).objects
+    assert [shape.name.partition(" ")[0] for shape in mixed] == ["cylinder"] * 2 + ["box"] * 15 + ["cylinder"] * 2
     # What no word names stays.
     assert new.rewards["work_penalty"] is TASK.rewards["work_penalty"]
     assert TASK.rewards["is_dropped"].weight == -100
@@ -47,6 +49,7 @@ def test_words_reach_rewards_their_parameters_endings_learning_and_the_task() ->
         ("rotation_progress.clp=3", "did you mean 'clip'"),
         ("entropy=much", r"'entropy' .*0\.002; received 'much'"),
         ("epochs=2.5", r"'epochs' .*5; received '2\.5'"),
+        ("objects=cilinder", "did you mean 'cylinder'"),
         ("goal.thresh=0.3", "did you mean 'threshold'"),
         ("episode.long=3", "'episode' has no parts"),
         ("goal=3", "dataclasses.replace"),

@@ -5,8 +5,6 @@ from __future__ import annotations
 import pytest
 import torch
 
-from brainbench.core.errors import UsageError
-from robotics_bridge.policies.encoders.arms import EncoderConfig
 from robotics_bridge.policies.encoders.reservoir import EchoState, FeatureNorm
 from robotics_bridge.policies.training.distill_config import DistillConfig
 
@@ -57,8 +55,3 @@ def test_the_arm_steps_remembers_and_takes_its_draw_from_the_student() -> None:
     torch.testing.assert_close(again[0], again[1])
     # Rows are independent.
     torch.testing.assert_close(arm(touch[0, :2], zeros[:2])[0], arm(touch[0], zeros)[0][:2])
-
-
-def test_unknown_standardisation_is_refused() -> None:
-    with pytest.raises(UsageError, match="did you mean 'feature'"):
-        EncoderConfig(standardise="featur")

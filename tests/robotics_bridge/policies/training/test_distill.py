@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import json
 import math
+import sys
 
 import pytest
 import torch
 
-from brainbench.core.errors import DataError, UsageError
+from brainbench.core.errors import DataError, MissingDependencyError, UsageError
 from robotics_bridge.policies.evaluate import Policy
 from robotics_bridge.policies.training.distill import distill
 from robotics_bridge.policies.training.distill_config import DistillConfig
@@ -171,3 +172,10 @@ def test_requests_that_do_not_fit_are_refused(tmp_path) -> None:
     (tmp_path / "config.json").write_text("{}")
     with pytest.raises(DataError, match=r"student; .*policy distill"):
         load_student(tmp_path)
+
+
+def test_without_the_package_for_training_nothing_is_distilled(tmp_path, monkeypatch) -> None:
+    monkeypatch.setitem(sys.modules, "rsl_rl.models", None)
+    with pytest.raises(MissingDependencyError, match=r"rsl-rl-lib.*policies"):
+        _run(tmp_path, iterations=1)
+    assert not (tmp_path / "config.json").exists()

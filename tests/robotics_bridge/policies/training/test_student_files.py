@@ -63,7 +63,7 @@ def test_many_damaged_folders_are_refused_or_sound(tmp_path) -> None:
         ("num_envs", [0, -1, 1.5, 10**30, True]),
         ("encoder_settings", [{"features": 10**9}, {"features": 0}, {"slots": -1}, {"speed": 1}, []]),
         ("actions", [0, 1.0, 10**6, None]),
-        ("groups", [[], [["proprio", [10**9]]], [["proprio", [9]], ["goal", [1]], ["tactile", [5, 5, 3]]]]),
+        ("groups", [[], [["proprio", [10**9]]], [["proprio", [9]], ["command", [1]], ["tactile", [5, 5, 3]]]]),
     ],
 )
 def test_sizes_and_numbers_out_of_range_are_refused_before_memory_is_taken(tmp_path, name, values) -> None:

@@ -154,6 +154,14 @@ def test_a_run_of_before_a_setting_existed_goes_on(tmp_path: Path) -> None:
     assert train(_env(), tmp_path, settings=SMALL, iterations=2, save_every=1).iterations == 2
 
 
+def test_a_run_of_another_version_of_the_tasks_does_not_go_on(tmp_path: Path) -> None:
+    train(_env(), tmp_path, settings=SMALL, iterations=1, save_every=1)
+    config = json.loads((tmp_path / "config.json").read_text())
+    (tmp_path / "config.json").write_text(json.dumps({**config, "task_version": 1}))
+    with pytest.raises(DataError, match="of version 1 of the tasks"):
+        train(_env(), tmp_path, settings=SMALL, iterations=2, save_every=1)
+
+
 def test_learning_begins_with_the_wide_goal_and_goes_on_with_the_one_it_reached(tmp_path: Path) -> None:
     goal = SteppingRotation(start_threshold=3.2, narrowing=0.5)
     # A threshold of half a turn and more is always met, so the first episodes to end narrow it.
@@ -161,12 +169,10 @@ def test_learning_begins_with_the_wide_goal_and_goes_on_with_the_one_it_reached(
     whole = train(_env(**changes), tmp_path / "whole", settings=SMALL, iterations=4, save_every=1)
     found = [row["threshold"] for row in whole.history]
     assert found[0] > found[-1] > 0.1
-    train(_env(**changes), tmp_path / "parts", settings=SMALL, iterations=2, save_every=1, keep_env=False)
+    train(_env(**changes), tmp_path / "parts", settings=SMALL, iterations=2, save_every=1)
     env = _env(**changes)
     assert float(env.goals.threshold) == pytest.approx(0.1)
-    parts = Trainer(env, SMALL)
-    state = state_tree.load(tmp_path / "parts" / RESUME)
-    parts.load({**state, "env": env.state_dict()})
+    Trainer(env, SMALL).load(state_tree.load(tmp_path / "parts" / RESUME))
     assert float(env.goals.threshold) == pytest.approx(found[1])
 
 
