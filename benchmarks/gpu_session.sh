@@ -10,6 +10,8 @@
 #   device, 2:  carry .gpu/b            cp .gpu/b/* /opt/w/
 #   device, 3:  carry .gpu/c .session   bash .gpu/c/install.sh && bash .session/gpu_session.sh start && bash /w/gpu.sh run tests
 #   device, 4…: bash /w/gpu.sh run PART …                             each at most as long as it says; all below 600 s
+#   a new machine (each lives 30 minutes; one GPU counts half):  calls 1 to 3, then JOB=teacher-plain bash /w/gpu.sh run
+#               teachers; JOB=teacher-safe …; JOB=teacher-round …      (policies/jobs.toml says what to compare)
 #   here:       git checkout -f main && git branch -D device; python -m benchmarks.report after copying results/*.json
 #
 # Calls follow one another within 30 s, or the machine goes back with all that is on it. `models/campaign_session.sh`
@@ -28,6 +30,7 @@ free      120  python3 -m benchmarks.whiskers.throughput --only free --links 20 
 touch     240  python3 -m benchmarks.tactile.throughput --device cuda --part sensors --input inputs/pyramid.npz --write
 friction  150  python3 -m benchmarks.tactile.friction_cost --device cuda --input inputs/friction.npz --write
 gradients 200  python3 -m benchmarks.whiskers.gradients --device cuda --scenes 10
+teachers  590  python3 -m benchmarks.policies.jobs run $JOB --minutes 6.5
 TABLE
 }
 
