@@ -13,7 +13,9 @@ from numpy.typing import NDArray
 from brainbench.core.devices import pick_device
 from brainbench.core.errors import UsageError
 from brainbench.stimuli.engines.fidelity import Fidelity
+from brainbench.stimuli.engines.planarity import stays_in_plane
 from brainbench.stimuli.engines.protocol import Job, Trace, base_rotation
+from brainbench.stimuli.engines.reach import reachable
 from brainbench.stimuli.engines.rod.adjoint import OutputDerivatives, RecordingSolver
 from brainbench.stimuli.engines.rod.differences import (
     Numbers,
@@ -143,8 +145,7 @@ class GradientRun:
             near = [jobs[index] for pair in self._changed for jobs in pair]
             # A parameter may take a whisker out of its plane, or move a base, where the run itself stays.
             if not task.twists and self.fidelity.twist is not False:
-                twists = any(one.twists for one in (make_task(j, self.fidelity, {}, silent=True) for j in near) if one)
-                task = replace(task, twists=twists)
+                task = replace(task, twists=any(_leaves_plane(task, one) for one in near[1::2]))
             if task.base.pieces is None:
                 task = self._with_knots(task, near)
             tasks.append(task)
@@ -241,6 +242,19 @@ class GradientRun:
                 if value is not None:
                     array[row][tuple(slice(n) for n in np.shape(value))] = value
         return OutputDerivatives(*arrays)
+
+
+def _leaves_plane(task: JobTask, job: Job) -> bool:
+    """Return True when a job near that of a task, which stays in a plane, does not."""
+    own = task.job
+    parts = zip((job.follicle, *job.obstacles), (own.follicle, *own.obstacles), strict=True)
+    same = job.loads is own.loads and job.gravity == own.gravity and all(one is other for one, other in parts)
+    if same and (job.whisker.curvature == 0) == (own.whisker.curvature == 0):
+        return False
+    times = np.unique(np.concatenate([_span(job), task.base.times, *(body.track.times for body in task.bodies)]))
+    position, euler = (np.asarray(values, dtype=float) for values in job.follicle.pose(times))
+    reach = reachable(job.whisker, position, job.obstacles, times, surfaces=True)
+    return not stays_in_plane(job, reach, position, euler, times)
 
 
 def _span(job: Job) -> tuple[float, float]:

@@ -125,12 +125,7 @@ class RecordingSolver(WhiskerSolver):
             given = adjoint.OutputCotangents()
             for name, values in self._kernel_units(outputs).items():
                 setattr(given, name, wp.array(values, dtype=structs.vec3, device=device))
-            system = allocate(
-                adjoint.ContactSystem,
-                device,
-                unit=(3 * contacts, self.capacity, count),
-                matrix=(3 * contacts, 3 * contacts + 2, count),
-            )
+            system = allocate(adjoint.ContactSystem, device, unit=(3 * contacts, self.capacity, count))
             gradients = allocate(
                 adjoint.PackedGradients,
                 device,

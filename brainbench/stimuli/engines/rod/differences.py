@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -24,7 +25,8 @@ from brainbench.stimuli.engines.rod.shapes import PackedShapes, TrackedObstacle
 from brainbench.stimuli.engines.rod.tasks import JobTask, PackedTasks
 from brainbench.stimuli.engines.units import MILLI
 from brainbench.stimuli.objects.obstacle import Obstacle, TriangleMesh
-from brainbench.stimuli.whiskers.chain import build_chain
+from brainbench.stimuli.whiskers.chain import Chain, build_chain
+from brainbench.stimuli.whiskers.whisker import Whisker
 
 Numbers = dict[str, NDArray[np.float64]]
 """Packed numbers of one job by the names of ``kernels.adjoint.chain.PackedGradients``; rotations as matrices."""
@@ -103,8 +105,13 @@ def packed_change(task: JobTask, low: Job, high: Job, width: float, quasistatic:
     return changes
 
 
+@lru_cache(maxsize=8)
+def _chain(whisker: Whisker, links: int) -> Chain:
+    return build_chain(whisker, links)
+
+
 def _whisker(task: JobTask, job: Job, quasistatic: bool) -> Numbers:
-    chain = build_chain(job.whisker, task.chain.links)
+    chain = _chain(job.whisker, task.chain.links)
     packed = pack_chains(chain.links, [chain], quasistatic, 2 + task.twists)
     length, cosine, sine, mass = packed["build"][:, 0].T
     centre, axial, transverse, *springs = packed["inertia"][:, 0].T
@@ -129,7 +136,7 @@ def _loads(task: JobTask, job: Job) -> Numbers:
     _require("loads", len(job.loads), len(task.job.loads))
     if not job.loads:
         return {}
-    chains = task.chain, build_chain(job.whisker, task.chain.links)
+    chains = task.chain, _chain(job.whisker, task.chain.links)
     shares = []
     for before, load in zip(task.job.loads, job.loads, strict=True):
         link = min(max(int(np.searchsorted(chains[0].nodes, before.arc)) - 1, 0), chains[0].links - 1)

@@ -19,6 +19,7 @@ from ..delassus import PerContact1, PerContact3, PerContactInt
 from ..delassus import row as contact_row
 from ..parameters import hinges, real
 from ..state import WhiskerJob, row
+from .dense import DenseSystem, dense_entry, solve_dense, width
 from .records import ContactRecord
 
 SLIDING = 1 - 1e-6
@@ -53,12 +54,10 @@ class AdjointContacts:
 
 @wp.struct
 class ContactSystem:
-    """Room for the systems of the contacts."""
+    """Room for what the contacts' system is made of."""
 
     unit: wp.array3d(dtype=JointVector)
     """[3 · contact, link, job] what the joints feel of a unit force at a contact."""
-    matrix: wp.array3d(dtype=real)
-    """[3 · contact, 3 · contact + 2, job] with the right-hand side, and which columns have a pivot."""
 
 
 @wp.struct
@@ -258,13 +257,12 @@ def solve_multipliers(
 
     ``asked`` is w − f̄ of each contact.
     """
-    index = job.index
     size = 3 * contacts.count
     carry_units(job, chain, contacts, system)
     for k in range(contacts.count):
         own = compliance(job, proximity, contacts, system, k, k, h)
         contacts.scale[k] = (own[0, 0] + own[1, 1] + own[2, 2]) / real(3.0)
-    largest = real(0.0)
+    matrix = DenseSystem()
     for k in range(contacts.count):
         for e in range(contacts.count):
             block = compliance(job, proximity, contacts, system, k, e, h) * velocity_block(contacts, e)
@@ -272,46 +270,12 @@ def solve_multipliers(
                 block = block + force_block(contacts, k)
             for a in range(3):
                 for b in range(3):
-                    system.matrix[3 * k + a, 3 * e + b, index] = block[a, b]
-                    largest = wp.max(largest, wp.abs(block[a, b]))
+                    matrix[(3 * k + a) * wp.static(width) + 3 * e + b] = block[a, b]
         for a in range(3):
-            system.matrix[3 * k + a, size, index] = contact_row(asked, k)[a]
-    # Gauss-Jordan with pivots; a column without one has no multiplier.
-    degenerate = int(0)
-    used = int(0)
+            matrix[(3 * k + a) * wp.static(width) + size] = contact_row(asked, k)[a]
+    degenerate = solve_dense(matrix, size)
     for c in range(size):
-        best = used
-        for r in range(used, size):
-            if wp.abs(system.matrix[r, c, index]) > wp.abs(system.matrix[best, c, index]):
-                best = r
-        pivot = real(0.0)
-        if used < size:
-            pivot = system.matrix[best, c, index]
-        if wp.abs(pivot) <= real(1e-11) * largest:
-            degenerate = 1
-            system.matrix[c, size + 1, index] = real(0.0)
-        else:
-            system.matrix[c, size + 1, index] = real(1.0)
-            for e in range(size + 1):
-                kept = system.matrix[used, e, index]
-                system.matrix[used, e, index] = system.matrix[best, e, index] / pivot
-                system.matrix[best, e, index] = wp.where(best == used, system.matrix[used, e, index], kept)
-            for r in range(size):
-                if r != used:
-                    factor = system.matrix[r, c, index]
-                    if factor != real(0.0):
-                        for e in range(size + 1):
-                            system.matrix[r, e, index] = (
-                                system.matrix[r, e, index] - factor * system.matrix[used, e, index]
-                            )
-            used = used + 1
-    r = int(0)
-    for c in range(size):
-        value = real(0.0)
-        if system.matrix[c, size + 1, index] == real(1.0):
-            value = system.matrix[r, size, index]
-            r = r + 1
-        contacts.multiplier[c // 3, c % 3] = value
+        contacts.multiplier[c // 3, c % 3] = dense_entry(matrix, c * wp.static(width) + size)
     for k in range(contacts.count):
         contacts.push[k] = velocity_block(contacts, k) * contact_row(contacts.multiplier, k) * (-h)
     return degenerate
