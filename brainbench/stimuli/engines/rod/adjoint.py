@@ -28,15 +28,15 @@ spheres, cylinders, faces, edges and corners by the second derivatives of the di
 Forces of recorded steps are solved to rounding, which those of the ordinary engine are not: the theorem holds at the
 solution.
 
-**Memory.** The run pauses after every √steps steps, where the state is kept; going back, each segment is run again from
-there and written down, the same steps to the digit. Step lengths are those that the run took: derivatives are at a
-fixed sequence of steps.
+**Memory.** Runs whose steps take at most ``ROOM`` are written down as they go. Longer ones pause after every √steps steps,
+where the state is kept; going back, each segment is run again from there and written down, the same steps to the digit.
+Step lengths are those that the run took: derivatives are at a fixed sequence of steps.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -51,6 +51,9 @@ from brainbench.stimuli.engines.rod.scheduling import allocate
 from brainbench.stimuli.engines.rod.streams import turn
 from brainbench.stimuli.engines.units import MICRO, MILLI
 from brainbench.stimuli.whiskers.chain import Chain
+
+ROOM = 2**26
+"""Bytes that records of the steps of a launch may take; beyond them they are written down in parts."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,6 +71,9 @@ class OutputDerivatives:
 class RecordingSolver(WhiskerSolver):
     """A solver whose launches can be gone back over. In double precision."""
 
+    room = ROOM
+    """Bytes that records of steps may take."""
+
     def __init__(self, chains: Sequence[Chain], fidelity: Fidelity, device: Any, needs: int, *, twists: bool) -> None:
         """Load kernels; arguments as for :class:`.launch.WhiskerSolver`."""
         super().__init__(chains, fidelity, device, needs, twists=twists, recorded=True)
@@ -80,11 +86,15 @@ class RecordingSolver(WhiskerSolver):
         wp, device, structs = warp(), self.device, self.kernels.structs
         jobs, readings = inputs[3], inputs[5]
         time = readings.time.numpy()[-1]
-        steps = (time["tick"] + time["part"]) / jobs.step.numpy().min()
+        steps = math.ceil((time["tick"] + time["part"]) / jobs.step.numpy().min()) + 8
         with turn(device):
             links = (self.capacity, count)
             self.paused = allocate(structs.PausedWhiskers, device, state=count, ended=count, link=links)
-            self.paused.budget = max(8, math.ceil(math.sqrt(steps)))
+            one = self._records(1, count)
+            affordable = self.room // sum(getattr(one, name).capacity for name in structs.StepRecords.vars)
+            self.paused.budget = budget = max(8, math.ceil(math.sqrt(steps)), min(steps, affordable))
+            self.paused.records = self._records(budget, count)
+            self.paused.keep = int(budget >= steps)
             self.inputs, self.checkpoints = inputs, []
             while not self.checkpoints or not self.paused.ended.numpy().all():
                 held = inputs[-1].held
@@ -92,8 +102,28 @@ class RecordingSolver(WhiskerSolver):
                 self._run()
             wp.synchronize_device(device)
 
+    def _records(self, steps: int, count: int) -> Any:
+        """Return room for so many steps of each of ``count`` jobs."""
+        links, contacts = (steps, self.capacity, count), (steps, contacts_for(self.capacity), count)
+        shapes = {"step": (steps, count), "count": count, "contact": contacts}
+        shapes |= dict.fromkeys(("angle", "rate", "acceleration"), links)
+        return allocate(self.kernels.structs.StepRecords, self.device, **shapes)
+
     def _run(self) -> None:
+        self.paused.records.count.zero_()
         warp().launch(self.kernels.run, self.count, [*self.inputs, self.paused], device=self.device)
+
+    def _segments(self, checkpoints: Iterable[tuple[Any, Any, Any]]) -> Iterator[Any]:
+        """Yield the records of the segments that begin at checkpoints; each is run again unless there is one."""
+        wp = warp()
+        whole = self.paused.keep == 1 and len(self.checkpoints) == 1
+        self.paused.keep = 1
+        for kept in checkpoints:
+            if not whole:
+                for state, now in zip(kept, (self.paused.state, self.paused.link, self.inputs[-1].held), strict=True):
+                    wp.copy(now, state)
+                self._run()
+            yield self.paused.records
 
     @property
     def count(self) -> int:
@@ -112,16 +142,7 @@ class RecordingSolver(WhiskerSolver):
             adjoint = build_adjoint(self.kernels)
         chains, motions, shapes, jobs, options, *_ = self.inputs
         count, contacts = self.count, contacts_for(self.capacity)
-        budget = self.paused.budget
         with turn(device):
-            records = allocate(
-                structs.StepRecords,
-                device,
-                step=(budget, count),
-                **dict.fromkeys(("angle", "rate", "acceleration"), (budget, self.capacity, count)),
-                contact=(budget, contacts, count),
-                count=count,
-            )
             given = adjoint.OutputCotangents()
             for name, values in self._kernel_units(outputs).items():
                 setattr(given, name, wp.array(values, dtype=structs.vec3, device=device))
@@ -137,16 +158,10 @@ class RecordingSolver(WhiskerSolver):
             )
             places = dict.fromkeys(("place", "turn", "size", "friction"), int(shapes.kind.shape[0]))
             gradients.shape = allocate(adjoint.ShapeGradients, device, **places)
-            for state, link, held in reversed(self.checkpoints):
-                self.paused.keep, self.paused.records = 1, records
-                for kept, now in ((state, self.paused.state), (link, self.paused.link), (held, self.inputs[-1].held)):
-                    wp.copy(now, kept)
-                records.count.zero_()
-                self._run()
+            for records in self._segments(reversed(self.checkpoints)):
                 # Going back needs no trees of meshes, nor what else only contact searches read.
                 arguments = [chains, motions, shapes, jobs, options, records, given, system, gradients]
                 wp.launch(adjoint.reverse_segment, count, arguments, device=device)
-            self.paused.keep = 0
             names = ("link", "beta", "friction", "gravity", "contacts", "knots", "load_force", "load_share")
             found = {name: getattr(gradients, name).numpy() for name in names}
             found |= {f"shape_{name}": getattr(gradients.shape, name).numpy() for name in places}

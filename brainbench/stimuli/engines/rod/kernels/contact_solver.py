@@ -376,7 +376,7 @@ def iterate_forces(
                 refresh = 0
             gauss_seidel_sweep(solver, own, matrix, slip_tries)
             if wp.static(recorded):
-                if solver.converged == 0 and turn % 2 == 0:
+                if solver.converged == 0 and turn >= 2 and turn % 2 == 0:
                     caution = real(wp.static(CAUTIOUS))
                     if turn % 4 == 2:
                         caution = real(wp.static(DIRECT))
