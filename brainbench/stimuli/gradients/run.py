@@ -22,6 +22,7 @@ from brainbench.stimuli.engines.rod.differences import (
     PackedPlaces,
     contract,
     packed_change,
+    packed_part,
 )
 from brainbench.stimuli.engines.rod.engine import RodEngine, trace_of
 from brainbench.stimuli.engines.rod.packing import capacity_for, knots_alike
@@ -51,6 +52,18 @@ class Gradient:
     def smooth(self) -> bool:
         """True when no contact was close to another state: the gradient holds on both sides."""
         return all(event.status == "smooth" for event in self.events)
+
+
+@dataclass(frozen=True, eq=False)
+class Tangents:
+    """Derivatives of the results of one job by each parameter; NaN when its simulation is not ``ok``."""
+
+    wrench: NDArray[np.float64]
+    """[p, n, 6]"""
+    link_positions: NDArray[np.float64]
+    """[p, n, links + 1, 3]"""
+    contact_wrench: NDArray[np.float64]
+    """[p, n, 6]"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -231,6 +244,32 @@ class GradientRun:
                 if trace.status != "ok":
                     by_job[index] = np.nan if any(some[index] is not None for some in given) else 0.0
         return Gradient(by_job.sum(axis=0), by_job, tuple(events[index] for index in range(count)))
+
+    def tangents(self) -> list[Tangents]:
+        """Return the derivatives of what :attr:`traces` hold by each parameter, one for each job.
+
+        One pass over the recorded steps gives them for all parameters: what a least-squares problem with many readings
+        needs, where :meth:`gradient` gives those of one number by any number of parameters.
+        """
+        found: dict[int, Tangents] = {}
+        for group in self._groups:
+            shapes = group.solver.packed_shapes
+            arrays = {name: np.zeros((len(self.values), *shape)) for name, shape in shapes.items()}
+            for row, index in enumerate(group.indices):
+                for p, change in enumerate(of_jobs[index] for of_jobs in self.changes):
+                    mine = {name: values[p] for name, values in arrays.items()}
+                    for name in change.keys() - {"positions"}:
+                        packed_part(mine, name, group.places[row], row)[...] = change[name]
+            results = group.solver.forward(arrays)
+            for row, index in enumerate(group.indices):
+                points = results["points"][:, row, :, : group.places[row].links + 1]
+                for p, change in enumerate(of_jobs[index] for of_jobs in self.changes):
+                    if "positions" in change:
+                        points[p] += change["positions"][:, None]
+                parts = results["wrench"][:, row], points, results["contact_wrench"][:, row]
+                trusted = self.traces[index].status == "ok"
+                found[index] = Tangents(*(part if trusted else np.full_like(part, np.nan) for part in parts))
+        return [found[index] for index in range(len(self.jobs))]
 
     def _outputs(self, group: _Group, given: Sequence[Given]) -> OutputDerivatives:
         frames, nodes = len(group.packed.tasks[0].job.times), group.solver.capacity + 1

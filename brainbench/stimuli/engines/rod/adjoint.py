@@ -36,7 +36,7 @@ Step lengths are those that the run took: derivatives are at a fixed sequence of
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -130,6 +130,66 @@ class RecordingSolver(WhiskerSolver):
         """Jobs of the last launch."""
         return self.paused.state.shape[0]
 
+    @property
+    def packed_shapes(self) -> dict[str, tuple[int, ...]]:
+        """Shapes of the packed arrays that changes are of, see ``kernels.adjoint.tangent.PackedTangents``."""
+        _, motions, shapes, jobs, *_ = self.inputs
+        loads, solids = int(jobs.load_force.shape[0]), int(shapes.kind.shape[0])
+        return {
+            "link": (10, self.capacity, self.count),
+            **dict.fromkeys(("beta", "friction"), (self.count,)),
+            "gravity": (self.count, 3),
+            "knots": (int(motions.place.shape[0]), 16),
+            "load_force": (loads, 3),
+            "load_share": (loads,),
+            **{f"shape_{name}": (solids, 3) for name in ("place", "turn", "size")},
+            "shape_friction": (solids,),
+        }
+
+    def forward(self, changes: Mapping[str, NDArray[np.float64]]) -> dict[str, NDArray[np.float64]]:
+        """Go over the last launch again; return the change of its results with that of what was packed.
+
+        Args:
+            changes: [p, …] by parameter, of the arrays and shapes of :attr:`packed_shapes`.
+
+        Returns:
+            ``wrench`` [p, job, reading, 6], ``points`` [p, job, reading, node, 3] from the base point, and
+            ``contact_wrench`` [p, job, reading, 6]. SI units.
+        """
+        from brainbench.stimuli.engines.rod.kernels import BUILDING, build_adjoint
+
+        wp, device, structs = warp(), self.device, self.kernels.structs
+        with BUILDING:
+            kernels = build_adjoint(self.kernels, "tangent")
+        chains, motions, shapes, jobs, options, readings, *_ = self.inputs
+        count, some = self.count, len(changes["beta"])
+        frames = int(readings.row.numpy().max()) + 1
+        with turn(device):
+            state = (some, self.capacity, count)
+            tangents = allocate(kernels.PackedTangents, device, angle=state, rate=state)
+            for name, values in changes.items():
+                setattr(tangents, name, wp.array(values, dtype=kernels.PackedTangents.vars[name].type.dtype, device=device))
+            system = allocate(
+                kernels.ContactSystem, device, unit=(3 * contacts_for(self.capacity), self.capacity, count)
+            )
+            outputs = allocate(
+                kernels.OutputTangents,
+                device,
+                points=(some, frames, self.capacity + 1, count),
+                **dict.fromkeys(("wrench", "contact"), (some, frames, 2, count)),
+            )
+            for records in self._segments(self.checkpoints):
+                arguments = [chains, motions, shapes, jobs, options, records, system, tangents, outputs]
+                wp.launch(kernels.tangent_segment, count, arguments, device=device)
+            found = {name: np.moveaxis(getattr(outputs, name).numpy(), 3, 1) for name in ("wrench", "points", "contact")}
+        units = np.array([MILLI, MICRO])[:, None]
+        # The kernels find the wrench of the base on the whisker, moment first.
+        return {
+            "wrench": (-found["wrench"][:, :, :, ::-1] / units).reshape(*found["wrench"].shape[:3], 6),
+            "points": found["points"] / MILLI,
+            "contact_wrench": (found["contact"] / units).reshape(*found["contact"].shape[:3], 6),
+        }
+
     def reverse(self, outputs: OutputDerivatives) -> dict[str, NDArray[Any]]:
         """Go back over the last launch; return the derivatives by what was packed.
 
@@ -139,7 +199,7 @@ class RecordingSolver(WhiskerSolver):
 
         wp, device, structs = warp(), self.device, self.kernels.structs
         with BUILDING:
-            adjoint = build_adjoint(self.kernels)
+            adjoint = build_adjoint(self.kernels, "chain")
         chains, motions, shapes, jobs, options, *_ = self.inputs
         count, contacts = self.count, contacts_for(self.capacity)
         with turn(device):

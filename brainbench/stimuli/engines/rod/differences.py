@@ -232,21 +232,23 @@ def _rotation(low: Numbers, high: Numbers) -> NDArray[np.float64]:
     return vectors / 2
 
 
+def packed_part(arrays: Mapping[str, NDArray[Any]], name: str, places: PackedPlaces, job: int) -> NDArray[Any]:
+    """Return the view of packed arrays in which some numbers of a job stand."""
+    if name == "link":
+        return arrays["link"][:, : places.links, job]
+    if name in ("beta", "friction", "gravity"):
+        return arrays[name][job : job + 1]
+    if name.startswith("load"):
+        return arrays[name][places.loads]
+    if name.startswith("shape"):
+        return arrays[name][places.shapes]
+    return arrays["knots"][places.base if name == "base" else places.bodies[int(name.removeprefix("body"))]]
+
+
 def contract(gradients: Mapping[str, NDArray[Any]], change: Numbers, places: PackedPlaces, job: int) -> float:
     """Return the derivative by a parameter from those by the packed numbers and the change of these with it.
 
     Positions of the base in the readings are not among them.
     """
-    where: dict[str, Any] = dict.fromkeys(("beta", "friction", "gravity"), job)
-    where |= dict.fromkeys(("load_share", "load_force"), places.loads)
-    where |= dict.fromkeys(("shape_place", "shape_turn", "shape_size", "shape_friction"), places.shapes)
-    total = 0.0
-    for name, values in change.items():
-        if name == "link":
-            total += np.vdot(gradients["link"][:, : places.links, job], values)
-        elif name in where:
-            total += np.vdot(gradients[name][where[name]], values)
-        elif name != "positions":
-            knots = places.base if name == "base" else places.bodies[int(name.removeprefix("body"))]
-            total += np.vdot(gradients["knots"][knots], values)
-    return float(total)
+    names = change.keys() - {"positions"}
+    return float(sum(np.vdot(packed_part(gradients, name, places, job), change[name]) for name in sorted(names)))

@@ -15,10 +15,10 @@ import warp as wp
 
 from brainbench.stimuli.engines.rod.limits import FOLD, STOP
 
-from ..algebra import JointVector, SpatialAcceleration, first_axis, vec3
+from ..algebra import JointVector, SpatialAcceleration, Wrench, first_axis, vec2, vec3
 from ..articulated_body import ChainState, ProximityState, articulated_inertia, forward_kinematics, hinge_direction
 from ..delassus import PerContact3
-from ..motion import elapsed, instant, pose_at, pose_from
+from ..motion import BodyMotion, Instant, elapsed, instant, pose_at, pose_from
 from ..parameters import hinges, module_options, real
 from ..state import (
     ChainArrays,
@@ -36,11 +36,14 @@ from .contacts import (
     AdjointContacts,
     ContactSummary,
     ContactSystem,
+    build_system,
     contact_row,
     set_state,
-    solve_multipliers,
+    solve_system,
     summarize,
+    velocity_block,
 )
+from .dense import DenseSystem
 from .fields import FieldCotangents, Fields, add_hinge, reverse_hinge
 from .pose import PoseCotangent, spread_pose
 from .records import StepRecords
@@ -105,11 +108,11 @@ def virtual_motion(
     pushing: int,
     virtual: wp.ref[PerLinkJoint],
     at_contacts: wp.ref[PerContact3],
-):
+) -> Wrench:
     """Solve the symmetric system of the chain: two passes over the factorised chain of the step.
 
     ``asked`` is the right-hand side, and with ``pushing`` the contacts' forces; the base moves as given. Found are the
-    rates of the joints and the velocity at each contact.
+    rates of the joints and the velocity at each contact; returned is what no joint takes up and the base must hold.
     """
     zero = real(0.0)
     tw = vec3(zero, zero, zero)
@@ -142,6 +145,9 @@ def virtual_motion(
         tw = tw - row(chain.gain1_w, i) * u1 - row(chain.gain2_w, i) * u2
         tv = tv - row(chain.gain1_v, i) * u1 - row(chain.gain2_v, i) * u2
         virtual[i] = found
+    held = Wrench()
+    held.moment = tw
+    held.force = tv
     aw = base_angular
     av = base_linear
     for i in range(job.links):
@@ -166,6 +172,7 @@ def virtual_motion(
         for k in range(contacts.count):
             if contact_row(contacts.link, k) == i:
                 at_contacts[k] = av + wp.cross(aw, contact_row(contacts.point, k))
+    return held
 
 
 @wp.func
@@ -218,6 +225,20 @@ def reverse_inertia(
 
 
 @wp.func
+def spring_state(angle: real, rate: real, lag: real) -> vec2:
+    """Return the stretch of a joint's spring, q + lag q̇, and how many times steeper than its stiffness it is there."""
+    stretch = angle + lag * rate
+    steepness = real(1.0)
+    bend = wp.abs(angle)
+    if bend > real(wp.static(FOLD)):
+        # Beyond FOLD it stiffens, see ``articulated_body``.
+        past = angle * (real(1.0) - real(wp.static(FOLD)) / bend)
+        stretch = stretch + real(wp.static(STOP)) * (past + lag * rate)
+        steepness = steepness + real(wp.static(STOP))
+    return vec2(stretch, steepness)
+
+
+@wp.func
 def spring(
     gradients: PackedGradients, which: int, i: int, index: int, stiffness: real, angle: real, rate: real, lag: real,
     virtual: real
@@ -227,22 +248,106 @@ def spring(
     ``which`` is the row of that. Returned is μ k of the joint as it is now: the derivative by the angle; that by the
     rate is lag times as much, and that by the lag the rate times as much.
     """
-    stretch = angle + lag * rate
-    steepness = real(1.0)
-    bend = wp.abs(angle)
-    if bend > real(wp.static(FOLD)):
-        # Beyond FOLD it stiffens, see ``articulated_body``.
-        past = angle * (real(1.0) - real(wp.static(FOLD)) / bend)
-        stretch = stretch + real(wp.static(STOP)) * (past + lag * rate)
-        steepness = steepness + real(wp.static(STOP))
-    add(gradients, which, i, index, virtual * stretch)
-    return virtual * stiffness * steepness
+    state = spring_state(angle, rate, lag)
+    add(gradients, which, i, index, virtual * state[0])
+    return virtual * stiffness * state[1]
 
 
 @wp.func
 def joint_axes(chain: wp.ref[ChainState], i: int) -> vec3:
     """Return the axis of a joint's first hinge."""
     return first_axis(row(chain.axis2, i), hinge_direction(chain, i), row(chain.angle, i)[1])
+
+
+@wp.struct
+class StepFrame:
+    """Base of a recorded step: at its beginning, half-way and at its end."""
+
+    now: Instant
+    middle: Instant
+    later: Instant
+    length: real
+    reading: wp.int32
+    pose: BodyMotion
+    after: BodyMotion
+    base: SpatialAcceleration
+
+
+@wp.func
+def restore_step(
+    chains: ChainArrays,
+    motions: MotionArrays,
+    shapes: ShapeArrays,
+    jobs: JobArrays,
+    options: StepOptions,
+    records: StepRecords,
+    job: WhiskerJob,
+    place: int,
+    chain: wp.ref[ChainState],
+    proximity: wp.ref[ProximityState],
+    contacts: wp.ref[AdjointContacts],
+    on: wp.ref[Fields],
+) -> StepFrame:
+    """Factorise the chain of a recorded step; find its contacts, and ``on`` the fields of its last link."""
+    index = job.index
+    step = records.step[place, index]
+    now = step.time
+    h = step.length
+    frame = StepFrame()
+    frame.now = now
+    frame.middle = instant(now.tick, now.part + real(0.5) * h)
+    frame.later = instant(now.tick, now.part + h)
+    frame.length = h
+    frame.reading = step.reading
+    pose = pose_at(motions, job.base, now)
+    after = pose_at(motions, job.base, frame.later)
+    frame.pose = pose
+    frame.after = after
+    state = WhiskerState()
+    for i in range(job.links):
+        chain.angle[i] = records.angle[place, i, index]
+        chain.rate[i] = records.rate[place, i, index]
+    base = SpatialAcceleration()
+    base.angular = (after.spin - pose.spin) / h
+    base.linear = (after.velocity - pose.velocity) / h - wp.cross(pose.spin, pose.velocity) - options.gravity
+    frame.base = base
+    tip = forward_kinematics(chains, job, pose, chain, proximity, state)
+    articulated_inertia(chains, jobs, job, chain, proximity, tip, base, elapsed(now), h, 1)
+
+    # Twists and accelerations down the chain, with those of the contacts at the end of the step.
+    contacts.count = step.contacts
+    on.vw = pose.spin
+    on.vv = pose.velocity
+    on.aw = base.angular
+    on.av = base.linear
+    for k in range(contacts.count):
+        contacts.link[k] = records.contact[place, k, index].link
+    for i in range(job.links):
+        at = row(chain.node, i)
+        rate = row(chain.rate, i)
+        a = records.acceleration[place, i, index]
+        add_hinge(on, at, joint_axes(chain, i), rate[0], a[0], real(0.0))
+        add_hinge(on, at, row(chain.axis2, i), rate[1], a[1], real(0.0))
+        if wp.static(hinges == 3):
+            if i % 2 == 1:
+                add_hinge(on, at, row(chain.axis3, i), rate[2], a[2], real(0.0))
+        for k in range(contacts.count):
+            if contact_row(contacts.link, k) == i:
+                contact = records.contact[place, k, index]
+                taper = chains.taper[i, job.whisker]
+                radius = taper.start_radius + (taper.end_radius - taper.start_radius) * contact.share
+                point = at + (row(chain.node, i + 1) - at) * contact.share - contact.normal * radius
+                half = pose_from(motions, shapes.track[contact.shape], frame.middle, pose)
+                velocity = (
+                    on.vv
+                    + (on.av + options.gravity) * h
+                    + wp.cross(on.vw + on.aw * h, point)
+                    - half.velocity
+                    - wp.cross(half.spin, point - half.place)
+                )
+                contacts.point[k] = point
+                set_state(contacts, k, contact, velocity)
+    return frame
 
 
 @wp.func
@@ -263,25 +368,17 @@ def reverse_step(
     zero = real(0.0)
     none = vec3(zero, zero, zero)
     index = job.index
-    step = records.step[place, index]
-    now = step.time
-    h = step.length
-    later = instant(now.tick, now.part + h)
-    pose = pose_at(motions, job.base, now)
-    after = pose_at(motions, job.base, later)
-
-    # The factorised chain of the step.
     chain = ChainState()
     proximity = ProximityState()
-    state = WhiskerState()
-    for i in range(job.links):
-        chain.angle[i] = records.angle[place, i, index]
-        chain.rate[i] = records.rate[place, i, index]
-    base = SpatialAcceleration()
-    base.angular = (after.spin - pose.spin) / h
-    base.linear = (after.velocity - pose.velocity) / h - wp.cross(pose.spin, pose.velocity) - options.gravity
-    tip = forward_kinematics(chains, job, pose, chain, proximity, state)
-    articulated_inertia(chains, jobs, job, chain, proximity, tip, base, elapsed(now), h, 1)
+    contacts = AdjointContacts()
+    on = Fields()
+    frame = restore_step(
+        chains, motions, shapes, jobs, options, records, job, place, chain, proximity, contacts, on
+    )  # fmt: skip
+    now = frame.now
+    later = frame.later
+    h = frame.length
+    pose = frame.pose
 
     # Derivatives of what follows by the accelerations: q⁺ = q + h q̇⁺, q̇⁺ = q̇ + h a.
     asked = PerLinkJoint()
@@ -294,7 +391,7 @@ def reverse_step(
     wrench_bar_v = none
     force_bar = none
     moment_bar = none
-    reading = step.reading
+    reading = frame.reading
     if reading >= 0:
         # A quasi-static step that turns out too long writes its reading with its first part, then again with its last.
         if reading + 1 == gradients.reading[index]:
@@ -307,46 +404,9 @@ def reverse_step(
         force_bar = outputs.contact[reading, 0, index]
         moment_bar = outputs.contact[reading, 1, index]
 
-    # Twists and accelerations down the chain, with those of the contacts at the end of the step.
-    contacts = AdjointContacts()
-    contacts.count = step.contacts
-    on = Fields()
-    on.vw = pose.spin
-    on.vv = pose.velocity
-    on.aw = base.angular
-    on.av = base.linear
-    middle = instant(now.tick, now.part + real(0.5) * h)
-    for k in range(contacts.count):
-        contacts.link[k] = records.contact[place, k, index].link
-    for i in range(job.links):
-        at = row(chain.node, i)
-        rate = row(chain.rate, i)
-        a = records.acceleration[place, i, index]
-        add_hinge(on, at, joint_axes(chain, i), rate[0], a[0], zero)
-        add_hinge(on, at, row(chain.axis2, i), rate[1], a[1], zero)
-        if wp.static(hinges == 3):
-            if i % 2 == 1:
-                add_hinge(on, at, row(chain.axis3, i), rate[2], a[2], zero)
-        for k in range(contacts.count):
-            if contact_row(contacts.link, k) == i:
-                contact = records.contact[place, k, index]
-                taper = chains.taper[i, job.whisker]
-                radius = taper.start_radius + (taper.end_radius - taper.start_radius) * contact.share
-                point = at + (row(chain.node, i + 1) - at) * contact.share - contact.normal * radius
-                half = pose_from(motions, shapes.track[contact.shape], middle, pose)
-                velocity = (
-                    on.vv
-                    + (on.av + options.gravity) * h
-                    + wp.cross(on.vw + on.aw * h, point)
-                    - half.velocity
-                    - wp.cross(half.spin, point - half.place)
-                )
-                contacts.point[k] = point
-                set_state(contacts, k, contact, velocity)
-
     summary = gradients.contacts[index]
-    summarize(summary, contacts, step.open_gap)
-    summary.degenerate = summary.degenerate + step.inexact
+    summarize(summary, contacts, records.step[place, index].open_gap)
+    summary.degenerate = summary.degenerate + records.step[place, index].inexact
     gradients.contacts[index] = summary
 
     # Multipliers: the virtual motion without contacts, then with what the contacts' own multipliers push.
@@ -357,8 +417,12 @@ def reverse_step(
         for k in range(contacts.count):
             force_bar_k = force_bar + wp.cross(moment_bar, contact_row(contacts.point, k))
             there[k] = contact_row(there, k) - force_bar_k
-        degenerate = solve_multipliers(job, chain, proximity, contacts, system, there, h)
+        matrix = DenseSystem()
+        build_system(job, chain, proximity, contacts, system, h, 0, matrix)
+        degenerate = solve_system(contacts, matrix, there)
         gradients.contacts[index].degenerate = gradients.contacts[index].degenerate + degenerate
+        for k in range(contacts.count):
+            contacts.push[k] = velocity_block(contacts, k) * contact_row(contacts.multiplier, k) * (-h)
         virtual_motion(job, chain, proximity, asked, wrench_bar_w, wrench_bar_v, contacts, 1, virtual, there)
     on.ww = wrench_bar_w
     on.wv = wrench_bar_v
@@ -393,7 +457,7 @@ def reverse_step(
                 taper = chains.taper[i, job.whisker]
                 taper_bar = reverse_contact(
                     motions, shapes, gradients.shape, gradients.knots, contacts, k, contact, on, bar, base_bar, pose,
-                    moment_bar, at, x * build.length, taper.start_radius, taper.end_radius, now, middle, h
+                    moment_bar, at, x * build.length, taper.start_radius, taper.end_radius, now, frame.middle, h
                 )  # fmt: skip
                 add(gradients, START_RADIUS, i, index, taper_bar.start_radius)
                 add(gradients, END_RADIUS, i, index, taper_bar.end_radius)

@@ -47,7 +47,7 @@ class AdjointContacts:
     scale: PerContact1
     """σ"""
     multiplier: PerContact3
-    """ν"""
+    """ν, or going forward the change of the force."""
     push: PerContact3
     """Force −h A ν that the multipliers exert on the virtual motion."""
 
@@ -244,38 +244,50 @@ def compliance(
 
 
 @wp.func
-def solve_multipliers(
+def build_system(
     job: WhiskerJob,
     chain: wp.ref[ChainState],
     proximity: wp.ref[ProximityState],
     contacts: wp.ref[AdjointContacts],
     system: ContactSystem,
-    asked: wp.ref[PerContact3],
     h: real,
-) -> int:
-    """Find the multipliers and what they push with; return 1 where contacts share a load in more than one way.
-
-    ``asked`` is w − f̄ of each contact.
-    """
-    size = 3 * contacts.count
+    forward: int,
+    matrix: wp.ref[DenseSystem],
+):
+    """Write the matrix of the multipliers, G A + Bᵀ, or with ``forward`` that of the change of forces, A G + B."""
     carry_units(job, chain, contacts, system)
     for k in range(contacts.count):
         own = compliance(job, proximity, contacts, system, k, k, h)
         contacts.scale[k] = (own[0, 0] + own[1, 1] + own[2, 2]) / real(3.0)
-    matrix = DenseSystem()
     for k in range(contacts.count):
         for e in range(contacts.count):
-            block = compliance(job, proximity, contacts, system, k, e, h) * velocity_block(contacts, e)
-            if k == e:
+            block = compliance(job, proximity, contacts, system, k, e, h)
+            if forward == 1:
+                block = velocity_block(contacts, k) * block
+            else:
+                block = block * velocity_block(contacts, e)
+            if k == e and forward == 1:
+                block = block + wp.transpose(force_block(contacts, k))
+            elif k == e:
                 block = block + force_block(contacts, k)
             for a in range(3):
                 for b in range(3):
                     matrix[(3 * k + a) * wp.static(width) + 3 * e + b] = block[a, b]
-        for a in range(3):
-            matrix[(3 * k + a) * wp.static(width) + size] = contact_row(asked, k)[a]
+
+
+@wp.func
+def solve_system(
+    contacts: wp.ref[AdjointContacts], matrix: wp.ref[DenseSystem], asked: wp.ref[PerContact3]
+) -> int:
+    """Solve the system in place for the multipliers, or for the change of the forces in their place.
+
+    Returned is 1 where contacts share a load in more than one way.
+    """
+    size = 3 * contacts.count
+    for r in range(size):
+        matrix[r * wp.static(width) + size] = contact_row(asked, r // 3)[r % 3]
     degenerate = solve_dense(matrix, size)
-    for c in range(size):
-        contacts.multiplier[c // 3, c % 3] = dense_entry(matrix, c * wp.static(width) + size)
     for k in range(contacts.count):
-        contacts.push[k] = velocity_block(contacts, k) * contact_row(contacts.multiplier, k) * (-h)
+        for d in range(3):
+            contacts.multiplier[k, d] = dense_entry(matrix, (3 * k + d) * wp.static(width) + size)
     return degenerate

@@ -81,3 +81,42 @@ def reverse_hinge(
     bar.at = bar.at + wp.cross(s, m_bar)
     bar.turn = bar.turn + wp.cross(s, s_bar)
     return rate_bar
+
+
+@wp.struct
+class FieldTangents:
+    """Change of the fields of a link, of its frame by a small turn, and of a joint's place."""
+
+    vw: vec3
+    vv: vec3
+    aw: vec3
+    av: vec3
+    turn: vec3
+    at: vec3
+
+
+@wp.func
+def move_hinge(
+    on: wp.ref[Fields],
+    moved: wp.ref[FieldTangents],
+    at: vec3,
+    s: vec3,
+    rate: real,
+    acceleration: real,
+    angle_d: real,
+    rate_d: real,
+):
+    """Go from the body before a hinge to that behind it, with the change of both at a fixed acceleration."""
+    m = wp.cross(at, s)
+    s_d = wp.cross(moved.turn, s)
+    m_d = wp.cross(moved.at, s) + wp.cross(at, s_d)
+    turning = wp.cross(on.vw, s)
+    moving = wp.cross(on.vw, m) + wp.cross(on.vv, s)
+    turning_d = wp.cross(moved.vw, s) + wp.cross(on.vw, s_d)
+    moving_d = wp.cross(moved.vw, m) + wp.cross(on.vw, m_d) + wp.cross(moved.vv, s) + wp.cross(on.vv, s_d)
+    moved.aw = moved.aw + turning_d * rate + turning * rate_d + s_d * acceleration
+    moved.av = moved.av + moving_d * rate + moving * rate_d + m_d * acceleration
+    moved.vw = moved.vw + s_d * rate + s * rate_d
+    moved.vv = moved.vv + m_d * rate + m * rate_d
+    moved.turn = moved.turn + s * angle_d
+    add_hinge(on, at, s, rate, acceleration, real(0.0))
