@@ -16,7 +16,6 @@ from brainbench.core.files import provenance
 from brainbench.core.records import Status
 from brainbench.stimuli.fitting.identifiability import Direction, directions, unknown_parameters
 from brainbench.stimuli.fitting.intervals import Profile, laplace_interval, quantile
-from brainbench.stimuli.fitting.jacobians import CentralDifferences, JacobianProvider
 from brainbench.stimuli.fitting.model import FitModel
 from brainbench.stimuli.fitting.options import FitOptions
 from brainbench.stimuli.fitting.parameters import FreeParameters, read_value, with_value
@@ -38,7 +37,6 @@ def fit(
     bounds: Mapping[str, tuple[float, float]] | None = None,
     priors: Mapping[str, Prior] | None = None,
     options: FitOptions | None = None,
-    provider: JacobianProvider | None = None,
 ) -> FitResult:
     """Estimate parameters of a whisker from one or several trials of it.
 
@@ -49,7 +47,6 @@ def fit(
         bounds: bounds of single parameters, in their units.
         priors: priors of single parameters, beside those that the options name.
         options: how the fit simulates, weighs and judges.
-        provider: what computes Jacobians; central differences when None.
 
     Returns:
         Estimates with intervals, noise, tests of the residuals, and a status with reasons.
@@ -71,7 +68,7 @@ def fit(
             for trial in trials
         ]
     free = FreeParameters(tuple(parameters), condition, bounds or {})
-    model = FitModel(trials, free, options, provider or CentralDifferences())
+    model = FitModel(trials, free, options)
     problem = _Problem(model, _chosen_priors(free, options, priors or {}))
     first = model.residual(np.zeros(len(free)))
     if not np.isfinite(first).all():
@@ -183,7 +180,7 @@ def _judge(problem: _Problem, u: Array, converged: bool, iterations: int, began:
     ]
     worst = {one.status for one in estimates} | ({"unreliable"} if reasons else {"ok"})
     status: Status = "undefined" if not converged or "undefined" in worst else "unreliable" if reasons else "ok"
-    (traces,) = model.traces([u])
+    traces = model.run(u).traces
     whisker = free.condition(u).whisker
     predicted = tuple(
         trace.link_positions if trial.of_shapes and trace.link_positions is not None else _wrench(trial, trace)

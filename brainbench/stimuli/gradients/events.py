@@ -5,13 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any, Literal
 
-SMALL_FORCE = 1e-5
+Nearness = Literal["ending", "beginning", "passing", "slipping", "sticking"]
+SMALL_FORCE = 1e-4
 """Share of the whisker's largest contact force below which a contact is about to end or has just begun."""
-SMALL_GAP = 1e-7
-"""Gap (mm) at the end of a step up to which an open contact is about to close."""
-FULL_CONE = 1 - 1e-5
+SMALL_GAP = 2e-5
+"""Gap (mm) at the end of a step up to which an open contact is about to close, or a contact to pass to the next link."""
+FULL_CONE = 1 - 1e-4
 """Share of the friction cone from which sticking is close to sliding."""
-SMALL_SLIP = 1e-5
+SMALL_SLIP = 1e-4
 """Share of the whisker's fastest slip below which sliding is close to sticking."""
 
 
@@ -21,7 +22,7 @@ class ContactEvents:
 
     status: Literal["smooth", "one-sided", "degenerate", "unstable"]
     """``smooth``: the gradient holds on both sides. ``one-sided``: in some step a contact was so near to opening,
-    closing, sticking or sliding (``close``) that the gradient on the other side is another. ``degenerate``: in some
+    closing, passing from link to link, sticking or sliding (``close``) that the gradient on the other side is another. ``degenerate``: in some
     step contacts shared their load in more than one way, or their forces could not be solved to rounding.
     ``unstable``: the simulation cannot be trusted, and the gradient is NaN."""
     begun: int
@@ -30,7 +31,7 @@ class ContactEvents:
     """Steps in which fewer did."""
     slipped: int
     """Steps in which as many pressed and more, or fewer, of them slid."""
-    close: tuple[Literal["ending", "beginning", "slipping", "sticking"], ...]
+    close: tuple[Nearness, ...]
     """What some contact was close to in some step."""
 
 
@@ -39,11 +40,13 @@ def contact_events(summary: Any, reason: str) -> ContactEvents:
 
     ``reason`` is why the run cannot be trusted, if so.
     """
-    close: list[Literal["ending", "beginning", "slipping", "sticking"]] = []
+    close: list[Nearness] = []
     if summary["least_force"] < SMALL_FORCE * summary["largest_force"]:
         close.append("ending")
     if summary["least_gap"] < SMALL_GAP:
         close.append("beginning")
+    if summary["least_lead"] < SMALL_GAP:
+        close.append("passing")
     if summary["fullest_cone"] > FULL_CONE:
         close.append("slipping")
     if summary["slowest_slip"] < SMALL_SLIP * summary["fastest_slip"]:

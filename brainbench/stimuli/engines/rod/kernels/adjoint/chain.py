@@ -405,8 +405,7 @@ def reverse_step(
         moment_bar = outputs.contact[reading, 1, index]
 
     summary = gradients.contacts[index]
-    summarize(summary, contacts, records.step[place, index].open_gap)
-    summary.degenerate = summary.degenerate + records.step[place, index].inexact
+    summarize(summary, contacts, records.step[place, index])
     gradients.contacts[index] = summary
 
     # Multipliers: the virtual motion without contacts, then with what the contacts' own multipliers push.

@@ -20,7 +20,7 @@ from ..delassus import row as contact_row
 from ..parameters import hinges, real
 from ..state import WhiskerJob, row
 from .dense import DenseSystem, dense_entry, solve_dense, width
-from .records import ContactRecord
+from .records import ContactRecord, StepRecord
 
 SLIDING = 1 - 1e-6
 """Share of the friction cone from which a contact slides: forces of recorded steps are solved to rounding."""
@@ -83,6 +83,8 @@ class ContactSummary:
     """Largest share of the friction cone that a sticking contact used."""
     least_gap: real
     """Least distance (mm) from closing, of what did not press."""
+    least_lead: real
+    """Least distance (mm) by which one link was chosen before the next one, which touched the same."""
     steps: wp.int32
 
 
@@ -90,13 +92,14 @@ class ContactSummary:
 def summarize(
     summary: wp.ref[ContactSummary],
     contacts: wp.ref[AdjointContacts],
-    open_gap: real,
+    step: StepRecord,
 ):
     """Add a step, which comes before those in the summary."""
     if summary.steps == 0:
         summary.least_force = real(1e30)
         summary.slowest_slip = real(1e30)
         summary.least_gap = real(1e30)
+        summary.least_lead = real(1e30)
     sliding = int(0)
     for k in range(contacts.count):
         n = contact_row(contacts.normal, k)
@@ -113,7 +116,9 @@ def summarize(
             speed = wp.length(v - n * wp.dot(n, v))
             summary.fastest_slip = wp.max(summary.fastest_slip, speed)
             summary.slowest_slip = wp.min(summary.slowest_slip, speed)
-    summary.least_gap = wp.min(summary.least_gap, wp.abs(open_gap))
+    summary.least_gap = wp.min(summary.least_gap, wp.abs(step.open_gap))
+    summary.least_lead = wp.min(summary.least_lead, step.lead)
+    summary.degenerate = summary.degenerate + step.inexact
     if summary.steps > 0:
         if summary.contacts > contacts.count:
             summary.begun = summary.begun + 1
