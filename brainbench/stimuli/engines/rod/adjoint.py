@@ -85,8 +85,9 @@ class RecordingSolver(WhiskerSolver):
     def _take_steps(self, inputs: list[Any], count: int, *, urgent: bool) -> None:
         wp, device, structs = warp(), self.device, self.kernels.structs
         jobs, readings = inputs[3], inputs[5]
-        time = readings.time.numpy()[-1]
-        steps = math.ceil((time["tick"] + time["part"]) / jobs.step.numpy().min()) + 8
+        time = readings.time.numpy()
+        spans = np.diff(time["tick"] + time["part"], prepend=0.0)
+        steps = int(np.ceil(spans / jobs.step.numpy().min()).sum()) + 8
         with turn(device):
             links = (self.capacity, count)
             self.paused = allocate(structs.PausedWhiskers, device, state=count, ended=count, link=links)

@@ -44,7 +44,7 @@ from .contacts import (
     velocity_block,
 )
 from .dense import DenseSystem
-from .fields import FieldCotangents, Fields, add_hinge, reverse_hinge
+from .fields import FieldCotangents, Fields, StepLinks, add_hinge, hinge_row, hinges_of, reverse_hinge
 from .pose import PoseCotangent, spread_pose
 from .records import StepRecords
 from .surfaces import ShapeGradients, reverse_contact
@@ -101,6 +101,7 @@ def virtual_motion(
     job: WhiskerJob,
     chain: wp.ref[ChainState],
     proximity: wp.ref[ProximityState],
+    links: wp.ref[StepLinks],
     asked: wp.ref[PerLinkJoint],
     base_angular: vec3,
     base_linear: vec3,
@@ -119,27 +120,24 @@ def virtual_motion(
     tv = vec3(zero, zero, zero)
     for back in range(job.links):
         i = job.links - 1 - back
-        at = row(chain.node, i)
         if pushing == 1:
             for k in range(contacts.count):
                 if contact_row(contacts.link, k) == i:
                     push = contact_row(contacts.push, k)
                     tv = tv + push
                     tw = tw + wp.cross(contact_row(contacts.point, k), push)
+        j = wp.static(hinges) * i
         b = row(asked, i)
         found = JointVector()
         inverse = row(proximity.inverse_inertia, i)
         if wp.static(hinges == 3):
             if i % 2 == 1:
-                s3 = row(chain.axis3, i)
-                u3 = b[2] + wp.dot(s3, tw) + wp.dot(wp.cross(at, s3), tv)
+                u3 = b[2] + wp.dot(hinge_row(links.axis, j + 2), tw) + wp.dot(hinge_row(links.moment, j + 2), tv)
                 found[2] = inverse[3] * u3
                 tw = tw - row(chain.gain3_w, i) * u3
                 tv = tv - row(chain.gain3_v, i) * u3
-        s2 = row(chain.axis2, i)
-        s1 = first_axis(s2, hinge_direction(chain, i), row(chain.angle, i)[1])
-        u1 = b[0] + wp.dot(s1, tw) + wp.dot(wp.cross(at, s1), tv)
-        u2 = b[1] + wp.dot(s2, tw) + wp.dot(wp.cross(at, s2), tv)
+        u1 = b[0] + wp.dot(hinge_row(links.axis, j), tw) + wp.dot(hinge_row(links.moment, j), tv)
+        u2 = b[1] + wp.dot(hinge_row(links.axis, j + 1), tw) + wp.dot(hinge_row(links.moment, j + 1), tv)
         found[0] = inverse[0] * u1 + inverse[1] * u2
         found[1] = inverse[1] * u1 + inverse[2] * u2
         tw = tw - row(chain.gain1_w, i) * u1 - row(chain.gain2_w, i) * u2
@@ -151,22 +149,19 @@ def virtual_motion(
     aw = base_angular
     av = base_linear
     for i in range(job.links):
-        at = row(chain.node, i)
-        s2 = row(chain.axis2, i)
-        s1 = first_axis(s2, hinge_direction(chain, i), row(chain.angle, i)[1])
+        j = wp.static(hinges) * i
         found = row(virtual, i)
         a1 = found[0] - wp.dot(row(chain.gain1_w, i), aw) - wp.dot(row(chain.gain1_v, i), av)
         a2 = found[1] - wp.dot(row(chain.gain2_w, i), aw) - wp.dot(row(chain.gain2_v, i), av)
-        aw = aw + s1 * a1 + s2 * a2
-        av = av + wp.cross(at, s1) * a1 + wp.cross(at, s2) * a2
+        aw = aw + hinge_row(links.axis, j) * a1 + hinge_row(links.axis, j + 1) * a2
+        av = av + hinge_row(links.moment, j) * a1 + hinge_row(links.moment, j + 1) * a2
         found[0] = a1
         found[1] = a2
         if wp.static(hinges == 3):
             if i % 2 == 1:
-                s3 = row(chain.axis3, i)
                 a3 = found[2] - wp.dot(row(chain.gain3_w, i), aw) - wp.dot(row(chain.gain3_v, i), av)
-                aw = aw + s3 * a3
-                av = av + wp.cross(at, s3) * a3
+                aw = aw + hinge_row(links.axis, j + 2) * a3
+                av = av + hinge_row(links.moment, j + 2) * a3
                 found[2] = a3
         virtual[i] = found
         for k in range(contacts.count):
@@ -253,12 +248,6 @@ def spring(
     return virtual * stiffness * state[1]
 
 
-@wp.func
-def joint_axes(chain: wp.ref[ChainState], i: int) -> vec3:
-    """Return the axis of a joint's first hinge."""
-    return first_axis(row(chain.axis2, i), hinge_direction(chain, i), row(chain.angle, i)[1])
-
-
 @wp.struct
 class StepFrame:
     """Base of a recorded step: at its beginning, half-way and at its end."""
@@ -285,10 +274,11 @@ def restore_step(
     place: int,
     chain: wp.ref[ChainState],
     proximity: wp.ref[ProximityState],
+    links: wp.ref[StepLinks],
     contacts: wp.ref[AdjointContacts],
     on: wp.ref[Fields],
 ) -> StepFrame:
-    """Factorise the chain of a recorded step; find its contacts, and ``on`` the fields of its last link."""
+    """Factorise the chain of a recorded step; find its hinges and contacts, and ``on`` the fields of its last link."""
     index = job.index
     step = records.step[place, index]
     now = step.time
@@ -326,11 +316,24 @@ def restore_step(
         at = row(chain.node, i)
         rate = row(chain.rate, i)
         a = records.acceleration[place, i, index]
-        add_hinge(on, at, joint_axes(chain, i), rate[0], a[0], real(0.0))
-        add_hinge(on, at, row(chain.axis2, i), rate[1], a[1], real(0.0))
+        angle = row(chain.angle, i)
+        s2 = row(chain.axis2, i)
+        s1 = first_axis(s2, hinge_direction(chain, i), angle[1])
+        links.before[i] = s2 * wp.cos(angle[0]) - wp.cross(s1, s2) * wp.sin(angle[0])
+        links.axis[wp.static(hinges) * i] = s1
+        links.axis[wp.static(hinges) * i + 1] = s2
         if wp.static(hinges == 3):
             if i % 2 == 1:
-                add_hinge(on, at, row(chain.axis3, i), rate[2], a[2], real(0.0))
+                s3 = row(chain.axis3, i)
+                links.axis[wp.static(hinges) * i + 2] = s3
+                # Half of the rest bend comes behind the twist, about the axis that is then z.
+                links.behind[i] = s2 * wp.cos(angle[2]) - wp.cross(s2, s3) * wp.sin(angle[2])
+        for d in range(hinges_of(i)):
+            j = wp.static(hinges) * i + d
+            links.vw[j] = on.vw
+            links.vv[j] = on.vv
+            links.moment[j] = wp.cross(at, hinge_row(links.axis, j))
+            add_hinge(on, at, hinge_row(links.axis, j), rate[d], a[d], real(0.0))
         for k in range(contacts.count):
             if contact_row(contacts.link, k) == i:
                 contact = records.contact[place, k, index]
@@ -370,10 +373,11 @@ def reverse_step(
     index = job.index
     chain = ChainState()
     proximity = ProximityState()
+    links = StepLinks()
     contacts = AdjointContacts()
     on = Fields()
     frame = restore_step(
-        chains, motions, shapes, jobs, options, records, job, place, chain, proximity, contacts, on
+        chains, motions, shapes, jobs, options, records, job, place, chain, proximity, links, contacts, on
     )  # fmt: skip
     now = frame.now
     later = frame.later
@@ -411,7 +415,7 @@ def reverse_step(
     # Multipliers: the virtual motion without contacts, then with what the contacts' own multipliers push.
     virtual = PerLinkJoint()
     there = PerContact3()
-    virtual_motion(job, chain, proximity, asked, wrench_bar_w, wrench_bar_v, contacts, 0, virtual, there)
+    virtual_motion(job, chain, proximity, links, asked, wrench_bar_w, wrench_bar_v, contacts, 0, virtual, there)
     if contacts.count > 0:
         for k in range(contacts.count):
             force_bar_k = force_bar + wp.cross(moment_bar, contact_row(contacts.point, k))
@@ -422,18 +426,14 @@ def reverse_step(
         gradients.contacts[index].degenerate = gradients.contacts[index].degenerate + degenerate
         for k in range(contacts.count):
             contacts.push[k] = velocity_block(contacts, k) * contact_row(contacts.multiplier, k) * (-h)
-        virtual_motion(job, chain, proximity, asked, wrench_bar_w, wrench_bar_v, contacts, 1, virtual, there)
+        virtual_motion(job, chain, proximity, links, asked, wrench_bar_w, wrench_bar_v, contacts, 1, virtual, there)
     on.ww = wrench_bar_w
     on.wv = wrench_bar_v
     for i in range(job.links):
-        at = row(chain.node, i)
         mu = row(virtual, i)
-        ww = joint_axes(chain, i) * mu[0] + row(chain.axis2, i) * mu[1]
-        if wp.static(hinges == 3):
-            if i % 2 == 1:
-                ww = ww + row(chain.axis3, i) * mu[2]
-        on.ww = on.ww + ww
-        on.wv = on.wv + wp.cross(at, ww)
+        for d in range(hinges_of(i)):
+            on.ww = on.ww + hinge_row(links.axis, wp.static(hinges) * i + d) * mu[d]
+            on.wv = on.wv + hinge_row(links.moment, wp.static(hinges) * i + d) * mu[d]
 
     # Up the chain.
     lag = wp.max(h, job.beta)
@@ -493,14 +493,12 @@ def reverse_step(
         angle_bar = gradients.angle[i, index]
         rate_bar = gradients.rate[i, index]
         lag_bar = zero
-        s2 = row(chain.axis2, i)
-        s1 = joint_axes(chain, i)
+        s1 = hinge_row(links.axis, wp.static(hinges) * i)
+        s2 = hinge_row(links.axis, wp.static(hinges) * i + 1)
         if wp.static(hinges == 3):
             if i % 2 == 1:
-                s3 = row(chain.axis3, i)
-                # Half of the rest bend comes behind the twist, about the axis that is then z.
-                behind = s2 * wp.cos(angle[2]) - wp.cross(s2, s3) * wp.sin(angle[2])
-                add(gradients, BEND, i, index, wp.dot(behind, bar.turn))
+                s3 = hinge_row(links.axis, wp.static(hinges) * i + 2)
+                add(gradients, BEND, i, index, wp.dot(row(links.behind, i), bar.turn))
                 pulled = spring(gradients, TORSION, i, index, inertia.torsion, angle[2], rate[2] + h * a[2], lag, mu[2])
                 angle_bar[2] = angle_bar[2] + wp.dot(s3, bar.turn) + pulled
                 rate_bar[2] = rate_bar[2] + lag * pulled
@@ -517,8 +515,7 @@ def reverse_step(
         lag_bar = lag_bar + pulled1 * (rate[0] + h * a[0]) + pulled2 * (rate[1] + h * a[1])
         if job.beta > h:
             gradients.beta[index] = gradients.beta[index] + lag_bar
-        before = s2 * wp.cos(angle[0]) - wp.cross(s1, s2) * wp.sin(angle[0])
-        add(gradients, BEND, i, index, wp.dot(before, bar.turn))
+        add(gradients, BEND, i, index, wp.dot(row(links.before, i), bar.turn))
         gradients.angle[i, index] = angle_bar
         gradients.rate[i, index] = rate_bar
         if reading >= 0:

@@ -1,9 +1,33 @@
 """Twist, acceleration and virtual motion of a link, carried over a hinge: down the chain, and back with derivatives."""
 
+from typing import Any
+
 import warp as wp
 
-from ..algebra import vec3
-from ..parameters import real
+from ..algebra import reader, vec3
+from ..parameters import capacity, hinges, real
+from ..state import PerLink3
+
+PerHinge3: Any = wp.types.matrix((hinges * capacity, 3), real)
+
+
+@wp.struct
+class StepLinks:
+    """Hinges of all links in a recorded step; hinge d of link i stands at hinges · i + d."""
+
+    axis: PerHinge3
+    moment: PerHinge3
+    """Axis about the base point, p × s."""
+    vw: PerHinge3
+    """Twist of the body before the hinge."""
+    vv: PerHinge3
+    before: PerLink3
+    """Axis z before the hinges, about which the link bends at rest."""
+    behind: PerLink3
+    """The same behind them, where the joint twists."""
+
+
+hinge_row = reader((PerHinge3, vec3))
 
 
 @wp.struct
@@ -96,27 +120,41 @@ class FieldTangents:
 
 
 @wp.func
+def hinges_of(i: int) -> int:
+    """Return how many hinges the joint of a link has."""
+    if wp.static(hinges == 3) and i % 2 == 1:
+        return 3
+    return 2
+
+
+@wp.func
 def move_hinge(
-    on: wp.ref[Fields],
+    links: wp.ref[StepLinks],
+    j: int,
     moved: wp.ref[FieldTangents],
     at: vec3,
-    s: vec3,
     rate: real,
     acceleration: real,
     angle_d: real,
     rate_d: real,
+    axis_d: wp.ref[PerHinge3],
+    moment_d: wp.ref[PerHinge3],
 ):
-    """Go from the body before a hinge to that behind it, with the change of both at a fixed acceleration."""
-    m = wp.cross(at, s)
+    """Take the change of the fields over hinge j, at a fixed acceleration; write those of its axis and moment."""
+    s = hinge_row(links.axis, j)
+    m = hinge_row(links.moment, j)
+    vw = hinge_row(links.vw, j)
+    vv = hinge_row(links.vv, j)
     s_d = wp.cross(moved.turn, s)
     m_d = wp.cross(moved.at, s) + wp.cross(at, s_d)
-    turning = wp.cross(on.vw, s)
-    moving = wp.cross(on.vw, m) + wp.cross(on.vv, s)
-    turning_d = wp.cross(moved.vw, s) + wp.cross(on.vw, s_d)
-    moving_d = wp.cross(moved.vw, m) + wp.cross(on.vw, m_d) + wp.cross(moved.vv, s) + wp.cross(on.vv, s_d)
-    moved.aw = moved.aw + turning_d * rate + turning * rate_d + s_d * acceleration
-    moved.av = moved.av + moving_d * rate + moving * rate_d + m_d * acceleration
+    # Of vw × s and vw × m + vv × s, each times the rate.
+    turning_d = wp.cross(moved.vw * rate + vw * rate_d, s) + wp.cross(vw, s_d * rate)
+    moving_d = wp.cross(moved.vw * rate + vw * rate_d, m) + wp.cross(vw, m_d * rate)
+    moving_d = moving_d + wp.cross(moved.vv * rate + vv * rate_d, s) + wp.cross(vv, s_d * rate)
+    moved.aw = moved.aw + turning_d + s_d * acceleration
+    moved.av = moved.av + moving_d + m_d * acceleration
     moved.vw = moved.vw + s_d * rate + s * rate_d
     moved.vv = moved.vv + m_d * rate + m * rate_d
     moved.turn = moved.turn + s * angle_d
-    add_hinge(on, at, s, rate, acceleration, real(0.0))
+    axis_d[j] = s_d
+    moment_d[j] = m_d

@@ -17,9 +17,9 @@ from brainbench.stimuli.engines.rod.limits import CREVICE, MESH
 from ..algebra import JointVector, Wrench, rotate, symmetric_times, unrotate, vec3
 from ..articulated_body import ChainState, ProximityState
 from ..delassus import PerContact3
-from ..motion import BodyMotion, MotionArrays, elapsed, pose_from
+from ..motion import MotionArrays, elapsed, pose_from
 from ..parameters import hinges, module_options, real
-from ..state import ChainArrays, JobArrays, MotionArrays, PerLink3, PerLinkJoint, ShapeArrays, StepOptions, WhiskerJob, row
+from ..state import ChainArrays, JobArrays, PerLink3, PerLinkJoint, ShapeArrays, StepOptions, WhiskerJob, row
 from ..step import load_job
 from .chain import (
     AXIAL,
@@ -33,14 +33,13 @@ from .chain import (
     TORSION,
     TRANSVERSE,
     StepFrame,
-    joint_axes,
     restore_step,
     spring_state,
     virtual_motion,
 )
 from .contacts import AdjointContacts, ContactSystem, build_system, contact_row, solve_system, unit, velocity_block
 from .dense import DenseSystem
-from .fields import Fields, FieldTangents, add_hinge, move_hinge
+from .fields import Fields, FieldTangents, PerHinge3, StepLinks, add_hinge, hinge_row, hinges_of, move_hinge
 from .pose import move_pose
 from .records import ContactRecord, StepRecords
 from .surfaces import size_cotangent
@@ -91,6 +90,23 @@ class OutputTangents:
 
 
 @wp.struct
+class LinkFields:
+    """Twist and acceleration of each link, velocity and acceleration of its centre, and loads."""
+
+    vw: PerLink3
+    vv: PerLink3
+    aw: PerLink3
+    av: PerLink3
+    vc: PerLink3
+    ac: PerLink3
+    own: PerLink3
+    """Moment of its thin part about its centre, over axial less transverse inertia."""
+    moment: PerLink3
+    """Moment and force on it and on all behind it."""
+    force: PerLink3
+
+
+@wp.struct
 class ContactTangent:
     """Change of a contact at fixed accelerations and forces."""
 
@@ -102,7 +118,6 @@ class ContactTangent:
 def move_contact(
     motions: MotionArrays,
     shapes: ShapeArrays,
-    options: StepOptions,
     tangents: PackedTangents,
     contacts: wp.ref[AdjointContacts],
     k: int,
@@ -110,7 +125,7 @@ def move_contact(
     frame: StepFrame,
     p: int,
     index: int,
-    on: Fields,
+    turning: vec3,
     moved: FieldTangents,
     base_place: vec3,
     at: vec3,
@@ -121,7 +136,8 @@ def move_contact(
 ) -> ContactTangent:
     """Return the change of a contact's point and of its condition c; the reverse of ``surfaces.reverse_contact``.
 
-    ``radii`` are those at both ends of the link. ``link`` goes from the joint ``at`` to its far end.
+    ``turning`` is the angular velocity of the link at the end of the step, ``radii`` are those at both of its ends;
+    ``link`` goes from the joint ``at`` to its far end.
     """
     zero = real(0.0)
     h = frame.length
@@ -173,7 +189,7 @@ def move_contact(
     half_d = move_pose(motions, tangents.knots, p, shapes.track[shape], frame.middle)
     v = contact_row(contacts.velocity, k)
     v_d = moved.vv + (moved.av + tangents.gravity[p, index]) * h
-    v_d = v_d + wp.cross(moved.vw + moved.aw * h, point) + wp.cross(on.vw + on.aw * h, found.point)
+    v_d = v_d + wp.cross(moved.vw + moved.aw * h, point) + wp.cross(turning, found.point)
     v_d = v_d - half_d.velocity - wp.cross(half_d.spin, point - half.place)
     v_d = v_d - wp.cross(half.spin, found.point - (half_d.place - base_place))
 
@@ -197,20 +213,6 @@ def move_contact(
     sliding = u * (contact.friction * pressed_d + friction_d * pressed) - n_d * pressed - n * pressed_d - across
     found.condition = found.condition + n * wp.dot(n_d, v) + sliding * scale
     return found
-
-
-@wp.func
-def hinge_load(
-    s: vec3, at: vec3, turn: vec3, at_d: vec3, load: Wrench, load_d: Wrench
-) -> real:
-    """Return the change of the moment about a hinge of the loads behind it."""
-    s_d = wp.cross(turn, s)
-    return (
-        wp.dot(s_d, load.moment)
-        + wp.dot(s, load_d.moment)
-        + wp.dot(wp.cross(at_d, s) + wp.cross(at, s_d), load.force)
-        + wp.dot(wp.cross(at, s), load_d.force)
-    )
 
 
 @wp.func
@@ -242,10 +244,11 @@ def tangent_step(
     index = job.index
     chain = ChainState()
     proximity = ProximityState()
+    links = StepLinks()
     contacts = AdjointContacts()
-    last = Fields()
+    on = Fields()
     frame = restore_step(
-        chains, motions, shapes, jobs, options, records, job, place, chain, proximity, contacts, last
+        chains, motions, shapes, jobs, options, records, job, place, chain, proximity, links, contacts, on
     )  # fmt: skip
     h = frame.length
     pose = frame.pose
@@ -253,10 +256,51 @@ def tangent_step(
     if contacts.count > 0:
         build_system(job, chain, proximity, contacts, system, h, 1, matrix)
     lag = wp.max(h, job.beta)
-    turned = PerLink3()
-    placed = PerLink3()
-    moment = PerLink3()
-    force = PerLink3()
+    # What the changes of all parameters share: fields of each link, and the load on and behind it.
+    fields = LinkFields()
+    on.vw = pose.spin
+    on.vv = pose.velocity
+    on.aw = frame.base.angular
+    on.av = frame.base.linear
+    for i in range(job.links):
+        inertia = chains.inertia[i, job.whisker]
+        at = row(chain.node, i)
+        rate = row(chain.rate, i)
+        a = records.acceleration[place, i, index]
+        for d in range(hinges_of(i)):
+            add_hinge(on, at, hinge_row(links.axis, wp.static(hinges) * i + d), rate[d], a[d], zero)
+        x = (row(chain.node, i + 1) - at) / chains.build[i, job.whisker].length
+        com = at + x * inertia.centre
+        vc = on.vv + wp.cross(on.vw, com)
+        ac = on.av + wp.cross(on.aw, com) + wp.cross(on.vw, vc)
+        whirl = wp.cross(on.vw, x)
+        own = x * wp.dot(x, on.aw) + whirl * wp.dot(x, on.vw)
+        fields.vw[i] = on.vw
+        fields.vv[i] = on.vv
+        fields.aw[i] = on.aw
+        fields.av[i] = on.av
+        fields.vc[i] = vc
+        fields.ac[i] = ac
+        fields.own[i] = own
+        f = ac * chains.build[i, job.whisker].mass
+        m = wp.cross(com, f) + on.aw * inertia.transverse + own * (inertia.axial - inertia.transverse)
+        for load in range(job.first_load, job.end_load):
+            if jobs.load_link[load] == i and elapsed(frame.now) < jobs.load_stop[load]:
+                pull = jobs.load_force[load]
+                f = f - pull
+                m = m - wp.cross(at + (row(chain.node, i + 1) - at) * jobs.load_share[load], pull)
+        for k in range(contacts.count):
+            if contact_row(contacts.link, k) == i:
+                f = f - contact_row(contacts.force, k)
+                m = m - wp.cross(contact_row(contacts.point, k), contact_row(contacts.force, k))
+        fields.force[i] = f
+        fields.moment[i] = m
+    for back in range(1, job.links):
+        i = job.links - 1 - back
+        fields.force[i] = row(fields.force, i) + row(fields.force, i + 1)
+        fields.moment[i] = row(fields.moment, i) + row(fields.moment, i + 1)
+    axis_d = PerHinge3()
+    arm_d = PerHinge3()
     moment_d = PerLink3()
     force_d = PerLink3()
     asked = PerLinkJoint()
@@ -270,11 +314,6 @@ def tangent_step(
         lag_d = zero
         if job.beta > h:
             lag_d = tangents.beta[p, index]
-        on = Fields()
-        on.vw = pose.spin
-        on.vv = pose.velocity
-        on.aw = frame.base.angular
-        on.av = frame.base.linear
         moved = FieldTangents()
         moved.turn = pose_d.turn
         moved.vw = pose_d.spin
@@ -283,67 +322,52 @@ def tangent_step(
         moved.av = (after_d.velocity - pose_d.velocity) / h - tangents.gravity[p, index]
         moved.av = moved.av - wp.cross(pose_d.spin, pose.velocity) - wp.cross(pose.spin, pose_d.velocity)
 
-        # Down the chain: fields, and the load of each link on it.
+        # Down the chain: fields, and the load on each link.
         for i in range(job.links):
             build = chains.build[i, job.whisker]
             inertia = chains.inertia[i, job.whisker]
             at = row(chain.node, i)
-            x = (row(chain.node, i + 1) - at) / build.length
-            angle = row(chain.angle, i)
+            span = row(chain.node, i + 1) - at
+            x = span / build.length
             rate = row(chain.rate, i)
             a = records.acceleration[place, i, index]
             angle_d = tangents.angle[p, i, index]
             rate_d = tangents.rate[p, i, index]
-            s2 = row(chain.axis2, i)
-            s1 = joint_axes(chain, i)
             bend_d = tangents.link[p, wp.static(BEND), i, index]
-            moved.turn = moved.turn + (s2 * wp.cos(angle[0]) - wp.cross(s1, s2) * wp.sin(angle[0])) * bend_d
-            turned[i] = moved.turn
-            placed[i] = moved.at
-            move_hinge(on, moved, at, s1, rate[0], a[0], angle_d[0], rate_d[0])
-            move_hinge(on, moved, at, s2, rate[1], a[1], angle_d[1], rate_d[1])
+            moved.turn = moved.turn + row(links.before, i) * bend_d
+            for d in range(hinges_of(i)):
+                j = wp.static(hinges) * i + d
+                move_hinge(links, j, moved, at, rate[d], a[d], angle_d[d], rate_d[d], axis_d, arm_d)
             if wp.static(hinges == 3):
-                if i % 2 == 1:
-                    s3 = row(chain.axis3, i)
-                    move_hinge(on, moved, at, s3, rate[2], a[2], angle_d[2], rate_d[2])
-                    behind = s2 * wp.cos(angle[2]) - wp.cross(s2, s3) * wp.sin(angle[2])
-                    moved.turn = moved.turn + behind * bend_d
+                moved.turn = moved.turn + row(links.behind, i) * bend_d
             x_d = wp.cross(moved.turn, x)
             length_d = tangents.link[p, wp.static(LENGTH), i, index]
-            mass_d = tangents.link[p, wp.static(MASS), i, index]
+            span_d = x_d * build.length + x * length_d
             transverse_d = tangents.link[p, wp.static(TRANSVERSE), i, index]
             thin = inertia.axial - inertia.transverse
             thin_d = tangents.link[p, wp.static(AXIAL), i, index] - transverse_d
+            vw = row(fields.vw, i)
+            aw = row(fields.aw, i)
+            ac = row(fields.ac, i)
             com = at + x * inertia.centre
             com_d = moved.at + x_d * inertia.centre + x * tangents.link[p, wp.static(CENTRE), i, index]
-            vc = on.vv + wp.cross(on.vw, com)
-            vc_d = moved.vv + wp.cross(moved.vw, com) + wp.cross(on.vw, com_d)
-            ac = on.av + wp.cross(on.aw, com) + wp.cross(on.vw, vc)
-            ac_d = moved.av + wp.cross(moved.aw, com) + wp.cross(on.aw, com_d)
-            ac_d = ac_d + wp.cross(moved.vw, vc) + wp.cross(on.vw, vc_d)
-            xa = wp.dot(x, on.aw)
-            xv = wp.dot(x, on.vw)
-            whirl = wp.cross(on.vw, x)
-            own = x * xa + whirl * xv
-            own_d = x_d * xa + x * (wp.dot(x_d, on.aw) + wp.dot(x, moved.aw))
-            own_d = own_d + (wp.cross(moved.vw, x) + wp.cross(on.vw, x_d)) * xv
-            own_d = own_d + whirl * (wp.dot(x_d, on.vw) + wp.dot(x, moved.vw))
-            f = ac * build.mass
-            f_d = ac_d * build.mass + ac * mass_d
-            m = wp.cross(com, f) + on.aw * inertia.transverse + own * thin
-            m_d = wp.cross(com_d, f) + wp.cross(com, f_d) + own * thin_d + own_d * thin
-            m_d = m_d + on.aw * transverse_d + moved.aw * inertia.transverse
+            vc_d = moved.vv + wp.cross(moved.vw, com) + wp.cross(vw, com_d)
+            ac_d = moved.av + wp.cross(moved.aw, com) + wp.cross(aw, com_d)
+            ac_d = ac_d + wp.cross(moved.vw, row(fields.vc, i)) + wp.cross(vw, vc_d)
+            own_d = x_d * wp.dot(x, aw) + x * (wp.dot(x_d, aw) + wp.dot(x, moved.aw))
+            own_d = own_d + (wp.cross(moved.vw, x) + wp.cross(vw, x_d)) * wp.dot(x, vw)
+            own_d = own_d + wp.cross(vw, x) * (wp.dot(x_d, vw) + wp.dot(x, moved.vw))
+            f_d = ac_d * build.mass + ac * tangents.link[p, wp.static(MASS), i, index]
+            m_d = wp.cross(com_d, ac * build.mass) + wp.cross(com, f_d) + row(fields.own, i) * thin_d + own_d * thin
+            m_d = m_d + aw * transverse_d + moved.aw * inertia.transverse
             for load in range(job.first_load, job.end_load):
                 if jobs.load_link[load] == i and elapsed(frame.now) < jobs.load_stop[load]:
                     pull = jobs.load_force[load]
                     pull_d = tangents.load_force[p, load]
-                    along = build.length * jobs.load_share[load]
-                    along_d = length_d * jobs.load_share[load] + build.length * tangents.load_share[p, load]
-                    f = f - pull
+                    share = jobs.load_share[load]
+                    reach_d = moved.at + span_d * share + span * tangents.load_share[p, load]
                     f_d = f_d - pull_d
-                    arm = at + x * along
-                    m = m - wp.cross(arm, pull)
-                    m_d = m_d - wp.cross(arm, pull_d) - wp.cross(moved.at + x_d * along + x * along_d, pull)
+                    m_d = m_d - wp.cross(at + span * share, pull_d) - wp.cross(reach_d, pull)
             for k in range(contacts.count):
                 if contact_row(contacts.link, k) == i:
                     contact = records.contact[place, k, index]
@@ -354,66 +378,52 @@ def tangent_step(
                         tangents.link[p, wp.static(END_RADIUS), i, index],
                         zero,
                     )
+                    turning = vw + aw * h
                     changed = move_contact(
-                        motions, shapes, options, tangents, contacts, k, contact, frame, p, index, on, moved,
-                        pose_d.place, at, x * build.length, x_d * build.length + x * length_d, radii, radii_d
+                        motions, shapes, tangents, contacts, k, contact, frame, p, index, turning, moved,
+                        pose_d.place, at, span, span_d, radii, radii_d
                     )  # fmt: skip
                     point_d[k] = changed.point
                     missed[k] = changed.condition
-                    f = f - contact.force
-                    m = m - wp.cross(contact_row(contacts.point, k), contact.force)
                     m_d = m_d - wp.cross(changed.point, contact.force)
-            moment[i] = m
-            force[i] = f
             moment_d[i] = m_d
             force_d[i] = f_d
-            moved.at = moved.at + x_d * build.length + x * length_d
+            moved.at = moved.at + span_d
             if frame.reading >= 0:
                 outputs.points[p, frame.reading, i + 1, index] = moved.at
 
         # Up the chain: what the joints miss.
-        total = Wrench()
-        total.moment = none
-        total.force = none
         total_d = Wrench()
         total_d.moment = none
         total_d.force = none
         for back in range(job.links):
             i = job.links - 1 - back
             inertia = chains.inertia[i, job.whisker]
-            at = row(chain.node, i)
-            at_d = row(placed, i)
-            total.moment = total.moment + row(moment, i)
-            total.force = total.force + row(force, i)
             total_d.moment = total_d.moment + row(moment_d, i)
             total_d.force = total_d.force + row(force_d, i)
             angle = row(chain.angle, i)
             rate = row(chain.rate, i) + records.acceleration[place, i, index] * h
             angle_d = tangents.angle[p, i, index]
             rate_d = tangents.rate[p, i, index]
-            stiffness_d = tangents.link[p, wp.static(STIFFNESS), i, index]
-            s2 = row(chain.axis2, i)
-            s1 = joint_axes(chain, i)
-            turn = row(turned, i)
             due = JointVector()
-            due[0] = -hinge_load(s1, at, turn, at_d, total, total_d) - spring_load(
-                inertia.stiffness, stiffness_d, angle[0], angle_d[0], rate[0], rate_d[0], lag, lag_d
-            )
-            turn = turn + s1 * angle_d[0]
-            due[1] = -hinge_load(s2, at, turn, at_d, total, total_d) - spring_load(
-                inertia.stiffness, stiffness_d, angle[1], angle_d[1], rate[1], rate_d[1], lag, lag_d
-            )
-            if wp.static(hinges == 3):
-                if i % 2 == 1:
-                    torsion_d = tangents.link[p, wp.static(TORSION), i, index]
-                    turn = turn + s2 * angle_d[1]
-                    due[2] = -hinge_load(row(chain.axis3, i), at, turn, at_d, total, total_d) - spring_load(
-                        inertia.torsion, torsion_d, angle[2], angle_d[2], rate[2], rate_d[2], lag, lag_d
-                    )
+            for d in range(hinges_of(i)):
+                j = wp.static(hinges) * i + d
+                stiffness = inertia.stiffness
+                stiffness_d = tangents.link[p, wp.static(STIFFNESS), i, index]
+                if wp.static(hinges == 3):
+                    if d == 2:
+                        stiffness = inertia.torsion
+                        stiffness_d = tangents.link[p, wp.static(TORSION), i, index]
+                due[d] = -spring_load(stiffness, stiffness_d, angle[d], angle_d[d], rate[d], rate_d[d], lag, lag_d) - (
+                    wp.dot(hinge_row(axis_d, j), row(fields.moment, i))
+                    + wp.dot(hinge_row(links.axis, j), total_d.moment)
+                    + wp.dot(hinge_row(arm_d, j), row(fields.force, i))
+                    + wp.dot(hinge_row(links.moment, j), total_d.force)
+                )
             asked[i] = due
 
         # Accelerations without a change of contact forces, then with it.
-        held = virtual_motion(job, chain, proximity, asked, none, none, contacts, 0, virtual, there)
+        held = virtual_motion(job, chain, proximity, links, asked, none, none, contacts, 0, virtual, there)
         contact_d = Wrench()
         contact_d.moment = none
         contact_d.force = none
@@ -431,7 +441,7 @@ def tangent_step(
                 contact_d.moment = contact_d.moment + wp.cross(
                     contact_row(point_d, k), contact_row(contacts.force, k)
                 )
-            held = virtual_motion(job, chain, proximity, asked, none, none, contacts, 1, virtual, there)
+            held = virtual_motion(job, chain, proximity, links, asked, none, none, contacts, 1, virtual, there)
         if frame.reading >= 0:
             outputs.wrench[p, frame.reading, 0, index] = total_d.moment - held.moment
             outputs.wrench[p, frame.reading, 1, index] = total_d.force - held.force
