@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from brainbench.core.devices import pick_device
+from brainbench.core.devices import pick_device, usable_processors
 from brainbench.core.errors import UsageError
 from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.engines.planarity import stays_in_plane
@@ -31,6 +32,7 @@ from brainbench.stimuli.engines.trust import check_jobs
 from brainbench.stimuli.gradients.events import ContactEvents, contact_events
 from brainbench.stimuli.whiskers.chain import build_chain
 
+T, R = TypeVar("T"), TypeVar("R")
 Build = Callable[[NDArray[np.float64]], Sequence[Job]]
 """Values of the parameters [p] → jobs, of the same kind and number for all values."""
 Given = Sequence[NDArray[np.float64] | None]
@@ -185,9 +187,11 @@ class GradientRun:
             job = task.job
             key = (capacity_for(task.chain.links), job.times.tobytes(), job.start, tuple(job.gravity), task.twists)
             alike.setdefault(key, []).append(index)
-        traces: dict[int, Trace] = {}
-        groups = []
-        for indices in alike.values():
+        # A processor takes the jobs of a launch one by one, so that each of its threads has a launch of its own.
+        threads = 1 if self.device.is_cuda else usable_processors()
+        parts = [part for some in alike.values() for start in range(threads) if (part := some[start::threads])]
+
+        def simulate(indices: Sequence[int]) -> tuple[_Group, list[Trace]]:
             some = [tasks[index] for index in indices]
             packed = PackedTasks.of(some, shared=False)
             needs = packed.shapes.needs
@@ -195,10 +199,12 @@ class GradientRun:
             if steps is not None:
                 solver.steps[packed.jobs.whisker] = [steps[index] for index in indices]
             result = packed.launch(solver, record_shape=True)
-            for row, index in enumerate(indices):
-                traces[index] = trace_of(result, row, some[row].job, self.fidelity, 0.0)
-            groups.append(_Group(tuple(indices), packed, solver, PackedPlaces.of(packed)))
-        return [traces[index] for index in range(len(tasks))], groups
+            found = [trace_of(result, row, task.job, self.fidelity, 0.0) for row, task in enumerate(some)]
+            return _Group(tuple(indices), packed, solver, PackedPlaces.of(packed)), found
+
+        launches = _at_once(simulate, parts)
+        traces = {index: trace for group, found in launches for index, trace in zip(group.indices, found, strict=True)}
+        return [traces[index] for index in range(len(tasks))], [group for group, _ in launches]
 
     @cached_property
     def changes(self) -> list[list[Numbers]]:
@@ -230,8 +236,8 @@ class GradientRun:
         given: list[Given] = [[None] * count if some is None else some for some in outputs]
         by_job = np.zeros((count, len(self.values)))
         events: dict[int, ContactEvents] = {}
-        for group in self._groups:
-            found = group.solver.reverse(self._outputs(group, given))
+        passes = _at_once(lambda group: group.solver.reverse(self._outputs(group, given)), self._groups)
+        for group, found in zip(self._groups, passes, strict=True):
             for row, index in enumerate(group.indices):
                 trace = self.traces[index]
                 events[index] = contact_events(found["contacts"][row], trace.reason)
@@ -252,18 +258,22 @@ class GradientRun:
         needs, where :meth:`gradient` gives those of one number by any number of parameters.
         """
         found: dict[int, Tangents] = {}
-        for group in self._groups:
+        changes = self.changes
+
+        def forward(group: _Group) -> dict[str, NDArray[np.float64]]:
             shapes = group.solver.packed_shapes
             arrays = {name: np.zeros((len(self.values), *shape)) for name, shape in shapes.items()}
             for row, index in enumerate(group.indices):
-                for p, change in enumerate(of_jobs[index] for of_jobs in self.changes):
+                for p, change in enumerate(of_jobs[index] for of_jobs in changes):
                     mine = {name: values[p] for name, values in arrays.items()}
                     for name in change.keys() - {"positions"}:
                         packed_part(mine, name, group.places[row], row)[...] = change[name]
-            results = group.solver.forward(arrays)
+            return group.solver.forward(arrays)
+
+        for group, results in zip(self._groups, _at_once(forward, self._groups), strict=True):
             for row, index in enumerate(group.indices):
                 points = results["points"][:, row, :, : group.places[row].links + 1]
-                for p, change in enumerate(of_jobs[index] for of_jobs in self.changes):
+                for p, change in enumerate(of_jobs[index] for of_jobs in changes):
                     if "positions" in change:
                         points[p] += change["positions"][:, None]
                 parts = results["wrench"][:, row], points, results["contact_wrench"][:, row]
@@ -281,6 +291,12 @@ class GradientRun:
                 if value is not None:
                     array[row][tuple(slice(n) for n in np.shape(value))] = value
         return OutputDerivatives(*arrays)
+
+
+def _at_once(function: Callable[[T], R], items: Sequence[T]) -> list[R]:
+    """Return the function's results in order; launches on a processor leave the interpreter free."""
+    with ThreadPoolExecutor(max_workers=min(len(items), usable_processors())) as pool:
+        return list(pool.map(function, items))
 
 
 def _leaves_plane(task: JobTask, job: Job) -> bool:

@@ -169,7 +169,9 @@ class RecordingSolver(WhiskerSolver):
             state = (some, self.capacity, count)
             tangents = allocate(kernels.PackedTangents, device, angle=state, rate=state)
             for name, values in changes.items():
-                setattr(tangents, name, wp.array(values, dtype=kernels.PackedTangents.vars[name].type.dtype, device=device))
+                setattr(
+                    tangents, name, wp.array(values, dtype=kernels.PackedTangents.vars[name].type.dtype, device=device)
+                )
             system = allocate(
                 kernels.ContactSystem, device, unit=(3 * contacts_for(self.capacity), self.capacity, count)
             )
@@ -182,7 +184,9 @@ class RecordingSolver(WhiskerSolver):
             for records in self._segments(self.checkpoints):
                 arguments = [chains, motions, shapes, jobs, options, records, system, tangents, outputs]
                 wp.launch(kernels.tangent_segment, count, arguments, device=device)
-            found = {name: np.moveaxis(getattr(outputs, name).numpy(), 3, 1) for name in ("wrench", "points", "contact")}
+            found = {
+                name: np.moveaxis(getattr(outputs, name).numpy(), 3, 1) for name in ("wrench", "points", "contact")
+            }
         units = np.array([MILLI, MICRO])[:, None]
         # The kernels find the wrench of the base on the whisker, moment first.
         return {

@@ -281,9 +281,7 @@ def build_system(
 
 
 @wp.func
-def solve_system(
-    contacts: wp.ref[AdjointContacts], matrix: wp.ref[DenseSystem], asked: wp.ref[PerContact3]
-) -> int:
+def solve_system(contacts: wp.ref[AdjointContacts], matrix: wp.ref[DenseSystem], asked: wp.ref[PerContact3]) -> int:
     """Solve the system in place for the multipliers, or for the change of the forces in their place.
 
     Returned is 1 where contacts share a load in more than one way.

@@ -438,9 +438,7 @@ def tangent_step(
                 contacts.push[k] = push
                 contact_d.force = contact_d.force + push
                 contact_d.moment = contact_d.moment + wp.cross(contact_row(contacts.point, k), push)
-                contact_d.moment = contact_d.moment + wp.cross(
-                    contact_row(point_d, k), contact_row(contacts.force, k)
-                )
+                contact_d.moment = contact_d.moment + wp.cross(contact_row(point_d, k), contact_row(contacts.force, k))
             held = virtual_motion(job, chain, proximity, links, asked, none, none, contacts, 1, virtual, there)
         if frame.reading >= 0:
             outputs.wrench[p, frame.reading, 0, index] = total_d.moment - held.moment
