@@ -3,9 +3,9 @@
 python -m benchmarks.whiskers.gradients [--scenes 50] [--write]
 
 Of each scene four random sums of its readings are differentiated, once of base wrenches, shapes and contact forces, by
-every parameter, forward; of the first of them the adjoint is held against that. Central differences are those of the same runs in double precision, with changes of 1e-5 and 1e-6 of
-the parameter's scale. Where these two differ by more than .3 %, and by more than rounding, or runs take other steps, a
-change of contact lies between: the scene counts as an event for this parameter, and no error is taken.
+every parameter, forward; of the first of them the adjoint is held against that. Central differences are those of the
+same runs in double precision, with changes of 1e-5 and 1e-6 of the parameter's scale. Where these two differ by more
+than .3 %, and by more than rounding, or runs take other steps, a change of contact lies between: the scene counts as an event for this parameter, and no error is taken.
 """
 
 from __future__ import annotations
@@ -236,6 +236,8 @@ def report(results: dict[str, Comparison], refused: int) -> str:
         for name, found in results.items()
         if found.events and found.status == "smooth"
     ]
+    told = ", ".join(f"{what} {count}" for what, count in close.items())
+    worst = [f"{np.median(cost):.2f} [{np.max(cost):.2f}]" for cost in (forward, reverse, both, each)]
     return (
         f"Relative error (%) of the derivatives of {SUMS} random sums of base wrenches, of shapes and of contact "
         "forces, the worst of the three, beside central differences in double precision. *event*: a change of contact "
@@ -245,15 +247,13 @@ def report(results: dict[str, Comparison], refused: int) -> str:
         f"{sum(found.status == 'one-sided' for found in random)}; degenerate: "
         f"{sum(found.status == 'degenerate' for found in random)}.\n\n"
         + table(head, rows)
-        + f"\nClose to a change of contact, scenes: {', '.join(f'{what} {count}' for what, count in close.items())}. Events "
-        f"without a flag: {'; '.join(missed) or 'none'}. Adjoint and forward derivatives differ by up to "
-        f"{max(found.apart for found in results.values()):.0e} of the largest.\n"
-        "\nProcessor time over that of the ordinary run (one whisker in double precision with its shapes, contact forces "
-        f"to its own tolerance), median of all {len(results)} scenes [worst]: the recorded run, whose contact forces are "
-        f"solved to rounding, {np.median(forward):.2f} [{np.max(forward):.2f}]; going back over it "
-        f"{np.median(reverse):.2f} [{np.max(reverse):.2f}]; both {np.median(both):.2f} [{np.max(both):.2f}]. Packing for "
-        f"up to {len(names)} parameters is in these. Forward derivatives of all readings: {np.median(each):.2f} "
-        f"[{np.max(each):.2f}] for each parameter, where a central difference takes 2."
+        + f"\nRandom scenes close to a change of contact: {told}. Events without a flag: {'; '.join(missed) or 'none'}. "
+        f"Adjoint and forward derivatives differ by up to {max(found.apart for found in results.values()):.0e} of the "
+        "largest.\n\nProcessor time over that of the ordinary run (one whisker in double precision with its shapes, "
+        f"contact forces to its own tolerance), median of all {len(results)} scenes [worst]: the recorded run, whose "
+        f"contact forces are solved to rounding, {worst[0]}; going back over it {worst[1]}; both {worst[2]}. Packing for "
+        f"up to {len(names)} parameters is in these. Forward derivatives of all readings: {worst[3]} for each "
+        "parameter, where a central difference takes 2."
     )
 
 

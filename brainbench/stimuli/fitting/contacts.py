@@ -63,7 +63,7 @@ class ContactOptions:
         check_number("frames of one contact", self.frames, least=1, whole=True)
         if self.frames % 2 == 0:
             raise UsageError(
-                f"A frame has as many neighbours before as behind it: frames is odd; received {self.frames}."
+                f"frames counts a frame and as many before as behind it, so it is odd; received {self.frames}."
             )
 
 
@@ -328,8 +328,8 @@ class ContactSolver:
         elif deviation > VAGUE * abs(force):
             status, reason = (
                 "unreliable",
-                f"The shape tells the force to {100 * deviation / abs(force):.0f} % only; give the contact point, trace "
-                "more of the whisker, or let neighbouring frames share their contact (frames).",
+                f"The shape tells the force to {100 * deviation / abs(force):.0f} % only; give the contact point, "
+                "trace more of the whisker, or let neighbouring frames share their contact (frames).",
             )
         return ContactEstimate(
             force=force,

@@ -28,9 +28,12 @@ spheres, cylinders, faces, edges and corners by the second derivatives of the di
 Forces of recorded steps are solved to rounding, which those of the ordinary engine are not: the theorem holds at the
 solution.
 
-**Memory.** Runs whose steps take at most ``ROOM`` are written down as they go. Longer ones pause after every √steps steps,
-where the state is kept; going back, each segment is run again from there and written down, the same steps to the digit.
-Step lengths are those that the run took: derivatives are at a fixed sequence of steps.
+**Forward.** With a change of the state and of θ the same system, transposed, gives the changes of a and f: one solution a
+step for each parameter, and with it the derivatives of all readings (``kernels.adjoint.tangent``).
+
+**Memory.** Runs whose steps take at most ``ROOM`` are written down as they go. Longer ones pause after every √steps
+steps, where the state is kept; going back, each segment is run again from there and written down, the same steps to the
+digit. Step lengths are those that the run took: derivatives are at a fixed sequence of steps.
 """
 
 from __future__ import annotations
@@ -159,7 +162,7 @@ class RecordingSolver(WhiskerSolver):
         """
         from brainbench.stimuli.engines.rod.kernels import BUILDING, build_adjoint
 
-        wp, device, structs = warp(), self.device, self.kernels.structs
+        wp, device = warp(), self.device
         with BUILDING:
             kernels = build_adjoint(self.kernels, "tangent")
         chains, motions, shapes, jobs, options, readings, *_ = self.inputs
