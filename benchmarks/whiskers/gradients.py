@@ -5,7 +5,8 @@ python -m benchmarks.whiskers.gradients [--scenes 50] [--write]
 Of each scene four random sums of its readings are differentiated, once of base wrenches, shapes and contact forces, by
 every parameter, forward; of the first of them the adjoint is held against that. Central differences are those of the
 same runs in double precision, with changes of 1e-5 and 1e-6 of the parameter's scale. Where these two differ by more
-than .3 %, and by more than rounding, or runs take other steps, a change of contact lies between: the scene counts as an event for this parameter, and no error is taken.
+than .3 %, and by more than rounding, or runs take other steps, a change of contact lies between: the scene counts as an
+event for this parameter, and no error is taken.
 """
 
 from __future__ import annotations
@@ -247,12 +248,12 @@ def report(results: dict[str, Comparison], refused: int) -> str:
         f"{sum(found.status == 'one-sided' for found in random)}; degenerate: "
         f"{sum(found.status == 'degenerate' for found in random)}.\n\n"
         + table(head, rows)
-        + f"\nRandom scenes close to a change of contact: {told}. Events without a flag: {'; '.join(missed) or 'none'}. "
-        f"Adjoint and forward derivatives differ by up to {max(found.apart for found in results.values()):.0e} of the "
+        + f"\nRandom scenes close to a change of contact: {told}. Events without a flag: {'; '.join(missed) or 'none'}."
+        f" Adjoint and forward derivatives differ by up to {max(found.apart for found in results.values()):.0e} of the "
         "largest.\n\nProcessor time over that of the ordinary run (one whisker in double precision with its shapes, "
         f"contact forces to its own tolerance), median of all {len(results)} scenes [worst]: the recorded run, whose "
-        f"contact forces are solved to rounding, {worst[0]}; going back over it {worst[1]}; both {worst[2]}. Packing for "
-        f"up to {len(names)} parameters is in these. Forward derivatives of all readings: {worst[3]} for each "
+        f"contact forces are solved to rounding, {worst[0]}; going back over it {worst[1]}; both {worst[2]}. Packing "
+        f"for up to {len(names)} parameters is in these. Forward derivatives of all readings: {worst[3]} for each "
         "parameter, where a central difference takes 2."
     )
 

@@ -98,7 +98,9 @@ class DesignOptions:
     iterations: int = 12
     """Iterations of the search."""
     starts: int = 16
-    """Other motions that are tried before, spread over the bounds; the search goes on from the best."""
+    """Other motions that are tried before, spread over the bounds."""
+    searches: int = 3
+    """Best of these from which the search goes on."""
     seed: int = 0
     """Of these."""
 
@@ -174,16 +176,19 @@ def design(
     if not np.isfinite(first[0]):
         raise DataError("Whiskers are unstable with the given motion; simulate the scenes more finely.")
     order = np.argsort(-np.nan_to_num(first, nan=-math.inf))
-    found = minimize(
-        cost,
-        tried[order[0]],
-        jac=True,
-        bounds=[(0, 1)] * len(at),
-        method="L-BFGS-B",
-        options={"maxiter": options.iterations, "maxls": 8},
-    )
+    searches = [
+        minimize(
+            cost,
+            tried[index],
+            jac=True,
+            bounds=[(0, 1)] * len(at),
+            method="L-BFGS-B",
+            options={"maxiter": options.iterations, "maxls": 8},
+        ).x
+        for index in order[: options.searches]
+    ]
     # What is best at the coarse setting need not be at the finer one, which has the last word.
-    finalists = [begin, *(limits[:, 0] + x * width for x in (found.x, *(tried[index] for index in order[:3])))]
+    finalists = [begin, *(limits[:, 0] + x * width for x in (*searches, tried[order[0]]))]
     fine = _Evaluator(scenes, tuple(variables), replace(options, fidelity=options.check), backend)
     measured = fine.distances(finalists)
     best = int(np.argmax(np.nan_to_num([_soft_least(one)[0] for one in measured[1:]], nan=-math.inf))) + 1

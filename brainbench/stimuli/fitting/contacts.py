@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -235,7 +235,7 @@ class ContactSolver:
         across = residual(best.x)[: len(points)] * noise
         spread = math.sqrt(float(np.sum(across**2)) / max(len(points) - 4, 1))
         matrix = jacobian(best.x) * (1.0 if self.options.noise else noise / spread)
-        covariance = np.linalg.pinv(matrix.T @ matrix, rcond=1e-14)
+        covariance: Any = np.linalg.pinv(matrix.T @ matrix, rcond=1e-14)
         reason = "" if best.status > 0 else "The fit of the shape did not converge."
         return ShapeFit(best.x, covariance, spread, math.sqrt(float(np.mean(across**2))), reason)
 
@@ -264,19 +264,18 @@ class ContactSolver:
         covariance; the pose of the base follows its regression on them. Frames with forces of the other sign, or with
         no sign of a force by themselves, have no part and stay as they are.
         """
-        some = [self._logarithms(one) for one in fits]
+        some = {k: own for k, one in enumerate(fits) if (own := self._logarithms(one)) is not None}
         half, found = self.options.frames // 2, list(fits)
-        for index, own in enumerate(some):
-            near = range(max(index - half, 0), min(index + half + 1, len(fits)))
-            use = [k for k in near if some[k] is not None and fits[k].unknowns[4] * fits[index].unknowns[4] > 0]
-            if own is None or len(use) < 3:
+        for index, (value, spread, slope) in some.items():
+            near = range(index - half, index + half + 1)
+            use = [k for k in near if k in some and fits[k].unknowns[4] * fits[index].unknowns[4] > 0]
+            if len(use) < 3:
                 continue
             design = [np.kron([1.0, times[k] - times[index]], np.eye(2)) for k in use]
             weights = [np.linalg.inv(some[k][1]) for k in use]
             information = sum(d.T @ w @ d for d, w in zip(design, weights, strict=True))
             asked = sum(d.T @ w @ some[k][0] for d, w, k in zip(design, weights, use, strict=True))
             line, covariance = np.linalg.solve(information, asked), np.linalg.inv(information)[:2, :2]
-            value, spread, slope = own
             # Unknowns given the logarithms: the Gaussian law of the frame's own fit, conditioned on them.
             gain = fits[index].covariance @ slope.T @ np.linalg.inv(spread)
             moved = fits[index].unknowns + gain @ (line[:2] - value)

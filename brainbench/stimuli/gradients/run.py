@@ -32,7 +32,8 @@ from brainbench.stimuli.engines.trust import check_jobs
 from brainbench.stimuli.gradients.events import ContactEvents, contact_events
 from brainbench.stimuli.whiskers.chain import build_chain
 
-T, R = TypeVar("T"), TypeVar("R")
+T = TypeVar("T")
+R = TypeVar("R")
 Build = Callable[[NDArray[np.float64]], Sequence[Job]]
 """Values of the parameters [p] → jobs, of the same kind and number for all values."""
 Given = Sequence[NDArray[np.float64] | None]

@@ -28,8 +28,8 @@ spheres, cylinders, faces, edges and corners by the second derivatives of the di
 Forces of recorded steps are solved to rounding, which those of the ordinary engine are not: the theorem holds at the
 solution.
 
-**Forward.** With a change of the state and of θ the same system, transposed, gives the changes of a and f: one solution a
-step for each parameter, and with it the derivatives of all readings (``kernels.adjoint.tangent``).
+**Forward.** With a change of the state and of θ the same system, transposed, gives the changes of a and f: one solution
+a step for each parameter, and with it the derivatives of all readings (``kernels.adjoint.tangent``).
 
 **Memory.** Runs whose steps take at most ``ROOM`` are written down as they go. Longer ones pause after every √steps
 steps, where the state is kept; going back, each segment is run again from there and written down, the same steps to the
