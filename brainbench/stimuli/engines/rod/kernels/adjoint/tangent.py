@@ -91,12 +91,10 @@ class OutputTangents:
 
 @wp.struct
 class LinkFields:
-    """Twist and acceleration of each link, velocity and acceleration of its centre, and loads."""
+    """Angular velocity and acceleration of each link, velocity and acceleration of its centre, and loads."""
 
     vw: PerLink3
-    vv: PerLink3
     aw: PerLink3
-    av: PerLink3
     vc: PerLink3
     ac: PerLink3
     own: PerLink3
@@ -276,9 +274,7 @@ def tangent_step(
         whirl = wp.cross(on.vw, x)
         own = x * wp.dot(x, on.aw) + whirl * wp.dot(x, on.vw)
         fields.vw[i] = on.vw
-        fields.vv[i] = on.vv
         fields.aw[i] = on.aw
-        fields.av[i] = on.av
         fields.vc[i] = vc
         fields.ac[i] = ac
         fields.own[i] = own
