@@ -38,9 +38,9 @@ OUTPUTS = ("wrench", "shape", "contact force")
 SUMS = 4
 CHANGES = 1e-5, 1e-6
 SMOOTH = 3e-3
-ROUNDING = 1e-8
+ROUNDING = 1e-11
 """Share of what the outputs are worth below which two runs differ by rounding; searches for contacts end at less."""
-NOTHING = 1e-7
+NOTHING = 1e-6
 """Derivative, as a share of what the outputs are worth, below which there is nothing to compare."""
 
 
