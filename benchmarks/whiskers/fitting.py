@@ -139,8 +139,7 @@ def main() -> None:
         f"period with {1e6 * SHAPE_NOISE:g} µm. Fits start from the "
         "published whisker; the base radius and density are known. Errors in %; coverage of the 95 % intervals "
         "(Laplace) with "
-        "Wilson intervals. `taper` is the slope of the radius, (base radius − tip radius)/length. Derivatives: "
-        "central differences in double precision."
+        "Wilson intervals. `taper` is the slope of the radius, (base radius − tip radius)/length."
     ]
     for kind, finer in cases:
         name = f"{kind}-{'finer' if finer else 'own'}"

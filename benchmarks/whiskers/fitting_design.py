@@ -6,6 +6,9 @@
 from __future__ import annotations
 
 import math
+import time
+
+import numpy as np
 
 from benchmarks.report import table, write_section
 from brainbench.stimuli import PlacedObject, Scene, WhiskerArray, Whisking
@@ -30,7 +33,7 @@ GOAL = 0.5
 
 
 def main() -> None:
-    rows, options = [], DesignOptions(iterations=8)
+    rows, seconds, options = [], [], DesignOptions(iterations=8)
     array = WhiskerArray.of("mouse", whiskers="C1-C3")
     for name, solids in SETS.items():
         scenes = [
@@ -38,7 +41,9 @@ def main() -> None:
             for k, solid in solids.items()
         ]
         for what, variables in CHOICES.items():
+            began = time.process_time()
             found = design(scenes, variables, options=options)
+            seconds.append(time.process_time() - began)
             words = {"frequency": "{:.1f} Hz", "object_x": "x {:+.2e} m", "object_y": "y {:+.2e} m"}
             told = ", ".join(
                 words[key].format(value) if key in words else f"{key} {math.degrees(value):.0f}°"
@@ -64,7 +69,8 @@ def main() -> None:
         f"Mouse whiskers C1 to C3, posts at {PLACE} m, default motion 10 Hz, 30° forward and 10° backward of rest. "
         f"Sensor noise {sensor} per second. D² of the closest pair in a whisk, and whisks and time over those of the "
         f"default motion for the same D², at `{options.check}`. Goal: {GOAL:g} of the whisks; reached in {kept} "
-        f"of {len(rows)}. `unreliable`: no better motion was found.\n\n"
+        f"of {len(rows)}. `unreliable`: no better motion was found. A design takes {np.median(seconds):.0f} s of "
+        "processor time (median).\n\n"
     )
     body += table(["objects", "chosen", "motion", "D² before", "D² after", "whisks", "time", "status"], rows)
     write_section(TITLE, "python -m benchmarks.whiskers.fitting_design", body, subject="whiskers")

@@ -2,8 +2,8 @@
 
 Two objects a, b that are felt with white noise of standard deviation σ in each reading are apart by Mahalanobis'
 distance D, D² = Σ ((wₐ − w_b)/σ)² over the readings, whiskers and components of a whisk. D² of n whisks is n times that
-of one, so a motion with twice the D² needs half the whisks. The smallest D² of all pairs is raised by its gradient
-(central differences, all whiskers of a point in one run of the engine).
+of one, so a motion with twice the D² needs half the whisks. The smallest D² of all pairs is raised by its gradient, for
+which one pass goes back over the simulation (:mod:`brainbench.stimuli.gradients`).
 """
 
 from __future__ import annotations
@@ -21,12 +21,14 @@ from brainbench.core.errors import DataError, UsageError, check_name
 from brainbench.core.records import Status
 from brainbench.stimuli.engines import DEFAULT_ENGINE, get_engine
 from brainbench.stimuli.engines.fidelity import Fidelity
+from brainbench.stimuli.engines.protocol import Job, Trace
+from brainbench.stimuli.gradients import GradientRun
 from brainbench.stimuli.motion.trajectories import Whisking
 from brainbench.stimuli.scenes.scene import Scene
 
 Array = NDArray[np.float64]
-STEP = 0.02
-"""Step of the differences as a share of a variable's range: contacts come and go, and finer ones would see each."""
+SCALE = 0.05
+"""Size of a small change of a variable, as a share of its range."""
 NOTHING = -50.0
 """Log D² where nothing is felt."""
 SOFTNESS = 0.15
@@ -96,7 +98,9 @@ class DesignOptions:
     iterations: int = 12
     """Iterations of the search."""
     starts: int = 16
-    """Other motions that are tried before, spread over the bounds; the search goes on from the best."""
+    """Other motions that are tried before, spread over the bounds."""
+    searches: int = 3
+    """Best of these from which the search goes on."""
     seed: int = 0
     """Of these."""
 
@@ -121,7 +125,7 @@ class DesignResult:
     scenes: tuple[Scene, ...]
     """The scenes with the chosen motion."""
     evaluations: int
-    """Motions that were simulated."""
+    """Motions that were simulated in the search."""
 
 
 def design(
@@ -160,38 +164,34 @@ def design(
     evaluator = _Evaluator(scenes, tuple(variables), options, backend)
 
     def cost(x: Array) -> tuple[float, Array]:
-        points = [x, *(np.clip(x + sign * STEP * e, 0, 1) for e in np.eye(len(x)) for sign in (1, -1))]
-        values = [_soft_least(d) for d in evaluator.distances([limits[:, 0] + p * width for p in points])]
-        if math.isnan(values[0]):  # unstable: the line search turns back
+        value, slope = evaluator.slope(limits[:, 0] + x * width, SCALE * width)
+        if math.isnan(value):  # unstable: the line search turns back
             return -NOTHING, np.zeros(len(x))
-        slopes = np.zeros(len(x))
-        for j in range(len(x)):
-            # One-sided where the other side is unstable or beyond a bound.
-            ends = [(points[k][j], values[k]) for k in (1 + 2 * j, 0, 2 + 2 * j) if not math.isnan(values[k])]
-            if (span := ends[0][0] - ends[-1][0]) > 0:
-                slopes[j] = (ends[0][1] - ends[-1][1]) / span
-        return -values[0], -slopes
+        return -value, -slope * width
 
     at = (begin - limits[:, 0]) / width
     others = np.random.default_rng(options.seed).uniform(size=(options.starts, len(at)))
     tried = [at, *others]
-    first = [_soft_least(d) for d in evaluator.distances([limits[:, 0] + x * width for x in tried])]
+    first = [_soft_least(d)[0] for d in evaluator.distances([limits[:, 0] + x * width for x in tried])]
     if not np.isfinite(first[0]):
         raise DataError("Whiskers are unstable with the given motion; simulate the scenes more finely.")
     order = np.argsort(-np.nan_to_num(first, nan=-math.inf))
-    found = minimize(
-        cost,
-        tried[order[0]],
-        jac=True,
-        bounds=[(0, 1)] * len(at),
-        method="L-BFGS-B",
-        options={"maxiter": options.iterations, "maxls": 8},
-    )
+    searches = [
+        minimize(
+            cost,
+            tried[index],
+            jac=True,
+            bounds=[(0, 1)] * len(at),
+            method="L-BFGS-B",
+            options={"maxiter": options.iterations, "maxls": 8},
+        ).x
+        for index in order[: options.searches]
+    ]
     # What is best at the coarse setting need not be at the finer one, which has the last word.
-    finalists = [begin, *(limits[:, 0] + x * width for x in (found.x, *(tried[index] for index in order[:3])))]
+    finalists = [begin, *(limits[:, 0] + x * width for x in (*searches, tried[order[0]]))]
     fine = _Evaluator(scenes, tuple(variables), replace(options, fidelity=options.check), backend)
     measured = fine.distances(finalists)
-    best = int(np.argmax(np.nan_to_num([_soft_least(one) for one in measured[1:]], nan=-math.inf))) + 1
+    best = int(np.argmax(np.nan_to_num([_soft_least(one)[0] for one in measured[1:]], nan=-math.inf))) + 1
     return _result(fine, variables, (begin, finalists[best]), (measured[0], measured[best]), evaluator.count)
 
 
@@ -222,13 +222,14 @@ def _result(
     )
 
 
-def _soft_least(distances: Array) -> float:
-    """Return a smooth lower bound of the smallest log D²; NaN with unstable whiskers."""
+def _soft_least(distances: Array) -> tuple[float, Array]:
+    """Return a smooth lower bound of the smallest log D², NaN with unstable whiskers, and its slope by each log D²."""
     if np.isnan(distances).any():
-        return math.nan
+        return math.nan, np.zeros(len(distances))
     logs = np.log(np.maximum(distances, math.exp(NOTHING)))
     least = float(logs.min())
-    return least - SOFTNESS * math.log(float(np.sum(np.exp(-(logs - least) / SOFTNESS))))
+    weights = np.exp(-(logs - least) / SOFTNESS)
+    return least - SOFTNESS * math.log(float(weights.sum())), weights / weights.sum()
 
 
 class _Evaluator:
@@ -253,20 +254,48 @@ class _Evaluator:
 
     def distances(self, points: Sequence[Array]) -> list[Array]:
         """Return D² [pair] of one whisk, after the onset, at each of some values; NaN with unstable whiskers."""
-        jobs, sizes = [], []
-        for values in points:
-            some = [self.changed(scene, values) for scene in self.scenes]
-            frequency, onset = getattr(some[0].whisking, "frequency", 1.0), getattr(some[0].whisking, "onset", 0.0)
-            times = onset + np.arange(1, max(int(self.options.rate / frequency), 2) + 1) / self.options.rate
-            jobs += [replace(job, times=times) for scene in some for job in scene.jobs()]
-            sizes.append(len(times))
+        jobs = [job for values in points for job in self._jobs(values, self._times(values))]
         self.count += len(points)
         traces = self.engine.run(jobs, self.fidelity)
-        whiskers = len(self.scenes[0].mounts)
-        found = []
-        for index in range(len(points)):
-            begin = index * whiskers * len(self.scenes)
-            rows = [traces[begin + k * whiskers : begin + (k + 1) * whiskers] for k in range(len(self.scenes))]
-            felt = [np.stack([trace.wrench for trace in row]) / self.noise for row in rows]
-            found.append(np.array([float(np.sum((a - b) ** 2)) for a, b in combinations(felt, 2)]))
-        return found
+        some = len(jobs) // len(points)
+        return [self._apart(traces[begin : begin + some])[0] for begin in range(0, len(jobs), some)]
+
+    def slope(self, values: Array, scales: Array) -> tuple[float, Array]:
+        """Return the soft minimum of log D² at some values [p], and its derivatives by them; NaN and 0 if unstable."""
+        times = self._times(values)
+        run = GradientRun(lambda moved: self._jobs(moved, times), values, scales=scales, fidelity=self.fidelity)
+        self.count += 1
+        distances, gaps = self._apart(run.traces)
+        least, weights = _soft_least(distances)
+        if math.isnan(least) or not distances.all():
+            return least, np.zeros(len(values))
+        by_wrench = np.zeros_like(gaps, shape=(len(self.scenes), *gaps.shape[1:]))
+        for (a, b), gap, share in zip(self._pairs, gaps, weights / distances, strict=True):
+            by_wrench[a] += 2 * share * gap / self.noise
+            by_wrench[b] -= 2 * share * gap / self.noise
+        slope = run.gradient(list(by_wrench.reshape(-1, len(times), 6))).values
+        if "frequency" in self.names:
+            # Slower whisks have more readings; the run has those of one whisk at the given frequency.
+            slope[self.names.index("frequency")] -= 1 / values[self.names.index("frequency")]
+        return least, slope
+
+    @property
+    def _pairs(self) -> list[tuple[int, int]]:
+        return list(combinations(range(len(self.scenes)), 2))
+
+    def _times(self, values: Array) -> Array:
+        """Return the times [n] (s) of the readings of one whisk, after the onset."""
+        whisking = self.changed(self.scenes[0], values).whisking
+        count = max(int(self.options.rate * self.period(values)), 2)
+        return getattr(whisking, "onset", 0.0) + np.arange(1, count + 1) / self.options.rate
+
+    def _jobs(self, values: Array, times: Array) -> list[Job]:
+        some = [self.changed(scene, values) for scene in self.scenes]
+        return [replace(job, times=times) for scene in some for job in scene.jobs()]
+
+    def _apart(self, traces: Sequence[Trace]) -> tuple[Array, Array]:
+        """Return D² [pair] of one whisk, and how far pairs are apart [pair, whisker, n, 6] in units of the noise."""
+        felt = np.stack([trace.wrench for trace in traces]) / self.noise
+        felt = felt.reshape(len(self.scenes), -1, *felt.shape[1:])
+        gaps = np.stack([felt[a] - felt[b] for a, b in self._pairs])
+        return np.sum(gaps**2, axis=(1, 2, 3)), gaps

@@ -9,7 +9,7 @@ import pytest
 
 from brainbench.core.errors import UsageError
 from brainbench.stimuli import PlacedObject, Scene, WhiskerArray, Whisking
-from brainbench.stimuli.design import DesignOptions, design
+from brainbench.stimuli.design import DesignOptions, _Evaluator, _soft_least, design
 from brainbench.stimuli.objects.primitives import cylinder
 
 QUICK = DesignOptions(iterations=2, starts=2, check="fast")
@@ -40,6 +40,19 @@ def test_distances_are_those_of_the_wrenches_over_the_noise():
     one, other = (design(_scenes(3e-4, 6e-4), ["object_x"], options=replace(options, force_noise=f, moment_noise=m))
                   for f, m in ((2e-6, 1e-8), (4e-6, 2e-8)))  # fmt: skip
     np.testing.assert_allclose(next(iter(one.distances.values()))[0], 4 * next(iter(other.distances.values()))[0])
+
+
+def test_the_slope_of_the_search_is_that_of_differences():
+    names = ("frequency", "protraction", "object_y")
+    evaluator = _Evaluator(_scenes(3e-4, 4.5e-4, 6e-4), names, replace(QUICK, fidelity="balanced"), "rod")
+    values, scales = np.array([20.0, 0.5, 0.0]), np.array([1.0, 0.05, 1e-4])
+    least, slope = evaluator.slope(values, scales)
+    assert least == pytest.approx(_soft_least(evaluator.distances([values])[0])[0], rel=1e-2)
+    # The number of readings goes in steps with the frequency, which its difference would not see.
+    for index in (1, 2):
+        shift = 1e-3 * scales * (np.arange(3) == index)
+        ends = [evaluator.slope(values + sign * shift, scales)[0] for sign in (1, -1)]
+        assert slope[index] == pytest.approx((ends[0] - ends[1]) / (2 * shift[index]), rel=0.02)
 
 
 def test_equal_objects_cannot_be_told_apart():

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from brainbench.stimuli.whiskers.whisker import Whisker
 
 _FIT = "brainbench.stimuli.fitting.options:FitOptions"
+_CONTACTS = "brainbench.stimuli.fitting.contacts:ContactOptions"
 _TRACK = "brainbench.stimuli.fitting.tracks.options:TrackOptions"
 
 
@@ -55,6 +56,7 @@ def fit(
     noise: Annotated[
         float | None, typer.Option(help="Standard deviation of a traced coordinate, µm, when repeats tell it.")
     ] = None,
+    frames: Annotated[int, option(_CONTACTS, "frames")] = 1,
     metres_per_pixel: Annotated[float | None, option(_TRACK, "metres_per_pixel")] = None,
     frame_rate: Annotated[float | None, option(_TRACK, "frame_rate")] = None,
     track: Annotated[str | None, option(_TRACK, "track")] = None,
@@ -90,7 +92,7 @@ def fit(
     else:
         measured = read_wrenches(file, whisker=None if scene is None else whisker, stimulus=stimulus)
     if contacts:
-        data, text = _contacts(measured, start, noise)
+        data, text = _contacts(measured, start, noise, frames)
     else:
         result = _fit(measured, start, whisker, chosen, parameters, bounds, deflection, options, picture)
         data, text = result.summary(), _text(result, measured)
@@ -128,13 +130,14 @@ def _fit(
     return result
 
 
-def _contacts(measured: xr.Dataset, whisker: Whisker, noise: float | None) -> tuple[dict[str, Any], str]:
+def _contacts(measured: xr.Dataset, whisker: Whisker, noise: float | None, frames: int) -> tuple[dict[str, Any], str]:
     """Return the contacts of a track as data and as a table."""
     from brainbench.stimuli.fitting import ContactOptions, find_contacts
 
+    options = ContactOptions(noise=None if noise is None else 1e-6 * noise, frames=frames)
     with progress_bar("finding contacts"):
-        found = find_contacts(measured, whisker, options=ContactOptions(noise=None if noise is None else 1e-6 * noise))
-    frames = [
+        found = find_contacts(measured, whisker, options=options)
+    rows = [
         {
             "time": float(found["time"].values[index]),
             **{
@@ -153,7 +156,7 @@ def _contacts(measured: xr.Dataset, whisker: Whisker, noise: float | None) -> tu
         "status": "{0[status]}",
         "": "{0[reason]}",
     }
-    return {"frames": frames, "faults": measured.attrs.get("faults", [])}, table_of("", frames, columns)
+    return {"frames": rows, "faults": measured.attrs.get("faults", [])}, table_of("", rows, columns)
 
 
 def _text(result: FitResult, measured: xr.Dataset) -> str:

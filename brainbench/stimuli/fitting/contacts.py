@@ -10,13 +10,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from brainbench.core.errors import DataError
+from brainbench.core.errors import DataError, UsageError
 from brainbench.core.reading.ranges import check_number
 from brainbench.stimuli.fitting.curves import offsets_of_samples
 from brainbench.stimuli.fitting.elastica import STEPS, LoadedShapes, LoadedWhisker
@@ -53,11 +53,34 @@ class ContactOptions:
     """True when the last traced point is the tip of the whisker."""
     contact_noise: float = 5e-5
     """Standard deviation of the contact points that are given [m]."""
+    frames: int = 1
+    """Neighbouring frames, an odd number, over which the contact's place and force are taken to change evenly."""
 
     def __post_init__(self) -> None:
         if self.noise is not None:
             check_number("noise of a shape (m)", self.noise, above=0)
         check_number("contact_noise (m)", self.contact_noise, above=0)
+        check_number("frames of one contact", self.frames, least=1, whole=True)
+        if self.frames % 2 == 0:
+            raise UsageError(
+                f"frames counts a frame and as many before as behind it, so it is odd; received {self.frames}."
+            )
+
+
+@dataclass(frozen=True, eq=False)
+class ShapeFit:
+    """The fit of one frame."""
+
+    unknowns: Array
+    """[5] as of :class:`ContactSolver`."""
+    covariance: Array
+    """[5, 5] of them."""
+    spread: float
+    """Standard deviation of the traced points from the fitted shape [m]."""
+    residual: float
+    """Root mean square distance of them [m]."""
+    reason: str = ""
+    """Why there is no fit, if so."""
 
 
 @dataclass(frozen=True)
@@ -117,12 +140,14 @@ def find_contacts(
     known = np.full((len(points), 2), np.nan) if contact_points is None else np.asarray(contact_points, dtype=float)
     if known.shape != (len(points), 2):
         raise DataError(f"{len(points)} frames take contact points [{len(points)}, 2]; received {known.shape}.")
-    solver, found = ContactSolver(whisker, options), []
+    solver, fits = ContactSolver(whisker, options), []
     before: Array | None = None
     for frame, place in zip(points, known, strict=True):
-        contact, solution = solver.solve(frame, place, before)
-        found.append(contact)
-        before = solution if contact.status == "ok" else None
+        fits.append(solver.solve(frame, place, before))
+        before = fits[-1].unknowns if solver.estimate(fits[-1]).status == "ok" else None
+    if options.frames > 1:
+        fits = solver.even_out(fits, shapes["time"].values.astype(float))
+    found = [solver.estimate(one) for one in fits]
     scalars = ("force", "arc", "moment", "base_angle", "force_deviation", "arc_deviation", "residual")
     units = dict.fromkeys(scalars, "m") | {"force": "N", "force_deviation": "N", "moment": "N m", "base_angle": "rad"}
     return xr.Dataset(
@@ -179,15 +204,14 @@ class ContactSolver:
             rows.append((shapes.contact - place) / options.contact_noise)
         return np.concatenate(rows, axis=1)
 
-    def solve(self, frame: Array, place: Array, before: Array | None = None) -> tuple[ContactEstimate, Array]:
-        """Return the contact of one frame's points [k, 2] (m), and the unknowns [5]; ``before`` is another start."""
+    def solve(self, frame: Array, place: Array, before: Array | None = None) -> ShapeFit:
+        """Return the fit of one frame's points [k, 2] (m); ``before`` [5] are unknowns to start from as well."""
         from scipy.optimize import least_squares
 
         points = frame[np.isfinite(frame).all(axis=-1)]
         if len(points) < FEWEST_POINTS:
-            return ContactEstimate(reason=f"{len(points)} points were traced; {FEWEST_POINTS} are needed."), np.full(
-                5, np.nan
-            )
+            missing = f"{len(points)} points were traced; {FEWEST_POINTS} are needed."
+            return ShapeFit(np.full(5, np.nan), np.full((5, 5), np.nan), math.nan, math.nan, missing)
         noise = self.options.noise or 1e-3 * self.whisker.arc_length
         low = np.array([-np.inf, -np.inf, -np.inf, NEAREST, -3.0])
         high = np.array([np.inf, np.inf, np.inf, FARTHEST, 3.0])
@@ -208,7 +232,12 @@ class ContactSolver:
             if best is None or found.cost < best.cost:
                 best = found
         assert best is not None
-        return self._judge(best, residual, jacobian, points, noise), best.x
+        across = residual(best.x)[: len(points)] * noise
+        spread = math.sqrt(float(np.sum(across**2)) / max(len(points) - 4, 1))
+        matrix = jacobian(best.x) * (1.0 if self.options.noise else noise / spread)
+        covariance: Any = np.linalg.pinv(matrix.T @ matrix, rcond=1e-14)
+        reason = "" if best.status > 0 else "The fit of the shape did not converge."
+        return ShapeFit(best.x, covariance, spread, math.sqrt(float(np.mean(across**2))), reason)
 
     def _starts(self, points: Array, place: Array, noise: float, before: Array | None) -> Sequence[Array]:
         """Return unknowns [5] to start from: the three best of a grid of arcs and forces, turned onto the points."""
@@ -228,61 +257,89 @@ class ContactSolver:
         order = np.argsort(np.nan_to_num(cost, nan=np.inf))[:3]
         return [*grid[order], *([] if before is None else [before])]
 
-    def _judge(self, found, residual, jacobian, points: Array, noise: float) -> ContactEstimate:  # noqa: ANN001
-        """Return the contact of a solution, with standard deviations and a status."""
-        length, options = self.whisker.arc_length, self.options
-        rows = residual(found.x)
-        across = rows[: len(points)] * noise
-        spread = math.sqrt(float(np.sum(across**2)) / max(len(points) - 4, 1))
-        matrix = jacobian(found.x) * (1.0 if options.noise else noise / spread)
-        covariance = np.linalg.pinv(matrix.T @ matrix, rcond=1e-14)
-        arc = np.array([found.x[3] * length])
-        force = float(self.force(arc, np.array([found.x[4] * length]))[0])
-        ends = found.x + np.concatenate([np.eye(5), -np.eye(5)]) * _STEP
+    def even_out(self, fits: Sequence[ShapeFit], times: Array) -> list[ShapeFit]:
+        """Return fits whose contact changes evenly over neighbouring frames, at ``times`` [n] (s).
+
+        The logarithms of arc and force of some frames are fitted by straight lines in time, weighted by their
+        covariance; the pose of the base follows its regression on them. Frames with forces of the other sign, or with
+        no sign of a force by themselves, have no part and stay as they are.
+        """
+        some = {k: own for k, one in enumerate(fits) if (own := self._logarithms(one)) is not None}
+        half, found = self.options.frames // 2, list(fits)
+        for index, (value, spread, slope) in some.items():
+            near = range(index - half, index + half + 1)
+            use = [k for k in near if k in some and fits[k].unknowns[4] * fits[index].unknowns[4] > 0]
+            if len(use) < 3:
+                continue
+            design = [np.kron([1.0, times[k] - times[index]], np.eye(2)) for k in use]
+            weights = [np.linalg.inv(some[k][1]) for k in use]
+            information = sum(d.T @ w @ d for d, w in zip(design, weights, strict=True))
+            asked = sum(d.T @ w @ some[k][0] for d, w, k in zip(design, weights, use, strict=True))
+            line, covariance = np.linalg.solve(information, asked), np.linalg.inv(information)[:2, :2]
+            # Unknowns given the logarithms: the Gaussian law of the frame's own fit, conditioned on them.
+            gain = fits[index].covariance @ slope.T @ np.linalg.inv(spread)
+            moved = fits[index].unknowns + gain @ (line[:2] - value)
+            left = fits[index].covariance - gain @ (spread - covariance) @ gain.T
+            moved[3] = np.clip(moved[3], NEAREST, FARTHEST)
+            found[index] = replace(fits[index], unknowns=moved, covariance=left)
+        return found
+
+    def _logarithms(self, one: ShapeFit) -> tuple[Array, Array, Array] | None:
+        """Return log arc and log force [2], their covariance [2, 2], and their slope [2, 5] by the unknowns."""
+        force, slope = self._force_slope(one)
+        if one.reason or not abs(force) >= NO_FORCE * math.sqrt(max(float(slope @ one.covariance @ slope), 0.0)):
+            return None
+        by = np.stack([np.eye(5)[3] / one.unknowns[3], slope / force])
+        return np.log([one.unknowns[3], abs(force)]), by @ one.covariance @ by.T, by
+
+    def _force_slope(self, one: ShapeFit) -> tuple[float, Array]:
+        """Return the force (N) of a fit, and its derivatives [5] by the unknowns."""
+        length = self.whisker.arc_length
+        ends = one.unknowns + np.concatenate([np.zeros((1, 5)), np.eye(5), -np.eye(5)]) * _STEP
         sizes = self.force(ends[:, 3] * length, ends[:, 4] * length)
-        slope = (sizes[:5] - sizes[5:]) / (2 * _STEP)
-        deviation = math.sqrt(max(float(slope @ covariance @ slope), 0.0))
-        arc_deviation = length * math.sqrt(max(float(covariance[3, 3]), 0.0))
-        shape = self.shapes(found.x[None])
+        return float(sizes[0]), (sizes[1:6] - sizes[6:]) / (2 * _STEP)
+
+    def estimate(self, one: ShapeFit) -> ContactEstimate:
+        """Return the contact of a fit, with standard deviations and a status."""
+        if not np.isfinite(one.unknowns).all():
+            return ContactEstimate(reason=one.reason)
+        options, length = self.options, self.whisker.arc_length
+        force, slope = self._force_slope(one)
+        deviation = math.sqrt(max(float(slope @ one.covariance @ slope), 0.0))
+        shape = self.shapes(one.unknowns[None])
         status, reason = "ok", ""
-        if found.status <= 0:
-            status, reason = "undefined", "The fit of the shape did not converge."
+        if one.reason:
+            status, reason = "undefined", one.reason
         elif abs(force) < NO_FORCE * deviation:
+            share = abs(force) / max(deviation, 1e-300)
             status, reason = (
                 "undefined",
-                (
-                    f"No sign of a contact: the force is {abs(force) / max(deviation, 1e-300):.1f} standard "
-                    "deviations from 0."
-                ),
+                f"No sign of a contact: the force is {share:.1f} standard deviations from 0.",
             )
-        elif options.noise and spread > MISFIT * options.noise:
+        elif options.noise and one.spread > MISFIT * options.noise:
             status, reason = (
                 "unreliable",
-                (
-                    f"The shape fits no whisker with one contact: points lie {1e6 * spread:.0f} µm from it, the noise "
-                    f"is {1e6 * options.noise:.0f} µm."
-                ),
+                f"The shape fits no whisker with one contact: points lie {1e6 * one.spread:.0f} µm from it, the noise "
+                f"is {1e6 * options.noise:.0f} µm.",
             )
-        elif not NEAREST + 1e-3 < found.x[3] < FARTHEST - 1e-3:
+        elif not NEAREST + 1e-3 < one.unknowns[3] < FARTHEST - 1e-3:
             status, reason = "unreliable", "The contact lies at the end of the range that is looked for."
         elif deviation > VAGUE * abs(force):
             status, reason = (
                 "unreliable",
-                (
-                    f"The shape tells the force to {100 * deviation / abs(force):.0f} % only; give the contact point, "
-                    "or trace more of the whisker."
-                ),
+                f"The shape tells the force to {100 * deviation / abs(force):.0f} % only; give the contact point, "
+                "trace more of the whisker, or let neighbouring frames share their contact (frames).",
             )
         return ContactEstimate(
             force=force,
-            arc=float(arc[0]),
+            arc=length * float(one.unknowns[3]),
             moment=float(shape.moment[0]),
             point=tuple(shape.contact[0].tolist()),
             vector=tuple((force * shape.force[0]).tolist()),
-            base_angle=float(found.x[2]),
+            base_angle=float(one.unknowns[2]),
             force_deviation=deviation,
-            arc_deviation=arc_deviation,
-            residual=math.sqrt(float(np.mean(across**2))),
+            arc_deviation=length * math.sqrt(max(float(one.covariance[3, 3]), 0.0)),
+            residual=one.residual,
             status=status,
             reason=reason,
         )

@@ -16,7 +16,6 @@ from brainbench.core.files import provenance
 from brainbench.core.records import Status
 from brainbench.stimuli.fitting.identifiability import directions, unknown_parameters
 from brainbench.stimuli.fitting.intervals import Profile, laplace_interval, quantile
-from brainbench.stimuli.fitting.jacobians import CentralDifferences, JacobianProvider
 from brainbench.stimuli.fitting.model import FitModel
 from brainbench.stimuli.fitting.options import FitOptions
 from brainbench.stimuli.fitting.parameters import FreeParameters, read_value, with_value
@@ -42,7 +41,6 @@ def fit(
     bounds: Mapping[str, tuple[float, float]] | None = None,
     priors: Mapping[str, Prior] | None = None,
     options: FitOptions | None = None,
-    provider: JacobianProvider | None = None,
 ) -> FitResult:
     """Estimate parameters of a whisker from one or several trials of it.
 
@@ -53,7 +51,6 @@ def fit(
         bounds: bounds of single parameters, in their units.
         priors: priors of single parameters, beside those that the options name.
         options: how the fit simulates, weighs and judges.
-        provider: what computes Jacobians; central differences when None.
 
     Returns:
         Estimates with intervals, noise, tests of the residuals, and a status with reasons.
@@ -76,16 +73,15 @@ def fit(
             for trial in trials
         ]
     free = FreeParameters(tuple(parameters), condition, bounds or {})
-    model = FitModel(trials, free, options, provider or CentralDifferences())
+    model = FitModel(trials, free, options)
     problem = _Problem(model, _chosen_priors(free, options, priors or {}))
     begin = np.zeros(len(free))
-    (traces,) = model.traces([begin])
-    if not np.isfinite(model.whitened(traces, begin)).all():
+    if not np.isfinite(model.residual(begin)).all():
         raise DataError(
             f"The whisker is unstable at the start values ({model.reason or 'no reading'}); start nearer to the truth, "
             "or with a shorter time step."
         )
-    check_wrenches(trials, traces)
+    check_wrenches(trials, model.run(begin).traces)
     solutions = sorted((problem.solve(u) for u in find_starts(model)), key=lambda one: one.deviance)
     return _judge(problem, solutions, began)
 
@@ -203,7 +199,7 @@ def _judge(problem: _Problem, solutions: Sequence[_Solution], began: float) -> F
             )
         )
     tests = check_residuals(residual, jacobian, model.readings)
-    (traces,) = model.traces([u])
+    traces = model.run(u).traces
     reasons = [
         *(() if best.converged else (f"The fit did not converge within {options.most_iterations} iterations.",)),
         *dict.fromkeys(one.reason for one in estimates if one.reason),

@@ -7,7 +7,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
+from itertools import chain, islice
 from typing import Any
 
 import numpy as np
@@ -17,13 +18,15 @@ from brainbench.core.errors import DataError
 from brainbench.stimuli.engines import get_engine
 from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.engines.protocol import Job, Trace
-from brainbench.stimuli.fitting.jacobians import CentralDifferences, JacobianProvider
 from brainbench.stimuli.fitting.options import FitOptions
 from brainbench.stimuli.fitting.parameters import Condition, FreeParameters
 from brainbench.stimuli.fitting.trials import Trial
+from brainbench.stimuli.gradients import GradientRun, Tangents
 from brainbench.stimuli.validation import references
 
 Array = NDArray[np.float64]
+SCALE = 5e-3
+"""Size of a small change of a coordinate."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,7 +91,6 @@ class FitModel:
     trials: Sequence[Trial]
     free: FreeParameters
     options: FitOptions
-    provider: JacobianProvider = field(default_factory=CentralDifferences)
 
     def __post_init__(self) -> None:
         self.readings = Readings.of(self.trials)
@@ -100,7 +102,7 @@ class FitModel:
         self.reset_noise()
         self.limits = self.free.limits()
         self.fidelity = self._fidelity()
-        self.engine = get_engine(self.options.backend)
+        self._last: GradientRun | None = None
         self.simulated = 0
         self.reason = ""
         """Why a simulation could not be trusted, of the last that was not."""
@@ -115,7 +117,7 @@ class FitModel:
         return float(residual @ residual) + 2 * float(np.log(self.sigma[self.readings.group]).sum())
 
     def _fidelity(self) -> Fidelity:
-        """Return the fidelity of all simulations: a step that stays, so that differences do not see it change."""
+        """Return the fidelity of all simulations: a step that stays, so that the residuals are smooth."""
         whisker = self.free.start.whisker
         first = float(references.natural_frequencies(whisker, 1)[0])
         options = self.options
@@ -135,44 +137,80 @@ class FitModel:
         first = float(references.natural_frequencies(self.free.condition(u).whisker, 1)[0])
         return math.pi * first * self.fidelity.time_step
 
-    def traces(self, points: Sequence[Array]) -> list[list[Trace]]:
-        """Simulate every trial under each of some coordinates [p], all in one run of the engine."""
-        conditions = [self.free.condition(u) for u in points]
-        jobs = [self._job(trial, condition) for condition in conditions for trial in self.trials]
-        shapes = any(trial.of_shapes for trial in self.trials)
-        found = self.engine.run(jobs, self.fidelity, workers=self.options.workers, record_shape=shapes)
-        self.simulated += len(jobs)
-        count = len(self.trials)
-        return [found[i : i + count] for i in range(0, len(found), count)]
+    def run(self, u: Array) -> GradientRun:
+        """Simulate every trial at coordinates u [p], or return the last run if it was there."""
+        # Packing is differentiated by small changes, which must not lie beyond a bound.
+        u = np.clip(u, self.limits[0] + SCALE / 1000, self.limits[1] - SCALE / 1000)
+        if self._last is None or not np.array_equal(self._last.values, u):
+            self._last = GradientRun(self._jobs, u, scales=np.full(len(u), SCALE), fidelity=self.fidelity)
+            self.simulated += len(self.trials)
+        return self._last
+
+    def _jobs(self, u: Array) -> list[Job]:
+        condition = self.free.condition(u)
+        return [self._job(trial, condition) for trial in self.trials]
 
     def _job(self, trial: Trial, condition: Condition) -> Job:
         if "deflection" not in self.free.names:  # each trial keeps its own
             condition = replace(condition, deflection=trial.condition.deflection)
         return trial.job_of(condition)
 
-    def evaluate(self, points: Sequence[Array]) -> list[Array]:
-        """Return the whitened residuals [m] at each of some coordinates [p]; NaN where a simulation is not trusted."""
-        return [self.whitened(traces, u) for traces, u in zip(self.traces(points), points, strict=True)]
-
-    def whitened(self, traces: Sequence[Trace], u: Array) -> Array:
-        """Return the residuals [m] of traces simulated at coordinates u [p], divided by the noise."""
-        whisker, readings = self.free.condition(u).whisker, self.readings
-        parts = []
-        for index, (trial, trace) in enumerate(zip(self.trials, traces, strict=True)):
-            if trace.status != "ok":
-                self.reason = trace.reason
-            values = trial.residuals(trace, whisker)
-            values = values if trial.of_shapes else values[:, None, :]
-            parts.append(values[tuple(readings.place[readings.trial == index].T)])
-        return np.concatenate(parts) / self.sigma[readings.group]
-
     def residual(self, u: Array) -> Array:
-        """Return the whitened residuals [m] at coordinates u [p]."""
-        return self.evaluate([u])[0]
+        """Return the whitened residuals [m] at coordinates u [p]; NaN where a simulation cannot be trusted."""
+        return self._residual(u, self._traces(u))
+
+    def scan(self, points: Sequence[Array]) -> list[Array]:
+        """Return the residuals [m] at each of many coordinates [p], simulated in one run of the engine."""
+        jobs = [self._jobs(u) for u in points]
+        shapes = any(trial.of_shapes for trial in self.trials)
+        found = iter(get_engine("rod").run(list(chain(*jobs)), self.fidelity, record_shape=shapes))
+        self.simulated += len(points) * len(self.trials)
+        return [self._residual(u, list(islice(found, len(self.trials)))) for u in points]
+
+    def _residual(self, u: Array, traces: Sequence[Trace]) -> Array:
+        whisker = self.free.condition(u).whisker
+        return self._whitened([
+            trial.residuals(trace, whisker) for trial, trace in zip(self.trials, traces, strict=True)
+        ])  # fmt: skip
 
     def jacobian(self, u: Array) -> Array:
-        """Return the derivatives [m, p] of the whitened residuals."""
-        return self.provider.jacobian(self.evaluate, u, self.limits)
+        """Return the derivatives [m, p] of the whitened residuals.
+
+        Raises:
+            DataError: a simulation cannot be trusted, so that there are none.
+        """
+        tangents = self.run(u).tangents()
+        traces = self._traces(u)
+        columns = []
+        for p, step in enumerate(SCALE * np.eye(len(u))):
+            # How residuals follow from shapes, and from the length of the whisker, is differentiated by differences.
+            ends = [self.free.condition(u + sign * step).whisker for sign in (1, -1)]
+            changes = []
+            for trial, trace, tangent in zip(self.trials, traces, tangents, strict=True):
+                above, below = (
+                    trial.residuals(_moved(trace, tangent, p, sign * SCALE), whisker)
+                    for sign, whisker in zip((1, -1), ends, strict=True)
+                )
+                changes.append((above - below) / (2 * SCALE))
+            columns.append(self._whitened(changes))
+        jacobian = np.stack(columns, axis=1)
+        if not np.isfinite(jacobian).all():
+            raise DataError("The whisker becomes unstable here; no derivative exists. Fit with a shorter time step.")
+        return jacobian
+
+    def _traces(self, u: Array) -> list[Trace]:
+        traces = self.run(u).traces
+        self.reason = next((trace.reason for trace in traces if trace.status != "ok"), self.reason)
+        return traces
+
+    def _whitened(self, values: Sequence[Array]) -> Array:
+        """Return the readings [m] among residuals, or changes of these, of each trial, divided by the noise."""
+        readings = self.readings
+        parts = []
+        for index, (trial, some) in enumerate(zip(self.trials, values, strict=True)):
+            some = some if trial.of_shapes else some[:, None, :]
+            parts.append(some[tuple(readings.place[readings.trial == index].T)])
+        return np.concatenate(parts) / self.sigma[readings.group]
 
     def update_noise(self, residual: Array, sigma: Array) -> None:
         """Estimate the noise of each group from residuals [m] that were divided by ``sigma`` [g], where none is known.
@@ -191,8 +229,15 @@ class FitModel:
     def describe(self) -> dict[str, Any]:
         """Return what the provenance of a result says of the model."""
         return {
-            "jacobian": self.provider.name,
-            "backend": self.options.backend,
+            "jacobian": "forward derivatives of the simulated steps",
             "fidelity": self.fidelity,
             "simulated_whiskers": self.simulated,
         }
+
+
+def _moved(trace: Trace, tangent: Tangents, p: int, way: float) -> Trace:
+    """Return a trace moved along the derivative by a parameter."""
+    shape = trace.link_positions
+    assert shape is not None
+    wrench = trace.wrench + way * tangent.wrench[p]
+    return replace(trace, wrench=wrench, link_positions=shape + way * tangent.link_positions[p])

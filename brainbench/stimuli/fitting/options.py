@@ -39,10 +39,6 @@ class FitOptions:
     """quasistatic leaves out inertia and damping, for slow contact."""
     twist: bool = True
     """Whether whiskers may twist."""
-    backend: str = "rod"
-    """Physics engine."""
-    workers: int | None = None
-    """Threads of the simulation; all usable processors when None."""
 
     def __post_init__(self) -> None:
         check_name("priors of a fit", self.priors, PRIORS)

@@ -41,7 +41,7 @@ def find_starts(model: FitModel) -> list[Array]:
     low, high = (float(limit[index]) for limit in model.limits)
     points[:, index] = np.linspace(low, high, len(points) + 2)[1:-1]
     points = np.insert(points, int(np.searchsorted(points[:, index], 0.0)), start, axis=0)
-    values = np.array([float(one @ one) for one in model.evaluate(list(points))])
+    values = np.array([float(one @ one) for one in model.scan(list(points))])
     values[~np.isfinite(values)] = math.inf
     walled = np.concatenate([[math.inf], values, [math.inf]])
     least = np.flatnonzero((values <= walled[:-2]) & (values <= walled[2:]) & np.isfinite(values))

@@ -44,8 +44,7 @@ def simulate_trial(trial: Trial, *, options: FitOptions = FINE) -> Trace:
         DataError: the whisker is unstable.
     """
     model = FitModel([trial], FreeParameters(("young_modulus",), trial.condition), options)
-    job = trial.job_of(trial.condition)
-    (trace,) = model.engine.run([job], model.fidelity, workers=options.workers, record_shape=True)
+    (trace,) = model.run(np.zeros(1)).traces
     if trace.status != "ok":
         raise DataError(f"The simulated trial is unstable: {trace.reason}.")
     return trace

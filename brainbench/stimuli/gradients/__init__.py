@@ -7,6 +7,6 @@
 
 from brainbench.stimuli.gradients.events import ContactEvents
 from brainbench.stimuli.gradients.parameters import JobParameters
-from brainbench.stimuli.gradients.run import Gradient, GradientRun
+from brainbench.stimuli.gradients.run import Gradient, GradientRun, Tangents
 
-__all__ = ["ContactEvents", "Gradient", "GradientRun", "JobParameters"]
+__all__ = ["ContactEvents", "Gradient", "GradientRun", "JobParameters", "Tangents"]

@@ -5,10 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any, Literal
 
+Nearness = Literal["ending", "beginning", "passing", "slipping", "sticking"]
 SMALL_FORCE = 1e-5
 """Share of the whisker's largest contact force below which a contact is about to end or has just begun."""
-SMALL_GAP = 1e-7
+SMALL_GAP = 1e-5
 """Gap (mm) at the end of a step up to which an open contact is about to close."""
+SMALL_LEAD = 1e-6
+"""Gap (mm) by which one link is nearer than the next up to which a contact is about to pass from one to the other."""
 FULL_CONE = 1 - 1e-5
 """Share of the friction cone from which sticking is close to sliding."""
 SMALL_SLIP = 1e-5
@@ -21,16 +24,16 @@ class ContactEvents:
 
     status: Literal["smooth", "one-sided", "degenerate", "unstable"]
     """``smooth``: the gradient holds on both sides. ``one-sided``: in some step a contact was so near to opening,
-    closing, sticking or sliding (``close``) that the gradient on the other side is another. ``degenerate``: in some
-    step contacts shared their load in more than one way, or their forces could not be solved to rounding.
-    ``unstable``: the simulation cannot be trusted, and the gradient is NaN."""
+    closing, passing from link to link, sticking or sliding (``close``) that the gradient on the other side is another.
+    ``degenerate``: in some step contacts shared their load in more than one way, or their forces could not be solved to
+    rounding. ``unstable``: the simulation cannot be trusted, and the gradient is NaN."""
     begun: int
     """Steps in which more contacts pressed than before."""
     ended: int
     """Steps in which fewer did."""
     slipped: int
     """Steps in which as many pressed and more, or fewer, of them slid."""
-    close: tuple[Literal["ending", "beginning", "slipping", "sticking"], ...]
+    close: tuple[Nearness, ...]
     """What some contact was close to in some step."""
 
 
@@ -39,11 +42,13 @@ def contact_events(summary: Any, reason: str) -> ContactEvents:
 
     ``reason`` is why the run cannot be trusted, if so.
     """
-    close: list[Literal["ending", "beginning", "slipping", "sticking"]] = []
+    close: list[Nearness] = []
     if summary["least_force"] < SMALL_FORCE * summary["largest_force"]:
         close.append("ending")
     if summary["least_gap"] < SMALL_GAP:
         close.append("beginning")
+    if summary["least_lead"] < SMALL_LEAD:
+        close.append("passing")
     if summary["fullest_cone"] > FULL_CONE:
         close.append("slipping")
     if summary["slowest_slip"] < SMALL_SLIP * summary["fastest_slip"]:

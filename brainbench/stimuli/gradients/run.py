@@ -3,23 +3,27 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from brainbench.core.devices import pick_device
+from brainbench.core.devices import pick_device, usable_processors
 from brainbench.core.errors import UsageError
 from brainbench.stimuli.engines.fidelity import Fidelity
+from brainbench.stimuli.engines.planarity import stays_in_plane
 from brainbench.stimuli.engines.protocol import Job, Trace, base_rotation
+from brainbench.stimuli.engines.reach import reachable
 from brainbench.stimuli.engines.rod.adjoint import OutputDerivatives, RecordingSolver
 from brainbench.stimuli.engines.rod.differences import (
     Numbers,
     PackedPlaces,
     contract,
     packed_change,
+    packed_part,
 )
 from brainbench.stimuli.engines.rod.engine import RodEngine, trace_of
 from brainbench.stimuli.engines.rod.packing import capacity_for, knots_alike
@@ -28,6 +32,8 @@ from brainbench.stimuli.engines.trust import check_jobs
 from brainbench.stimuli.gradients.events import ContactEvents, contact_events
 from brainbench.stimuli.whiskers.chain import build_chain
 
+T = TypeVar("T")
+R = TypeVar("R")
 Build = Callable[[NDArray[np.float64]], Sequence[Job]]
 """Values of the parameters [p] → jobs, of the same kind and number for all values."""
 Given = Sequence[NDArray[np.float64] | None]
@@ -49,6 +55,18 @@ class Gradient:
     def smooth(self) -> bool:
         """True when no contact was close to another state: the gradient holds on both sides."""
         return all(event.status == "smooth" for event in self.events)
+
+
+@dataclass(frozen=True, eq=False)
+class Tangents:
+    """Derivatives of the results of one job by each parameter; NaN when its simulation is not ``ok``."""
+
+    wrench: NDArray[np.float64]
+    """[p, n, 6]"""
+    link_positions: NDArray[np.float64]
+    """[p, n, links + 1, 3]"""
+    contact_wrench: NDArray[np.float64]
+    """[p, n, 6]"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,8 +161,7 @@ class GradientRun:
             near = [jobs[index] for pair in self._changed for jobs in pair]
             # A parameter may take a whisker out of its plane, or move a base, where the run itself stays.
             if not task.twists and self.fidelity.twist is not False:
-                twists = any(one.twists for one in (make_task(j, self.fidelity, {}, silent=True) for j in near) if one)
-                task = replace(task, twists=twists)
+                task = replace(task, twists=any(_leaves_plane(task, one) for one in near[1::2]))
             if task.base.pieces is None:
                 task = self._with_knots(task, near)
             tasks.append(task)
@@ -171,9 +188,11 @@ class GradientRun:
             job = task.job
             key = (capacity_for(task.chain.links), job.times.tobytes(), job.start, tuple(job.gravity), task.twists)
             alike.setdefault(key, []).append(index)
-        traces: dict[int, Trace] = {}
-        groups = []
-        for indices in alike.values():
+        # A processor takes the jobs of a launch one by one, so that each of its threads has a launch of its own.
+        threads = 1 if self.device.is_cuda else usable_processors()
+        parts = [part for some in alike.values() for start in range(threads) if (part := some[start::threads])]
+
+        def simulate(indices: Sequence[int]) -> tuple[_Group, list[Trace]]:
             some = [tasks[index] for index in indices]
             packed = PackedTasks.of(some, shared=False)
             needs = packed.shapes.needs
@@ -181,10 +200,12 @@ class GradientRun:
             if steps is not None:
                 solver.steps[packed.jobs.whisker] = [steps[index] for index in indices]
             result = packed.launch(solver, record_shape=True)
-            for row, index in enumerate(indices):
-                traces[index] = trace_of(result, row, some[row].job, self.fidelity, 0.0)
-            groups.append(_Group(tuple(indices), packed, solver, PackedPlaces.of(packed)))
-        return [traces[index] for index in range(len(tasks))], groups
+            found = [trace_of(result, row, task.job, self.fidelity, 0.0) for row, task in enumerate(some)]
+            return _Group(tuple(indices), packed, solver, PackedPlaces.of(packed)), found
+
+        launches = _at_once(simulate, parts)
+        traces = {index: trace for group, found in launches for index, trace in zip(group.indices, found, strict=True)}
+        return [traces[index] for index in range(len(tasks))], [group for group, _ in launches]
 
     @cached_property
     def changes(self) -> list[list[Numbers]]:
@@ -216,8 +237,8 @@ class GradientRun:
         given: list[Given] = [[None] * count if some is None else some for some in outputs]
         by_job = np.zeros((count, len(self.values)))
         events: dict[int, ContactEvents] = {}
-        for group in self._groups:
-            found = group.solver.reverse(self._outputs(group, given))
+        passes = _at_once(lambda group: group.solver.reverse(self._outputs(group, given)), self._groups)
+        for group, found in zip(self._groups, passes, strict=True):
             for row, index in enumerate(group.indices):
                 trace = self.traces[index]
                 events[index] = contact_events(found["contacts"][row], trace.reason)
@@ -231,6 +252,36 @@ class GradientRun:
                     by_job[index] = np.nan if any(some[index] is not None for some in given) else 0.0
         return Gradient(by_job.sum(axis=0), by_job, tuple(events[index] for index in range(count)))
 
+    def tangents(self) -> list[Tangents]:
+        """Return the derivatives of what :attr:`traces` hold by each parameter, one for each job.
+
+        One pass over the recorded steps gives them for all parameters: what a least-squares problem with many readings
+        needs, where :meth:`gradient` gives those of one number by any number of parameters.
+        """
+        found: dict[int, Tangents] = {}
+        changes = self.changes
+
+        def forward(group: _Group) -> dict[str, NDArray[np.float64]]:
+            shapes = group.solver.packed_shapes
+            arrays = {name: np.zeros((len(self.values), *shape)) for name, shape in shapes.items()}
+            for row, index in enumerate(group.indices):
+                for p, change in enumerate(of_jobs[index] for of_jobs in changes):
+                    mine = {name: values[p] for name, values in arrays.items()}
+                    for name in change.keys() - {"positions"}:
+                        packed_part(mine, name, group.places[row], row)[...] = change[name]
+            return group.solver.forward(arrays)
+
+        for group, results in zip(self._groups, _at_once(forward, self._groups), strict=True):
+            for row, index in enumerate(group.indices):
+                points = results["points"][:, row, :, : group.places[row].links + 1]
+                for p, change in enumerate(of_jobs[index] for of_jobs in changes):
+                    if "positions" in change:
+                        points[p] += change["positions"][:, None]
+                parts = results["wrench"][:, row], points, results["contact_wrench"][:, row]
+                trusted = self.traces[index].status == "ok"
+                found[index] = Tangents(*(part if trusted else np.full_like(part, np.nan) for part in parts))
+        return [found[index] for index in range(len(self.jobs))]
+
     def _outputs(self, group: _Group, given: Sequence[Given]) -> OutputDerivatives:
         frames, nodes = len(group.packed.tasks[0].job.times), group.solver.capacity + 1
         shapes = ((frames, 6), (frames, nodes, 3), (frames, 6))
@@ -241,6 +292,25 @@ class GradientRun:
                 if value is not None:
                     array[row][tuple(slice(n) for n in np.shape(value))] = value
         return OutputDerivatives(*arrays)
+
+
+def _at_once(function: Callable[[T], R], items: Sequence[T]) -> list[R]:
+    """Return the function's results in order; launches on a processor leave the interpreter free."""
+    with ThreadPoolExecutor(max_workers=min(len(items), usable_processors())) as pool:
+        return list(pool.map(function, items))
+
+
+def _leaves_plane(task: JobTask, job: Job) -> bool:
+    """Return True when a job near that of a task, which stays in a plane, does not."""
+    own = task.job
+    parts = zip((job.follicle, *job.obstacles), (own.follicle, *own.obstacles), strict=True)
+    same = job.loads is own.loads and job.gravity == own.gravity and all(one is other for one, other in parts)
+    if same and (job.whisker.curvature == 0) == (own.whisker.curvature == 0):
+        return False
+    times = np.unique(np.concatenate([_span(job), task.base.times, *(body.track.times for body in task.bodies)]))
+    position, euler = (np.asarray(values, dtype=float) for values in job.follicle.pose(times))
+    reach = reachable(job.whisker, position, job.obstacles, times, surfaces=True)
+    return not stays_in_plane(job, reach, position, euler, times)
 
 
 def _span(job: Job) -> tuple[float, float]:

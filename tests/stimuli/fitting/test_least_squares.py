@@ -49,7 +49,7 @@ def test_stiffness_and_damping_of_a_ring_down_come_back(rung):
     assert result["damping_ratio"].value == pytest.approx(0.2, rel=0.02)
     assert result["deflection"].value == pytest.approx(1e-3, rel=0.05)
     assert result["young_modulus"].interval.low < 3.5e9 < result["young_modulus"].interval.high
-    assert "central differences" in result.provenance["jacobian"]
+    assert "forward" in result.provenance["jacobian"]
     assert result.noise["Mz"] == pytest.approx(0.01 * np.abs(rung[1].wrench[:, 5]).max(), rel=0.2)
 
 
@@ -203,29 +203,25 @@ def test_too_few_frames_readings_and_long_shapes_are_refused():
         Trial.ringdown(KNOWN, new_shapes(np.arange(1, 5) * 1e-3, shapes), 1e-3)
 
 
-def test_the_jacobian_is_that_of_finer_differences(rung):
-    trial = Trial.ringdown(KNOWN, _wrenches(rung), 1e-3)
-    model = FitModel([trial], FreeParameters(("young_modulus", "damping_ratio", "tip_radius"), trial.condition), QUICK)
-    u = np.array([-0.2, 0.1, 0.05])
+@pytest.mark.parametrize("kind", ["wrench", "shape"])
+def test_the_jacobian_is_that_of_differences(rung, kind):
+    trial = Trial.ringdown(KNOWN, _wrenches(rung) if kind == "wrench" else _shapes(rung), 1e-3)
+    names = ("young_modulus", "damping_ratio", "tip_radius", "deflection", "arc_length", "base_x", "base_angle")
+    model = FitModel([trial], FreeParameters(names, trial.condition), QUICK)
+    u = np.array([-0.2, 0.1, 0.05, 0.1, 0.01, 0.02, 0.03])
     jacobian = model.jacobian(u)
-    for column, step in enumerate(5e-4 * np.eye(3)):
-        above, below = model.evaluate([u + step, u - step])
-        fine = (above - below) / 1e-3
-        assert np.linalg.norm(jacobian[:, column] - fine) < 2e-3 * np.linalg.norm(fine)
+    for column, step in enumerate(1e-4 * np.eye(len(names))):
+        fine = (model.residual(u + step) - model.residual(u - step)) / 2e-4
+        # The foot of a traced point goes from sample to sample of the curve, which small differences see.
+        assert np.linalg.norm(jacobian[:, column] - fine) < 5e-4 * np.linalg.norm(fine) + 1e-6
 
 
-def test_the_cost_is_a_batch_for_each_jacobian(rung):
+def test_an_iteration_costs_one_simulation(rung):
     trial = Trial.ringdown(KNOWN, _wrenches(rung), 1e-3)
     model = FitModel([trial], FreeParameters(("young_modulus", "damping_ratio"), trial.condition), QUICK)
-    runs, run = [], model.engine.run
-
-    def count(jobs, *rest, **more):
-        runs.append(len(jobs))
-        return run(jobs, *rest, **more)
-
-    object.__setattr__(model.engine, "run", count)
+    model.residual(np.zeros(2))
     model.jacobian(np.zeros(2))
-    assert runs == [4]
+    assert model.simulated == 1
 
 
 @pytest.mark.parametrize("kind", ["wrench", "shape"])

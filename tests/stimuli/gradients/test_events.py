@@ -12,7 +12,7 @@ from tests.factories.gradients import COARSE, touching_job
 
 SUMMARY = {
     "contacts": 0, "begun": 1, "ended": 1, "slipped": 0, "degenerate": 0, "largest_force": 1.0, "least_force": 0.1,
-    "fastest_slip": 1.0, "slowest_slip": 0.1, "fullest_cone": 0.5, "least_gap": 0.01,
+    "fastest_slip": 1.0, "slowest_slip": 0.1, "fullest_cone": 0.5, "least_gap": 0.01, "least_lead": 0.01,
 }  # fmt: skip
 
 
@@ -38,6 +38,7 @@ def test_beginning_end_and_slip_of_a_contact_are_counted():
     [
         ({"least_force": 1e-7}, "ending"),
         ({"least_gap": 1e-9}, "beginning"),
+        ({"least_lead": 1e-9}, "passing"),
         ({"fullest_cone": 1 - 1e-7}, "slipping"),
         ({"slowest_slip": 1e-8}, "sticking"),
     ],

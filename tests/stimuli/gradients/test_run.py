@@ -9,6 +9,7 @@ from brainbench.core.errors import UsageError
 from brainbench.core.rotations import euler_matrix
 from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.engines.protocol import Job, Load, StillFollicle
+from brainbench.stimuli.engines.rod.adjoint import RecordingSolver
 from brainbench.stimuli.gradients import GradientRun, JobParameters
 from brainbench.stimuli.objects.obstacle import Box, Capsule, Cylinder, Obstacle, Sphere, TriangleMesh
 from brainbench.stimuli.validation.contact_scenes import contact_jobs
@@ -76,6 +77,47 @@ def _check_contact(kind: str, friction: float) -> None:
     assert np.nanmax(errors) < 1e-3
 
 
+@pytest.mark.parametrize("friction", [0.0, 0.4])
+@pytest.mark.parametrize("kind", ["post", "rim", pytest.param("mesh", marks=pytest.mark.slow)])
+def test_tangents_are_the_transpose_of_gradients(kind, friction):
+    load = Load(0.0143, (0.0, 1e-6, 5e-7), stop=0.0153)
+    job = replace(touching_job(SOLIDS[kind], friction=friction), gravity=(0.0, 5.0, -5.0), loads=(load,))
+    _check_transpose(JobParameters([job], (*MATERIAL, *BASE, *OBJECT, *(("friction",) if friction else ()))), COARSE)
+
+
+def test_tangents_are_those_of_quasistatic_runs_moving_objects_and_several_segments(monkeypatch):
+    monkeypatch.setattr(RecordingSolver, "room", 0)
+    job = touching_job(SOLIDS["post"], friction=0.3)
+
+    def motion(times):
+        angle = 0.3 * np.sin(50 * times)
+        turn = np.stack([np.cos(angle / 2), 0.6 * np.sin(angle / 2), 0 * angle, 0.8 * np.sin(angle / 2)], axis=1)
+        return np.outer(np.sin(40 * times), [0, -1e-3, 3e-4]), turn
+
+    moving = replace(job, obstacles=(replace(job.obstacles[0], motion=motion),))
+    still = Job(replace(WHISKER, arc_length=0.015), StillFollicle(), (), np.array([0.01, 0.02]), gravity=(0, 0, -9.8))
+    _check_transpose(JobParameters([moving], (*BASE, *OBJECT)), COARSE)
+    _check_transpose(JobParameters([moving], ("young_modulus", *OBJECT)), _quasistatic())
+    _check_transpose(JobParameters([still, job], ("young_modulus", "density", "base.x")), COARSE)
+
+
+def _check_transpose(parameters: JobParameters, fidelity: Fidelity) -> None:
+    run = GradientRun(parameters.build, parameters.values, scales=parameters.scales, fidelity=fidelity)
+    random = np.random.default_rng(0)
+    tangents = run.tangents()
+    for output, name in enumerate(("wrench", "link_positions", "contact_wrench")):
+        weights = [random.normal(size=np.shape(getattr(trace, name))) for trace in run.traces]
+        gradient = run.gradient(*[weights if k == output else None for k in range(3)]).by_job
+        forward = [
+            [np.vdot(weight, change) for change in getattr(tangent, name)]
+            for weight, tangent in zip(weights, tangents, strict=True)
+        ]
+        scale = np.abs(gradient * parameters.scales).max()
+        np.testing.assert_allclose(
+            forward * parameters.scales, gradient * parameters.scales, rtol=1e-6, atol=1e-9 * scale
+        )
+
+
 def test_sizes_of_a_primitive_and_its_own_friction_have_gradients():
     job = touching_job(SOLIDS["post"])
 
@@ -85,6 +127,7 @@ def test_sizes_of_a_primitive_and_its_own_friction_have_gradients():
 
     run = GradientRun(build, [5e-4, 0.3], fidelity=COARSE)
     gradient = run.gradient([np.ones((30, 6)) * [0, 0, 0, 1, 1, 1]]).values
+    np.testing.assert_allclose(run.tangents()[0].wrench[:, :, 3:].sum(axis=(1, 2)), gradient, rtol=1e-8)
     for p, value in enumerate((5e-4, 0.3)):
         shift = 1e-5 * value * (np.arange(2) == p)
         high, low = (run.traces_at([5e-4, 0.3] + sign * shift)[0].wrench[:, 3:].sum() for sign in (1, -1))
@@ -151,8 +194,10 @@ def test_a_whisker_that_nothing_bends_has_the_shape_gradient_of_its_rest():
 def test_an_unstable_whisker_has_no_gradient():
     job = touching_job(Sphere((11e-3, 5e-4, 0.0), 1e-3))
     parameters = JobParameters([job], ("young_modulus",))
-    gradient = GradientRun(parameters.build, parameters.values, fidelity=COARSE).gradient([np.ones((30, 6))])
+    run = GradientRun(parameters.build, parameters.values, fidelity=COARSE)
+    gradient = run.gradient([np.ones((30, 6))])
     assert np.isnan(gradient.values).all()
+    assert np.isnan(run.tangents()[0].wrench).all()
     assert gradient.events[0].status == "unstable"
     assert not gradient.smooth
 

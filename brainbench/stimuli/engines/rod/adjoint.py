@@ -28,15 +28,18 @@ spheres, cylinders, faces, edges and corners by the second derivatives of the di
 Forces of recorded steps are solved to rounding, which those of the ordinary engine are not: the theorem holds at the
 solution.
 
-**Memory.** The run pauses after every √steps steps, where the state is kept; going back, each segment is run again from
-there and written down, the same steps to the digit. Step lengths are those that the run took: derivatives are at a
-fixed sequence of steps.
+**Forward.** With a change of the state and of θ the same system, transposed, gives the changes of a and f: one solution
+a step for each parameter, and with it the derivatives of all readings (``kernels.adjoint.tangent``).
+
+**Memory.** Runs whose steps take at most ``ROOM`` are written down as they go. Longer ones pause after every √steps
+steps, where the state is kept; going back, each segment is run again from there and written down, the same steps to the
+digit. Step lengths are those that the run took: derivatives are at a fixed sequence of steps.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -51,6 +54,9 @@ from brainbench.stimuli.engines.rod.scheduling import allocate
 from brainbench.stimuli.engines.rod.streams import turn
 from brainbench.stimuli.engines.units import MICRO, MILLI
 from brainbench.stimuli.whiskers.chain import Chain
+
+ROOM = 2**26
+"""Bytes that records of the steps of a launch may take; beyond them they are written down in parts."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,6 +74,9 @@ class OutputDerivatives:
 class RecordingSolver(WhiskerSolver):
     """A solver whose launches can be gone back over. In double precision."""
 
+    room = ROOM
+    """Bytes that records of steps may take."""
+
     def __init__(self, chains: Sequence[Chain], fidelity: Fidelity, device: Any, needs: int, *, twists: bool) -> None:
         """Load kernels; arguments as for :class:`.launch.WhiskerSolver`."""
         super().__init__(chains, fidelity, device, needs, twists=twists, recorded=True)
@@ -79,12 +88,17 @@ class RecordingSolver(WhiskerSolver):
     def _take_steps(self, inputs: list[Any], count: int, *, urgent: bool) -> None:
         wp, device, structs = warp(), self.device, self.kernels.structs
         jobs, readings = inputs[3], inputs[5]
-        time = readings.time.numpy()[-1]
-        steps = (time["tick"] + time["part"]) / jobs.step.numpy().min()
+        time = readings.time.numpy()
+        spans = np.diff(time["tick"] + time["part"], prepend=0.0)
+        steps = int(np.ceil(spans / jobs.step.numpy().min()).sum()) + 8
         with turn(device):
             links = (self.capacity, count)
             self.paused = allocate(structs.PausedWhiskers, device, state=count, ended=count, link=links)
-            self.paused.budget = max(8, math.ceil(math.sqrt(steps)))
+            one = self._records(1, count)
+            affordable = self.room // sum(getattr(one, name).capacity for name in structs.StepRecords.vars)
+            self.paused.budget = budget = max(8, math.ceil(math.sqrt(steps)), min(steps, affordable))
+            self.paused.records = self._records(budget, count)
+            self.paused.keep = int(budget >= steps)
             self.inputs, self.checkpoints = inputs, []
             while not self.checkpoints or not self.paused.ended.numpy().all():
                 held = inputs[-1].held
@@ -92,13 +106,97 @@ class RecordingSolver(WhiskerSolver):
                 self._run()
             wp.synchronize_device(device)
 
+    def _records(self, steps: int, count: int) -> Any:
+        """Return room for so many steps of each of ``count`` jobs."""
+        links, contacts = (steps, self.capacity, count), (steps, contacts_for(self.capacity), count)
+        shapes = {"step": (steps, count), "count": count, "contact": contacts}
+        shapes |= dict.fromkeys(("angle", "rate", "acceleration"), links)
+        return allocate(self.kernels.structs.StepRecords, self.device, **shapes)
+
     def _run(self) -> None:
+        self.paused.records.count.zero_()
         warp().launch(self.kernels.run, self.count, [*self.inputs, self.paused], device=self.device)
+
+    def _segments(self, checkpoints: Iterable[tuple[Any, Any, Any]]) -> Iterator[Any]:
+        """Yield the records of the segments that begin at checkpoints; each is run again unless there is one."""
+        wp = warp()
+        whole = self.paused.keep == 1 and len(self.checkpoints) == 1
+        self.paused.keep = 1
+        for kept in checkpoints:
+            if not whole:
+                for state, now in zip(kept, (self.paused.state, self.paused.link, self.inputs[-1].held), strict=True):
+                    wp.copy(now, state)
+                self._run()
+            yield self.paused.records
 
     @property
     def count(self) -> int:
         """Jobs of the last launch."""
         return self.paused.state.shape[0]
+
+    @property
+    def packed_shapes(self) -> dict[str, tuple[int, ...]]:
+        """Shapes of the packed arrays that changes are of, see ``kernels.adjoint.tangent.PackedTangents``."""
+        _, motions, shapes, jobs, *_ = self.inputs
+        loads, solids = int(jobs.load_force.shape[0]), int(shapes.kind.shape[0])
+        return {
+            "link": (10, self.capacity, self.count),
+            **dict.fromkeys(("beta", "friction"), (self.count,)),
+            "gravity": (self.count, 3),
+            "knots": (int(motions.place.shape[0]), 16),
+            "load_force": (loads, 3),
+            "load_share": (loads,),
+            **{f"shape_{name}": (solids, 3) for name in ("place", "turn", "size")},
+            "shape_friction": (solids,),
+        }
+
+    def forward(self, changes: Mapping[str, NDArray[np.float64]]) -> dict[str, NDArray[np.float64]]:
+        """Go over the last launch again; return the change of its results with that of what was packed.
+
+        Args:
+            changes: [p, …] by parameter, of the arrays and shapes of :attr:`packed_shapes`.
+
+        Returns:
+            ``wrench`` [p, job, reading, 6], ``points`` [p, job, reading, node, 3] from the base point, and
+            ``contact_wrench`` [p, job, reading, 6]. SI units.
+        """
+        from brainbench.stimuli.engines.rod.kernels import BUILDING, build_adjoint
+
+        wp, device = warp(), self.device
+        with BUILDING:
+            kernels = build_adjoint(self.kernels, "tangent")
+        chains, motions, shapes, jobs, options, readings, *_ = self.inputs
+        count, some = self.count, len(changes["beta"])
+        frames = int(readings.row.numpy().max()) + 1
+        with turn(device):
+            state = (some, self.capacity, count)
+            tangents = allocate(kernels.PackedTangents, device, angle=state, rate=state)
+            for name, values in changes.items():
+                setattr(
+                    tangents, name, wp.array(values, dtype=kernels.PackedTangents.vars[name].type.dtype, device=device)
+                )
+            system = allocate(
+                kernels.ContactSystem, device, unit=(3 * contacts_for(self.capacity), self.capacity, count)
+            )
+            outputs = allocate(
+                kernels.OutputTangents,
+                device,
+                points=(some, frames, self.capacity + 1, count),
+                **dict.fromkeys(("wrench", "contact"), (some, frames, 2, count)),
+            )
+            for records in self._segments(self.checkpoints):
+                arguments = [chains, motions, shapes, jobs, options, records, system, tangents, outputs]
+                wp.launch(kernels.tangent_segment, count, arguments, device=device)
+            found = {
+                name: np.moveaxis(getattr(outputs, name).numpy(), 3, 1) for name in ("wrench", "points", "contact")
+            }
+        units = np.array([MILLI, MICRO])[:, None]
+        # The kernels find the wrench of the base on the whisker, moment first.
+        return {
+            "wrench": (-found["wrench"][:, :, :, ::-1] / units).reshape(*found["wrench"].shape[:3], 6),
+            "points": found["points"] / MILLI,
+            "contact_wrench": (found["contact"] / units).reshape(*found["contact"].shape[:3], 6),
+        }
 
     def reverse(self, outputs: OutputDerivatives) -> dict[str, NDArray[Any]]:
         """Go back over the last launch; return the derivatives by what was packed.
@@ -109,28 +207,14 @@ class RecordingSolver(WhiskerSolver):
 
         wp, device, structs = warp(), self.device, self.kernels.structs
         with BUILDING:
-            adjoint = build_adjoint(self.kernels)
+            adjoint = build_adjoint(self.kernels, "chain")
         chains, motions, shapes, jobs, options, *_ = self.inputs
         count, contacts = self.count, contacts_for(self.capacity)
-        budget = self.paused.budget
         with turn(device):
-            records = allocate(
-                structs.StepRecords,
-                device,
-                step=(budget, count),
-                **dict.fromkeys(("angle", "rate", "acceleration"), (budget, self.capacity, count)),
-                contact=(budget, contacts, count),
-                count=count,
-            )
             given = adjoint.OutputCotangents()
             for name, values in self._kernel_units(outputs).items():
                 setattr(given, name, wp.array(values, dtype=structs.vec3, device=device))
-            system = allocate(
-                adjoint.ContactSystem,
-                device,
-                unit=(3 * contacts, self.capacity, count),
-                matrix=(3 * contacts, 3 * contacts + 2, count),
-            )
+            system = allocate(adjoint.ContactSystem, device, unit=(3 * contacts, self.capacity, count))
             gradients = allocate(
                 adjoint.PackedGradients,
                 device,
@@ -142,16 +226,10 @@ class RecordingSolver(WhiskerSolver):
             )
             places = dict.fromkeys(("place", "turn", "size", "friction"), int(shapes.kind.shape[0]))
             gradients.shape = allocate(adjoint.ShapeGradients, device, **places)
-            for state, link, held in reversed(self.checkpoints):
-                self.paused.keep, self.paused.records = 1, records
-                for kept, now in ((state, self.paused.state), (link, self.paused.link), (held, self.inputs[-1].held)):
-                    wp.copy(now, kept)
-                records.count.zero_()
-                self._run()
+            for records in self._segments(reversed(self.checkpoints)):
                 # Going back needs no trees of meshes, nor what else only contact searches read.
                 arguments = [chains, motions, shapes, jobs, options, records, given, system, gradients]
                 wp.launch(adjoint.reverse_segment, count, arguments, device=device)
-            self.paused.keep = 0
             names = ("link", "beta", "friction", "gravity", "contacts", "knots", "load_force", "load_share")
             found = {name: getattr(gradients, name).numpy() for name in names}
             found |= {f"shape_{name}": getattr(gradients.shape, name).numpy() for name in places}

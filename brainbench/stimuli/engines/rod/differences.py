@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -24,7 +25,8 @@ from brainbench.stimuli.engines.rod.shapes import PackedShapes, TrackedObstacle
 from brainbench.stimuli.engines.rod.tasks import JobTask, PackedTasks
 from brainbench.stimuli.engines.units import MILLI
 from brainbench.stimuli.objects.obstacle import Obstacle, TriangleMesh
-from brainbench.stimuli.whiskers.chain import build_chain
+from brainbench.stimuli.whiskers.chain import Chain, build_chain
+from brainbench.stimuli.whiskers.whisker import Whisker
 
 Numbers = dict[str, NDArray[np.float64]]
 """Packed numbers of one job by the names of ``kernels.adjoint.chain.PackedGradients``; rotations as matrices."""
@@ -103,8 +105,13 @@ def packed_change(task: JobTask, low: Job, high: Job, width: float, quasistatic:
     return changes
 
 
+@lru_cache(maxsize=8)
+def _chain(whisker: Whisker, links: int) -> Chain:
+    return build_chain(whisker, links)
+
+
 def _whisker(task: JobTask, job: Job, quasistatic: bool) -> Numbers:
-    chain = build_chain(job.whisker, task.chain.links)
+    chain = _chain(job.whisker, task.chain.links)
     packed = pack_chains(chain.links, [chain], quasistatic, 2 + task.twists)
     length, cosine, sine, mass = packed["build"][:, 0].T
     centre, axial, transverse, *springs = packed["inertia"][:, 0].T
@@ -129,7 +136,7 @@ def _loads(task: JobTask, job: Job) -> Numbers:
     _require("loads", len(job.loads), len(task.job.loads))
     if not job.loads:
         return {}
-    chains = task.chain, build_chain(job.whisker, task.chain.links)
+    chains = task.chain, _chain(job.whisker, task.chain.links)
     shares = []
     for before, load in zip(task.job.loads, job.loads, strict=True):
         link = min(max(int(np.searchsorted(chains[0].nodes, before.arc)) - 1, 0), chains[0].links - 1)
@@ -225,21 +232,23 @@ def _rotation(low: Numbers, high: Numbers) -> NDArray[np.float64]:
     return vectors / 2
 
 
+def packed_part(arrays: Mapping[str, NDArray[Any]], name: str, places: PackedPlaces, job: int) -> NDArray[Any]:
+    """Return the view of packed arrays in which some numbers of a job stand."""
+    if name == "link":
+        return arrays["link"][:, : places.links, job]
+    if name in ("beta", "friction", "gravity"):
+        return arrays[name][job : job + 1]
+    if name.startswith("load"):
+        return arrays[name][places.loads]
+    if name.startswith("shape"):
+        return arrays[name][places.shapes]
+    return arrays["knots"][places.base if name == "base" else places.bodies[int(name.removeprefix("body"))]]
+
+
 def contract(gradients: Mapping[str, NDArray[Any]], change: Numbers, places: PackedPlaces, job: int) -> float:
     """Return the derivative by a parameter from those by the packed numbers and the change of these with it.
 
     Positions of the base in the readings are not among them.
     """
-    where: dict[str, Any] = dict.fromkeys(("beta", "friction", "gravity"), job)
-    where |= dict.fromkeys(("load_share", "load_force"), places.loads)
-    where |= dict.fromkeys(("shape_place", "shape_turn", "shape_size", "shape_friction"), places.shapes)
-    total = 0.0
-    for name, values in change.items():
-        if name == "link":
-            total += np.vdot(gradients["link"][:, : places.links, job], values)
-        elif name in where:
-            total += np.vdot(gradients[name][where[name]], values)
-        elif name != "positions":
-            knots = places.base if name == "base" else places.bodies[int(name.removeprefix("body"))]
-            total += np.vdot(gradients["knots"][knots], values)
-    return float(total)
+    names = change.keys() - {"positions"}
+    return float(sum(np.vdot(packed_part(gradients, name, places, job), change[name]) for name in sorted(names)))

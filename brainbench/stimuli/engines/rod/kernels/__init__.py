@@ -105,6 +105,6 @@ def build_kernels(
     )
 
 
-def build_adjoint(kernels: Kernels) -> ModuleType:
-    """Return the module ``adjoint.chain`` for kernels that record their steps."""
-    return specialize("adjoint.chain", **kernels.parameters)
+def build_adjoint(kernels: Kernels, module: str) -> ModuleType:
+    """Return the module ``adjoint.chain`` or ``adjoint.tangent`` for kernels that record their steps."""
+    return specialize(f"adjoint.{module}", **kernels.parameters)

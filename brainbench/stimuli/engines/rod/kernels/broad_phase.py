@@ -253,6 +253,13 @@ def candidate_slot(
         same = wp.dot(row(candidates.normal, j), normal) > real(0.85)
         if same and apart < real(0.0625) * wp.length_sq(link):
             slot = j
+    if wp.static(recorded):
+        # By how much one of two links is nearer to what both touch.
+        lead = real(1e30)
+        if slot < count:
+            lead = wp.min(row(candidates.lead, slot), wp.abs(row(candidates.predicted_gap, slot) - ahead))
+        if slot < wp.static(most_candidates):
+            candidates.lead[slot] = lead
     if slot < count:
         if row(candidates.predicted_gap, slot) <= ahead:
             slot = int(-1)

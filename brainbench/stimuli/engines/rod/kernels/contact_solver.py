@@ -36,7 +36,10 @@ from .parameters import group_size, max_contacts, module_options, queue, real, r
 from .state import ContactProblems, PausedWhiskers, PerLinkJoint
 from .thread_groups import broadcast, group_max, group_or, group_sum, warp_max
 
-tolerance, tries, sweeps = (1e-12, 400, 400) if recorded else (1e-4, 8, SWEEPS)
+if recorded:
+    from .adjoint.newton import CAUTIOUS, DIRECT, newton_forces
+
+tolerance, sweeps = (1e-12, 16) if recorded else (1e-4, SWEEPS)
 """Steps that are recorded are solved to rounding: the adjoint is that of the solution."""
 
 
@@ -358,7 +361,7 @@ def iterate_forces(
     active: int,
 ):
     """Sweep until the forces hold, with all normal forces solved for at once after every other sweep."""
-    slip_tries = int(wp.static(tries)) + solver.unknown_zero
+    slip_tries = int(8) + solver.unknown_zero
     guess_tries = int(10) + solver.unknown_zero
     sweeps_most = int(wp.static(sweeps)) + solver.unknown_zero
     solver.converged = 1 - active
@@ -372,6 +375,13 @@ def iterate_forces(
                 contact_rates(solver, own, matrix, refresh)
                 refresh = 0
             gauss_seidel_sweep(solver, own, matrix, slip_tries)
+            if wp.static(recorded):
+                if solver.converged == 0 and turn >= 2 and turn % 2 == 0:
+                    caution = real(wp.static(CAUTIOUS))
+                    if turn % 4 == 2:
+                        caution = real(wp.static(DIRECT))
+                    solver.converged = newton_forces(solver, own, matrix, caution)
+                    refresh = 1
             guessing = int(0)
             if solver.converged == 0 and solver.contacts > 1 and turn % 2 == 1:
                 guessing = 1

@@ -308,6 +308,7 @@ class ContactCandidates:
     if recorded:
         shape: PerCandidateInt
         share: PerCandidate1  # place along the link, 0 to 1
+        lead: PerCandidate1  # how much nearer (mm) than the neighbouring link it is, if that touches the same
 
 
 @wp.struct

@@ -1,6 +1,6 @@
-"""Kernels of gradients: ``recording`` writes steps down (``records``), ``chain`` goes back over them.
+"""Kernels of gradients: ``recording`` writes steps down (``records``), ``chain`` goes back over them, ``tangent`` on.
 
-It carries ``fields`` up the chain; ``contacts`` solves for the contacts' multipliers, ``surfaces`` and ``pose`` hand on
-what contacts give to shapes and to the tracks of bodies. The equations are those of
-:mod:`brainbench.stimuli.engines.rod.adjoint`.
+Both carry ``fields`` along the chain; ``contacts`` solves for what the contacts add, with ``dense`` systems;
+``surfaces`` and ``pose`` hand it on to shapes and to the tracks of bodies. ``newton`` solves the contact forces of
+recorded steps to rounding. The equations are those of :mod:`brainbench.stimuli.engines.rod.adjoint`.
 """

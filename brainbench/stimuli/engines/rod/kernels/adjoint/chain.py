@@ -15,10 +15,10 @@ import warp as wp
 
 from brainbench.stimuli.engines.rod.limits import FOLD, STOP
 
-from ..algebra import JointVector, SpatialAcceleration, first_axis, vec3
+from ..algebra import JointVector, SpatialAcceleration, Wrench, first_axis, vec2, vec3
 from ..articulated_body import ChainState, ProximityState, articulated_inertia, forward_kinematics, hinge_direction
 from ..delassus import PerContact3
-from ..motion import elapsed, instant, pose_at, pose_from
+from ..motion import BodyMotion, Instant, elapsed, instant, pose_at, pose_from
 from ..parameters import hinges, module_options, real
 from ..state import (
     ChainArrays,
@@ -36,12 +36,15 @@ from .contacts import (
     AdjointContacts,
     ContactSummary,
     ContactSystem,
+    build_system,
     contact_row,
     set_state,
-    solve_multipliers,
+    solve_system,
     summarize,
+    velocity_block,
 )
-from .fields import FieldCotangents, Fields, add_hinge, reverse_hinge
+from .dense import DenseSystem
+from .fields import FieldCotangents, Fields, StepLinks, add_hinge, hinge_row, hinges_of, reverse_hinge
 from .pose import PoseCotangent, spread_pose
 from .records import StepRecords
 from .surfaces import ShapeGradients, reverse_contact
@@ -98,6 +101,7 @@ def virtual_motion(
     job: WhiskerJob,
     chain: wp.ref[ChainState],
     proximity: wp.ref[ProximityState],
+    links: wp.ref[StepLinks],
     asked: wp.ref[PerLinkJoint],
     base_angular: vec3,
     base_linear: vec3,
@@ -105,67 +109,65 @@ def virtual_motion(
     pushing: int,
     virtual: wp.ref[PerLinkJoint],
     at_contacts: wp.ref[PerContact3],
-):
+) -> Wrench:
     """Solve the symmetric system of the chain: two passes over the factorised chain of the step.
 
     ``asked`` is the right-hand side, and with ``pushing`` the contacts' forces; the base moves as given. Found are the
-    rates of the joints and the velocity at each contact.
+    rates of the joints and the velocity at each contact; returned is what no joint takes up and the base must hold.
     """
     zero = real(0.0)
     tw = vec3(zero, zero, zero)
     tv = vec3(zero, zero, zero)
     for back in range(job.links):
         i = job.links - 1 - back
-        at = row(chain.node, i)
         if pushing == 1:
             for k in range(contacts.count):
                 if contact_row(contacts.link, k) == i:
                     push = contact_row(contacts.push, k)
                     tv = tv + push
                     tw = tw + wp.cross(contact_row(contacts.point, k), push)
+        j = wp.static(hinges) * i
         b = row(asked, i)
         found = JointVector()
         inverse = row(proximity.inverse_inertia, i)
         if wp.static(hinges == 3):
             if i % 2 == 1:
-                s3 = row(chain.axis3, i)
-                u3 = b[2] + wp.dot(s3, tw) + wp.dot(wp.cross(at, s3), tv)
+                u3 = b[2] + wp.dot(hinge_row(links.axis, j + 2), tw) + wp.dot(hinge_row(links.moment, j + 2), tv)
                 found[2] = inverse[3] * u3
                 tw = tw - row(chain.gain3_w, i) * u3
                 tv = tv - row(chain.gain3_v, i) * u3
-        s2 = row(chain.axis2, i)
-        s1 = first_axis(s2, hinge_direction(chain, i), row(chain.angle, i)[1])
-        u1 = b[0] + wp.dot(s1, tw) + wp.dot(wp.cross(at, s1), tv)
-        u2 = b[1] + wp.dot(s2, tw) + wp.dot(wp.cross(at, s2), tv)
+        u1 = b[0] + wp.dot(hinge_row(links.axis, j), tw) + wp.dot(hinge_row(links.moment, j), tv)
+        u2 = b[1] + wp.dot(hinge_row(links.axis, j + 1), tw) + wp.dot(hinge_row(links.moment, j + 1), tv)
         found[0] = inverse[0] * u1 + inverse[1] * u2
         found[1] = inverse[1] * u1 + inverse[2] * u2
         tw = tw - row(chain.gain1_w, i) * u1 - row(chain.gain2_w, i) * u2
         tv = tv - row(chain.gain1_v, i) * u1 - row(chain.gain2_v, i) * u2
         virtual[i] = found
+    held = Wrench()
+    held.moment = tw
+    held.force = tv
     aw = base_angular
     av = base_linear
     for i in range(job.links):
-        at = row(chain.node, i)
-        s2 = row(chain.axis2, i)
-        s1 = first_axis(s2, hinge_direction(chain, i), row(chain.angle, i)[1])
+        j = wp.static(hinges) * i
         found = row(virtual, i)
         a1 = found[0] - wp.dot(row(chain.gain1_w, i), aw) - wp.dot(row(chain.gain1_v, i), av)
         a2 = found[1] - wp.dot(row(chain.gain2_w, i), aw) - wp.dot(row(chain.gain2_v, i), av)
-        aw = aw + s1 * a1 + s2 * a2
-        av = av + wp.cross(at, s1) * a1 + wp.cross(at, s2) * a2
+        aw = aw + hinge_row(links.axis, j) * a1 + hinge_row(links.axis, j + 1) * a2
+        av = av + hinge_row(links.moment, j) * a1 + hinge_row(links.moment, j + 1) * a2
         found[0] = a1
         found[1] = a2
         if wp.static(hinges == 3):
             if i % 2 == 1:
-                s3 = row(chain.axis3, i)
                 a3 = found[2] - wp.dot(row(chain.gain3_w, i), aw) - wp.dot(row(chain.gain3_v, i), av)
-                aw = aw + s3 * a3
-                av = av + wp.cross(at, s3) * a3
+                aw = aw + hinge_row(links.axis, j + 2) * a3
+                av = av + hinge_row(links.moment, j + 2) * a3
                 found[2] = a3
         virtual[i] = found
         for k in range(contacts.count):
             if contact_row(contacts.link, k) == i:
                 at_contacts[k] = av + wp.cross(aw, contact_row(contacts.point, k))
+    return held
 
 
 @wp.func
@@ -218,6 +220,20 @@ def reverse_inertia(
 
 
 @wp.func
+def spring_state(angle: real, rate: real, lag: real) -> vec2:
+    """Return the stretch of a joint's spring, q + lag q̇, and how many times steeper than its stiffness it is there."""
+    stretch = angle + lag * rate
+    steepness = real(1.0)
+    bend = wp.abs(angle)
+    if bend > real(wp.static(FOLD)):
+        # Beyond FOLD it stiffens, see ``articulated_body``.
+        past = angle * (real(1.0) - real(wp.static(FOLD)) / bend)
+        stretch = stretch + real(wp.static(STOP)) * (past + lag * rate)
+        steepness = steepness + real(wp.static(STOP))
+    return vec2(stretch, steepness)
+
+
+@wp.func
 def spring(
     gradients: PackedGradients, which: int, i: int, index: int, stiffness: real, angle: real, rate: real, lag: real,
     virtual: real
@@ -227,22 +243,114 @@ def spring(
     ``which`` is the row of that. Returned is μ k of the joint as it is now: the derivative by the angle; that by the
     rate is lag times as much, and that by the lag the rate times as much.
     """
-    stretch = angle + lag * rate
-    steepness = real(1.0)
-    bend = wp.abs(angle)
-    if bend > real(wp.static(FOLD)):
-        # Beyond FOLD it stiffens, see ``articulated_body``.
-        past = angle * (real(1.0) - real(wp.static(FOLD)) / bend)
-        stretch = stretch + real(wp.static(STOP)) * (past + lag * rate)
-        steepness = steepness + real(wp.static(STOP))
-    add(gradients, which, i, index, virtual * stretch)
-    return virtual * stiffness * steepness
+    state = spring_state(angle, rate, lag)
+    add(gradients, which, i, index, virtual * state[0])
+    return virtual * stiffness * state[1]
+
+
+@wp.struct
+class StepFrame:
+    """Base of a recorded step: at its beginning, half-way and at its end."""
+
+    now: Instant
+    middle: Instant
+    later: Instant
+    length: real
+    reading: wp.int32
+    pose: BodyMotion
+    after: BodyMotion
+    base: SpatialAcceleration
 
 
 @wp.func
-def joint_axes(chain: wp.ref[ChainState], i: int) -> vec3:
-    """Return the axis of a joint's first hinge."""
-    return first_axis(row(chain.axis2, i), hinge_direction(chain, i), row(chain.angle, i)[1])
+def restore_step(
+    chains: ChainArrays,
+    motions: MotionArrays,
+    shapes: ShapeArrays,
+    jobs: JobArrays,
+    options: StepOptions,
+    records: StepRecords,
+    job: WhiskerJob,
+    place: int,
+    chain: wp.ref[ChainState],
+    proximity: wp.ref[ProximityState],
+    links: wp.ref[StepLinks],
+    contacts: wp.ref[AdjointContacts],
+    on: wp.ref[Fields],
+) -> StepFrame:
+    """Factorise the chain of a recorded step; find its hinges and contacts, and ``on`` the fields of its last link."""
+    index = job.index
+    step = records.step[place, index]
+    now = step.time
+    h = step.length
+    frame = StepFrame()
+    frame.now = now
+    frame.middle = instant(now.tick, now.part + real(0.5) * h)
+    frame.later = instant(now.tick, now.part + h)
+    frame.length = h
+    frame.reading = step.reading
+    pose = pose_at(motions, job.base, now)
+    after = pose_at(motions, job.base, frame.later)
+    frame.pose = pose
+    frame.after = after
+    state = WhiskerState()
+    for i in range(job.links):
+        chain.angle[i] = records.angle[place, i, index]
+        chain.rate[i] = records.rate[place, i, index]
+    base = SpatialAcceleration()
+    base.angular = (after.spin - pose.spin) / h
+    base.linear = (after.velocity - pose.velocity) / h - wp.cross(pose.spin, pose.velocity) - options.gravity
+    frame.base = base
+    tip = forward_kinematics(chains, job, pose, chain, proximity, state)
+    articulated_inertia(chains, jobs, job, chain, proximity, tip, base, elapsed(now), h, 1)
+
+    # Twists and accelerations down the chain, with those of the contacts at the end of the step.
+    contacts.count = step.contacts
+    on.vw = pose.spin
+    on.vv = pose.velocity
+    on.aw = base.angular
+    on.av = base.linear
+    for k in range(contacts.count):
+        contacts.link[k] = records.contact[place, k, index].link
+    for i in range(job.links):
+        at = row(chain.node, i)
+        rate = row(chain.rate, i)
+        a = records.acceleration[place, i, index]
+        angle = row(chain.angle, i)
+        s2 = row(chain.axis2, i)
+        s1 = first_axis(s2, hinge_direction(chain, i), angle[1])
+        links.before[i] = s2 * wp.cos(angle[0]) - wp.cross(s1, s2) * wp.sin(angle[0])
+        links.axis[wp.static(hinges) * i] = s1
+        links.axis[wp.static(hinges) * i + 1] = s2
+        if wp.static(hinges == 3):
+            if i % 2 == 1:
+                s3 = row(chain.axis3, i)
+                links.axis[wp.static(hinges) * i + 2] = s3
+                # Half of the rest bend comes behind the twist, about the axis that is then z.
+                links.behind[i] = s2 * wp.cos(angle[2]) - wp.cross(s2, s3) * wp.sin(angle[2])
+        for d in range(hinges_of(i)):
+            j = wp.static(hinges) * i + d
+            links.vw[j] = on.vw
+            links.vv[j] = on.vv
+            links.moment[j] = wp.cross(at, hinge_row(links.axis, j))
+            add_hinge(on, at, hinge_row(links.axis, j), rate[d], a[d], real(0.0))
+        for k in range(contacts.count):
+            if contact_row(contacts.link, k) == i:
+                contact = records.contact[place, k, index]
+                taper = chains.taper[i, job.whisker]
+                radius = taper.start_radius + (taper.end_radius - taper.start_radius) * contact.share
+                point = at + (row(chain.node, i + 1) - at) * contact.share - contact.normal * radius
+                half = pose_from(motions, shapes.track[contact.shape], frame.middle, pose)
+                velocity = (
+                    on.vv
+                    + (on.av + options.gravity) * h
+                    + wp.cross(on.vw + on.aw * h, point)
+                    - half.velocity
+                    - wp.cross(half.spin, point - half.place)
+                )
+                contacts.point[k] = point
+                set_state(contacts, k, contact, velocity)
+    return frame
 
 
 @wp.func
@@ -263,25 +371,18 @@ def reverse_step(
     zero = real(0.0)
     none = vec3(zero, zero, zero)
     index = job.index
-    step = records.step[place, index]
-    now = step.time
-    h = step.length
-    later = instant(now.tick, now.part + h)
-    pose = pose_at(motions, job.base, now)
-    after = pose_at(motions, job.base, later)
-
-    # The factorised chain of the step.
     chain = ChainState()
     proximity = ProximityState()
-    state = WhiskerState()
-    for i in range(job.links):
-        chain.angle[i] = records.angle[place, i, index]
-        chain.rate[i] = records.rate[place, i, index]
-    base = SpatialAcceleration()
-    base.angular = (after.spin - pose.spin) / h
-    base.linear = (after.velocity - pose.velocity) / h - wp.cross(pose.spin, pose.velocity) - options.gravity
-    tip = forward_kinematics(chains, job, pose, chain, proximity, state)
-    articulated_inertia(chains, jobs, job, chain, proximity, tip, base, elapsed(now), h, 1)
+    links = StepLinks()
+    contacts = AdjointContacts()
+    on = Fields()
+    frame = restore_step(
+        chains, motions, shapes, jobs, options, records, job, place, chain, proximity, links, contacts, on
+    )  # fmt: skip
+    now = frame.now
+    later = frame.later
+    h = frame.length
+    pose = frame.pose
 
     # Derivatives of what follows by the accelerations: q⁺ = q + h q̇⁺, q̇⁺ = q̇ + h a.
     asked = PerLinkJoint()
@@ -294,7 +395,7 @@ def reverse_step(
     wrench_bar_v = none
     force_bar = none
     moment_bar = none
-    reading = step.reading
+    reading = frame.reading
     if reading >= 0:
         # A quasi-static step that turns out too long writes its reading with its first part, then again with its last.
         if reading + 1 == gradients.reading[index]:
@@ -307,70 +408,32 @@ def reverse_step(
         force_bar = outputs.contact[reading, 0, index]
         moment_bar = outputs.contact[reading, 1, index]
 
-    # Twists and accelerations down the chain, with those of the contacts at the end of the step.
-    contacts = AdjointContacts()
-    contacts.count = step.contacts
-    on = Fields()
-    on.vw = pose.spin
-    on.vv = pose.velocity
-    on.aw = base.angular
-    on.av = base.linear
-    middle = instant(now.tick, now.part + real(0.5) * h)
-    for k in range(contacts.count):
-        contacts.link[k] = records.contact[place, k, index].link
-    for i in range(job.links):
-        at = row(chain.node, i)
-        rate = row(chain.rate, i)
-        a = records.acceleration[place, i, index]
-        add_hinge(on, at, joint_axes(chain, i), rate[0], a[0], zero)
-        add_hinge(on, at, row(chain.axis2, i), rate[1], a[1], zero)
-        if wp.static(hinges == 3):
-            if i % 2 == 1:
-                add_hinge(on, at, row(chain.axis3, i), rate[2], a[2], zero)
-        for k in range(contacts.count):
-            if contact_row(contacts.link, k) == i:
-                contact = records.contact[place, k, index]
-                taper = chains.taper[i, job.whisker]
-                radius = taper.start_radius + (taper.end_radius - taper.start_radius) * contact.share
-                point = at + (row(chain.node, i + 1) - at) * contact.share - contact.normal * radius
-                half = pose_from(motions, shapes.track[contact.shape], middle, pose)
-                velocity = (
-                    on.vv
-                    + (on.av + options.gravity) * h
-                    + wp.cross(on.vw + on.aw * h, point)
-                    - half.velocity
-                    - wp.cross(half.spin, point - half.place)
-                )
-                contacts.point[k] = point
-                set_state(contacts, k, contact, velocity)
-
     summary = gradients.contacts[index]
-    summarize(summary, contacts, step.open_gap)
-    summary.degenerate = summary.degenerate + step.inexact
+    summarize(summary, contacts, records.step[place, index])
     gradients.contacts[index] = summary
 
     # Multipliers: the virtual motion without contacts, then with what the contacts' own multipliers push.
     virtual = PerLinkJoint()
     there = PerContact3()
-    virtual_motion(job, chain, proximity, asked, wrench_bar_w, wrench_bar_v, contacts, 0, virtual, there)
+    virtual_motion(job, chain, proximity, links, asked, wrench_bar_w, wrench_bar_v, contacts, 0, virtual, there)
     if contacts.count > 0:
         for k in range(contacts.count):
             force_bar_k = force_bar + wp.cross(moment_bar, contact_row(contacts.point, k))
             there[k] = contact_row(there, k) - force_bar_k
-        degenerate = solve_multipliers(job, chain, proximity, contacts, system, there, h)
+        matrix = DenseSystem()
+        build_system(job, chain, proximity, contacts, system, h, 0, matrix)
+        degenerate = solve_system(contacts, matrix, there)
         gradients.contacts[index].degenerate = gradients.contacts[index].degenerate + degenerate
-        virtual_motion(job, chain, proximity, asked, wrench_bar_w, wrench_bar_v, contacts, 1, virtual, there)
+        for k in range(contacts.count):
+            contacts.push[k] = velocity_block(contacts, k) * contact_row(contacts.multiplier, k) * (-h)
+        virtual_motion(job, chain, proximity, links, asked, wrench_bar_w, wrench_bar_v, contacts, 1, virtual, there)
     on.ww = wrench_bar_w
     on.wv = wrench_bar_v
     for i in range(job.links):
-        at = row(chain.node, i)
         mu = row(virtual, i)
-        ww = joint_axes(chain, i) * mu[0] + row(chain.axis2, i) * mu[1]
-        if wp.static(hinges == 3):
-            if i % 2 == 1:
-                ww = ww + row(chain.axis3, i) * mu[2]
-        on.ww = on.ww + ww
-        on.wv = on.wv + wp.cross(at, ww)
+        for d in range(hinges_of(i)):
+            on.ww = on.ww + hinge_row(links.axis, wp.static(hinges) * i + d) * mu[d]
+            on.wv = on.wv + hinge_row(links.moment, wp.static(hinges) * i + d) * mu[d]
 
     # Up the chain.
     lag = wp.max(h, job.beta)
@@ -393,7 +456,7 @@ def reverse_step(
                 taper = chains.taper[i, job.whisker]
                 taper_bar = reverse_contact(
                     motions, shapes, gradients.shape, gradients.knots, contacts, k, contact, on, bar, base_bar, pose,
-                    moment_bar, at, x * build.length, taper.start_radius, taper.end_radius, now, middle, h
+                    moment_bar, at, x * build.length, taper.start_radius, taper.end_radius, now, frame.middle, h
                 )  # fmt: skip
                 add(gradients, START_RADIUS, i, index, taper_bar.start_radius)
                 add(gradients, END_RADIUS, i, index, taper_bar.end_radius)
@@ -430,14 +493,12 @@ def reverse_step(
         angle_bar = gradients.angle[i, index]
         rate_bar = gradients.rate[i, index]
         lag_bar = zero
-        s2 = row(chain.axis2, i)
-        s1 = joint_axes(chain, i)
+        s1 = hinge_row(links.axis, wp.static(hinges) * i)
+        s2 = hinge_row(links.axis, wp.static(hinges) * i + 1)
         if wp.static(hinges == 3):
             if i % 2 == 1:
-                s3 = row(chain.axis3, i)
-                # Half of the rest bend comes behind the twist, about the axis that is then z.
-                behind = s2 * wp.cos(angle[2]) - wp.cross(s2, s3) * wp.sin(angle[2])
-                add(gradients, BEND, i, index, wp.dot(behind, bar.turn))
+                s3 = hinge_row(links.axis, wp.static(hinges) * i + 2)
+                add(gradients, BEND, i, index, wp.dot(row(links.behind, i), bar.turn))
                 pulled = spring(gradients, TORSION, i, index, inertia.torsion, angle[2], rate[2] + h * a[2], lag, mu[2])
                 angle_bar[2] = angle_bar[2] + wp.dot(s3, bar.turn) + pulled
                 rate_bar[2] = rate_bar[2] + lag * pulled
@@ -454,8 +515,7 @@ def reverse_step(
         lag_bar = lag_bar + pulled1 * (rate[0] + h * a[0]) + pulled2 * (rate[1] + h * a[1])
         if job.beta > h:
             gradients.beta[index] = gradients.beta[index] + lag_bar
-        before = s2 * wp.cos(angle[0]) - wp.cross(s1, s2) * wp.sin(angle[0])
-        add(gradients, BEND, i, index, wp.dot(before, bar.turn))
+        add(gradients, BEND, i, index, wp.dot(row(links.before, i), bar.turn))
         gradients.angle[i, index] = angle_bar
         gradients.rate[i, index] = rate_bar
         if reading >= 0:

@@ -19,7 +19,8 @@ from ..delassus import PerContact1, PerContact3, PerContactInt
 from ..delassus import row as contact_row
 from ..parameters import hinges, real
 from ..state import WhiskerJob, row
-from .records import ContactRecord
+from .dense import DenseSystem, dense_entry, solve_dense, width
+from .records import ContactRecord, StepRecord
 
 SLIDING = 1 - 1e-6
 """Share of the friction cone from which a contact slides: forces of recorded steps are solved to rounding."""
@@ -46,19 +47,17 @@ class AdjointContacts:
     scale: PerContact1
     """σ"""
     multiplier: PerContact3
-    """ν"""
+    """ν, or going forward the change of the force."""
     push: PerContact3
     """Force −h A ν that the multipliers exert on the virtual motion."""
 
 
 @wp.struct
 class ContactSystem:
-    """Room for the systems of the contacts."""
+    """Room for what the contacts' system is made of."""
 
     unit: wp.array3d(dtype=JointVector)
     """[3 · contact, link, job] what the joints feel of a unit force at a contact."""
-    matrix: wp.array3d(dtype=real)
-    """[3 · contact, 3 · contact + 2, job] with the right-hand side, and which columns have a pivot."""
 
 
 @wp.struct
@@ -84,6 +83,8 @@ class ContactSummary:
     """Largest share of the friction cone that a sticking contact used."""
     least_gap: real
     """Least distance (mm) from closing, of what did not press."""
+    least_lead: real
+    """Least distance (mm) by which one link was chosen before the next one, which touched the same."""
     steps: wp.int32
 
 
@@ -91,13 +92,14 @@ class ContactSummary:
 def summarize(
     summary: wp.ref[ContactSummary],
     contacts: wp.ref[AdjointContacts],
-    open_gap: real,
+    step: StepRecord,
 ):
     """Add a step, which comes before those in the summary."""
     if summary.steps == 0:
         summary.least_force = real(1e30)
         summary.slowest_slip = real(1e30)
         summary.least_gap = real(1e30)
+        summary.least_lead = real(1e30)
     sliding = int(0)
     for k in range(contacts.count):
         n = contact_row(contacts.normal, k)
@@ -114,7 +116,9 @@ def summarize(
             speed = wp.length(v - n * wp.dot(n, v))
             summary.fastest_slip = wp.max(summary.fastest_slip, speed)
             summary.slowest_slip = wp.min(summary.slowest_slip, speed)
-    summary.least_gap = wp.min(summary.least_gap, wp.abs(open_gap))
+    summary.least_gap = wp.min(summary.least_gap, wp.abs(step.open_gap))
+    summary.least_lead = wp.min(summary.least_lead, step.lead)
+    summary.degenerate = summary.degenerate + step.inexact
     if summary.steps > 0:
         if summary.contacts > contacts.count:
             summary.begun = summary.begun + 1
@@ -245,73 +249,48 @@ def compliance(
 
 
 @wp.func
-def solve_multipliers(
+def build_system(
     job: WhiskerJob,
     chain: wp.ref[ChainState],
     proximity: wp.ref[ProximityState],
     contacts: wp.ref[AdjointContacts],
     system: ContactSystem,
-    asked: wp.ref[PerContact3],
     h: real,
-) -> int:
-    """Find the multipliers and what they push with; return 1 where contacts share a load in more than one way.
-
-    ``asked`` is w − f̄ of each contact.
-    """
-    index = job.index
-    size = 3 * contacts.count
+    forward: int,
+    matrix: wp.ref[DenseSystem],
+):
+    """Write the matrix of the multipliers, G A + Bᵀ, or with ``forward`` that of the change of forces, A G + B."""
     carry_units(job, chain, contacts, system)
     for k in range(contacts.count):
         own = compliance(job, proximity, contacts, system, k, k, h)
         contacts.scale[k] = (own[0, 0] + own[1, 1] + own[2, 2]) / real(3.0)
-    largest = real(0.0)
     for k in range(contacts.count):
         for e in range(contacts.count):
-            block = compliance(job, proximity, contacts, system, k, e, h) * velocity_block(contacts, e)
-            if k == e:
+            block = compliance(job, proximity, contacts, system, k, e, h)
+            if forward == 1:
+                block = velocity_block(contacts, k) * block
+            else:
+                block = block * velocity_block(contacts, e)
+            if k == e and forward == 1:
+                block = block + wp.transpose(force_block(contacts, k))
+            elif k == e:
                 block = block + force_block(contacts, k)
             for a in range(3):
                 for b in range(3):
-                    system.matrix[3 * k + a, 3 * e + b, index] = block[a, b]
-                    largest = wp.max(largest, wp.abs(block[a, b]))
-        for a in range(3):
-            system.matrix[3 * k + a, size, index] = contact_row(asked, k)[a]
-    # Gauss-Jordan with pivots; a column without one has no multiplier.
-    degenerate = int(0)
-    used = int(0)
-    for c in range(size):
-        best = used
-        for r in range(used, size):
-            if wp.abs(system.matrix[r, c, index]) > wp.abs(system.matrix[best, c, index]):
-                best = r
-        pivot = real(0.0)
-        if used < size:
-            pivot = system.matrix[best, c, index]
-        if wp.abs(pivot) <= real(1e-11) * largest:
-            degenerate = 1
-            system.matrix[c, size + 1, index] = real(0.0)
-        else:
-            system.matrix[c, size + 1, index] = real(1.0)
-            for e in range(size + 1):
-                kept = system.matrix[used, e, index]
-                system.matrix[used, e, index] = system.matrix[best, e, index] / pivot
-                system.matrix[best, e, index] = wp.where(best == used, system.matrix[used, e, index], kept)
-            for r in range(size):
-                if r != used:
-                    factor = system.matrix[r, c, index]
-                    if factor != real(0.0):
-                        for e in range(size + 1):
-                            system.matrix[r, e, index] = (
-                                system.matrix[r, e, index] - factor * system.matrix[used, e, index]
-                            )
-            used = used + 1
-    r = int(0)
-    for c in range(size):
-        value = real(0.0)
-        if system.matrix[c, size + 1, index] == real(1.0):
-            value = system.matrix[r, size, index]
-            r = r + 1
-        contacts.multiplier[c // 3, c % 3] = value
+                    matrix[(3 * k + a) * wp.static(width) + 3 * e + b] = block[a, b]
+
+
+@wp.func
+def solve_system(contacts: wp.ref[AdjointContacts], matrix: wp.ref[DenseSystem], asked: wp.ref[PerContact3]) -> int:
+    """Solve the system in place for the multipliers, or for the change of the forces in their place.
+
+    Returned is 1 where contacts share a load in more than one way.
+    """
+    size = 3 * contacts.count
+    for r in range(size):
+        matrix[r * wp.static(width) + size] = contact_row(asked, r // 3)[r % 3]
+    degenerate = solve_dense(matrix, size)
     for k in range(contacts.count):
-        contacts.push[k] = velocity_block(contacts, k) * contact_row(contacts.multiplier, k) * (-h)
+        for d in range(3):
+            contacts.multiplier[k, d] = dense_entry(matrix, (3 * k + d) * wp.static(width) + size)
     return degenerate

@@ -207,6 +207,7 @@ def record_state(
     record.length = h
     record.reading = state.pending_reading
     record.open_gap = real(1e30)
+    record.lead = real(1e30)
     for i in range(job.links):
         paused.records.angle[place, i, job.index] = row(chain.angle, i)
         paused.records.rate[place, i, job.index] = row(chain.rate, i)
@@ -235,6 +236,7 @@ def record_contacts(
     first = index * wp.static(most_candidates)
     pressing = int(0)
     taken = int(0)
+    lead = real(1e30)
     if solved == 1:
         paused.records.step[place, index].inexact = problems.solution[index].inexact
         for k in range(problems.solution[index].contacts):
@@ -248,6 +250,7 @@ def record_contacts(
                 taper = chains.taper[i, job.whisker]
                 radius = taper.start_radius + (taper.end_radius - taper.start_radius) * share
                 start = row(chain.node, i)
+                lead = wp.min(lead, row(candidates.lead, held.slot))
                 record = ContactRecord()
                 record.link = i
                 record.shape = shape
@@ -278,6 +281,7 @@ def record_contacts(
             least = wp.min(least, ahead)
     paused.records.step[place, index].contacts = pressing
     paused.records.step[place, index].open_gap = least
+    paused.records.step[place, index].lead = lead
 
 
 @wp.func

@@ -22,6 +22,8 @@ class StepRecord:
     """1: its contact forces were not solved to rounding."""
     open_gap: real
     """Least gap at the end of the step of what could touch and does not press."""
+    lead: real
+    """Least distance by which a link that presses was chosen before the next one, which touches the same."""
 
 
 @wp.struct

@@ -1,0 +1,468 @@
+"""Forward derivatives of recorded steps: one thread takes one whisker, with the changes of all parameters.
+
+The equations are those of :mod:`brainbench.stimuli.engines.rod.adjoint`. A step solves R(a, f; q, q̇, θ) = 0; with a
+change of state and packed numbers, those of a and f solve
+
+    H δa − Jᵀ δf = −δR,        h A J δa + B δf = −δc,
+
+where δR and δc are the changes at fixed a and f: the factorised chain and the contacts' system of the step, transposed
+against the adjoint's. One step costs one solution for each parameter, where a difference costs two simulations. Rates
+of change have the letter p of their parameter; ``_d`` marks the change of a number. Units as in ``step``.
+"""
+
+import warp as wp
+
+from brainbench.stimuli.engines.rod.limits import CREVICE, MESH
+
+from ..algebra import JointVector, Wrench, rotate, symmetric_times, unrotate, vec3
+from ..articulated_body import ChainState, ProximityState
+from ..delassus import PerContact3
+from ..motion import MotionArrays, elapsed, pose_from
+from ..parameters import hinges, module_options, real
+from ..state import ChainArrays, JobArrays, PerLink3, PerLinkJoint, ShapeArrays, StepOptions, WhiskerJob, row
+from ..step import load_job
+from .chain import (
+    AXIAL,
+    BEND,
+    CENTRE,
+    END_RADIUS,
+    LENGTH,
+    MASS,
+    START_RADIUS,
+    STIFFNESS,
+    TORSION,
+    TRANSVERSE,
+    StepFrame,
+    restore_step,
+    spring_state,
+    virtual_motion,
+)
+from .contacts import AdjointContacts, ContactSystem, build_system, contact_row, solve_system, unit, velocity_block
+from .dense import DenseSystem
+from .fields import Fields, FieldTangents, PerHinge3, StepLinks, add_hinge, hinge_row, hinges_of, move_hinge
+from .pose import move_pose
+from .records import ContactRecord, StepRecords
+from .surfaces import size_cotangent
+
+
+@wp.struct
+class PackedTangents:
+    """Changes of the packed arrays with each parameter p, and of the state."""
+
+    angle: wp.array3d(dtype=JointVector)
+    """[p, link, job] of the state at the beginning of the next step."""
+    rate: wp.array3d(dtype=JointVector)
+    """[p, link, job]"""
+    link: wp.array4d(dtype=real)
+    """[p, 10, link, job] rows as in :class:`.chain.PackedGradients`."""
+    beta: wp.array2d(dtype=real)
+    """[p, job]"""
+    friction: wp.array2d(dtype=real)
+    """[p, job]"""
+    gravity: wp.array2d(dtype=vec3)
+    """[p, job]"""
+    knots: wp.array3d(dtype=real)
+    """[p, knot, 16]"""
+    load_force: wp.array2d(dtype=vec3)
+    """[p, load]"""
+    load_share: wp.array2d(dtype=real)
+    """[p, load]"""
+    shape_place: wp.array2d(dtype=vec3)
+    """[p, shape] as in :class:`.surfaces.ShapeGradients`."""
+    shape_turn: wp.array2d(dtype=vec3)
+    """[p, shape]"""
+    shape_size: wp.array2d(dtype=vec3)
+    """[p, shape]"""
+    shape_friction: wp.array2d(dtype=real)
+    """[p, shape]"""
+
+
+@wp.struct
+class OutputTangents:
+    """Changes of what the steps wrote with each parameter, in the units of the kernels."""
+
+    wrench: wp.array4d(dtype=vec3)
+    """[p, reading, 2, job] moment and force of the base on the whisker."""
+    points: wp.array4d(dtype=vec3)
+    """[p, reading, node, job] joints and tip, from the base point."""
+    contact: wp.array4d(dtype=vec3)
+    """[p, reading, 2, job] force and moment about the base point of all contacts."""
+
+
+@wp.struct
+class LinkFields:
+    """Angular velocity and acceleration of each link, velocity and acceleration of its centre, and loads."""
+
+    vw: PerLink3
+    aw: PerLink3
+    vc: PerLink3
+    ac: PerLink3
+    own: PerLink3
+    """Moment of its thin part about its centre, over axial less transverse inertia."""
+    moment: PerLink3
+    """Moment and force on it and on all behind it."""
+    force: PerLink3
+
+
+@wp.struct
+class ContactTangent:
+    """Change of a contact at fixed accelerations and forces."""
+
+    point: vec3
+    condition: vec3
+
+
+@wp.func
+def move_contact(
+    motions: MotionArrays,
+    shapes: ShapeArrays,
+    tangents: PackedTangents,
+    contacts: wp.ref[AdjointContacts],
+    k: int,
+    contact: ContactRecord,
+    frame: StepFrame,
+    p: int,
+    index: int,
+    turning: vec3,
+    moved: FieldTangents,
+    base_place: vec3,
+    at: vec3,
+    link: vec3,
+    link_d: vec3,
+    radii: vec3,
+    radii_d: vec3,
+) -> ContactTangent:
+    """Return the change of a contact's point and of its condition c; the reverse of ``surfaces.reverse_contact``.
+
+    ``turning`` is the angular velocity of the link at the end of the step, ``radii`` are those at both of its ends;
+    ``link`` goes from the joint ``at`` to its far end.
+    """
+    zero = real(0.0)
+    h = frame.length
+    shape = contact.shape
+    n = contact.normal
+    f = contact.force
+    s = contact.share
+    # The object: its shift at the place x of the axis, and its turn.
+    body = pose_from(motions, shapes.track[shape], frame.now, frame.pose)
+    body_d = move_pose(motions, tangents.knots, p, shapes.track[shape], frame.now)
+    x = at + link * s
+    origin = body.place + rotate(body.turn, shapes.place[shape])
+    turn_in = rotate(body.turn, tangents.shape_turn[p, shape])
+    turned = body_d.turn + turn_in
+    shift = body_d.place - base_place + wp.cross(body_d.turn, x - body.place)
+    shift = shift + rotate(body.turn, tangents.shape_place[p, shape]) + wp.cross(turn_in, x - origin)
+    gap_d = zero
+    if shapes.kind[shape] != wp.static(MESH):
+        inside = unrotate(shapes.turn[shape], unrotate(body.turn, x - origin))
+        size_d = tangents.shape_size[p, shape]
+        none = vec3(zero, zero, zero)
+        grown = vec3(zero, zero, zero)
+        for d in range(3):
+            grown[d] = wp.dot(size_d, size_cotangent(shapes.kind[shape], shapes.size[shape], inside, zero, unit(d)))
+        gap_d = wp.dot(size_d, size_cotangent(shapes.kind[shape], shapes.size[shape], inside, real(1.0), none))
+        shift = shift + rotate(body.turn, rotate(shapes.turn[shape], grown))
+
+    # The place on the axis, gap and normal there.
+    away = moved.at + link_d * s - shift
+    n_d = symmetric_times(contact.curvature, away) + wp.cross(turned, n)
+    bent = symmetric_times(contact.curvature, link)
+    curved = wp.dot(link, bent)
+    share_d = zero
+    if s < real(1.0) and curved > real(1e-9) * wp.length_sq(link):
+        slope = wp.dot(n, link_d) + wp.dot(n_d, link)
+        if shapes.kind[shape] != wp.static(MESH):
+            slope = slope - (radii_d[1] - radii_d[0])
+        share_d = -slope / curved
+    n_d = n_d + bent * share_d
+    radius = radii[0] + (radii[1] - radii[0]) * s
+    radius_d = radii_d[0] * (real(1.0) - s) + radii_d[1] * s + (radii[1] - radii[0]) * share_d
+    gap_d = gap_d + wp.dot(n, away + link * share_d) - radius_d
+    found = ContactTangent()
+    found.point = moved.at + link_d * s + link * share_d - n_d * radius - n * radius_d
+
+    # The velocity against the object at the end of the step.
+    point = contact_row(contacts.point, k)
+    half = pose_from(motions, shapes.track[shape], frame.middle, frame.pose)
+    half_d = move_pose(motions, tangents.knots, p, shapes.track[shape], frame.middle)
+    v = contact_row(contacts.velocity, k)
+    v_d = moved.vv + (moved.av + tangents.gravity[p, index]) * h
+    v_d = v_d + wp.cross(moved.vw + moved.aw * h, point) + wp.cross(turning, found.point)
+    v_d = v_d - half_d.velocity - wp.cross(half_d.spin, point - half.place)
+    v_d = v_d - wp.cross(half.spin, found.point - (half_d.place - base_place))
+
+    closing_d = zero
+    if -contact.gap < real(wp.static(CREVICE)):
+        closing_d = -gap_d / h
+    found.condition = velocity_block(contacts, k) * v_d - n * closing_d
+    if contact_row(contacts.slides, k) == 0:
+        closing = wp.min(-contact.gap, real(wp.static(CREVICE))) / h
+        found.condition = found.condition - n_d * closing
+        return found
+    friction_d = tangents.shape_friction[p, shape]
+    if shapes.friction[shape] < zero:
+        friction_d = tangents.friction[p, index]
+    u = contact_row(contacts.slip, k)
+    scale = contact_row(contacts.scale, k)
+    pressed = wp.dot(n, f)
+    pressed_d = wp.dot(n_d, f)
+    across = n_d * wp.dot(n, v) + n * wp.dot(n_d, v)
+    across = (across - u * wp.dot(u, across)) * contact_row(contacts.friction, k)
+    sliding = u * (contact.friction * pressed_d + friction_d * pressed) - n_d * pressed - n * pressed_d - across
+    found.condition = found.condition + n * wp.dot(n_d, v) + sliding * scale
+    return found
+
+
+@wp.func
+def spring_load(
+    stiffness: real, stiffness_d: real, angle: real, angle_d: real, rate: real, rate_d: real, lag: real, lag_d: real
+) -> real:
+    """Return the change of a joint's spring moment; rates are those at the end of the step."""
+    state = spring_state(angle, rate, lag)
+    return stiffness_d * state[0] + stiffness * state[1] * (angle_d + lag * rate_d + lag_d * rate)
+
+
+@wp.func
+def tangent_step(
+    chains: ChainArrays,
+    motions: MotionArrays,
+    shapes: ShapeArrays,
+    jobs: JobArrays,
+    options: StepOptions,
+    records: StepRecords,
+    system: ContactSystem,
+    tangents: PackedTangents,
+    outputs: OutputTangents,
+    job: WhiskerJob,
+    place: int,
+):
+    """Take the changes of all parameters over one step."""
+    zero = real(0.0)
+    none = vec3(zero, zero, zero)
+    index = job.index
+    chain = ChainState()
+    proximity = ProximityState()
+    links = StepLinks()
+    contacts = AdjointContacts()
+    on = Fields()
+    frame = restore_step(
+        chains, motions, shapes, jobs, options, records, job, place, chain, proximity, links, contacts, on
+    )  # fmt: skip
+    h = frame.length
+    pose = frame.pose
+    matrix = DenseSystem()
+    if contacts.count > 0:
+        build_system(job, chain, proximity, contacts, system, h, 1, matrix)
+    lag = wp.max(h, job.beta)
+    # What the changes of all parameters share: fields of each link, and the load on and behind it.
+    fields = LinkFields()
+    on.vw = pose.spin
+    on.vv = pose.velocity
+    on.aw = frame.base.angular
+    on.av = frame.base.linear
+    for i in range(job.links):
+        inertia = chains.inertia[i, job.whisker]
+        at = row(chain.node, i)
+        rate = row(chain.rate, i)
+        a = records.acceleration[place, i, index]
+        for d in range(hinges_of(i)):
+            add_hinge(on, at, hinge_row(links.axis, wp.static(hinges) * i + d), rate[d], a[d], zero)
+        x = (row(chain.node, i + 1) - at) / chains.build[i, job.whisker].length
+        com = at + x * inertia.centre
+        vc = on.vv + wp.cross(on.vw, com)
+        ac = on.av + wp.cross(on.aw, com) + wp.cross(on.vw, vc)
+        whirl = wp.cross(on.vw, x)
+        own = x * wp.dot(x, on.aw) + whirl * wp.dot(x, on.vw)
+        fields.vw[i] = on.vw
+        fields.aw[i] = on.aw
+        fields.vc[i] = vc
+        fields.ac[i] = ac
+        fields.own[i] = own
+        f = ac * chains.build[i, job.whisker].mass
+        m = wp.cross(com, f) + on.aw * inertia.transverse + own * (inertia.axial - inertia.transverse)
+        for load in range(job.first_load, job.end_load):
+            if jobs.load_link[load] == i and elapsed(frame.now) < jobs.load_stop[load]:
+                pull = jobs.load_force[load]
+                f = f - pull
+                m = m - wp.cross(at + (row(chain.node, i + 1) - at) * jobs.load_share[load], pull)
+        for k in range(contacts.count):
+            if contact_row(contacts.link, k) == i:
+                f = f - contact_row(contacts.force, k)
+                m = m - wp.cross(contact_row(contacts.point, k), contact_row(contacts.force, k))
+        fields.force[i] = f
+        fields.moment[i] = m
+    for back in range(1, job.links):
+        i = job.links - 1 - back
+        fields.force[i] = row(fields.force, i) + row(fields.force, i + 1)
+        fields.moment[i] = row(fields.moment, i) + row(fields.moment, i + 1)
+    axis_d = PerHinge3()
+    arm_d = PerHinge3()
+    moment_d = PerLink3()
+    force_d = PerLink3()
+    asked = PerLinkJoint()
+    virtual = PerLinkJoint()
+    point_d = PerContact3()
+    missed = PerContact3()
+    there = PerContact3()
+    for p in range(tangents.angle.shape[0]):
+        pose_d = move_pose(motions, tangents.knots, p, job.base, frame.now)
+        after_d = move_pose(motions, tangents.knots, p, job.base, frame.later)
+        lag_d = zero
+        if job.beta > h:
+            lag_d = tangents.beta[p, index]
+        moved = FieldTangents()
+        moved.turn = pose_d.turn
+        moved.vw = pose_d.spin
+        moved.vv = pose_d.velocity
+        moved.aw = (after_d.spin - pose_d.spin) / h
+        moved.av = (after_d.velocity - pose_d.velocity) / h - tangents.gravity[p, index]
+        moved.av = moved.av - wp.cross(pose_d.spin, pose.velocity) - wp.cross(pose.spin, pose_d.velocity)
+
+        # Down the chain: fields, and the load on each link.
+        for i in range(job.links):
+            build = chains.build[i, job.whisker]
+            inertia = chains.inertia[i, job.whisker]
+            at = row(chain.node, i)
+            span = row(chain.node, i + 1) - at
+            x = span / build.length
+            rate = row(chain.rate, i)
+            a = records.acceleration[place, i, index]
+            angle_d = tangents.angle[p, i, index]
+            rate_d = tangents.rate[p, i, index]
+            bend_d = tangents.link[p, wp.static(BEND), i, index]
+            moved.turn = moved.turn + row(links.before, i) * bend_d
+            for d in range(hinges_of(i)):
+                j = wp.static(hinges) * i + d
+                move_hinge(links, j, moved, at, rate[d], a[d], angle_d[d], rate_d[d], axis_d, arm_d)
+            if wp.static(hinges == 3):
+                moved.turn = moved.turn + row(links.behind, i) * bend_d
+            x_d = wp.cross(moved.turn, x)
+            length_d = tangents.link[p, wp.static(LENGTH), i, index]
+            span_d = x_d * build.length + x * length_d
+            transverse_d = tangents.link[p, wp.static(TRANSVERSE), i, index]
+            thin = inertia.axial - inertia.transverse
+            thin_d = tangents.link[p, wp.static(AXIAL), i, index] - transverse_d
+            vw = row(fields.vw, i)
+            aw = row(fields.aw, i)
+            ac = row(fields.ac, i)
+            com = at + x * inertia.centre
+            com_d = moved.at + x_d * inertia.centre + x * tangents.link[p, wp.static(CENTRE), i, index]
+            vc_d = moved.vv + wp.cross(moved.vw, com) + wp.cross(vw, com_d)
+            ac_d = moved.av + wp.cross(moved.aw, com) + wp.cross(aw, com_d)
+            ac_d = ac_d + wp.cross(moved.vw, row(fields.vc, i)) + wp.cross(vw, vc_d)
+            own_d = x_d * wp.dot(x, aw) + x * (wp.dot(x_d, aw) + wp.dot(x, moved.aw))
+            own_d = own_d + (wp.cross(moved.vw, x) + wp.cross(vw, x_d)) * wp.dot(x, vw)
+            own_d = own_d + wp.cross(vw, x) * (wp.dot(x_d, vw) + wp.dot(x, moved.vw))
+            f_d = ac_d * build.mass + ac * tangents.link[p, wp.static(MASS), i, index]
+            m_d = wp.cross(com_d, ac * build.mass) + wp.cross(com, f_d) + row(fields.own, i) * thin_d + own_d * thin
+            m_d = m_d + aw * transverse_d + moved.aw * inertia.transverse
+            for load in range(job.first_load, job.end_load):
+                if jobs.load_link[load] == i and elapsed(frame.now) < jobs.load_stop[load]:
+                    pull = jobs.load_force[load]
+                    pull_d = tangents.load_force[p, load]
+                    share = jobs.load_share[load]
+                    reach_d = moved.at + span_d * share + span * tangents.load_share[p, load]
+                    f_d = f_d - pull_d
+                    m_d = m_d - wp.cross(at + span * share, pull_d) - wp.cross(reach_d, pull)
+            for k in range(contacts.count):
+                if contact_row(contacts.link, k) == i:
+                    contact = records.contact[place, k, index]
+                    taper = chains.taper[i, job.whisker]
+                    radii = vec3(taper.start_radius, taper.end_radius, zero)
+                    radii_d = vec3(
+                        tangents.link[p, wp.static(START_RADIUS), i, index],
+                        tangents.link[p, wp.static(END_RADIUS), i, index],
+                        zero,
+                    )
+                    turning = vw + aw * h
+                    changed = move_contact(
+                        motions, shapes, tangents, contacts, k, contact, frame, p, index, turning, moved,
+                        pose_d.place, at, span, span_d, radii, radii_d
+                    )  # fmt: skip
+                    point_d[k] = changed.point
+                    missed[k] = changed.condition
+                    m_d = m_d - wp.cross(changed.point, contact.force)
+            moment_d[i] = m_d
+            force_d[i] = f_d
+            moved.at = moved.at + span_d
+            if frame.reading >= 0:
+                outputs.points[p, frame.reading, i + 1, index] = moved.at
+
+        # Up the chain: what the joints miss.
+        total_d = Wrench()
+        total_d.moment = none
+        total_d.force = none
+        for back in range(job.links):
+            i = job.links - 1 - back
+            inertia = chains.inertia[i, job.whisker]
+            total_d.moment = total_d.moment + row(moment_d, i)
+            total_d.force = total_d.force + row(force_d, i)
+            angle = row(chain.angle, i)
+            rate = row(chain.rate, i) + records.acceleration[place, i, index] * h
+            angle_d = tangents.angle[p, i, index]
+            rate_d = tangents.rate[p, i, index]
+            due = JointVector()
+            for d in range(hinges_of(i)):
+                j = wp.static(hinges) * i + d
+                stiffness = inertia.stiffness
+                stiffness_d = tangents.link[p, wp.static(STIFFNESS), i, index]
+                if wp.static(hinges == 3):
+                    if d == 2:
+                        stiffness = inertia.torsion
+                        stiffness_d = tangents.link[p, wp.static(TORSION), i, index]
+                due[d] = -spring_load(stiffness, stiffness_d, angle[d], angle_d[d], rate[d], rate_d[d], lag, lag_d) - (
+                    wp.dot(hinge_row(axis_d, j), row(fields.moment, i))
+                    + wp.dot(hinge_row(links.axis, j), total_d.moment)
+                    + wp.dot(hinge_row(arm_d, j), row(fields.force, i))
+                    + wp.dot(hinge_row(links.moment, j), total_d.force)
+                )
+            asked[i] = due
+
+        # Accelerations without a change of contact forces, then with it.
+        held = virtual_motion(job, chain, proximity, links, asked, none, none, contacts, 0, virtual, there)
+        contact_d = Wrench()
+        contact_d.moment = none
+        contact_d.force = none
+        if contacts.count > 0:
+            for k in range(contacts.count):
+                there[k] = -contact_row(missed, k) - velocity_block(contacts, k) * contact_row(there, k) * h
+            work = DenseSystem()
+            work = matrix
+            solve_system(contacts, work, there)
+            for k in range(contacts.count):
+                push = contact_row(contacts.multiplier, k)
+                contacts.push[k] = push
+                contact_d.force = contact_d.force + push
+                contact_d.moment = contact_d.moment + wp.cross(contact_row(contacts.point, k), push)
+                contact_d.moment = contact_d.moment + wp.cross(contact_row(point_d, k), contact_row(contacts.force, k))
+            held = virtual_motion(job, chain, proximity, links, asked, none, none, contacts, 1, virtual, there)
+        if frame.reading >= 0:
+            outputs.wrench[p, frame.reading, 0, index] = total_d.moment - held.moment
+            outputs.wrench[p, frame.reading, 1, index] = total_d.force - held.force
+            outputs.contact[p, frame.reading, 0, index] = contact_d.force
+            outputs.contact[p, frame.reading, 1, index] = contact_d.moment
+        for i in range(job.links):
+            rate_d = tangents.rate[p, i, index] + row(virtual, i) * h
+            tangents.angle[p, i, index] = tangents.angle[p, i, index] + rate_d * h
+            if options.quasistatic == 1:
+                rate_d = JointVector()
+            tangents.rate[p, i, index] = rate_d
+
+
+@wp.kernel(enable_backward=False, module="unique", module_options=module_options())
+def tangent_segment(
+    chains: ChainArrays,
+    motions: MotionArrays,
+    shapes: ShapeArrays,
+    jobs: JobArrays,
+    options: StepOptions,
+    records: StepRecords,
+    system: ContactSystem,
+    tangents: PackedTangents,
+    outputs: OutputTangents,
+):
+    """Take the changes of each whisker over the recorded steps."""
+    index = wp.tid()
+    job = load_job(chains, motions, shapes, jobs, options, index)
+    for place in range(records.count[index]):
+        tangent_step(chains, motions, shapes, jobs, options, records, system, tangents, outputs, job, place)
