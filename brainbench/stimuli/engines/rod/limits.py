@@ -23,8 +23,15 @@ CLOSED = 1e-3
 """Overlap (mm) at the end of a step from which a place counts as pressed upon."""
 LARGEST_FORCE = 1e6
 """Force (mN) of a contact from which it counts as one that no force can resolve."""
-SWEEPS = 8
-"""Most Gauss-Seidel sweeps over the contacts of one step."""
+FEW_ITERATIONS = 1e-4, 8, 8
+"""How contact forces are solved where the fidelity states no tolerance: change of the forces in a sweep (as a share of
+them; or error of the gaps, mm) at which sweeps end, most Gauss-Seidel sweeps of one step, and most iterations for the
+direction in which one contact slips. The last are too few for some contacts (benchmarks/RESULTS.md, "Contact forces
+solved to a tolerance")."""
+MOST_ITERATIONS = 400
+"""Most sweeps, and most iterations within one, where it states a tolerance."""
+ROUNDING = 1e-12
+"""Tolerance of runs of gradients: the adjoint is that of the solution."""
 FOLD = 1.2
 """Bend (rad) beyond which a joint stiffens. The last links of a fine tip are so soft that the slightest force folds
 them double; what reaches the base through them is nothing."""

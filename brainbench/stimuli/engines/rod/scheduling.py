@@ -187,10 +187,10 @@ def allocate(kind: Any, device: Any, **shapes: int | tuple[int, ...]) -> Any:
     return struct
 
 
-def make_problems(kernels: Any, capacity: int, lanes: int, device: Any) -> Any:
-    """Return room for the contact problem of each lane."""
+def make_problems(kernels: Any, capacity: int, lanes: int, device: Any, tolerance: float | None) -> Any:
+    """Return room for the contact problem of each lane; ``tolerance`` is that of the fidelity."""
     held, candidates = contacts_for(capacity), contacts_for(capacity) + limits.SPARE
-    return allocate(
+    problems = allocate(
         kernels.structs.ContactProblems,
         device,
         **dict.fromkeys(("given", "solution"), lanes),
@@ -199,3 +199,7 @@ def make_problems(kernels: Any, capacity: int, lanes: int, device: Any) -> Any:
         held=(lanes, held),
         **dict.fromkeys(("free_acceleration", "added_acceleration"), (lanes, capacity)),
     )
+    most = limits.MOST_ITERATIONS
+    limited = limits.FEW_ITERATIONS if tolerance is None else (tolerance, most, most)
+    problems.tolerance, problems.sweeps, problems.tries = limited
+    return problems
