@@ -24,7 +24,10 @@ from brainbench.stimuli.tradeoff import REFERENCE, SimulationSetting, run_for_co
 from brainbench.stimuli.validation.contact_scenes import FRICTIONS, contact_jobs, difference
 
 ERRORS = (0.4, 0.2, 0.1, 0.07, 0.05)
-FINER = Fidelity(links=60, time_step=5e-6, precision="double"), Fidelity(links=40, time_step=5e-6)
+FINER = (
+    Fidelity(links=60, time_step=5e-6, precision="double", contact_tolerance=1e-9),
+    Fidelity(links=40, time_step=5e-6, contact_tolerance=1e-6),
+)
 
 
 def main() -> None:
@@ -48,6 +51,8 @@ def main() -> None:
         below = np.mean(errors <= error)
         interval = wilson_interval(float(np.sum(errors <= error)), len(errors), over="whiskers")
         setting = f"{fidelity.links} links, {fidelity.time_step * 1e3:g} ms, {fidelity.steps_per_period:g} a period"
+        setting += f", {fidelity.links_per_mm:g} links per mm" if fidelity.links_per_mm else ""
+        setting += f", contacts to {fidelity.contact_tolerance:g}" if fidelity.contact_tolerance else ""
         share = f"{below:.1%} [{interval.low:.1%}, {interval.high:.1%}]"
         rows.append([f"{error:.0%}", setting, share, f"{np.median(errors):.2%}", f"{cost:.3f}"])
         print(*rows[-1], sep=" | ", flush=True)
@@ -70,7 +75,7 @@ def main() -> None:
         f"{len(jobs)} whiskers (seed {args.seed}; {len(found) - len(jobs)} start inside an object or touch nothing): "
         "mouse and rat, post, ball, edge and hollow, friction 0, .4 and .8, whisking at 5, 10 and 20 Hz. Error: root "
         "mean square over time of base force or moment, whichever is larger, relative to the converged simulation "
-        "(40 links, 10 µs, double precision).\n\n"
+        "(40 links, 10 µs, double precision, contact forces solved to 1e-9).\n\n"
         + table(["asked for", "`Fidelity.auto`", "whiskers below it", "median error", "processor s / whisker-s"], rows)
         + told
     )
