@@ -33,8 +33,8 @@ def friction(cone: str, impratio: float, noslip: int) -> Iterator[None]:
     """Let the models of the backend have another friction."""
     plain = backend.build_model
 
-    def changed(*args: Any) -> Any:
-        built = plain(*args)
+    def changed(*args: Any, **options: Any) -> Any:
+        built = plain(*args, **options)
         built.model.opt.impratio = impratio
         built.model.opt.noslip_iterations = noslip
         built.model.opt.cone = getattr(engine().mjtCone, f"mjCONE_{cone.upper()}")

@@ -57,7 +57,11 @@ def whisker(
 
         plot_tradeoff(points, plot)
     best = tradeoff.front(points)
-    setting = {">links": "{0[links]}", ">step ms": lambda point: f"{point['time_step'] * 1e3:g}"}
+    setting = {
+        ">links": "{0[links]}",
+        ">step ms": lambda point: f"{point['time_step'] * 1e3:g}",
+        ">contacts to": lambda point: _known(point.get("contact_tolerance"), "g"),
+    }
     cost = {">processor s / whisker-s": lambda point: _known(point["cost"], ".3g")}
     text = table_of(
         f"{len(points)} settings measured; those that no other beats in cost and error (90 % of whiskers stay below):",

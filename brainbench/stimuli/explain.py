@@ -61,6 +61,8 @@ class Explanation:
     """Contact pairs of all links of all runs with all parts of their objects."""
     out_of_reach: Mapping[str, tuple[str, ...]]
     """Stimulus → whiskers that its objects cannot touch, whatever these whiskers do."""
+    unsolved: int = 0
+    """Time steps whose contact forces were not solved (:attr:`Trace.unsolved`)."""
     bodies: str = "convex parts"
     """Bodies that the contact pairs count: ``convex parts``, ``triangles`` or both."""
     seconds: Mapping[str, float] = field(default_factory=dict)
@@ -103,16 +105,18 @@ class Explanation:
         low, high = self.links
         links = f"{low}" if low == high else f"{low}–{high}"
         elapsed = ", ".join(f"{name} {value:.2f} s" for name, value in self.seconds.items())
-        return [
+        rows = [
             ("asked for", f"{self.stimuli} stimuli × {self.whiskers} whiskers = {self.runs} runs of {links} links"),
             ("simulated", f"{self.simulated} runs, {self.steps:,} of {self.steps_in_full:,} time steps"),
             ("shared", f"{self.shared} runs equal to another stimulus's"),
             ("silent", f"{self.silent} runs that can feel nothing: exactly zero without simulation"),
+            ("not solved", f"contact forces of {self.unsolved:,} time steps"),
             ("contact pairs", f"{self.pairs:,} of {self.pairs_in_full:,} (links × {self.bodies}) can ever meet"),
             ("saved", f"{self._saved_steps()}, {_share(self.pairs, self.pairs_in_full)} of the contact pairs"),
             ("time", elapsed or "not known: made by another process"),
             ("made", "now" if self.source is None else f"earlier, read from {self.source}"),
         ]  # fmt: skip
+        return [row for row in rows if self.unsolved or row[0] != "not solved"]
 
     def _saved_steps(self) -> str:
         if self.steps <= self.steps_in_full:
@@ -157,6 +161,7 @@ def explain(scenes: Sequence[Scene], plan: JobSchedule, traces: Sequence[Trace],
         shared=runs - simulated - silent,
         silent=silent,
         steps=sum(trace.steps for trace in traces),
+        unsolved=sum(trace.unsolved for trace in traces),
         steps_in_full=steps_in_full,
         pairs=pairs,
         pairs_in_full=pairs_in_full,

@@ -51,13 +51,15 @@ from brainbench.stimuli.validation.bench_tests import peg, ringdown
 from brainbench.stimuli.whiskers.array import WhiskerArray
 from brainbench.stimuli.whiskers.whisker import Whisker
 
-PROTOCOL = 4
+PROTOCOL = 5
 """Counts up when the experiments change, so that points of different experiments never share a table."""
 PEGS = ((0.3, 0.05), (0.5, 0.1), (0.5, 0.2), (0.7, 0.2), (0.8, 0.02))
 """Centre-line points (a/L, d/L) of the static tests."""
 LINKS = (6, 8, 10, 14, 20, 30)
 TIME_STEPS = ((5e-4, 6.0), (2e-4, 10.0), (1e-4, 25.0), (5e-5, 60.0), (5e-5, 120.0), (2e-5, 250.0))
 """Time step [s] with the least steps per period of the first mode, which short whiskers need."""
+CONTACT_TOLERANCES = (1e-6, None)
+"""Tolerances of contact forces; None for few iterations."""
 COLLISIONS = ("exact", "decomposition-0.02", "decomposition-0.1", "hull")
 """Collision geometries of the concave object; a decomposition with its threshold."""
 ERROR = SHARES[0.9]
@@ -80,10 +82,11 @@ class SimulationSetting:
             _collision(self.collision)
 
 
-REFERENCE = SimulationSetting(Fidelity(links=40, time_step=1e-5, precision="double"), "rod")
-"""The converged simulation, in double precision: single precision loses more at such short steps than they gain. With
-friction ``rod`` is within some tenths of a per cent of a differential equation that no engine shares
-(``benchmarks/whiskers/friction_reference.py``), ``mujoco`` within some per cent."""
+REFERENCE = SimulationSetting(Fidelity(links=40, time_step=1e-5, precision="double", contact_tolerance=1e-9), "rod")
+"""The converged simulation, in double precision: single precision loses more at such short steps than they gain. Its
+contact forces are solved, so what few iterations leave counts among the errors. With friction ``rod`` is within some
+tenths of a per cent of a differential equation that no engine shares (``benchmarks/whiskers/friction_reference.py``),
+``mujoco`` within some per cent."""
 
 
 def settings(
@@ -93,20 +96,27 @@ def settings(
     backends: Sequence[str] = (DEFAULT_ENGINE,),
     collisions: Sequence[str] = (),
     solvers: Sequence[str] = ("dynamic",),
+    contact_tolerances: Sequence[float | None] = CONTACT_TOLERANCES,
 ) -> list[SimulationSetting]:
     """Return every combination (``time_steps`` pairs a step [s] with steps per period), after the presets.
 
     Args:
-        links, time_steps, backends, solvers: axes of the bench tests; the solver ``quasistatic``, of ``rod`` alone, has
-            no presets and no steps per period.
+        links, time_steps, backends, solvers, contact_tolerances: axes of the bench tests; the solver ``quasistatic``,
+            of ``rod`` alone, has no presets, no steps per period and the first of the tolerances.
         collisions: geometries of a concave object to measure as well, at each preset, as in :data:`COLLISIONS`.
 
     Raises:
         UsageError: a value lies outside the range of :class:`Fidelity`, or a collision geometry is unknown.
     """
     presets, steps = [Fidelity.preset(name) for name in list_presets()], list(itertools.product(links, time_steps))
-    grid = [Fidelity(links=n, time_step=step, steps_per_period=periods) for n, (step, periods) in steps]
-    still = [Fidelity(links=n, time_step=step, solver="quasistatic") for n, (step, _) in steps]
+    grid = [
+        Fidelity(links=n, time_step=step, steps_per_period=periods, contact_tolerance=tolerance)
+        for tolerance, (n, (step, periods)) in itertools.product(contact_tolerances, steps)
+    ]
+    still = [
+        Fidelity(links=n, time_step=step, solver="quasistatic", contact_tolerance=contact_tolerances[0])
+        for n, (step, _) in steps
+    ]
     fidelities = {"dynamic": dict.fromkeys([*presets, *grid]), "quasistatic": still}
     for solver in solvers:
         check_name("solver", solver, fidelities)
@@ -172,7 +182,7 @@ def front(points: Iterable[dict[str, Any]], *, backend: str | None = None) -> li
     """
     return pareto_front(
         TradeoffPoint(
-            math.inf if p[ERROR] is None else p[ERROR], p["cost"], {n: p[n] for n in (*RESOLUTION, "backend")}
+            math.inf if p[ERROR] is None else p[ERROR], p["cost"], {n: p.get(n) for n in (*RESOLUTION, "backend")}
         )
         for p in points
         if p["cost"] is not None and not p.get("collision") and backend in (None, p["backend"]) and _moves(p)

@@ -205,3 +205,16 @@ def test_a_set_without_or_with_a_damaged_explanation_is_refused_in_words():
     del dataset.attrs["explanation"]
     with pytest.raises(UsageError, match="simulate it again"):
         Explanation.of(dataset)
+
+
+def test_steps_whose_contact_forces_were_not_solved_are_told():
+    pytest.importorskip("warp")
+    scene = get_recipe("rodgers").scenes[0].select("C1,C2")
+    few, solved = (
+        Explanation.of(simulate(scene, fidelity=f"balanced,contact_tolerance={tolerance}", cache=False))
+        for tolerance in ("none", "1e-6")
+    )
+    assert few.unsolved > 0 == solved.unsolved
+    assert [dict(told.lines()).get("not solved") for told in (few, solved)] == [
+        f"contact forces of {few.unsolved:,} time steps", None,
+    ]  # fmt: skip

@@ -27,6 +27,7 @@ def quick(monkeypatch):
 
 
 COARSE = SimulationSetting(Fidelity(links=6, time_step=2e-4, steps_per_period=10), "mujoco")
+SOLVED = tradeoff.REFERENCE.fidelity.contact_tolerance
 FINE = SimulationSetting(Fidelity(links=8, time_step=2e-4, steps_per_period=10), "mujoco")
 
 
@@ -118,7 +119,7 @@ def test_the_solver_is_an_axis_of_the_backend_that_has_two_and_no_rival_of_the_p
         links=(8,), time_steps=((1e-3, 25.0),), backends=("mujoco", "rod"), solvers=("quasistatic",)
     )
     assert [(item.backend, item.fidelity) for item in chosen] == [
-        ("rod", Fidelity(links=8, time_step=1e-3, solver="quasistatic"))
+        ("rod", Fidelity(links=8, time_step=1e-3, solver="quasistatic", contact_tolerance=1e-6))
     ]
     with pytest.raises(UsageError, match="'static'; did you mean 'quasistatic'"):
         tradeoff.settings(solvers=("static",))
@@ -126,6 +127,18 @@ def test_the_solver_is_an_axis_of_the_backend_that_has_two_and_no_rival_of_the_p
     moving, still = ({**point, "solver": name, "error_90": 0.1, "cost": 1.0} for name in ("dynamic", "quasistatic"))
     assert len(tradeoff.front([moving, {**still, "error_90": 0.01}])) == 1
     assert tradeoff.front([still]) == []
+
+
+def test_what_few_iterations_leave_of_contact_forces_is_among_the_errors(quick, monkeypatch, tmp_path):
+    pytest.importorskip("warp")
+    monkeypatch.setattr(contact_scenes, "FRICTIONS", (0.8,))
+    same = Fidelity(links=8, time_step=2e-4, steps_per_period=10, precision="double")
+    monkeypatch.setattr(tradeoff, "REFERENCE", SimulationSetting(replace(same, contact_tolerance=SOLVED), "rod"))
+    chosen = [SimulationSetting(replace(same, contact_tolerance=each), "rod") for each in (None, 1e-6)]
+    few, solved = tradeoff.measure_tradeoff(tmp_path / "table.json", chosen)
+    # Two points, though they differ in the tolerance alone.
+    assert few["error_90"] > 0.1
+    assert solved["error_90"] < 1e-4
 
 
 @pytest.mark.slow

@@ -126,6 +126,9 @@ class Trace:
     reason: str = ""
     steps: int = 0
     """Time steps computed; 0 when the whisker was proven silent and not simulated."""
+    unsolved: int = 0
+    """Steps whose contact forces were not solved to :attr:`Fidelity.contact_tolerance`, or to 1e-4 where that is None;
+    of engines that tell (``rod`` does)."""
     seconds: float = 0.0
     """Processor time of this whisker [s]."""
     link_positions: NDArray[np.float64] | None = None

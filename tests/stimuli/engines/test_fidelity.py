@@ -105,6 +105,8 @@ def test_a_preset_in_a_text_may_be_changed_value_by_value():
         ("fast,time_step=", r"time_step .*received ''"),
         ("fast,solver=static", "quasistatic"),
         ("fast,time_step=1", "time_step .*at most 0.005"),
+        ("fast,contact_tolerance=0", "contact_tolerance .*at least 1e-12"),
+        ("fast,contact_tolerance=1e-9", "contact_tolerance .*1e-06 in single precision; received 1e-09"),
     ],
 )
 def test_a_wrong_text_is_answered_in_words(text, message):
@@ -115,6 +117,13 @@ def test_a_wrong_text_is_answered_in_words(text, message):
 def test_a_value_that_came_later_leaves_old_hashes_alone():
     assert "solver" not in to_plain(Fidelity())
     assert to_plain(Fidelity(solver="quasistatic"))["solver"] == "quasistatic"
+    assert "contact_tolerance" not in to_plain(Fidelity())
+    assert to_plain(Fidelity(contact_tolerance=1e-5))["contact_tolerance"] == 1e-5
+
+
+def test_contacts_may_be_solved_more_strictly_in_double_precision():
+    assert Fidelity.parse("balanced,precision=double,contact_tolerance=1e-9").contact_tolerance == 1e-9
+    assert Fidelity.parse("auto=0.05,contact_tolerance=none").contact_tolerance is None
 
 
 def test_twist_is_in_hashes_only_where_it_is_on():

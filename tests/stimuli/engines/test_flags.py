@@ -11,6 +11,7 @@ from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.engines.protocol import Job, Load, StillFollicle
 from brainbench.stimuli.engines.trust import LARGEST_OVERLAP, LARGEST_STRAIN, LOST, halved, judge
 from brainbench.stimuli.objects.obstacle import Capsule, Obstacle, Sphere, TriangleMesh
+from brainbench.stimuli.validation.contact_scenes import contact_jobs
 from tests.factories.trust import facts
 from tests.factories.whiskers import C2
 
@@ -41,6 +42,13 @@ def _moving(start, velocity, part):
 def _ball(overlap):
     """A ball beside the whisker, 8 mm from its base."""
     return Obstacle((Sphere((0.008, 0.005 + float(C2.radius(0.008)) - overlap, 0.0), 0.005),), friction=0.0)
+
+
+def _rubbing():
+    job = next(job for job in contact_jobs(5, each=1) if job.obstacles[0].friction == 0.8)
+    (trace,) = get_engine("rod").run([job], Fidelity(links=10, time_step=2e-4))
+    assert trace.unsolved > 0
+    return trace.reason
 
 
 def _peg(radius):
@@ -90,6 +98,7 @@ NOT_FLAGGED = {
     "starts in contact": lambda: _reason(_ball(1e-5)),
     "overlaps for a step": lambda: _judged(depth=0.9 * LARGEST_OVERLAP),
     "has an object behind its base": lambda: _reason(Obstacle((Sphere((-1.1e-3, 0.0, 0.0), 1e-3),))),
+    "slides with contact forces that were not solved": _rubbing,
     "sticks or slips at another time": lambda: str(judge(facts()).suspicious[0] or ""),
     "lies in bodies that overlap": lambda: _reason(_overlapping_boxes()),
 }

@@ -57,7 +57,10 @@ class MujocoWhiskerEngine(SteppedEngine):
         twists = stepped.fidelity.twist is not False
         if twists:
             twists = not stays_in_plane(job, stepped.reach, *stepped.pose, stepped.times)
-        built = build_model(job, chain, stepped.reach, stepped.step, stepped.times, twists=twists)
+        tolerance = stepped.fidelity.contact_tolerance
+        built = build_model(
+            job, chain, stepped.reach, stepped.step, stepped.times, twists=twists, contact_tolerance=tolerance
+        )
         sensors, hinges, failed, reason = _integrate(built, job, stepped.times)
         failed, reason = stepped.end(failed, reason)
         frames = stepped.frames(failed)

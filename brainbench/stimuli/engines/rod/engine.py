@@ -214,6 +214,7 @@ def trace_of(result: LaunchResult, row: int, job: Job, fidelity: Fidelity, secon
         status="unstable" if reason else "ok",
         reason=reason,
         steps=int(result.steps[row, 0]),
+        unsolved=int(result.counts["unsolved"][row, 0]),
         seconds=seconds,
         link_positions=None if shape is None else np.where(good[:, None, None], base + shape[row, :, :nodes], np.nan),
         contact_wrench=None if felt is None else np.where(good[:, None], felt[row], np.nan),

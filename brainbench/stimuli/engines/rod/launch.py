@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from brainbench.core.devices import to_struct, warp
 from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.engines.rod.compilation import load_kernels
-from brainbench.stimuli.engines.rod.limits import FINEST, LIGHT, LONGEST_SPAN
+from brainbench.stimuli.engines.rod.limits import FINEST, LIGHT, LONGEST_SPAN, TO_ROUNDING, contact_iterations
 from brainbench.stimuli.engines.rod.packing import PackedJobs, PackedMotions, capacity_for, pack_chains
 from brainbench.stimuli.engines.rod.scheduling import Slices, allocate, make_problems
 from brainbench.stimuli.engines.rod.shapes import PackedShapes
@@ -37,7 +37,8 @@ class LaunchResult:
     """[row, reading, column] arc of the contact (m), negative without."""
     counts: dict[str, NDArray[np.int32]]
     """[row, column] of each: ``status``, ``steps`` computed, steps ``touching`` anything, steps for some of whose
-    contacts there was no room (``crowded``), and steps whose contact forces did not converge (``unsolved``)."""
+    contacts there was no room (``crowded``), and steps whose contact forces were not solved to the tolerance
+    (``unsolved``)."""
     depth: NDArray[np.floating]
     """[row, column] deepest overlap (m)."""
     residual: NDArray[np.floating]
@@ -126,6 +127,7 @@ class WhiskerSolver:
         self.real = real_type(fidelity)
         self.capacity = capacity_for(max(chain.links for chain in chains))
         self.quasistatic = fidelity.solver == "quasistatic"
+        self.iterations = TO_ROUNDING if options.get("recorded") else contact_iterations(fidelity.contact_tolerance)
         hinges = 2 + (fidelity.twist is not False if twists is None else twists)
         if options:
             options["sliced"] = sliced
@@ -255,7 +257,7 @@ class WhiskerSolver:
             out = allocate(structs.ResultArrays, device, **shapes_of)
             out.contact = wp.full((size[0], frames, size[1]), -1.0, dtype=self.real, device=device)
             *scene, reading = [to_struct(kind, values, device) for kind, values in given]
-            problems = make_problems(self.kernels, self.capacity, count, device)
+            problems = make_problems(self.kernels, self.capacity, count, device, self.iterations)
         return [self.chain_arrays, *scene, options, reading, out, problems], out, shapes_of
 
     def _take_steps(self, inputs: list[Any], count: int, *, urgent: bool) -> Slices | None:

@@ -23,8 +23,15 @@ CLOSED = 1e-3
 """Overlap (mm) at the end of a step from which a place counts as pressed upon."""
 LARGEST_FORCE = 1e6
 """Force (mN) of a contact from which it counts as one that no force can resolve."""
-SWEEPS = 8
-"""Most Gauss-Seidel sweeps over the contacts of one step."""
+FEW_ITERATIONS = 1e-4, 8, 8
+"""How contact forces are solved where the fidelity states no tolerance: change of the forces in a sweep (as a share of
+them; or error of the gaps, mm) at which sweeps end, most Gauss-Seidel sweeps of one step, and most iterations for the
+direction in which one contact slips. The last are too few for some contacts (benchmarks/RESULTS.md, "Contact forces
+solved to a tolerance")."""
+MOST_ITERATIONS = 400
+"""Most sweeps, and most iterations within one, where it states a tolerance."""
+TO_ROUNDING = 1e-12, 16, 8
+"""How runs of gradients solve them, whose sweeps alternate with Newton's steps: the adjoint is that of the solution."""
 FOLD = 1.2
 """Bend (rad) beyond which a joint stiffens. The last links of a fine tip are so soft that the slightest force folds
 them double; what reaches the base through them is nothing."""
@@ -90,3 +97,8 @@ NOTHING, PRIMITIVES, MESHES = 0, 1, 2
 
 SPHERE, CAPSULE, CYLINDER, BOX, MESH = range(5)
 """Kinds of shapes: sizes are (radius, –, –), (radius, half length, –) twice, half edge lengths, and nothing."""
+
+
+def contact_iterations(tolerance: float | None) -> tuple[float, int, int]:
+    """Return how contact forces are solved to the tolerance of a fidelity, as :data:`FEW_ITERATIONS`."""
+    return FEW_ITERATIONS if tolerance is None else (tolerance, MOST_ITERATIONS, MOST_ITERATIONS)

@@ -187,10 +187,10 @@ def allocate(kind: Any, device: Any, **shapes: int | tuple[int, ...]) -> Any:
     return struct
 
 
-def make_problems(kernels: Any, capacity: int, lanes: int, device: Any) -> Any:
-    """Return room for the contact problem of each lane."""
+def make_problems(kernels: Any, capacity: int, lanes: int, device: Any, iterations: tuple[float, int, int]) -> Any:
+    """Return room for the contact problem of each lane, solved as :data:`limits.FEW_ITERATIONS` says."""
     held, candidates = contacts_for(capacity), contacts_for(capacity) + limits.SPARE
-    return allocate(
+    problems = allocate(
         kernels.structs.ContactProblems,
         device,
         **dict.fromkeys(("given", "solution"), lanes),
@@ -199,3 +199,5 @@ def make_problems(kernels: Any, capacity: int, lanes: int, device: Any) -> Any:
         held=(lanes, held),
         **dict.fromkeys(("free_acceleration", "added_acceleration"), (lanes, capacity)),
     )
+    problems.tolerance, problems.sweeps, problems.tries = iterations
+    return problems

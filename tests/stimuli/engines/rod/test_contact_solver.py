@@ -7,15 +7,19 @@ import numpy as np
 import pytest
 
 from brainbench.core.devices import to_struct
-from brainbench.stimuli.engines.rod.limits import SPARE, contacts_for
-from brainbench.stimuli.engines.rod.scheduling import allocate
+from brainbench.stimuli.engines.rod.limits import contact_iterations
+from brainbench.stimuli.engines.rod.scheduling import make_problems
 from tests.factories.rod_chain import CAPACITY, DenseChain, in_double
 from tests.factories.rod_threads import Records, thread_warp
 
 wp = pytest.importorskip("warp")
 
 STEP = 0.5
-PLACES = contacts_for(CAPACITY) + SPARE
+ARRAYS = (
+    "given", "solution", "joint", "held", "candidate", "candidate_link", "predicted_gap", "free_acceleration",
+    "added_acceleration",
+)  # fmt: skip
+LIMITS = ("tolerance", "sweeps", "tries")
 
 
 def _problem(count, friction, seed, links=8, hinges=2):
@@ -40,7 +44,7 @@ def _problem(count, friction, seed, links=8, hinges=2):
     )  # fmt: skip
 
 
-def _factorised(problem):
+def _factorised(problem, tolerance=None):
     """What ``write_problem`` leaves of these candidates: fields of ``ContactProblems`` for one job."""
     hinges = problem.chain.hinges
     kernels, passes = (in_double(name, hinges=hinges) for name in ("contact_problem", "articulated_body"))
@@ -92,10 +96,7 @@ def _factorised(problem):
         none = vec3(real(0.0), real(0.0), real(0.0))
         write_problem(problems, chains, job, chain, proximity, candidates, state, felt, none, h, link.shape[0])
 
-    shapes = {"given": 1, "solution": 1, "joint": CAPACITY, "held": (1, contacts_for(CAPACITY))}
-    shapes |= dict.fromkeys(("candidate", "candidate_link", "predicted_gap"), PLACES)
-    shapes |= dict.fromkeys(("free_acceleration", "added_acceleration"), (1, CAPACITY))
-    problems = allocate(ContactProblems, "cpu", **shapes)
+    problems = make_problems(SimpleNamespace(structs=kernels), CAPACITY, 1, "cpu", contact_iterations(tolerance))
     pose = BodyMotion()
     pose.turn = problem.chain.base_turn
     vectors = (wp.array(values, dtype=vec3) for values in (problem.point, problem.normal, problem.free))
@@ -105,10 +106,10 @@ def _factorised(problem):
         wp.array(problem.chain.angle, dtype=JointVector), wp.array(problem.link), *vectors, *numbers, STEP, problems,
     ]  # fmt: skip
     wp.launch(write, 1, inputs, device="cpu")
-    return problems, tuple(shapes)
+    return problems
 
 
-def _solve(problem):
+def _solve(problem, tolerance=None):
     """Forces [candidate, 3] in world axes, added accelerations [link, hinge] and the solution."""
     kernels = in_double("contact_solver", hinges=problem.chain.hinges)
     solve_contacts, ContactProblems = kernels.solve_contacts, kernels.ContactProblems
@@ -117,7 +118,7 @@ def _solve(problem):
     def solve(problems: ContactProblems):
         solve_contacts(problems, 0, 0, 1)
 
-    problems, _ = _factorised(problem)
+    problems = _factorised(problem, tolerance)
     wp.launch(solve, 1, [problems], device="cpu")
     solution = problems.solution.numpy()[0]
     return _by_candidate(problem, problems.held.numpy()[0], solution), problems.added_acceleration.numpy()[0], solution
@@ -169,44 +170,54 @@ def test_without_friction_the_forces_are_those_of_the_only_consistent_set_of_con
     )
 
 
-@pytest.mark.parametrize("friction", [0.2, 0.6])
-# Sweeps end before they converge, and the step is called unsolved, in one of these problems.
-@pytest.mark.parametrize(("hinges", "seed"), [*product([2], range(6)), *product([3], range(4))])
-def test_contacts_keep_signorini_and_coulomb(seed, friction, hinges):
-    problem = _problem(3, friction, seed, hinges=hinges)
-    forces, _, solution = _solve(problem)
-    assert solution["unsolved"] == 0
+def _coulomb(problem, forces):
+    """Return forces [contact] along the normals, rates there, friction and slip [contact, 3]."""
     compliance, _ = _compliance(problem)
     velocity = problem.free + np.einsum("iajb,jb->ia", compliance, forces)
     n = problem.normal
     normal, rate = np.sum(forces * n, axis=1), np.sum(velocity * n, axis=1)
+    return normal, rate, forces - normal[:, None] * n, velocity - rate[:, None] * n
+
+
+@pytest.mark.parametrize("friction", [0.2, 0.6])
+@pytest.mark.parametrize(("hinges", "seed"), [*product([2], range(6)), *product([3], range(4))])
+@pytest.mark.parametrize("tolerance", [None, 1e-6, 1e-9])
+def test_contacts_keep_signorini_and_coulomb(seed, friction, hinges, tolerance):
+    problem = _problem(3, friction, seed, hinges=hinges)
+    forces, _, solution = _solve(problem, tolerance)
+    assert tolerance is None or solution["unsolved"] == 0
+    off = 1e-3 if tolerance is None else 10 * tolerance
+    normal, rate, sliding, slip = _coulomb(problem, forces)
     gap = problem.gap + STEP * rate
-    sliding, slip = forces - normal[:, None] * n, velocity - rate[:, None] * n
     size, speed = np.linalg.norm(sliding, axis=1), np.linalg.norm(slip, axis=1)
     scale = np.abs(forces).max()
     assert (normal >= 0).all()
-    assert (gap >= -1e-3).all()
-    assert (np.abs(gap[normal > 1e-3 * scale]) < 1e-3).all()
-    assert (size <= friction * normal * (1 + 1e-3)).all()
+    assert (gap >= -off).all()
+    assert (np.abs(gap[normal > 1e-3 * scale]) < off).all()
+    assert (size <= friction * normal * (1 + off)).all()
     held = (normal > 1e-3 * scale) & (size < 0.99 * friction * normal)
-    assert (speed[held] * STEP < 2e-3).all()
+    assert (speed[held] * STEP < 2 * off).all()
     moving = (normal > 1e-3 * scale) & (speed * STEP > 1e-2)
     opposed = -np.sum(sliding * slip, axis=1)[moving] / (size * speed)[moving]
-    assert (opposed > 0.98).all()
+    assert (1 - opposed < 20 * off).all()
 
 
-def test_a_group_of_threads_finds_what_one_finds():
-    problem = _problem(4, 0.4, 1)
-    alone, added, _ = _solve(problem)
-    problems, names = _factorised(problem)
+# Few iterations do not find a direction of slip in the second problem.
+@pytest.mark.parametrize(("seed", "tolerance", "unsolved"), [(1, None, 0), (2, None, 1), (2, 1e-8, 0)])
+def test_a_group_of_threads_finds_what_one_finds(seed, tolerance, unsolved):
+    problem = _problem(4, 0.4, seed)
+    alone, added, told = _solve(problem, tolerance)
+    problems = _factorised(problem, tolerance)
     size = 4
     with thread_warp() as (threads, load):
         solver = load("contact_solver", group_size=size, max_contacts=size, capacity=CAPACITY)
-        given = SimpleNamespace(**{name: Records(getattr(problems, name).numpy()) for name in names})
+        given = SimpleNamespace(**{name: Records(getattr(problems, name).numpy()) for name in ARRAYS})
+        vars(given).update({name: getattr(problems, name) for name in LIMITS})
         # The other groups of the warp have nothing to solve and keep the first company.
         threads.run(lambda thread: solver.solve_contacts(given, 0, thread % size, int(thread < size)))
         held, solution = given.held.values[0], given.solution.values[0]
-    assert solution["contacts"] == 4
+    assert solution["contacts"] == told["contacts"] >= 2
+    assert solution["unsolved"] == told["unsolved"] == unsolved
     scale = np.abs(alone).max()
     np.testing.assert_allclose(_by_candidate(problem, held, solution), alone, atol=1e-6 * scale)
     np.testing.assert_allclose(given.added_acceleration.values[0], added, atol=1e-6 * np.abs(added).max())

@@ -1,10 +1,13 @@
 """Friction of ``rod`` beside a differential equation with penalty contact and viscous creep, solved by SciPy's BDF."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from brainbench.stimuli.engines import get_engine
 from brainbench.stimuli.engines.fidelity import Fidelity
+from brainbench.stimuli.validation.contact_scenes import contact_jobs, difference
 from brainbench.stimuli.whiskers.array import WhiskerArray
 from tests.factories.friction_reference import Passing, Penalty, misses, solve
 
@@ -20,3 +23,24 @@ def test_a_whisker_dragged_over_something_rough_feels_what_the_differential_equa
     assert np.linalg.norm(truth[-1, :3]) > 1e-5
     # Per cent of the peak: difference of the peaks, median reading, root mean square; force, then moment.
     assert np.all(np.array(misses(trace.wrench[: len(truth)], truth)) < 1.0)
+
+
+@pytest.mark.parametrize(("backend", "left"), [("rod", 1e-4), ("mujoco", 1e-3)])
+def test_contact_forces_are_as_exact_as_is_asked_for(backend, left):
+    engine = get_engine(backend)
+    jobs = [job for job in contact_jobs(5, each=1) if job.obstacles[0].friction == 0.8 and len(job.times) < 200][::4]
+    fidelity = Fidelity(links=12, time_step=1e-4, precision="double")
+    few, asked, solved = (
+        engine.run(jobs, replace(fidelity, contact_tolerance=tolerance)) for tolerance in (None, 1e-6, 1e-10)
+    )
+    assert max(map(difference, few, solved)) > 0.01
+    assert max(map(difference, asked, solved)) < left
+
+
+def test_steps_whose_contact_forces_were_not_solved_are_counted():
+    jobs = [job for job in contact_jobs(5, each=1) if len(job.times) < 200][::4]
+    runs = [get_engine("rod").run(jobs, Fidelity(links=12, contact_tolerance=tolerance)) for tolerance in (None, 1e-5)]
+    rough = np.array([job.obstacles[0].friction > 0 for job in jobs])
+    few, solved = (np.array([trace.unsolved / max(1, trace.steps) for trace in traces]) for traces in runs)
+    assert few[~rough].max() < 1e-3 < few[rough].mean()
+    assert solved.max() < 0.1 * few[rough].mean()

@@ -13,9 +13,9 @@ the source is the same. Forces in mN, compliance in mm/ms per mN.
 
 import warp as wp
 
-from brainbench.stimuli.engines.rod.limits import CONTACT_BOUNDS, CONTACT_ROUNDS, LARGEST_FORCE, SWEEPS, WARP
+from brainbench.stimuli.engines.rod.limits import CONTACT_BOUNDS, CONTACT_ROUNDS, LARGEST_FORCE, WARP
 
-from .algebra import vec3, vec6
+from .algebra import vec3, vec4, vec6
 from .delassus import (
     DelassusRows,
     NormalMatrix,
@@ -39,13 +39,12 @@ from .thread_groups import broadcast, group_max, group_or, group_sum, warp_max
 if recorded:
     from .adjoint.newton import CAUTIOUS, DIRECT, newton_forces
 
-tolerance, sweeps = (1e-12, 16) if recorded else (1e-4, SWEEPS)
-"""Steps that are recorded are solved to rounding: the adjoint is that of the solution."""
-
 
 @wp.func
-def solve_single_contact(own6: vec6, bn: real, b1: real, b2: real, p0: real, q0: real, mu: real, tries: int) -> vec3:
-    """Return the forces (normal, two tangents) of one contact alone.
+def solve_single_contact(
+    own6: vec6, bn: real, b1: real, b2: real, p0: real, q0: real, mu: real, tolerance: real, tries: int
+) -> vec4:
+    """Return the forces (normal, two tangents) of one contact alone, and 1 if its direction of slip was not found.
 
     ``own6`` is its compliance to them (nn, n1, n2, 11, 12, 22); bn, b1, b2 are its rates without them, p0 and q0 its
     last friction.
@@ -62,6 +61,7 @@ def solve_single_contact(own6: vec6, bn: real, b1: real, b2: real, p0: real, q0:
     fn = zero
     f1 = zero
     f2 = zero
+    missed = zero
     if bn < zero:
         fn = -bn / nn
         if mu > zero:
@@ -91,7 +91,9 @@ def solve_single_contact(own6: vec6, bn: real, b1: real, b2: real, p0: real, q0:
                 f2 = q0
                 # The trace is at least the largest eigenvalue of the block, so that the projected step cannot
                 # overshoot.
+                # Slow where the two tangents differ much: a whisker hardly yields along itself.
                 relaxation = one / (c11 + c22)
+                missed = one
                 for _ in range(tries):
                     fn = wp.max(zero, -(bn + n1 * f1 + n2 * f2) / nn)
                     slip1 = f1 - relaxation * (b1 + n1 * fn + c11 * f1 + c12 * f2)
@@ -105,7 +107,8 @@ def solve_single_contact(own6: vec6, bn: real, b1: real, b2: real, p0: real, q0:
                     moved_by = wp.abs(f1 - slip1) + wp.abs(f2 - slip2)
                     f1 = slip1
                     f2 = slip2
-                    if moved_by <= real(wp.static(tolerance)) * bound:
+                    if moved_by <= tolerance * bound:
+                        missed = zero
                         break
                 fn = wp.max(zero, -(bn + n1 * f1 + n2 * f2) / nn)
     # Two contacts at one point may leave nothing to divide by.
@@ -113,7 +116,7 @@ def solve_single_contact(own6: vec6, bn: real, b1: real, b2: real, p0: real, q0:
         fn = zero
         f1 = zero
         f2 = zero
-    return vec3(fn, f1, f2)
+    return vec4(fn, f1, f2, missed)
 
 
 @wp.func(inline=True)
@@ -143,6 +146,8 @@ def gauss_seidel_sweep(
     gap_error = zero
     force_change = zero
     force_sum = zero
+    if solver.converged == 0:
+        solver.slip_missed = 0
     for c in range(solver.warp_contacts):
         d0 = zero
         d1 = zero
@@ -159,7 +164,9 @@ def gauss_seidel_sweep(
             bn = missed - block[0] * n0 - block[1] * p0 - block[2] * q0
             b1 = row(own.rate, 3 * k + 1) - block[1] * n0 - block[3] * p0 - block[4] * q0
             b2 = row(own.rate, 3 * k + 2) - block[2] * n0 - block[4] * p0 - block[5] * q0
-            found = solve_single_contact(block, bn, b1, b2, p0, q0, row(own.friction, k), tries)
+            found = solve_single_contact(block, bn, b1, b2, p0, q0, row(own.friction, k), solver.tolerance, tries)
+            if found[3] > zero:
+                solver.slip_missed = 1
             # No force below LARGEST_FORCE keeps it closed: without this, zero forces would count as solved.
             if bn < zero and found[0] == zero:
                 force_change += real(wp.static(LARGEST_FORCE))
@@ -189,8 +196,7 @@ def gauss_seidel_sweep(
         solver.gap_error = gap_error
         solver.force_change = force_change
         solver.force_sum = force_sum
-        # A tenth of a micrometre, or one part in ten thousand of the forces.
-        if gap_error <= real(wp.static(tolerance)) or force_change <= real(wp.static(tolerance)) * force_sum:
+        if gap_error <= solver.tolerance or force_change <= solver.tolerance * force_sum:
             solver.converged = 1
 
 
@@ -353,6 +359,7 @@ def share_normal_forces(
 
 @wp.func(inline=True)
 def iterate_forces(
+    problems: ContactProblems,
     solver: wp.ref[SolverState],
     own: wp.ref[ThreadContacts],
     matrix: wp.ref[DelassusRows],
@@ -361,9 +368,10 @@ def iterate_forces(
     active: int,
 ):
     """Sweep until the forces hold, with all normal forces solved for at once after every other sweep."""
-    slip_tries = int(8) + solver.unknown_zero
+    solver.tolerance = problems.tolerance
+    slip_tries = problems.tries + solver.unknown_zero
     guess_tries = int(10) + solver.unknown_zero
-    sweeps_most = int(wp.static(sweeps)) + solver.unknown_zero
+    sweeps_most = problems.sweeps + solver.unknown_zero
     solver.converged = 1 - active
     refresh = active
     solver.gap_error = real(0.0)
@@ -381,6 +389,7 @@ def iterate_forces(
                     if turn % 4 == 2:
                         caution = real(wp.static(DIRECT))
                     solver.converged = newton_forces(solver, own, matrix, caution)
+                    solver.slip_missed = 1 - solver.converged
                     refresh = 1
             guessing = int(0)
             if solver.converged == 0 and solver.contacts > 1 and turn % 2 == 1:
@@ -450,7 +459,7 @@ def solve_contacts(problems: ContactProblems, index: int, part: int, live: int):
         if warp_max(active) == 1:
             select_contacts(problems, solver, own, active)
             build_delassus(problems, solver, own, matrix)
-            iterate_forces(solver, own, matrix, normals, work, active)
+            iterate_forces(problems, solver, own, matrix, normals, work, active)
             last = int(0)
             if round_ == wp.static(CONTACT_ROUNDS - 1):
                 last = 1

@@ -16,7 +16,7 @@ from .algebra import JointVector, reader, vec3, vec6
 from .distances import NUMBERS
 from .parameters import capacity, group_size, hinges, max_contacts, real, recorded
 from .state import ContactProblems, JointRecord, PerLinkJoint, most_candidates
-from .thread_groups import broadcast, group_sum, warp_max
+from .thread_groups import broadcast, group_or, group_sum, warp_max
 
 own_contacts = max_contacts if group_size == 1 else 1
 row_size = 3 * max_contacts
@@ -84,7 +84,10 @@ class SolverState:
     """Most contacts of a whisker of the warp."""
     last_link: wp.int32
     """Last link with a contact, of all whiskers of the warp."""
+    tolerance: real
     converged: wp.int32
+    slip_missed: wp.int32
+    """1: the thread did not find the direction in which one of its contacts slips, in the last sweep."""
     gap_error: real
     """Largest error (mm) of a gap in the last sweep."""
     force_change: real
@@ -425,6 +428,7 @@ def apply_forces(
                 joint_change[i, 2] = inv[3] * u3
     tw = vec3(group_sum(tw[0]), group_sum(tw[1]), group_sum(tw[2]))
     tv = vec3(group_sum(tv[0]), group_sum(tv[1]), group_sum(tv[2]))
+    unsolved = group_or(wp.max(solver.slip_missed, 1 - solver.converged))
     # The forces that no joint takes up reach the base (tw, tv); they are subtracted from its wrench below.
     # Down again, and where the other candidates are then.
     more = int(0)
@@ -465,16 +469,13 @@ def apply_forces(
             more = int(0)
             crowded = int(1)
         if more == 0 and solver.thread == 0:
-            # Ten micrometres and one per cent, a hundred times what the sweeps aim at: less does not show in the
-            # wrench.
-            unsolved = int(0)
+            # Below ten micrometres or one per cent it does not show in the wrench.
             miss = zero
             if (
                 solver.converged == 0
                 and solver.gap_error > real(1e-2)
                 and solver.force_change > real(1e-2) * solver.force_sum
             ):
-                unsolved = int(1)
                 miss = solver.force_change * solver.force_change
             index = solver.job
             problems.solution[index].contacts = solver.contacts

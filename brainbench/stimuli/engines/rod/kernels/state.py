@@ -209,7 +209,7 @@ class ResultArrays:
     crowded: wp.array(dtype=wp.int32)
     """[job] steps in which a contact found no place."""
     unsolved: wp.array(dtype=wp.int32)
-    """[job] steps whose contact forces did not converge."""
+    """[job] steps whose contact forces were not solved to the tolerance."""
     miss: wp.array(dtype=real)
     """[job] sum over the steps of the square of what the last iteration changed in the forces (mN²)."""
     load: wp.array(dtype=real)
@@ -409,7 +409,7 @@ class ContactSolution:
     crowded: wp.int32
     """1: there was no room for a contact."""
     unsolved: wp.int32
-    """1: the forces did not converge."""
+    """1: sweeps, or iterations for a direction of slip, ended before they met the tolerance."""
     miss: real
     """Square of what the last iteration changed in the forces; of the forces."""
     load: real
@@ -447,6 +447,12 @@ class ContactProblems:
     """[job, link] acceleration that they add."""
     solution: wp.array(dtype=ContactSolution)
     """[job]"""
+    tolerance: real
+    """Change of the forces in a sweep, as a share of them, at which sweeps end; or error of the gaps (mm)."""
+    sweeps: wp.int32
+    """Most sweeps over the contacts."""
+    tries: wp.int32
+    """Most iterations for the direction in which one contact slips."""
 
 
 @wp.struct
