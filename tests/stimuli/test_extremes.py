@@ -22,8 +22,8 @@ AT, PUSH, PEG = 0.007, 1e-3, 5e-4
 LONG_STEPS, SHORT_STEPS = (1e-5, 1e-4, 1e-3, 5e-3), (1e-6,)
 
 
-def _run(job, fidelity, **options):
-    return get_engine("mujoco").run([job], fidelity, workers=1, **options)[0]
+def _run(job, fidelity, *, retry=4, **options):
+    return get_engine("mujoco", retry=retry).run([job], fidelity, workers=1, **options)[0]
 
 
 def _moving(shape, start, end, duration, friction=0.0):
@@ -90,7 +90,8 @@ def test_a_box_that_sweeps_past_lets_the_whisker_come_to_rest_or_is_too_fast_for
     travel = 0.02 / speed
     sweep = _moving(box, (at, -0.01, 0.0), (at, 0.01, 0.0), 2 * travel, friction=0.48)
     times = np.linspace(travel / 20, 2 * travel + 0.1, 200)
-    trace = _run(Job(C2, StillFollicle(), (sweep,), times), Fidelity(links=10, time_step=time_step))
+    # Without second tries, whose steps are shorter.
+    trace = _run(Job(C2, StillFollicle(), (sweep,), times), Fidelity(links=10, time_step=time_step), retry=1)
     assert _sound(trace)
     if time_step > 1.1 * 2e-3 / speed:
         # It moves on by more than its thickness of 2 mm in most steps.
@@ -150,7 +151,7 @@ def test_sixty_links_agree_with_the_elastica():
 
 @pytest.mark.parametrize("values", [{"links": 1}, {"time_step": 1e-2}, {"links": 1000}])
 def test_settings_that_cannot_be_right_are_refused(values):
-    with pytest.raises(UsageError, match="must lie between"):
+    with pytest.raises(UsageError, match=r"at least .* and at most"):
         Fidelity(**values)
 
 

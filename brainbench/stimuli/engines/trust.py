@@ -322,25 +322,25 @@ def step_travel(
 def passed_unseen(job: Job, reach: Reach, position: NDArray, euler: NDArray, times: NDArray) -> tuple[int, str]:
     """Return the first step in which whisker and obstacle can pass through one another unseen, and what is wrong.
 
-    Contact is looked for at the end of each step only. Without such a step it is their number. Arguments as for
-    :func:`step_travel`.
+    Contact is looked for at the end of each step only, and behind its middle an object that moves on lets go. Without
+    such a step it is their number. Arguments as for :func:`step_travel`.
     """
     first, reason = len(times) - 1, ""
     for obstacle in reach.obstacles:
         bounds = obstacle.bounds
-        thickness = float((bounds[1] - bounds[0]).min()) + 2 * job.whisker.base_radius
+        half = float((bounds[1] - bounds[0]).min()) / 2 + job.whisker.base_radius
         travel = step_travel(job.whisker, position, euler, obstacle, times)
-        if not (travel > thickness).any():
+        if not (travel > half).any():
             continue
         # Only where the whisker can be: within its length of the base, and what both move in the step.
         near = distances(obstacle, bounds, position, times)[:-1] <= job.whisker.arc_length + travel
-        found = np.flatnonzero((travel > thickness) & near)
+        found = np.flatnonzero((travel > half) & near)
         if len(found) and found[0] < first:
             first = int(found[0])
             reason = (
                 f"an object moves by {travel[first] * MILLI:.3g} mm against the whisker in one step at "
-                f"{times[first]:.6g} s and is only {thickness * MILLI:.3g} mm thick, so it may pass without being "
-                "touched; choose a smaller time step"
+                f"{times[first]:.6g} s, more than half of its {2 * half * MILLI:.3g} mm, so it may pass without being "
+                "felt; choose a smaller time step"
             )
     return first, reason
 
