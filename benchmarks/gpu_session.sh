@@ -29,7 +29,7 @@ sweeps-4  240  python3 -m benchmarks.whiskers.public_rate --objects procedural-2
 free      120  python3 -m benchmarks.whiskers.throughput --only free --links 20 --blocks 64,128 --bounds 0,64x6,64x8
 touch     240  python3 -m benchmarks.tactile.throughput --device cuda --part sensors --input inputs/pyramid.npz --write
 friction  150  python3 -m benchmarks.tactile.friction_cost --device cuda --input inputs/friction.npz --write
-gradients 200  python3 -m benchmarks.whiskers.gradients --device cuda --scenes 10
+gradients 200  python3 -m benchmarks.whiskers.gradient_cost --device cuda --each 4 --input inputs/gradients.npz --write
 teachers  590  python3 -m benchmarks.policies.jobs run $JOB --minutes 6.5
 TABLE
 }
@@ -41,7 +41,8 @@ prepare() {
   rm -rf "$tree"/leaderboards/{reproduction/records,results}/*.json "$tree"/benchmarks/results/*
   mkdir "$tree/inputs"
   (cd "$top" && python -m benchmarks.tactile.throughput --device cpu --write-input "$tree/inputs/pyramid.npz" &&
-    python -m benchmarks.tactile.friction_cost --write-input "$tree/inputs/friction.npz")
+    python -m benchmarks.tactile.friction_cost --write-input "$tree/inputs/friction.npz" &&
+    python -m benchmarks.whiskers.gradient_cost --each 4 --write-input "$tree/inputs/gradients.npz")
   tar cJf "$out/head.tar.xz" -C "$tree" . && cp "$0" "$out/gpu_session.sh"; rm -rf "$tree"; ls -la "$out"
 }
 

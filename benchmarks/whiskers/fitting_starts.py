@@ -57,8 +57,8 @@ def main() -> None:
     )
     text = (
         f"Mouse C2 (damping ratio .05, known) let go from 1 mm and read {READINGS} times with {100 * NOISE:g} % noise; "
-        "Young's modulus and deflection are fitted from the published whisker and .8 mm. Columns: Young's modulus over the "
-        f"published one, periods of the published whisker between readings, and estimate over truth. {told}.\n\n"
+        "Young's modulus and deflection are fitted from the published whisker and .8 mm. Columns: Young's modulus over "
+        f"the published one, periods of the published whisker between readings, and estimate over truth. {told}.\n\n"
     )
     head = ["truth / start", "periods a reading", "start alone", "status", "scan", "status"]
     print(told)

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brainbench.core.errors import DataError, UsageError, check_name
+from brainbench.core.reading.ranges import check_fields
 from brainbench.core.records import Status
 from brainbench.stimuli.engines import DEFAULT_ENGINE, get_engine
 from brainbench.stimuli.engines.fidelity import Fidelity
@@ -103,6 +104,15 @@ class DesignOptions:
     """Best of these from which the search goes on."""
     seed: int = 0
     """Of these."""
+
+    def __post_init__(self) -> None:
+        check_fields(self, "force_noise", above=0, of="{} (N)")
+        check_fields(self, "moment_noise", above=0, of="{} (N·m)")
+        check_fields(self, "rate", above=0, of="{} (Hz)")
+        check_fields(self, "starts", "seed", least=0, whole=True)
+        check_fields(self, "iterations", "searches", least=1, whole=True)
+        Fidelity.parse(self.fidelity)
+        Fidelity.parse(self.check)
 
 
 @dataclass(frozen=True)

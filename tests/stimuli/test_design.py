@@ -69,3 +69,17 @@ def test_wrong_requests_are_refused():
         design(_scenes(3e-4, 6e-4), ["protracton"])
     with pytest.raises(UsageError, match="outside the bounds"):
         design(_scenes(3e-4, 6e-4), ["frequency"], bounds={"frequency": (4.0, 8.0)})
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("force_noise", 0.0), ("moment_noise", -1e-9), ("rate", float("nan")), ("iterations", 0), ("starts", -1)],
+)
+def test_options_out_of_range_are_refused(name: str, value: float):
+    with pytest.raises(UsageError, match=name):
+        DesignOptions(**{name: value})
+
+
+def test_fidelities_of_a_design_are_read_at_once():
+    with pytest.raises(UsageError, match="did you mean 'accurate'"):
+        DesignOptions(check="acurate")
