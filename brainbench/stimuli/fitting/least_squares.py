@@ -18,9 +18,8 @@ from brainbench.stimuli.fitting.identifiability import directions, unknown_param
 from brainbench.stimuli.fitting.intervals import Profile, laplace_interval, quantile
 from brainbench.stimuli.fitting.model import FitModel
 from brainbench.stimuli.fitting.options import FitOptions
-from brainbench.stimuli.fitting.parameters import FreeParameters, read_value, with_value
+from brainbench.stimuli.fitting.parameters import PUBLISHED, FreeParameters, Prior, read_value, with_value
 from brainbench.stimuli.fitting.plausibility import check_wrenches, dead_channels
-from brainbench.stimuli.fitting.priors import PUBLISHED, Prior
 from brainbench.stimuli.fitting.residual_tests import check_residuals, failed_words
 from brainbench.stimuli.fitting.result import FitResult, FittedParameter
 from brainbench.stimuli.fitting.starts import find_starts, scanned

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from brainbench.core.records import Interval, Status
 from brainbench.stimuli.fitting.identifiability import Direction
-from brainbench.stimuli.fitting.priors import Prior
+from brainbench.stimuli.fitting.parameters import Prior
 from brainbench.stimuli.fitting.residual_tests import ResidualTest
 from brainbench.stimuli.whiskers.whisker import Whisker
 
