@@ -427,14 +427,12 @@ class ContactSolution:
 
 @wp.struct
 class ContactProblems:
-    """Contact problem of each job's step, and its solution. Links and candidates of jobs lie one behind the other."""
+    """Problem ``given`` [job] of a step, its ``solution`` [job]; links and candidates of jobs follow one another."""
 
     given: wp.array(dtype=ContactProblem)
-    """[job]"""
     joint: wp.array(dtype=JointRecord)
     """[job · link]"""
     candidate: wp.array(dtype=CandidateRecord)
-    """[job · candidate]"""
     candidate_link: wp.array(dtype=wp.int32)
     """[job · candidate]"""
     predicted_gap: wp.array(dtype=real)
@@ -446,13 +444,10 @@ class ContactProblems:
     added_acceleration: wp.array2d(dtype=JointVector)
     """[job, link] acceleration that they add."""
     solution: wp.array(dtype=ContactSolution)
-    """[job]"""
     tolerance: real
-    """Change of the forces in a sweep, as a share of them, at which sweeps end; or error of the gaps (mm)."""
     sweeps: wp.int32
-    """Most sweeps over the contacts."""
     tries: wp.int32
-    """Most iterations for the direction in which one contact slips."""
+    """How forces are solved, see ``limits.FEW_ITERATIONS``."""
 
 
 @wp.struct

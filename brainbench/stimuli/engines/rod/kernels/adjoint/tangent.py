@@ -32,8 +32,6 @@ from .chain import (
     STIFFNESS,
     TORSION,
     TRANSVERSE,
-    StepFrame,
-    restore_step,
     spring_state,
     virtual_motion,
 )
@@ -42,6 +40,7 @@ from .dense import DenseSystem
 from .fields import Fields, FieldTangents, PerHinge3, StepLinks, add_hinge, hinge_row, hinges_of, move_hinge
 from .pose import move_pose
 from .records import ContactRecord, StepRecords
+from .restoring import StepFrame, restore_step
 from .surfaces import size_cotangent
 
 
