@@ -27,8 +27,8 @@ sweeps-2   60  python3 -m benchmarks.whiskers.public_rate --objects procedural-2
 sweeps-3  150  python3 -m benchmarks.whiskers.public_rate --objects procedural-24:2 $P --parts kernels --room 0,32768 --ahead :2,1:24,124:
 sweeps-4  240  python3 -m benchmarks.whiskers.public_rate --objects procedural-24:2 $P --parts command --write
 free      120  python3 -m benchmarks.whiskers.throughput --only free --links 20 --blocks 64,128 --bounds 0,64x6,64x8
-touch     240  python3 -m benchmarks.tactile.throughput --device cuda --part sensors --input inputs/pyramid.npz --write
-friction  150  python3 -m benchmarks.tactile.friction_cost --device cuda --input inputs/friction.npz --write
+touch     320  python3 -m benchmarks.tactile.throughput --device cuda --part sensors --input inputs/pyramid.npz --write
+friction  150  python3 -m benchmarks.tactile.friction_cost --device cuda --write
 gradients 200  python3 -m benchmarks.whiskers.gradient_cost --device cuda --each 4 --input inputs/gradients.npz --write
 teachers  590  python3 -m benchmarks.policies.jobs run $JOB --minutes 6.5
 TABLE
@@ -41,7 +41,6 @@ prepare() {
   rm -rf "$tree"/leaderboards/{reproduction/records,results}/*.json "$tree"/benchmarks/results/*
   mkdir "$tree/inputs"
   (cd "$top" && python -m benchmarks.tactile.throughput --device cpu --write-input "$tree/inputs/pyramid.npz" &&
-    python -m benchmarks.tactile.friction_cost --write-input "$tree/inputs/friction.npz" &&
     python -m benchmarks.whiskers.gradient_cost --each 4 --write-input "$tree/inputs/gradients.npz")
   tar cJf "$out/head.tar.xz" -C "$tree" . && cp "$0" "$out/gpu_session.sh"; rm -rf "$tree"; ls -la "$out"
 }
@@ -55,7 +54,7 @@ run() {
     while read -r name limit command; do
       [ "$name" = "$wanted" ] || continue
       echo "== $name, $(($(date +%s) - $(cat /w/t0))) s"
-      eval "timeout $limit $command" 2>&1 | tee "$OUT/$name.log" | tail -n 25 | cut -c1-200
+      eval "timeout $limit $command" </dev/null 2>&1 | tee "$OUT/$name.log" | tail -n 25 | cut -c1-200
     done < <(parts)
   done
   tar czf "$OUT/results.tar.gz" benchmarks/results; nvidia-smi --query-gpu=name,memory.used --format=csv,noheader
