@@ -10,12 +10,13 @@
 #   device, 2:  carry .gpu/b            cp .gpu/b/* /opt/w/
 #   device, 3:  carry .gpu/c .session   bash .gpu/c/install.sh && bash .session/gpu_session.sh start && bash /w/gpu.sh run tests
 #   device, 4…: bash /w/gpu.sh run PART …                             each at most as long as it says; all below 600 s
-#   a new machine (each lives 30 minutes; one GPU counts half):  calls 1 to 3, then JOB=teacher-plain bash /w/gpu.sh run
-#               teachers; JOB=teacher-safe …; JOB=teacher-round …      (policies/jobs.toml says what to compare)
+#   or, on a machine of several GPUs, parts in the background, one after the other on each GPU, and a look at them:
+#               JOB=teacher-plain bash /w/gpu.sh lane 2 teachers teachers; bash /w/gpu.sh look SECOND
+#               (of the machine's life; policies/jobs.toml says which teachers to compare, and what to compare)
 #   here:       git checkout -f main && git branch -D device; python -m benchmarks.report after copying results/*.json
 #
-# Calls follow one another within 30 s, or the machine goes back with all that is on it. `models/campaign_session.sh`
-# shares these three calls: its training may run while `tests` does, never while something is timed.
+# Calls follow one another within 30 s, or the machine goes back with all that is on it. A machine lives 30 minutes; one
+# GPU counts half, four count as one that is not halved. What is timed has its GPU for itself.
 set -eu
 
 # Part, its limit in seconds, its command.
@@ -26,11 +27,14 @@ sweeps-1  100  python3 -m benchmarks.whiskers.public_rate --objects procedural-2
 sweeps-2   60  python3 -m benchmarks.whiskers.public_rate --objects procedural-24:1 --limit 2 $P --parts stages
 sweeps-3  150  python3 -m benchmarks.whiskers.public_rate --objects procedural-24:2 $P --parts kernels --room 0,32768 --ahead :2,1:24,124:
 sweeps-4  240  python3 -m benchmarks.whiskers.public_rate --objects procedural-24:2 $P --parts command --write
+scaling   300  python3 -m benchmarks.whiskers.public_rate --objects procedural-24:32 $P --parts command --gpus 1,2,4 --write
 free      120  python3 -m benchmarks.whiskers.throughput --only free --links 20 --blocks 64,128 --bounds 0,64x6,64x8
 touch     320  python3 -m benchmarks.tactile.throughput --device cuda --part sensors --input inputs/pyramid.npz --write
 friction  150  python3 -m benchmarks.tactile.friction_cost --device cuda --write
 gradients 200  python3 -m benchmarks.whiskers.gradient_cost --device cuda --each 4 --input inputs/gradients.npz --write
-teachers  590  python3 -m benchmarks.policies.jobs run $JOB --minutes 6.5
+teachers  590  python3 -m benchmarks.policies.jobs run $JOB --minutes ${MINUTES:-7}
+campaign  900  (cd /w/code && PYTHONPATH=/opt/w:/w/code python3 -m benchmarks.models.campaign --work /tmp/campaign --minutes 14 --places 3)
+campaign- 60   (cd /w/code && PYTHONPATH=/opt/w:/w/code python3 -m benchmarks.models.campaign --work /tmp/campaign --pack 0 --out /w/out)
 TABLE
 }
 
@@ -45,7 +49,7 @@ prepare() {
   tar cJf "$out/head.tar.xz" -C "$tree" . && cp "$0" "$out/gpu_session.sh"; rm -rf "$tree"; ls -la "$out"
 }
 
-start() { mkdir -p /w/head && tar xJf .session/head.tar.xz -C /w/head && cp "$0" /w/gpu.sh; }
+start() { mkdir -p /w/head /w/code /w/out && if [ -d .campaign ]; then tar xJf .campaign/code.tar.xz -C /w/code; fi && tar xJf .session/head.tar.xz -C /w/head && cp "$0" /w/gpu.sh; }
 
 run() {
   cd /w/head && export PYTHONPATH=/opt/w:/w/head PYTHONUNBUFFERED=1 BRAINBENCH_CACHE=/w/cache
@@ -54,10 +58,26 @@ run() {
     while read -r name limit command; do
       [ "$name" = "$wanted" ] || continue
       echo "== $name, $(($(date +%s) - $(cat /w/t0))) s"
-      eval "timeout $limit $command" </dev/null 2>&1 | tee "$OUT/$name.log" | tail -n 25 | cut -c1-200
+      # A subshell of its own, for commands that change folder.
+      timeout "$limit" bash -c "$(declare -p P); $command" </dev/null 2>&1 | tee "$OUT/$name${CUDA_VISIBLE_DEVICES:+-$CUDA_VISIBLE_DEVICES}.log" | tail -n 25 | cut -c1-200
     done < <(parts)
   done
   tar czf "$OUT/results.tar.gz" benchmarks/results; nvidia-smi --query-gpu=name,memory.used --format=csv,noheader
+}
+
+lane() {
+  local gpu=$1; shift
+  OUT=/w/out CUDA_VISIBLE_DEVICES=$gpu setsid bash /w/gpu.sh run "$@" >>"/w/out/lane-$gpu.log" 2>&1 </dev/null &
+}
+
+look() {
+  while [ $(($(date +%s) - $(cat /w/t0))) -lt "$1" ]; do sleep 1; done
+  tail -n "${2:-15}" /w/out/lane-*.log
+  nvidia-smi --query-gpu=utilization.gpu,memory.used --format=csv,noheader
+  cd / && tar czf "$OUT/seen.tar.gz" w/out/*.log w/head/benchmarks/results $(ls -d tmp/run/*/{evaluated.json,log.csv,config.json} 2>/dev/null)
+  for run in /tmp/run/*/; do  # the newest model of each teacher
+    [ -d "$run" ] && tar czf "$OUT/$(basename "$run").tar.gz" -C "$run" $(cd "$run" && ls -v model_*.safetensors 2>/dev/null | tail -n 1) config.json
+  done; cp /w/out/campaign-*.tar "$OUT" 2>/dev/null || true
 }
 
 "$@"

@@ -33,7 +33,7 @@ from benchmarks.report import table, write_section
 
 STARTED = time.time()
 PARTS = ("kernels", "stages")
-TITLE = "Sweeps on a {}, by the public command"
+TITLE = "Sweeps on {}, by the public command"
 
 
 def main() -> None:
@@ -70,7 +70,8 @@ def main() -> None:
         print(told, flush=True)
         body += f"\n\n{part.capitalize()} (`{args.fidelity[0]}`):\n\n```\n{told.strip()}\n```"
     if args.write:
-        title = TITLE.format("processor" if args.device == "cpu" else "GPU")
+        kind = "processor" if args.device == "cpu" else "GPU" if args.gpus == "1" else "several GPUs"
+        title = TITLE.format(kind if kind.startswith("several") else f"a {kind}")
         about = f"`brainbench stimuli sweep {' '.join(options(args, 'FIDELITY', Path('DIR')))}`\n\n"
         command = "python -m benchmarks.whiskers.public_rate " + " ".join(sys.argv[1:])
         where = "" if args.device == "cpu" else machine()
@@ -104,7 +105,9 @@ def run(args: argparse.Namespace, fidelity: str, gpus: int, cold: bool, environm
     """Return a row of the table for one run of the command on so many GPUs."""
     folder = Path(tempfile.mkdtemp())
     if args.device != "cpu":
-        environment = {**environment, "CUDA_VISIBLE_DEVICES": ",".join(map(str, range(gpus)))}
+        # This process may itself see only some of the GPUs.
+        seen = os.environ.get("CUDA_VISIBLE_DEVICES", ",".join(map(str, range(gpus)))).split(",")[:gpus]
+        environment = {**environment, "CUDA_VISIBLE_DEVICES": ",".join(seen)}
     started, busy = time.perf_counter(), processor_seconds()
     made = subprocess.run(
         [sys.executable, "-m", "brainbench", "stimuli", "sweep", *options(args, fidelity, folder / "set"), "--json"],
