@@ -33,7 +33,7 @@ touch     320  python3 -m benchmarks.tactile.throughput --device cuda --part sen
 friction  150  python3 -m benchmarks.tactile.friction_cost --device cuda --write
 gradients 200  python3 -m benchmarks.whiskers.gradient_cost --device cuda --each 4 --input inputs/gradients.npz --write
 teachers  590  python3 -m benchmarks.policies.jobs run $JOB --minutes ${MINUTES:-7}
-campaign  900  (cd /w/code && PYTHONPATH=/opt/w:/w/code python3 -m benchmarks.models.campaign --work /tmp/campaign --minutes 14 --places 3)
+campaign  1500 (cd /w/code && PYTHONPATH=/opt/w:/w/code python3 -m benchmarks.models.campaign --work /tmp/campaign --minutes 28 --places 3)
 campaign- 60   (cd /w/code && PYTHONPATH=/opt/w:/w/code python3 -m benchmarks.models.campaign --work /tmp/campaign --pack 0 --out /w/out)
 TABLE
 }
