@@ -57,6 +57,7 @@ def workspace(tmp_path_factory: pytest.TempPathFactory) -> Path:
     from brainbench.datasets.synthetic import PopulationDesign, ResponseGeometry, write_files
     from brainbench.models.features import write_features
     from brainbench.stimuli import get_recipe
+    from tests.factories.ringdown_table import write_ringdown
 
     folder = tmp_path_factory.mktemp("readme")
     (folder / "mine.py").write_text(MODEL)
@@ -66,6 +67,7 @@ def workspace(tmp_path_factory: pytest.TempPathFactory) -> Path:
     geometry = ResponseGeometry.from_features(rng.normal(size=(len(names), 4)), names)
     design = PopulationDesign(animals=3, units=20, trials=10, window=0.5)
     paths = write_files(folder / "data", geometry, design, seed=1)
+    write_ringdown(folder / "ringdown.csv")
     (folder / "session.nwb").write_bytes(paths[0].read_bytes())
     (folder / "leaderboards").symlink_to(ROOT / "leaderboards")
     return folder

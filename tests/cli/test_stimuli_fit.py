@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
-from brainbench.stimuli import WhiskerArray, references
-from brainbench.stimuli.fitting import FitOptions, Trial
-from brainbench.stimuli.fitting.synthetic import blank_wrenches, measure_wrenches, simulate_trial
+from brainbench.stimuli import WhiskerArray
+from tests.factories.ringdown_table import write_ringdown
 from tests.factories.whisker_tracks import write_points
 
 WHISKER = WhiskerArray.of("mouse")["C2"].whisker
@@ -20,18 +17,7 @@ QUICK = ["--links", "8", "--steps-per-period", "80"]
 @pytest.fixture(scope="module")
 def ringdown_file(tmp_path_factory):
     """Base wrenches of a ring-down, as a table in mN and µN·m."""
-    truth = replace(WHISKER, young_modulus=4e9, damping_ratio=0.2)
-    period = 1 / float(references.natural_frequencies(WHISKER, 1)[0])
-    trial = Trial.ringdown(truth, blank_wrenches(np.arange(1, 61) * period / 15), 1e-3)
-    trace = simulate_trial(trial, options=FitOptions(links=8, steps_per_period=4.0, time_step=period / 80))
-    measured = measure_wrenches(trial, trace, 0.01, np.random.default_rng(0)).measured
-    names = [str(name) for name in measured["channel"].values]
-    path = tmp_path_factory.mktemp("fit") / "ringdown.csv"
-    head = ",".join(["time_ms", *(f"{name}_mN" if name[0] == "F" else f"{name}_uNm" for name in names)])
-    factor = [1e3 if name[0] == "F" else 1e6 for name in names]
-    table = np.column_stack([1e3 * measured["time"].values, measured["wrench"].values * factor])
-    path.write_text(head + "\n" + "\n".join(",".join(f"{cell:.9g}" for cell in row) for row in table) + "\n")
-    return path
+    return write_ringdown(tmp_path_factory.mktemp("fit") / "ringdown.csv")
 
 
 def test_a_ring_down_is_fitted_written_and_drawn(run, ringdown_file, tmp_path):
