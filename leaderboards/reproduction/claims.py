@@ -15,6 +15,7 @@ from itertools import combinations
 import numpy as np
 
 from brainbench.core.statistics import wilson_interval
+from leaderboards.boards import Board
 from leaderboards.figures.scatter import regression
 from leaderboards.ranking import lacking
 from leaderboards.reproduction import measures
@@ -97,7 +98,7 @@ def judge_fit(campaign: Campaign, place: int) -> list[Judgement]:
     if not campaign.boards:
         return [Judgement(claim, None, "not trained yet", "not trained yet") for claim in claims]
     board, fit = campaign.boards[place], measures.fits(campaign, place)
-    lacks = lacking(max((len(entry.score.subjects) for entry in board.entries), default=0), len(board.conditions))
+    lacks = lacks_of(board)
     accuracy = {key: item.value for key, item in measures.accuracies(campaign).networks.items()}
     measured: dict[str, Callable[[PublishedClaim], Effect | None]] = {
         "fit": lambda claim: _compare(claim, fit),
@@ -117,6 +118,11 @@ def judge_fit(campaign: Campaign, place: int) -> list[Judgement]:
             verdict, reason = _untestable, "; ".join(filter(None, (SYNTHETIC_REASON, reason)))
         found.append(Judgement(claim, effect, verdict, rule, reason))
     return found
+
+
+def lacks_of(board: Board) -> str:
+    """Return what a board lacks for the rule to decide anything, in words; empty when nothing."""
+    return lacking(max((len(entry.score.subjects) for entry in board.entries), default=0), len(board.conditions))
 
 
 _untestable: Verdict = "cannot be tested here"

@@ -15,7 +15,7 @@ from leaderboards.figures.charts import board_figures
 from leaderboards.figures.plots import Figure
 from leaderboards.figures.svg import standalone
 from leaderboards.reproduction.campaign import Campaign, Network, NetworkKey, board_name
-from leaderboards.reproduction.claims import GOAL, Judgement, judge_accuracy, judge_fit, seed_agreement
+from leaderboards.reproduction.claims import GOAL, Judgement, judge_accuracy, judge_fit, lacks_of, seed_agreement
 from leaderboards.reproduction.contrasts import Effect, Matched, Observed, contrast
 from leaderboards.reproduction.measures import Measured, accuracies, fits, observed, published, published_accuracy
 from leaderboards.reproduction.trainings import TRAININGS, Training
@@ -44,6 +44,7 @@ def write_page(campaign: Campaign, out: str | os.PathLike[str]) -> tuple[list[Pa
         "counts": [_counts("Accuracy and training", accuracy), _counts("Neural fit", fit[0])],
         "accuracy": [_accuracy_row(item) for item in accuracy],
         "boards": [board_name(board) for board in campaign.boards],
+        "too_small": [(board_name(board), lacks) for board in campaign.boards if (lacks := lacks_of(board))],
         "fit": [_fit_row(items, bool(campaign.boards)) for items in zip(*fit, strict=True)],
         "goal": GOAL,
         "seeds": _seed_rows(campaign),

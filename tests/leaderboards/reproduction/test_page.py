@@ -43,6 +43,15 @@ def test_tables_are_whole_and_say_the_verdicts(written):
     assert "not trained yet" in next(line for line in text.splitlines() if "zhuang-lstm.simsiam" in line)
 
 
+def test_a_board_on_which_the_rule_decides_nothing_says_so(written, tmp_path):
+    campaign = draw_campaign(1, synthetic=True)
+    few = replace(campaign, boards=tuple(replace(board, conditions=board.conditions[:6]) for board in campaign.boards))
+    files, _ = write_page(few, tmp_path)
+    told = "the rule leaves all undecided: it needs at least 10 stimuli (here 6)."
+    assert told in files[0].read_text(encoding="utf-8")
+    assert told not in written[2]
+
+
 def test_figures_of_the_study_are_drawn_for_light_and_dark(written):
     files, _, text = written
     drawn = {path.stem for path in files[1:]}
