@@ -40,8 +40,16 @@ error than any preset has, and keratin yields at some 2 %. Whiskers that brush p
 (benchmarks/RESULTS.md)."""
 SUSPICIOUS_SHARE = 0.4
 """Share of the largest overlap, residual and base force from which a reliable whisker is suspicious."""
+SUSPICIOUS_ROUGHNESS = 0.05
+"""Roughness of the base force (:func:`roughness`) from which a whisker in soft contacts is suspicious. Whiskers that
+follow what they touch stay below .01; those that are thrown off and caught again have .1 to 2."""
 LARGEST_CHANGE = 0.2
 """Share by which the base force (root mean square over the readings) may change when the step is halved."""
+LARGEST_ROUGH_CHANGE = 0.7
+"""The same in soft contacts of a whisker that is suspicious for its roughness or overlap and meets no :data:`BLOW`:
+with friction, soft contacts hop at ordinary speeds too, and change by some .3 to .6 in long steps."""
+BLOW = 1.0
+"""Speed (m/s) of an object against the base from which it counts as a blow."""
 
 OK, BENT, LOST, STARTED_INSIDE, GOT_INSIDE, AT_BASE = range(6)
 """Ends of an integration: in order; with a joint bent beyond :data:`LARGEST_BEND`; with a value that is no number; in
@@ -176,12 +184,24 @@ def halved(verdict: Verdict, change: NDArray[np.floating], which: NDArray[np.boo
     # NaN fails the comparison and counts as changed.
     changed, reasons = which & ~(change <= LARGEST_CHANGE), verdict.reasons.copy()
     for index in zip(*np.nonzero(changed), strict=True):
-        by = f"by {change[index]:.0%}" if np.isfinite(change[index]) else "beyond what can be trusted"
-        reasons[index] = (
-            f"the base force changes {by} (root mean square) with half the step; choose a smaller time step"
-        )
+        reasons[index] = changes_words(change[index])
     until = np.where(changed, -np.inf, verdict.until)
     return Verdict(until, verdict.retryable | changed, reasons, verdict.suspicious & ~which)
+
+
+def changes_words(change: float) -> str:
+    """Return in words that the base force changes with half the step; NaN where the finer run is not reliable."""
+    by = f"by {change:.0%}" if np.isfinite(change) else "beyond what can be trusted"
+    return f"the base force changes {by} (root mean square) with half the step; choose a smaller time step"
+
+
+def roughness(force: NDArray[np.floating]) -> float:
+    """Return how much a force [step, 3] changes from step to step, as a share of itself (mean squares); 2 when it hops.
+
+    The force on a whisker that follows its contact hardly changes in a step; one that is thrown off and caught again
+    changes by all of it.
+    """
+    return float(np.sum(np.diff(force, axis=0) ** 2) / max(float(np.sum(force**2)), 1e-30))
 
 
 def force_change(force: NDArray[np.floating], half: NDArray[np.floating]) -> NDArray[np.floating]:
@@ -319,6 +339,16 @@ def step_travel(
     return own + np.linalg.norm(np.diff(places, axis=0), axis=1) + 2 * chord * size
 
 
+def near_travel(
+    whisker: Whisker, position: NDArray, euler: NDArray, obstacle: Obstacle, times: NDArray
+) -> NDArray[np.float64]:
+    """Return :func:`step_travel` where the whisker can be, and 0 in steps in which the obstacle is out of its reach."""
+    travel = step_travel(whisker, position, euler, obstacle, times)
+    # Within its length of the base, and what both move in the step.
+    near = distances(obstacle, obstacle.bounds, position, times)[:-1] <= whisker.arc_length + travel
+    return np.where(near, travel, 0.0)
+
+
 def passed_unseen(job: Job, reach: Reach, position: NDArray, euler: NDArray, times: NDArray) -> tuple[int, str]:
     """Return the first step in which whisker and obstacle can pass through one another unseen, and what is wrong.
 
@@ -327,14 +357,9 @@ def passed_unseen(job: Job, reach: Reach, position: NDArray, euler: NDArray, tim
     """
     first, reason = len(times) - 1, ""
     for obstacle in reach.obstacles:
-        bounds = obstacle.bounds
-        half = float((bounds[1] - bounds[0]).min()) / 2 + job.whisker.base_radius
-        travel = step_travel(job.whisker, position, euler, obstacle, times)
-        if not (travel > half).any():
-            continue
-        # Only where the whisker can be: within its length of the base, and what both move in the step.
-        near = distances(obstacle, bounds, position, times)[:-1] <= job.whisker.arc_length + travel
-        found = np.flatnonzero((travel > half) & near)
+        half = float(np.diff(obstacle.bounds, axis=0).min()) / 2 + job.whisker.base_radius
+        travel = near_travel(job.whisker, position, euler, obstacle, times)
+        found = np.flatnonzero(travel > half)
         if len(found) and found[0] < first:
             first = int(found[0])
             reason = (

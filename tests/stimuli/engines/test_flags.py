@@ -6,11 +6,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from brainbench.stimuli import get_recipe, simulate
 from brainbench.stimuli.engines import get_engine
 from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.engines.protocol import Job, Load, StillFollicle
 from brainbench.stimuli.engines.trust import LARGEST_OVERLAP, LARGEST_STRAIN, LOST, halved, judge
-from brainbench.stimuli.objects.obstacle import Capsule, Obstacle, Sphere, TriangleMesh
+from brainbench.stimuli.objects.obstacle import Box, Capsule, Obstacle, Sphere, TriangleMesh
 from brainbench.stimuli.validation.contact_scenes import contact_jobs
 from tests.factories.trust import facts
 from tests.factories.whiskers import C2
@@ -21,8 +22,8 @@ PAGE = Path(__file__).parents[3] / "docs" / "unstable-whiskers.md"
 TIMES = np.arange(1, 31) * 1e-3
 
 
-def _reason(*obstacles, loads=(), step=2e-4, engine="rod"):
-    job = Job(C2, StillFollicle(), obstacles, TIMES, loads=loads)
+def _reason(*obstacles, loads=(), step=2e-4, engine="rod", times=TIMES):
+    job = Job(C2, StillFollicle(), obstacles, times, loads=loads)
     (trace,) = get_engine(engine).run([job], Fidelity(links=10, time_step=step))
     assert (trace.status == "ok") == (trace.reason == "") == np.isfinite(trace.wrench).all()
     return trace.reason
@@ -64,6 +65,18 @@ def _overlapping_boxes():
     return Obstacle((), surface=TriangleMesh(np.asarray(mesh.vertices), np.asarray(mesh.faces)))
 
 
+def _struck(speed, engine="mujoco"):
+    """A box that passes the whisker with its flat face ahead."""
+    box = _moving((0.009, -0.002, 0), (0, speed, 0), Box((0.0, 0.0, 0.0), (2e-3, 1e-3, 5e-3)))
+    return _reason(box, step=1e-4, engine=engine, times=TIMES / 10)
+
+
+def _hopping():
+    """A whisker that whisks over a flat face with friction: a scene of the golden wrenches."""
+    scene = get_recipe("rodgers").scenes[0].select("C1")
+    return str(simulate(scene, fidelity="fast", backend="mujoco", cache=False)["reason"].values.item())
+
+
 FLAGGED = {
     "starts in an object": ("starts 0.11 mm deep", lambda **some: _reason(_ball(1.1002e-4), **some)),
     "penetrates one too far": (
@@ -91,6 +104,7 @@ FLAGGED = {
         "changes by 30%",
         lambda: halved(judge(facts(depth=3e-4)), np.array([0.3]), np.array([True])).reasons[0],
     ),
+    "is thrown off by its contacts": ("changes by", lambda: _struck(5.0)),
 }
 """Row of the table: words of the reason, and how it comes about."""
 
@@ -99,6 +113,7 @@ NOT_FLAGGED = {
     "overlaps for a step": lambda: _judged(depth=0.9 * LARGEST_OVERLAP),
     "has an object behind its base": lambda: _reason(Obstacle((Sphere((-1.1e-3, 0.0, 0.0), 1e-3),))),
     "slides with contact forces that were not solved": _rubbing,
+    "hops at ordinary speeds": _hopping,
     "sticks or slips at another time": lambda: str(judge(facts()).suspicious[0] or ""),
     "lies in bodies that overlap": lambda: _reason(_overlapping_boxes()),
 }
@@ -133,6 +148,10 @@ def test_other_engines_share_these_rows(engine, row):
     if engine == "bullet":
         pytest.importorskip("pybullet")
     assert FLAGGED[row][0] in FLAGGED[row][1](engine=engine)
+
+
+def test_the_blow_that_mujoco_cannot_follow_is_followed_by_rod():
+    assert _struck(5.0, engine="rod") == ""
 
 
 def test_the_numbers_of_the_page_are_those_of_the_rule():

@@ -49,7 +49,7 @@ class BulletEngine(SteppedEngine):
         """See :meth:`SteppedEngine.session`."""
         return nullcontext(engine())
 
-    def simulate(self, stepped: SteppedJob) -> Trace:
+    def simulate(self, stepped: SteppedJob) -> tuple[Trace, float]:
         """See :meth:`SteppedEngine.simulate`."""
         gravity = np.asarray(stepped.job.gravity, float)
         shown = stepped.frames(len(stepped.times)).nearest.tolist() if stepped.record_shape else []
@@ -68,7 +68,7 @@ class BulletEngine(SteppedEngine):
             np.stack([run.shapes[step] for step in nearest.tolist()]) / MILLI if stepped.record_shape else np.zeros(0),
             penetration=run.penetration / MILLI,
             reason=reason,
-            steps=min(failed, run.steps),
+            forces=run.wrench[: min(failed, run.steps), :3],
         )
 
 

@@ -51,7 +51,7 @@ class MujocoWhiskerEngine(SteppedEngine):
         finally:
             mujoco.set_mju_user_warning(before)
 
-    def simulate(self, stepped: SteppedJob) -> Trace:
+    def simulate(self, stepped: SteppedJob) -> tuple[Trace, float]:
         """See :meth:`SteppedEngine.simulate`."""
         job, chain = stepped.job, stepped.chain
         twists = stepped.fidelity.twist is not False
@@ -80,7 +80,7 @@ class MujocoWhiskerEngine(SteppedEngine):
             shape / MILLI,
             penetration=_penetration(sensors[: failed + 1, 6:], hinges[: failed + 1], built, chain),
             reason=reason,
-            steps=min(failed, len(sensors)),
+            forces=sensors[:failed, :3] / MILLI,
         )
 
 
