@@ -178,11 +178,13 @@ def _judge(problem: _Problem, solutions: Sequence[_Solution], began: float) -> F
         least = float(np.sum(problem.residual(u) ** 2))
         profile = Profile(problem.residual, problem.jacobian, model.limits, u, covariance, least, scale)
     unknown = {name: direction.words for name, direction in unknown_parameters(found).items()}
-    unknown |= _rivals(problem, solutions, covariance)
+    # Priors took part in the comparison of minima, so that none makes up for it.
+    rivals = _rivals(problem, solutions, covariance)
     estimates = []
     for index, (name, value) in enumerate(zip(free.names, free.values(u), strict=True)):
         deviation = math.sqrt(covariance[index, index]) if covariance[index, index] >= 0 else math.inf
-        status, reason = _judge_one(problem, index, u, unknown.get(name))
+        rival = rivals.get(name)
+        status, reason = ("undefined", rival) if rival else _judge_one(problem, index, u, unknown.get(name))
         estimates.append(
             FittedParameter(
                 name,

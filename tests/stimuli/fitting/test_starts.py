@@ -10,7 +10,7 @@ import pytest
 from brainbench.stimuli import WhiskerArray, references
 from brainbench.stimuli.fitting import FitOptions, Trial, fit
 from brainbench.stimuli.fitting.model import FitModel
-from brainbench.stimuli.fitting.parameters import FreeParameters
+from brainbench.stimuli.fitting.parameters import FreeParameters, Prior
 from brainbench.stimuli.fitting.starts import find_starts
 from brainbench.stimuli.fitting.synthetic import blank_wrenches, measure_wrenches, simulate_trial
 
@@ -36,12 +36,24 @@ def test_a_softer_whisker_is_found_though_readings_are_rare(share: float, step: 
     assert found["young_modulus"].value == pytest.approx(truth, rel=0.01)
 
 
-def test_two_stiffnesses_that_fit_alike_are_said():
-    # Six readings, three periods apart: noise leaves several numbers of swings between them.
+@pytest.mark.parametrize("spread", [None, 0.4])
+def test_two_stiffnesses_that_fit_alike_are_said_also_with_a_prior(spread: float | None):
+    # Six readings, three periods apart: noise leaves several numbers of swings between them. A prior takes part in the
+    # comparison and leaves them, so that it does not make the stiffness known.
     trial = _trial(KNOWN.young_modulus, np.arange(1, 7) * 3 * PERIOD, noise=0.1)
-    found = fit(trial, FREE, options=QUICK)
+    priors = {"young_modulus": Prior(KNOWN.young_modulus, spread, "the test")} if spread else {}
+    found = fit(trial, FREE, priors=priors, options=QUICK)
     assert (found["young_modulus"].status, found.status) == ("undefined", "undefined")
     assert "fit alike: the readings are too rare" in found["young_modulus"].reason
+    assert "prior" not in found["young_modulus"].reason
+
+
+def test_a_prior_that_tells_two_stiffnesses_apart_leaves_one():
+    trial = _trial(KNOWN.young_modulus, np.arange(1, 7) * 3 * PERIOD, noise=0.1)
+    priors = {"young_modulus": Prior(KNOWN.young_modulus, 0.005, "the test")}
+    found = fit(trial, FREE, priors=priors, options=QUICK)
+    assert found["young_modulus"].status != "undefined"
+    assert found["young_modulus"].value == pytest.approx(KNOWN.young_modulus, rel=0.02)
 
 
 def test_only_ring_downs_with_an_unknown_frequency_are_scanned():
