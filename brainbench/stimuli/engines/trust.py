@@ -184,7 +184,7 @@ def halved(verdict: Verdict, change: NDArray[np.floating], which: NDArray[np.boo
     # NaN fails the comparison and counts as changed.
     changed, reasons = which & ~(change <= LARGEST_CHANGE), verdict.reasons.copy()
     for index in zip(*np.nonzero(changed), strict=True):
-        reasons[index] = changes_words(change[index])
+        reasons[index] = changes_words(float(change[index]))
     until = np.where(changed, -np.inf, verdict.until)
     return Verdict(until, verdict.retryable | changed, reasons, verdict.suspicious & ~which)
 

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brainbench.core.records import Interval
-from brainbench.stimuli.fitting.parameters import PARAMETERS, FreeParameters, read_value
+from brainbench.stimuli.fitting.parameters import PARAMETERS, FreeParameters
 
 Array = NDArray[np.float64]
 WIDEST = 12.0
@@ -38,7 +38,7 @@ def laplace_interval(free: FreeParameters, index: int, u: Array, deviation: floa
 
 def _interval(free: FreeParameters, index: int, low: float, high: float, level: float, method: str) -> Interval:
     name = free.names[index]
-    parameter, start = PARAMETERS[name], read_value(free.start, name)
+    parameter, start = PARAMETERS[name], free.start[name]
 
     def value(end: float) -> float:
         if abs(end) <= 700:

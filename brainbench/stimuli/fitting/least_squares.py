@@ -18,7 +18,7 @@ from brainbench.stimuli.fitting.identifiability import directions, unknown_param
 from brainbench.stimuli.fitting.intervals import Profile, laplace_interval, quantile
 from brainbench.stimuli.fitting.model import FitModel
 from brainbench.stimuli.fitting.options import FitOptions
-from brainbench.stimuli.fitting.parameters import PUBLISHED, FreeParameters, Prior, read_value, with_value
+from brainbench.stimuli.fitting.parameters import PARAMETERS, PUBLISHED, FreeParameters, Prior
 from brainbench.stimuli.fitting.plausibility import check_wrenches, dead_channels
 from brainbench.stimuli.fitting.residual_tests import check_residuals, failed_words
 from brainbench.stimuli.fitting.result import FitResult, FittedParameter
@@ -64,11 +64,12 @@ def fit(
     if not trials:
         raise UsageError("There is no trial to fit.")
     condition = trials[0].condition
-    for name, value in (start or {}).items():
-        condition = with_value(condition, FreeParameters((name,), condition).names[0], value)
+    if start:
+        FreeParameters(tuple(start), condition)
+        condition = condition.changed(start)
     if "deflection" in (start or {}):
         trials = [
-            replace(trial, pluck=replace(trial.pluck, deflection=condition.deflection)) if trial.pluck else trial
+            replace(trial, pluck=replace(trial.pluck, deflection=condition["deflection"])) if trial.pluck else trial
             for trial in trials
         ]
     free = FreeParameters(tuple(parameters), condition, bounds or {})
@@ -111,10 +112,7 @@ class _Problem:
     def __init__(self, model: FitModel, priors: Mapping[int, Prior]) -> None:
         self.model, self.priors = model, priors
         free = model.free
-        rows = [
-            prior.row(free.names[i], read_value(free.start, free.names[i]), free.start.whisker)
-            for i, prior in priors.items()
-        ]
+        rows = [prior.row(free.names[i], free.start[free.names[i]], free.start.whisker) for i, prior in priors.items()]
         self.mean, self.spread = np.array(rows).reshape(-1, 2).T
         self.prior_jacobian = np.zeros((len(rows), len(free)))
         for row, index in enumerate(priors):
@@ -188,9 +186,9 @@ def _judge(problem: _Problem, solutions: Sequence[_Solution], began: float) -> F
         estimates.append(
             FittedParameter(
                 name,
-                _unit(name),
+                PARAMETERS[name].unit,
                 value,
-                read_value(free.start, name),
+                free.start[name],
                 deviation,
                 laplace_interval(free, index, u, deviation, options.level, t),
                 profile.interval(free, index, options.level, t) if profile and status != "undefined" else None,
@@ -239,7 +237,7 @@ def _rivals(problem: _Problem, solutions: Sequence[_Solution], covariance: Array
     apart = math.sqrt(max(float(covariance[index, index]), 0.0))
     for other in solutions[1:]:
         if other.deviance < best.deviance + ALIKE and abs(other.u[index] - best.u[index]) > max(apart, 0.01):
-            name, unit = model.free.names[index], _unit(model.free.names[index])
+            name, unit = model.free.names[index], PARAMETERS[model.free.names[index]].unit
             values = sorted(model.free.values(one.u)[index] for one in (best, other))
             return {
                 name: f"{name} of {values[0]:.4g} and of {values[1]:.4g} {unit} fit alike: the readings are too rare "
@@ -265,12 +263,6 @@ def _judge_one(problem: _Problem, index: int, u: Array, unknown: str | None) -> 
             "more steps_per_period."
         )
     return "ok", ""
-
-
-def _unit(name: str) -> str:
-    from brainbench.stimuli.fitting.parameters import PARAMETERS
-
-    return PARAMETERS[name].unit
 
 
 def _wrench(trial: Trial, trace: Any) -> Array:

@@ -152,7 +152,7 @@ class FitModel:
 
     def _job(self, trial: Trial, condition: Condition) -> Job:
         if "deflection" not in self.free.names:  # each trial keeps its own
-            condition = replace(condition, deflection=trial.condition.deflection)
+            condition = condition.changed({"deflection": trial.condition["deflection"]})
         return trial.job_of(condition)
 
     def residual(self, u: Array) -> Array:

@@ -15,24 +15,38 @@ from typing import Any, Literal
 import numpy as np
 
 from brainbench.core.errors import UsageError, check_name
+from brainbench.stimuli.engines.protocol import Job
+from brainbench.stimuli.gradients.parameters import WHISKER, JobParameters, whisker_value, with_values
 from brainbench.stimuli.whiskers.whisker import Whisker
-
-Vector = tuple[float, float, float]
 
 
 @dataclass(frozen=True)
 class Condition:
-    """Everything about a trial that a fit may change."""
+    """Everything about a trial that a fit may change: values of :data:`PARAMETERS`, as ``condition["base_x"]``."""
 
     whisker: Whisker
-    base_offset: Vector = (0.0, 0.0, 0.0)
-    """Displacement of the base against the trial's [m, frame of the job]."""
-    base_angle: float = 0.0
-    """Turn of the base about the z axis of the job's frame against the trial's [rad]."""
-    object_offset: Vector = (0.0, 0.0, 0.0)
-    """Displacement of all objects against the trial's [m, frame of the job]."""
-    deflection: float = math.nan
-    """Deflection of the plucked point before its release [m]; NaN without a pluck."""
+    others: Mapping[str, float] = field(default_factory=dict)
+    """Values of parameters that are not the whisker's; displacements that are not named are 0."""
+
+    def __getitem__(self, name: str) -> float:
+        """Return the value of a parameter; of a deflection that no trial has NaN."""
+        if name in WHISKER:
+            return whisker_value(self.whisker, name)
+        return self.others.get(name, math.nan if name == "deflection" else 0.0)
+
+    def changed(self, values: Mapping[str, float]) -> Condition:
+        """Return a condition with other values of some parameters."""
+        own = {name: value for name, value in values.items() if name in WHISKER}
+        return Condition(
+            with_values(self.whisker, own), {**self.others, **{k: values[k] for k in values if k not in own}}
+        )
+
+    def job(self, job: Job) -> Job:
+        """Return the job of a trial under this condition, but for what holds its whisker aside."""
+        job = replace(job, whisker=self.whisker)
+        moves = {PARAMETERS[name].of_job: value for name, value in self.others.items() if value}
+        moves.pop("", None)
+        return JobParameters([job], tuple(moves)).build(np.array([*moves.values()]))[0] if moves else job
 
 
 @dataclass(frozen=True)
@@ -52,6 +66,8 @@ class Parameter:
     """Length of one unit of u: a value for ``linear`` (for ``length`` and ``curvature`` scaled by the whisker)."""
     of_length: int = 0
     """Power of the arc length that ``scale`` is multiplied by."""
+    of_job: str = ""
+    """Displacement of :class:`brainbench.stimuli.gradients.JobParameters` that it is."""
 
     def unit_of(self, whisker: Whisker) -> float:
         """Return what one unit of u is worth, in the parameter's unit; of ``log`` parameters 1."""
@@ -70,8 +86,8 @@ def _positive(name: str, unit: str, what: str, low: float = 0.1, high: float = 1
     return Parameter(name, unit, "log", low, high, what)
 
 
-def _shift(name: str, what: str) -> Parameter:
-    return Parameter(name, "m", "linear", -4.0, 4.0, what, scale=0.05, of_length=1)
+def _shift(name: str, what: str, of_job: str) -> Parameter:
+    return Parameter(name, "m", "linear", -4.0, 4.0, what, 0.05, 1, of_job)
 
 
 PARAMETERS: Mapping[str, Parameter] = {
@@ -85,44 +101,14 @@ PARAMETERS: Mapping[str, Parameter] = {
         _positive("arc_length", "m", "length along the whisker", 0.5, 2.0),
         Parameter("curvature", "1/m", "linear", -30.0, 30.0, "coefficient A of the rest shape y = A x²", 0.1, -1),
         Parameter("friction", "", "linear", -10.0, 10.0, "Coulomb coefficient of the whisker", 0.3),
-        Parameter("base_angle", "rad", "linear", -10.0, 10.0, "turn of the base about z", 0.05),
-        *(_shift(f"base_{axis}", f"displacement of the base along {axis}") for axis in "xyz"),
-        *(_shift(f"object_{axis}", f"displacement of the objects along {axis}") for axis in "xyz"),
+        # θ turns about the z axis last, so that its change is a turn about z of the whole base.
+        Parameter("base_angle", "rad", "linear", -10.0, 10.0, "turn of the base about z", 0.05, of_job="base.theta"),
+        *(_shift(f"base_{axis}", f"displacement of the base along {axis}", f"base.{axis}") for axis in "xyz"),
+        *(_shift(f"object_{axis}", f"displacement of the objects along {axis}", f"objects.{axis}") for axis in "xyz"),
         _positive("deflection", "m", "deflection of the plucked point before its release", 0.05, 20.0),
     )
 }
 """Parameters by name."""
-_OF_WHISKER = ("young_modulus", "damping_ratio", "base_radius", "tip_radius", "arc_length", "curvature", "friction")
-
-
-def read_value(condition: Condition, name: str) -> float:
-    """Return the value of a parameter in a condition."""
-    if name in _OF_WHISKER:
-        return float(getattr(condition.whisker, name))
-    if name == "density":
-        return condition.whisker.densities[0]
-    if name[:-1] in ("base_", "object_"):
-        return getattr(condition, f"{name[:-2]}_offset")["xyz".index(name[-1])]
-    return float(getattr(condition, name))
-
-
-def with_value(condition: Condition, name: str, value: float) -> Condition:
-    """Return a condition with one parameter changed."""
-    whisker = condition.whisker
-    if name in _OF_WHISKER:
-        return replace(condition, whisker=replace(whisker, **{name: value}))
-    if name == "density":
-        base, tip = whisker.densities
-        density = (value, value * tip / base) if isinstance(whisker.density, tuple) else value
-        return replace(condition, whisker=replace(whisker, density=density))
-    if name[:-1] in ("base_", "object_"):
-        field = f"{name[:-2]}_offset"
-        offset = list(getattr(condition, field))
-        offset["xyz".index(name[-1])] = value
-        changes: dict[str, Any] = {field: tuple(offset)}
-        return replace(condition, **changes)
-    changes = {name: value}
-    return replace(condition, **changes)
 
 
 @dataclass(frozen=True)
@@ -145,7 +131,7 @@ class FreeParameters:
         if not self.names or len(set(self.names)) < len(self.names):
             raise UsageError(f"A fit needs at least one parameter, each once; received {list(self.names)}.")
         for name in self.names:
-            value = read_value(self.start, name)
+            value = self.start[name]
             if math.isnan(value):
                 raise UsageError(f"{name!r} is a parameter of a ring-down, and no trial here is one; leave it out.")
             if PARAMETERS[name].kind == "log" and not value > 0:
@@ -158,16 +144,13 @@ class FreeParameters:
         """Return the values at coordinates u [p]."""
         whisker = self.start.whisker
         return tuple(
-            PARAMETERS[name].value(read_value(self.start, name), float(one), whisker)
+            PARAMETERS[name].value(self.start[name], float(one), whisker)
             for name, one in zip(self.names, u, strict=True)
         )
 
     def condition(self, u: Any) -> Condition:
         """Return the condition at coordinates u [p]."""
-        condition = self.start
-        for name, value in zip(self.names, self.values(u), strict=True):
-            condition = with_value(condition, name, value)
-        return condition
+        return self.start.changed(dict(zip(self.names, self.values(u), strict=True)))
 
     def limits(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the lower and upper bounds of u [p]; a start value outside its bounds is a :class:`UsageError`."""
@@ -176,7 +159,7 @@ class FreeParameters:
         return low, high
 
     def _limits(self, name: str) -> tuple[float, float]:
-        parameter, start = PARAMETERS[name], read_value(self.start, name)
+        parameter, start = PARAMETERS[name], self.start[name]
         low, high = parameter.low, parameter.high
         if parameter.kind == "log":
             low, high = math.log(low), math.log(high)

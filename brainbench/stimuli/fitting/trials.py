@@ -14,10 +14,9 @@ from numpy.typing import NDArray
 
 from brainbench.core.contracts import CHANNELS
 from brainbench.core.errors import DataError, UsageError, check_name
-from brainbench.stimuli.engines.displaced import MovedFollicle, move_obstacle
-from brainbench.stimuli.engines.protocol import Follicle, Job, Load, StillFollicle, Trace
+from brainbench.stimuli.engines.protocol import Job, Load, StillFollicle, Trace
 from brainbench.stimuli.fitting.curves import normal_offsets
-from brainbench.stimuli.fitting.parameters import Condition, Vector
+from brainbench.stimuli.fitting.parameters import Condition
 from brainbench.stimuli.fitting.plausibility import check_clock
 from brainbench.stimuli.fitting.tracks.quality import check_length
 from brainbench.stimuli.validation import references
@@ -27,9 +26,9 @@ from brainbench.stimuli.whiskers.whisker import Whisker
 if TYPE_CHECKING:
     import xarray as xr
 
-    from brainbench.stimuli.objects.obstacle import Obstacle
     from brainbench.stimuli.scenes.scene import Scene
 
+Vector = tuple[float, float, float]
 SETTLING = 4.0
 """Time for which a plucked whisker is held, in decay times 1/(ζ ω) of its first mode; it is held in a way that hardly
 swings."""
@@ -57,7 +56,7 @@ class Pluck:
         arc = min(self.arc, whisker.arc_length)
         # The small-bending closed form is that of the straight whisker; curvature changes it by second order.
         straight = replace(whisker, curvature=0.0)
-        force = condition.deflection / references.point_load_deflection(straight, 1.0, arc)
+        force = condition["deflection"] / references.point_load_deflection(straight, 1.0, arc)
         whole = force * np.asarray(self.direction, dtype=float)
         ratio, omega = min(whisker.damping_ratio, 0.9), float(build_chain(whisker, 16).frequencies()[0])
         damped = math.sqrt(1 - ratio**2)
@@ -153,7 +152,7 @@ class Trial:
     @property
     def condition(self) -> Condition:
         """What the trial states, unchanged."""
-        return Condition(self.job.whisker, deflection=self.pluck.deflection if self.pluck else math.nan)
+        return Condition(self.job.whisker, {"deflection": self.pluck.deflection} if self.pluck else {})
 
     @property
     def channels(self) -> tuple[str, ...]:
@@ -162,21 +161,10 @@ class Trial:
 
     def job_of(self, condition: Condition) -> Job:
         """Return the job that simulates the trial under a condition."""
-        loads = self.job.loads
-        if self.pluck is not None:
-            loads = (*loads, *self.pluck.loads(condition, self.job.start))
-        return replace(
-            self.job,
-            whisker=condition.whisker,
-            loads=loads,
-            follicle=_moved_base(self.job.follicle, condition),
-            obstacles=self._obstacles(condition.object_offset),
-        )
-
-    def _obstacles(self, offset: Vector) -> tuple[Obstacle, ...]:
-        if not any(offset):
-            return self.job.obstacles
-        return tuple(move_obstacle(item, offset, start=self.job.start) for item in self.job.obstacles)
+        job = condition.job(self.job)
+        if self.pluck is None:
+            return job
+        return replace(job, loads=(*job.loads, *self.pluck.loads(condition, job.start)))
 
     def residuals(self, trace: Trace, whisker: Whisker) -> NDArray[np.float64]:
         """Return predicted minus measured: [n, c] (N, N·m), or [n, k, d] (m) across the predicted shape; NaN: missing.
@@ -189,13 +177,6 @@ class Trial:
         assert trace.link_positions is not None
         nodes = build_chain(whisker, trace.link_positions.shape[1] - 1).nodes
         return normal_offsets(nodes, trace.link_positions, self.measured["shape"].values)
-
-
-def _moved_base(follicle: Follicle, condition: Condition) -> Follicle:
-    if not any(condition.base_offset) and not condition.base_angle:
-        return follicle
-    # θ turns about the z axis last, so that its change is a turn about z of the whole base.
-    return MovedFollicle(follicle, np.array([*condition.base_offset, condition.base_angle, 0.0, 0.0]))
 
 
 def to_frame(measured: xr.Dataset, axes: NDArray[np.float64], origin: NDArray[np.float64]) -> xr.Dataset:

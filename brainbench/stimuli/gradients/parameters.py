@@ -25,13 +25,13 @@ BASE = ("x", "y", "z", "theta", "phi", "zeta")
 """Shifts of the base [m] and of its Euler angles [rad], as ``base.x``; at a knot in time as ``base.theta[2]``."""
 OBJECT = ("x", "y", "z", "rx", "ry", "rz", "friction")
 """Shift [m] and turn [rad] of an object about its middle at the start, in world axes, as ``object.x``; of further
-objects as ``object1.rz``."""
+objects as ``object1.rz``, of all together as ``objects.x``."""
 _ANGLE = 0.1
 """Scale of an angle (rad)."""
 _SHARE = 0.05
 """Scale of a shift as a share of the arc length."""
 _BASE_NAME = re.compile(r"base\.(\w+)(?:\[(\d+)\])?")
-_OBJECT_NAME = re.compile(r"object(\d*)\.(\w+)")
+_OBJECT_NAME = re.compile(r"object(\d*|s)\.(\w+)")
 
 
 class JobParameters:
@@ -74,13 +74,13 @@ class JobParameters:
 
     def _nominal(self, name: str) -> float:
         if name in WHISKER:
-            found = {_field(job.whisker, name) for job in self.jobs}
+            found = {whisker_value(job.whisker, name) for job in self.jobs}
             if len(found) > 1:
                 raise UsageError(f"The whiskers of the jobs differ in {name!r}; fit them one by one.")
             return found.pop()
         kind, index, what = self._parse(name)
         if kind == "object" and what == "friction":
-            return float(self.jobs[0].obstacles[index].friction or 0.0)
+            return float(self.jobs[0].obstacles[max(index, 0)].friction or 0.0)
         return 0.0
 
     def _scale(self, name: str, value: float, length: float) -> float:
@@ -92,7 +92,7 @@ class JobParameters:
         return _SHARE * length if what in ("x", "y", "z") else _ANGLE
 
     def _parse(self, name: str) -> tuple[str, int, str]:
-        """Return what a name is of, its knot (−1 for none) or object, and the coordinate."""
+        """Return what a name is of, its knot (−1 for none) or object (−1 for all), and the coordinate."""
         if match := _BASE_NAME.fullmatch(name):
             what, knot = match.groups()
             if what in BASE:
@@ -104,6 +104,8 @@ class JobParameters:
                 return "base", int(knot), what
         if match := _OBJECT_NAME.fullmatch(name):
             which, what = match.groups()
+            if what in OBJECT and which == "s":
+                return "object", -1, what
             if what in OBJECT:
                 count = min(len(job.obstacles) for job in self.jobs)
                 if int(which or 0) >= count:
@@ -123,12 +125,13 @@ class JobParameters:
                 continue
             kind, index, what = self._parse(name)
             if kind == "object":
-                moves.setdefault(index, {})[what] = value
+                for one in range(len(job.obstacles)) if index < 0 else (index,):
+                    moves.setdefault(one, {})[what] = value
             elif index < 0:
                 constant[what] = value
             else:
                 at_knots[index, what] = value
-        whisker = self._keep(("whisker", job.whisker), material, lambda: _whisker(job.whisker, material))
+        whisker = self._keep(("whisker", job.whisker), material, lambda: with_values(job.whisker, material))
         follicle, obstacles = job.follicle, list(job.obstacles)
         if constant or at_knots:
             both = constant | at_knots
@@ -161,13 +164,15 @@ class JobParameters:
         return MovedFollicle(follicle, np.array([constant.get(what, 0.0) for what in BASE]))
 
 
-def _field(whisker: Whisker, name: str) -> float:
+def whisker_value(whisker: Whisker, name: str) -> float:
+    """Return the value of a parameter of :data:`WHISKER`."""
     return whisker.densities[0] if name == "density" else float(getattr(whisker, name))
 
 
-def _whisker(whisker: Whisker, given: dict[str, float]) -> Whisker:
+def with_values(whisker: Whisker, given: Mapping[str, float]) -> Whisker:
+    """Return a whisker with other values of parameters of :data:`WHISKER`."""
     changes: dict[str, Any] = dict(given)
-    if "density" in given:
+    if "density" in given and isinstance(whisker.density, tuple):
         low, high = whisker.densities
         changes["density"] = (given["density"], given["density"] * high / low)
     return replace(whisker, **changes) if changes else whisker

@@ -11,7 +11,7 @@ from brainbench.core.errors import DataError, UsageError
 from brainbench.stimuli import WhiskerArray, references
 from brainbench.stimuli.fitting import FitOptions, Trial, fit, new_shapes, new_wrenches
 from brainbench.stimuli.fitting.model import FitModel
-from brainbench.stimuli.fitting.parameters import PARAMETERS, FreeParameters, read_value, with_value
+from brainbench.stimuli.fitting.parameters import PARAMETERS, FreeParameters
 from brainbench.stimuli.fitting.synthetic import blank_wrenches, measure_shapes, measure_wrenches, simulate_trial
 
 KNOWN = replace(WhiskerArray.of("mouse")["C2"].whisker, damping_ratio=0.15)
@@ -171,10 +171,10 @@ def test_a_pole_is_found_by_the_forces_on_the_base():
 @pytest.mark.parametrize("name", [name for name in PARAMETERS if name != "deflection"])
 def test_every_parameter_is_set_and_read(name):
     trial = Trial.ringdown(KNOWN, blank_wrenches(np.arange(1, 9) * 1e-3), 1e-3)
-    value = read_value(trial.condition, name) * 1.1 + (0.0 if PARAMETERS[name].kind == "log" else 1e-4)
-    assert read_value(with_value(trial.condition, name, value), name) == pytest.approx(value)
+    value = trial.condition[name] * 1.1 + (0.0 if PARAMETERS[name].kind == "log" else 1e-4)
+    assert trial.condition.changed({name: value})[name] == pytest.approx(value)
     free = FreeParameters((name,), trial.condition)
-    assert read_value(free.condition([0.3]), name) == pytest.approx(free.values([0.3])[0])
+    assert free.condition([0.3])[name] == pytest.approx(free.values([0.3])[0])
     low, high = free.limits()
     assert low[0] < 0 < high[0]
 

@@ -24,7 +24,7 @@ def test_values_are_those_of_the_jobs_and_shifts_begin_at_zero():
     assert parameters.values.tolist() == [3e9, 1300.0, 0.0, 0.0]
     assert (parameters.scales > 0).all()
     same = parameters.build(parameters.values)[0]
-    assert same.whisker == replace(WHISKER, density=(1300.0, 1300.0))
+    assert same.whisker == WHISKER
     assert same.obstacles[0].parts == BALL.obstacles[0].parts
 
 
@@ -37,6 +37,15 @@ def test_an_object_is_shifted_and_turned_about_its_middle():
     moved = _build(BALL, **{"object.y": 1e-3, "object.rz": 0.5, "object.friction": 0.2}).obstacles[0]
     assert moved.parts[0].centre == pytest.approx((11e-3, 3.2e-3, 0.0))
     assert moved.friction == 0.2
+
+
+def test_all_objects_are_shifted_together():
+    two = replace(BALL, obstacles=BALL.obstacles * 2)
+    moved = _build(two, **{"objects.y": 1e-3}).obstacles
+    assert [one.parts[0].centre for one in moved] == [pytest.approx((11e-3, 3.2e-3, 0.0))] * 2
+    alone = _build(two, **{"object1.y": 1e-3}).obstacles
+    assert alone[0] is two.obstacles[0]
+    assert alone[1].parts[0].centre == pytest.approx((11e-3, 3.2e-3, 0.0))
 
 
 def test_an_object_that_moves_is_shifted_along_its_whole_way():
