@@ -38,13 +38,18 @@ def test_sweeps_are_simulated_once_into_shards_with_a_manifest(run, tmp_path):
     assert sorted(path.name for path in folder.iterdir()) == [
         "config.json", "manifest.json", "test-00000.h5", "train-00000.h5", "validation-00000.h5",
     ]  # fmt: skip
+    manifest = json.loads((folder / "manifest.json").read_text())
+    counted = sum(shard["unsolved"] for shard in manifest["shards"])
+    assert data["unsolved"] == manifest["unsolved"] == counted
     with h5py.File(folder / "train-00000.h5") as file:
+        assert file.attrs["unsolved"] == manifest["shards"][0]["unsolved"]
         assert set(file["object"].asstr()[:]) >= {"cube"}
         assert file["class"].asstr()[:].tolist() == ["brick", "cube"]
     before = [(folder / name).stat().st_mtime_ns for name in ("train-00000.h5", "test-00000.h5")]
     again = run(*arguments, "--out", str(folder), *SMALL)
     assert again.status == 0
     assert "0 of 8 sweeps, marked" in again.out
+    assert (f"contact forces of {counted} time steps" in again.out) == (counted > 0)
     assert [(folder / name).stat().st_mtime_ns for name in ("train-00000.h5", "test-00000.h5")] == before
     # What is there is never taken for something else.
     other = run(*arguments, "--out", str(folder), *SMALL, "--whiskers", "C2", "--split", "sweep")

@@ -112,8 +112,11 @@ def _generate(
     with progress_bar() as progress:
         manifest = generate(plan, out, workers=workers, scheduler=scheduler, progress=progress)
     seconds = time.perf_counter() - started
+    unsolved = manifest["unsolved"]
     saved = 1 - manifest["steps"] / max(1, manifest["steps_in_full"])
-    about = ("sweeps", "unstable", "unusable", "steps", "steps_in_full", "splits", "content_hash", "config_hash")
+    about = (
+        "sweeps", "unstable", "unusable", "steps", "steps_in_full", "unsolved", "splits", "content_hash", "config_hash",
+    )  # fmt: skip
     data = {
         **{key: manifest[key] for key in about},
         "seconds": seconds,
@@ -122,7 +125,9 @@ def _generate(
     }
     unusable = {name: item["unusable"] for name, item in manifest["objects"].items() if "unusable" in item}
     rows = {
-        "steps": f"{manifest['steps']:,} of {manifest['steps_in_full']:,} computed ({saved:.0%} saved)",
+        "steps": f"{manifest['steps']:,} of {manifest['steps_in_full']:,} computed"
+        + f" ({saved:.0%} saved)" * (saved >= 0),
+        "not solved": f"contact forces of {unsolved:,} time steps" if unsolved else "",
         "unstable": f"{manifest['unstable']:,} of {manifest['sweeps']:,} sweeps, marked in the shards",
         "unusable": "\n".join(f"{name}: {reason}" for name, reason in unusable.items()),
         "hash": manifest["content_hash"],

@@ -30,6 +30,8 @@ class SweepBatch:
     """Time steps that simulating every whisker of every sweep from start to end takes."""
     retried: int = 0
     """Sweeps with a whisker that was simulated again with finer steps, because it could not be trusted at first."""
+    unsolved: int = 0
+    """Time steps whose contact forces were not solved (:attr:`brainbench.stimuli.engines.protocol.Trace.unsolved`)."""
 
     def __post_init__(self) -> None:
         count, _, whiskers, channels = np.shape(self.wrench)
@@ -61,7 +63,7 @@ def join_batches(parts: Sequence[SweepBatch]) -> SweepBatch:
     """Return several batches as one."""
     if len(parts) == 1:
         return parts[0]
-    names = ("wrench", "contact", "unstable"), ("steps", "steps_in_full", "retried")
+    names = ("wrench", "contact", "unstable"), ("steps", "steps_in_full", "retried", "unsolved")
     arrays: dict[str, Any] = {name: np.concatenate([getattr(part, name) for part in parts]) for name in names[0]}
     counts: dict[str, Any] = {name: sum(getattr(part, name) for part in parts) for name in names[1]}
     return SweepBatch(**arrays, reasons=tuple(reason for part in parts for reason in part.reasons), **counts)

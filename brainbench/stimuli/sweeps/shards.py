@@ -31,8 +31,8 @@ OK, UNSTABLE, UNUSABLE = 0, 1, 2
 ALIGNMENT = 4096
 """The forces begin at a multiple of this, so that pages of memory and of the file coincide."""
 
-COUNTS: tuple[str, ...] = ("steps", "steps_in_full", "retried")
-"""Attributes that say how much was simulated."""
+COUNTS: tuple[str, ...] = ("steps", "steps_in_full", "retried", "unsolved")
+"""Attributes that say how much was simulated, and in how many steps contact forces were not solved."""
 _CONDITIONS = tuple(item.name for item in fields(Sweep))
 
 

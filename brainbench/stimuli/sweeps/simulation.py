@@ -66,4 +66,5 @@ def _one_by_one(
         reasons=describe_unstable(names, unstable, dataset["reason"].values),
         steps=told.steps,
         steps_in_full=told.steps_in_full,
+        unsolved=told.unsolved,
     )

@@ -144,6 +144,7 @@ class SweepLauncher:
             steps=int(result.steps.sum()),
             steps_in_full=self.steps_in_full(len(unstable)),
             retried=int(result.retried.any(axis=1).sum()),
+            unsolved=int(result.counts["unsolved"].sum()),
         )
 
     def steps_in_full(self, sweeps: int) -> int:
