@@ -21,7 +21,7 @@ from tests.factories.sweep_batches import GRID, small_plan
 
 @pytest.fixture(scope="module")
 def plan():
-    return small_plan(("brick:5", "cone:5"), whiskers="C2,C3,D1", shard_size=10)
+    return small_plan(("brick:5", "cone:5"), whiskers="C2,C3,D2", shard_size=10)
 
 
 @pytest.fixture(scope="module")
