@@ -144,11 +144,7 @@ class Thermometers:
             balls = len(self._balls)
             drawn = (self._env.draw(1, 0.0, 1.0)[:, 0] * balls).long().clamp(max=balls - 1)
             self._env.episode.target.copy_(torch.where(mask, drawn, self._env.episode.target))
-        self._apply(mask)
-        self.suite.reset(mask)
-        for cells in self._cells:
-            # Until their next update, readings are those of the episode before.
-            cells.masked_fill_(mask.view(-1, 1, 1, 1), self.thermal.ambient)
+        self._begin_anew(mask)
         self.latched &= ~mask
         self.touching &= ~mask
         self.latch_time.masked_fill_(mask, float("inf"))
@@ -210,8 +206,16 @@ class Thermometers:
         return {**own, "touching": self.touching, "age": self.age}
 
     def restored(self) -> None:
-        """Make the target ball hot that a loaded state has."""
-        self._apply(self.latched | True)
+        """Make the target ball hot that a loaded state has, and the fingers cold: their temperatures are not kept."""
+        self._begin_anew(self.latched | True)
+
+    def _begin_anew(self, mask: torch.Tensor) -> None:
+        """Make the target ball hot and the fingers cold."""
+        self._apply(mask)
+        self.suite.reset(mask)
+        for cells in self._cells:
+            # Until their next update, readings are those of the episode before.
+            cells.masked_fill_(mask.view(-1, 1, 1, 1), self.thermal.ambient)
 
     def _apply(self, mask: torch.Tensor) -> None:
         """Make the target ball hot."""

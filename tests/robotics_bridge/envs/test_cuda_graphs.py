@@ -274,6 +274,21 @@ def _waiting(m: StepContext) -> torch.Tensor:
     return m.power * float(m.power.sum())
 
 
+def test_a_part_after_a_loaded_state_reads_the_same_temperatures_again() -> None:
+    # What the test below rests on, without a GPU. The episode of .2 s ends within these steps, which cools fingers.
+    env = _make("hot_ball", {}, threads=1)
+    for _ in range(12):
+        env.step(torch.zeros(3, env.num_actions))
+        state = env.state_dict()
+        found = []
+        for _ in range(2):
+            env.load_state_dict(state)
+            found.append(_pytree.tree_map(torch.clone, compute_step(env.state, env.reset_episodes)))
+        leaves = (_pytree.tree_leaves_with_path(one) for one in found)
+        for (path, one), (_, two) in zip(*leaves, strict=True):
+            assert torch.allclose(one.float(), two.float(), rtol=1e-4, atol=1e-4, equal_nan=True), path
+
+
 @pytest.mark.gpu
 @pytest.mark.parametrize("task", [case[0] for case in CASES])
 def test_a_replayed_part_is_the_eager_part(task: str) -> None:
