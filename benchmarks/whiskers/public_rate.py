@@ -13,7 +13,6 @@ from __future__ import annotations
 import argparse
 import faulthandler
 import io
-import itertools
 import json
 import os
 import resource
@@ -52,7 +51,6 @@ def main() -> None:
         "--ahead",
         help="of kernels and stages: tries ahead as '1:24' (a digit a try); for the kernels several, by commas",
     )
-    parser.add_argument("--room", help="the same: threads over which few whiskers are spread, 0 for none")
     parser.add_argument("--inside", choices=PARTS, help=argparse.SUPPRESS)
     parser.add_argument("--write", action="store_true", help="write the section of RESULTS.md")
     args = parser.parse_args()
@@ -137,7 +135,6 @@ def kernels(args: argparse.Namespace) -> None:
     from benchmarks.whiskers.throughput import load_objects
     from brainbench.core.files import content_hash
     from brainbench.stimuli import Fidelity
-    from brainbench.stimuli.engines.rod import scheduling
     from brainbench.stimuli.engines.rod.sweeps import SweepLauncher
     from brainbench.stimuli.sweeps.sweep_scenes import GRIDS, SweepScenes
 
@@ -148,9 +145,8 @@ def kernels(args: argparse.Namespace) -> None:
     launcher.launch(groups[:1])
     seen, count = _timed_launches(), sum(len(some) for _, some in groups)
     aheads = [_tries(word) for word in args.ahead.split(",")] if args.ahead else [launcher.ahead]
-    rooms = [int(word) for word in args.room.split(",")] if args.room else [scheduling.ROOM]
-    for launcher.ahead, scheduling.ROOM in itertools.product(aheads, rooms):
-        print(f"ahead {launcher.ahead}, room {scheduling.ROOM:,}")
+    for launcher.ahead in aheads:
+        print(f"ahead {launcher.ahead}")
         seen.clear()
         started = time.perf_counter()
         batch = launcher.trusted(groups, 5)
@@ -166,7 +162,7 @@ def kernels(args: argparse.Namespace) -> None:
         every = sum(spent["kernel"] for *_, spent in seen)
         print(
             f"kernels {count / first:,.0f} sweeps/s; with whiskers again {count / every:,.0f}; "
-            f"all {count / seconds:,.0f}; hash {content_hash([batch.wrench, batch.reasons, batch.steps])}",
+            f"all {count / seconds:,.0f}; hash {content_hash(batch.wrench, batch.reasons, batch.steps)}",
             flush=True,
         )
     if args.whole:
@@ -224,14 +220,12 @@ def _timed_launches() -> list[tuple[str, int, int, dict[str, float]]]:
 def stages(args: argparse.Namespace) -> None:
     """Run the command in this process, and print when each shard was where and what its stages took."""
     from brainbench.cli import app
-    from brainbench.stimuli.engines.rod import limits, scheduling
+    from brainbench.stimuli.engines.rod import limits
     from brainbench.stimuli.sweeps import running
 
     seen, moments, lock = _timed_launches(), [], threading.Lock()
     if args.ahead:
         limits.AHEAD[True] = _tries(args.ahead)
-    if args.room:
-        scheduling.ROOM = int(args.room)
     if args.side_by_side:
         running.SIDE_BY_SIDE = args.side_by_side
     totals: dict[str, float] = {}

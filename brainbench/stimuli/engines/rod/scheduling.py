@@ -28,9 +28,6 @@ SLICES_PER_CHECK = 8
 """Slices (an even number) after which the host counts the whiskers that are left."""
 MOST_THREADS = 2**19
 """Most threads that find distances at once: a few times as many as a GPU runs side by side."""
-ROOM = 0
-"""Threads over which few whiskers are spread: with 2^15, as many as a GPU runs side by side, each has a warp, in which
-it waits for no neighbour elsewhere in its step. Off until ``public_rate --room`` has measured it on a GPU."""
 REPEATS, RARELY = (4, 64), 256
 """Least and most times that a recorded graph is launched for each count, and slices so far for one time more: the host
 has many launches to look after."""
@@ -47,7 +44,6 @@ class Slices:
         device: Any,
         budget: int | None = None,
         recorded: bool | None = None,
-        room: int | None = None,
         urgent: bool = False,
     ) -> None:
         """Make room for ``lanes`` whiskers on the device.
@@ -56,13 +52,11 @@ class Slices:
             kernels, capacity, lanes, device: as of the launch.
             budget: steps that a whisker begins in one slice; by the number of whiskers that are left when None.
             recorded: False when a GPU is given kernel after kernel instead of CUDA graphs.
-            room: threads over which few whiskers are spread; :data:`ROOM` on a GPU when None.
             urgent: True when these go first among all that the GPU could do.
         """
         wp = warp()
         self.kernels, self.device, self.lanes, self.capacity = kernels, device, lanes, capacity
         self.budget = budget
-        self.room = (ROOM if device.is_cuda else 0) if room is None else room
         self.recorded = device.is_cuda if recorded is None else recorded
         # Distances and contact forces of a slice need not wait for each other.
         self.stream: Any = None
@@ -143,17 +137,14 @@ class Slices:
         """Launch some slices for at most ``left`` whiskers."""
         wp, on, device, kernels = warp(), self.struct, self.device, self.kernels
         on.budget = self.budget or (1 if left < FEW else BUDGET)
-        # The largest power of two for which all have room.
-        on.spread = 2 ** (min(max(self.room // left, 1), WARP).bit_length() - 1)
         for _ in range(SLICES_PER_CHECK):
-            many = (left + 3 * WARP) * on.spread
-            wp.launch(kernels.run, many, [*inputs, on], device=device, stream=self.stream, block_dim=block)
+            wp.launch(kernels.run, left + 3 * WARP, [*inputs, on], device=device, stream=self.stream, block_dim=block)
             # After an even number of slices both arrays are back in place, so a recorded graph can be repeated.
             on.queue, on.next_queue = on.next_queue, on.queue
             wp.launch(kernels.swap_queues, 1, [on], device=device, stream=self.stream)
             for (kernel, threads), stream in zip(kernels.solve_contacts, self.streams, strict=True):
                 # Whole warps: the threads of a group speak with each other.
-                many = -(-left * min(threads * on.spread, WARP) // WARP) * WARP
+                many = -(-left * threads // WARP) * WARP
                 if stream is not None:
                     stream.wait_stream(self.stream)
                 wp.launch(
@@ -164,7 +155,7 @@ class Slices:
                     stream=stream or self.stream,
                     block_dim=limits.CONTACT_BOUNDS[0],
                 )
-            many = min(self.queries, self.capacity * left) * min(kernels.distance_group * on.spread, WARP)
+            many = min(self.queries, self.capacity * left) * kernels.distance_group
             many = min(-(-many // WARP) * WARP, MOST_THREADS)
             wp.launch(
                 kernels.measure_distances,

@@ -472,13 +472,11 @@ def solve_queue(problems: ContactProblems, paused: PausedWhiskers):
     """Solve the problems of one queue in place: ``group_size`` threads take one problem."""
     thread = wp.tid()
     count = paused.problem_size[wp.static(queue)]
-    spread = wp.min(paused.spread, wp.static(WARP // group_size))
-    group = thread // wp.static(group_size)
-    which = group // spread
+    which = thread // wp.static(group_size)
     # All threads of a warp go on, or none.
-    if (thread // wp.static(WARP)) * wp.static(WARP // group_size) // spread < count:
+    if (thread // wp.static(WARP)) * wp.static(WARP // group_size) < count:
         live = int(0)
-        if which < count and group % spread == 0:
+        if which < count:
             live = int(1)
         index = paused.problem_queue[wp.static(queue), wp.min(which, count - 1)]
         solve_contacts(problems, index, thread % wp.static(group_size), live)

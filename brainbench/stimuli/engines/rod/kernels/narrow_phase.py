@@ -266,20 +266,15 @@ def measure_distances(
     """
     thread = wp.tid()
     part = thread % wp.static(group_size)
-    spread = wp.min(paused.spread, wp.static(WARP // group_size))
-    group = thread // wp.static(group_size)
-    # The first query of the warp, and that of the group.
-    first = (thread // wp.static(WARP)) * (wp.static(WARP // group_size) // spread)
-    place = group // spread
+    place = thread // wp.static(group_size)
     count = wp.min(paused.query_count[0], paused.query.shape[0])
     # All threads of a warp go on, or none.
-    while first < count:
+    while place - place % wp.static(WARP // group_size) < count:
         live = int(0)
-        if place < count and group % spread == 0:
+        if place < count:
             live = 1
         which = wp.min(place, count - 1)
-        first = first + threads // wp.static(group_size) // spread
-        place = place + threads // wp.static(group_size) // spread
+        place = place + threads // wp.static(group_size)
         index = paused.query[which].job
         i = paused.query[which].link
         s = shapes.first[jobs.scene[index]]

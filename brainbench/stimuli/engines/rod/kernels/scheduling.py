@@ -22,9 +22,7 @@ from .state import (
 def next_job(paused: PausedWhiskers, thread: int) -> int:
     """Return the job of a thread, −1 without. Each queue begins with a block of threads of its own."""
     index = int(-1)
-    place = thread // paused.spread
-    if thread % paused.spread != 0:
-        return index
+    place = thread
     for which in range(3):
         if place >= 0 and index < 0:
             many = paused.queue_size[which]

@@ -487,8 +487,6 @@ class PausedWhiskers:
 
     budget: wp.int32
     """Steps that a whisker begins in one slice."""
-    spread: wp.int32
-    """Threads, or groups of threads, of which one has a whisker or a query: a power of two, at most a warp."""
     queue: wp.array2d(dtype=wp.int32)
     """[3, job] whiskers to go on with: after distances, after contact forces, all others."""
     next_queue: wp.array2d(dtype=wp.int32)
