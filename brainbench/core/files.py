@@ -189,7 +189,8 @@ def _rounded(value: Any) -> Any:
 def content_hash(*values: Any, length: int = 16) -> str:
     """Hash configuration and arrays to a hexadecimal name that is equal on every machine.
 
-    Arrays count by dtype, shape and bytes; paths by the bytes of the file; all else by its JSON.
+    Arrays count by dtype, shape and bytes; paths by the bytes of the file; all else by its JSON. So do arrays within a
+    list, a hundred times as slowly as those that are values themselves.
     """
     digest = hashlib.sha256()
     for value in values:
