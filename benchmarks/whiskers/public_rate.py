@@ -144,9 +144,10 @@ def kernels(args: argparse.Namespace) -> None:
     groups = [(name, scenes.grid.sweeps(name)[: args.limit]) for name in scenes.objects]
     launcher.launch(groups[:1])
     seen, count = _timed_launches(), sum(len(some) for _, some in groups)
-    aheads = [_tries(word) for word in args.ahead.split(",")] if args.ahead else [launcher.ahead]
-    for launcher.ahead in aheads:
-        print(f"ahead {launcher.ahead}")
+    aheads = [_tries(word) for word in args.ahead.split(",")] if args.ahead else [launcher.ahead()]
+    for ahead in aheads:
+        launcher.ahead = lambda ahead=ahead: ahead
+        print(f"ahead {ahead}")
         seen.clear()
         started = time.perf_counter()
         batch = launcher.trusted(groups, 5)
@@ -220,12 +221,12 @@ def _timed_launches() -> list[tuple[str, int, int, dict[str, float]]]:
 def stages(args: argparse.Namespace) -> None:
     """Run the command in this process, and print when each shard was where and what its stages took."""
     from brainbench.cli import app
-    from brainbench.stimuli.engines.rod import limits
+    from brainbench.stimuli.engines.rod import tries
     from brainbench.stimuli.sweeps import running
 
     seen, moments, lock = _timed_launches(), [], threading.Lock()
     if args.ahead:
-        limits.AHEAD[True] = _tries(args.ahead)
+        tries.ON_AN_IDLE_GPU = _tries(args.ahead)
     if args.side_by_side:
         running.SIDE_BY_SIDE = args.side_by_side
     totals: dict[str, float] = {}

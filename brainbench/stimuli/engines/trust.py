@@ -242,7 +242,10 @@ Result = TypeVar("Result", bound=Judged)
 
 
 def run_with_retries(
-    simulate: Callable[[Sequence[Try]], Sequence[Result]], retry: int, *, ahead: Ahead = ONE_BY_ONE
+    simulate: Callable[[Sequence[Try]], Sequence[Result]],
+    retry: int,
+    *,
+    ahead: Callable[[], Ahead] = lambda: ONE_BY_ONE,
 ) -> Result:
     """Simulate whiskers, and those that finer steps may mend again: with steps over ``retry``, then over twice that.
 
@@ -252,8 +255,8 @@ def run_with_retries(
         simulate: gives the results of tries, which may be simulated at the same time; whiskers of a mask are in its
             order, and alone.
         retry: 1 leaves all whiskers as they are.
-        ahead: tries that are simulated before it is known whether they are needed, where further whiskers cost less
-            time than further launches. Results do not depend on it.
+        ahead: gives the tries to simulate before it is known whether they are needed, where further whiskers cost
+            less time than further launches; asked before each. Results do not depend on it.
     """
     (result,) = simulate([(None, 1)])
     if retry == 1:
@@ -278,7 +281,7 @@ def run_with_retries(
                 yield some, found.picked(some[simulated])
 
     left = np.ones_like(result.verdict.retryable)
-    for finer, multiples in ((1, ahead[0]), (retry, ahead[1]), (2 * retry, ())):
+    for place, finer in enumerate((1, retry, 2 * retry)):
         if finer > 1:
             left = result.verdict.retryable.copy()
             run({finer: left})
@@ -286,7 +289,7 @@ def run_with_retries(
                 result = result.replaced(some, found)
         suspicious = result.verdict.suspicious & left
         doubtful = suspicious | result.verdict.retryable
-        run({2 * finer: suspicious} | {retry * k: doubtful for k in multiples})
+        run({2 * finer: suspicious} | {retry * k: doubtful for k in (*ahead(), ())[place]})
         for some, half in parts(suspicious, 2 * finer):
             result = result.compared(some, half)
     return result

@@ -18,10 +18,10 @@ from brainbench.stimuli.engines.job_pool import run_groups
 from brainbench.stimuli.engines.protocol import Job, Progress, Trace, WhiskerEngine
 from brainbench.stimuli.engines.rod.compilation import load_kernels
 from brainbench.stimuli.engines.rod.launch import LaunchResult, WhiskerSolver, real_type
-from brainbench.stimuli.engines.rod.limits import AHEAD
 from brainbench.stimuli.engines.rod.packing import Track, capacity_for
 from brainbench.stimuli.engines.rod.shapes import PackedSurface
 from brainbench.stimuli.engines.rod.tasks import JobTask, PackedTasks, make_task
+from brainbench.stimuli.engines.rod.tries import tries_ahead
 from brainbench.stimuli.engines.stepping import silent_trace
 from brainbench.stimuli.engines.sweep_batch import SweepBatch
 from brainbench.stimuli.engines.trust import Try, check_jobs, run_with_retries
@@ -175,7 +175,7 @@ def _simulate_alike(
         np.add.at(seconds, rows, spent / len(rows))
         return result.split(counts)
 
-    result = run_with_retries(launch, retry, ahead=AHEAD[device.is_cuda])
+    result = run_with_retries(launch, retry, ahead=lambda: tries_ahead(device))
     found = (trace_of(result, row, task.job, fidelity, seconds[row]) for row, task in enumerate(given))
     return dict(zip(tasks, found, strict=True))
 

@@ -8,7 +8,6 @@ from brainbench.stimuli.engines.trust import (  # noqa: F401 — kernels take ev
     LARGEST_OVERLAP,
     LARGEST_START_OVERLAP,
     LOST,
-    ONE_BY_ONE,
     STARTED_INSIDE,
 )
 
@@ -71,11 +70,6 @@ def contacts_for(capacity: int) -> int:
     """Return the contacts that a kernel for chains of at most ``capacity`` links solves together."""
     return CONTACTS[capacity > 12]
 
-
-AHEAD = {False: ONE_BY_ONE, True: ((1,), (2, 4))}
-"""Tries ahead on a processor and on a GPU (:func:`brainbench.stimuli.engines.trust.run_with_retries`). On a GPU few
-whiskers take as long as the one with most steps: with steps over 2, 5, 10 and 20 one after the other these waits add up
-to 38 times that of the first simulation, with 2 and 5 and then 10 and 20 at the same time to 26."""
 
 WARP = 32
 """Threads of a GPU that run in step."""

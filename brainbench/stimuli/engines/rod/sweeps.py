@@ -6,9 +6,10 @@ The object's surface is uploaded once and scaled, turned and moved inside the ke
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from functools import cache
+from contextlib import nullcontext
+from functools import cache, partial
 from itertools import groupby
 from typing import Any
 
@@ -21,11 +22,12 @@ from brainbench.core.rotations import euler_matrix, from_matrices
 from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.engines.protocol import base_rotation
 from brainbench.stimuli.engines.rod.launch import LaunchResult, WhiskerSolver
-from brainbench.stimuli.engines.rod.limits import AHEAD, MESHES, WIDEST
+from brainbench.stimuli.engines.rod.limits import MESHES, WIDEST
 from brainbench.stimuli.engines.rod.packing import PackedJobs, PackedMotions, still_knots
 from brainbench.stimuli.engines.rod.shapes import PackedShapes, PackedSurface
+from brainbench.stimuli.engines.rod.tries import first_simulation, tries_ahead
 from brainbench.stimuli.engines.sweep_batch import SweepBatch, describe_unstable, join_batches
-from brainbench.stimuli.engines.trust import Try, run_with_retries
+from brainbench.stimuli.engines.trust import Ahead, Try, run_with_retries
 from brainbench.stimuli.engines.units import MILLI
 from brainbench.stimuli.objects.solid import Solid
 from brainbench.stimuli.sweeps.sweep_scenes import SweepScenes
@@ -62,7 +64,7 @@ class SweepLauncher:
         sliced = bool(against == MESHES and self.device.is_cuda) if sliced is None else sliced
         bounds = bounds or (SLICED_BOUNDS if sliced else BOUNDS)
         self.scenes, self.grid = scenes, grid
-        self.ahead = AHEAD[self.device.is_cuda]
+        self.ahead: Callable[[], Ahead] = partial(tries_ahead, self.device)
         """As in :func:`brainbench.stimuli.engines.trust.run_with_retries`."""
         self.seconds: dict[str, float] = {}
         """Elapsed time of the last launch for placing objects, uploading, and computing."""
@@ -156,7 +158,8 @@ class SweepLauncher:
 
         def launch(tries: Sequence[Try]) -> list[LaunchResult]:
             some = [(which, finer) for which, finer in tries if which is not None]
-            result = self.launch(objects, some)
+            with nullcontext() if some else first_simulation(self.device):
+                result = self.launch(objects, some)
             return result.split([int(which.sum()) for which, _ in some] or [len(result.wrench)])
 
         return self.batch(run_with_retries(launch, retry, ahead=self.ahead))

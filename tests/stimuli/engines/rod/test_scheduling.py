@@ -3,7 +3,7 @@
 import threading
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import fields
-from itertools import groupby
+from itertools import cycle, groupby
 from types import SimpleNamespace
 
 import numpy as np
@@ -14,7 +14,9 @@ from brainbench.core.files import content_hash, portable
 from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.engines.rod import launch, scheduling, streams, sweeps
 from brainbench.stimuli.engines.rod.sweeps import SweepLauncher
+from brainbench.stimuli.engines.rod.tries import ON_AN_IDLE_GPU, first_simulation, tries_ahead
 from brainbench.stimuli.engines.sweep_batch import SweepBatch
+from brainbench.stimuli.engines.trust import ONE_BY_ONE
 from brainbench.stimuli.objects.collections import resolve_objects
 from brainbench.stimuli.sweeps.grid import SweepGrid
 from brainbench.stimuli.sweeps.sweep_scenes import GRIDS, SweepScenes
@@ -145,10 +147,12 @@ def test_tries_at_the_same_time_give_the_bytes_of_tries_one_after_the_other(slic
         return launch(objects, tries)
 
     launcher.launch = seen
-    for launcher.ahead in (((), (2,)), ((1,), (2, 4)), ((1, 2, 4), ())):
+    at_once = (1,), (2, 4)
+    for answers in ([ONE_BY_ONE], [at_once], [((1, 2, 4), ())], [at_once, ONE_BY_ONE], [ONE_BY_ONE, at_once]):
+        launcher.ahead = cycle(answers).__next__
         batches.append(launcher.trusted(chosen, 5))
         launches.append(None)
-    one, two, all_ = (list(some) for which, some in groupby(launches, lambda seen: seen is not None) if which)
+    one, two, all_, *mixed = (list(some) for which, some in groupby(launches, lambda seen: seen is not None) if which)
     one_by_one, *others = batches
     (suspicious, doubtful), tenths = two[1].values(), sum(launch.get(10, 0) for launch in one)
     # Of the suspicious some are confirmed by half the step and some are not; of those that are simulated again some are
@@ -159,6 +163,38 @@ def test_tries_at_the_same_time_give_the_bytes_of_tries_one_after_the_other(slic
     assert any(20 in launch for launch in one)
     assert one_by_one.unstable.any()
     assert (two[2:], all_[2:]) == ([{10: tenths, 20: tenths}], [])
+    assert [len(some) for some in mixed] == [4, 4]
     for batch in others:
         for field in fields(SweepBatch):
             np.testing.assert_array_equal(getattr(batch, field.name), getattr(one_by_one, field.name))
+
+
+def test_tries_run_ahead_only_while_no_thread_simulates_sweeps_for_the_first_time(monkeypatch):
+    gpu, other = (SimpleNamespace(is_cuda=True, alias=f"cuda:{place}") for place in range(2))
+    assert tries_ahead(warp().get_device("cpu")) == ONE_BY_ONE
+    assert tries_ahead(gpu) == ON_AN_IDLE_GPU
+    with first_simulation(gpu), first_simulation(gpu):
+        with ThreadPoolExecutor(1) as pool:
+            assert pool.submit(tries_ahead, gpu).result() == ONE_BY_ONE
+        assert tries_ahead(other) == ON_AN_IDLE_GPU
+    assert tries_ahead(gpu) == ON_AN_IDLE_GPU
+
+    scenes = SweepScenes(GRID, {"brick-0": resolve_objects(["brick-0"], surfaces=True)["brick-0"].load})
+    launcher = SweepLauncher(scenes, COARSE)
+    launcher.device, states = gpu, []
+
+    def run(launch, retry, *, ahead):
+        for tries in ([(None, 1)], [(np.ones((2, 1), dtype=bool), 5)]):
+            launch(tries)
+        states.append(ahead())
+
+    def launched(objects, tries):
+        states.append(tries_ahead(gpu))
+        return SimpleNamespace(wrench=np.zeros(2), split=lambda counts: counts)
+
+    monkeypatch.setattr(launcher, "launch", launched)
+    monkeypatch.setattr(launcher, "batch", lambda result: result)
+    monkeypatch.setattr(sweeps, "run_with_retries", run)
+    launcher.ahead = lambda: tries_ahead(gpu)
+    launcher.trusted([], 5)
+    assert states == [ONE_BY_ONE, ON_AN_IDLE_GPU, ON_AN_IDLE_GPU]
