@@ -10,7 +10,6 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, ThreadPoolExecutor, as_completed, wait
 from concurrent.futures.process import BrokenProcessPool
 from functools import partial
-from itertools import islice
 from multiprocessing import connection
 from multiprocessing.process import BaseProcess
 from pathlib import Path
@@ -20,7 +19,9 @@ from brainbench.core.errors import BrainbenchError, DataError
 from brainbench.core.jobs import STOPPING, pool_died, run_on_cluster, start_worker, stop_pool, worker_pool
 from brainbench.stimuli.sweeps.plan import ShardTask
 from brainbench.stimuli.sweeps.shards import (
+    BuiltObject,
     PreparedShard,
+    build_object,
     make_shard,
     prepare_shard,
     simulate_shard,
@@ -39,7 +40,9 @@ WHISKER_BYTES = 10_000, 32
 WRITERS = 4
 """Shards behind a GPU that may be hashed and written meanwhile: one thread hashes about 1 GB/s."""
 AHEAD = 4
-"""Shards at least that are prepared ahead of the simulation; as many as there are processes to do it, if more."""
+"""Shards at least whose objects are built ahead of the simulation; more if a process would have nothing to do."""
+STARTING = 8
+"""Objects that take about as long to build as a process to start."""
 
 
 def run_here(tasks: Sequence[ShardTask], folder: Path, workers: int | None, done: Done) -> None:
@@ -144,7 +147,7 @@ def _run_share(gpu: str, pipe: connection.Connection, tasks: Sequence[ShardTask]
 def run_pipelined(tasks: Sequence[ShardTask], folder: Path, workers: int, done: Done) -> None:
     """Make shards in threads of this process, some at the same time, while other processes build objects.
 
-    The objects of as many shards as there are workers and the forces of at most :data:`SIDE_BY_SIDE` + :data:`WRITERS`
+    The objects of some shards ahead (:data:`AHEAD`) and the forces of at most :data:`SIDE_BY_SIDE` + :data:`WRITERS`
     shards are in memory.
     """
     at_once = _shards_at_once(tasks[0])
@@ -157,12 +160,13 @@ def run_pipelined(tasks: Sequence[ShardTask], folder: Path, workers: int, done: 
 
     most = min(at_once + WRITERS, len(tasks))
     making: set[Future[int]] = set()
+    processes = min(workers, max(len(tasks), sum(len(task.objects) for task in tasks) // STARTING))
     try:
-        with worker_pool(min(workers, len(tasks))) as builders, ThreadPoolExecutor(most) as threads:
+        with worker_pool(processes) as builders, ThreadPoolExecutor(most) as threads:
             try:
                 # Fails where the first shard will fail, which tells of it.
                 threads.submit(warm_up, tasks[0])
-                for task, prepared in _built_ahead(tasks, builders, max(AHEAD, workers)):
+                for task, prepared in _built_ahead(tasks, builders, processes):
                     making.add(threads.submit(make, task, prepared))
                     del prepared
                     if len(making) == most:
@@ -190,10 +194,15 @@ def _shards_at_once(task: ShardTask) -> int:
 
 
 def _built_ahead(
-    tasks: Sequence[ShardTask], builders: ProcessPoolExecutor, ahead: int
+    tasks: Sequence[ShardTask], builders: ProcessPoolExecutor, processes: int
 ) -> Iterator[tuple[ShardTask, PreparedShard]]:
-    coming: deque[Future[PreparedShard]] = deque()
+    """Yield shards in order while the objects of the next ones are built, each by any of the processes."""
+    coming: deque[list[Future[BuiltObject]]] = deque()
     waiting = iter(tasks)
     for task in tasks:
-        coming.extend(builders.submit(prepare_shard, later) for later in islice(waiting, ahead + 1 - len(coming)))
-        yield task, coming.popleft().result()
+        while len(coming) <= AHEAD or sum(map(len, coming)) < 2 * processes:
+            if (later := next(waiting, None)) is None:
+                break
+            build = partial(build_object, settings=later.settings, grid=later.grid)
+            coming.append([builders.submit(build, item) for item in later.objects])
+        yield task, prepare_shard(task, [one.result() for one in coming.popleft()])

@@ -18,9 +18,10 @@ from brainbench.core.contracts import CHANNELS, SWEEPS_FORMAT, SWEEPS_SCHEMA
 from brainbench.core.errors import DataError, UsageError
 from brainbench.core.files import atomic_path, content_hash, hash_arrays, to_json
 from brainbench.stimuli.engines import get_engine
+from brainbench.stimuli.objects.collections import NamedObject
 from brainbench.stimuli.objects.solid import Solid
-from brainbench.stimuli.sweeps.grid import Sweep
-from brainbench.stimuli.sweeps.plan import PlannedShard, ShardTask
+from brainbench.stimuli.sweeps.grid import Sweep, SweepGrid
+from brainbench.stimuli.sweeps.plan import GenerationSettings, PlannedShard, ShardTask
 from brainbench.stimuli.sweeps.simulation import simulate_sweeps, takes_sweeps
 from brainbench.stimuli.sweeps.sweep_scenes import SweepScenes
 from brainbench.stimuli.whiskers.array import WhiskerArray
@@ -47,15 +48,23 @@ class ShardContent:
 
 
 @dataclass(frozen=True, eq=False)
-class PreparedShard:
-    """Objects and tables of a shard before it is simulated; made by another process while the GPU works."""
+class BuiltObject:
+    """An object of a shard; made by another process while the GPU works."""
 
-    solids: tuple[Solid | None, ...]
-    """The objects of the shard; None for one that cannot be used."""
-    reasons: tuple[str, ...]
-    """Reason for which an object cannot be used; empty for the others."""
-    packed: tuple[Any, ...]
-    """Result of :meth:`WhiskerEngine.pack` for the objects, empty when the engine takes no sweeps."""
+    solid: Solid | None
+    """None when it cannot be used."""
+    reason: str = ""
+    """Reason for which it cannot be used."""
+    hash: str = ""
+    packed: Any = None
+    """Result of :meth:`WhiskerEngine.pack`; None when the engine takes no sweeps."""
+
+
+@dataclass(frozen=True, eq=False)
+class PreparedShard:
+    """Objects and tables of a shard before it is simulated."""
+
+    objects: tuple[BuiltObject, ...]
     tables: Mapping[str, NDArray[Any]]
     """The arrays that do not depend on the simulation."""
 
@@ -65,22 +74,23 @@ def make_shard(task: ShardTask, folder: str, workers: int | None = None) -> int:
     return write_shard(simulate_shard(task, prepare_shard(task), workers), folder)
 
 
-def prepare_shard(task: ShardTask) -> PreparedShard:
-    """Build the objects of a shard and list its sweeps."""
-    built: list[tuple[Solid | None, str]] = []
-    for item in task.objects:
-        try:
-            built.append((item.load(), ""))
-        except (DataError, UsageError) as error:
-            built.append((None, str(error) or type(error).__name__))
-    solids, reasons = zip(*built, strict=True)
-    hashes = ["" if solid is None else _hash_solid(solid) for solid in solids]
+def build_object(item: NamedObject, settings: GenerationSettings, grid: SweepGrid) -> BuiltObject:
+    """Build one object of a data set, as its engine takes it."""
+    try:
+        solid = item.load()
+    except (DataError, UsageError) as error:
+        return BuiltObject(None, str(error) or type(error).__name__)
+    engine = get_engine(settings.backend, device=settings.device)
+    packed = engine.pack(solid) if takes_sweeps(engine, grid) else None
+    return BuiltObject(solid, "", _hash_solid(solid), packed)
+
+
+def prepare_shard(task: ShardTask, objects: Iterable[BuiltObject] = ()) -> PreparedShard:
+    """List the sweeps of a shard; build its objects, unless they are given."""
+    built = tuple(objects) or tuple(build_object(item, task.settings, task.grid) for item in task.objects)
     array = WhiskerArray.of(task.grid.species).select(task.whiskers)
-    tables = shard_tables(task, array, task.grid.frames.times, hashes)
-    engine = get_engine(task.settings.backend, device=task.settings.device)
-    sweeps = takes_sweeps(engine, task.grid)
-    packed = tuple(solid and engine.pack(solid) for solid in solids) if sweeps else ()
-    return PreparedShard(solids, reasons, packed, {**tables, **_conditions(task)})
+    tables = shard_tables(task, array, task.grid.frames.times, [one.hash for one in built])
+    return PreparedShard(built, {**tables, **_conditions(task)})
 
 
 def warm_up(task: ShardTask) -> None:
@@ -95,20 +105,21 @@ def simulate_shard(task: ShardTask, prepared: PreparedShard, workers: int | None
     """Simulate the sweeps of a shard past its objects."""
     count, frames = task.grid.count, task.grid.frames
     whiskers = len(task.config["whiskers"]["names"])
-    place = {owner: rank for rank, owner in enumerate(i for i, solid in enumerate(prepared.solids) if solid)}
+    usable = {owner: one for owner, one in enumerate(prepared.objects) if one.solid is not None}
+    place = {owner: rank for rank, owner in enumerate(usable)}
     chosen = np.flatnonzero(np.isin(task.owner, list(place)))
     shape = (len(task), frames.count, whiskers, 6)
     contact = np.zeros((len(task), whiskers), dtype=np.float32)
     status = np.full((len(task), whiskers), UNUSABLE, dtype=np.uint8)
-    reasons = [prepared.reasons[owner] for owner in task.owner.tolist()]
+    reasons = [prepared.objects[owner].reason for owner in task.owner.tolist()]
     counts: dict[str, int] = dict.fromkeys(COUNTS, 0)
     wrench = np.empty((0, *shape[1:]), dtype=np.float32)
     if len(chosen):
-        named = {task.objects[owner].name: solid for owner in place if (solid := prepared.solids[owner])}
+        named = {task.objects[owner].name: one.solid for owner, one in usable.items() if one.solid is not None}
         settings = {name: getattr(task.settings, name) for name in ("fidelity", "backend", "device", "retry")}
         indices = [place[int(task.owner[i])] * count + int(task.within[i]) for i in chosen.tolist()]
         scenes = SweepScenes(task.grid, named, whiskers=task.whiskers)
-        packed = {task.objects[owner].name: some for owner, some in enumerate(prepared.packed) if some is not None}
+        packed = {task.objects[owner].name: one.packed for owner, one in usable.items() if one.packed is not None}
         batch = simulate_sweeps(scenes, indices, workers=workers, packed=packed, **settings)
         if batch.wrench.shape != (len(chosen), *shape[1:]):
             raise UsageError(f"The engine gave wrenches {batch.wrench.shape}; expected {(len(chosen), *shape[1:])}.")

@@ -4,6 +4,7 @@ import logging
 import os
 import shutil
 from collections import namedtuple
+from concurrent.futures import Future
 
 import pytest
 
@@ -13,6 +14,7 @@ from brainbench.stimuli.engines.fidelity import Fidelity, list_presets
 from brainbench.stimuli.sweeps import running
 from brainbench.stimuli.sweeps.generation import generate
 from brainbench.stimuli.sweeps.plan import GenerationSettings
+from brainbench.stimuli.sweeps.shards import BuiltObject
 from tests.factories.sweep_batches import GRID, files_of, small_plan
 
 
@@ -82,6 +84,25 @@ def test_the_pipeline_behind_a_gpu_writes_the_same_bytes(plan, unbroken, tmp_pat
     assert sum(done) == 32
     expected = {name: data for name, data in files_of(unbroken).items() if name != "manifest.json"}
     assert files_of(tmp_path) == expected
+
+
+@pytest.mark.parametrize(("processes", "ahead"), [(1, 5), (4, 8), (40, 8)])
+def test_objects_are_built_one_by_one_and_as_many_ahead_as_keep_processes_busy(processes, ahead, monkeypatch):
+    plan = small_plan(("brick:8",), shard_size=4)
+    asked = []
+
+    class Pool:
+        def submit(self, build, item):
+            asked.append(item.name)
+            done = Future()
+            done.set_result(build(item))
+            return done
+
+    monkeypatch.setattr(running, "build_object", lambda item, *, settings, grid: BuiltObject(None, f"no {item.name}"))
+    for count, (task, prepared) in enumerate(running._built_ahead(plan.shards, Pool(), processes)):
+        assert len(asked) == min(8, ahead + count)
+        assert [one.reason for one in prepared.objects] == [f"no {item.name}" for item in task.objects]
+    assert asked == [item.name for task in plan.shards for item in task.objects]
 
 
 def test_a_set_of_sweeps_has_the_hash_that_it_always_had(tmp_path, monkeypatch):
