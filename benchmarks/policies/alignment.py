@@ -38,7 +38,7 @@ from robotics_bridge.policies.readouts.rollout import TARGETS, TouchRollout, cal
 
 BOARD = Path(__file__).resolve().parents[2] / "leaderboards" / "results"
 PICTURE = Path(__file__).resolve().parents[2] / "docs" / "images" / "policy-alignment.png"
-TASK, CONFIG, AGENT = "in_palm_rotate", "careful", "in_palm_rotate.firm"
+TASK, CONFIG, AGENT = "in_palm_rotate", "careful", "in_palm_rotate.teacher"
 WINDOW = 22
 """Steps that a transformer sees, as in its training."""
 PERMUTATIONS = 20_000

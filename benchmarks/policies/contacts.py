@@ -1,6 +1,6 @@
 """Overlap and force of the block under a policy, success and cost, for contact models of a task.
 
-    python -m benchmarks.policies.contacts --out FOLDER [--policy in_palm_rotate.firm] [--envs 96] [--write]
+    python -m benchmarks.policies.contacts --out FOLDER [--policy in_palm_rotate.teacher] [--envs 96] [--write]
 
 C MuJoCo on the processor. Contacts of the block are read once a control step, over whole episodes of three seeds; one
 JSON file a model stands in the folder, and a model that stands there is not measured again. With ``--write`` a section
@@ -158,7 +158,7 @@ def draw(rows: Mapping[str, dict[str, Any]]) -> None:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, required=True)
-    parser.add_argument("--policy", default="in_palm_rotate.firm")
+    parser.add_argument("--policy", default="in_palm_rotate.teacher")
     parser.add_argument("--envs", type=int, default=96)
     parser.add_argument("--notes", type=Path, help="text that follows the table")
     parser.add_argument("--write", action="store_true")

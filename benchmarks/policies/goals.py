@@ -1,6 +1,6 @@
 """Success of a teacher by the yaw at which the block starts, with goals that keep that yaw and with flat ones.
 
-    python -m benchmarks.policies.goals [--agent in_palm_rotate.firm] [--envs 340] [--write]
+    python -m benchmarks.policies.goals [--agent in_palm_rotate.teacher] [--envs 340] [--write]
 
 Every environment has one episode, on C MuJoCo; both kinds of goals have the same starts.
 """
@@ -66,7 +66,7 @@ def rows(kind: str, found: dict[str, NDArray]) -> list[list[str]]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--agent", default="in_palm_rotate.firm")
+    parser.add_argument("--agent", default="in_palm_rotate.teacher")
     parser.add_argument("--envs", type=int, default=340)
     parser.add_argument("--write", action="store_true")
     options = parser.parse_args()

@@ -1,6 +1,6 @@
 """Lay out the read-outs of tactile encoders that ``brainbench policy probe --out FILE`` measured.
 
-    brainbench policy probe in_palm_rotate --agent in_palm_rotate.firm --config careful --seconds 8 --out FILE
+    brainbench policy probe in_palm_rotate --agent in_palm_rotate.teacher --config careful --seconds 8 --out FILE
     brainbench policy probe … --place 50 --out FILE
     python -m benchmarks.policies.readouts --record FILE [FILE …] [--device "one NVIDIA H100"] [--notes FILE] [--write]
 

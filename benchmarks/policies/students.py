@@ -62,8 +62,8 @@ ARMS: dict[str, dict[str, Any]] = {
 CONTRASTS = (
     ("ft_hand", "ft_tips"), ("bool_hand", "bool_tips"), ("ft_tips", "bool_tips"), ("ft_hand", "bool_hand"),
     ("ead_simclr", "ead_supervised"), ("ead_simclr", "ead_untrained"), ("ead_supervised", "ead_untrained"),
-    ("ead_simclr", "reservoir"), ("ead_supervised", "reservoir"), ("ft_hand", "ead_simclr"), ("bool_tips", "none"),
-    ("ead_untrained", "none"),
+    ("ead_simclr", "reservoir"), ("ead_supervised", "reservoir"), ("ft_hand", "ead_simclr"), ("ft_hand", "reservoir"),
+    ("ft_hand", "none_memory"), ("reservoir", "none_memory"), ("ead_simclr", "none_memory"), ("none_memory", "none"),
 )  # fmt: skip
 """Arms whose differences are tested."""
 RANDOM, TRAINED = ("reservoir", "ead_untrained"), ("ead_simclr", "ead_supervised")
@@ -72,8 +72,9 @@ _TAR = 15 << 20
 _SMOOTH = 8
 """Last iterations over which a loss and a success are averaged."""
 _PICTURES = Path(__file__).resolve().parents[2] / "docs" / "images"
-_PER_EVALUATION = 60.0
-"""Seconds kept for making the environments of a student and for its evaluation."""
+_PER_EVALUATION = 90.0
+"""Seconds kept for making the environments of a student (7 to 15) and for its evaluation (50 to 75, where two share an
+H200). What begins later learns too little to count."""
 
 
 def put(out: Path, row: dict[str, Any]) -> None:
@@ -93,7 +94,7 @@ def train(options: argparse.Namespace) -> None:
     if "encoder" in settings:
         # A draw of a random arm is its seed; networks answer without added latency.
         own = {"seed": options.draw if options.draw is not None else options.seed}
-        if settings["encoder"].startswith(NETWORK):
+        if _is_network(settings):
             own |= {"learning": "frozen", "options": {"unroll": "full"}}
         if options.pretrained is not None and settings["encoder"].startswith(f"{NETWORK}."):
             own["pretrained"] = str(options.pretrained)
@@ -248,20 +249,21 @@ def lay_out(options: argparse.Namespace) -> None:
             print(write_record(record, options.records))
 
 
+def _is_network(settings: dict[str, Any]) -> bool:
+    return settings.get("encoder", "").startswith(NETWORK)
+
+
 def arm_of(config: DistillConfig) -> str | None:
-    """Return the arm that a student belongs to."""
-    learned = {} if config.tactile is None else {"encoder": config.tactile.arm}
+    """Return the arm that a student belongs to; None where it belongs to none of them."""
+    from robotics_bridge.policies.training.distill_config import DistillConfig
+
     for arm, settings in ARMS.items():
-        wanted = {"placement": config.placement, "encoder": learned.get("encoder"), **settings}
-        if config.observe == "none" == settings["observe"]:
-            if config.embedder == settings.get("embedder", "mlp"):
-                return arm
-            continue
-        learning = None
-        if str(settings.get("encoder")).startswith(NETWORK):
-            learning = settings.get("encoder_settings", {}).get("learning", "frozen")
-        if (config.observe, config.placement) == (settings["observe"], wanted["placement"]) and (
-            config.encoder_settings.get("learning") == learning and learned.get("encoder") == wanted["encoder"]
+        learning = settings.get("encoder_settings", {}).get("learning", "frozen" if _is_network(settings) else None)
+        plain = {name: value for name, value in settings.items() if name != "encoder_settings"}
+        wanted = DistillConfig(task=config.task, **plain)
+        same = ("observe", "embedder") if config.observe == "none" else ("observe", "embedder", "placement", "encoder")
+        if all(getattr(config, name) == getattr(wanted, name) for name in same) and (
+            config.encoder_settings.get("learning") == learning
         ):
             return arm
     return None
@@ -348,7 +350,9 @@ def seen(log: list[dict[str, Any]], iteration: int) -> float:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--teacher", type=Path, default=Path("in_palm_rotate.firm"), help="shipped, or a run's folder")
+    parser.add_argument(
+        "--teacher", type=Path, default=Path("in_palm_rotate.teacher"), help="shipped, or a run's folder"
+    )
     parser.add_argument("--lay-out", type=Path, nargs="+", help="folders of students that came back")
     parser.add_argument("--at-least", type=int, default=0, help="iterations; what learned fewer is left out, by name")
     parser.add_argument("--records", type=Path, help="folder for records of what is laid out")

@@ -17,15 +17,18 @@ FOLDER = Path(__file__).parent / "trained"
 
 
 RETIRED = {
-    "in_palm_rotate.force-torque-hand": "is no longer shipped: it read the object's angle to the goal, which no hand "
-    "measures",
+    "in_palm_rotate.careful": "in_palm_rotate.teacher",
+    "in_palm_rotate.firm": "in_palm_rotate.teacher",
+    "in_palm_rotate.force-torque-hand": "in_palm_rotate.student",
 }
-"""Policy that used to ship → why it does not any more."""
+"""Policy that used to ship → the one that took its place."""
 
 
 def hint(name: str) -> str:
     """Return what to do instead where there is no policy of a name."""
-    return f"{name!r} {RETIRED[name]}." if name in RETIRED else "Or give the folder of a training run."
+    if name in RETIRED:
+        return f"{name!r} is no longer shipped; {RETIRED[name]!r} took its place."
+    return "Or give the folder of a training run."
 
 
 def list_policies(kind: str, task: str | None = None) -> list[str]:

@@ -12,6 +12,7 @@ from typer.testing import CliRunner
 
 from brainbench.cli import app
 from brainbench.core.errors import DataError, UsageError
+from tests.factories.policies import teacher_in
 
 SMALL = """
 from dataclasses import replace
@@ -55,7 +56,7 @@ def test_a_played_task_leaves_a_strip_of_frames(tmp_path: Path) -> None:
 
 
 def test_what_a_shipped_policy_did_is_told_in_goals_turns_and_drops() -> None:
-    words = ("play", "in_palm_rotate", "--agent", "in_palm_rotate.firm", "--seconds", "2", "--seed", "2")
+    words = ("play", "in_palm_rotate", "--agent", "in_palm_rotate.teacher", "--seconds", "2", "--seed", "2")
     told = {line.split("  ")[0]: line.split("  ")[-1].strip() for line in _run(*words).splitlines()}
     found = json.loads(_run(*words, "--json"))
     assert int(told["goals reached"]) == found["goals"] >= 1
@@ -65,12 +66,12 @@ def test_what_a_shipped_policy_did_is_told_in_goals_turns_and_drops() -> None:
 
 def _student(folder: Path) -> Path:
     """Return an untrained student of in_palm_rotate, as ``distill`` leaves it."""
-    words = ("--teacher", "in_palm_rotate.firm", "--observe", "force_torque", "--envs", "1", "--stop-at", "1")
+    words = ("--teacher", "in_palm_rotate.teacher", "--observe", "force_torque", "--envs", "1", "--stop-at", "1")
     _run("distill", "in_palm_rotate", *words, "--iterations", "1", "--episodes", "0", "--out", str(folder / "felt"))
     return folder / "felt"
 
 
-def test_playing_needs_no_package_for_training_and_checks_names_first(tmp_path: Path) -> None:
+def test_playing_needs_no_package_for_training_and_checks_names_first() -> None:
     code = (
         "import sys\n"
         "for name in ('rsl_rl', 'tensordict', 'tensorboard', 'gymnasium'): sys.modules[name] = None\n"
@@ -82,12 +83,12 @@ def test_playing_needs_no_package_for_training_and_checks_names_first(tmp_path: 
         words = ["policy", "play", "in_palm_rotate", "--agent", agent, "--seconds", "0.1", *more]
         return subprocess.run([sys.executable, "-c", code, *words], capture_output=True, text=True, check=False)
 
-    for agent in ("in_palm_rotate.firm", str(_student(tmp_path))):
+    for agent in ("in_palm_rotate.teacher", "in_palm_rotate.student"):
         done = play(agent)
         assert done.returncode == 0, done.stderr
         assert "CUDA" not in done.stderr
     light = code.replace("'gymnasium'", "'gymnasium', 'torch', 'warp', 'mujoco'")
-    for words in (["--agent", "in_palm_rotate.carful"], ["--video", "x.mpx"]):
+    for words in (["--agent", "in_palm_rotate.teachr"], ["--video", "x.mpx"]):
         given = [sys.executable, "-c", light, "policy", "play", "in_palm_rotate", *words]
         done = subprocess.run(given, capture_output=True, text=True, check=False)
         assert (done.returncode, done.stderr.count("\n")) == (2, 1), done.stderr
@@ -95,40 +96,39 @@ def test_playing_needs_no_package_for_training_and_checks_names_first(tmp_path: 
 
 def test_shipped_policies_are_listed_with_the_contacts_that_they_were_trained_in() -> None:
     found = {row["task"]: row["contacts"] for row in json.loads(_run("tasks", "--json"))}["in_palm_rotate"]
-    contacts = {"careful": "published", "firm": "firm"}
-    assert found == {f"in_palm_rotate.{name}": model for name, model in contacts.items()}
+    assert found == {"in_palm_rotate.teacher": "firm", "in_palm_rotate.student": "firm"}
     told = [line.split() for line in _run("tasks").splitlines() if line.startswith("in_palm_rotate.")]
-    assert [(name, model) for name, _, model, *_ in told] == list(found.items())
+    assert {name: model for name, _, model, *_ in told} == found
 
 
-def test_a_policy_plays_in_the_contacts_that_it_was_trained_in_unless_told_otherwise() -> None:
+def test_a_policy_plays_in_the_contacts_that_it_was_trained_in_unless_told_otherwise(tmp_path: Path) -> None:
+    other = str(teacher_in("published", tmp_path / "other"))
+
     def contacts(agent: str, *more: str) -> str:
         words = ("--agent", agent, "--seconds", "0.05", *more)
         return json.loads(_run("play", "in_palm_rotate", *words, "--json"))["contacts"]
 
     firm = ("--change", "contacts=firm")
-    assert contacts("random") == contacts("in_palm_rotate.firm") == contacts("in_palm_rotate.careful", *firm) == "firm"
-    assert contacts("in_palm_rotate.careful") == "published"
-    assert contacts("in_palm_rotate.firm", "--config", "published") == "published"
-    both = ("evaluate", "in_palm_rotate", "in_palm_rotate.careful", "in_palm_rotate.firm")
+    assert contacts("random") == contacts("in_palm_rotate.teacher") == contacts(other, *firm) == "firm"
+    assert contacts(other) == contacts("in_palm_rotate.teacher", "--config", "published") == "published"
     with pytest.raises(UsageError, match="different contacts"):
-        _run(*both)
+        _run("evaluate", "in_palm_rotate", other, "in_palm_rotate.teacher")
 
 
 def test_a_student_plays_with_its_own_touch_and_is_exported(tmp_path: Path) -> None:
     from robotics_bridge.deploy.session import read_deployed
     from robotics_bridge.tasks.contact_model import CONTACTS
 
-    run = str(_student(tmp_path))
-    out = json.loads(_run("play", "in_palm_rotate", "--agent", run, "--seconds", "0.2", "--json"))
-    assert (out["agent"], out["contacts"]) == (run, "firm")
-    _run("export", run)
-    deployed = read_deployed(Path(run) / "policy.onnx")
+    name, file = "in_palm_rotate.student", tmp_path / "policy.onnx"
+    out = json.loads(_run("play", "in_palm_rotate", "--agent", name, "--seconds", "0.2", "--json"))
+    assert (out["agent"], out["contacts"]) == (name, "firm")
+    _run("export", name, "--out", str(file))
+    deployed = read_deployed(file)
     assert (deployed.contract.observe, deployed.contract.more["contacts"]) == ("force_torque", CONTACTS["firm"])
     # What a hand measures or is told is all that it reads: nothing but touch is asked for.
     assert list(deployed.groups) == ["proprio", "command", "tactile"]
     assert list(deployed.require({"tactile"})) == ["tactile"]
-    with pytest.raises(UsageError, match="no longer shipped"):
+    with pytest.raises(UsageError, match=r"no longer shipped; 'in_palm_rotate\.student'"):
         _run("play", "in_palm_rotate", "--agent", "in_palm_rotate.force-torque-hand")
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -9,9 +10,10 @@ from typing import Any
 import torch
 from tensordict import TensorDict
 
-from brainbench.core.files import to_plain, write_json
+from brainbench.core.files import read_json, to_plain, write_json
 from robotics_bridge import hands
 from robotics_bridge.policies.export import export_policy
+from robotics_bridge.policies.shipped import FOLDER
 from robotics_bridge.policies.student import TactilePolicy
 from robotics_bridge.policies.training.distill_config import DistillConfig
 from robotics_bridge.policies.training.state_tree import write_tensors
@@ -52,6 +54,14 @@ def export_small(folder: Path) -> Path:
         "contacts": asdict(CONTACTS["published"]),
     }  # fmt: skip
     return export_policy(policy, folder / "policy", deployment=deployment).path
+
+
+def teacher_in(contacts: str, folder: Path) -> Path:
+    """Write a copy of the shipped teacher that says it was trained in other contacts."""
+    shutil.copytree(FOLDER / "in_palm_rotate.teacher", folder)
+    described = {**read_json(folder / "config.json"), "contacts": asdict(CONTACTS[contacts])}
+    write_json(folder / "config.json", described)
+    return folder
 
 
 def student_folder(folder: Path) -> Path:

@@ -16,6 +16,7 @@ from robotics_bridge import tasks
 from robotics_bridge.policies.fit import check_fit, trained_contacts, with_contacts_of
 from robotics_bridge.tasks.contact_model import CONTACTS, ContactModel
 from robotics_bridge.tasks.task import TASK_VERSION
+from tests.factories.policies import teacher_in
 
 
 def _env(contacts: str = "published") -> Any:
@@ -61,14 +62,15 @@ def test_a_policy_says_in_which_contacts_it_was_trained_and_earlier_ones_had_the
 def test_policies_act_in_the_contacts_that_they_were_trained_in(tmp_path: Path) -> None:
     task = tasks.load("in_palm_rotate")
     assert with_contacts_of(task, ("zero", "random")) == task
-    for name, contacts in (("careful", "published"), ("firm", "firm")):
-        assert with_contacts_of(task, ("zero", f"in_palm_rotate.{name}")).contacts == CONTACTS[contacts]
+    other = str(teacher_in("published", tmp_path / "other"))
+    for name, contacts in ((other, "published"), ("in_palm_rotate.teacher", "firm")):
+        assert with_contacts_of(task, ("zero", name)).contacts == CONTACTS[contacts]
     own = ContactModel(time_constant=0.011)
     write_json(tmp_path / "config.json", {"contacts": asdict(own)})
     (tmp_path / "model_3.safetensors").touch()
     for path in (tmp_path, tmp_path / "model_3.safetensors"):
         assert with_contacts_of(task, [str(path)]).contacts == own
     with pytest.raises(
-        UsageError, match=r"careful \(published\), in_palm_rotate.firm \(firm\).*--change contacts=firm"
+        UsageError, match=r"other \(published\), in_palm_rotate.teacher \(firm\).*--change contacts=firm"
     ):
-        with_contacts_of(task, ("in_palm_rotate.careful", "in_palm_rotate.firm"))
+        with_contacts_of(task, (other, "in_palm_rotate.teacher"))

@@ -222,12 +222,12 @@ def test_records_make_a_board_of_the_leaderboard(tmp_path) -> None:
 def test_a_record_says_how_to_make_its_student(tmp_path) -> None:
     assert command(DistillConfig(task="in_palm_rotate")) == "brainbench policy distill in_palm_rotate"
     config = DistillConfig(
-        task="in_palm_rotate", variant="careful", teacher="in_palm_rotate.careful", placement="tips", noisy=True,
+        task="in_palm_rotate", variant="careful", teacher="in_palm_rotate.teacher", placement="tips", noisy=True,
         encoder="zhuang-small.simclr", encoder_settings={"learning": "frozen"}, num_envs=64, iterations=6000,
         learning_rate=5e-4,
     )  # fmt: skip
     assert command(config, stop_at=77) == (
-        "brainbench policy distill in_palm_rotate --teacher in_palm_rotate.careful --config careful --placement tips "
+        "brainbench policy distill in_palm_rotate --teacher in_palm_rotate.teacher --config careful --placement tips "
         "--encoder zhuang-small.simclr --noisy --learning frozen --envs 64 --iterations 6000 --learning-rate 0.0005 "
         "--stop-at 77"
     )

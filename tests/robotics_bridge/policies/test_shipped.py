@@ -1,4 +1,4 @@
-"""Teachers that come with the package."""
+"""Policies that come with the package."""
 
 from __future__ import annotations
 
@@ -10,9 +10,13 @@ import torch
 from brainbench.core.errors import UsageError
 from brainbench.core.files import read_json
 from robotics_bridge import tasks
+from robotics_bridge.policies.evaluate import Policy, evaluate
+from robotics_bridge.policies.export import export_policy
 from robotics_bridge.policies.fit import with_contacts_of
-from robotics_bridge.policies.shipped import FOLDER, list_policies, policy_path
+from robotics_bridge.policies.shipped import FOLDER, RETIRED, list_policies, policy_path
+from robotics_bridge.policies.training.student_files import load_student
 from robotics_bridge.policies.training.teacher import Trainer, load_teacher
+from robotics_bridge.tasks.task import MEASURED
 
 
 @pytest.mark.parametrize("name", list_policies("teacher"))
@@ -29,6 +33,21 @@ def test_every_teacher_fits_its_task_and_has_a_card(name: str) -> None:
     assert torch.isfinite(action).all()
 
 
+@pytest.mark.parametrize("name", list_policies("student"))
+def test_every_student_reads_what_a_hand_measures_and_exports(name: str, tmp_path: Path) -> None:
+    student, facts = load_student(name)
+    kept = facts["distill"]
+    assert kept["task"] == name.partition(".")[0]
+    assert kept["teacher"] in list_policies("teacher")
+    assert {group for group, _ in facts["groups"]} <= set(MEASURED)
+    assert f"# {name}\n" in (FOLDER / name / "README.md").read_text(encoding="utf-8")
+    assert sum(path.stat().st_size for path in (FOLDER / name).iterdir()) < 1.7e6
+    senses = {key: kept[key] for key in ("observe", "placement", "resolution", "noisy")}
+    env = tasks.make(kept["task"], num_envs=2, hand=kept["hand"], threads=1, **senses)
+    assert torch.isfinite(Policy(student)(env.reset())).all()
+    assert export_policy(student, tmp_path / "policy", deployment=facts["deployment"]).difference < 1e-5
+
+
 def test_taxels_hold_what_they_touch_but_in_published_tasks() -> None:
     env = tasks.make("in_palm_rotate", num_envs=1, threads=1, observe="force_torque")
     assert {(sensor.total, sensor.friction) for sensor in env.touch.suite.sensors.values()} == {("engine", 1.0)}
@@ -37,28 +56,32 @@ def test_taxels_hold_what_they_touch_but_in_published_tasks() -> None:
 
 
 def test_a_name_stands_for_its_folder_and_paths_for_themselves(tmp_path: Path) -> None:
-    assert policy_path("teacher", "in_palm_rotate.careful") == FOLDER / "in_palm_rotate.careful"
+    assert policy_path("teacher", "in_palm_rotate.teacher") == FOLDER / "in_palm_rotate.teacher"
     assert policy_path("teacher", tmp_path) == tmp_path
-    with pytest.raises(UsageError, match=r"'in_palm_rotate\.careful'.*folder"):
-        policy_path("teacher", "in_palm_rotate.carefull")
-    with pytest.raises(UsageError, match="no longer shipped: it read the object's angle to the goal"):
-        policy_path("student", "in_palm_rotate.force-torque-hand")
+    with pytest.raises(UsageError, match=r"'in_palm_rotate\.teacher'.*folder"):
+        policy_path("teacher", "in_palm_rotate.teachr")
+
+
+@pytest.mark.parametrize(("name", "instead"), RETIRED.items())
+def test_a_retired_name_says_what_took_its_place(name: str, instead: str) -> None:
+    (kind,) = (kind for kind in ("teacher", "student") if instead in list_policies(kind))
+    with pytest.raises(UsageError, match=rf"'{name}' is no longer shipped; '{instead}' took its place"):
+        policy_path(kind, name)
 
 
 def test_learning_goes_on_from_a_shipped_teacher() -> None:
     env = tasks.make("in_palm_rotate", num_envs=2, config="careful", threads=1)
     trainer = Trainer(env)
-    trainer.begin_from(Path("in_palm_rotate.careful"))
+    trainer.begin_from(Path("in_palm_rotate.teacher"))
     observations = env.reset()
     torch.testing.assert_close(
-        trainer.policy()(observations), load_teacher("in_palm_rotate.careful", env)(observations), rtol=0, atol=0
+        trainer.policy()(observations), load_teacher("in_palm_rotate.teacher", env)(observations), rtol=0, atol=0
     )
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", list_policies("teacher"))
 def test_a_shipped_teacher_turns_the_block_on_c_mujoco(name: str) -> None:
-    from robotics_bridge.policies.evaluate import evaluate
 
     env = tasks.make(with_contacts_of(tasks.load("in_palm_rotate"), [name]), num_envs=32, seed=5)
     found = evaluate(env, load_teacher(name, env), episodes=64, seed=7)

@@ -12,6 +12,7 @@ from robotics_bridge.policies.fit import trained_contacts
 from robotics_bridge.policies.training.distill_config import DistillConfig
 from robotics_bridge.policies.training.students import calibrated, train_student
 from robotics_bridge.tasks.contact_model import CONTACTS
+from tests.factories.policies import teacher_in
 from tests.factories.task_worlds import Follower, TouchWorld
 
 
@@ -60,9 +61,9 @@ def test_a_student_needs_a_teacher(tmp_path) -> None:
 @pytest.mark.parametrize(
     ("teacher", "changes", "contacts"),
     [
-        ("careful", {}, "published"),
+        ("published", {}, "published"),
         ("firm", {}, "firm"),
-        ("careful", {"contacts": "firm"}, "firm"),
+        ("published", {"contacts": "firm"}, "firm"),
         ("firm", {"variant": "published"}, "published"),
     ],
 )
@@ -70,10 +71,10 @@ def test_a_student_is_taught_in_the_contacts_of_its_teacher_unless_told_otherwis
     tmp_path, teacher, changes, contacts
 ) -> None:
     config = DistillConfig(
-        task="in_palm_rotate", teacher=f"in_palm_rotate.{teacher}", observe="none", hidden=(8,), num_envs=2,
-        steps_per_env=2, iterations=1, epochs=1, **changes,
+        task="in_palm_rotate", teacher=str(teacher_in(teacher, tmp_path / "teacher")), observe="none", hidden=(8,),
+        num_envs=2, steps_per_env=2, iterations=1, epochs=1, **changes,
     )  # fmt: skip
-    train_student(config, tmp_path, episodes=0)
-    described = read_json(tmp_path / "config.json")
+    train_student(config, tmp_path / "run", episodes=0)
+    described = read_json(tmp_path / "run" / "config.json")
     assert described["distill"]["contacts"] == contacts
     assert trained_contacts(described) == trained_contacts(described["deployment"]) == CONTACTS[contacts]

@@ -211,7 +211,7 @@ def test_trees_of_tensors_and_numbers_survive_a_file(tmp_path: Path) -> None:
 
 
 def _check_mutants(folder, cases: int) -> None:
-    whole = FOLDER / "in_palm_rotate.careful"
+    whole = FOLDER / "in_palm_rotate.teacher"
     config, weights = (whole / "config.json").read_bytes(), newest(whole).read_bytes()
     env = tasks.make("in_palm_rotate", num_envs=2, config="careful")
     refused = 0
