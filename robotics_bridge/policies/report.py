@@ -157,7 +157,8 @@ def read_results(folders: Iterable[str | Path], *, at_least: int = 0) -> list[St
         r if r.world not in models else replace(r, interval=models[r.world].mean(r.name).interval or r.interval)
         for r in results
     ]
-    bare = {r.world: r for r in results if r.config.observe == "none"}
+    # With memory and without, the better of the two is what touch has to beat.
+    bare = {r.world: r for r in sorted(results, key=lambda r: r.value) if r.config.observe == "none"}
     found = [_against(result, bare.get(result.world)) for result in results]
     return sorted(found, key=lambda r: (r.world, -r.value, r.config.name))
 
@@ -313,7 +314,7 @@ def rows(results: Sequence[StudentResult]) -> list[list[str]]:
             where = [config.placement, config.resolution, "noisy" if config.noisy else "clean", tactile.arm + learning]
         found.append(
             [
-                *result.world, config.observe, *where,
+                *result.world, config.felt, *where,
                 _learned(result.learned) or "–", str(len(result.seeds)),
                 f"{result.value:.3f}{_span(result.interval)}",
                 "–" if result.gain is None else f"{result.gain:+.3f}{_span(result.difference)}",
@@ -513,6 +514,6 @@ def _label(result: StudentResult) -> str:
     config, tactile = result.config, result.config.tactile
     seeds = f"{len(result.seeds)} seeds" if len(result.seeds) > 1 else "one seed"
     if tactile is None:
-        return f"none\n{seeds}"
+        return f"{config.felt}\n{seeds}"
     noise = ", noisy" if config.noisy else ""
-    return f"{config.observe}, {config.placement}, {config.resolution}{noise}\n{tactile.arm}, {seeds}"
+    return f"{config.felt}, {config.placement}, {config.resolution}{noise}\n{tactile.arm}, {seeds}"

@@ -136,6 +136,11 @@ class DistillConfig:
         return tactile.pretrained or tagged or f"seed {tactile.seed}"
 
     @property
+    def felt(self) -> str:
+        """Observation type, with the embedder of joints where that is not the usual one."""
+        return self.observe if self.embedder == "mlp" else f"{self.observe} ({self.embedder})"
+
+    @property
     def name(self) -> str:
         """Name that distinguishes the student from its neighbours, for folders and reports."""
         parts = [self.task, self.hand, self.observe]
@@ -148,6 +153,7 @@ class DistillConfig:
                 "noisy" if self.noisy else "clean",
                 f"{arm}{learning}",
             ]
+        parts += [] if self.embedder == "mlp" else [self.embedder]
         parts += [] if self.contacts in (None, "firm") else [self.contacts]
         parts.append(f"seed{self.seed}")
         drawn = self.encoder_settings.get("pretrained") or self.encoder_settings.get("seed", self.seed)

@@ -69,6 +69,17 @@ def test_success_and_gain_have_t_intervals_over_training_seeds(tmp_path) -> None
     assert table[0][COLUMNS.index("over none")].startswith("+0.300")
 
 
+def test_students_with_and_without_memory_are_two_arms(tmp_path) -> None:
+    _three_seeds(tmp_path)
+    for seed in range(3):
+        _write(tmp_path, [0.6] * 3, seed=seed, observe="none", embedder="lstm")
+    felt, remembered, bare = read_results([tmp_path])
+    assert (remembered.config.embedder, bare.config.embedder) == ("lstm", "mlp")
+    # What touch adds is counted from the better of them.
+    assert felt.gain == pytest.approx(0.2)
+    assert [row[COLUMNS.index("touch")] for row in rows([felt, remembered])] == ["force_torque", "none (lstm)"]
+
+
 def test_a_single_student_is_said_to_be_one(tmp_path) -> None:
     _write(tmp_path, [0.5, 0.6, 0.7], observe="bool", placement="tips")
     (only,) = read_results([tmp_path])
