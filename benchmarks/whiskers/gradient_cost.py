@@ -1,16 +1,21 @@
 """What gradients of many whiskers in contact cost on a device, and whether they are those of a processor.
 
-``python -m benchmarks.whiskers.gradient_cost [--device cuda] [--each 1] [--write-input FILE] [--input FILE] [--write]``
+``python -m benchmarks.whiskers.gradient_cost [--device cuda] [--each 1] [--links 11] [--readings 100]
+[--write-input FILE] [--input FILE] [--write]``
 
 ``--write-input`` keeps the gradients of a processor, with which a machine compares that has no compiler for its own.
-Times are those of a second round, when kernels are compiled.
+Every part is told as it ends. Times are those of the second round, when kernels are compiled; the first round stands
+beside it.
 """
 
 from __future__ import annotations
 
 import argparse
 import time
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -18,6 +23,8 @@ from benchmarks.report import table, write_section
 from benchmarks.whiskers.gradients import BASE, FIDELITY, OBJECT
 from brainbench.core.devices import pick_device
 from brainbench.stimuli.engines import get_engine
+from brainbench.stimuli.engines.fidelity import Fidelity
+from brainbench.stimuli.engines.protocol import Job
 from brainbench.stimuli.gradients import GradientRun, JobParameters
 from brainbench.stimuli.validation.contact_scenes import contact_jobs
 
@@ -25,45 +32,65 @@ NAMES = (*BASE[:3], *OBJECT[:3])
 PARTS = ("ordinary run", "recorded run", "going back", "forward, all parameters")
 
 
-def measure(each: int, device: str) -> tuple[dict[str, np.ndarray], list[float]]:
-    """Return gradients by job and whether they hold on both sides, and the times (s) of :data:`PARTS`."""
-    jobs = contact_jobs(11, each=each)
+def measure(
+    jobs: list[Job], fidelity: Fidelity, device: str
+) -> tuple[dict[str, np.ndarray], dict[str, float], dict[str, float]]:
+    """Return gradients by job and whether they hold on both sides, and the times (s) of :data:`PARTS` of both rounds.
+
+    What is known is printed at once: a part may take minutes while kernels compile.
+    """
     parameters = JobParameters(jobs, NAMES)
     rng = np.random.default_rng(0)
     weights = [rng.normal(size=(len(job.times), 6)) for job in jobs]
     engine = get_engine("rod", device=device)
+    options = {"scales": parameters.scales, "fidelity": fidelity, "device": device}
+    rounds: list[dict[str, float]] = []
+
+    def timed(part: str, work: Callable[[], Any]) -> Any:
+        began = time.perf_counter()
+        found = work()
+        rounds[-1][part] = time.perf_counter() - began
+        print(f"round {len(rounds)}: {part} {rounds[-1][part]:.3g} s", flush=True)
+        return found
+
+    print(f"{len(jobs)} whiskers, {fidelity.links} links, {len(NAMES)} parameters on {device}", flush=True)
     for _ in range(2):
-        clock = [time.perf_counter()]
-        engine.run(jobs, FIDELITY, record_shape=True)
-        clock.append(time.perf_counter())
-        options = {"scales": parameters.scales, "fidelity": FIDELITY, "device": device}
-        run = GradientRun(parameters.build, parameters.values, **options)
-        clock.append(time.perf_counter())
-        gradient = run.gradient(weights)
-        clock.append(time.perf_counter())
-        run.tangents()
-        clock.append(time.perf_counter())
+        rounds.append({})
+        timed(PARTS[0], lambda: engine.run(jobs, fidelity, record_shape=True))
+        run = timed(PARTS[1], lambda: GradientRun(parameters.build, parameters.values, **options))
+        if len(rounds) == 1:
+            print(f"         {run.describe()}", flush=True)
+        gradient = timed(PARTS[2], lambda run=run: run.gradient(weights))
+        timed(PARTS[3], run.tangents)
     smooth = np.array([event.status == "smooth" for event in gradient.events])
-    return {"by_job": gradient.by_job, "smooth": smooth}, np.diff(clock).tolist()
+    return {"by_job": gradient.by_job, "smooth": smooth}, rounds[0], rounds[1]
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--each", type=int, default=1, help="scenes of each of the 72 combinations")
+    parser.add_argument("--links", type=int, default=FIDELITY.links)
+    parser.add_argument("--readings", type=int, help="keep so many readings, 1 ms apart, of each scene")
     parser.add_argument("--write-input", type=Path)
     parser.add_argument("--input", type=Path)
     parser.add_argument("--write", action="store_true")
     args = parser.parse_args()
-    found, seconds = measure(args.each, args.device)
+    jobs = [replace(job, times=job.times[: args.readings]) for job in contact_jobs(11, each=args.each)]
+    found, first, seconds = measure(jobs, replace(FIDELITY, links=args.links), args.device)
     if args.write_input:
         np.savez_compressed(args.write_input, allow_pickle=False, **found)
     where = pick_device(args.device)
     name = where.name if where.is_cuda else "2 shared cores"
-    rows = [[part, f"{value:.3g}", f"{value / seconds[0]:.2f}"] for part, value in zip(PARTS, seconds, strict=True)]
-    text = f"{len(found['smooth'])} whiskers in contact, 11 links, .1 ms, double precision, {len(NAMES)} parameters; "
+    rows = [
+        [part, f"{seconds[part]:.3g}", f"{seconds[part] / seconds[PARTS[0]]:.2f}", f"{first[part]:.3g}"]
+        for part in PARTS
+    ]
+    length = f", first {args.readings} ms" if args.readings else ""
+    text = f"{len(jobs)} whiskers in contact{length}, {args.links} links, .1 ms, double precision, "
+    text += f"{len(NAMES)} parameters; "
     text += f"{name}.\n\n"
-    text += table(["part", "s", "× ordinary run"], rows)
+    text += table(["part", "s", "× ordinary run", "first time, s"], rows)
     if args.input:
         with np.load(args.input) as kept:
             both = kept["smooth"] & found["smooth"] & np.isfinite(kept["by_job"] + found["by_job"]).all(axis=1)
@@ -77,6 +104,8 @@ def main() -> None:
     print(text)
     if args.write:
         command = f"python -m benchmarks.whiskers.gradient_cost --device {args.device} --each {args.each} --write"
+        command += f" --links {args.links}" * (args.links != FIDELITY.links)
+        command += f" --readings {args.readings}" * bool(args.readings)
         write_section(f"Gradients of many whiskers on a {name}", command, text, subject="whiskers", where=f"one {name}")
 
 

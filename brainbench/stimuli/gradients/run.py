@@ -36,6 +36,9 @@ T = TypeVar("T")
 R = TypeVar("R")
 Build = Callable[[NDArray[np.float64]], Sequence[Job]]
 """Values of the parameters [p] → jobs, of the same kind and number for all values."""
+CUDA_ROOM = 2**32
+"""Bytes that records of steps may take on a GPU: what does not fit is simulated once more on the way back, and its
+threads take a whisker each, so that steps take as long for one whisker as for thousands."""
 Given = Sequence[NDArray[np.float64] | None]
 """Derivatives of a number by one output of each job; None for zeros."""
 
@@ -130,6 +133,15 @@ class GradientRun:
     def _widths(self) -> NDArray[np.float64]:
         return 1e-4 * self.scales
 
+    def describe(self) -> str:
+        """Say in words how the jobs were launched: each launch has a thread a whisker and kernels of its kind."""
+        launches = [
+            f"{len(group.indices)} whiskers of {hinges} hinges a joint in {len(group.solver.checkpoints)} parts"
+            for group in self._groups
+            for hinges in (3 if group.packed.tasks[0].twists else 2,)
+        ]
+        return f"{len(launches)} launches: {'; '.join(launches)}"
+
     def traces_at(self, values: Sequence[float] | NDArray[np.float64]) -> list[Trace]:
         """Return what the jobs of other values give, computed as :attr:`traces` are: for differences and line searches.
 
@@ -197,6 +209,8 @@ class GradientRun:
             packed = PackedTasks.of(some, shared=False)
             needs = packed.shapes.needs
             solver = RecordingSolver(packed.chains, self.fidelity, self.device, needs, twists=some[0].twists)
+            if self.device.is_cuda:
+                solver.room = CUDA_ROOM
             if steps is not None:
                 solver.steps[packed.jobs.whisker] = [steps[index] for index in indices]
             result = packed.launch(solver, record_shape=True)
