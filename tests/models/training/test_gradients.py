@@ -1,13 +1,17 @@
+from contextlib import nullcontext
+
 import pytest
 import torch
 
+from brainbench.models import load_model
 from brainbench.models.cells import CELLS
 from brainbench.models.training import gradients
 from brainbench.models.training.config import TrainingConfig
-from brainbench.models.training.gradients import fuse
+from brainbench.models.training.gradients import Gradients, copy_state, fuse
+from brainbench.models.training.objectives import make_learner
 from brainbench.models.training.run_folder import read_log
 from brainbench.models.training.trainer import train
-from tests.factories.training_sweeps import tiny
+from tests.factories.training_sweeps import sweeps, tiny
 
 
 @pytest.mark.parametrize("model", ["zhuang-small", "resnet18-small"])
@@ -51,6 +55,33 @@ def test_a_fused_cell_computes_what_the_plain_one_does(name, layer_norm):
     torch.testing.assert_close(results(), plain)
 
 
+@pytest.mark.filterwarnings("ignore:The AccumulateGrad node's stream:UserWarning")
+@pytest.mark.parametrize("device", ["cpu", pytest.param("cuda", marks=pytest.mark.gpu)])
+@pytest.mark.parametrize("objective", ["supervised", "simclr"])
+def test_a_recorded_step_gives_the_gradients_of_a_plain_one_at_the_same_weights(objective, device):
+    # In double precision, where nothing that training does to rounding hides a fault or looks like one.
+    learner = make_learner(objective, load_model("zhuang-ugrnn-small", classes=3, decoder="linear")).train()
+    learner = learner.double().to(device)
+    parts = {"clip": 1.0, "autocast": nullcontext}
+    plain, recorded = (Gradients(learner, learner, record=record, **parts) for record in (False, True))
+    optimizer = torch.optim.SGD(learner.parameters(), lr=0.1)
+    for number in range(5):
+        # The fourth batch has another shape than the recorded one.
+        views = [sweeps(6 if number == 3 else 8, 10 * number + view)[0].double().to(device) for view in (0, 1)]
+        labels = (torch.arange(len(views[0])) % 3).to(device)
+        given = tuple(views[: 2 if objective == "simclr" else 1])
+        found = []
+        for gradients in (plain, recorded):
+            state = {name: value.clone() for name, value in learner.named_buffers()}
+            loss, norm = gradients(given, labels)
+            rows = [parameter.grad.clone() for parameter in learner.parameters() if parameter.grad is not None]
+            found.append([loss.clone(), norm.clone(), *rows])
+            copy_state(learner, state)
+        torch.testing.assert_close(found[1], found[0], rtol=1e-8, atol=1e-12)
+        assert found[0][1] > 0
+        optimizer.step()
+
+
 # What PyTorch itself warns of while it compiles and records (seen with 2.11); none of it changes a number.
 @pytest.mark.filterwarnings("ignore:.*torch.jit.script_method.*:DeprecationWarning")
 @pytest.mark.filterwarnings("ignore:The .grad attribute of a Tensor:UserWarning")
@@ -66,4 +97,7 @@ def test_recorded_steps_learn_on_a_gpu_as_plain_ones_do(objective, tmp_path):
         result = train(config, tiny(), out=tmp_path / how, device="cuda")
         assert result.status == "finished"
         losses.append([line["loss"] for line in read_log(tmp_path / how, "epoch")])
-    assert losses[1] == pytest.approx(losses[0], rel=0.02)
+    # Fused cells round otherwise, which training multiplies from epoch to epoch: to 5 % in the fourth (seen on an H200,
+    # where the first three agreed). That single steps are right is told by the test above.
+    assert losses[1][0] == pytest.approx(losses[0][0], rel=0.01)
+    assert losses[1] == pytest.approx(losses[0], rel=0.15)
