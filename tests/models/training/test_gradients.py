@@ -71,9 +71,9 @@ def test_a_recorded_step_gives_the_gradients_of_a_plain_one_at_the_same_weights(
         labels = (torch.arange(len(views[0])) % 3).to(device)
         given = tuple(views[: 2 if objective == "simclr" else 1])
         found = []
-        for gradients in (plain, recorded):
+        for step in (plain, recorded):
             state = {name: value.clone() for name, value in learner.named_buffers()}
-            loss, norm = gradients(given, labels)
+            loss, norm = step(given, labels)
             rows = [parameter.grad.clone() for parameter in learner.parameters() if parameter.grad is not None]
             found.append([loss.clone(), norm.clone(), *rows])
             copy_state(learner, state)
