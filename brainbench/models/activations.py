@@ -89,7 +89,7 @@ def extract(
 
         reader = partial(published_activations, model, layers=layers)
     else:
-        reader = _named_reader(model, layers)
+        reader = named_reader(model, layers)
         reader = reader or partial(_hooked_run, model, _hooked(model, layers), layers is not None)
     result = Activations()
     with evaluating(model), torch.no_grad():
@@ -181,7 +181,7 @@ class _LayerError(UsageError):
     """A layer, not the stimulus, is what does not fit."""
 
 
-def _named_reader(model: nn.Module, layers: Collection[str] | None) -> Any:
+def named_reader(model: nn.Module, layers: Collection[str] | None) -> Any:
     """Return a function from stimuli to activations if the model names its layers itself."""
     named, read = getattr(model, "layers", None), getattr(model, "activations", None)
     if not isinstance(named, tuple) or not all(isinstance(name, str) for name in named) or not callable(read):

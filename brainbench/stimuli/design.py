@@ -12,7 +12,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -159,19 +159,60 @@ def design(
         UsageError: there is one scene only, or a variable is unknown or starts outside its bounds.
         DataError: whiskers are unstable with the given motion.
     """
-    from scipy.optimize import minimize
-
     options = options or DesignOptions()
     if len(scenes) < 2:
         raise UsageError("A design needs at least two scenes, each with an object to tell from the others.")
-    for name in (*variables, *(bounds or {})):
+    begin, limits = read_limits(scenes[0], variables, bounds or {})
+    evaluator = _Evaluator(scenes, tuple(variables), options, backend)
+    finalists = find_motions(evaluator, begin, limits, options)
+    # What is best at the coarse setting need not be at the finer one, which has the last word.
+    fine = _Evaluator(scenes, tuple(variables), replace(options, fidelity=options.check), backend)
+    measured = fine.distances(finalists)
+    best = int(np.argmax(np.nan_to_num([_soft_least(one)[0] for one in measured[1:]], nan=-math.inf))) + 1
+    return _result(fine, variables, (begin, finalists[best]), (measured[0], measured[best]), evaluator.count)
+
+
+def read_limits(
+    scene: Scene, variables: Sequence[str], bounds: Mapping[str, tuple[float, float]]
+) -> tuple[Array, Array]:
+    """Return the values [p] of variables in a scene, and their bounds [p, 2].
+
+    Raises:
+        UsageError: a variable is unknown, is not one of the scene, or starts outside its bounds.
+    """
+    for name in (*variables, *bounds):
         check_name("variable of a design", name, VARIABLES)
-    limits = np.array([(bounds or {}).get(name, (VARIABLES[name].low, VARIABLES[name].high)) for name in variables])
-    begin = np.array([VARIABLES[name].read(scenes[0]) for name in variables])
+    limits = np.array([bounds.get(name, (VARIABLES[name].low, VARIABLES[name].high)) for name in variables])
+    begin = np.array([VARIABLES[name].read(scene) for name in variables])
     if (begin < limits[:, 0]).any() or (begin > limits[:, 1]).any():
         raise UsageError(f"The given motion lies outside the bounds of {', '.join(variables)}; widen them.")
+    return begin, limits
+
+
+class MotionEvaluator(Protocol):
+    """What a motion is worth; more is better."""
+
+    differentiable: bool
+    """False when :meth:`slope` must not be asked for."""
+
+    def worths(self, points: Sequence[Array]) -> list[float]:
+        """Return the worth at each of some values [p]; NaN with unstable whiskers."""
+        ...
+
+    def slope(self, values: Array, scales: Array) -> tuple[float, Array]:
+        """Return the worth at some values [p] and its derivatives by them; NaN and 0 with unstable whiskers."""
+        ...
+
+
+def find_motions(evaluator: MotionEvaluator, begin: Array, limits: Array, options: DesignOptions) -> list[Array]:
+    """Return the given motion and the best that were found: ends of searches by gradient, and the best that was tried.
+
+    Raises:
+        DataError: whiskers are unstable with the given motion.
+    """
+    from scipy.optimize import minimize
+
     width = limits[:, 1] - limits[:, 0]
-    evaluator = _Evaluator(scenes, tuple(variables), options, backend)
 
     def cost(x: Array) -> tuple[float, Array]:
         value, slope = evaluator.slope(limits[:, 0] + x * width, SCALE * width)
@@ -182,27 +223,24 @@ def design(
     at = (begin - limits[:, 0]) / width
     others = np.random.default_rng(options.seed).uniform(size=(options.starts, len(at)))
     tried = [at, *others]
-    first = [_soft_least(d)[0] for d in evaluator.distances([limits[:, 0] + x * width for x in tried])]
+    first = evaluator.worths([limits[:, 0] + x * width for x in tried])
     if not np.isfinite(first[0]):
         raise DataError("Whiskers are unstable with the given motion; simulate the scenes more finely.")
-    order = np.argsort(-np.nan_to_num(first, nan=-math.inf))
-    searches = [
-        minimize(
-            cost,
-            tried[index],
-            jac=True,
-            bounds=[(0, 1)] * len(at),
-            method="L-BFGS-B",
-            options={"maxiter": options.iterations, "maxls": 8},
-        ).x
-        for index in order[: options.searches]
-    ]
-    # What is best at the coarse setting need not be at the finer one, which has the last word.
-    finalists = [begin, *(limits[:, 0] + x * width for x in (*searches, tried[order[0]]))]
-    fine = _Evaluator(scenes, tuple(variables), replace(options, fidelity=options.check), backend)
-    measured = fine.distances(finalists)
-    best = int(np.argmax(np.nan_to_num([_soft_least(one)[0] for one in measured[1:]], nan=-math.inf))) + 1
-    return _result(fine, variables, (begin, finalists[best]), (measured[0], measured[best]), evaluator.count)
+    order = np.argsort(-np.nan_to_num(first, nan=-math.inf))[: options.searches]
+    found = [tried[index] for index in order]
+    if evaluator.differentiable:
+        how = {"maxiter": options.iterations, "maxls": 8}
+        bounds = [(0, 1)] * len(at)
+        ends = [minimize(cost, x, jac=True, bounds=bounds, method="L-BFGS-B", options=how).x for x in found]
+        found = [*ends, found[0]]
+    return [begin, *(limits[:, 0] + x * width for x in found)]
+
+
+def changed(scene: Scene, names: Sequence[str], values: Array) -> Scene:
+    """Return a scene with variables at some values [p]."""
+    for name, value in zip(names, values, strict=True):
+        scene = VARIABLES[name].change(scene, float(value))
+    return scene
 
 
 def _result(
@@ -227,7 +265,7 @@ def _result(
         distances={pair: (float(a), float(b)) for pair, a, b in zip(pairs, before, after, strict=True)},
         whisks=ratio,
         time=ratio * fine.period(values[1]) / fine.period(values[0]),
-        scenes=tuple(fine.changed(scene, values[1]) for scene in fine.scenes),
+        scenes=tuple(changed(scene, fine.names, values[1]) for scene in fine.scenes),
         evaluations=count,
     )
 
@@ -245,6 +283,8 @@ def _soft_least(distances: Array) -> tuple[float, Array]:
 class _Evaluator:
     """Distances between the objects of scenes, at values of the variables."""
 
+    differentiable = True
+
     def __init__(self, scenes: Sequence[Scene], names: tuple[str, ...], options: DesignOptions, backend: str) -> None:
         self.scenes, self.names, self.options = list(scenes), names, options
         self.engine = get_engine(backend)
@@ -252,15 +292,13 @@ class _Evaluator:
         self.noise = np.repeat([options.force_noise, options.moment_noise], 3)
         self.count = 0
 
-    def changed(self, scene: Scene, values: Array) -> Scene:
-        """Return a scene with the variables at some values."""
-        for name, value in zip(self.names, values, strict=True):
-            scene = VARIABLES[name].change(scene, float(value))
-        return scene
+    def worths(self, points: Sequence[Array]) -> list[float]:
+        """Return the soft minimum of log D² at each of some values [p]; NaN with unstable whiskers."""
+        return [_soft_least(one)[0] for one in self.distances(points)]
 
     def period(self, values: Array) -> float:
         """Return the time [s] of one whisk at some values."""
-        return 1 / getattr(self.changed(self.scenes[0], values).whisking, "frequency", 1.0)
+        return 1 / getattr(changed(self.scenes[0], self.names, values).whisking, "frequency", 1.0)
 
     def distances(self, points: Sequence[Array]) -> list[Array]:
         """Return D² [pair] of one whisk, after the onset, at each of some values; NaN with unstable whiskers."""
@@ -295,12 +333,12 @@ class _Evaluator:
 
     def _times(self, values: Array) -> Array:
         """Return the times [n] (s) of the readings of one whisk, after the onset."""
-        whisking = self.changed(self.scenes[0], values).whisking
+        whisking = changed(self.scenes[0], self.names, values).whisking
         count = max(int(self.options.rate * self.period(values)), 2)
         return getattr(whisking, "onset", 0.0) + np.arange(1, count + 1) / self.options.rate
 
     def _jobs(self, values: Array, times: Array) -> list[Job]:
-        some = [self.changed(scene, values) for scene in self.scenes]
+        some = [changed(scene, self.names, values) for scene in self.scenes]
         return [replace(job, times=times) for scene in some for job in scene.jobs()]
 
     def _apart(self, traces: Sequence[Trace]) -> tuple[Array, Array]:

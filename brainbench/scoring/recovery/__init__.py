@@ -3,7 +3,7 @@
 ``candidates`` runs the networks on the stimuli, ``boards`` draws animals from one of them and scores all (``design``
 says how many and how noisy), ``study`` does so for many boards, and ``confusion`` counts how often the true network
 wins, as numbers and as a picture. ``selection`` picks the stimuli of a larger pool that separate the candidates best,
-``cheapest`` looks for the smallest design that suffices.
+``cheapest`` looks for the smallest design that suffices, and ``motion`` for the whisking that tells two networks apart.
 """
 
 from __future__ import annotations
@@ -17,13 +17,16 @@ if TYPE_CHECKING:
     from brainbench.scoring.recovery.cheapest import find_cheapest
     from brainbench.scoring.recovery.confusion import Recovery, plot_confusion
     from brainbench.scoring.recovery.design import RecoveryDesign
+    from brainbench.scoring.recovery.motion import NetworkDesign, design_for_networks
     from brainbench.scoring.recovery.selection import select_stimuli
     from brainbench.scoring.recovery.study import recover
 
 __all__ = [
     "Candidate",
+    "NetworkDesign",
     "Recovery",
     "RecoveryDesign",
+    "design_for_networks",
     "find_cheapest",
     "open_candidates",
     "plot_confusion",

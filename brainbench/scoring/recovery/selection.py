@@ -70,7 +70,7 @@ def select_stimuli(
     metric = get_metric(design.metric)
     if not metric.of_rdms:
         raise UsageError(f"Stimuli are chosen by RDMs; the metric {metric.name!r} does not compare any, 'rsa' does.")
-    margins = _Margins(candidates, design, metric, boards)
+    margins = Margins(candidates, design, metric, boards)
     random = np.random.default_rng([design.seed, FIRST_BOARD])
     order = random.permutation(pool)
     kept, spare = order[:keep].copy(), order[keep:].copy()
@@ -110,7 +110,7 @@ def _worth(margins: Floats, scale: float) -> float:
     return float(np.tanh(margins / scale).mean())
 
 
-class _Margins:
+class Margins:
     """Leads [boards] of the true candidates over the best of the others, for any set of stimuli."""
 
     def __init__(self, candidates: Sequence[Candidate], design: RecoveryDesign, metric: Metric, boards: int) -> None:
@@ -127,6 +127,7 @@ class _Margins:
         self.brain = np.stack(drawn)
 
     def __call__(self, rows: Ints) -> Floats:
+        """Return the leads [boards], in scores, on the stimuli ``rows``."""
         pairs = permuted_pairs(np.sort(rows)[None], self.pool)[0]
         boards, animals = self.brain.shape[:2]
         brain = self.brain[..., pairs].reshape(boards * animals, -1)

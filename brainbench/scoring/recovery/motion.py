@@ -1,0 +1,300 @@
+"""Choose how to whisk, or where to hold objects, so that two networks are told apart best.
+
+A recovery compares a network with animals by the whitened cosine of RDMs of squared distances, which is the linear
+centred kernel alignment (CKA) of their responses (Diedrichsen et al. 2020, arXiv 2007.02789). The less alike two
+networks are by it, the larger the lead of the true one on a board, at equal noise; so 1 − CKA is raised, by its
+gradient where both networks can be differentiated: through the network by PyTorch, and through the simulation by
+:mod:`brainbench.stimuli.gradients`. Every other object is searched on. For the others animals are drawn from each
+network as for boards, which say what the motion is worth. Letters: K stimulus, F feature, p variable.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from brainbench.core.contracts import GRID_SHAPE
+from brainbench.core.errors import DataError, UsageError
+from brainbench.core.records import Interval, Status
+from brainbench.core.statistics import t_interval
+from brainbench.metrics.measures.registry import get_metric
+from brainbench.scoring.model_responses import ResolvedModel, resolve_model
+from brainbench.scoring.options import ScoreOptions
+from brainbench.scoring.recovery.candidates import Candidate
+from brainbench.scoring.recovery.design import FEWEST_STIMULI, RecoveryDesign
+from brainbench.scoring.recovery.selection import Margins
+from brainbench.stimuli import Scene, load_stimuli, simulate
+from brainbench.stimuli.design import NOTHING, DesignOptions, changed, find_motions, read_limits
+from brainbench.stimuli.engines import DEFAULT_ENGINE, get_engine
+from brainbench.stimuli.engines.fidelity import Fidelity
+from brainbench.stimuli.gradients import GradientRun
+
+Array = NDArray[np.float64]
+SUBSTEPS = 5
+"""Frames of a time step of the input, as in :func:`brainbench.stimuli.readout.to_grid`."""
+FINER = 5
+"""Divisor of the time step for a gradient of whiskers that cannot be trusted."""
+BOARDS = 10
+"""Boards of each network on which motions are compared."""
+
+
+@dataclass(frozen=True)
+class NetworkDesign:
+    """The chosen motion, and how well it tells two networks apart."""
+
+    status: Status
+    """``unreliable``: on other objects and animals the lead does not surely grow; ``undefined``: there is none."""
+    reason: str
+    values: Mapping[str, float]
+    """Chosen values, in their units."""
+    start: Mapping[str, float]
+    layers: Mapping[str, str]
+    """Layer of each network that is compared."""
+    search: str
+    """``gradient``, or ``trials`` where a network cannot be differentiated."""
+    contrast: tuple[float, float]
+    """1 − similarity (CKA) of the networks' responses to the objects of the search: given, chosen motion."""
+    held_out: tuple[float, float]
+    """The same on the other objects."""
+    leads: tuple[float, float]
+    """Mean lead of the true network over the other in scores, on animals drawn for the other objects."""
+    gain: Interval | None
+    """Of the difference of the leads, over boards with the same noise."""
+    won: tuple[float, float]
+    """Share of these boards that the true network wins."""
+    scenes: tuple[Scene, ...] = field(repr=False)
+    """All scenes with the chosen motion."""
+    evaluations: int = 0
+    """Motions that were simulated in the search."""
+
+
+def design_for_networks(
+    scenes: Sequence[Scene],
+    networks: Sequence[Any],
+    variables: Sequence[str],
+    *,
+    bounds: Mapping[str, tuple[float, float]] | None = None,
+    options: DesignOptions | None = None,
+    study: RecoveryDesign | None = None,
+    boards: int = BOARDS,
+    backend: str = DEFAULT_ENGINE,
+) -> NetworkDesign:
+    """Choose the motion with which two networks are told apart best.
+
+    Args:
+        scenes: the same whiskers and motion, each with another object; at least eight, every other one is held out.
+        networks: two models as :func:`brainbench.score` takes them; no files of activations.
+        variables: names of :data:`brainbench.stimuli.design.VARIABLES`.
+        bounds: bounds of single variables, in their units.
+        options: search and simulation; noise and rate of its sensor do not count, the noise is that of animals.
+        study: animals that are drawn to compare motions; its layer is that of networks that commit to none: ``any``
+            and ``last`` stand for the last.
+        boards: boards of each network on which motions are compared, at least 2.
+        backend: physics engine.
+
+    Raises:
+        UsageError: there are too few scenes, or not two networks, or a network cannot see other motions.
+        DataError: whiskers are unstable with the given motion.
+    """
+    options, study = options or DesignOptions(), replace(study or RecoveryDesign(), stimuli=None)
+    if len(scenes) < 2 * FEWEST_STIMULI:
+        raise UsageError(
+            f"A design for networks needs at least {2 * FEWEST_STIMULI} scenes, half of which are held out; received "
+            f"{len(scenes)}."
+        )
+    if len(networks) != 2:
+        raise UsageError(f"A design tells two networks apart; received {len(networks)}.")
+    begin, limits = read_limits(scenes[0], variables, bounds or {})
+    models = [_Network.of(model, study.layer) for model in networks]
+    if models[0].name == models[1].name:
+        raise UsageError(f"The network {models[0].name!r} is given twice; give two different ones.")
+    names = tuple(variables)
+    evaluator = _Evaluator(scenes[::2], names, models, options.fidelity, backend)
+    points = find_motions(evaluator, begin, limits, options)
+    # What is best at the coarse setting need not be at the finer one, which has the last word.
+    fine = _Evaluator(scenes[::2], names, models, options.check, backend)
+    other = _Evaluator(scenes[1::2], names, models, options.check, backend)
+    if other.features(begin) is None:
+        raise DataError("Whiskers are unstable with the given motion; simulate the scenes more finely.")
+    worths = np.nan_to_num(fine.worths(points), nan=-math.inf)
+    order = np.argsort(-worths, kind="stable").tolist()
+    chosen = next(points[index] for index in order if other.features(points[index]) is not None)
+    margins = [other.margins(point, study, boards) for point in (begin, chosen)]
+    gain = t_interval(margins[1] - margins[0], over="boards")
+    status, reason = _judge(gain, bool(np.array_equal(begin, chosen)))
+    first, last = (fine.contrast(point) for point in (begin, chosen))
+    return NetworkDesign(
+        status=status,
+        reason=reason,
+        values=dict(zip(variables, chosen.tolist(), strict=True)),
+        start=dict(zip(variables, begin.tolist(), strict=True)),
+        layers={model.name: model.layer for model in models},
+        search="gradient" if evaluator.differentiable else "trials",
+        contrast=(first, last),
+        held_out=(other.contrast(begin), other.contrast(chosen)),
+        leads=(float(margins[0].mean()), float(margins[1].mean())),
+        gain=gain,
+        won=(float((margins[0] > 0).mean()), float((margins[1] > 0).mean())),
+        scenes=tuple(changed(scene, names, chosen) for scene in scenes),
+        evaluations=evaluator.count,
+    )
+
+
+def _judge(gain: Interval | None, same: bool) -> tuple[Status, str]:
+    """Return the status of a design, and why."""
+    if gain is None:
+        return "undefined", "A network responds alike to all held-out objects, so that nothing tells the two apart."
+    if same:
+        return "unreliable", "Nothing was gained: at the finer setting no motion was better than the given one."
+    if not gain.low > 0:
+        return "unreliable", "Nothing was gained that holds for other objects and animals; the interval contains zero."
+    return "ok", ""
+
+
+@dataclass(frozen=True)
+class _Network:
+    """A network and the layer that is compared."""
+
+    name: str
+    model: ResolvedModel
+    layer: str
+    read: Callable[[Any], Mapping[str, Any]] | None
+    """Activations of the layer [K, T, …] of an input, which PyTorch can differentiate; None where it cannot."""
+
+    @classmethod
+    def of(cls, model: Any, layer: str) -> _Network:
+        """Find a network; the layer is the one it commits to, or else the one asked for."""
+        from brainbench.models.activations import named_reader
+
+        found = resolve_model(model)
+        if found.module is None:
+            raise UsageError(
+                f"{found.card.name} is a file of activations, which cannot be run on other motions; give the network."
+            )
+        named = getattr(found.module, "layers", None)
+        chosen = found.card.layer if layer in ("any", "last") else layer
+        if chosen is None:
+            if not named:
+                raise UsageError(f"{found.card.name} commits to no layer and names none; choose one with --layer.")
+            chosen = named[-1]
+        # Other modules are read by hooks, which keep no gradient.
+        read = named_reader(found.module, (chosen,)) if hasattr(found.module, "spec") else None
+        return cls(found.card.name, found, chosen, read)
+
+    def features(self, dataset: Any) -> Array:
+        """Return the responses [K, F] to a stimulus set, averaged over time."""
+        found = self.model.respond(ScoreOptions(stimuli=load_stimuli(dataset), layers=(self.layer,), layer=self.layer))
+        return found.features(list(range(len(found.labels))))[self.layer].astype(float)
+
+
+class _Evaluator:
+    """How unlike two networks respond to the objects of scenes, at values of the variables."""
+
+    def __init__(
+        self, scenes: Sequence[Scene], names: tuple[str, ...], networks: Sequence[_Network], fidelity: str, backend: str
+    ) -> None:
+        self.scenes, self.names, self.networks, self.backend = list(scenes), names, networks, backend
+        twist = get_engine(backend).twists and any(scene.twist for scene in scenes)
+        self.fidelity = Fidelity.of(fidelity).resolved(twist)
+        frames = scenes[0].frames
+        plain = frames.lowpass is None and frames.clip is None and frames.axes == "world" and not scenes[0].others
+        self.differentiable = plain and all(network.read for network in networks)
+        self.count = 0
+        self._kept: dict[bytes, list[Array] | None] = {}
+
+    def worths(self, points: Sequence[Array]) -> list[float]:
+        """Return log(1 − CKA) at each of some values; NaN with unstable whiskers."""
+        self.count += len(points)
+        return [math.log(max(value, math.exp(NOTHING))) for value in map(self.contrast, points)]
+
+    def contrast(self, values: Array) -> float:
+        """Return 1 − CKA at some values; 0 where a network responds alike to all, NaN with unstable whiskers."""
+        found = self.features(values)
+        if found is None:
+            return math.nan
+        grams = [(centred := some - some.mean(axis=0)) @ centred.T for some in found]
+        sizes = [float(np.linalg.norm(gram)) for gram in grams]
+        return 1 - float(np.vdot(*grams)) / (sizes[0] * sizes[1]) if min(sizes) > 0 else 0.0
+
+    def features(self, values: Array) -> list[Array] | None:
+        """Return the responses [K, F] of both networks at some values; None with unstable whiskers."""
+        key = values.tobytes()
+        if key not in self._kept:
+            some = [changed(scene, self.names, values) for scene in self.scenes]
+            dataset = simulate(some, fidelity=self.fidelity, backend=self.backend, cache=False)
+            sound = bool((dataset["status"].values == "ok").all())
+            self._kept[key] = [network.features(dataset) for network in self.networks] if sound else None
+        return self._kept[key]
+
+    def slope(self, values: Array, scales: Array) -> tuple[float, Array]:
+        """Return log(1 − CKA) at some values [p], and its derivatives by them; NaN and 0 with unstable whiskers."""
+        import torch
+
+        from brainbench.models.activations import evaluating
+
+        self.count += 1
+        nothing = np.zeros(len(values))
+        # As the engine does, steps are taken finer where a whisker cannot be trusted.
+        for finer in (1, FINER):
+            fidelity = replace(self.fidelity, time_step=self.fidelity.time_step / finer)
+            run = GradientRun(self._jobs, values, scales=scales, fidelity=fidelity)
+            if all(trace.status == "ok" for trace in run.traces):
+                break
+        else:
+            return math.nan, nothing
+        readings = np.stack([trace.wrench for trace in run.traces])
+        wrench = torch.tensor(readings, dtype=torch.float64, requires_grad=True)
+        grid = self._input(wrench)
+        grams = []
+        for network in self.networks:
+            assert network.read is not None
+            assert network.model.module is not None
+            like = next(network.model.module.parameters())
+            with evaluating(network.model.module):
+                response = network.read(grid.to(like.device, like.dtype))[network.layer].cpu().double()
+            response = response.mean(dim=1).flatten(1)
+            centred = response - response.mean(dim=0)
+            grams.append(centred @ centred.T)
+        apart = 1 - (grams[0] * grams[1]).sum() / (grams[0].norm() * grams[1].norm())
+        if not apart.item() > math.exp(NOTHING):
+            return NOTHING, nothing
+        worth = apart.log()
+        (by_wrench,) = torch.autograd.grad(worth, wrench)
+        return worth.item(), run.gradient(list(by_wrench.numpy())).values
+
+    def margins(self, values: Array, study: RecoveryDesign, boards: int) -> Array:
+        """Return the leads of the true network at some values [2 boards]; NaN where there are none."""
+        found = self.features(values)
+        if found is None or not all(np.ptp(some, axis=0).any() for some in found):
+            return np.full(2 * boards, math.nan)
+        labels = [scene.label for scene in self.scenes]
+        candidates = [
+            Candidate.of(network.name, labels, {network.layer: some})
+            for network, some in zip(self.networks, found, strict=True)
+        ]
+        design = replace(study, layer="last")
+        return Margins(candidates, design, get_metric(design.metric), boards)(np.arange(len(labels)))
+
+    def _jobs(self, values: Array) -> list[Any]:
+        return [job for scene in self.scenes for job in changed(scene, self.names, values).jobs()]
+
+    def _input(self, wrench: Any) -> Any:
+        """Return the networks' input [K, T, S·C, H, W] of readings [K·whisker, n, 6] in the frames of the jobs.
+
+        As simulated stimuli are read (:mod:`brainbench.stimuli.simulation`), by operations that PyTorch differentiates.
+        """
+        import torch
+
+        scene, frames = self.scenes[0], self.scenes[0].frames
+        count, whiskers = len(self.scenes), len(scene.names)
+        turn = torch.tensor(scene.head.matrix)
+        means = wrench.reshape(count, whiskers, frames.count, frames.average, 2, 3).mean(dim=3) @ turn.T
+        cells = torch.tensor([mount.row * GRID_SHAPE[1] + mount.col for mount in scene.mounts])
+        grid = torch.zeros(count, frames.count, 6, GRID_SHAPE[0] * GRID_SHAPE[1], dtype=wrench.dtype)
+        grid = grid.index_copy(3, cells, means.flatten(3).permute(0, 2, 3, 1))
+        return grid.reshape(count, frames.count // SUBSTEPS, SUBSTEPS * 6, *GRID_SHAPE)
