@@ -199,7 +199,8 @@ class _Evaluator:
         self, scenes: Sequence[Scene], names: tuple[str, ...], networks: Sequence[_Network], fidelity: str, backend: str
     ) -> None:
         self.scenes, self.names, self.networks, self.backend = list(scenes), names, networks, backend
-        twist = get_engine(backend).twists and any(scene.twist for scene in scenes)
+        self.engine = get_engine(backend)
+        twist = self.engine.twists and any(scene.twist for scene in scenes)
         self.fidelity = Fidelity.of(fidelity).resolved(twist)
         frames = scenes[0].frames
         plain = frames.lowpass is None and frames.clip is None and frames.axes == "world" and not scenes[0].others
