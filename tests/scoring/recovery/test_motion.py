@@ -103,9 +103,7 @@ class _Other(_Plain):
 
 def test_networks_without_gradients_are_told_apart_by_trials():
     study = replace(FEW, layer="output")
-    found = design_for_networks(
-        _scenes(), [_Plain(1), _Other(2)], ["object_y"], options=QUICK, study=study, boards=3
-    )
+    found = design_for_networks(_scenes(), [_Plain(1), _Other(2)], ["object_y"], options=QUICK, study=study, boards=3)
     assert found.search == "trials"
     assert found.contrast[1] >= found.contrast[0]
 
@@ -125,7 +123,7 @@ def test_nothing_gained_is_said(gain, same, status, words):
     assert words in found[1]
 
 
-def test_wrong_requests_are_refused(tmp_path):
+def test_wrong_requests_are_refused():
     with pytest.raises(UsageError, match="at least 8 scenes"):
         design_for_networks(_scenes(7), NAMES, ["object_y"])
     with pytest.raises(UsageError, match="two networks apart; received 1"):
@@ -134,5 +132,5 @@ def test_wrong_requests_are_refused(tmp_path):
         design_for_networks(_scenes(), [NAMES[0]] * 2, ["object_y"])
     with pytest.raises(UsageError, match="did you mean 'object_y'"):
         design_for_networks(_scenes(), NAMES, ["objekt_y"])
-    with pytest.raises(UsageError, match="file of activations|cannot be run on other motions"):
+    with pytest.raises(UsageError, match="cannot be run on other motions"):
         design_for_networks(_scenes(), [{"layer": np.zeros((8, 3))}, NAMES[0]], ["object_y"])
