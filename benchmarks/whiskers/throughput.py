@@ -6,6 +6,7 @@ python -m benchmarks.whiskers.throughput [--device cuda] [--only free,peer,sweep
 from __future__ import annotations
 
 import argparse
+import itertools
 import multiprocessing
 import os
 import statistics
@@ -55,12 +56,14 @@ def free(
     block: int,
     bounds: tuple[int, int] | None = None,
     precision: str = "single",
+    twists: bool = False,
 ) -> None:
-    """Whiskers that swing under gravity, nothing near: pure integration."""
+    """Whiskers that swing under gravity, nothing near: pure integration; in their plane, or out of it, which twists."""
     step = 1e-4
     fidelity = Fidelity(links=links, time_step=step, precision=precision)
     chains = [build_chain(mount.whisker, links) for mount in WhiskerArray.mouse()]
-    solver = WhiskerSolver(chains, fidelity, pick_device(device_name), NOTHING, block=block, bounds=bounds)
+    device, gravity = pick_device(device_name), (0.0, 0.0, -9.81) if twists else (0.0, -9.81, 0.0)
+    solver = WhiskerSolver(chains, fidelity, device, NOTHING, twists=twists, block=block, bounds=bounds)
     motions, shapes = PackedMotions(), PackedShapes()
     motions.add_straight(still_knots(np.zeros(3), np.array([1.0, 0, 0, 0])))
     shapes.first.append(0)
@@ -68,11 +71,11 @@ def free(
     jobs = PackedJobs(which, zeros, zeros, np.arange(lanes, dtype=np.int32), zeros, zeros + 1)
     kernels = []
     for _ in range(4):
-        result = solver.launch(jobs, motions, shapes, np.array([steps * step]), (lanes, 1), gravity=(0.0, 0.0, -9.81))
+        result = solver.launch(jobs, motions, shapes, np.array([steps * step]), (lanes, 1), gravity=gravity)
         kernels.append(result.seconds["kernel"])
     seconds = statistics.median(kernels[1:])
     print(
-        f"free  N={links} {precision} lanes={lanes} block={block} bounds={bounds}: "
+        f"free  N={links} {'twist' if twists else 'bending'} {precision} lanes={lanes} block={block} bounds={bounds}: "
         f"{int(result.steps.astype(np.int64).sum()) / seconds:.3e} whisker-steps/s "
         f"({seconds:.3f} s, {int((result.counts['status'] != 0).sum())} failed)",
         flush=True,
@@ -198,6 +201,13 @@ def load_objects(words: list[str]) -> dict[str, Solid]:
         return dict(zip(objects, pool.map(_load, objects.values(), chunksize=4), strict=True))
 
 
+def _bounds(words: str) -> tuple[int, int] | None:
+    if words == "0":
+        return None
+    threads, blocks = words.split("x")
+    return int(threads), int(blocks)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--device", default="cuda")
@@ -219,12 +229,13 @@ def main() -> None:
     small = args.device == "cpu"
     chosen = args.only.split(",")
     if "free" in chosen:
-        for links in (10, 20):
-            for pair in args.blocks.split(","):
-                block = int(pair)
-                for words in args.bounds.split(","):
-                    bounds = None if words == "0" else tuple(map(int, words.split("x")))
-                    free(args.device, 60 if small else args.lanes, links, 200 if small else 100, block, bounds)
+        blocks = [int(words) for words in args.blocks.split(",")]
+        limits = [_bounds(words) for words in args.bounds.split(",")]
+        lanes, steps = (60, 200) if small else (args.lanes, 100)
+        for links, twists, block, bounds in itertools.product((10, 20), (False, True), blocks, limits):
+            # CUDA refuses blocks of more threads than a kernel was compiled for.
+            if bounds is None or block <= bounds[0]:
+                free(args.device, lanes, links, steps, block, bounds, twists=twists)
     if "peer" in chosen:
         for links in (10, 20):
             peer(args.device, 16 if small else 32_768, links, 20)
