@@ -15,7 +15,7 @@ from brainbench.stimuli.engines.rod.mesh_bvh import BITS, LEVELS, WIDE
 
 from .algebra import maximum, minimum, vec3
 from .distances import NUMBERS, TRIANGLES
-from .parameters import group_size, real
+from .parameters import cuda, group_size, real
 from .state import LeafCorners, NodeBoxes, ShapeArrays
 from .thread_groups import broadcast, group_min, group_min_int, warp_max
 
@@ -255,7 +255,8 @@ def node_count(count: int, level: int) -> int:
     return ((count - 1) >> (wp.static(BITS) * (level + 2))) + 1
 
 
-@wp.func
+# Where one thread searches alone, compilers of GPUs would write the search out at all its 20 calls: minutes to compile.
+@wp.func(inline=False if cuda and group_size == 1 else None)
 def nearest_triangles(
     shapes: ShapeArrays, s: int, a: vec3, b: vec3, radius: real, within: real, leaf: int, part: int, live: int
 ) -> NearestTriangles:
