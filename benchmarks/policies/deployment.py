@@ -138,6 +138,7 @@ def main() -> None:
     parser.add_argument("--student", default="in_palm_rotate.student")
     parser.add_argument("--envs", type=int, default=102)
     parser.add_argument("--seeds", type=int, default=3)
+    parser.add_argument("--notes", type=Path, help="text that follows the table")
     parser.add_argument("--write", action="store_true")
     options = parser.parse_args()
     student, described = load_student(options.student)
@@ -161,6 +162,8 @@ def main() -> None:
             ways[name] = {key: torch.cat([found[key] for found, _ in runs]).tolist() for key in runs[0][0]}
             reports += [report for _, own in runs for report in own] if limited else []
     text = body(options.student, task, ways, reports) + f" What the policy reads: {', '.join(deployed.groups)}."
+    if options.notes:
+        text += "\n\n" + options.notes.read_text(encoding="utf-8").strip()
     print(text)
     if options.write:
         command = "python -m benchmarks.policies.deployment --write"
