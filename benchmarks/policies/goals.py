@@ -78,8 +78,9 @@ def main() -> None:
         "object as it lies, so that the random yaw of the start (up to .26 rad) is in every goal: there it is a tilt "
         "against the palm, at which a block cannot lie, and of which the policy is not told. Flat goals count from an "
         "object without yaw. A cylinder's turn about itself, which does not show, counts as published, and not in flat "
-        "goals. The shipped teacher was trained with flat goals. The one before, `in_palm_rotate.firm`, was trained with "
-        "published ones, and did better with flat ones too: .69 [.64, .74] and .84 [.80, .88] of the same 340 starts."
+        "goals. The shipped teacher was trained with flat goals. The one before, `in_palm_rotate.firm`, was trained "
+        "with published ones, and did better with flat ones too: .69 [.64, .74] and .84 [.80, .88] of the same 340 "
+        "starts."
     )
     print(text)
     if options.write:
