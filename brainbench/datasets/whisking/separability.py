@@ -126,8 +126,8 @@ def separate(
     if fewest < 2:
         poor = names[[len(found) for found in members].index(fewest)]
         raise DataError(
-            f"The class {poor!r} has {fewest} object{'s' * (fewest != 1)}; telling classes apart needs two of each, one "
-            "to learn from and one to be tested with."
+            f"The class {poor!r} has {fewest} object{'s' * (fewest != 1)}; telling classes apart needs two of each: "
+            "one to learn from and one to be tested with."
         )
     values = np.asarray(features, dtype=np.float32)
     # As gamma="scale" would take it, but once for all choices and folds.
