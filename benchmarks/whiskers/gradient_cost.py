@@ -4,8 +4,12 @@
 [--write-input FILE] [--input FILE] [--write]``
 
 ``--write-input`` keeps the gradients of a processor, with which a machine compares that has no compiler for its own.
-Every part is told as it ends. Times are those of the second round, when kernels are compiled; the first round stands
-beside it.
+Every part is told as it ends. ``--compile-only`` compiles the kernels and says how long each takes; without a GPU too:
+
+    python -m benchmarks.whiskers.precompile --pack FILE benchmarks/whiskers/gradient_cost.py --device cuda
+    --compile-only
+
+Times are those of the second round, when kernels are compiled; the first round stands beside it.
 """
 
 from __future__ import annotations
@@ -25,11 +29,38 @@ from brainbench.core.devices import pick_device
 from brainbench.stimuli.engines import get_engine
 from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.engines.protocol import Job
+from brainbench.stimuli.engines.rod.compilation import load_kernels
+from brainbench.stimuli.engines.rod.kernels import BUILDING, build_adjoint
+from brainbench.stimuli.engines.rod.launch import real_type
+from brainbench.stimuli.engines.rod.packing import capacity_for
+from brainbench.stimuli.engines.rod.tasks import PackedTasks, make_task
 from brainbench.stimuli.gradients import GradientRun, JobParameters
 from brainbench.stimuli.validation.contact_scenes import contact_jobs
 
 NAMES = (*BASE[:3], *OBJECT[:3])
 PARTS = ("ordinary run", "recorded run", "going back", "forward, all parameters")
+
+
+def compile_kernels(jobs: list[Job], fidelity: Fidelity, device: str) -> None:
+    """Compile what a measurement launches, and print how long each kernel takes."""
+    where = pick_device(device)
+    tasks = [task for job in jobs if (task := make_task(job, fidelity, {}, silent=True))]
+    needs = PackedTasks.of(tasks, shared=False).shapes.needs
+    capacity, hinges = capacity_for(fidelity.links), 3 if any(task.twists for task in tasks) else 2
+    for recorded in (False, True):
+        began = time.perf_counter()
+        options = {"hinges": hinges, "recorded": recorded}
+        kernels = load_kernels(where, real_type(fidelity), capacity, needs, **options)
+        print(f"compiling: {PARTS[recorded]} {time.perf_counter() - began:.3g} s", flush=True)
+    for part, module, name in (
+        (PARTS[2], "chain", "reverse_segment"),
+        (PARTS[3], "tangent", "tangent_segment"),
+    ):
+        began = time.perf_counter()
+        with BUILDING:
+            adjoint = build_adjoint(kernels, module)
+        getattr(adjoint, name).module.load(where)
+        print(f"compiling: {part} {time.perf_counter() - began:.3g} s", flush=True)
 
 
 def measure(
@@ -72,12 +103,16 @@ def main() -> None:
     parser.add_argument("--each", type=int, default=1, help="scenes of each of the 72 combinations")
     parser.add_argument("--links", type=int, default=FIDELITY.links)
     parser.add_argument("--readings", type=int, help="keep so many readings, 1 ms apart, of each scene")
+    parser.add_argument("--compile-only", action="store_true")
     parser.add_argument("--write-input", type=Path)
     parser.add_argument("--input", type=Path)
     parser.add_argument("--write", action="store_true")
     args = parser.parse_args()
     jobs = [replace(job, times=job.times[: args.readings]) for job in contact_jobs(11, each=args.each)]
-    found, first, seconds = measure(jobs, replace(FIDELITY, links=args.links), args.device)
+    fidelity = replace(FIDELITY, links=args.links)
+    if args.compile_only:
+        return compile_kernels(jobs, fidelity, args.device)
+    found, first, seconds = measure(jobs, fidelity, args.device)
     if args.write_input:
         np.savez_compressed(args.write_input, allow_pickle=False, **found)
     where = pick_device(args.device)
