@@ -70,10 +70,9 @@ class SafetyLimits:
         if missing := [name for name in joints if name not in names]:
             raise UsageError(f"The hand {hand.name!r} has no joint {missing[0]!r}.")
         ranges = np.array([model.jnt_range[names[name]] for name in joints])
-        speeds = {joint.name: joint.velocity for joint in hand.spec.joints} if hand.spec is not None else {}
         for name in changes:
             check_name("safety limit", name, LIMITS)
-        return cls(ranges[:, 0], ranges[:, 1], np.array([speeds.get(name, 5.0) for name in joints]), **changes)
+        return cls(ranges[:, 0], ranges[:, 1], hand.rated_speeds(joints), **changes)
 
     def fault(self, reading: HandReading, age: float) -> str | None:
         """Return why a report must not be acted upon, in words; None if it may."""

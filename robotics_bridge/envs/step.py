@@ -45,8 +45,11 @@ class ActionMap:
 def apply_action(state: EnvState) -> None:
     """Set the actuators' targets for the action, and what pushes the object."""
     target, moved = state.actuators.target, state.moved
+    before = target[:, moved]
     target.copy_(state.episode.rest_targets)
     wanted = target[:, moved] + state.action_scale * state.episode.action
+    if state.target_step is not None:
+        wanted = torch.clamp(wanted, before - state.target_step, before + state.target_step)
     target[:, moved] = torch.clamp(wanted, state.low[moved], state.high[moved])
     push, left = state.task.push, state.episode.push_left
     if push is None:

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import contextlib
 import os
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
+
+import numpy as np
+from numpy.typing import NDArray
 
 from brainbench.core.devices import mujoco_module
 from brainbench.core.errors import DataError, UsageError, check_name, shown
@@ -27,6 +30,8 @@ _AUTO_GRIDS = {
 """Rows, columns and radius (m) on a link of a hand without a layout of its own."""
 _NAMES = {"name", "class", "childclass", "joint", "body", "link", "geom", "site", "mesh", "material", "file"}
 """Attributes of URDF and MJCF that hold words."""
+UNKNOWN_SPEED = 5.0
+"""Speed (rad/s or m/s) that counts as the largest of a joint whose data states none."""
 _LARGEST = 1e15
 """Magnitude of numbers in a hand's file that no hand has."""
 
@@ -70,6 +75,11 @@ class Hand:
         """Names of the hinges and slides, in the model's order."""
         model = self.model
         return tuple(model.joint(index).name for index in range(model.njnt) if model.jnt_type[index] in (2, 3))
+
+    def rated_speeds(self, joints: Iterable[str]) -> NDArray[np.float64]:
+        """Return the largest speeds [J] (rad/s or m/s) of joints; :data:`UNKNOWN_SPEED` where none is stated."""
+        known = {joint.name: joint.velocity for joint in self.spec.joints} if self.spec is not None else {}
+        return np.array([known.get(name, UNKNOWN_SPEED) for name in joints])
 
     @property
     def tips(self) -> tuple[str, ...]:

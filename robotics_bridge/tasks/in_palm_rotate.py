@@ -122,3 +122,9 @@ def careful() -> Task:
         task.teacher, rnd_weight=50.0, learning_rate=3e-4, learning_rate_range=(1e-4, 3e-3), std_range=(0.2, 1.0)
     )
     return replace(task, rewards=rewards, teacher=settings, goal=FLAT_GOAL)
+
+
+@register("in_palm_rotate", "deployed")
+def deployed() -> Task:
+    """Return ``careful`` with targets that move no faster than the rated speed of the joints, as on a real hand."""
+    return replace(careful(), rated_speed=True)

@@ -201,6 +201,9 @@ class Task:
     What moves no joint further changes no motion, but policies that read their own last action can otherwise run away
     from themselves.
     """
+    rated_speed: bool = False
+    """Whether targets move no faster than the rated speed of the joints, as those of a deployed policy do
+    (:class:`~robotics_bridge.deploy.safety.SafetyLimits`); ``--change rated_speed=true``."""
     # --- randomness ---
     actuators: ActuatorRandomisation | None = ActuatorRandomisation()
     object_changes: ObjectRandomisation = ObjectRandomisation()

@@ -13,6 +13,7 @@ from brainbench.core.devices import mujoco_module, warp
 from brainbench.core.errors import UsageError
 from brainbench.core.rotations import to_matrices
 from robotics_bridge import tasks
+from robotics_bridge.deploy.safety import SafetyLimits
 from robotics_bridge.envs import Env
 from robotics_bridge.hands.observations import observation_type, observe, sensors_for
 from robotics_bridge.tasks.goals import SteppingRotation
@@ -52,6 +53,17 @@ def test_without_touch_no_tactile_sensor_is_built() -> None:
     env = _make(1)
     assert env.touch is None
     assert "tactile" not in env.observations
+
+
+def test_targets_at_rated_speed_are_those_that_deployment_sends() -> None:
+    env = _make(2, task=_calm(rated_speed=True))
+    moved, limits = env.state.moved, SafetyLimits.of_hand(env.hand, env.state.model.moved)
+    target = env.state.actuators.target
+    for action in _actions(env, 6):
+        before, wanted = target[:, moved].clone().numpy(), env.action_map.targets(action.numpy())
+        env.step(action)
+        assert np.abs(wanted - before).max() > 0.025 * limits.speed.max()
+        np.testing.assert_allclose(target[:, moved], limits.limit(wanted, before, env.step_dt), atol=1e-6)
 
 
 def test_the_same_seed_gives_the_same_episode_and_another_seed_another() -> None:
