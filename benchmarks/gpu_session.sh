@@ -23,9 +23,9 @@
 #
 # What is open of sweeps: whether tries ahead gain on an idle GPU, and whether the same launch gives the same hash twice
 # (sweeps-1; on 2026-11-26 two launches that should agree did not); when kernels are loaded and shards begin (sweeps-2);
-# how a GPU is shared where shards queue (sweeps-3); what users get (sweeps-4), and on 2 and 4 GPUs (scaling: 164, 97 and
-# 74 s on 2026-11-26). Of free motion: bending alone beside twist, and fewer threads at a time, whose memory then fits
-# the cache (free). golden compiles three kernels of 20 s each (200 s each until 2026-11-26).
+# how a GPU is shared where shards queue, 16 or 32 at once (sweeps-3); what users get (sweeps-4), and on 2 and 4 GPUs
+# (scaling: 164, 97 and 74 s on 2026-11-26). Of free motion: bending alone beside twist, and fewer threads at a time,
+# whose memory then fits the cache (free). golden compiles three kernels of 20 s each (200 s until 2026-11-26).
 set -eu
 
 # Part, its limit in seconds, its command.
@@ -34,7 +34,7 @@ tests     420  python3 -m pytest -q -n 0 -m gpu tests -p no:cacheprovider --cont
 golden    300  python3 -m pytest -q -n 0 -p no:cacheprovider tests/stimuli/engines/test_golden_wrenches.py -k rod
 sweeps-1  150  python3 -m benchmarks.whiskers.public_rate --objects procedural-24:2 $P --parts kernels --ahead :2,1:24,1:24
 sweeps-2   90  python3 -m benchmarks.whiskers.public_rate --objects procedural-24:2 $P --parts stages
-sweeps-3  150  python3 -m benchmarks.whiskers.public_rate --objects procedural-24:8 $P --parts stages
+sweeps-3  240  for n in 16 32; do python3 -m benchmarks.whiskers.public_rate --objects procedural-24:8 $P --parts stages --side-by-side $n; done
 sweeps-4  120  python3 -m benchmarks.whiskers.public_rate --objects procedural-24:2 $P --parts command --write
 scaling   480  python3 -m benchmarks.whiskers.public_rate --objects procedural-24:32 $P --parts command --gpus 1,2,4 --write
 free      150  python3 -m benchmarks.whiskers.throughput --only free --blocks 64,256,320 --bounds 0,64x6
