@@ -21,10 +21,10 @@
 # Calls follow one another within 30 s, or the machine goes back with all that is on it. A machine lives 30 minutes; one
 # GPU counts half, four count as one that is not halved. What is timed has its GPU for itself.
 #
-# What is open of sweeps: whether tries ahead gain on an idle GPU, and whether the same launch gives the same hash twice
-# (sweeps-1; on 2026-11-26 two launches that should agree did not); when kernels are loaded and shards begin (sweeps-2);
-# how a GPU is shared where shards queue, 16 or 32 at once (sweeps-3); what users get (sweeps-4), and on 2 and 4 GPUs
-# (scaling: 164, 97 and 74 s on 2026-11-26). Of free motion: bending alone beside twist, and fewer threads at a time,
+# What is open of sweeps: whether tries ahead gain on an idle GPU (sweeps-1; hashes are equal); when kernels are loaded and
+# shards begin (sweeps-2); how a GPU is shared where shards queue, 16 or 32 at once (sweeps-3); what users get (sweeps-4),
+# and on 2 and 4 GPUs (scaling, all GPUs idle: 164, 97 and 74 s on 2026-11-26); which kernel takes the time (slices).
+# Training on 1, 2 and 4 GPUs: training, all GPUs idle. Of free motion: bending alone beside twist, and fewer threads at a time,
 # whose memory then fits the cache (free). golden compiles three kernels of 20 s each (200 s until 2026-11-26).
 set -eu
 
@@ -37,14 +37,14 @@ sweeps-2   90  python3 -m benchmarks.whiskers.public_rate --objects procedural-2
 sweeps-3  240  for n in 16 32; do python3 -m benchmarks.whiskers.public_rate --objects procedural-24:8 $P --parts stages --side-by-side $n; done
 sweeps-4  120  python3 -m benchmarks.whiskers.public_rate --objects procedural-24:2 $P --parts command --write
 scaling   480  python3 -m benchmarks.whiskers.public_rate --objects procedural-24:32 $P --parts command --gpus 1,2,4 --write
+slices    150  python3 -m benchmarks.whiskers.slices --objects procedural-24:2 --device cuda --write
 free      150  python3 -m benchmarks.whiskers.throughput --only free --blocks 64,256,320 --bounds 0,64x6
 touch     320  python3 -m benchmarks.tactile.throughput --device cuda --part sensors --input inputs/pyramid.npz --write
 friction  150  python3 -m benchmarks.tactile.friction_cost --device cuda --write
 gradients 500  python3 -m benchmarks.whiskers.gradient_cost --device cuda --each 1 --input inputs/gradients.npz --write
 teachers  590  python3 -m benchmarks.policies.jobs run $JOB --minutes ${MINUTES:-7.5}
 students-for 1200 python3 -m benchmarks.policies.students --teacher $TEACHER --config careful --seed $SEED --arms ${ARMS:-none_memory ft_hand reservoir ead_untrained ead_simclr} --no-agents --device cuda --envs 4096 --iterations 110 --learning-rate 5e-4 --episodes 512 --together 2 --end $(($(cat /w/t0) + 1680)) --out /tmp/run/students-$SEED
-campaign  1500 (cd /w/code && PYTHONPATH=/opt/w:/w/code python3 -m benchmarks.models.campaign --work /tmp/campaign --minutes 28 --places 3)
-campaign- 60   (cd /w/code && PYTHONPATH=/opt/w:/w/code python3 -m benchmarks.models.campaign --work /tmp/campaign --pack 0 --out /w/out)
+training  420  python3 -m brainbench stimuli sweep thesis-low procedural:30 --split sweep --device cuda $P --out /tmp/few && python3 -m benchmarks.models.data_parallel /tmp/few --counts 1,2,4 --networks zhuang-intersection-ln+gpt.supervised --out /w/out/data-parallel.json
 TABLE
 }
 
@@ -59,7 +59,7 @@ prepare() {
   tar cJf "$out/head.tar.xz" -C "$tree" . && cp "$0" "$out/gpu_session.sh"; rm -rf "$tree"; ls -la "$out"
 }
 
-start() { mkdir -p /w/head /w/code /w/out && if [ -d .campaign ]; then tar xJf .campaign/code.tar.xz -C /w/code; fi && tar xJf .session/head.tar.xz -C /w/head && cp "$0" /w/gpu.sh; }
+start() { mkdir -p /w/head /w/out && tar xJf .session/head.tar.xz -C /w/head && cp "$0" /w/gpu.sh; }
 
 run() {
   cd /w/head && export PYTHONPATH=/opt/w:/w/head PYTHONUNBUFFERED=1 BRAINBENCH_CACHE=/w/cache
@@ -88,7 +88,7 @@ look() {
   for run in /tmp/run/*/; do  # the newest model of each teacher
     local model; model=$(ls -v "$run"model_*.safetensors 2>/dev/null | tail -n 1)
     [ -z "$model" ] || tar czf "$OUT/$(basename "$run").tar.gz" -C "$run" "$(basename "$model")" $(cd "$run" && ls config.json 2>/dev/null)
-  done; cp /w/out/campaign-*.tar "$OUT" 2>/dev/null || true
+  done; cp /w/out/*.json "$OUT" 2>/dev/null || true
 }
 
 "$@"
