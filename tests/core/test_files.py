@@ -89,6 +89,11 @@ def test_hashes_separate_what_differs_and_only_that(tmp_path: Path):
     assert files.content_hash(first) == files.content_hash(second)
 
 
+def test_long_doubles_count_as_the_numbers_they_are():
+    values = np.arange(3) / 4
+    assert files.content_hash([values.astype(np.longdouble)]) == files.content_hash([values])
+
+
 def test_a_hash_is_equal_on_every_machine():
     raw = b"array:<f4:(3,):" + np.arange(3, dtype="<f4").tobytes() + b"\0" + b'json:{"a": 0.5, "b": 1}\0'
     expected = hashlib.sha256(raw).hexdigest()[:16]
