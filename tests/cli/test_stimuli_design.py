@@ -33,7 +33,11 @@ def test_two_networks_are_told_apart_on_held_out_objects(run, poles):
     assert data["contrast"][1] >= data["contrast"][0]
     assert data["gain"]["low"] <= data["leads"][1] - data["leads"][0] <= data["gain"]["high"]
     assert set(data["layers"]) == set(NETWORKS.split(","))
-    told = run(*arguments).out
+
+
+@pytest.mark.slow
+def test_a_design_for_networks_is_told_in_words(run, poles):
+    told = run("stimuli", "design", poles, "--variables", "object_y", "--networks", NETWORKS, *QUICK).out
     for words in ("lead of the true network, held-out objects", "by gradient", "status", "object_y"):
         assert words in told
 

@@ -180,12 +180,12 @@ def test_a_link_outside_is_never_told_that_it_overlaps_wherever_the_search_begin
     surface = TriangleMesh(surface.vertices * (3.0 / np.ptp(surface.vertices, axis=0).max()), surface.faces)
     # Links that stand on a face, most of each further away than what is looked for on its own.
     rng = np.random.default_rng(0)
-    corners = surface.vertices[surface.faces[rng.integers(len(surface.faces), size=400)]]
+    corners = surface.vertices[surface.faces[rng.integers(len(surface.faces), size=200)]]
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     normal /= np.maximum(np.linalg.norm(normal, axis=1), 1e-12)[:, None]
     starts = corners.mean(axis=1) + 0.02 * normal
     stops = starts + 0.3 * (normal + 0.5 * rng.normal(size=normal.shape))
-    share = np.linspace(0, 1, 21)[:, None, None]
+    share = np.linspace(0, 1, 11)[:, None, None]
     points = starts + share * (stops - starts)
     outside = ~np.array([_inside(surface, some) for some in points]).any(axis=0)
     away = np.array([_distances(surface, some) for some in points]).min(axis=0)
