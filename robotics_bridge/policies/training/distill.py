@@ -22,10 +22,11 @@ from typing import Any, Literal
 import torch
 from torch import nn
 
-from brainbench.core.errors import UsageError, missing_dependency
+from brainbench.core.errors import missing_dependency
 from brainbench.core.files import provenance, read_mapping, to_plain, write_json
 from brainbench.core.progress import Progress
-from brainbench.models.training.run_folder import RunLog, load_state, save_state
+from brainbench.core.writing.locks import lock_folder
+from brainbench.models.training.run_folder import RunLog, check_same, load_state, save_state
 from robotics_bridge.policies.encoders.arms import perceptron
 from robotics_bridge.policies.evaluate import Policy
 from robotics_bridge.policies.fit import check_version
@@ -85,7 +86,7 @@ def distill(
         progress: Called with (iterations done, iterations in all, what).
 
     Raises:
-        UsageError: the folder holds another run, or the environment does not fit.
+        UsageError: the folder holds another run, another process is writing it, or the environment does not fit.
         DataError: a file of the run is damaged.
         MissingDependencyError: rsl-rl-lib is not installed.
     """
@@ -94,7 +95,7 @@ def distill(
     except ImportError as error:  # without it a student can act, but not learn
         raise missing_dependency("rsl-rl-lib", extra="policies", purpose="Training policies") from error
     devices = [env.device] if torch.device(env.device).type == "cuda" else []
-    with torch.random.fork_rng(devices=devices):
+    with lock_folder(Path(out), wait=False), torch.random.fork_rng(devices=devices):
         torch.manual_seed(config.seed)
         run = _Run(config.resolved(env.task.student), Path(out), env, teacher, graphs=graphs)
         # Products as exact as PyTorch's convolutions are by default.
@@ -291,13 +292,7 @@ class _Run:
         if path.is_file():
             known = read_mapping(path)
             check_version(known, str(self.out))
-            found = known.get("distill")
-            differing = sorted(key for key in mine if not isinstance(found, dict) or found.get(key) != mine[key])
-            if differing:
-                raise UsageError(
-                    f"{str(self.out)!r} holds another student (its {differing[0]} differs); choose another folder, or "
-                    "delete it to start anew."
-                )
+            check_same(self.out, known.get("distill"), mine, "student")
             return
         write_json(path, describe_run(self.config, self.student, self.env))
 

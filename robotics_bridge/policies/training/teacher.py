@@ -25,7 +25,7 @@ from brainbench.core.progress import Progress
 from brainbench.core.reading.regular import readable
 from brainbench.core.reading.tensors import check_finite
 from brainbench.core.writing.locks import lock_folder
-from brainbench.models.training.run_folder import LOG, RESTART, trim_log
+from brainbench.models.training.run_folder import LOG, RESTART, check_same, trim_log
 from robotics_bridge.envs.rsl_rl import RslRlEnv
 from robotics_bridge.policies.acting import ActingModel
 from robotics_bridge.policies.evaluate import Policy
@@ -314,12 +314,8 @@ def _resume(trainer: Trainer, run: Path, facts: dict[str, Any]) -> None:
     with readable(config, "configuration of a run"):
         # Settings that came later than the run had their defaults in it.
         known["settings"] = asdict(TeacherSettings(**_plain(known["settings"])))
-    for name in ("task", "hand", "num_envs", "seed", "settings", "observe", "contacts"):
-        if json.loads(json.dumps(facts[name])) != json.loads(json.dumps(known.get(name))):
-            raise UsageError(
-                f"The run in {str(run)!r} has {name} = {known.get(name)!r}; this one {facts[name]!r}. "
-                "Choose another folder."
-            )
+    names = ("task", "hand", "num_envs", "seed", "settings", "observe", "contacts")
+    check_same(run, json.loads(json.dumps(known)), {name: json.loads(json.dumps(facts[name])) for name in names})
     if not (run / RESUME).exists():
         trim_log(run / LOG, "iteration", 0)
         return

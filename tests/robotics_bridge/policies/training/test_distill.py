@@ -10,6 +10,7 @@ import pytest
 import torch
 
 from brainbench.core.errors import DataError, MissingDependencyError, UsageError
+from brainbench.core.writing.locks import lock_folder
 from robotics_bridge.policies.evaluate import Policy
 from robotics_bridge.policies.training.distill import distill
 from robotics_bridge.policies.training.distill_config import DistillConfig
@@ -159,8 +160,10 @@ def test_tables_4_4_fills_what_is_left_open_and_logs_say_what_was_learned(tmp_pa
 
 def test_requests_that_do_not_fit_are_refused(tmp_path) -> None:
     _run(tmp_path, iterations=2)
-    with pytest.raises(UsageError, match=r"\(its learning_rate"):
+    with pytest.raises(UsageError, match=r"another student: learning_rate .* \(now 0\.01\)"):
         _run(tmp_path, iterations=2, learning_rate=1e-2)
+    with lock_folder(tmp_path), pytest.raises(UsageError, match="Another process is writing"):
+        _run(tmp_path, iterations=3)
     with pytest.raises(UsageError, match="did you mean 'mse'"):
         _config(loss="ms")
     with pytest.raises(UsageError, match=r"share .* received 2"):

@@ -178,7 +178,7 @@ def test_learning_begins_with_the_wide_goal_and_goes_on_with_the_one_it_reached(
 
 def test_a_folder_of_another_run_is_refused(tmp_path: Path) -> None:
     train(_env(), tmp_path, settings=SMALL, iterations=1)
-    with pytest.raises(UsageError, match=r"'epochs': 2.*'epochs': 3"):
+    with pytest.raises(UsageError, match=r"another run: settings\.epochs 2 \(now 3\)"):
         train(_env(), tmp_path, settings=replace(SMALL, epochs=3), iterations=2)
 
 
