@@ -128,7 +128,7 @@ def to_plain(value: Any) -> Any:
         return os.fspath(value)
     as_list = getattr(value, "tolist", None)  # numpy scalars and arrays, torch tensors
     if callable(as_list):
-        plain = as_list()
+        plain: Any = as_list()
         # A long double has no type of its own in Python and gives itself.
         return to_plain(float(plain) if type(plain) is type(value) else plain)
     if isinstance(value, float) and not math.isfinite(value):
