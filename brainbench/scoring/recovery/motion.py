@@ -22,6 +22,7 @@ from brainbench.core.contracts import GRID_SHAPE
 from brainbench.core.errors import DataError, UsageError
 from brainbench.core.records import Interval, Status
 from brainbench.core.statistics import t_interval
+from brainbench.metrics.measures.patterns import LinearCKA
 from brainbench.metrics.measures.registry import get_metric
 from brainbench.scoring.model_responses import ResolvedModel, resolve_model
 from brainbench.scoring.options import ScoreOptions
@@ -218,9 +219,8 @@ class _Evaluator:
         found = self.features(values)
         if found is None:
             return math.nan
-        grams = [(centred := some - some.mean(axis=0)) @ centred.T for some in found]
-        sizes = [float(np.linalg.norm(gram)) for gram in grams]
-        return 1 - float(np.vdot(*grams)) / (sizes[0] * sizes[1]) if min(sizes) > 0 else 0.0
+        alike = LinearCKA().similarity(*found)
+        return 0.0 if math.isnan(alike) else 1 - alike
 
     def features(self, values: Array) -> list[Array] | None:
         """Return the responses [K, F] of both networks at some values; None with unstable whiskers."""
