@@ -43,8 +43,9 @@ touch     320  python3 -m benchmarks.tactile.throughput --device cuda --part sen
 friction  150  python3 -m benchmarks.tactile.friction_cost --device cuda --write
 gradients 500  python3 -m benchmarks.whiskers.gradient_cost --device cuda --each 1 --input inputs/gradients.npz --write
 teachers  590  python3 -m benchmarks.policies.jobs run $JOB --minutes ${MINUTES:-7.5}
-students-for 1200 python3 -m benchmarks.policies.students --teacher $TEACHER --config careful --seed $SEED --arms ${ARMS:-none_memory ft_hand reservoir ead_untrained ead_simclr} --no-agents --device cuda --envs 4096 --iterations 110 --learning-rate 5e-4 --episodes 512 --together 2 --end $(($(cat /w/t0) + 1680)) --out /tmp/run/students-$SEED
-training  420  python3 -m brainbench stimuli sweep thesis-low procedural:30 --split sweep --device cuda $P --out /tmp/few && python3 -m benchmarks.models.data_parallel /tmp/few --counts 1,2,4 --networks zhuang-intersection-ln+gpt.supervised --out /w/out/data-parallel.json
+students-for 1500 python3 -m benchmarks.policies.students --teacher $TEACHER --config careful --seed $SEED --arms ${ARMS:-none_memory ft_hand reservoir ead_untrained ead_simclr} --no-agents --evaluations 1 --device cuda --envs 4096 --iterations 110 --learning-rate 5e-4 --episodes 512 --together 2 --end $(($(cat /w/t0) + 1680)) --out /tmp/run/students-$SEED
+few       240  python3 -m brainbench stimuli sweep thesis-low procedural:30 --split sweep --device cuda $P --out /tmp/few
+training  300  python3 -m benchmarks.models.data_parallel /tmp/few --counts $COUNTS --networks zhuang-intersection-ln+gpt.supervised --out /w/out/data-parallel-$COUNTS.json
 TABLE
 }
 

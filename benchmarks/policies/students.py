@@ -40,7 +40,8 @@ if TYPE_CHECKING:
 NETWORK = "zhuang-intersection-ln-small"
 ARMS: dict[str, dict[str, Any]] = {
     "none": {"observe": "none"},
-    "none_memory": {"observe": "none", "embedder": "lstm"},
+    # Wider, so that it learns as many parameters as the others.
+    "none_memory": {"observe": "none", "embedder": "lstm", "hidden": (1024, 256, 128)},
     "ft_hand": {"observe": "force_torque", "placement": "hand"},
     "ft_tips": {"observe": "force_torque", "placement": "tips"},
     "bool_hand": {"observe": "agg_bool", "placement": "hand"},
@@ -116,7 +117,7 @@ def train(options: argparse.Namespace) -> None:
 
     student = train_student(
         config, folder, device=options.device, episodes=options.episodes, stop_after=left, stop_at=options.iterations,
-        progress=tell,
+        progress=tell, evaluations=options.evaluations,
     )  # fmt: skip
     logged = [json.loads(line) for line in (folder / "log.jsonl").read_text(encoding="utf-8").splitlines()]
     last = {kind: next((row for row in reversed(logged) if row["kind"] == kind), {}) for kind in ("loss", "time")}
@@ -375,6 +376,7 @@ def main() -> None:
     parser.add_argument("--teacher-share", type=float, default=0.0, help="of the first iteration's actions")
     parser.add_argument("--teacher-iterations", type=int, default=0, help="over which that share falls to 0")
     parser.add_argument("--episodes", type=int, default=512, help="per evaluation seed, at least")
+    parser.add_argument("--evaluations", type=int, default=3, help="seeds of evaluation, of --envs episodes each")
     parser.add_argument("--end", type=float, help="second since 1970 by which all is done")
     parser.add_argument("--reserve", type=float, default=_PER_EVALUATION, help="of it, for start and evaluation")
     parser.add_argument("--every", type=int, default=25, help="iterations between rows")

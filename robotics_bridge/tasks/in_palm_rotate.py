@@ -123,8 +123,3 @@ def careful() -> Task:
     )
     return replace(task, rewards=rewards, teacher=settings, goal=FLAT_GOAL)
 
-
-@register("in_palm_rotate", "deployed")
-def deployed() -> Task:
-    """Return ``careful`` with targets that move no faster than the rated speed of the joints, as on a real hand."""
-    return replace(careful(), rated_speed=True)

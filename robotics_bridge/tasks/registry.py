@@ -39,16 +39,18 @@ def register(name: str, config: str = "default") -> Callable[[Maker], Maker]:
 
 
 def bounded(task: Task) -> Task:
-    """Return a published task as we train it: firm contacts, bounded actions, taxels that hold, students with commands.
+    """Return a published task as we train it: firm contacts, targets as on a hand, taxels that hold, commands.
 
-    A student is told what to do and does not read the goal, which follows from the object's pose. Goals are judged by
+    Actions are bounded, and targets move no faster than the joints are rated for. A student is told what to do and does not read the goal, which follows from the object's pose. Goals are judged by
     what an object looks like.
     """
     student = tuple(name for name in task.groups["student"] if name != "goal")
     groups = {**task.groups, "student": (*student, "command")}
     goal = task.goal and replace(task.goal, by_looks=True)
-    firm = CONTACTS["firm"]
-    return replace(task, contacts=firm, action_limit=ACTION_LIMIT, taxel_twist=None, groups=groups, goal=goal)
+    return replace(
+        task, contacts=CONTACTS["firm"], action_limit=ACTION_LIMIT, rated_speed=True, taxel_twist=None, groups=groups,
+        goal=goal,
+    )  # fmt: skip
 
 
 def register_bounded(name: str, published: Maker) -> None:

@@ -203,7 +203,7 @@ class Task:
     """
     rated_speed: bool = False
     """Whether targets move no faster than the rated speed of the joints, as those of a deployed policy do
-    (:class:`~robotics_bridge.deploy.safety.SafetyLimits`); ``--change rated_speed=true``."""
+    (:class:`~robotics_bridge.deploy.safety.SafetyLimits`)."""
     # --- randomness ---
     actuators: ActuatorRandomisation | None = ActuatorRandomisation()
     object_changes: ObjectRandomisation = ObjectRandomisation()
@@ -280,7 +280,7 @@ class Task:
 ACTION_LIMIT = 2.0
 """Bound of actions of the tasks on which we train: an action of 1 is half a joint's range, so 2 reaches every target
 from every rest position."""
-TASK_VERSION = 2
+TASK_VERSION = 3
 """Raised when a change of the tasks leaves earlier policies in a world that they were not trained in."""
 GROUPS = (
     "proprio", "tactile", "link_pose", "command", "goal", "priv_proprio", "priv_obj_state", "priv_obj_props",

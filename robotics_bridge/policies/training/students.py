@@ -49,6 +49,7 @@ def train_student(
     *,
     device: str = "cpu",
     episodes: int = 100,
+    evaluations: int = len(SEEDS),
     stop_after: float | None = None,
     stop_at: int | None = None,
     progress: Progress | None = None,
@@ -60,6 +61,7 @@ def train_student(
         out: The run's folder; a finished and evaluated run is left as it is.
         device: ``cpu``, or ``cuda`` for MuJoCo Warp.
         episodes: Per evaluation seed; 0 evaluates nothing. An evaluation says how many iterations the student had.
+        evaluations: How many of :data:`SEEDS` it is evaluated with.
         stop_after: Seconds; this and the next as of :func:`~robotics_bridge.policies.training.distill.distill`.
         stop_at: Iterations.
         progress: Called with (done, in all, what).
@@ -91,7 +93,7 @@ def train_student(
     result = distill(config, out, env=env, teacher=teacher, stop_after=stop_after, stop_at=stop_at, progress=progress)
     if result.status == "diverged" or not episodes:
         return Student(out, result, ())
-    return Student(out, result, evaluate_student(out, env, episodes, result.iterations, progress))
+    return Student(out, result, evaluate_student(out, env, episodes, result.iterations, progress, evaluations))
 
 
 def calibrated(config: DistillConfig, env: Any, teacher: Any, out: Path) -> DistillConfig:
@@ -125,16 +127,16 @@ def _measure(tactile: EncoderConfig, env: Any, teacher: Any) -> HandCalibration:
 
 
 def evaluate_student(
-    folder: str | Path, env: Any, episodes: int, iterations: int, progress: Progress | None
+    folder: str | Path, env: Any, episodes: int, iterations: int, progress: Progress | None, evaluations: int
 ) -> tuple[dict[str, Any], ...]:
-    """Run whole episodes with a student and write ``evaluation.json``, one entry per seed.
+    """Run whole episodes with a student and write ``evaluation.json``, one entry per seed of the first ``evaluations``.
 
     An entry lists per episode ``success``, ``metric``, ``returns``, ``goals``, ``turn_rate`` (rad/s), ``seconds`` and
     ``dropped`` (:class:`~robotics_bridge.policies.evaluate.Evaluation`), and holds the ``iterations`` learned so far.
     """
     student, _ = load_student(folder, device=str(env.device))
     policy, found = Policy(student), []
-    for number, seed in enumerate(SEEDS):
+    for number, seed in enumerate(SEEDS[:evaluations]):
         result = evaluate(env, policy, episodes=episodes, seed=seed, name=Path(folder).name)
         found.append(
             {
@@ -144,6 +146,6 @@ def evaluate_student(
             }
         )  # fmt: skip
         if progress is not None:
-            progress(number + 1, len(SEEDS), "evaluating")
+            progress(number + 1, evaluations, "evaluating")
     write_json(Path(folder) / EVALUATION, found)
     return tuple(found)
