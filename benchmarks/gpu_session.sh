@@ -12,8 +12,9 @@
 #   device, 3:  carry .gpu/c .session   bash .gpu/c/install.sh && bash .session/gpu_session.sh start && bash /w/gpu.sh run tests
 #   device, 4…: bash /w/gpu.sh run PART …                             each at most as long as it says; all below 600 s
 #   or, on a machine of several GPUs, parts in the background, one after the other on each GPU, and a look at them:
-#               JOB=teacher-plain-0 bash /w/gpu.sh lane 2 teachers; bash /w/gpu.sh look SECOND
-#               TEACHER=/tmp/run/teacher-plain-0 SEED=0 bash /w/gpu.sh lane 2 students-for
+#               JOB=teacher-deployed-0 bash /w/gpu.sh lane 2 teachers; bash /w/gpu.sh look SECOND
+#               TEACHER=/tmp/run/teacher-deployed-0 PLAN="0:ead_simclr,reservoir 4:ead_simclr" bash /w/gpu.sh lane 2 students-for
+#               (PLAN: seed:arms …)
 #               (SECOND of the machine's life; policies/jobs.toml says which teachers to compare, and what to compare; on
 #               a fresh machine two minutes of a teacher's go into compiling)
 #   here:       git checkout -f main && git branch -D device; python -m benchmarks.report after copying results/*.json
@@ -24,7 +25,7 @@
 # What is open of sweeps: whether tries ahead gain on an idle GPU (sweeps-1; hashes are equal); when kernels are loaded and
 # shards begin (sweeps-2); how a GPU is shared where shards queue, 16 or 32 at once (sweeps-3); what users get (sweeps-4),
 # and on 2 and 4 GPUs (scaling, all GPUs idle: 164, 97 and 74 s on 2026-11-26); which kernel takes the time (slices).
-# Training on 1, 2 and 4 GPUs: training, all GPUs idle. Of free motion: bending alone beside twist, and fewer threads at a time,
+# Training on 1, 2 and 4 GPUs: few, then training with COUNTS=1,2,4, all GPUs idle. Of free motion: bending alone beside twist, and fewer threads at a time,
 # whose memory then fits the cache (free). golden compiles three kernels of 20 s each (200 s until 2026-11-26).
 set -eu
 
@@ -36,14 +37,15 @@ sweeps-1  150  python3 -m benchmarks.whiskers.public_rate --objects procedural-2
 sweeps-2   90  python3 -m benchmarks.whiskers.public_rate --objects procedural-24:2 $P --parts stages
 sweeps-3  240  for n in 16 32; do python3 -m benchmarks.whiskers.public_rate --objects procedural-24:8 $P --parts stages --side-by-side $n; done
 sweeps-4  120  python3 -m benchmarks.whiskers.public_rate --objects procedural-24:2 $P --parts command --write
-scaling   480  python3 -m benchmarks.whiskers.public_rate --objects procedural-24:32 $P --parts command --gpus 1,2,4 --write
+scaling   480  python3 -m benchmarks.whiskers.public_rate --objects procedural-24:32 $P --parts command --gpus ${COUNTS:-1,2,4}
 slices    150  python3 -m benchmarks.whiskers.slices --objects procedural-24:2 --device cuda --write
 free      150  python3 -m benchmarks.whiskers.throughput --only free --blocks 64,256,320 --bounds 0,64x6
 touch     320  python3 -m benchmarks.tactile.throughput --device cuda --part sensors --input inputs/pyramid.npz --write
+variants  300  python3 -m benchmarks.tactile.variants --device cuda --input inputs/pyramid.npz
 friction  150  python3 -m benchmarks.tactile.friction_cost --device cuda --write
 gradients 500  python3 -m benchmarks.whiskers.gradient_cost --device cuda --each 1 --input inputs/gradients.npz --write
 teachers  590  python3 -m benchmarks.policies.jobs run $JOB --minutes ${MINUTES:-7.5}
-students-for 1500 python3 -m benchmarks.policies.students --teacher $TEACHER --config careful --seed $SEED --arms ${ARMS:-none_memory ft_hand reservoir ead_untrained ead_simclr} --no-agents --evaluations 1 --device cuda --envs 4096 --iterations 110 --learning-rate 5e-4 --episodes 512 --together 2 --end $(($(cat /w/t0) + 1680)) --out /tmp/run/students-$SEED
+students-for 1500  for one in $PLAN; do python3 -m benchmarks.policies.students --teacher $TEACHER --config careful --seed ${one%%:*} --arms $(echo ${one#*:} | tr , ' ') ${AGENTS---no-agents} --evaluations 1 --device cuda --envs 4096 --iterations 110 --learning-rate 5e-4 --episodes 512 --together 2 --end $(($(cat /w/t0) + 1670)) --reserve 60 --out /tmp/run/students-${one%%:*}; done
 few       240  python3 -m brainbench stimuli sweep thesis-low procedural:30 --split sweep --device cuda $P --out /tmp/few
 training  300  python3 -m benchmarks.models.data_parallel /tmp/few --counts $COUNTS --networks zhuang-intersection-ln+gpt.supervised --out /w/out/data-parallel-$COUNTS.json
 TABLE
