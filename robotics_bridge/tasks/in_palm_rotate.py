@@ -122,4 +122,3 @@ def careful() -> Task:
         task.teacher, rnd_weight=50.0, learning_rate=3e-4, learning_rate_range=(1e-4, 3e-3), std_range=(0.2, 1.0)
     )
     return replace(task, rewards=rewards, teacher=settings, goal=FLAT_GOAL)
-

@@ -41,8 +41,8 @@ def register(name: str, config: str = "default") -> Callable[[Maker], Maker]:
 def bounded(task: Task) -> Task:
     """Return a published task as we train it: firm contacts, targets as on a hand, taxels that hold, commands.
 
-    Actions are bounded, and targets move no faster than the joints are rated for. A student is told what to do and does not read the goal, which follows from the object's pose. Goals are judged by
-    what an object looks like.
+    Actions are bounded, and targets move no faster than the joints are rated for. A student is told what to do and does
+    not read the goal, which follows from the object's pose. Goals are judged by what an object looks like.
     """
     student = tuple(name for name in task.groups["student"] if name != "goal")
     groups = {**task.groups, "student": (*student, "command")}

@@ -6,7 +6,7 @@ Letters: T control step, B environment, S sub-step, N taxel, F feature.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -15,6 +15,7 @@ from brainbench.core.contracts import CHANNELS
 from robotics_bridge.hands.observations import TAXELS_IN_CONTACT
 from robotics_bridge.policies.encoders.calibration import HandCalibration
 from robotics_bridge.policies.encoders.front_end import FrontEnd
+from robotics_bridge.policies.encoders.posture import PostureTurn
 from robotics_bridge.policies.encoders.reservoir import EchoState
 from robotics_bridge.policies.encoders.taxel_grid import TaxelGrid
 from robotics_bridge.policies.readouts.rollout import TouchRollout
@@ -112,6 +113,18 @@ def grid(one: Subject) -> Features:
     return felt.flatten(1).unflatten(0, one.rollout.taxels.shape[:2])
 
 
+def bent(one: Subject) -> Subject:
+    """Return a subject whose map follows the posture of the fingers."""
+    turn, rollout = PostureTurn(one.grid).to(one.rollout.taxels.device), one.rollout
+    steps = zip(rollout.taxels, rollout.link_pose, strict=True)
+    return replace(one, rollout=replace(rollout, taxels=torch.stack([turn(*step) for step in steps])))
+
+
+def _reservoirs(one: Subject) -> list[Features]:
+    seeds = range(one.seed, one.seed + one.reservoirs)
+    return [reservoir(one.rollout, one.grid, one.calibration, seed=seed) for seed in seeds]
+
+
 def _with_traces(features: Callable[[Subject], Features]) -> Callable[[Subject], list[Features]]:
     return lambda one: [traces(features(one), one.rollout.begun)]
 
@@ -126,11 +139,12 @@ ARMS: Mapping[str, Callable[[Subject], list[Features]]] = {
     "taxels": lambda one: [raw(one.rollout)],
     "taxels, memory": _with_traces(lambda one: raw(one.rollout)),
     "grid, memory": _with_traces(grid),
-    "reservoir": lambda one: [
-        reservoir(one.rollout, one.grid, one.calibration, seed=one.seed + draw) for draw in range(one.reservoirs)
-    ],
+    "grid, posture, memory": _with_traces(lambda one: grid(bent(one))),
+    "reservoir": _reservoirs,
+    "reservoir, posture": lambda one: _reservoirs(bent(one)),
     "untrained": lambda one: _networks("native", NETWORK, one, range(one.untrained)),
     "simclr": lambda one: _networks("native", f"{NETWORK}.simclr", one),
+    "simclr, posture": lambda one: _networks("native", f"{NETWORK}.simclr", bent(one)),
     "supervised": lambda one: _networks("native", f"{NETWORK}.supervised", one),
     "untrained, 45 ms": lambda one: _networks("resampled", NETWORK, one, range(one.untrained)),
     "simclr, 45 ms": lambda one: _networks("resampled", f"{NETWORK}.simclr", one),
@@ -138,4 +152,5 @@ ARMS: Mapping[str, Callable[[Subject], list[Features]]] = {
 }
 """Arm → its features, once for each draw; every arm has the joints beside them. ``none`` feels nothing, ``bits`` has
 one bit per link, ``force`` and ``taxels`` every taxel's force, and force with torque; ``memory`` adds two leaky
-averages. ``grid`` is the input of the networks. ``45 ms``: at the pace of training, else a step per control step."""
+averages. ``grid`` is the input of the networks, with ``posture`` along the fingers as they are
+bent. ``45 ms``: at the pace of training, else a step per control step."""

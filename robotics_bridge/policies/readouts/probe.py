@@ -150,7 +150,8 @@ def place(
 CONTRASTS = (
     ("simclr", "untrained"), ("supervised", "untrained"), ("simclr", "reservoir"), ("supervised", "reservoir"),
     ("simclr, 45 ms", "untrained, 45 ms"), ("supervised, 45 ms", "untrained, 45 ms"), ("reservoir", "none, memory"),
-    ("simclr", "taxels, memory"), ("simclr", "bits, memory"),
+    ("simclr", "taxels, memory"), ("simclr", "bits, memory"), ("grid, posture, memory", "grid, memory"),
+    ("reservoir, posture", "reservoir"), ("simclr, posture", "simclr"),
 )  # fmt: skip
 """Arms that are compared."""
 

@@ -39,6 +39,8 @@ class TouchRollout:
     """Name → [T, B, 3]; NaN where undefined."""
     valid: torch.Tensor
     """[T, B] bool: past the settling of its episode."""
+    link_pose: torch.Tensor
+    """[T, B, L, 7] of the tactile links in the palm's frame (m, quaternion)."""
 
     @property
     def wanted(self) -> torch.Tensor:
@@ -62,6 +64,7 @@ def collect(env: Env, policy: Acting, seconds: float) -> TouchRollout:
     for _ in range(round(seconds / env.step_dt)):
         velocity, spin = env.state.target_velocity
         row = {"proprio": observations["proprio"], "taxels": observations["tactile"], "begun": age == 0}
+        row["link_pose"] = env.link_pose
         row |= {"position": env.state.target_pose[:, :3], "velocity": velocity, "spin": spin}
         row |= {"contact": _centre(env, age), "valid": age >= _SETTLING}
         for name, value in row.items():

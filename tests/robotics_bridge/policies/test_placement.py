@@ -72,7 +72,7 @@ def test_nothing_is_gained_by_choosing_from_noise() -> None:
         name: torch.randn(60, 40, 3, generator=generator) for name in ("position", "velocity", "spin", "contact")
     }
     begun = torch.zeros(60, 40, dtype=torch.bool)
-    rollout = TouchRollout(torch.zeros(60, 40, 1), touch, begun, targets, ~begun)
+    rollout = TouchRollout(torch.zeros(60, 40, 1), touch, begun, targets, ~begun, torch.empty(0))
     layout = {"link": Probes(np.zeros((40, 3)), np.tile([0.0, 0.0, 1.0], (40, 1)), np.full(40, 1e-3), (40,))}
     found = {one.name: one.readout for one in placement.read_placements(rollout, layout, 10, draws=3)}
     assert abs(found["chosen"].r2("position") - found["random"].r2("position")) < 0.02
@@ -90,7 +90,7 @@ def test_chosen_taxels_are_read_on_environments_that_did_not_choose_them(monkeyp
     begun = torch.zeros(30, 20, dtype=torch.bool)
     half = (torch.arange(20) >= 10).float()[None, :, None].expand(30, 20, 3)
     targets = {name: half + 0.01 * torch.randn(30, 20, 3) for name in ("position", "velocity", "spin", "contact")}
-    rollout = TouchRollout(torch.zeros(30, 20, 1), torch.randn(30, 20, 1, 8, 6), begun, targets, ~begun)
+    rollout = TouchRollout(torch.zeros(30, 20, 1), torch.randn(30, 20, 1, 8, 6), begun, targets, ~begun, torch.empty(0))
     layout = {"link": Probes(np.zeros((8, 3)), np.tile([0.0, 0.0, 1.0], (8, 1)), np.full(8, 1e-3), (8,))}
     found = {one.name: one for one in placement.read_placements(rollout, layout, 2, draws=1)}
     # The first half (targets near 0) is read from what the second (near 1) chose, and the other way round.

@@ -82,7 +82,7 @@ def test_memory_begins_anew_with_an_episode() -> None:
     grid = TaxelGrid("xhand1", placement="tips", resolution="low")
     touch = torch.randn(6, 2, 5, grid.items, 6, generator=torch.Generator().manual_seed(0))
     touch[3:, 1] = touch[:3, 0]
-    rollout = TouchRollout(torch.zeros(6, 2, 3), touch, begun, {}, ~begun)
+    rollout = TouchRollout(torch.zeros(6, 2, 3), touch, begun, {}, ~begun, torch.empty(0))
     state = arms.reservoir(rollout, grid, HandCalibration(), seed=1)
     torch.testing.assert_close(state[3:, 1], state[:3, 0])
     assert not torch.equal(state, arms.reservoir(rollout, grid, HandCalibration(), seed=2))
@@ -92,7 +92,7 @@ def test_bits_say_that_more_than_two_taxels_of_a_link_touch() -> None:
     touch = torch.zeros(1, 1, 1, 7, 6)
     touch[..., :2, 2] = 1.0
     touch[..., 4:, 2] = 1.0
-    rollout = TouchRollout(torch.zeros(1, 1, 1), touch, torch.ones(1, 1, dtype=torch.bool), {}, torch.ones(1, 1))
+    rollout = TouchRollout(torch.zeros(1, 1, 1), touch, torch.ones(1, 1).bool(), {}, torch.ones(1, 1), touch)
     assert arms.bits(rollout, [4, 3]).flatten().tolist() == [0.0, 1.0]
 
 
@@ -120,9 +120,9 @@ def test_options_of_a_probe_name_the_culprit() -> None:
 
 def test_what_is_read_does_not_set_the_unit_of_the_encoders() -> None:
     env = tasks.make(
-        "in_palm_rotate", num_envs=4, observe="force_torque", placement="tips", resolution="low", threads=1, seed=3
+        "in_palm_rotate", num_envs=4, observe="force_torque", placement="palm", resolution="low", threads=1, seed=3
     )
-    policy, grid = agent("random", env), TaxelGrid("xhand1", placement="tips", resolution="low")
+    policy, grid = agent("random", env), TaxelGrid("xhand1", placement="palm", resolution="low")
     first = collect(env, agent("random", env), 0.5)
     found = calibrate(env, policy, grid, 3)
     assert found != HandCalibration.fit(grid(first.taxels.flatten(0, 1)))
