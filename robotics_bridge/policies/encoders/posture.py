@@ -1,9 +1,9 @@
 """Force and torque of taxels turned so that the fixed map of a hand shows them along the fingers as they are bent.
 
 :class:`~robotics_bridge.policies.encoders.taxel_grid.TaxelGrid` shows forces in the palm's axes with all joints at
-their reference, so that a touch gives one image however its finger is bent. Here they are in the palm's axes as they
-act now; sites keep their cells. With R a link's rotation at the reference and Q R its rotation now, a site of lever l from the
-link's origin shows F = Q R f and M = Q (R m + l × R f).
+their reference, so that a touch gives one image however its finger is bent. Here forces are in the palm's axes as they
+act now; sites keep their cells. With R a link's rotation at the reference, Q R its rotation now, and l the lever from
+the middle of a site to the link's origin, the site shows F = Q R f and M = Q (R m + l × R f).
 
 Letters: B batch, S sub-step, N taxel, L link.
 """
