@@ -38,6 +38,8 @@ if TYPE_CHECKING:
     from robotics_bridge.policies.training.distill_config import DistillConfig
 
 NETWORK = "zhuang-intersection-ln-small"
+CHOSEN = "benchmarks/policies/records/taxels-in_palm_rotate-50.json"
+"""The 50 taxels that read-outs chose."""
 ARMS: dict[str, dict[str, Any]] = {
     "none": {"observe": "none"},
     # Wider, so that it learns as many parameters as the others.
@@ -50,6 +52,7 @@ ARMS: dict[str, dict[str, Any]] = {
     "ead_supervised": {"observe": "force_torque", "placement": "hand", "encoder": f"{NETWORK}.supervised"},
     "ead_untrained": {"observe": "force_torque", "placement": "hand", "encoder": NETWORK},
     "reservoir": {"observe": "force_torque", "placement": "hand", "encoder": "reservoir"},
+    "reservoir_50": {"observe": "force_torque", "placement": "hand", "encoder": "reservoir", "resolution": CHOSEN},
     "raw_rnn": {"observe": "force_torque", "placement": "hand", "encoder": "rnn"},
     "ead_finetuned": {
         "observe": "force_torque", "placement": "hand", "encoder": f"{NETWORK}.simclr",
@@ -65,6 +68,7 @@ CONTRASTS = (
     ("ead_simclr", "ead_supervised"), ("ead_simclr", "ead_untrained"), ("ead_supervised", "ead_untrained"),
     ("ead_simclr", "reservoir"), ("ead_supervised", "reservoir"), ("ft_hand", "ead_simclr"), ("ft_hand", "reservoir"),
     ("ft_hand", "none_memory"), ("reservoir", "none_memory"), ("ead_simclr", "none_memory"), ("none_memory", "none"),
+    ("reservoir_50", "reservoir"),
 )  # fmt: skip
 """Arms whose differences are tested."""
 RANDOM, TRAINED = ("reservoir", "ead_untrained"), ("ead_simclr", "ead_supervised")
@@ -262,7 +266,8 @@ def arm_of(config: DistillConfig) -> str | None:
         learning = settings.get("encoder_settings", {}).get("learning", "frozen" if _is_network(settings) else None)
         plain = {name: value for name, value in settings.items() if name != "encoder_settings"}
         wanted = DistillConfig(task=config.task, **plain)
-        same = ("observe", "embedder") if config.observe == "none" else ("observe", "embedder", "placement", "encoder")
+        felt = () if config.observe == "none" else ("placement", "resolution", "encoder")
+        same = ("observe", "embedder", *felt)
         if all(getattr(config, name) == getattr(wanted, name) for name in same) and (
             config.encoder_settings.get("learning") == learning
         ):
