@@ -98,6 +98,8 @@ def readout_functions(mode: int, hysteresis: bool, walk: bool, channels: int = 6
         walk: whether the group stores a drift.
         channels: that ``emit_six`` writes, known to the compiler so that vectors stay in registers.
     """
+    pairs = (channels + 1) // 2
+    Normals = wp.types.matrix(shape=(pairs, 4), dtype=wp.float32)
 
     @wp.func
     def measure(
@@ -181,28 +183,21 @@ def readout_functions(mode: int, hysteresis: bool, walk: bool, channels: int = 6
             if wp.static(hysteresis):
                 if knobs.hysteresis != 0.0:
                     fading = decay(io.dt / knobs.tau)
-            # Channels go in pairs because one Philox call gives the four normal numbers that two of them need.
-            for pair in range(wp.static((channels + 1) // 2)):
-                # z holds (white, walk) of the even channel, then of the odd one.
-                z = pair_normals(knobs, env + io.env_offset, probe, pair, age, episode)
-                for odd in range(2):
-                    channel = 2 * pair + odd
-                    if channel < wp.static(channels):
-                        y = apply_drawn(
-                            knobs,
-                            signal[channel],
-                            z[2 * odd],
-                            z[2 * odd + 1],
-                            fixed,
-                            fading,
-                            lag[channel],
-                            drift[channel],
-                        )
-                        io.measured[channel, env, n] = y[0]
-                        if wp.static(hysteresis):
-                            io.hysteresis[channel, env, n] = y[1]
-                        if wp.static(walk):
-                            io.walk[channel, env, n] = y[2]
+            # Channels go in pairs because one Philox call gives the four normal numbers that two of them need: (white,
+            # walk) of the even channel, then of the odd one. Calls next to each other share the schedule of their key.
+            z = Normals()
+            if knobs.white > 0.0 or knobs.walk > 0.0:
+                for pair in range(wp.static(pairs)):
+                    z[pair] = pair_normals(knobs, env + io.env_offset, probe, pair, age, episode)
+            for channel in range(wp.static(channels)):
+                white = z[channel // 2, 2 * (channel % 2)]
+                step = z[channel // 2, 2 * (channel % 2) + 1]
+                y = apply_drawn(knobs, signal[channel], white, step, fixed, fading, lag[channel], drift[channel])
+                io.measured[channel, env, n] = y[0]
+                if wp.static(hysteresis):
+                    io.hysteresis[channel, env, n] = y[1]
+                if wp.static(walk):
+                    io.walk[channel, env, n] = y[2]
 
     return SimpleNamespace(emit=emit, emit_six=emit_six, recall_six=recall_six, measure=measure)
 

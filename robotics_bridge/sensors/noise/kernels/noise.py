@@ -143,9 +143,7 @@ def decay(t: float) -> float:
 
 @wp.func
 def pair_normals(p: NoiseParams, env: int, probe: int, pair: int, age: int, episode: int) -> wp.vec4:
-    """Return (white, walk) of channel 2 ``pair`` and of the next, from one Philox call; 0 where neither is set."""
-    if p.white <= float(0.0) and p.walk <= float(0.0):
-        return wp.vec4(float(0.0), float(0.0), float(0.0), float(0.0))
+    """Return (white, walk) of channel 2 ``pair`` and of the next, from one Philox call."""
     w0, w1, w2, w3 = draw(p, env, probe, age, episode, wp.static(CHANNELS) + pair)
     first = normals(w0, w1)
     second = normals(w2, w3)
@@ -232,7 +230,9 @@ def apply_noise(
         walk_state: Drift d of the last update (0 at first).
     """
     # One call of Philox yields four words: white noise and drift of two neighbouring channels.
-    z = pair_normals(p, env, probe, channel // 2, age, episode)
+    z = wp.vec4()
+    if p.white > float(0.0) or p.walk > float(0.0):
+        z = pair_normals(p, env, probe, channel // 2, age, episode)
     white = z[0]
     walk = z[1]
     if channel % 2 == 1:
