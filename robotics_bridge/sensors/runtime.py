@@ -189,7 +189,7 @@ class ProbeRuntime(Runtime):
 
 _SHARED = 32
 """Probes that one thread of a processor takes in turn."""
-_SHARED_CUDA = {CLEAN: (8, 6144), FUSED: (4, 6144), STAGED: (8, 3072)}
+_SHARED_CUDA = {CLEAN: (8, 6144), FUSED: (1, 6144), STAGED: (8, 3072)}
 """The same on a GPU by mode: at most, and probes of a multiprocessor for each of them (measured on an H100)."""
 
 
@@ -202,7 +202,7 @@ def probe_rows(slices: Iterable[ReadoutSlice], context: LaunchContext, mode: int
     Args:
         slices: of the sensors, in the order of their numbers.
         context: of the suite.
-        mode: of the readout; noise leaves fewer registers to share.
+        mode: of the readout; noise in the same kernel leaves no registers to share.
     """
     slices = list(slices)
     cuda = bool(context.device.is_cuda)

@@ -10,6 +10,7 @@ import numpy as np
 from brainbench.core.devices import warp
 from robotics_bridge.physics.state import HandState
 from robotics_bridge.sensors.context import SuiteContext, fill
+from robotics_bridge.sensors.kernels.readout import FUSED
 from robotics_bridge.sensors.queries.surface_points import list_by_cells, sample_cloud
 from robotics_bridge.sensors.runtime import ProbeRuntime, probe_rows
 from robotics_bridge.sensors.taxels.kernels.contact_load import ContactNodes, PressArrays, SpreadPlan
@@ -31,13 +32,14 @@ class KinematicRuntime(ProbeRuntime):
         first = next(iter(sensors.values()))
         # Readings of a taxel whose forces are summed depend on others, so that none can be finished, noise included.
         super().__init__(sensors, 6, context, fusable=not self.summed)
+        rows = probe_rows(self.slices.values(), context, self.mode)
         self._kernel = kinematic_kernel(
             self.kinds, first.query == "raycast", first.convention == "physical", first.sticky, self.summed, self.mode,
-            *self.stores, context.device.is_cuda,
+            *self.stores, context.device.is_cuda, self.mode == FUSED and len(rows) == self.count,
         )  # fmt: skip
         laws = [fill(KinematicParams, sensor, friction=sensor.friction or 0.0) for sensor in sensors.values()]
         self._laws = context.array(laws, KinematicParams)
-        self.rows: Any = context.array(probe_rows(self.slices.values(), context, self.mode), wp.vec4i)
+        self.rows: Any = context.array(rows, wp.vec4i)
         """Warp array [R]: rows of taxels that one thread takes in turn."""
         self.plan, self.nodes, self.press = SpreadPlan(), ContactNodes(), PressArrays()
         """Warp structures of the sums, empty here."""

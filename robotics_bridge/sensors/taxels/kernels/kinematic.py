@@ -32,6 +32,8 @@ THREADS = 256
 """Threads of a block."""
 BLOCKS = {CLEAN: 3, FUSED: 2, STAGED: 3}
 """Blocks that a multiprocessor holds at once, by mode: what registers are left to a thread."""
+BLOCKS_SINGLE = 4
+"""The same where every row is one taxel, except for ray casts, which need the registers."""
 
 
 @wp.struct
@@ -104,6 +106,7 @@ def kinematic_kernel(
     hysteresis: bool,
     walk: bool,
     fast: bool = False,
+    single: bool = False,
 ) -> Any:
     """Return the kernel of KinematicTaxel (4.6–4.9). Dim [B R], R rows of probes that one thread takes in turn.
 
@@ -119,6 +122,7 @@ def kinematic_kernel(
         hysteresis: whether it is stored.
         walk: whether it is stored.
         fast: square roots and quotients of the GPU's approximate units (2 units in the last place).
+        single: every row is one taxel; nothing is kept for another.
     """
     shapes, readout = shape_functions(kinds, raycast), readout_functions(mode, hysteresis, walk)
     shape_of, distance_to = shapes.shape_of, shapes.distance_to
@@ -130,7 +134,7 @@ def kinematic_kernel(
     @wp.kernel(
         module="unique",
         grid_stride=False,
-        launch_bounds=(THREADS, BLOCKS[mode]),
+        launch_bounds=(THREADS, BLOCKS_SINGLE if single and not raycast else BLOCKS[mode]),
         module_options={"fast_math": fast},
     )
     def kinematic(
@@ -278,20 +282,30 @@ def kinematic_kernel(
                     if best < radius or noisy > 0.0:
                         velocity = entry_of(pairs.velocity, env, place)
                         spin = entry_of(pairs.spin, env, place)
-                        if best < radius:
+                        if wp.static(mode == CLEAN):
                             truth = wrench(law, x, radius - best, normal, velocity, spin, sigma)
-                        if wp.static(mode != CLEAN):
-                            if noisy > 0.0:
-                                signal = wrench(law, x, noisy, normal, velocity, spin, sigma)
+                        else:
+                            # Both are worked out, so that they share what is the same. The law is read again here, as
+                            # are the knobs below: until then other numbers need the registers.
+                            again = laws[part]
+                            truth = wrench(again, x, radius - best, normal, velocity, spin, sigma)
+                            signal = wrench(again, x, noisy, normal, velocity, spin, sigma)
+                            if best >= radius:
+                                truth = wp.spatial_vectorf()
+                            if noisy <= 0.0:
+                                signal = wp.spatial_vectorf()
                     if wp.static(mode == CLEAN):
                         store_planes(io.truth, env, n, 6, truth)
                     else:
-                        emit_six(io, knobs, env, n, probe, age, episode, fixed, lag, drift, truth, signal)
+                        emit_six(io, io.knobs[part], env, n, probe, age, episode, fixed, lag, drift, truth, signal)
             elif wp.static(summed):
                 press.total[env, n] = 0.0
             else:
                 idle(io, 6, env, n)
             n += span[2]
+            if wp.static(single):
+                # Told so, the compiler keeps nothing for further taxels in registers.
+                n = span[1]
         if wp.static(summed):
             press.part[env, at_row] = wp.spatial_vectorf(touched, whole, straight, field[0], field[1], field[2])
 
