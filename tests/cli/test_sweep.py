@@ -54,7 +54,9 @@ def test_sweeps_are_simulated_once_into_shards_with_a_manifest(run, tmp_path):
     # What is there is never taken for something else.
     other = run(*arguments, "--out", str(folder), *SMALL, "--whiskers", "C2", "--split", "sweep")
     assert other.status == 2
-    assert "begun with other split, whiskers" in other.err
+    assert "another data set" in other.err
+    assert "split 'object' (now 'sweep')" in other.err
+    assert "whiskers.names" in other.err
 
 
 @pytest.mark.parametrize(

@@ -11,17 +11,18 @@ from __future__ import annotations
 import json
 import logging
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import torch
 from torch import nn
 
-from brainbench.core.errors import DataError, UsageError, install_command, shown
+from brainbench.core.errors import DataError, install_command, shown
 from brainbench.core.files import atomic_path, read_mapping, write_json, write_text
 from brainbench.core.reading.regular import check_file, readable, reason
 from brainbench.core.reading.tensors import check_finite
+from brainbench.core.writing.same_run import check_same
 
 _log = logging.getLogger(__name__)
 
@@ -44,30 +45,6 @@ def claim(folder: Path, identity: Mapping[str, Any], *, write: bool) -> None:
     elif write:
         folder.mkdir(parents=True, exist_ok=True)
         write_json(path, {"run": dict(identity), "status": "running"})
-
-
-def check_same(folder: Path, known: object, identity: Mapping[str, Any], what: str = "run") -> None:
-    """Check that what is known of the run in a folder is what identifies this one, both as JSON has it.
-
-    Raises:
-        UsageError: the folder holds another run.
-    """
-    other, mine = (dict(_leaves(part)) if isinstance(part, Mapping) else {} for part in (known, identity))
-    # Of what identifies a run, no part may have more in it than now.
-    names = [*mine, *(name for name in other if name not in mine and name.partition(".")[0] in identity)]
-    if differing := [name for name in names if other.get(name) != mine.get(name)]:
-        told = ", ".join(f"{name} {shown(other.get(name))} (now {shown(mine.get(name))})" for name in differing[:4])
-        raise UsageError(
-            f"{str(folder)!r} holds another {what}: {told}. Choose another folder, or delete it to start anew."
-        )
-
-
-def _leaves(values: Mapping[str, Any], above: str = "") -> Iterator[tuple[str, Any]]:
-    for name, value in values.items():
-        if isinstance(value, Mapping) and value:
-            yield from _leaves(value, f"{above}{name}.")
-        else:
-            yield f"{above}{name}", value
 
 
 def mark(folder: Path, **values: Any) -> None:

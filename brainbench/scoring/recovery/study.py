@@ -11,11 +11,12 @@ from typing import Any
 import numpy as np
 
 from brainbench.core.errors import UsageError
-from brainbench.core.files import content_hash, read_json, read_mapping, to_plain, write_json
+from brainbench.core.files import read_json, read_mapping, to_plain, write_json
 from brainbench.core.jobs import run_jobs
 from brainbench.core.progress import Progress
 from brainbench.core.reading.ranges import check_number
 from brainbench.core.reading.regular import readable
+from brainbench.core.writing.same_run import check_same
 from brainbench.metrics.measures.registry import get_metric
 from brainbench.scoring.recovery.boards import RecoveryBoard, make_board
 from brainbench.scoring.recovery.candidates import Candidate
@@ -126,14 +127,10 @@ def check_candidates(candidates: Sequence[Candidate], design: RecoveryDesign, bo
 def _begin(folder: Path, config: dict[str, Any]) -> None:
     """Refuse to go on with what was begun otherwise; note what is begun."""
     folder.mkdir(parents=True, exist_ok=True)
-    stated = {**config, "hash": content_hash(config)}
     path = folder / _CONFIG
     if not path.exists():
         if any(folder.iterdir()):
             raise UsageError(f"{str(folder)!r} is not empty and holds no recovery; choose a new folder.")
-        write_json(path, stated)
-    elif read_mapping(path).get("hash") != stated["hash"]:
-        raise UsageError(
-            f"{str(folder)!r} holds a recovery begun with other candidates, stimuli or options; give the same as then, "
-            "or choose another folder."
-        )
+        write_json(path, config)
+    else:
+        check_same(folder, read_mapping(path), config, "recovery")

@@ -18,6 +18,7 @@ from brainbench.core.files import read_mapping, to_plain, write_json
 from brainbench.core.progress import Progress
 from brainbench.core.reading.ranges import check_number
 from brainbench.core.writing.locks import lock_folder
+from brainbench.core.writing.same_run import check_same
 from brainbench.stimuli.engines import get_engine
 from brainbench.stimuli.sweeps import running
 from brainbench.stimuli.sweeps.manifest import MANIFEST, is_complete, make_manifest
@@ -139,15 +140,11 @@ def _check_config(plan: GenerationPlan | SweepTable, folder: Path) -> None:
         write_json(path, config)
         return
     found = read_mapping(path)
-    if found != config and not any(folder.glob("*.h5")):
+    if any(folder.glob("*.h5")):
+        check_same(folder, found, config, "data set")
+    elif found != config:
         # Begun, but nothing was made: a failed first try must not stand in the way.
         write_json(path, config)
-    elif found != config:
-        other = sorted(key for key in {*found, *config} if found.get(key) != config.get(key))
-        raise UsageError(
-            f"{str(folder)!r} holds a data set begun with other {', '.join(other)}; give the same options as then, or "
-            "choose another folder."
-        )
 
 
 def _clean(folder: Path) -> None:

@@ -26,7 +26,8 @@ from brainbench.core.errors import missing_dependency
 from brainbench.core.files import provenance, read_mapping, to_plain, write_json
 from brainbench.core.progress import Progress
 from brainbench.core.writing.locks import lock_folder
-from brainbench.models.training.run_folder import RunLog, check_same, load_state, save_state
+from brainbench.core.writing.same_run import check_same
+from brainbench.models.training.run_folder import RunLog, load_state, save_state
 from robotics_bridge.policies.encoders.arms import perceptron
 from robotics_bridge.policies.evaluate import Policy
 from robotics_bridge.policies.fit import check_version

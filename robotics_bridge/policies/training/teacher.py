@@ -25,7 +25,8 @@ from brainbench.core.progress import Progress
 from brainbench.core.reading.regular import readable
 from brainbench.core.reading.tensors import check_finite
 from brainbench.core.writing.locks import lock_folder
-from brainbench.models.training.run_folder import LOG, RESTART, check_same, trim_log
+from brainbench.core.writing.same_run import check_same
+from brainbench.models.training.run_folder import LOG, RESTART, trim_log
 from robotics_bridge.envs.rsl_rl import RslRlEnv
 from robotics_bridge.policies.acting import ActingModel
 from robotics_bridge.policies.evaluate import Policy

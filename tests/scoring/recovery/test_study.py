@@ -48,7 +48,7 @@ def test_an_interrupted_recovery_goes_on(tmp_path, monkeypatch):
 def test_a_folder_of_another_recovery_is_refused(tmp_path):
     candidates = make_candidates(8)
     recover(candidates, DESIGN, boards=1, workers=1, folder=tmp_path)
-    with pytest.raises(UsageError, match="begun with other"):
+    with pytest.raises(UsageError, match=r"another recovery: design\.seed 0 \(now 1\)"):
         recover(candidates, replace(DESIGN, seed=1), boards=1, workers=1, folder=tmp_path)
 
 

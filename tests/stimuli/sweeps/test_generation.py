@@ -193,7 +193,7 @@ def test_several_processes_write_the_same_bytes(plan, unbroken, tmp_path):
 
 
 def test_another_data_set_in_the_folder_is_refused_and_named(unbroken, tmp_path):
-    with pytest.raises(UsageError, match="other seed, whiskers"):
+    with pytest.raises(UsageError, match=r"another data set: whiskers\.names .*, seed 0 \(now 3\)"):
         generate(small_plan(("brick:4", "cone:4"), shard_size=4, seed=3, whiskers="C2"), unbroken)
     (tmp_path / "thesis.docx").write_text("")
     with pytest.raises(UsageError, match=r"'thesis\.docx'"):
