@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from brainbench.core.contracts import CHANNELS, GRID_SHAPE
 from brainbench.core.errors import DataError, UsageError, check_name, listing, unknown_name
+from brainbench.core.reading.ranges import check_number
 from brainbench.core.reading.tables import read_numbers
 from brainbench.stimuli.external import FRAME_STATUSES, assemble_stimulus_set
 from brainbench.stimuli.scenes.frames import Frames
@@ -165,8 +166,8 @@ def _frames(rows: int, cleaning: Cleaning, rate: float | None) -> Frames:
             f"A run of {rows} rows does not tell its times; say how many rows make a second, as --rate does (1000 and "
             "110 rows are taken as one second)."
         )
-    if rate is not None and not 0 < rate < math.inf:
-        raise UsageError(f"The rate is a positive number of rows per second [Hz]; received {rate!r}.")
+    if rate is not None:
+        check_number("rate (rows per second, Hz)", rate, above=0)
     return _ROWS[rows] if rate is None else Frames(first=0.0, interval=1 / rate, count=rows)
 
 

@@ -13,7 +13,7 @@ from importlib import resources
 from typing import Any, Literal
 
 from brainbench.core.errors import UsageError, check_name, shown
-from brainbench.core.reading.ranges import check_fields
+from brainbench.core.reading.ranges import check_fields, check_number
 from brainbench.core.tradeoffs import TradeoffPoint, cheapest
 from brainbench.stimuli.engines import DEFAULT_ENGINE
 from brainbench.stimuli.whiskers.chain import Chain
@@ -51,7 +51,6 @@ class Fidelity:
         check_fields(self, "links", least=2, most=MOST_LINKS, whole=True)
         check_fields(self, "links_per_mm", above=0)
         check_fields(self, "time_step", least=1e-7, most=5e-3, of="{} (s)")
-
         if self.twist not in (None, True, False):
             raise UsageError(f"twist must be True, False or None; received {shown(self.twist)}.")
         check_name("solver", self.solver, SOLVERS)
@@ -111,8 +110,7 @@ class Fidelity:
             UsageError: ``error`` is not positive, ``share`` or the backend was not measured, or no setting is that
                 accurate.
         """
-        if not error > 0:
-            raise UsageError(f"error must be positive (0.05 = 5 %); received {error!r}.")
+        check_number("error (0.05 = 5 %)", error, above=0)
         return cls(**cheapest(measured(backend, share), error).settings)
 
     def resolved(self, twist: bool) -> Fidelity:

@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from brainbench.core.errors import UsageError
 from brainbench.core.progress import Progress as NamedProgress
+from brainbench.core.reading.ranges import check_number
 from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.engines.sweep_batch import SweepBatch
 from brainbench.stimuli.objects.obstacle import Obstacle
@@ -98,11 +99,7 @@ class Job:
         if times[0] < self.start:
             raise UsageError(f"The first frame ({times[0]:g} s) lies before the start of the job ({self.start:g} s).")
         for load in self.loads:
-            if not 0 < load.arc <= self.whisker.arc_length:
-                raise UsageError(
-                    f"A load acts at arc length {load.arc:g} m; it must lie in 0 < arc ≤ "
-                    f"{self.whisker.arc_length:g} m on this whisker."
-                )
+            check_number("arc of a load on this whisker (m)", load.arc, above=0, most=self.whisker.arc_length)
         times.setflags(write=False)
         object.__setattr__(self, "times", times)
         object.__setattr__(self, "obstacles", tuple(self.obstacles))

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brainbench.core.errors import UsageError, listing
+from brainbench.core.reading.ranges import check_number
 from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.engines.protocol import Job, WhiskerEngine
 from brainbench.stimuli.engines.reach import Reach, distances
@@ -375,8 +376,8 @@ def passed_unseen(job: Job, reach: Reach, position: NDArray, euler: NDArray, tim
 
 def check_jobs(engine: WhiskerEngine, jobs: Sequence[Job], fidelity: Fidelity, workers: int | None) -> None:
     """Refuse jobs, solvers and workers that an engine cannot run, and warn of steps that damp whiskers too much."""
-    if workers is not None and workers < 1:
-        raise UsageError(f"workers must be at least 1; received {workers}.")
+    if workers is not None:
+        check_number("workers", workers, least=1, whole=True)
     if fidelity.solver not in engine.solvers:
         raise UsageError(
             f"The backend {engine.name!r} has no solver {fidelity.solver!r}, only {listing(engine.solvers)}; use the "

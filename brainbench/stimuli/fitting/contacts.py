@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from brainbench.core.errors import DataError, UsageError
-from brainbench.core.reading.ranges import check_number
+from brainbench.core.reading.ranges import check_fields
 from brainbench.stimuli.fitting.curves import offsets_of_samples
 from brainbench.stimuli.fitting.elastica import STEPS, LoadedShapes, LoadedWhisker
 from brainbench.stimuli.fitting.tracks.quality import check_length, check_track
@@ -57,10 +57,8 @@ class ContactOptions:
     """Neighbouring frames, an odd number, over which the contact's place and force are taken to change evenly."""
 
     def __post_init__(self) -> None:
-        if self.noise is not None:
-            check_number("noise of a shape (m)", self.noise, above=0)
-        check_number("contact_noise (m)", self.contact_noise, above=0)
-        check_number("frames of one contact", self.frames, least=1, whole=True)
+        check_fields(self, "noise", "contact_noise", above=0, of="{} (m)")
+        check_fields(self, "frames", least=1, whole=True, of="{} of one contact")
         if self.frames % 2 == 0:
             raise UsageError(
                 f"frames counts a frame and as many before as behind it, so it is odd; received {self.frames}."

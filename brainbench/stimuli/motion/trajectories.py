@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brainbench.core.errors import UsageError
+from brainbench.core.reading.ranges import check_fields, check_number
 from brainbench.stimuli.engines.protocol import base_rotation
 from brainbench.stimuli.motion.hinge_angles import follow_angles
 from brainbench.stimuli.whiskers.array import MountedWhisker
@@ -96,8 +97,8 @@ class Whisking(_Motion):
     rotations: Rotations = field(default_factory=lambda: ROTATIONS["knutsen"])
 
     def __post_init__(self) -> None:
-        _require("whisking frequency (Hz)", self.frequency, positive=True)
-        _require("whisking onset (s)", self.onset)
+        check_fields(self, "frequency", above=0, of="whisking {} (Hz)")
+        check_fields(self, "onset", least=0, of="whisking {} (s)")
         for name in ("protraction", "retraction"):
             value = getattr(self, name)
             if not math.isfinite(value) or abs(value) > math.pi / 2:
@@ -144,7 +145,7 @@ class _SteadyMotion(_Motion):
             raise UsageError(
                 f"The velocity of a {name} is three finite numbers in {self._unit}; received {self.velocity!r}."
             )
-        _require(f"{name} onset (s)", self.onset)
+        check_number(f"{name} onset (s)", self.onset, least=0)
 
     @property
     def finest(self) -> float:
@@ -297,8 +298,3 @@ def _smooth_path(times: NDArray[np.float64], onset: float) -> NDArray[np.float64
     u = np.clip(times / onset, 0.0, 1.0)
     # Integral of that quintic; it is ½ at u = 1, so half of the onset is lost against full speed.
     return onset * (u**6 - 3 * u**5 + 2.5 * u**4) + np.maximum(times - onset, 0.0)
-
-
-def _require(what: str, value: float, *, positive: bool = False) -> None:
-    if not math.isfinite(value) or value < 0 or (positive and value == 0):
-        raise UsageError(f"The {what} must be {'positive' if positive else 'zero or more'}; received {value!r}.")

@@ -114,8 +114,7 @@ class _Primitive:
                 raise UsageError(f"{field} of a {name} must be three finite numbers (m); received {value!r}.")
         for field in self._sizes:
             for size in np.atleast_1d(getattr(self, field)).tolist():
-                if not (math.isfinite(size) and size > 0):
-                    raise UsageError(f"{field} of a {name} must be positive (m); received {size!r}.")
+                check_number(f"{field} of a {name} (m)", size, above=0)
 
     def moved(self, rotation: NDArray[np.float64], translation: NDArray[np.float64]) -> Self:
         """Return the body rotated by a matrix [3, 3] about the origin, then translated by [3] (m)."""

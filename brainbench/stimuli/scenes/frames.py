@@ -60,18 +60,13 @@ class Frames:
     number in the published units mN and mN·mm (there 1000: ``clip`` = 1). None for no clipping."""
 
     def __post_init__(self) -> None:
-        if not (math.isfinite(self.first) and self.first >= 0 and math.isfinite(self.interval) and self.interval > 0):
-            raise UsageError(
-                "The first frame lies at 0 s or later and the interval is positive;"
-                f" received {self.first!r} s and {self.interval!r} s."
-            )
-        for name in ("count", "average"):
-            value = getattr(self, name)
-            if not isinstance(value, int) or value < 1:
-                raise UsageError(f"{name} of the frames must be a whole number of at least 1; received {value!r}.")
+        check_fields(self, "first", least=0, of="{} of the frames (s)")
+        check_fields(self, "interval", above=0, of="{} of the frames (s)")
+        check_fields(self, "count", "average", least=1, whole=True, of="{} of the frames")
         for name, allowed in (("phase", ("zero", "causal")), ("axes", ("world", "follicle"))):
             check_name(f"{name} of the frames", getattr(self, name), allowed)
         check_fields(self, "clip", above=0, of="{} of the frames (N)")
+        check_fields(self, "lowpass", above=0, of="{} of the frames (Hz)")
         if self.lowpass is not None:
             self._check_filter(self.lowpass)
 
@@ -131,8 +126,6 @@ class Frames:
         return max(self.average - 1, math.ceil(_EDGE / self.lowpass / self.interval * self.average))
 
     def _check_filter(self, cutoff: float) -> None:
-        if not (math.isfinite(cutoff) and cutoff > 0):
-            raise UsageError(f"lowpass of the frames must be a positive frequency in Hz, or None; received {cutoff!r}.")
         if cutoff * self.interval >= 0.5:
             raise UsageError(
                 f"A low-pass at {cutoff:g} Hz lets aliases through: frames {self.interval * 1e3:g} ms apart show "

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from brainbench.core.errors import UsageError, check_name
 from brainbench.core.files import content_hash
+from brainbench.core.reading.ranges import check_fields
 from brainbench.core.rotations import euler_matrix
 from brainbench.stimuli.motion.trajectories import Still, Translation
 from brainbench.stimuli.objects.obstacle import bounds_of
@@ -137,8 +138,9 @@ class SweepGrid:
             values = getattr(self, name)
             if (values.low if isinstance(values, Span) else min(values)) <= 0:
                 raise UsageError(f"{name} of a sweep grid must be positive (SI units); received {values!r}.")
-        if self.draws < 1 or not self.turns:
-            raise UsageError(f"A sweep grid needs a draw and a turn; received {self.draws!r} and {self.turns!r}.")
+        check_fields(self, "draws", least=1, whole=True, of="{} of a sweep grid")
+        if not self.turns:
+            raise UsageError("A sweep grid needs at least one turn; received none.")
         if self.heights_per_draw is not None and (
             isinstance(self.height, Span) or not 1 <= self.heights_per_draw <= len(self.height)
         ):

@@ -245,10 +245,7 @@ def ringdown(
             is not between 1 and 5.
         DataError: the simulation was unstable, or nothing rang: the time step overdamps the whisker.
     """
-    if not 0 < whisker.damping_ratio < 1:
-        raise UsageError(
-            f"A ring-down needs a damping ratio between 0 and 1; this whisker has {whisker.damping_ratio:g}."
-        )
+    check_number("damping_ratio of a whisker that rings down", whisker.damping_ratio, above=0, below=1)
     check_number("modes of a ring-down", modes, least=1, most=5, whole=True)
     fidelity = Fidelity.of(fidelity)
     references_hz = references.natural_frequencies(whisker, modes)

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brainbench.core.errors import UsageError
+from brainbench.core.reading.ranges import check_number
 from brainbench.stimuli.whiskers.whisker import Whisker
 
 # Runge-Kutta steps along the rod, and finite elements of the frequencies.
@@ -305,11 +306,7 @@ class _Branch:
 
 
 def _check_at(whisker: Whisker, at: float) -> None:
-    if not 0 < at <= whisker.arc_length:
-        raise UsageError(
-            f"The distance from the base must lie in 0 < at ≤ {whisker.arc_length:g} m, the arc length; "
-            f"received {at:g} m."
-        )
+    check_number("at (m), the distance from the base", at, above=0, most=whisker.arc_length)
 
 
 def _base_stiffness(whisker: Whisker, at: float) -> float:

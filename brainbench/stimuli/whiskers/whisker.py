@@ -6,7 +6,6 @@ plane with its concave side towards +y. Arc length s runs from 0 at the base to 
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -14,6 +13,7 @@ from numpy.polynomial import Polynomial
 from numpy.typing import ArrayLike, NDArray
 
 from brainbench.core.errors import UsageError
+from brainbench.core.reading.ranges import check_fields, check_number
 
 
 @dataclass(frozen=True)
@@ -48,17 +48,11 @@ class Whisker:
     is usual for polymers. Along its axis human hair twists more easily still: E = 3.9, G = .9 GPa (Robbins 2012)."""
 
     def __post_init__(self) -> None:
-        for name in ("arc_length", "base_radius", "tip_radius", "young_modulus"):
-            _require(name, getattr(self, name), positive=True)
-        for name in ("damping_ratio", "friction"):
-            _require(name, getattr(self, name))
-        ratio = self.poisson_ratio
-        if not isinstance(ratio, (int, float, np.number)) or not -1 < ratio <= 0.5:
-            raise UsageError(
-                f"poisson_ratio of a whisker must lie above -1 and at most at 0.5 (default 0.4); received {ratio!r}."
-            )
-        if not math.isfinite(self.curvature):
-            raise UsageError(f"curvature of a whisker must be a finite number (1/m); received {self.curvature!r}.")
+        of = "{} of a whisker (SI units)"
+        check_fields(self, "arc_length", "base_radius", "tip_radius", "young_modulus", above=0, of=of)
+        check_fields(self, "damping_ratio", "friction", least=0, of=of)
+        check_fields(self, "curvature", of=of)
+        check_fields(self, "poisson_ratio", above=-1, most=0.5, of=of)
         if isinstance(self.density, (tuple, list)):
             if len(self.density) != 2:
                 raise UsageError(
@@ -66,7 +60,7 @@ class Whisker:
                 )
             object.__setattr__(self, "density", (float(self.density[0]), float(self.density[1])))
         for value in self.densities:
-            _require("density", value, positive=True)
+            check_number("density of a whisker (kg/m³)", value, above=0)
         thickest = max(self.base_radius, self.tip_radius)
         if thickest > self.arc_length / 5:
             raise UsageError(
@@ -141,12 +135,3 @@ class Whisker:
 
     def _fraction(self, s: ArrayLike) -> NDArray[np.float64]:
         return np.asarray(s, dtype=float) / self.arc_length
-
-
-def _require(name: str, value: float, *, positive: bool = False) -> None:
-    """Refuse values that are not finite, negative, or zero where that has no meaning."""
-    if not isinstance(value, (int, float, np.number)) or not math.isfinite(value):
-        raise UsageError(f"{name} of a whisker must be a finite number in SI units; received {value!r}.")
-    if value < 0 or (positive and value == 0):
-        least = "positive" if positive else "zero or more"
-        raise UsageError(f"{name} of a whisker must be {least} (SI units); received {value!r}.")

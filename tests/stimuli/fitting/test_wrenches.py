@@ -69,5 +69,5 @@ def test_one_whisker_of_a_stimulus_set_is_read(tmp_path):
 def test_unknown_channels_and_noise_are_refused():
     with pytest.raises(UsageError, match="Fx"):
         new_wrenches(TIMES, VALUES[:, :1], ["Fq"])
-    with pytest.raises(UsageError, match="positive"):
+    with pytest.raises(UsageError, match=r"noise .*above 0; received 0\.0"):
         new_wrenches(TIMES, VALUES, noise=0.0)

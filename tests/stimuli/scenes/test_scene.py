@@ -18,20 +18,6 @@ def test_the_default_frames_are_those_of_the_published_pipeline():
     np.testing.assert_allclose(times * 1e3, np.arange(1000)[1::9][:110])
 
 
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"first": -1.0}, "at 0 s or later"),
-        ({"interval": 0.0}, "positive"),
-        ({"count": 0}, "count .* at least 1"),
-        ({"average": 1.5}, "average"),
-    ],
-)
-def test_impossible_frames_are_refused(changes, message):
-    with pytest.raises(UsageError, match=message):
-        Frames(**changes)
-
-
 def test_the_readings_of_a_frame_fill_its_interval():
     frames = Frames(0.001, 0.009, 2, average=3)
     np.testing.assert_allclose(frames.times, [0.001, 0.010])

@@ -135,7 +135,7 @@ def test_a_mesh_can_be_decomposed_by_keys_of_its_table(tmp_path):
         ),
         (
             '[[scene]]\nlabel="a"\n[[scene.object]]\nshape = "sphere"\nradius_mm = -1',
-            "radius of a sphere must be positive",
+            "radius of a sphere .*above 0",
         ),
         (
             '[[scene]]\nlabel="a"\n[[scene.object]]\nshape = "sphere"\nradius_mm = 1\ncolour = "red"',

@@ -206,7 +206,7 @@ def test_one_sweep_is_simulated_end_to_end():
         ({"mover": "heat"}, "Unknown mover 'heat'; did you mean 'head'"),
         ({"placing": "cleer"}, "did you mean 'clear'"),
         ({"heights_per_draw": 2}, r"heights_per_draw .*got 2"),
-        ({"draws": 0}, "needs a draw"),
+        ({"draws": 0}, "draws .*received 0"),
         ({"head": Head(motion=Translation((0.0, 0.1, 0.0)))}, "choose mover='head'"),
     ],
 )

@@ -8,7 +8,6 @@ from repeats.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -17,11 +16,13 @@ from numpy.typing import ArrayLike, NDArray
 
 from brainbench.core.contracts import CHANNELS
 from brainbench.core.errors import DataError, UsageError, check_name
+from brainbench.core.reading.ranges import check_number
 
 if TYPE_CHECKING:
     import xarray as xr
 
 AXES = ("x", "y", "z")
+_NOISE = "noise of a measurement (standard deviation, SI units)"
 
 
 def new_shapes(times: ArrayLike, points: ArrayLike, *, noise: float | None = None, **attributes: Any) -> xr.Dataset:
@@ -57,7 +58,8 @@ def new_shapes(times: ArrayLike, points: ArrayLike, *, noise: float | None = Non
         attrs=attributes,
     )
     if noise is not None:
-        dataset["noise"] = _positive(noise)
+        check_number(_NOISE, noise, above=0)
+        dataset["noise"] = float(noise)
     return dataset
 
 
@@ -103,7 +105,9 @@ def new_wrenches(
     )
     if noise is not None:
         levels = np.broadcast_to(np.asarray(noise, dtype=float), len(channels))
-        dataset["noise"] = ("channel", np.array([_positive(one) for one in levels]))
+        for level in levels:
+            check_number(_NOISE, level, above=0)
+        dataset["noise"] = ("channel", levels.copy())
     return dataset
 
 
@@ -116,11 +120,3 @@ def check_times(times: ArrayLike, count: int) -> NDArray[np.float64]:
         wrong = int(np.flatnonzero(~(np.diff(values, prepend=-np.inf) > 0))[0])
         raise DataError(f"The times of a measurement increase, in seconds; row {wrong + 1} has {values[wrong]:g}.")
     return values
-
-
-def _positive(value: Any) -> float:
-    if not (math.isfinite(value) and value > 0):
-        raise UsageError(
-            f"The noise of a measurement is a positive standard deviation in SI units; received {value!r}."
-        )
-    return float(value)

@@ -118,7 +118,7 @@ def test_unknown_backends_and_bad_jobs_are_refused():
         Job(C2, StillFollicle(), (), np.array([0.2, 0.1]))
     with pytest.raises(UsageError, match=r"\(0 s\) .*\(0\.1 s\)"):
         Job(C2, StillFollicle(), (), np.array([0.0]), start=0.1)
-    with pytest.raises(UsageError, match=r"0\.02 m.*0\.0152\d* m"):
+    with pytest.raises(UsageError, match=r"arc of a load .*\(m\).*0\.015265.*received 0\.02"):
         Job(C2, StillFollicle(), (), np.array([0.1]), loads=(Load(0.02, (0, 0, 1e-6)),))
     with pytest.raises(UsageError, match=r"workers .*received 0"):
         _run(Job(C2, StillFollicle(), (), np.array([0.1])), workers=0)
