@@ -46,10 +46,9 @@ class Recording:
         from brainbench.stimuli.whiskers.chain import build_chain
 
         job, axes = self.scene.jobs()[whisker], self.scene.axes[whisker]
-        origin = [part.head.position for part in self.scene.split() for _ in part.array][whisker]
         place, euler = job.follicle.pose(self.times[instant : instant + 1])
         rest = np.pad(build_chain(job.whisker, self.joints[whisker].shape[1] - 1).points, ((0, 0), (0, 1)))
-        return (rest @ base_rotation(euler)[0].T + place[0]) @ axes.T + np.asarray(origin)
+        return (rest @ base_rotation(euler)[0].T + place[0]) @ axes.T + self.scene.origins[whisker]
 
 
 def record(
@@ -91,9 +90,8 @@ def record(
             write_sealed(path, "shapes of whiskers", dict(zip(names, local, strict=True)), compress=True)
     moments = tuple(bending_moments(job, points) for job, points in zip(jobs, local, strict=True))
     # Jobs stand in the frame of their array as it was at t = 0.
-    origins = [part.head.position for part in scene.split() for _ in part.array]
-    places = zip(local, scene.axes, origins, strict=True)
-    joints = tuple(points @ axes.T + np.asarray(origin) for points, axes, origin in places)
+    places = zip(local, scene.axes, scene.origins, strict=True)
+    joints = tuple(points @ axes.T + origin for points, axes, origin in places)
     return Recording(scene, times, joints, moments)
 
 

@@ -22,7 +22,7 @@ from brainbench.core.errors import UsageError
 from brainbench.core.rotations import to_matrices
 from brainbench.stimuli.engines.protocol import Follicle
 from brainbench.stimuli.engines.units import MILLI
-from brainbench.stimuli.objects.obstacle import Obstacle
+from brainbench.stimuli.objects.obstacle import Obstacle, RigidMotion
 
 KNOT = 1e-3
 """Length of a cell (s); one cubic piece follows whisking at 20 Hz to 1e-7 of its way."""
@@ -47,6 +47,8 @@ _INSIDE = 16
 
 Path = Callable[[NDArray[np.float64]], NDArray[np.float64]]
 """Times [n] (s) → coordinates [n, k] (mm; angles times a length)."""
+Pose = Callable[[NDArray[np.float64]], tuple[NDArray, NDArray]]
+"""Times [n] (s) → places [n, 3] (m) and rotations [n, …] of a base or a body."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,6 +123,18 @@ def cut(
     return MotionPieces(count, needed, moves)
 
 
+def carried_pose(motion: RigidMotion | None, anchor: NDArray[np.float64]) -> Pose:
+    """Return the pose, with rotation matrices [n, 3, 3], of the point ``anchor`` [3] (m) of a body that moves."""
+    assert motion is not None
+
+    def pose(times: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        place, turn = motion(times)
+        turn = to_matrices(np.asarray(turn, dtype=float))
+        return np.asarray(place) + turn @ anchor, turn
+
+    return pose
+
+
 @dataclass(frozen=True)
 class Cutting:
     """When motions are followed, and in which steps. Seconds."""
@@ -142,16 +156,14 @@ class Cutting:
 
     def obstacle(self, obstacle: Obstacle, anchor: NDArray[np.float64]) -> MotionPieces:
         """Cut the motion of an obstacle, by that of its point ``anchor`` [3] (m) and its turns; errors as above."""
-        motion = obstacle.motion
-        assert motion is not None
+        pose = carried_pose(obstacle.motion, anchor)
         size = float(np.linalg.norm(obstacle.bounds - anchor, axis=1).max())
 
         def path(times: NDArray[np.float64]) -> NDArray[np.float64]:
-            place, turn = motion(times)
-            turn = to_matrices(np.asarray(turn, dtype=float))
-            return np.concatenate([np.asarray(place) + turn @ anchor, turn.reshape(-1, 9) * size], axis=1) * MILLI
+            place, turn = pose(times)
+            return np.concatenate([place, turn.reshape(-1, 9) * size], axis=1) * MILLI
 
-        return self._cut(path, motion, "an object")
+        return self._cut(path, obstacle.motion, "an object")
 
     def _cut(self, path: Path, motion: object, what: str) -> MotionPieces:
         finest = getattr(motion, "finest", None)

@@ -13,6 +13,7 @@ from scipy.spatial import ConvexHull
 
 from brainbench.core.rotations import to_matrices
 from brainbench.stimuli.engines.protocol import base_rotation
+from brainbench.stimuli.engines.reach import to_obstacle_frame
 from brainbench.stimuli.engines.trust import AT_BASE, LARGEST_START_OVERLAP, STARTED_INSIDE, fault
 from brainbench.stimuli.objects.obstacle import Box, Capsule, Cylinder, Obstacle, Part, Sphere
 from brainbench.stimuli.whiskers.chain import Chain
@@ -44,11 +45,8 @@ def part_depth(part: Part, points: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def obstacle_depth(obstacle: Obstacle, points: NDArray, times: NDArray) -> NDArray[np.float64]:
     """Return how deep [n] points [n, 3] (world), at ``times`` [n] (s), lie in the deepest part of an obstacle."""
-    if obstacle.motion is not None:
-        place, quaternion = (np.asarray(values, dtype=float) for values in obstacle.motion(times))
-        # The transposed rotation: from world axes into those of the obstacle.
-        points = np.einsum("nji,nj->ni", to_matrices(quaternion), points - place)
-    return np.max([part_depth(part, points) for part in obstacle.parts], axis=0)
+    local = to_obstacle_frame(obstacle, points, times)
+    return np.max([part_depth(part, local) for part in obstacle.parts], axis=0)
 
 
 def overlap_fault(

@@ -77,7 +77,7 @@ def reachable(
         elif len(obstacle.parts) > 1:
             boxes = np.stack([part.bounds() for part in obstacle.parts])
         # The bounds of what stands still have been looked at.
-        points = _in_obstacle_frame(obstacle, base, times)
+        points = to_obstacle_frame(obstacle, base, times)
         if len(boxes) > 1 or not still[index]:
             distances = _box_distances(boxes, points)
         if distances.min() > limit and not _encloses(obstacle, points[0]):
@@ -123,18 +123,15 @@ def touched(obstacle: Obstacle, *, surfaces: bool) -> Obstacle:
 
 def distances(obstacle: Obstacle, bounds: NDArray, points: NDArray, times: NDArray) -> NDArray[np.float64]:
     """Distances [n] (m) of points [n, 3] (world) at ``times`` [n] from a box [2, 3] that the obstacle carries."""
-    return np.broadcast_to(_box_distance(bounds, _in_obstacle_frame(obstacle, points, times)), len(times))
+    local = to_obstacle_frame(obstacle, points, times)
+    outside = np.maximum(np.maximum(bounds[0] - local, local - bounds[1]), 0.0)
+    return np.broadcast_to(np.linalg.norm(outside, axis=1), len(times))
 
 
-def _in_obstacle_frame(obstacle: Obstacle, points: NDArray, times: NDArray) -> NDArray[np.float64]:
+def to_obstacle_frame(obstacle: Obstacle, points: NDArray, times: NDArray) -> NDArray[np.float64]:
+    """Return points [n, 3] (world) as the obstacle sees them at ``times`` [n] (s)."""
     if obstacle.motion is None:
         return points
     position, quaternion = obstacle.motion(times)
     # The transposed rotation: from world axes into those of the obstacle.
     return np.einsum("nji,nj->ni", to_matrices(quaternion), points - position)
-
-
-def _box_distance(bounds: NDArray, points: NDArray) -> NDArray[np.float64]:
-    """Distance of points [n, 3] from an axis-aligned box [2, 3]; zero inside."""
-    outside = np.maximum(np.maximum(bounds[0] - points, points - bounds[1]), 0.0)
-    return np.linalg.norm(outside, axis=1)

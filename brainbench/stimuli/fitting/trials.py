@@ -101,9 +101,8 @@ class Trial:
         check_name("whisker of the scene", whisker, scene.names)
         which = scene.names.index(whisker)
         job, axes = scene.jobs()[which], scene.axes[which]
-        origin = [part.head.position for part in scene.split() for _ in part.array][which]
         times = measured["time"].values.astype(float)
-        local = to_frame(measured, axes, np.asarray(origin, dtype=float))
+        local = to_frame(measured, axes, scene.origins[which])
         return cls(replace(job, whisker=start or job.whisker, times=times), local)
 
     @classmethod

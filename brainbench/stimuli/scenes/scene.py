@@ -102,6 +102,11 @@ class Scene:
         """Rotations [whisker, 3, 3] from the frame in which each whisker's job stands to the world."""
         return np.concatenate([np.tile(part.head.matrix, (len(part.array), 1, 1)) for part in self.split()])
 
+    @property
+    def origins(self) -> NDArray[np.float64]:
+        """Origins [whisker, 3] (m, world) of these frames."""
+        return np.array([part.head.position for part in self.split() for _ in part.array], dtype=float)
+
     def split(self) -> tuple[Scene, ...]:
         """Return one scene per animal; together they are this one, because whiskers touch objects only."""
         rest = (

@@ -89,14 +89,9 @@ class Ringdown:
         return float(self.damping_ratios[0])
 
     @property
-    def reference_frequency(self) -> float:
-        """Euler-Bernoulli frequency of the first mode (Hz)."""
-        return float(self.reference_frequencies[0])
-
-    @property
     def frequency_error(self) -> float:
         """Relative error of the first frequency (signed)."""
-        return self.frequency / self.reference_frequency - 1
+        return float(self.frequency_errors[0])
 
     @property
     def frequency_errors(self) -> NDArray[np.float64]:

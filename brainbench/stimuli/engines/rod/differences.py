@@ -18,10 +18,11 @@ from numpy.typing import NDArray
 
 from brainbench.core import rotations
 from brainbench.core.errors import UsageError
+from brainbench.stimuli.engines.motion_pieces import carried_pose
 from brainbench.stimuli.engines.protocol import Job, base_rotation
 from brainbench.stimuli.engines.rod.limits import LIGHT
 from brainbench.stimuli.engines.rod.packing import knots_alike, pack_chains
-from brainbench.stimuli.engines.rod.shapes import PackedShapes, TrackedObstacle
+from brainbench.stimuli.engines.rod.shapes import PackedShapes
 from brainbench.stimuli.engines.rod.tasks import JobTask, PackedTasks
 from brainbench.stimuli.engines.units import MILLI
 from brainbench.stimuli.objects.obstacle import Obstacle, TriangleMesh
@@ -157,7 +158,8 @@ def _shapes(task: JobTask, job: Job) -> Numbers:
             sizes.append(size)
             frictions.append(-1.0 if moved.friction is None else moved.friction)
         if whole.motion is not None:
-            knots.append(_body_knots(body, moved, (task.job.start, float(task.job.times[-1]))))
+            pose, span = carried_pose(moved.motion, body.anchor), (task.job.start, float(task.job.times[-1]))
+            knots.append(knots_alike(body.track, pose, np.asarray, span, "an object"))
     return {
         "shape_place": np.array(places).reshape(-1, 3),
         "shape_turn": np.array(turns).reshape(-1, 3, 3),
@@ -206,18 +208,6 @@ def _rigid(nominal: TriangleMesh, moved: TriangleMesh) -> tuple[NDArray[np.float
             "place and turn: use a primitive (sphere, capsule, cylinder, box), whose sizes are."
         )
     return turn, shift
-
-
-def _body_knots(body: TrackedObstacle, moved: Obstacle, span: tuple[float, float]) -> NDArray[np.float64]:
-    motion = moved.motion
-    assert motion is not None
-
-    def pose(times: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        place, turn = motion(times)
-        turn = rotations.to_matrices(np.asarray(turn, dtype=float))
-        return np.asarray(place) + turn @ body.anchor, turn
-
-    return knots_alike(body.track, pose, np.asarray, span, "an object")
 
 
 def _require(what: str, found: int, wanted: int) -> None:

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from brainbench.core import rotations
 from brainbench.core.errors import UsageError
-from brainbench.stimuli.engines.motion_pieces import Cutting, MotionPieces, side_of
+from brainbench.stimuli.engines.motion_pieces import Cutting, MotionPieces, Pose, carried_pose, side_of
 from brainbench.stimuli.engines.protocol import Follicle, Load, base_rotation
 from brainbench.stimuli.engines.rod.limits import LIGHT
 from brainbench.stimuli.engines.units import MICRO, MILLI
@@ -20,8 +20,6 @@ from brainbench.stimuli.whiskers.chain import Chain
 
 CAPACITIES = (12, 24, 48, 100)
 """Links for which kernels are compiled; a chain takes the smallest that holds it."""
-Pose = Callable[[NDArray[np.float64]], tuple[NDArray, NDArray]]
-"""Times [n] (s) → places [n, 3] (m) and rotations [n, …] of a base or a body."""
 GRID = 32.0
 """Knots are kept as a multiple of this (mm), exact in single precision up to kilometres, and the rest."""
 
@@ -117,14 +115,7 @@ def follicle_track(follicle: Follicle, size: float, cutting: Cutting) -> Track:
 
 def body_track(obstacle: Obstacle, anchor: NDArray[np.float64], cutting: Cutting) -> Track:
     """Return the track of the point ``anchor`` [3] (m) of an obstacle that moves."""
-    motion = obstacle.motion
-    assert motion is not None
-
-    def pose(times: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        place, turn = motion(times)
-        turn = rotations.to_matrices(np.asarray(turn, dtype=float))
-        return np.asarray(place) + turn @ anchor, turn
-
+    pose = carried_pose(obstacle.motion, anchor)
     return _track(pose, np.asarray, cutting.obstacle(obstacle, anchor), cutting.start)
 
 

@@ -52,8 +52,6 @@ class SweepLauncher:
         scenes: SweepScenes,
         fidelity: Fidelity,
         device: str = "cpu",
-        against: int = MESHES,
-        bounds: tuple[int, int] | None = None,
         sliced: bool | None = None,
         packed: Mapping[str, tuple[float, PackedSurface]] | None = None,
     ) -> None:
@@ -61,8 +59,8 @@ class SweepLauncher:
         if grid.mover != "object":
             raise UsageError("Only sweeps whose object moves go through the fast path; received mover='head'.")
         self.device = pick_device(device)
-        sliced = bool(against == MESHES and self.device.is_cuda) if sliced is None else sliced
-        bounds = bounds or (SLICED_BOUNDS if sliced else BOUNDS)
+        sliced = self.device.is_cuda if sliced is None else sliced
+        bounds = SLICED_BOUNDS if sliced else BOUNDS
         self.scenes, self.grid = scenes, grid
         self.ahead: Callable[[], Ahead] = partial(tries_ahead, self.device)
         """As in :func:`brainbench.stimuli.engines.trust.run_with_retries`."""
@@ -70,7 +68,7 @@ class SweepLauncher:
         """Elapsed time of the last launch for placing objects, uploading, and computing."""
         mounts = list(scenes.array)
         chains = [fidelity.chain(mount.whisker) for mount in mounts]
-        self.solver = WhiskerSolver(chains, fidelity, self.device, against, block=BLOCK, sliced=sliced, bounds=bounds)
+        self.solver = WhiskerSolver(chains, fidelity, self.device, MESHES, block=BLOCK, sliced=sliced, bounds=bounds)
         self._head = grid.head.matrix
         self._origin = np.asarray(grid.head.position)
         self._packed = packed or {}

@@ -148,10 +148,10 @@ def lathe(outer: ArrayLike, facets: int, *, wall: float | None = None, floor: fl
     return Body(solid, parts)
 
 
-def tube(path: ArrayLike, radius: ArrayLike, sides: int, *, closed: bool, aspect: float = 1.0) -> Body:
+def tube(path: ArrayLike, radius: ArrayLike, sides: int, *, closed: bool) -> Body:
     """Sweep a circle of ``sides`` corners and of one radius, or one per point, along a path [n, 3], without twist.
 
-    On a closed path the last point is followed by the first; ``aspect`` is height over width of the cross-section.
+    On a closed path the last point is followed by the first.
     """
     from manifold3d import Manifold, Mesh64
 
@@ -164,7 +164,7 @@ def tube(path: ArrayLike, radius: ArrayLike, sides: int, *, closed: bool, aspect
     angle = 2 * np.pi * np.arange(sides) / sides
     radii = np.broadcast_to(np.asarray(radius, dtype=float), count)[:, None, None]
     cosine, sine = np.cos(angle)[None, :, None], np.sin(angle)[None, :, None]
-    rings = line[:, None] + radii * (cosine * normal[:, None] + aspect * sine * side[:, None])
+    rings = line[:, None] + radii * (cosine * normal[:, None] + sine * side[:, None])
     here = np.arange(count if closed else count - 1)
     ahead = (here + 1) % count
     k = np.arange(sides)
