@@ -6,7 +6,6 @@ inside out: each is repaired as far as possible when it is loaded, and scaled to
 
 from __future__ import annotations
 
-import csv
 import functools
 import json
 import logging
@@ -19,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from brainbench.core.errors import DataError, DataFileNotFoundError, UsageError, listing, shown
-from brainbench.core.reading.regular import readable
+from brainbench.core.reading.tables import read_rows
 from brainbench.core.reading.texts import read_json, read_text
 from brainbench.stimuli.objects.mesh_solids import mesh_solid
 from brainbench.stimuli.objects.solid import Solid
@@ -156,14 +155,13 @@ def read_categories(path: str | os.PathLike[str]) -> dict[str, str]:
         if not isinstance(data, dict) or not all(isinstance(label, str) for label in data.values()):
             raise DataError(f"{os.fspath(path)!r} must be one JSON object from names to labels (texts).")
         return data
-    with readable(path, "table of categories"):
-        rows = [row for row in csv.reader(read_text(path).splitlines()) if row]
+    rows = read_rows(path, "table of categories")
     for number, row in enumerate(rows, start=1):
         if len(row) != 2:
             raise DataError(
                 f"Row {number} of {os.fspath(path)!r} must be a name and a label; it is {shown(','.join(row))}."
             )
-    return {name.strip(): label.strip() for name, label in rows if _is_name(name.strip().partition("/")[0])}
+    return {name: label for name, label in rows if _is_name(name.partition("/")[0])}
 
 
 def _everything(folder: Path) -> tuple[str, ...]:

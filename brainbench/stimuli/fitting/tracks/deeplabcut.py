@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 
 from brainbench.core.errors import DataError, UsageError, check_name, listing, shown
 from brainbench.core.reading.hdf5 import open_hdf5
+from brainbench.core.reading.tables import read_rows, to_numbers
 from brainbench.stimuli.fitting.tracks.options import TrackOptions
-from brainbench.stimuli.fitting.tracks.tables import numbers_of, read_rows
 
 Array = NDArray[np.float64]
 Columns = dict[tuple[str, str, str], Array]
@@ -64,7 +64,7 @@ def _read_csv(path: str | os.PathLike[str]) -> tuple[NDArray[np.int_], Columns]:
     body = rows[len(heads) :]
     if not body:
         raise DataError(f"{shown(os.fspath(path))} holds no frame.")
-    table = numbers_of(body, path, kind, first=len(heads) + 1, columns=len(rows[0]))
+    table = to_numbers(body, path, kind, first=len(heads) + 1, columns=len(rows[0]), gaps=True)
     individuals = heads.get("individuals", [""] * len(heads["bodyparts"]))
     names = zip(individuals, heads["bodyparts"], heads["coords"], strict=True)
     return _frames(table[:, 0], path), {key: table[:, 1 + index] for index, key in enumerate(names)}

@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 from brainbench.core.errors import DataError, UsageError, listing, shown
 from brainbench.core.reading.hdf5 import open_hdf5
 from brainbench.core.reading.regular import check_file
+from brainbench.core.reading.tables import read_columns, read_rows
 from brainbench.stimuli.fitting.tracks.contract import new_shapes
 from brainbench.stimuli.fitting.tracks.deeplabcut import read_deeplabcut
 from brainbench.stimuli.fitting.tracks.options import TrackOptions
 from brainbench.stimuli.fitting.tracks.quality import check_track
-from brainbench.stimuli.fitting.tracks.tables import read_rows, read_table
 from brainbench.stimuli.fitting.tracks.whisk import read_whisk
 from brainbench.stimuli.fitting.tracks.whiskerman import read_whiskerman
 
@@ -108,7 +108,7 @@ def detect_layout(path: str | os.PathLike[str]) -> str:
 
 def _read_points(path: str | os.PathLike[str], options: TrackOptions) -> tuple[NDArray[np.int_], Array]:
     """Return frames [n] and points [n, k, 2 or 3] of a table of points."""
-    names, table = read_table(path, "table of points")
+    names, table = read_columns(path, "table of points", gaps=True)
     columns = {name: table[:, index] for index, name in enumerate(names)}
     if missing := [name for name in ("frame", "x", "y") if name not in columns]:
         raise DataError(f"{shown(os.fspath(path))} has no column {missing[0]!r}.")

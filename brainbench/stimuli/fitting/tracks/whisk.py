@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 from brainbench.core.errors import DataError, UsageError, listing, shown
 from brainbench.core.reading.hdf5 import open_hdf5
 from brainbench.core.reading.regular import MOST_TEXT, check_file, readable
+from brainbench.core.reading.tables import read_columns, read_rows
 from brainbench.stimuli.fitting.tracks.options import TrackOptions
-from brainbench.stimuli.fitting.tracks.tables import read_rows, read_table
 from brainbench.stimuli.fitting.tracks.traces import stack_traces
 
 Array = NDArray[np.float64]
@@ -109,7 +109,7 @@ def _parse_text(rows: list[list[str]], name: str) -> Segments:
 
 def _read_identities(path: str) -> tuple[dict[tuple[int, int], int], dict[tuple[int, int], Array]]:
     """Return the label and the follicle (pixels) of each trace, by frame and number."""
-    names, table = read_table(path, "table of whisk's measurements")
+    names, table = read_columns(path, "table of whisk's measurements", gaps=True)
     if missing := [name for name in ("fid", "wid", "label") if name not in names]:
         raise DataError(
             f"{shown(path)} is no table of whisk's measurements: the column {missing[0]!r} is missing; it has "

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from brainbench.core.contracts import CHANNELS
 from brainbench.core.errors import DataError, UsageError, check_name, listing, shown
 from brainbench.core.reading.hdf5 import open_hdf5
+from brainbench.core.reading.tables import read_columns
 from brainbench.stimuli.fitting.tracks.contract import new_wrenches
-from brainbench.stimuli.fitting.tracks.tables import read_table
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -57,7 +57,7 @@ def read_wrenches(
 
 
 def _read_csv(path: str | os.PathLike[str]) -> xr.Dataset:
-    names, table = read_table(path, "table of wrenches")
+    names, table = read_columns(path, "table of wrenches", gaps=True)
     clock = next((name for name in names if name.lower() in TIMES), None)
     if clock is None:
         raise _no_times(path, names)
