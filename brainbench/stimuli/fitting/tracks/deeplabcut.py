@@ -67,12 +67,12 @@ def _read_csv(path: str | os.PathLike[str]) -> tuple[NDArray[np.int_], Columns]:
     table = to_numbers(body, path, kind, first=len(heads) + 1, columns=len(rows[0]), gaps=True)
     individuals = heads.get("individuals", [""] * len(heads["bodyparts"]))
     names = zip(individuals, heads["bodyparts"], heads["coords"], strict=True)
-    return _frames(table[:, 0], path), {key: table[:, 1 + index] for index, key in enumerate(names)}
+    return frame_numbers(table[:, 0], path), {key: table[:, 1 + index] for index, key in enumerate(names)}
 
 
 def _read_hdf5(path: str | os.PathLike[str]) -> tuple[NDArray[np.int_], Columns]:
     with open_hdf5(path, "table of DeepLabCut") as file:
-        groups = [item for item in file.values() if "table" in item or "block0_values" in item]
+        groups = pandas_groups(file)
         if not groups:
             raise DataError(f"{shown(os.fspath(path))} is no table of DeepLabCut: it holds no pandas table.")
         group: Any = groups[0]
@@ -91,10 +91,16 @@ def _read_hdf5(path: str | os.PathLike[str]) -> tuple[NDArray[np.int_], Columns]
             names = list(zip(*words, strict=True))
     # The first level is the scorer; before the last two there may be individuals.
     keys = [(name[1] if len(name) == 4 else "", name[-2], name[-1]) for name in names]
-    return _frames(index, path), {key: values[:, column] for column, key in enumerate(keys)}
+    return frame_numbers(index, path), {key: values[:, column] for column, key in enumerate(keys)}
 
 
-def _frames(values: Array, path: str | os.PathLike[str]) -> NDArray[np.int_]:
+def pandas_groups(file: Any) -> list[Any]:
+    """Return the groups of an HDF5 file that hold a table of pandas."""
+    return [item for item in file.values() if hasattr(item, "keys") and ("table" in item or "block0_values" in item)]
+
+
+def frame_numbers(values: Array, path: str | os.PathLike[str]) -> NDArray[np.int_]:
+    """Return frame numbers [n] as integers; others are a :class:`DataError`."""
     if not np.isfinite(values).all() or (values % 1).any():
         raise DataError(f"The frame numbers of {shown(os.fspath(path))} are not whole numbers.")
     return values.astype(int)

@@ -14,13 +14,17 @@ from brainbench.core.reading.hdf5 import open_hdf5
 from brainbench.core.reading.regular import check_file
 from brainbench.core.reading.tables import read_columns, read_rows
 from brainbench.stimuli.fitting.tracks.contract import new_shapes
-from brainbench.stimuli.fitting.tracks.deeplabcut import read_deeplabcut
+from brainbench.stimuli.fitting.tracks.deeplabcut import frame_numbers, pandas_groups, read_deeplabcut
 from brainbench.stimuli.fitting.tracks.options import TrackOptions
 from brainbench.stimuli.fitting.tracks.quality import check_track
 from brainbench.stimuli.fitting.tracks.whisk import read_whisk
 from brainbench.stimuli.fitting.tracks.whiskerman import read_whiskerman
 
 Array = NDArray[np.float64]
+_LAYOUTS = {".whiskers": "whisk", **dict.fromkeys((".tr4", ".tr4_2d", ".mat"), "whiskerman")}
+"""Layout by the ending of the file."""
+_SEVERAL = (".csv", ".h5", ".hdf5")
+"""Endings of several layouts, and of wrenches."""
 
 
 def read_shapes(path: str | os.PathLike[str], options: TrackOptions):  # noqa: ANN201 — xarray is imported late
@@ -62,48 +66,38 @@ def read_shapes(path: str | os.PathLike[str], options: TrackOptions):  # noqa: A
 def holds_shapes(path: str | os.PathLike[str]) -> bool:
     """Return True for a file of traced shapes, False for one of wrenches, as far as its ending and first names tell."""
     suffix = Path(path).suffix.lower()
-    if suffix == ".csv":
-        first = read_rows(path, "track or table of wrenches")[:1]
-        return bool(first) and (first[0][0] == "scorer" or {"x", "y"} <= set(first[0]))
-    if suffix in (".h5", ".hdf5"):
-        with open_hdf5(path, "track or file of wrenches") as file:
-            groups = [item for item in file.values() if hasattr(item, "keys")]
-            return "pixels_x" in file or any("table" in item or "block0_values" in item for item in groups)
-    return suffix not in (".nwb", ".nc")
+    return _look(path)[0] is not None if suffix in _SEVERAL else suffix not in (".nwb", ".nc")
 
 
 def detect_layout(path: str | os.PathLike[str]) -> str:
     """Return the kind of table that a file holds; a file that is none is a :class:`DataError`."""
     suffix, name = Path(path).suffix.lower(), shown(os.fspath(path))
     check_file(path, "track")
-    if suffix == ".whiskers":
-        return "whisk"
-    if suffix in (".tr4", ".tr4_2d", ".mat"):
-        return "whiskerman"
-    if suffix in (".h5", ".hdf5"):
-        with open_hdf5(path, "track") as file:
-            if "pixels_x" in file:
-                return "whisk"
-            if any("table" in item or "block0_values" in item for item in file.values() if hasattr(item, "keys")):
-                return "deeplabcut"
-            held = listing(file)
-        raise DataError(f"{name} is no track: an HDF5 file of DeepLabCut or WhiskiWrap is read; this one holds {held}.")
-    if suffix == ".csv":
-        first = read_rows(path, "track")[:1]
-        if first and first[0][0] == "scorer":
-            return "deeplabcut"
-        if first and {"frame", "x", "y"} <= set(first[0]):
-            return "points"
-        raise DataError(
-            f"{name} is no track: a table of DeepLabCut begins with scorer, one of points with frame, x and y; this "
-            f"one begins with {listing(first[0] if first else [])}."
-        )
+    if suffix in _LAYOUTS:
+        return _LAYOUTS[suffix]
+    if suffix in _SEVERAL:
+        layout, held = _look(path)
+        if layout is None:
+            raise DataError(
+                f"{name} is no track: a table of DeepLabCut begins with scorer, one of points with frame, x and y, and "
+                f"HDF5 files are of DeepLabCut or WhiskiWrap; this one holds {listing(held)}."
+            )
+        return layout
     if suffix == ".measurements":
         raise UsageError(
             f"{name} holds no shapes; give the file of traces (.whiskers), and the measurements, exported as CSV, as "
             "identities."
         )
     raise UsageError(f"{name} is no track; tracks end in .csv, .h5, .hdf5, .mat, .tr4 or .whiskers.")
+
+
+def _look(path: str | os.PathLike[str]) -> tuple[str | None, list[str]]:
+    """Return the layout of a table or an HDF5 file, None for no track, and the first names in it."""
+    if Path(path).suffix.lower() == ".csv":
+        names = (read_rows(path, "track or table of wrenches") or [[""]])[0]
+        return "deeplabcut" if names[0] == "scorer" else "points" if {"x", "y"} <= set(names) else None, names
+    with open_hdf5(path, "track or file of wrenches") as file:
+        return "whisk" if "pixels_x" in file else "deeplabcut" if pandas_groups(file) else None, list(file)
 
 
 def _read_points(path: str | os.PathLike[str], options: TrackOptions) -> tuple[NDArray[np.int_], Array]:
@@ -122,11 +116,9 @@ def _read_points(path: str | os.PathLike[str], options: TrackOptions) -> tuple[N
             )
         chosen = columns["whisker"] == float(wanted)
         columns = {name: values[chosen] for name, values in columns.items()}
-    frames = columns["frame"]
-    if not np.isfinite(frames).all() or (frames % 1).any():
-        raise DataError(f"The frame numbers of {shown(os.fspath(path))} are not whole numbers.")
+    frames = frame_numbers(columns["frame"], path)
     axes = [axis for axis in ("x", "y", "z") if axis in columns]
-    every = np.arange(int(frames.min()), int(frames.max()) + 1)
+    every = np.arange(frames.min(), frames.max() + 1)
     counts = np.array([np.sum(frames == frame) for frame in every])
     points = np.full((len(every), counts.max(), len(axes)), np.nan)
     for index, frame in enumerate(every):
