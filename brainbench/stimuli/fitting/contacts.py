@@ -39,6 +39,9 @@ FEWEST_POINTS = 6
 _STEP = 1e-5
 _ARCS = (0.15, 0.3, 0.45, 0.6, 0.75, 0.9)
 _DEFLECTIONS = (0.02, 0.06, 0.15, 0.3)
+_UNITS = {"force": "N", "arc": "m", "moment": "N m", "base_angle": "rad", "force_deviation": "N", "arc_deviation": "m",
+          "residual": "m", "force_vector": "N", "point": "m"}  # fmt: skip
+"""Numbers that are found in a frame; the last two have two axes."""
 
 
 @dataclass(frozen=True)
@@ -81,31 +84,6 @@ class ShapeFit:
     """Why there is no fit, if so."""
 
 
-@dataclass(frozen=True)
-class ContactEstimate:
-    """Contact of one frame, as its shape tells."""
-
-    force: float = math.nan
-    """Force on the whisker [N], along the normal on its left where positive."""
-    arc: float = math.nan
-    """Arc length of the contact [m]."""
-    moment: float = math.nan
-    """Moment of the whisker on its base about the base point [N·m]."""
-    point: tuple[float, float] = (math.nan, math.nan)
-    """Contact point on the centre line [m]."""
-    vector: tuple[float, float] = (math.nan, math.nan)
-    """Force on the whisker [N]."""
-    base_angle: float = math.nan
-    """Direction of the whisker at its base [rad]."""
-    force_deviation: float = math.nan
-    arc_deviation: float = math.nan
-    """Standard deviations [N, m]."""
-    residual: float = math.nan
-    """Root mean square distance of the traced points from the fitted shape [m]."""
-    status: str = "undefined"
-    reason: str = ""
-
-
 def find_contacts(
     shapes: xr.Dataset,
     whisker: Whisker,
@@ -123,8 +101,9 @@ def find_contacts(
 
     Returns:
         ``force`` [time] (N, positive on the left of the whisker), ``force_vector`` [time, axis], ``arc``, ``point``
-        [time, axis] (m), ``moment`` (N·m), ``base_angle``, their standard deviations ``force_deviation`` and
-        ``arc_deviation``, ``residual`` (m), ``status`` and ``reason``. ``undefined``: no sign of a contact, or no fit.
+        [time, axis] (m), ``moment`` (N·m, of the whisker on its base), ``base_angle``, standard deviations
+        ``force_deviation`` and ``arc_deviation``, ``residual`` (m), ``status`` and ``reason``. ``undefined``: no sign
+        of a contact, or no fit.
 
     Raises:
         DataError: the shapes are not those of a whisker of this length, change places, or bend in no plane.
@@ -142,19 +121,18 @@ def find_contacts(
     before: Array | None = None
     for frame, place in zip(points, known, strict=True):
         fits.append(solver.solve(frame, place, before))
-        before = fits[-1].unknowns if solver.estimate(fits[-1]).status == "ok" else None
+        before = fits[-1].unknowns if solver.estimate(fits[-1])["status"] == "ok" else None
     if options.frames > 1:
         fits = solver.even_out(fits, shapes["time"].values.astype(float))
     found = [solver.estimate(one) for one in fits]
-    scalars = ("force", "arc", "moment", "base_angle", "force_deviation", "arc_deviation", "residual")
-    units = dict.fromkeys(scalars, "m") | {"force": "N", "force_deviation": "N", "moment": "N m", "base_angle": "rad"}
+    shape = {"force_vector": ("time", "axis"), "point": ("time", "axis")}
     return xr.Dataset(
         {
-            **{name: ("time", [getattr(one, name) for one in found], {"units": units[name]}) for name in scalars},
-            "force_vector": (("time", "axis"), [one.vector for one in found], {"units": "N"}),
-            "point": (("time", "axis"), [one.point for one in found], {"units": "m"}),
-            "status": ("time", np.array([one.status for one in found], dtype=object)),
-            "reason": ("time", np.array([one.reason for one in found], dtype=object)),
+            **{
+                name: (shape.get(name, "time"), [one[name] for one in found], {"units": unit})
+                for name, unit in _UNITS.items()
+            },
+            **{name: ("time", np.array([one[name] for one in found], dtype=object)) for name in ("status", "reason")},
         },
         coords={"time": shapes["time"], "axis": np.array(["x", "y"], dtype=object)},
         attrs={"young_modulus": whisker.young_modulus, "arc_length": whisker.arc_length},
@@ -284,63 +262,64 @@ class ContactSolver:
 
     def _logarithms(self, one: ShapeFit) -> tuple[Array, Array, Array] | None:
         """Return log arc and log force [2], their covariance [2, 2], and their slope [2, 5] by the unknowns."""
-        force, slope = self._force_slope(one)
-        if one.reason or not abs(force) >= NO_FORCE * math.sqrt(max(float(slope @ one.covariance @ slope), 0.0)):
+        force, deviation, slope = self._force(one)
+        if one.reason or not abs(force) >= NO_FORCE * deviation:
             return None
         by = np.stack([np.eye(5)[3] / one.unknowns[3], slope / force])
         return np.log([one.unknowns[3], abs(force)]), by @ one.covariance @ by.T, by
 
-    def _force_slope(self, one: ShapeFit) -> tuple[float, Array]:
-        """Return the force (N) of a fit, and its derivatives [5] by the unknowns."""
+    def _force(self, one: ShapeFit) -> tuple[float, float, Array]:
+        """Return the force (N) of a fit, its standard deviation, and its derivatives [5] by the unknowns."""
         length = self.whisker.arc_length
         ends = one.unknowns + np.concatenate([np.zeros((1, 5)), np.eye(5), -np.eye(5)]) * _STEP
         sizes = self.force(ends[:, 3] * length, ends[:, 4] * length)
-        return float(sizes[0]), (sizes[1:6] - sizes[6:]) / (2 * _STEP)
+        slope = (sizes[1:6] - sizes[6:]) / (2 * _STEP)
+        return float(sizes[0]), math.sqrt(max(float(slope @ one.covariance @ slope), 0.0)), slope
 
-    def estimate(self, one: ShapeFit) -> ContactEstimate:
-        """Return the contact of a fit, with standard deviations and a status."""
+    def estimate(self, one: ShapeFit) -> dict[str, Any]:
+        """Return what :func:`find_contacts` gives of a frame from its fit, with a status."""
         if not np.isfinite(one.unknowns).all():
-            return ContactEstimate(reason=one.reason)
-        options, length = self.options, self.whisker.arc_length
-        force, slope = self._force_slope(one)
-        deviation = math.sqrt(max(float(slope @ one.covariance @ slope), 0.0))
+            nothing = dict.fromkeys(_UNITS, math.nan) | dict.fromkeys(("force_vector", "point"), (math.nan, math.nan))
+            return {**nothing, "status": "undefined", "reason": one.reason}
+        length = self.whisker.arc_length
+        force, deviation, _ = self._force(one)
         shape = self.shapes(one.unknowns[None])
-        status, reason = "ok", ""
+        status, reason = self._judge(one, force, deviation)
+        return {
+            "force": force,
+            "arc": length * float(one.unknowns[3]),
+            "moment": float(shape.moment[0]),
+            "base_angle": float(one.unknowns[2]),
+            "force_deviation": deviation,
+            "arc_deviation": length * math.sqrt(max(float(one.covariance[3, 3]), 0.0)),
+            "residual": one.residual,
+            "force_vector": (force * shape.force[0]).tolist(),
+            "point": shape.contact[0].tolist(),
+            "status": status,
+            "reason": reason,
+        }
+
+    def _judge(self, one: ShapeFit, force: float, deviation: float) -> tuple[str, str]:
+        """Return the status of a fit and why, from its force and the standard deviation of it (N)."""
+        noise = self.options.noise
         if one.reason:
-            status, reason = "undefined", one.reason
-        elif abs(force) < NO_FORCE * deviation:
+            return "undefined", one.reason
+        if abs(force) < NO_FORCE * deviation:
             share = abs(force) / max(deviation, 1e-300)
-            status, reason = (
-                "undefined",
-                f"No sign of a contact: the force is {share:.1f} standard deviations from 0.",
-            )
-        elif options.noise and one.spread > MISFIT * options.noise:
-            status, reason = (
-                "unreliable",
+            return "undefined", f"No sign of a contact: the force is {share:.1f} standard deviations from 0."
+        if noise and one.spread > MISFIT * noise:
+            return "unreliable", (
                 f"The shape fits no whisker with one contact: points lie {1e6 * one.spread:.0f} µm from it, the noise "
-                f"is {1e6 * options.noise:.0f} µm.",
+                f"is {1e6 * noise:.0f} µm."
             )
-        elif not NEAREST + 1e-3 < one.unknowns[3] < FARTHEST - 1e-3:
-            status, reason = "unreliable", "The contact lies at the end of the range that is looked for."
-        elif deviation > VAGUE * abs(force):
-            status, reason = (
-                "unreliable",
+        if not NEAREST + 1e-3 < one.unknowns[3] < FARTHEST - 1e-3:
+            return "unreliable", "The contact lies at the end of the range that is looked for."
+        if deviation > VAGUE * abs(force):
+            return "unreliable", (
                 f"The shape tells the force to {100 * deviation / abs(force):.0f} % only; give the contact point, "
-                "trace more of the whisker, or let neighbouring frames share their contact (frames).",
+                "trace more of the whisker, or let neighbouring frames share their contact (frames)."
             )
-        return ContactEstimate(
-            force=force,
-            arc=length * float(one.unknowns[3]),
-            moment=float(shape.moment[0]),
-            point=tuple(shape.contact[0].tolist()),
-            vector=tuple((force * shape.force[0]).tolist()),
-            base_angle=float(one.unknowns[2]),
-            force_deviation=deviation,
-            arc_deviation=length * math.sqrt(max(float(one.covariance[3, 3]), 0.0)),
-            residual=one.residual,
-            status=status,
-            reason=reason,
-        )
+        return "ok", ""
 
 
 def _in_plane(points: Array) -> Array:
