@@ -18,7 +18,8 @@ from benchmarks.report import table, write_section
 from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.engines.rod.sweeps import SweepLauncher
 from brainbench.stimuli.engines.trust import LARGEST_CHANGE, LARGEST_STRAIN, force_change
-from brainbench.stimuli.objects.mesh_solids import shape_solids
+from brainbench.stimuli.objects.collections import resolve_objects
+from brainbench.stimuli.objects.procedural import list_families
 from brainbench.stimuli.sweeps.sweep_scenes import GRIDS, SweepScenes
 
 CASES = (
@@ -31,7 +32,7 @@ CASES = (
 def run(recipe: str, placing: str, fidelity: str, objects: int, each: int) -> list[str]:
     """One row: sweeps at a fidelity with and without the comparison, and every whisker at half the step."""
     grid = replace(GRIDS[recipe], placing=placing)
-    solids = shape_solids()
+    solids = {name: item.load for name, item in resolve_objects(list_families()).items()}
     names = list(solids)[:: len(solids) // objects][:objects]
     launcher = SweepLauncher(SweepScenes(grid, {name: solids[name] for name in names}), Fidelity.of(fidelity))
     picked: dict[str, list[Any]] = {}

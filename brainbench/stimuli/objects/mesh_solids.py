@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import functools
 import logging
 import os
-from collections.abc import Callable, Iterable
 from dataclasses import replace
 
 from brainbench.core.errors import UsageError, check_name
 from brainbench.core.files import content_hash
-from brainbench.core.reading.ranges import check_number
 from brainbench.geometry import DecompositionSettings, Mesh, decompose, deviation, load_mesh, repair
 from brainbench.stimuli.objects.obstacle import ConvexPart
 from brainbench.stimuli.objects.procedural import Shape
@@ -85,37 +82,6 @@ def shape_solid(
     parts = tuple(ConvexPart(part.vertices) for part in shape.parts)
     origin = {"mesh": mesh.content_hash, "parts": content_hash([*shape.part_points])}
     return Solid(name, parts, mesh, notes, origin, to_surface(mesh)).to_diagonal(diagonal)
-
-
-def shape_solids(
-    families: Iterable[str] | None = None,
-    *,
-    members: int = 1,
-    diagonal: float = 0.04,
-    detail: int = 4_000,
-    collision: str | None = None,
-) -> dict[str, Callable[[], Solid]]:
-    """Return, by name (``torus-0``), functions that make procedural solids when they are needed, as sweeps take them.
-
-    Args:
-        families: names from :func:`brainbench.stimuli.objects.procedural.list_families`; all of them when None.
-        members: shapes of each family, with the seeds 0, 1, ….
-        diagonal, collision, detail: as for :func:`shape_solid` and :func:`brainbench.stimuli.objects.procedural.make`.
-
-    Raises:
-        UsageError: a family is unknown, or there is less than one member.
-    """
-    from brainbench.stimuli.objects import procedural
-
-    check_number("members of a family", members, least=1, whole=True)
-    chosen = procedural.list_families() if families is None else tuple(families)
-    for family in chosen:
-        procedural.describe_family(family)
-
-    def load(family: str, seed: int) -> Solid:
-        return shape_solid(procedural.make(family, seed, detail=detail), diagonal=diagonal, collision=collision)
-
-    return {f"{family}-{seed}": functools.partial(load, family, seed) for family in chosen for seed in range(members)}
 
 
 def touchable(mesh: Mesh, collision: str, settings: DecompositionSettings | None) -> Solid:

@@ -16,7 +16,7 @@ from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.engines.protocol import Job, StillFollicle
 from brainbench.stimuli.motion.trajectories import Path, Spin, Translation
 from brainbench.stimuli.objects import procedural
-from brainbench.stimuli.objects.mesh_solids import mesh_solid, shape_solid, shape_solids
+from brainbench.stimuli.objects.mesh_solids import mesh_solid, shape_solid
 from brainbench.stimuli.objects.obstacle import TriangleMesh
 from brainbench.stimuli.objects.placed_object import PlacedObject
 from brainbench.stimuli.objects.primitives import RODGERS_CONTROL, box, capsule, cylinder, rodgers_solid, sphere
@@ -296,17 +296,6 @@ def test_engines_of_convex_bodies_refuse_a_concave_surface_and_name_what_works(b
     job = Job(whisker, StillFollicle(), (item.obstacle(),), np.array([1e-3]))
     with pytest.raises(UsageError, match=rf"'{backend}'.*'decomposition'.*'rod'"):
         get_engine(backend).run([job], Fidelity(links=4, time_step=2e-4))
-
-
-def test_labelled_sets_of_shapes_are_made_on_demand():
-    loaders = shape_solids(["brick", "cone"], members=2, detail=2000)
-    assert list(loaders) == ["brick-0", "brick-1", "cone-0", "cone-1"]
-    assert loaders["cone-1"]().name == "cone-1"
-    assert len(shape_solids()) >= 24
-    with pytest.raises(UsageError, match="did you mean 'brick'"):
-        shape_solids(["brik"])
-    with pytest.raises(UsageError, match=r"members .*received 0"):
-        shape_solids(members=0)
 
 
 def test_a_flat_mesh_cannot_be_touched(tmp_path):

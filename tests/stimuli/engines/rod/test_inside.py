@@ -11,8 +11,9 @@ from brainbench.stimuli.engines import get_engine
 from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.engines.protocol import Job, StillFollicle, base_rotation
 from brainbench.stimuli.engines.rod.engine import RodEngine
-from brainbench.stimuli.objects.mesh_solids import shape_solids
+from brainbench.stimuli.objects.mesh_solids import shape_solid
 from brainbench.stimuli.objects.obstacle import Box, Capsule, ConvexPart, Cylinder, Obstacle, Sphere, TriangleMesh
+from brainbench.stimuli.objects.procedural import make
 from brainbench.stimuli.sweeps.grid import SweepGrid
 from brainbench.stimuli.sweeps.simulation import simulate_sweeps
 from brainbench.stimuli.sweeps.sweep_scenes import SweepScenes
@@ -51,7 +52,7 @@ def _depths(scene, fidelity=COARSE):
 def released():
     """Large objects in the released placing, which start inside the array, and how deep each whisker then is."""
     grid = SweepGrid(start=0.016, placing="released", size=(0.05,), rotation=(0.0,), distance=(0.005,))
-    scenes = SweepScenes(grid, shape_solids(["ellipsoid", "brick"], detail=2000))
+    scenes = SweepScenes(grid, [shape_solid(make(family, detail=2000)) for family in ("ellipsoid", "brick")])
     return scenes, np.array([_depths(scene) for scene in scenes])
 
 
