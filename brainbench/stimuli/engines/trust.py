@@ -1,11 +1,10 @@
-"""The one rule of which simulated whiskers can be trusted, and the one way of simulating the others again."""
+"""The one rule of which simulated whiskers can be trusted."""
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Protocol, Self, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -209,91 +208,6 @@ def force_change(force: NDArray[np.floating], half: NDArray[np.floating]) -> NDA
     """Return the difference [row, column] of two forces [row, reading, column, 3] over the larger (rms)."""
     square = [np.einsum("rtcd,rtcd->rc", x, x, dtype=float) for x in (half - force, force, half)]
     return np.sqrt(square[0] / np.maximum(np.maximum(square[1], square[2]), 1e-30))
-
-
-class Judged(Protocol):
-    """Results of a simulation whose whiskers were judged."""
-
-    @property
-    def verdict(self) -> Verdict:
-        """Reliability of each whisker."""
-        ...
-
-    def picked(self, which: NDArray[np.bool_]) -> Self:
-        """Return the results of some of these whiskers; their steps count for the first who asks."""
-        ...
-
-    def replaced(self, which: NDArray[np.bool_], finer: Self) -> Self:
-        """Return the results with these whiskers as another simulation of them alone gave them."""
-        ...
-
-    def compared(self, which: NDArray[np.bool_], half: Self) -> Self:
-        """Return the results with these whiskers judged by a simulation of them with half the step (:func:`halved`)."""
-        ...
-
-
-Try = tuple[NDArray[np.bool_] | None, int]
-"""Whiskers to simulate, all when None, and what divides their steps."""
-Ahead = tuple[Sequence[int], Sequence[int]]
-"""Multiples of ``retry`` by which steps are divided at once for whiskers in doubt: right after the first simulation,
-and after that with steps over ``retry``."""
-ONE_BY_ONE: Ahead = (), (2,)
-"""Only what is needed: who is in doubt with steps over ``retry`` needs those over twice that, as a half or as a try."""
-Result = TypeVar("Result", bound=Judged)
-
-
-def run_with_retries(
-    simulate: Callable[[Sequence[Try]], Sequence[Result]],
-    retry: int,
-    *,
-    ahead: Callable[[], Ahead] = lambda: ONE_BY_ONE,
-) -> Result:
-    """Simulate whiskers, and those that finer steps may mend again: with steps over ``retry``, then over twice that.
-
-    After each of these, suspicious whiskers are compared with half the step (:func:`halved`).
-
-    Args:
-        simulate: gives the results of tries, which may be simulated at the same time; whiskers of a mask are in its
-            order, and alone.
-        retry: 1 leaves all whiskers as they are.
-        ahead: gives the tries to simulate before it is known whether they are needed, where further whiskers cost
-            less time than further launches; asked before each. Results do not depend on it.
-    """
-    (result,) = simulate([(None, 1)])
-    if retry == 1:
-        return result
-    known: dict[int, list[tuple[NDArray[np.bool_], Result]]] = {}
-
-    def run(wanted: Mapping[int, NDArray[np.bool_]]) -> None:
-        """Simulate whiskers, by what divides their steps, unless that was done before."""
-        tries = []
-        for finer, which in wanted.items():
-            missing = which & ~np.any([some for some, _ in known.setdefault(finer, [])], axis=0)
-            if missing.any():
-                tries.append((missing, finer))
-        for (which, finer), found in zip(tries, simulate(tries) if tries else (), strict=True):
-            known[finer].append((which, found))
-
-    def parts(which: NDArray[np.bool_], finer: int) -> Iterator[tuple[NDArray[np.bool_], Result]]:
-        """Yield these whiskers in parts with their results."""
-        for simulated, found in known[finer]:
-            some = which & simulated
-            if some.any():
-                yield some, found.picked(some[simulated])
-
-    left = np.ones_like(result.verdict.retryable)
-    for place, finer in enumerate((1, retry, 2 * retry)):
-        if finer > 1:
-            left = result.verdict.retryable.copy()
-            run({finer: left})
-            for some, found in parts(left, finer):
-                result = result.replaced(some, found)
-        suspicious = result.verdict.suspicious & left
-        doubtful = suspicious | result.verdict.retryable
-        run({2 * finer: suspicious} | {retry * k: doubtful for k in (*ahead(), ())[place]})
-        for some, half in parts(suspicious, 2 * finer):
-            result = result.compared(some, half)
-    return result
 
 
 def strongest_force(whisker: Whisker) -> float:

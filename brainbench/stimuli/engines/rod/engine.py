@@ -21,10 +21,10 @@ from brainbench.stimuli.engines.rod.launch import LaunchResult, WhiskerSolver, r
 from brainbench.stimuli.engines.rod.packing import Track, capacity_for
 from brainbench.stimuli.engines.rod.shapes import PackedSurface
 from brainbench.stimuli.engines.rod.tasks import JobTask, PackedTasks, make_task
-from brainbench.stimuli.engines.rod.tries import tries_ahead
+from brainbench.stimuli.engines.rod.tries import Try, run_with_retries, tries_ahead
 from brainbench.stimuli.engines.stepping import silent_trace
 from brainbench.stimuli.engines.sweep_batch import SweepBatch
-from brainbench.stimuli.engines.trust import Try, check_jobs, run_with_retries
+from brainbench.stimuli.engines.trust import check_jobs
 from brainbench.stimuli.objects.solid import Solid
 from brainbench.stimuli.sweeps.sweep_scenes import SweepScenes
 

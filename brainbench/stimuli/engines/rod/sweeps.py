@@ -25,9 +25,8 @@ from brainbench.stimuli.engines.rod.launch import LaunchResult, WhiskerSolver
 from brainbench.stimuli.engines.rod.limits import MESHES, WIDEST
 from brainbench.stimuli.engines.rod.packing import PackedJobs, PackedMotions, still_knots
 from brainbench.stimuli.engines.rod.shapes import PackedShapes, PackedSurface
-from brainbench.stimuli.engines.rod.tries import first_simulation, tries_ahead
+from brainbench.stimuli.engines.rod.tries import Ahead, Try, first_simulation, run_with_retries, tries_ahead
 from brainbench.stimuli.engines.sweep_batch import SweepBatch, describe_unstable, join_batches
-from brainbench.stimuli.engines.trust import Ahead, Try, run_with_retries
 from brainbench.stimuli.engines.units import MILLI
 from brainbench.stimuli.objects.solid import Solid
 from brainbench.stimuli.sweeps.sweep_scenes import SweepScenes
@@ -59,11 +58,11 @@ class SweepLauncher:
         if grid.mover != "object":
             raise UsageError("Only sweeps whose object moves go through the fast path; received mover='head'.")
         self.device = pick_device(device)
-        sliced = self.device.is_cuda if sliced is None else sliced
+        sliced = bool(self.device.is_cuda) if sliced is None else sliced
         bounds = SLICED_BOUNDS if sliced else BOUNDS
         self.scenes, self.grid = scenes, grid
         self.ahead: Callable[[], Ahead] = partial(tries_ahead, self.device)
-        """As in :func:`brainbench.stimuli.engines.trust.run_with_retries`."""
+        """As in :func:`.tries.run_with_retries`."""
         self.seconds: dict[str, float] = {}
         """Elapsed time of the last launch for placing objects, uploading, and computing."""
         mounts = list(scenes.array)
