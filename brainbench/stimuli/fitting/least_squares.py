@@ -74,7 +74,8 @@ def fit(
         ]
     free = FreeParameters(tuple(parameters), condition, bounds or {})
     model = FitModel(trials, free, options)
-    problem = _Problem(model, _chosen_priors(free, options, priors or {}))
+    chosen = {**(PUBLISHED if options.priors == "published" else {}), **(priors or {})}
+    problem = _Problem(model, {index: chosen[name] for index, name in enumerate(free.names) if name in chosen})
     begin = np.zeros(len(free))
     if not np.isfinite(model.residual(begin)).all():
         raise DataError(
@@ -84,12 +85,6 @@ def fit(
     check_wrenches(trials, model.run(begin).traces)
     solutions = sorted((problem.solve(u) for u in find_starts(model)), key=lambda one: one.deviance)
     return _judge(problem, solutions, began)
-
-
-def _chosen_priors(free: FreeParameters, options: FitOptions, given: Mapping[str, Prior]) -> dict[int, Prior]:
-    """Return the prior of each parameter that has one, by its index."""
-    chosen = {**(PUBLISHED if options.priors == "published" else {}), **given}
-    return {index: chosen[name] for index, name in enumerate(free.names) if name in chosen}
 
 
 @dataclass(frozen=True, eq=False)
@@ -224,7 +219,13 @@ def _judge(problem: _Problem, solutions: Sequence[_Solution], began: float) -> F
         predicted=predicted,
         covariance=covariance,
         iterations=sum(one.iterations for one in solutions),
-        provenance=provenance(options=options, seconds=time.perf_counter() - began, **model.describe()),
+        provenance=provenance(
+            options=options,
+            seconds=time.perf_counter() - began,
+            jacobian="forward derivatives of the simulated steps",
+            fidelity=model.fidelity,
+            simulated_whiskers=model.simulated,
+        ),
     )
 
 

@@ -9,7 +9,6 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import chain, islice
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -225,14 +224,6 @@ class FitModel:
                 level = math.sqrt(float(np.mean(some**2)) / share)
                 # Without any noise the numbers of the simulation are exact to about this.
                 self.sigma[index] = max(level, 1e-6 * readings.size[index], 1e-300)
-
-    def describe(self) -> dict[str, Any]:
-        """Return what the provenance of a result says of the model."""
-        return {
-            "jacobian": "forward derivatives of the simulated steps",
-            "fidelity": self.fidelity,
-            "simulated_whiskers": self.simulated,
-        }
 
 
 def _moved(trace: Trace, tangent: Tangents, p: int, way: float) -> Trace:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
@@ -78,14 +77,14 @@ class FitResult:
         return next(one for one in self.estimates if one.name == name)
 
     def summary(self) -> dict[str, Any]:
-        """Return plain values of everything but the arrays, for JSON."""
+        """Return everything but the arrays, for JSON."""
         return {
             "status": self.status,
             "reasons": list(self.reasons),
-            "estimates": [_plain(one) for one in self.estimates],
+            "estimates": [vars(one) for one in self.estimates],
             "noise": dict(self.noise),
             "directions": [
-                {"words": one.words, "deviation": _finite(one.deviation), "identified": one.identified}
+                {"words": one.words, "deviation": one.deviation, "identified": one.identified}
                 for one in self.directions
             ],
             "residual_tests": [vars(one) for one in self.tests],
@@ -93,11 +92,3 @@ class FitResult:
             "iterations": self.iterations,
             "provenance": dict(self.provenance),
         }
-
-
-def _finite(value: float) -> float | None:
-    return value if math.isfinite(value) else None
-
-
-def _plain(one: FittedParameter) -> dict[str, Any]:
-    return {**vars(one), "relative_deviation": _finite(one.relative_deviation)}
