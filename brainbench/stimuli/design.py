@@ -12,7 +12,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -164,7 +164,7 @@ def design(
         raise UsageError("A design needs at least two scenes, each with an object to tell from the others.")
     begin, limits = read_limits(scenes[0], variables, bounds or {})
     evaluator = _Evaluator(scenes, tuple(variables), options, backend)
-    finalists = find_motions(evaluator, begin, limits, options)
+    finalists = find_motions(evaluator.worths, evaluator.slope, begin, limits, options)
     # What is best at the coarse setting need not be at the finer one, which has the last word.
     fine = _Evaluator(scenes, tuple(variables), replace(options, fidelity=options.check), backend)
     measured = fine.distances(finalists)
@@ -189,23 +189,20 @@ def read_limits(
     return begin, limits
 
 
-class MotionEvaluator(Protocol):
-    """What a motion is worth; more is better."""
-
-    differentiable: bool
-    """False when :meth:`slope` must not be asked for."""
-
-    def worths(self, points: Sequence[Array]) -> list[float]:
-        """Return the worth at each of some values [p]; NaN with unstable whiskers."""
-        ...
-
-    def slope(self, values: Array, scales: Array) -> tuple[float, Array]:
-        """Return the worth at some values [p] and its derivatives by them; NaN and 0 with unstable whiskers."""
-        ...
-
-
-def find_motions(evaluator: MotionEvaluator, begin: Array, limits: Array, options: DesignOptions) -> list[Array]:
+def find_motions(
+    worths: Callable[[Sequence[Array]], list[float]],
+    slope: Callable[[Array, Array], tuple[float, Array]] | None,
+    begin: Array,
+    limits: Array,
+    options: DesignOptions,
+) -> list[Array]:
     """Return the given motion and the best that were found: ends of searches by gradient, and the best that was tried.
+
+    Args:
+        worths: worth of a motion at each of some values [p], more is better; NaN with unstable whiskers.
+        slope: worth at some values [p] and its derivatives by them, given the sizes of small changes [p]; NaN and 0
+            with unstable whiskers. None where there is no gradient.
+        begin, limits, options: values [p] of the given motion, bounds [p, 2], and the search.
 
     Raises:
         DataError: whiskers are unstable with the given motion.
@@ -215,20 +212,20 @@ def find_motions(evaluator: MotionEvaluator, begin: Array, limits: Array, option
     width = limits[:, 1] - limits[:, 0]
 
     def cost(x: Array) -> tuple[float, Array]:
-        value, slope = evaluator.slope(limits[:, 0] + x * width, SCALE * width)
+        value, by = slope(limits[:, 0] + x * width, SCALE * width)  # type: ignore[misc]
         if math.isnan(value):  # unstable: the line search turns back
             return -NOTHING, np.zeros(len(x))
-        return -value, -slope * width
+        return -value, -by * width
 
     at = (begin - limits[:, 0]) / width
     others = np.random.default_rng(options.seed).uniform(size=(options.starts, len(at)))
     tried = [at, *others]
-    first = evaluator.worths([limits[:, 0] + x * width for x in tried])
+    first = worths([limits[:, 0] + x * width for x in tried])
     if not np.isfinite(first[0]):
         raise DataError("Whiskers are unstable with the given motion; simulate the scenes more finely.")
     order = np.argsort(-np.nan_to_num(first, nan=-math.inf))[: options.searches]
     found = [tried[index] for index in order]
-    if evaluator.differentiable:
+    if slope is not None:
         how = {"maxiter": options.iterations, "maxls": 8}
         bounds = [(0, 1)] * len(at)
         ends = [minimize(cost, x, jac=True, bounds=bounds, method="L-BFGS-B", options=how).x for x in found]
@@ -282,8 +279,6 @@ def _soft_least(distances: Array) -> tuple[float, Array]:
 
 class _Evaluator:
     """Distances between the objects of scenes, at values of the variables."""
-
-    differentiable = True
 
     def __init__(self, scenes: Sequence[Scene], names: tuple[str, ...], options: DesignOptions, backend: str) -> None:
         self.scenes, self.names, self.options = list(scenes), names, options

@@ -25,9 +25,9 @@ from __future__ import annotations
 import itertools
 import math
 import os
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass, replace
-from functools import cached_property
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -35,7 +35,7 @@ import numpy as np
 
 from brainbench.core.errors import BrainbenchError, DataError, check_name, unknown_name
 from brainbench.core.files import read_json, write_json, write_text
-from brainbench.core.progress import Progress
+from brainbench.core.progress import Progress, track
 from brainbench.core.tradeoffs import TradeoffPoint, pareto_front
 from brainbench.geometry import DecompositionSettings
 from brainbench.stimuli.engines import DEFAULT_ENGINE, get_engine
@@ -157,12 +157,10 @@ def measure_tradeoff(
         points = list(table["points"])
     known = {_key(point) for point in points}
     missing = [setting for setting in wanted if _key(_fields(setting)) not in known]
-    all_objects, hollows = _References(contact_scenes.OBJECTS), _References(("hollow",))
-    for done, setting in enumerate(missing, start=1):
-        points.append(_measure(setting, hollows if setting.collision else all_objects))
+    references = cache(_references)
+    for setting in track(missing, "measuring settings", progress):
+        points.append(_measure(setting, references))
         write_json(path, {**head, "points": points})
-        if progress is not None:
-            progress(done, len(missing), "measuring settings")
     return points
 
 
@@ -174,18 +172,18 @@ def write_csv(points: Iterable[dict[str, Any]], path: str | os.PathLike[str]) ->
     return write_text(path, pd.DataFrame(list(points), dtype=object).sort_index(axis=1).to_csv(index=False))
 
 
-def front(points: Iterable[dict[str, Any]], *, backend: str | None = None) -> list[TradeoffPoint]:
+def front(points: Iterable[dict[str, Any]]) -> list[TradeoffPoint]:
     """Return the points of the bench tests that none beats in both error and cost, cheapest first.
 
-    They are of one backend, or of all. Points with a collision geometry are other experiments and are left out, and so
-    are those without inertia, for which some of the errors mean nothing.
+    Points with a collision geometry are other experiments and are left out, and so are those without inertia, for
+    which some of the errors mean nothing.
     """
     return pareto_front(
         TradeoffPoint(
             math.inf if p[ERROR] is None else p[ERROR], p["cost"], {n: p.get(n) for n in (*RESOLUTION, "backend")}
         )
         for p in points
-        if p["cost"] is not None and not p.get("collision") and backend in (None, p["backend"]) and _moves(p)
+        if p["cost"] is not None and not p.get("collision") and _moves(p)
     )
 
 
@@ -228,21 +226,18 @@ def _header() -> dict[str, Any]:
     }
 
 
-class _References:
-    """Jobs of the scenes with some objects, and what a converged simulation says of them, once it is asked for."""
+def _references(objects: tuple[str, ...]) -> dict[int, Trace]:
+    """Return what a converged simulation says of the scenes with some objects, by the index of their job.
 
-    def __init__(self, objects: Sequence[str]) -> None:
-        self.objects = objects
-
-    @cached_property
-    def traces(self) -> dict[int, Trace]:
-        """Traces that can be trusted and touch something, by the index of their job."""
-        jobs = contact_scenes.contact_jobs(SEED, objects=self.objects)
-        traces = get_engine(REFERENCE.backend).run(jobs, REFERENCE.fidelity.resolved(True))
-        return {i: trace for i, trace in enumerate(traces) if trace.status == "ok" and trace.contact.any()}
+    Only traces are there that can be trusted and touch something.
+    """
+    jobs = contact_scenes.contact_jobs(SEED, objects=objects)
+    traces = get_engine(REFERENCE.backend).run(jobs, REFERENCE.fidelity.resolved(True))
+    return {i: trace for i, trace in enumerate(traces) if trace.status == "ok" and trace.contact.any()}
 
 
-def _measure(setting: SimulationSetting, references: _References) -> dict[str, Any]:
+def _measure(setting: SimulationSetting, references: Callable[[tuple[str, ...]], dict[int, Trace]]) -> dict[str, Any]:
+    objects = ("hollow",) if setting.collision else contact_scenes.OBJECTS
     values: dict[str, Any] = {**_fields(setting), **dict.fromkeys((*SHARES.values(), "untrusted", "cost")), "note": ""}
     try:
         solid = None
@@ -252,9 +247,9 @@ def _measure(setting: SimulationSetting, references: _References) -> dict[str, A
             values["pieces"] = len(body.parts) if body.surface is None else len(body.surface.faces)
         else:
             _test_bench(setting, values)
-        jobs = contact_scenes.contact_jobs(SEED, objects=references.objects, hollow=solid)
-        traces, values["cost"] = run_for_cost(setting, [jobs[index] for index in references.traces])
-        errors = [contact_scenes.difference(*pair) for pair in zip(traces, references.traces.values(), strict=True)]
+        jobs, known = contact_scenes.contact_jobs(SEED, objects=objects, hollow=solid), references(objects)
+        traces, values["cost"] = run_for_cost(setting, [jobs[index] for index in known])
+        errors = [contact_scenes.difference(*pair) for pair in zip(traces, known.values(), strict=True)]
         values["untrusted"] = float(np.isinf(errors).mean())
         for share, name in SHARES.items():
             bound = float(np.quantile(errors, share, method="higher"))

@@ -116,7 +116,8 @@ def design_for_networks(
         raise UsageError(f"The network {models[0].name!r} is given twice; give two different ones.")
     names = tuple(variables)
     evaluator = _Evaluator(scenes[::2], names, models, options.fidelity, backend)
-    points = find_motions(evaluator, begin, limits, options)
+    slope = evaluator.slope if evaluator.differentiable else None
+    points = find_motions(evaluator.worths, slope, begin, limits, options)
     # What is best at the coarse setting need not be at the finer one, which has the last word.
     fine = _Evaluator(scenes[::2], names, models, options.check, backend)
     other = _Evaluator(scenes[1::2], names, models, options.check, backend)
