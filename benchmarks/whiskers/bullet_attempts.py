@@ -110,17 +110,16 @@ class Native:
         return np.array(moments)
 
     def _prepare(self, world: BulletWorld) -> None:
-        b, c, body = world.bullet, world.client, world.whisker
+        b, body = world.bullet, world.whisker
         b.setPhysicsEngineParameter(
             fixedTimeStep=self.h,
             numSubSteps=0,
             numSolverIterations=500,
             solverResidualThreshold=1e-14,
             contactERP=0.2,
-            physicsClientId=c,
         )
         for part in itertools.chain(*world.parts):
-            b.changeDynamics(part, -1, lateralFriction=0, physicsClientId=c)
+            b.changeDynamics(part, -1, lateralFriction=0)
         least = (self.h**2 * self.k + 2 * self.h * self.d)[1::2] / 4
         added = 2 * (least + np.append(least[1:], 0.0)) if self.method == "added inertia" else np.zeros(LINKS)
         for joint in range(FOLLICLE + 2 * LINKS):
@@ -132,15 +131,14 @@ class Native:
                 inertia = self.chain.inertias[(joint - FOLLICLE) // 2] * 1e12
                 more = added[(joint - FOLLICLE) // 2]
                 options.update(localInertiaDiagonal=(inertia[0], inertia[1] + more, inertia[1] + more))
-            b.changeDynamics(body, joint, **options, physicsClientId=c)
+            b.changeDynamics(body, joint, **options)
         # Every joint is born with a motor that holds it.
         b.setJointMotorControlArray(
             body, range(FOLLICLE + 2 * LINKS), b.VELOCITY_CONTROL, forces=[0.0] * (FOLLICLE + 2 * LINKS),
-            physicsClientId=c,
         )  # fmt: skip
 
     def _step(self, world: BulletWorld, q: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        b, c, body, h = world.bullet, world.client, world.whisker, self.h
+        b, body, h = world.bullet, world.whisker, self.h
         joints = range(FOLLICLE, FOLLICLE + 2 * LINKS)
         if self.method in ("explicit", "added inertia"):
             torque = -self.k * q - self.d * v
@@ -151,12 +149,11 @@ class Native:
         if self.method == "motors":
             b.setJointMotorControlArray(
                 body, joints, b.VELOCITY_CONTROL, targetVelocities=(v + h * a).tolist(), forces=[1e9] * 2 * LINKS,
-                physicsClientId=c,
             )  # fmt: skip
         else:
-            b.setJointMotorControlArray(body, joints, b.TORQUE_CONTROL, forces=torque.tolist(), physicsClientId=c)
-        b.stepSimulation(physicsClientId=c)
-        states = b.getJointStates(body, joints, physicsClientId=c)
+            b.setJointMotorControlArray(body, joints, b.TORQUE_CONTROL, forces=torque.tolist())
+        b.stepSimulation()
+        states = b.getJointStates(body, joints)
         return np.array([state[0] for state in states]), np.array([state[1] for state in states])
 
 

@@ -77,39 +77,37 @@ class BulletWorld:
         self._margins = np.where(self._cores > 0, thin - HULL_MARGIN, 0.0)
 
     def __enter__(self) -> BulletWorld:
-        self.client = self.bullet.connect(self.bullet.DIRECT)
-        self.bullet.setGravity(*(self.gravity / MILLI), physicsClientId=self.client)
+        # The module, with the number of this world in every call.
+        self.bullet = import_module("pybullet_utils.bullet_client").BulletClient(self.bullet.DIRECT)
+        self.bullet.setGravity(*(self.gravity / MILLI))
         self.whisker = self._add_whisker()
-        self.parts = [[self._add_part(part) for part in obstacle.parts] for obstacle in self.obstacles]
+        bodies = self.bullet.createMultiBody
+        self.parts = [[bodies(0, self._shape(part)) for part in obstacle.parts] for obstacle in self.obstacles]
         return self
 
     def __exit__(self, *_: object) -> None:
-        self.bullet.disconnect(physicsClientId=self.client)
+        self.bullet.disconnect()
 
     def mass_matrix(self, q: Sequence[float]) -> NDArray[np.float64]:
         """Return the joint-space inertia [6 + 2N, 6 + 2N] at the joint positions ``q``."""
-        return np.array(self.bullet.calculateMassMatrix(self.whisker, q, physicsClientId=self.client))
+        return np.array(self.bullet.calculateMassMatrix(self.whisker, q))
 
     def inverse_dynamics(
         self, q: Sequence[float], rate: Sequence[float], acceleration: Sequence[float]
     ) -> NDArray[np.float64]:
         """Return the joint forces [6 + 2N] that cause the accelerations without contacts, gravity included."""
-        return np.array(
-            self.bullet.calculateInverseDynamics(self.whisker, q, rate, acceleration, physicsClientId=self.client)
-        )
+        return np.array(self.bullet.calculateInverseDynamics(self.whisker, q, rate, acceleration))
 
     def place(self, q: Sequence[float]) -> None:
         """Put the whisker's joints at ``q`` [6 + 2N]."""
         joints = range(len(q))
-        self.bullet.resetJointStatesMultiDof(
-            self.whisker, joints, [[value] for value in q], [[0.0]] * len(q), physicsClientId=self.client
-        )
+        self.bullet.resetJointStatesMultiDof(self.whisker, joints, [[value] for value in q], [[0.0]] * len(q))
 
     def place_obstacle(self, number: int, position: NDArray[np.float64], quaternion: NDArray[np.float64]) -> None:
         """Put an obstacle at ``position`` [3] (mm) turned by ``quaternion`` [4] (w, x, y, z)."""
         w, x, y, z = quaternion
         for body in self.parts[number]:
-            self.bullet.resetBasePositionAndOrientation(body, position, (x, y, z, w), physicsClientId=self.client)
+            self.bullet.resetBasePositionAndOrientation(body, position, (x, y, z, w))
 
     def closest(self, margin: float) -> Iterator[tuple[int, int, NDArray, NDArray, float]]:
         """Yield link, obstacle, point on the whisker [3], normal into the whisker [3] and distance (mm).
@@ -122,7 +120,7 @@ class BulletWorld:
         for number, bodies in enumerate(self.parts):
             for body, part in zip(bodies, self.obstacles[number].parts, strict=True):
                 extra = HULL_MARGIN if isinstance(part, ConvexPart) else 0.0
-                found = self.bullet.getClosestPoints(self.whisker, body, distance=margin, physicsClientId=self.client)
+                found = self.bullet.getClosestPoints(self.whisker, body, distance=margin)
                 for point in found:
                     link, normal = (point[3] - FOLLICLE) // 2, np.array(point[7])
                     # Closest points of the cores, moved by the margin along the normal, are those of the thickened
@@ -133,19 +131,15 @@ class BulletWorld:
     def jacobian(self, link: int, q: Sequence[float]) -> tuple[NDArray, NDArray, NDArray, NDArray]:
         """Return a link's start [3], its axis [3], and how joint rates move the start [3, 6 + 2N] and turn the link."""
         joint, zero = self._joint(link), [0.0] * len(q)
-        state = self.bullet.getLinkState(self.whisker, joint, physicsClientId=self.client)
-        linear, angular = self.bullet.calculateJacobian(
-            self.whisker, joint, (0.0, 0.0, 0.0), q, zero, zero, physicsClientId=self.client
-        )
+        state = self.bullet.getLinkState(self.whisker, joint)
+        linear, angular = self.bullet.calculateJacobian(self.whisker, joint, (0.0, 0.0, 0.0), q, zero, zero)
         axis = np.array(self.bullet.getMatrixFromQuaternion(state[5])).reshape(3, 3)[:, 0]
         return np.array(state[4]), axis, np.array(linear), np.array(angular)
 
     def shape(self) -> NDArray[np.float64]:
         """Return joints and tip [N + 1, 3] (mm) as the whisker was last placed."""
         joints = [self._joint(link) for link in range(self.chain.links)]
-        states = self.bullet.getLinkStates(
-            self.whisker, joints, computeForwardKinematics=1, physicsClientId=self.client
-        )
+        states = self.bullet.getLinkStates(self.whisker, joints, computeForwardKinematics=1)
         axis = np.array(self.bullet.getMatrixFromQuaternion(states[-1][5])).reshape(3, 3)[:, 0]
         points = [np.array(state[4]) for state in states]
         return np.array([*points, points[-1] + axis * self.chain.lengths[-1] * MILLI])
@@ -189,11 +183,10 @@ class BulletWorld:
             linkParentIndices=list(range(count)),
             linkJointTypes=kinds,
             linkJointAxis=axes,
-            physicsClientId=self.client,
         )
         for joint, inertia in enumerate(inertias):
             # Bullet would derive the inertia from the collision shape.
-            bullet.changeDynamics(body, joint, localInertiaDiagonal=inertia, physicsClientId=self.client)
+            bullet.changeDynamics(body, joint, localInertiaDiagonal=inertia)
         return body
 
     def _link(self, link: int) -> int:
@@ -206,9 +199,6 @@ class BulletWorld:
         radii = self.chain.whisker.radius(self.chain.nodes[link : link + 2])
         cone = cone_vertices(core, length, narrows=bool(radii[0] > radii[1]))
         return self._collision("MESH", vertices=cone.tolist())
-
-    def _add_part(self, part: Part) -> int:
-        return self.bullet.createMultiBody(0, self._shape(part), physicsClientId=self.client)
 
     def _shape(self, part: Part) -> int:
         match part:
@@ -233,8 +223,8 @@ class BulletWorld:
 
     def _collision(self, kind: str, centre: ArrayLike = (0.0, 0.0, 0.0), **options: Any) -> int:
         """Add a collision shape around ``centre`` (mm)."""
-        place = {"collisionFramePosition": centre, "physicsClientId": self.client}
-        return self.bullet.createCollisionShape(getattr(self.bullet, f"GEOM_{kind}"), **options, **place)
+        kind = getattr(self.bullet, f"GEOM_{kind}")
+        return self.bullet.createCollisionShape(kind, collisionFramePosition=centre, **options)
 
 
 def _turn_from_z(axis: NDArray[np.float64]) -> tuple[float, float, float, float]:

@@ -188,42 +188,34 @@ def test_steps_converge_on_what_bullet_itself_computes_at_a_fraction_of_a_micros
         record_shape=True,
     )[0]  # fmt: skip
     with BulletWorld(chain, [], math.inf, np.zeros(3)) as world:
-        bullet, client, body = world.bullet, world.client, world.whisker
-        tips = _steps_of_bullet(bullet, client, body, chain, step, count, load)
+        bullet, body = world.bullet, world.whisker
+        tips = _steps_of_bullet(bullet, body, chain, step, count, load)
     assert ours.link_positions is not None
     np.testing.assert_allclose(ours.link_positions[:, -1], tips, atol=0.01 * np.ptp(tips, axis=0).max())
 
 
-def _steps_of_bullet(bullet, client, body, chain, step, count, load):
+def _steps_of_bullet(bullet, body, chain, step, count, load):
     """Tip positions [8, 3] (m) at every millisecond from Bullet's own time step with explicit spring torques."""
-    bullet.setPhysicsEngineParameter(fixedTimeStep=step * 1e3, numSubSteps=0, physicsClientId=client)
+    bullet.setPhysicsEngineParameter(fixedTimeStep=step * 1e3, numSubSteps=0)
     joints = range(FOLLICLE, FOLLICLE + 2 * chain.links)
     for joint in range(FOLLICLE + 2 * chain.links):
         heavy = {"mass": 1e9, "localInertiaDiagonal": (1e9,) * 3} if joint < FOLLICLE else {}
-        bullet.changeDynamics(
-            body, joint, linearDamping=0, angularDamping=0, jointDamping=0, physicsClientId=client, **heavy
-        )
+        bullet.changeDynamics(body, joint, linearDamping=0, angularDamping=0, jointDamping=0, **heavy)
     everything = range(FOLLICLE + 2 * chain.links)
-    bullet.setJointMotorControlArray(
-        body, everything, bullet.VELOCITY_CONTROL, forces=[0.0] * len(everything), physicsClientId=client
-    )
+    bullet.setJointMotorControlArray(body, everything, bullet.VELOCITY_CONTROL, forces=[0.0] * len(everything))
     k, d = np.repeat(chain.stiffness, 2) * 1e6, np.repeat(chain.damping(0.0), 2) * 1e9
     tips, length = [], chain.lengths[-1] * 1e3
     for n in range(count):
-        states = np.array([state[:2] for state in bullet.getJointStates(body, joints, physicsClientId=client)])
+        states = np.array([state[:2] for state in bullet.getJointStates(body, joints)])
         torque = -k * states[:, 0] - d * states[:, 1]
-        bullet.setJointMotorControlArray(
-            body, joints, bullet.TORQUE_CONTROL, forces=torque.tolist(), physicsClientId=client
-        )
-        frame = bullet.getLinkState(body, joints[-1], computeForwardKinematics=1, physicsClientId=client)
+        bullet.setJointMotorControlArray(body, joints, bullet.TORQUE_CONTROL, forces=torque.tolist())
+        frame = bullet.getLinkState(body, joints[-1], computeForwardKinematics=1)
         axis = np.array(bullet.getMatrixFromQuaternion(frame[5])).reshape(3, 3)[:, 0]
         tip = np.array(frame[4]) + length * axis
-        bullet.applyExternalForce(
-            body, joints[-1], np.multiply(load.force, 1e3), tip, bullet.WORLD_FRAME, physicsClientId=client
-        )
-        bullet.stepSimulation(physicsClientId=client)
+        bullet.applyExternalForce(body, joints[-1], np.multiply(load.force, 1e3), tip, bullet.WORLD_FRAME)
+        bullet.stepSimulation()
         if (n + 1) % round(1e-3 / step) == 0:
-            frame = bullet.getLinkState(body, joints[-1], computeForwardKinematics=1, physicsClientId=client)
+            frame = bullet.getLinkState(body, joints[-1], computeForwardKinematics=1)
             axis = np.array(bullet.getMatrixFromQuaternion(frame[5])).reshape(3, 3)[:, 0]
             tips.append((np.array(frame[4]) + length * axis) / 1e3)
     return np.array(tips)
