@@ -9,6 +9,7 @@ that whisk's Python and MATLAB interfaces export; binary ``.measurements`` files
 from __future__ import annotations
 
 import os
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, cast
 
@@ -20,7 +21,6 @@ from brainbench.core.reading.hdf5 import open_hdf5
 from brainbench.core.reading.regular import MOST_TEXT, check_file, readable
 from brainbench.core.reading.tables import read_columns, read_rows
 from brainbench.stimuli.fitting.tracks.options import TrackOptions
-from brainbench.stimuli.fitting.tracks.traces import stack_traces
 
 Array = NDArray[np.float64]
 Segments = dict[tuple[int, int], Array]
@@ -62,7 +62,7 @@ def read_whisk(path: str | os.PathLike[str], options: TrackOptions) -> tuple[NDA
     traces = {key[0]: segments[key] for key in chosen}
     if not traces:
         raise DataError(f"{name} holds no trace of the whisker {shown(wanted)}.")
-    return stack_traces(traces, {key[0]: follicles[key] for key in chosen if key in follicles}, options.points)
+    return _stack(traces, {key[0]: follicles[key] for key in chosen if key in follicles}, options.points)
 
 
 def _read_segments(path: str | os.PathLike[str]) -> Segments:
@@ -147,3 +147,46 @@ def _read_whiskiwrap(
         points = [np.stack([np.asarray(x, dtype=float), np.asarray(y, dtype=float)], axis=1) for x, y in pairs]
     keys = [(int(frame), int(number)) for frame, number in zip(columns["fid"], columns["wid"], strict=True)]
     return dict(zip(keys, points, strict=True)), *_identities(columns)
+
+
+def _stack(traces: Mapping[int, Array], follicles: Mapping[int, Array], most: int) -> tuple[NDArray[np.int_], Array]:
+    """Return frame numbers [n] and points [n, k, 2] of traces by frame, base first, NaN behind the last.
+
+    Frames between the first and the last that have no trace are NaN. Traces with more than ``most`` points lose some of
+    them evenly: neighbours of a trace share the noise of their pixels, and more points would tell no more.
+    """
+    frames = np.arange(min(traces), max(traces) + 1)
+    known = sorted(traces)
+    oriented = _orient({frame: traces[frame] for frame in known}, follicles)
+    points = np.full((len(frames), min(most, max(len(one) for one in traces.values())), 2), np.nan)
+    for frame, trace in oriented.items():
+        picked = np.unique(np.linspace(0, len(trace) - 1, min(len(trace), most)).round().astype(int))
+        points[frame - frames[0], : len(picked)] = trace[picked]
+    return frames, points
+
+
+def _orient(traces: Mapping[int, Array], follicles: Mapping[int, Array]) -> dict[int, Array]:
+    """Return the traces with their base first: the end nearer to the follicle where that is known.
+
+    Else ends are followed from frame to frame, and the base is the one that moves less.
+    """
+    found: dict[int, Array] = {}
+    unknown: list[int] = []
+    before: Array | None = None
+    for frame, trace in traces.items():
+        if frame in follicles:
+            near = np.linalg.norm(trace[[0, -1]] - follicles[frame], axis=1)
+            trace = trace if near[0] <= near[1] else trace[::-1]
+        else:
+            unknown.append(frame)
+            if before is not None:
+                same = np.linalg.norm(trace[0] - before[0]) + np.linalg.norm(trace[-1] - before[-1])
+                swapped = np.linalg.norm(trace[-1] - before[0]) + np.linalg.norm(trace[0] - before[-1])
+                trace = trace if same <= swapped else trace[::-1]
+        found[frame] = before = trace
+    if len(unknown) == len(found):
+        ends = np.array([[trace[0], trace[-1]] for trace in found.values()])
+        moved = ends.std(axis=0).sum(axis=1)
+        if moved[0] > moved[1]:
+            found = {frame: trace[::-1] for frame, trace in found.items()}
+    return found
