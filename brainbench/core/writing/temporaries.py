@@ -25,6 +25,11 @@ def temporary_path(target: Path) -> Path:
     return target.with_name(f".{target.stem[:200]}-{token}{target.suffix}")
 
 
+def is_temporary(name: str) -> bool:
+    """Return whether a file of this name is one that is being written, or was when its process was killed."""
+    return _TEMPORARY.fullmatch(name) is not None
+
+
 @lru_cache(maxsize=1024)
 def sweep(folder: Path, process: int) -> None:
     """Remove from a folder what processes of this machine left that run no more; once for a folder and process."""

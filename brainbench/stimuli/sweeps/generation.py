@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 import multiprocessing
 import os
-import re
 import shutil
 import time
 from collections.abc import Callable, Sequence
@@ -19,6 +18,7 @@ from brainbench.core.progress import Progress
 from brainbench.core.reading.ranges import check_number
 from brainbench.core.writing.locks import lock_folder
 from brainbench.core.writing.same_run import check_same
+from brainbench.core.writing.temporaries import is_temporary
 from brainbench.stimuli.engines import get_engine
 from brainbench.stimuli.sweeps import running
 from brainbench.stimuli.sweeps.manifest import MANIFEST, is_complete, make_manifest
@@ -30,7 +30,6 @@ if TYPE_CHECKING:
 _LOG = logging.getLogger(__name__)
 
 CONFIG = "config.json"
-_TEMPORARY = re.compile(r"\.((train|validation|test)-\d{5}-[0-9a-f]+\.h5|(config|manifest)-[0-9a-f]+\.json)")
 _SPARE = 64e6
 """Bytes of disk that are left free."""
 
@@ -132,7 +131,7 @@ def _check_config(plan: GenerationPlan | SweepTable, folder: Path) -> None:
     """Refuse to go on with what was begun otherwise; note what is begun."""
     path, config = folder / CONFIG, to_plain(plan.config)
     if not path.exists():
-        if strange := [item.name for item in folder.iterdir() if not _TEMPORARY.fullmatch(item.name)]:
+        if strange := [item.name for item in folder.iterdir() if not is_temporary(item.name)]:
             raise UsageError(
                 f"{str(folder)!r} is not empty and holds no data set of sweeps (it has {sorted(strange)[0]!r}); choose "
                 "a new folder."
@@ -150,7 +149,7 @@ def _check_config(plan: GenerationPlan | SweepTable, folder: Path) -> None:
 def _clean(folder: Path) -> None:
     """Remove what processes that were killed left half-written."""
     for item in folder.iterdir():
-        if _TEMPORARY.fullmatch(item.name):
+        if is_temporary(item.name):
             item.unlink(missing_ok=True)
 
 
