@@ -165,7 +165,7 @@ def sweep(
     wp.synchronize_device(launcher.device)
     seconds = time.perf_counter() - started
     count = sum(len(some) for _, some in groups)
-    steps, full = int(result.steps.astype(np.int64).sum()), launcher.steps_in_full(count)
+    steps, full = int(result.steps.astype(np.int64).sum()), launcher.steps_in_full * count
     # Delivered: every whisker at every time step of the recording, as a solver without skipping would compute them.
     print(
         f"sweep {recipe} {count} sweeps of {len(objects)} objects, {fidelity.links} links, "

@@ -139,15 +139,6 @@ class SteppedJob:
         """Obstacles that the whisker could ever touch, in convex parts."""
         return reachable(self.job.whisker, self.pose[0], self.job.obstacles, self.times)
 
-    @property
-    def is_silent(self) -> bool:
-        """True when the whisker feels nothing."""
-        return is_silent(self.job, self.reach, *self.pose)
-
-    def silent_trace(self) -> Trace:
-        """Return the trace of a whisker that feels nothing."""
-        return silent_trace(self.job, self.fidelity, self.record_shape, time.thread_time() - self.started)
-
     @cached_property
     def overlap(self) -> tuple[int, str, float]:
         """First step at which the whisker starts in an object or one reaches its base, why, and overlap at first."""
@@ -236,6 +227,9 @@ class SteppedEngine(WhiskerEngine):
 
         ``changes`` takes up by how much the base force of one that is kept changes, where that is much.
         """
+        if is_silent(stepped.job, stepped.reach, *stepped.pose):
+            seconds = time.thread_time() - stepped.started
+            return silent_trace(stepped.job, stepped.fidelity, stepped.record_shape, seconds)
         trace, allowed = self.simulate(stepped)
         if allowed == math.inf:
             return trace
@@ -268,10 +262,7 @@ class SteppedEngine(WhiskerEngine):
         changes: list[float] = []
 
         def run(group: Sequence[int]) -> dict[int, Trace]:
-            stepped = [(index, SteppedJob(jobs[index], fidelity, record_shape)) for index in group]
-            return {
-                index: one.silent_trace() if one.is_silent else self._trusted(one, changes) for index, one in stepped
-            }
+            return {index: self._trusted(SteppedJob(jobs[index], fidelity, record_shape), changes) for index in group}
 
         with self.session():
             check_jobs(self, jobs, fidelity, workers)

@@ -187,12 +187,6 @@ class Recorded:
         _LOG.info("the recording lacks %s, which moves as %s", name, chosen)
         return chosen
 
-    def initial_angles(self, mount: MountedWhisker) -> NDArray[np.float64]:
-        """Return (θ, φ, ζ) [3] (rad) at t = 0."""
-        if (given := self.initial.get(mount.full_name)) is not None:
-            return np.array(given, dtype=float)
-        return np.array(mount.angles) + self.start * np.array(self.rotations.rates(mount))
-
     def angles(self, mount: MountedWhisker, times: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return continuous (θ, φ, ζ) [n, 3] (rad) of one whisker.
 
@@ -200,7 +194,8 @@ class Recorded:
             UsageError: a time lies outside the recording, no line moves the whisker, or it turns towards the
                 vertical, where these angles lose their meaning.
         """
-        first = self.initial_angles(mount)
+        first = np.array(mount.angles) + self.start * np.array(self.rotations.rates(mount))
+        first = np.array(self.initial.get(mount.full_name, first), dtype=float)
         # Recorded turns are in the axes of the array: they act from the left on the starting frame.
         base, line = base_rotation(first), self.line(mount)
         return follow_angles(lambda t: self.trajectory.rotation(line, t) @ base, times, first, mount.full_name)

@@ -8,7 +8,7 @@ bending in the x-y plane. Wrenches are the action of the whisker on its base, ab
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -18,7 +18,7 @@ from brainbench.core.errors import DataError, UsageError
 from brainbench.core.reading.ranges import check_number
 from brainbench.stimuli.engines import DEFAULT_ENGINE, get_engine
 from brainbench.stimuli.engines.fidelity import Fidelity
-from brainbench.stimuli.engines.protocol import Job, Load, StillFollicle, Trace, WhiskerEngine
+from brainbench.stimuli.engines.protocol import Job, Load, StillFollicle, Trace
 from brainbench.stimuli.motion.trajectories import smooth_step
 from brainbench.stimuli.objects.obstacle import Capsule, Cylinder, Obstacle, RigidMotion
 from brainbench.stimuli.validation import references
@@ -361,15 +361,7 @@ def settling_time(whisker: Whisker) -> float:
 
 def run_one(backend: str, job: Job, fidelity: Fidelity | str) -> Trace:
     """Run one job with its shapes; an unstable one is a :class:`DataError`."""
-    return run_stable(get_engine(backend), [job], Fidelity.of(fidelity), record_shape=True)[0]
-
-
-def run_stable(
-    engine: WhiskerEngine, jobs: Sequence[Job], fidelity: Fidelity, *, record_shape: bool = False
-) -> list[Trace]:
-    """Simulate jobs on one thread; an unstable one is a :class:`DataError`."""
-    traces = engine.run(jobs, fidelity, workers=1, record_shape=record_shape)
-    for trace in traces:
-        if trace.status != "ok":
-            raise DataError(f"The simulation was unstable: {trace.reason}.")
-    return traces
+    (trace,) = get_engine(backend).run([job], Fidelity.of(fidelity), workers=1, record_shape=True)
+    if trace.status != "ok":
+        raise DataError(f"The simulation was unstable: {trace.reason}.")
+    return trace

@@ -78,7 +78,8 @@ class SweepLauncher:
         # Steps between readings, rounded as the kernel rounds them.
         spans = np.diff(grid.frames.readings * MILLI, prepend=0.0)
         steps = self.solver.steps
-        self._steps_in_full = sum(int(np.ceil(spans / step - 1e-3).clip(1).sum()) for step in steps)
+        self.steps_in_full = sum(int(np.ceil(spans / step - 1e-3).clip(1).sum()) for step in steps)
+        """Steps that the whiskers of one sweep take from start to end."""
 
     def launch(
         self, objects: Sequence[tuple[str, Sequence[Any]]], tries: Sequence[tuple[NDArray[np.bool_], int]] = ()
@@ -141,14 +142,10 @@ class SweepLauncher:
             unstable=unstable,
             reasons=describe_unstable(self.scenes.array.names, unstable, result.verdict.reasons),
             steps=int(result.steps.sum()),
-            steps_in_full=self.steps_in_full(len(unstable)),
+            steps_in_full=self.steps_in_full * len(unstable),
             retried=int(result.retried.any(axis=1).sum()),
             unsolved=int(result.counts["unsolved"].sum()),
         )
-
-    def steps_in_full(self, sweeps: int) -> int:
-        """Return the steps that every whisker of some sweeps takes from start to end."""
-        return self._steps_in_full * sweeps
 
     def trusted(self, objects: Sequence[tuple[str, Sequence[Any]]], retry: int) -> SweepBatch:
         """Simulate sweeps as :meth:`launch` takes them, and whiskers that cannot be trusted again with finer steps."""
