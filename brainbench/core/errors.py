@@ -106,6 +106,23 @@ def check_name(kind: str, name: object, options: Iterable[str], *, hint: str = "
         raise unknown_name(kind, name, choices, hint=hint)
 
 
+def choose_name(kind: str, wanted: str | None, options: Iterable[str], *, how: str = "") -> str:
+    """Return the name that is wanted, or the only one there is; ``how`` says in what way one is named.
+
+    Raises:
+        UsageError: there is no such name, or none is given and there are several.
+
+    >>> choose_name("stimulus", None, ["pole"])
+    'pole'
+    """
+    choices = list(options)
+    if wanted is None and len(choices) != 1:
+        raise UsageError(f"Name one {kind}{how and ' ' + how}; there are {listing(choices)}.")
+    chosen = choices[0] if wanted is None else wanted
+    check_name(kind, chosen, choices)
+    return chosen
+
+
 def install_command(extra: str) -> str:
     """Return the command that installs an extra, to be given where this package was checked out.
 

@@ -96,13 +96,12 @@ def settings(
     backends: Sequence[str] = (DEFAULT_ENGINE,),
     collisions: Sequence[str] = (),
     solvers: Sequence[str] = ("dynamic",),
-    contact_tolerances: Sequence[float | None] = CONTACT_TOLERANCES,
 ) -> list[SimulationSetting]:
     """Return every combination (``time_steps`` pairs a step [s] with steps per period), after the presets.
 
     Args:
-        links, time_steps, backends, solvers, contact_tolerances: axes of the bench tests; the solver ``quasistatic``,
-            of ``rod`` alone, has no presets, no steps per period and the first of the tolerances.
+        links, time_steps, backends, solvers: axes of the bench tests; the solver ``quasistatic``, of ``rod`` alone, has
+            no presets, no steps per period and the first of :data:`CONTACT_TOLERANCES`.
         collisions: geometries of a concave object to measure as well, at each preset, as in :data:`COLLISIONS`.
 
     Raises:
@@ -111,10 +110,10 @@ def settings(
     presets, steps = [Fidelity.preset(name) for name in list_presets()], list(itertools.product(links, time_steps))
     grid = [
         Fidelity(links=n, time_step=step, steps_per_period=periods, contact_tolerance=tolerance)
-        for tolerance, (n, (step, periods)) in itertools.product(contact_tolerances, steps)
+        for tolerance, (n, (step, periods)) in itertools.product(CONTACT_TOLERANCES, steps)
     ]
     still = [
-        Fidelity(links=n, time_step=step, solver="quasistatic", contact_tolerance=contact_tolerances[0])
+        Fidelity(links=n, time_step=step, solver="quasistatic", contact_tolerance=CONTACT_TOLERANCES[0])
         for n, (step, _) in steps
     ]
     fidelities = {"dynamic": dict.fromkeys([*presets, *grid]), "quasistatic": still}

@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from brainbench.core.contracts import CHANNELS, check_stimulus_set
-from brainbench.core.errors import DataError, UsageError, check_name
+from brainbench.core.errors import DataError, UsageError, check_name, choose_name
 from brainbench.core.files import write_text
 from brainbench.core.reading.tables import read_numbers
 from brainbench.core.reading.texts import read_text
@@ -153,10 +153,7 @@ def save_run(
     check_stimulus_set(dataset)
     check_name("dialect", dialect, DIALECTS)
     labels = [str(label) for label in dataset["stimulus"].values]
-    if stimulus is None and len(labels) > 1:
-        raise UsageError(f"The stimulus set has {len(labels)} stimuli; say which one to write: {labels[0]!r}, …")
-    chosen = labels[0] if stimulus is None else stimulus
-    check_name("stimulus", chosen, labels)
+    chosen = choose_name("stimulus", stimulus, labels)
     if not str(dataset.attrs.get("frame", "world")).startswith("world"):
         raise UsageError("WHISKiT's results are in world axes; read the stimulus set in world axes to write them.")
     one = dataset.isel(stimulus=labels.index(chosen))

@@ -73,12 +73,9 @@ def measure_shapes(
     rng: np.random.Generator,
     *,
     points: int = 12,
-    traced: float = 0.95,
-    axes: int = 2,
 ) -> Trial:
-    """Return a trial with traced shapes of a simulation: points evenly spaced on a share of the whisker, with noise "
-    "(m)."""
-    places = sample_shape(trace, whisker, np.linspace(0.0, traced * whisker.arc_length, points))[..., :axes]
+    """Return a trial with traced shapes of a simulation: points evenly spaced on 95 % of it, with noise (m)."""
+    places = sample_shape(trace, whisker, np.linspace(0.0, 0.95 * whisker.arc_length, points))[..., :2]
     return replace(trial, measured=new_shapes(trial.job.times, places + rng.normal(size=places.shape) * noise))
 
 

@@ -92,7 +92,7 @@ def test_whisk_traces_are_chosen_by_label_and_turned_by_follicle(tmp_path, write
     table = tracks.write_measurements(tmp_path / "a.csv", labels, follicles)
     found = read_shapes(path, _options(identities=str(table), track="0"))
     np.testing.assert_allclose(found["shape"].values, SHAPES, atol=1e-7)
-    with pytest.raises(UsageError, match="labels '0', '1'"):
+    with pytest.raises(UsageError, match=r"\(label\).*as track.* '0', '1'"):
         read_shapes(path, _options(identities=str(table)))
     with pytest.raises(UsageError, match="identities"):
         read_shapes(path, _options())

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from brainbench.core.errors import DataError, UsageError, check_name, listing, shown
+from brainbench.core.errors import DataError, check_name, choose_name, shown
 from brainbench.core.reading.hdf5 import open_hdf5
 from brainbench.core.reading.tables import read_rows, to_numbers
 from brainbench.stimuli.fitting.tracks.options import TrackOptions
@@ -35,10 +35,7 @@ def read_deeplabcut(path: str | os.PathLike[str], options: TrackOptions) -> tupl
     name = shown(os.fspath(path))
     frames, columns = _read_hdf5(path) if Path(path).suffix in (".h5", ".hdf5") else _read_csv(path)
     individuals = list(dict.fromkeys(individual for individual, _, _ in columns))
-    wanted = options.track if options.track is not None else (individuals[0] if len(individuals) == 1 else None)
-    if wanted is None:
-        raise UsageError(f"Name one individual of {name} as track; it holds {listing(individuals)}.")
-    check_name(f"individual of {name}", wanted, individuals)
+    wanted = choose_name(f"individual of {name}", options.track, individuals, how="as track")
     parts = list(dict.fromkeys(part for individual, part, _ in columns if individual == wanted))
     for part in options.parts:
         check_name(f"body part of {name}", part, parts)

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from brainbench.core.errors import DataError, UsageError, listing, shown
+from brainbench.core.errors import DataError, UsageError, choose_name, listing, shown
 from brainbench.core.reading.hdf5 import open_hdf5
 from brainbench.core.reading.regular import check_file
 from brainbench.core.reading.tables import read_columns, read_rows
@@ -107,13 +107,8 @@ def _read_points(path: str | os.PathLike[str], options: TrackOptions) -> tuple[N
     if missing := [name for name in ("frame", "x", "y") if name not in columns]:
         raise DataError(f"{shown(os.fspath(path))} has no column {missing[0]!r}.")
     if "whisker" in columns:
-        present = np.unique(columns["whisker"])
-        wanted = options.track or (f"{present[0]:g}" if len(present) == 1 else None)
-        if wanted is None or wanted not in [f"{one:g}" for one in present]:
-            raise UsageError(
-                f"Name one whisker of {shown(os.fspath(path))} as track; it holds "
-                f"{listing(f'{one:g}' for one in present)}."
-            )
+        present = [f"{one:g}" for one in np.unique(columns["whisker"])]
+        wanted = choose_name(f"whisker of {shown(os.fspath(path))}", options.track, present, how="as track")
         chosen = columns["whisker"] == float(wanted)
         columns = {name: values[chosen] for name, values in columns.items()}
     frames = frame_numbers(columns["frame"], path)

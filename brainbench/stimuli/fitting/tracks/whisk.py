@@ -16,7 +16,7 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from brainbench.core.errors import DataError, UsageError, listing, shown
+from brainbench.core.errors import DataError, UsageError, choose_name, listing, shown
 from brainbench.core.reading.hdf5 import open_hdf5
 from brainbench.core.reading.regular import MOST_TEXT, check_file, readable
 from brainbench.core.reading.tables import read_columns, read_rows
@@ -46,10 +46,7 @@ def read_whisk(path: str | os.PathLike[str], options: TrackOptions) -> tuple[NDA
     wanted = options.track
     if labels:
         present = sorted({label for key, label in labels.items() if key in segments and label >= 0})
-        if wanted is None and len(present) == 1:
-            wanted = str(present[0])
-        if wanted is None or wanted not in map(str, present):
-            raise UsageError(f"Name one whisker of {name} as track; it holds the labels {listing(map(str, present))}.")
+        wanted = choose_name(f"whisker (label) of {name}", wanted, map(str, present), how="as track")
         chosen = {key: label for key, label in labels.items() if str(label) == wanted and key in segments}
     else:
         chosen = {key: 0 for key in segments if wanted is None or str(key[1]) == wanted}

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from brainbench.core.errors import DataError, UsageError, shown
+from brainbench.core.errors import DataError, choose_name, shown
 from brainbench.core.reading.hdf5 import open_hdf5
 from brainbench.core.reading.regular import MOST_TABLE, check_file, readable
 from brainbench.stimuli.fitting.tracks.options import TrackOptions
@@ -35,11 +35,8 @@ def read_whiskerman(path: str | os.PathLike[str], options: TrackOptions) -> tupl
     whiskers = _read(path)
     if not whiskers:
         raise DataError(f"{name} holds no whisker.")
-    wanted = options.track or ("1" if len(whiskers) == 1 else None)
-    if wanted is None or not wanted.isdigit() or not 1 <= int(wanted) <= len(whiskers):
-        raise UsageError(
-            f"Name one whisker of {name} as track, a number from 1 to {len(whiskers)}; received {wanted!r}."
-        )
+    numbers = [str(number) for number in range(1, len(whiskers) + 1)]
+    wanted = choose_name(f"whisker of {name}", options.track, numbers, how="as track")
     fields = whiskers[int(wanted) - 1]
     control = np.asarray(fields["r3all"], dtype=float)
     if control.ndim != 3 or control.shape[1] != 3:

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brainbench.core.contracts import CHANNELS
-from brainbench.core.errors import DataError, UsageError, check_name, listing, shown
+from brainbench.core.errors import DataError, UsageError, choose_name, listing, shown
 from brainbench.core.reading.hdf5 import open_hdf5
 from brainbench.core.reading.tables import read_columns
 from brainbench.stimuli.fitting.tracks.contract import new_wrenches
@@ -131,11 +131,7 @@ def _read_stimulus_set(path: str | os.PathLike[str], whisker: str | None, stimul
     dataset, chosen = read_stimulus_set(path), {}
     for kind, name in (("whisker", whisker), ("stimulus", stimulus)):
         present = [str(one) for one in dataset[kind].values]
-        if name is None and len(present) > 1:
-            raise UsageError(f"Name one {kind} of {shown(os.fspath(path))}; it holds {listing(present)}.")
-        if name is not None:
-            check_name(kind, name, present)
-        chosen[kind] = present.index(name or present[0])
+        chosen[kind] = present.index(choose_name(f"{kind} of {shown(os.fspath(path))}", name, present))
     one = dataset["wrench"].isel(chosen)
     return new_wrenches(dataset["time"].values, one.values, source=os.fspath(path), axes=dataset.attrs.get("axes", ""))
 
