@@ -185,6 +185,6 @@ def test_a_run_that_cannot_be_written_says_why(tmp_path, run):
     with pytest.raises(UsageError, match=r"WHISKiT.*need"):
         save_run(dataset.drop_vars("side"), tmp_path)
     both = dataset.isel(stimulus=[0, 0]).assign_coords(stimulus=["a", "b"])
-    with pytest.raises(UsageError, match="Name one stimulus.*'a', 'b'"):
+    with pytest.raises(UsageError, match=r"Name one stimulus.*'a', 'b'"):
         save_run(both, tmp_path)
     assert save_run(both, tmp_path / "b", stimulus="b").is_dir()
