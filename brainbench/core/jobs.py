@@ -23,7 +23,12 @@ QUEUED = 4
 
 
 def run_jobs(
-    function: Callable[[Any], Any], jobs: Sequence[Any], *, workers: int | None = None, scheduler: str | None = None
+    function: Callable[[Any], Any],
+    jobs: Sequence[Any],
+    *,
+    workers: int | None = None,
+    scheduler: str | None = None,
+    threads: int | None = 1,
 ) -> Iterator[tuple[int, Any]]:
     """Yield (place of a job, what the function returned for it) as jobs finish, in any order.
 
@@ -32,6 +37,7 @@ def run_jobs(
         jobs: Its arguments, pickled too.
         workers: Processes on this machine; as many as there are usable processors when None. One: this process.
         scheduler: Address of a Dask scheduler (``tcp://host:8786``), whose workers do it instead.
+        threads: As for :func:`worker_pool`.
 
     Raises:
         UsageError: no positive number of workers, or no scheduler answers.
@@ -50,7 +56,7 @@ def run_jobs(
         yield from ((place, function(job)) for place, job in enumerate(jobs))
         return
     try:
-        with worker_pool(processes, threads=1) as pool:
+        with worker_pool(processes, threads=threads) as pool:
             places = {pool.submit(function, job): place for place, job in enumerate(jobs)}
             try:
                 for future in as_completed(places):

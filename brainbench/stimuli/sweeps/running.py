@@ -16,7 +16,7 @@ from pathlib import Path
 
 from brainbench.core.devices import gpus, pick_device, usable_processors
 from brainbench.core.errors import BrainbenchError, DataError
-from brainbench.core.jobs import STOPPING, pool_died, run_on_cluster, start_worker, stop_pool, worker_pool
+from brainbench.core.jobs import STOPPING, pool_died, run_jobs, run_on_cluster, start_worker, stop_pool, worker_pool
 from brainbench.stimuli.sweeps.plan import ShardTask
 from brainbench.stimuli.sweeps.shards import (
     BuiltObject,
@@ -51,14 +51,14 @@ def run_here(tasks: Sequence[ShardTask], folder: Path, workers: int | None, done
     A process that died is a :class:`DataError`.
     """
     count = workers or usable_processors()
+    if tasks[0].settings.device == "cpu":
+        processes = min(count, len(tasks))
+        make = partial(make_shard, folder=str(folder), workers=max(1, count // processes))
+        for _, sweeps in run_jobs(make, tasks, workers=processes, threads=None):
+            done(sweeps)
+        return
     try:
-        if tasks[0].settings.device != "cpu":
-            run_on_gpus(tasks, folder, count, done)
-        elif min(count, len(tasks)) == 1:
-            for task in tasks:
-                done(make_shard(task, str(folder), count))
-        else:
-            _run_pool(tasks, folder, count, done)
+        run_on_gpus(tasks, folder, count, done)
     except BrokenProcessPool as error:
         raise DataError(pool_died("Every finished shard")) from error
 
@@ -83,18 +83,6 @@ def run_shards_on_cluster(tasks: Sequence[ShardTask], folder: Path, scheduler: s
                 "workers share."
             )
         done(sweeps)
-
-
-def _run_pool(tasks: Sequence[ShardTask], folder: Path, workers: int, done: Done) -> None:
-    processes = min(workers, len(tasks))
-    with worker_pool(processes) as pool:
-        futures = [pool.submit(make_shard, task, str(folder), max(1, workers // processes)) for task in tasks]
-        try:
-            for future in as_completed(futures):
-                done(future.result())
-        except BaseException:
-            stop_pool(pool)
-            raise
 
 
 def run_on_gpus(tasks: Sequence[ShardTask], folder: Path, workers: int, done: Done) -> None:

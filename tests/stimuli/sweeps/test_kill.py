@@ -105,7 +105,7 @@ def test_a_process_of_the_pool_that_dies_is_said_and_the_shards_before_are_kept(
     fatal = dict(plan.objects)
     last = plan.shards[-1].objects[0].name
     fatal[last] = dataclasses.replace(fatal[last], load=_end_this_process)
-    with pytest.raises(DataError, match=r"process .*memory.* shard"):
+    with pytest.raises(DataError, match=r"process .*memory.*finished is kept"):
         generate(dataclasses.replace(plan, objects=fatal), tmp_path, workers=2)
     generate(plan, tmp_path, workers=1)
     assert (tmp_path / "manifest.json").is_file()
