@@ -73,8 +73,9 @@ class FitResult:
         """Return the estimate of a parameter."""
         from brainbench.core.errors import check_name
 
-        check_name("fitted parameter", name, [one.name for one in self.estimates])
-        return next(one for one in self.estimates if one.name == name)
+        known = {one.name: one for one in self.estimates}
+        check_name("fitted parameter", name, known)
+        return known[name]
 
     def summary(self) -> dict[str, Any]:
         """Return everything but the arrays, for JSON."""

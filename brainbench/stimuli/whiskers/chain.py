@@ -54,6 +54,11 @@ class Chain:
         """Number of links N."""
         return len(self.lengths)
 
+    def locate(self, arc: float) -> tuple[int, float]:
+        """Return the link at an arc length (m), at a joint the one before it, and the share of the link up to there."""
+        link = min(max(int(np.searchsorted(self.nodes, arc)) - 1, 0), self.links - 1)
+        return link, (arc - self.nodes[link]) / (self.nodes[link + 1] - self.nodes[link])
+
     def frequencies(self, count: int = 1) -> NDArray[np.float64]:
         """Return the lowest angular frequencies [count] (rad/s) of small planar motion, undamped, base fixed."""
         from scipy.linalg import eigh

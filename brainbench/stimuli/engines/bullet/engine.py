@@ -181,8 +181,7 @@ class _Run:
         for load in self.loads:
             if self.times[n] >= load.stop:
                 continue
-            link = int(np.searchsorted(self.chain.nodes, load.arc)) - 1
-            share = (load.arc - self.chain.nodes[link]) / (self.chain.nodes[link + 1] - self.chain.nodes[link])
+            link, share = self.chain.locate(load.arc)
             self.world.place(q)
             _, axis, linear, angular = self.world.jacobian(link, q)
             # Jᵀ F with J the velocity of the loaded point: that of the link's start plus ω × arm.

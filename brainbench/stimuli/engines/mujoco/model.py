@@ -129,7 +129,9 @@ def build_model(
     if path.shape[1]:
         drives.append(drive_scalars(path, step))
     _add(base, "site", name="base", size=1e-3)
-    travel = _travel(job, reach, times, position, euler)
+    moves = (step_travel(job.whisker, position / MILLI, euler, obstacle, times) for obstacle in reach.obstacles)
+    # How far a point of the unbent whisker can move against an obstacle in one step at most.
+    travel = max((float(move.max(initial=0.0)) for move in moves), default=0.0) * MILLI
     cores = [_thickness(chain, link, travel) for link in range(chain.links)]
     twisting = (chain.torsion > 0) & twists
     _add_links(base, assets, job, chain, chain.damping(time_step), reach.nearest, cores, twisting)
@@ -211,8 +213,8 @@ def _add_links(
         if chain.nodes[i + 1] + thickest >= nearest:
             _add(body, "geom", **_segment(chain, i, end, assets, cores[i]), contype=1, conaffinity=0)
         for index, load in enumerate(job.loads):
-            if chain.nodes[i] < load.arc <= chain.nodes[i + 1]:
-                share = (load.arc - chain.nodes[i]) / (chain.nodes[i + 1] - chain.nodes[i])
+            link, share = chain.locate(load.arc)
+            if link == i:
                 point = _add(body, "body", name=f"load{index}", pos=(share * end, 0, 0))
                 _add(point, "inertial", pos="0 0 0", **_NOTHING)
 
@@ -240,12 +242,6 @@ def _thickness(chain: Chain, link: int, travel: float) -> tuple[float, float]:
     # A link of radii r₁ > r₂ is taken as all points within r₂ of a slim cone of radius r₁ − r₂ that ends in a point.
     core, margin = float(abs(first - last)), float(min(first, last))
     return (core, margin) if core >= LEAST_TAPER and margin >= SAFE_TRAVEL * travel else (0.0, 0.0)
-
-
-def _travel(job: Job, reach: Reach, times: NDArray, position: NDArray, euler: NDArray) -> float:
-    """Return how far (mm) a point of the unbent whisker can move against an obstacle in one step at most."""
-    moves = (step_travel(job.whisker, position / MILLI, euler, obstacle, times) for obstacle in reach.obstacles)
-    return max((float(move.max(initial=0.0)) for move in moves), default=0.0) * MILLI
 
 
 def _add_obstacles(

@@ -137,11 +137,11 @@ def _loads(task: JobTask, job: Job) -> Numbers:
     _require("loads", len(job.loads), len(task.job.loads))
     if not job.loads:
         return {}
-    chains = task.chain, _chain(job.whisker, task.chain.links)
+    nodes = _chain(job.whisker, task.chain.links).nodes
     shares = []
     for before, load in zip(task.job.loads, job.loads, strict=True):
-        link = min(max(int(np.searchsorted(chains[0].nodes, before.arc)) - 1, 0), chains[0].links - 1)
-        start, stop = chains[1].nodes[link : link + 2]
+        link, _ = task.chain.locate(before.arc)
+        start, stop = nodes[link : link + 2]
         shares.append((load.arc - start) / (stop - start))
     forces = np.array([np.multiply(load.force, MILLI) for load in job.loads]).reshape(-1, 3)
     return {"load_share": np.array(shares), "load_force": forces}

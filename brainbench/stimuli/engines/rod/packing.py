@@ -285,12 +285,7 @@ class PackedJobs:
         """
         counts = [len(loads) for loads in self.loads] or [0] * len(self)
         loads = [(load, chains[which]) for which, some in zip(self.whisker, self.loads, strict=False) for load in some]
-        # A load at a joint belongs to the link before it.
-        links = [min(max(int(np.searchsorted(c.nodes, load.arc)) - 1, 0), c.links - 1) for load, c in loads]
-        shares = [
-            (load.arc - c.nodes[link]) / (c.nodes[link + 1] - c.nodes[link])
-            for (load, c), link in zip(loads, links, strict=True)
-        ]
+        places = [chain.locate(load.arc) for load, chain in loads]
         some = zip(self.limits, self.finer, strict=True) if self.limits else ()
         limits = [np.zeros(0) if limit is None else limit * MILLI / finer for limit, finer in some]
         limits = limits or [np.zeros(0)] * len(self)
@@ -300,8 +295,8 @@ class PackedJobs:
             "limit_first": np.cumsum([0, *map(len, limits)], dtype=np.int32),
             "limit": np.concatenate(limits),
             "load_first": np.cumsum([0, *counts], dtype=np.int32),
-            "load_link": np.array(links, dtype=np.int32),
-            "load_share": np.array(shares),
+            "load_link": np.array([link for link, _ in places], dtype=np.int32),
+            "load_share": np.array([share for _, share in places]),
             "load_force": np.array([np.multiply(load.force, MILLI) for load, _ in loads]).reshape(-1, 3),
             "load_stop": np.minimum([(load.stop - start) * MILLI for load, _ in loads], 1e30),
         }
