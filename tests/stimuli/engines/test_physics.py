@@ -129,8 +129,9 @@ def test_gravity_pulls_the_base_with_the_weight_of_the_whisker_when_asked(engine
     assert trace.wrench[0, 4] == pytest.approx(9.81 * np.trapezoid(C2.linear_density(s) * s, s), rel=1e-3)
 
 
-def test_a_point_load_bends_the_cantilever_by_the_closed_form(engine):
-    at = 0.65 * C2.arc_length
+@pytest.mark.parametrize("share", [0.3, 0.65, 1.0])
+def test_a_point_load_bends_the_cantilever_by_the_closed_form(engine, share):
+    at = share * C2.arc_length
     weak = 1e-3 * at / bench_tests.references.point_load_deflection(C2, 1.0, at)
     result = bench_tests.point_load(C2, weak, at, backend=engine.name)
     assert result.wrench[1] == pytest.approx(weak, rel=1e-8)
@@ -138,7 +139,15 @@ def test_a_point_load_bends_the_cantilever_by_the_closed_form(engine):
     assert result.deflection == pytest.approx(result.reference_deflection, rel=0.01)
 
 
-@pytest.mark.parametrize(("at", "offset", "radius"), [(0.3, 0.05, 2.5e-4), (0.5, 0.2, 1e-3)])
+def test_a_ringdown_shows_the_first_frequency_and_the_damping_ratio(engine):
+    light = replace(C2, damping_ratio=0.15)
+    result = bench_tests.ringdown(light, modes=1, backend=engine.name, fidelity=Fidelity(links=10, time_step=4e-5))
+    assert result.frequency_error == pytest.approx(0, abs=0.01)
+    assert result.damping_ratio == pytest.approx(0.15, rel=0.02)
+    assert abs(result.wrench[-1, 5]) < 1e-4 * np.abs(result.wrench[:, 5]).max()
+
+
+@pytest.mark.parametrize(("at", "offset", "radius"), [(0.3, 0.05, 2.5e-4), (0.5, 0.2, 1e-3), (0.7, 0.2, 2.5e-4)])
 def test_a_peg_reproduces_the_elastica(engine, at, offset, radius):
     length = C2.arc_length
     result = bench_tests.peg(C2, at * length, offset * length, peg_radius=radius, backend=engine.name)

@@ -52,21 +52,6 @@ def test_without_pybullet_the_error_names_the_extra_or_the_python(monkeypatch):
 
 
 @needs_bullet
-@pytest.mark.parametrize(("at", "offset", "radius"), [(0.3, 0.05, 2.5e-4), (0.5, 0.2, 1e-3), (0.7, 0.2, 2.5e-4)])
-def test_a_peg_reproduces_the_elastica(at, offset, radius):
-    result = bench_tests.peg(
-        C2, at * C2.arc_length, offset * C2.arc_length, peg_radius=radius, backend="bullet", fidelity="balanced"
-    )
-    assert result.moment_error < 0.01
-    assert result.force_error < 0.02
-    assert result.wrench[1] > 0
-    assert result.wrench[5] > 0
-    assert result.trace.penetration < 1e-8
-    expected = bench_tests.references.elastica(C2, at * C2.arc_length, offset * C2.arc_length).arc
-    assert result.contact_arc == pytest.approx(expected, rel=3e-3)
-
-
-@needs_bullet
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("at", "offset"),
@@ -93,14 +78,6 @@ def test_the_rodgers_stimuli_feel_alike_on_both_engines_at_fine_steps(label):
     assert moments[0].max() == pytest.approx(moments[1].max(), rel=0.03)
     assert np.sqrt(np.mean((moments[0] - moments[1]) ** 2)) < 0.04 * moments[1].max()
     assert ours.contact.any()
-
-
-@needs_bullet
-def test_a_ringdown_shows_the_first_frequency_and_the_damping_ratio():
-    light = replace(C2, damping_ratio=0.15)
-    result = bench_tests.ringdown(light, backend="bullet", fidelity=Fidelity(links=10, time_step=4e-5))
-    assert result.frequency_error == pytest.approx(0, abs=0.01)
-    assert result.damping_ratio == pytest.approx(0.15, rel=0.02)
 
 
 @needs_bullet
