@@ -30,6 +30,7 @@ from brainbench.stimuli.engines.bullet.model import FOLLICLE, BulletWorld
 from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.objects.obstacle import Capsule, Obstacle
 from brainbench.stimuli.validation import bench_tests, references
+from brainbench.stimuli.validation.ringing import fit_decay, ringdown
 from brainbench.stimuli.whiskers.chain import build_chain
 from brainbench.stimuli.whiskers.whisker import Whisker
 
@@ -86,7 +87,7 @@ class Native:
             return math.nan
         expected = float(references.natural_frequencies(C2, 1)[0])
         times = self.h / 1e3 * np.arange(1, len(moments) + 1)
-        return bench_tests._fit_decay(times, moments, expected, 0.15)[0] / expected - 1
+        return fit_decay(times, moments, expected, 0.15)[0] / expected - 1
 
     def _run(
         self, obstacles: list[Obstacle], q: np.ndarray, end: float, place: Callable[[float], np.ndarray] | None
@@ -171,7 +172,7 @@ def main() -> None:
     for step in (1e-4, 1e-5):
         fidelity = Fidelity(LINKS, time_step=step)
         static = bench_tests.peg(C2, AT, OFFSET, backend="bullet", fidelity=fidelity)
-        ringing = bench_tests.ringdown(replace(C2, damping_ratio=0.15), backend="bullet", fidelity=fidelity)
+        ringing = ringdown(replace(C2, damping_ratio=0.15), backend="bullet", fidelity=fidelity)
         cost = static.trace.seconds / (static.trace.steps * step)
         show("implicit", step, static.wrench[5] / static.reference[5] - 1, ringing.frequency_error, cost)
 

@@ -13,6 +13,7 @@ from dataclasses import replace
 from brainbench.stimuli import Fidelity, Whisker, WhiskerArray
 from brainbench.stimuli.engines.fidelity import list_presets
 from brainbench.stimuli.validation import bench_tests
+from brainbench.stimuli.validation.ringing import ringdown
 
 PEGS = ((0.3, 0.05), (0.5, 0.1), (0.5, 0.2), (0.7, 0.2))
 
@@ -29,7 +30,7 @@ def row(name: str, whisker: Whisker, preset: str) -> str:
     at = 0.7 * length
     weak = 1e-3 * at / bench_tests.references.point_load_deflection(whisker, 1.0, at)
     load = bench_tests.point_load(whisker, weak, at, backend="bullet", fidelity=preset)
-    ringing = bench_tests.ringdown(whisker, backend="bullet", fidelity=preset)
+    ringing = ringdown(whisker, backend="bullet", fidelity=preset)
     seconds = sum(peg.trace.seconds for peg in pegs) / sum(peg.trace.steps for peg in pegs)
     return (
         f"| {name} | {preset}, {Fidelity.preset(preset).link_count(length)} links | "

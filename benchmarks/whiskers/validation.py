@@ -22,6 +22,7 @@ from brainbench.stimuli.engines import list_engines
 from brainbench.stimuli.engines.fidelity import Fidelity, list_presets
 from brainbench.stimuli.motion.trajectories import smooth_step
 from brainbench.stimuli.validation import bench_tests, references
+from brainbench.stimuli.validation.ringing import ringdown
 from brainbench.stimuli.whiskers.array import WhiskerArray
 from brainbench.stimuli.whiskers.whisker import Whisker
 from tests.factories.shaken_base import shaken_base
@@ -83,8 +84,8 @@ def measure(name: str, backend: str) -> dict[str, dict[str, object]]:
                 except BrainbenchError:
                     out["slips"][at] = math.inf
     for preset, out in result.items():
-        out["ring"] = bench_tests.ringdown(whisker, backend=backend, fidelity=preset)
-        out["own"] = bench_tests.ringdown(whisker, own_step=True, backend=backend, fidelity=preset).frequency_errors
+        out["ring"] = ringdown(whisker, backend=backend, fidelity=preset)
+        out["own"] = ringdown(whisker, own_step=True, backend=backend, fidelity=preset).frequency_errors
     return result
 
 

@@ -13,6 +13,7 @@ from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.engines.protocol import Job, Load, StillFollicle, base_rotation
 from brainbench.stimuli.objects.obstacle import Box, Capsule, ConvexPart, Cylinder, Obstacle, Sphere
 from brainbench.stimuli.validation import bench_tests
+from brainbench.stimuli.validation.ringing import ringdown
 from brainbench.stimuli.whiskers.chain import build_chain
 from tests.factories.obstacles import post
 from tests.factories.swing import Swing
@@ -141,7 +142,7 @@ def test_a_point_load_bends_the_cantilever_by_the_closed_form(engine, share):
 
 def test_a_ringdown_shows_the_first_frequency_and_the_damping_ratio(engine):
     light = replace(C2, damping_ratio=0.15)
-    result = bench_tests.ringdown(light, modes=1, backend=engine.name, fidelity=Fidelity(links=10, time_step=4e-5))
+    result = ringdown(light, modes=1, backend=engine.name, fidelity=Fidelity(links=10, time_step=4e-5))
     assert result.frequency_error == pytest.approx(0, abs=0.01)
     assert result.damping_ratio == pytest.approx(0.15, rel=0.02)
     assert abs(result.wrench[-1, 5]) < 1e-4 * np.abs(result.wrench[:, 5]).max()
