@@ -36,8 +36,8 @@ def design(
     as_json: JsonOption = False,
 ) -> None:
     """Choose the whisking, or the place of the objects, that tells the objects, or two networks, apart best."""
-    from brainbench.stimuli.design import VARIABLES
     from brainbench.stimuli.design import design as run
+    from brainbench.stimuli.design_variables import VARIABLES
 
     recipe = scenes.open_recipe(source, whiskers)
     with progress_bar("searching"):

@@ -30,7 +30,8 @@ from brainbench.scoring.recovery.candidates import Candidate
 from brainbench.scoring.recovery.design import FEWEST_STIMULI, RecoveryDesign
 from brainbench.scoring.recovery.selection import Margins
 from brainbench.stimuli import Scene, load_stimuli, simulate
-from brainbench.stimuli.design import NOTHING, DesignOptions, changed, find_motions, read_limits
+from brainbench.stimuli.design import NOTHING, DesignOptions, find_motions
+from brainbench.stimuli.design_variables import changed, read_limits
 from brainbench.stimuli.engines import DEFAULT_ENGINE, get_engine
 from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.gradients import GradientRun
@@ -90,7 +91,7 @@ def design_for_networks(
     Args:
         scenes: the same whiskers and motion, each with another object; at least eight, every other one is held out.
         networks: two models as :func:`brainbench.score` takes them; no files of activations.
-        variables: names of :data:`brainbench.stimuli.design.VARIABLES`.
+        variables: names of :data:`brainbench.stimuli.design_variables.VARIABLES`.
         bounds: bounds of single variables, in their units.
         options: search and simulation; noise and rate of its sensor do not count, the noise is that of animals.
         study: animals that are drawn to compare motions; its layer is that of networks that commit to none: ``any``
