@@ -394,7 +394,7 @@ def command(config: DistillConfig, *, stop_at: int | None = None) -> str:
         words |= {"unroll": config.encoder_settings.get("options", {}).get("unroll")}
     words |= {"contacts": config.contacts, "embedder": config.embedder, "hand": config.hand, "envs": config.num_envs}
     words |= {"seed": config.seed, "precision": config.precision, "iterations": config.iterations}
-    words |= {"learning-rate": config.learning_rate, "epochs": config.epochs}
+    words |= {"learning-rate": config.learning_rate, "epochs": config.epochs, "start": config.start}
     words |= {"stop-at": stop_at if stop_at != config.iterations else None}
     usual = DistillConfig(task=config.task)
     given = {

@@ -69,6 +69,7 @@ DISTILL_FLAGS = {"variant": ("--config",), "num_envs": ("--envs",)}
 OFFERED = (
     "observe", "placement", "resolution", "noisy", "contacts", "embedder", "hand", "variant", "num_envs", "iterations",
     "learning_rate", "epochs", "teacher_share", "teacher_iterations", "aggregate", "precision", "save_interval", "seed",
+    "start",
 )  # fmt: skip
 """Fields of a student's configuration that have a flag of their name."""
 

@@ -36,7 +36,7 @@ from robotics_bridge.policies.training.cuda_graph_step import ChunkStep
 from robotics_bridge.policies.training.distill_config import DistillConfig
 from robotics_bridge.policies.training.rollouts import Recorder, Rollout
 from robotics_bridge.policies.training.state_tree import write_tensors
-from robotics_bridge.policies.training.student_files import CONFIG, MODEL, build_student
+from robotics_bridge.policies.training.student_files import CONFIG, MODEL, begin_with, build_student
 from robotics_bridge.tasks.task import TASK_VERSION, check_measured
 
 _log = logging.getLogger(__name__)
@@ -142,6 +142,8 @@ class _Run:
         check_measured((name for name in read if name != "goal"), "A student")
         self.groups: list[str] = [*read, TACTILE] if config.tactile is not None else read
         self.student = build_student(config, env.observation_shapes, self.groups, env.num_actions).to(self.device)
+        if config.start is not None and not (out / STATE).exists():
+            begin_with(self.student, config.start)
         self.decoders = env.task.decoders
         sizes, features = env.observation_shapes, self.student.core.features
         heads = {one.target: perceptron(features, one.hidden, math.prod(sizes[one.target])) for one in self.decoders}

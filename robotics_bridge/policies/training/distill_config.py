@@ -30,6 +30,9 @@ class DistillConfig:
     task: str
     teacher: str = ""
     """Folder of the teacher's run, or the name of a shipped teacher."""
+    start: str | None = None
+    """A student, by folder or shipped name, whose weights it begins with; by default new ones. Any version of the tasks
+    will do."""
     hand: str = "xhand1"
     """``xhand1``, ``sharpa``, or a URDF or MJCF file."""
     variant: str = "default"

@@ -39,6 +39,26 @@ def build_student(
     )  # fmt: skip
 
 
+def begin_with(student: TactilePolicy, start: str | Path) -> None:
+    """Give a student the weights of another, by folder or shipped name; learning begins anew.
+
+    Raises:
+        UsageError: there is no such folder or name.
+        DataError: it has no weights, or those of another network.
+    """
+    path, own = policy_path("student", start) / MODEL, student.state_dict()
+    with readable(path, "student", "It is damaged, or of another student."):
+        found = read_tensors(path, "file of weights (safetensors)")
+    for name in {**own, **found}:
+        theirs, mine = (list(weights[name].shape) if name in weights else None for weights in (found, own))
+        if theirs != mine:
+            raise DataError(
+                f"The student {str(start)!r} has {name!r} of shape {theirs}, here {mine}: start from one that feels "
+                "and acts alike."
+            )
+    student.load_state_dict(found)
+
+
 def load_student(folder: str | Path, *, device: str = "cpu") -> tuple[TactilePolicy, dict[str, Any]]:
     """Return a distilled student in evaluation mode, and its run's configuration.
 
