@@ -12,21 +12,19 @@
 #   device, 3:  carry .gpu/c .session   bash .gpu/c/install.sh && bash .session/gpu_session.sh start && bash /w/gpu.sh run tests
 #   device, 4…: bash /w/gpu.sh run PART …                             each at most as long as it says; all below 600 s
 #   or, on a machine of several GPUs, parts in the background, one after the other on each GPU, and a look at them:
-#               JOB=teacher-deployed-0 bash /w/gpu.sh lane 2 teachers; bash /w/gpu.sh look SECOND
-#               TEACHER=/tmp/run/teacher-deployed-0 PLAN="0:ead_simclr,reservoir 4:ead_simclr" bash /w/gpu.sh lane 2 students-for
-#               (PLAN: seed:arms …)
-#               (SECOND of the machine's life; policies/jobs.toml says which teachers to compare, and what to compare; on
-#               a fresh machine two minutes of a teacher's go into compiling)
+#               PLAN="0:ft_hand,reservoir_50 3:ft_hand" bash /w/gpu.sh lane 0 students-for; bash /w/gpu.sh look SECOND
+#               (PLAN: seed:arms …, TEACHER a run's folder; JOB=NAME-0 … lane 1 teachers; SECOND of the machine's life;
+#               policies/jobs.toml says what to compare; on a fresh machine two minutes go into compiling)
 #   here:       git checkout -f main && git branch -D device; python -m benchmarks.report after copying results/*.json
 #
-# Calls follow one another within 30 s, or the machine goes back with all that is on it. A machine lives 30 minutes; one
-# GPU counts half, four count as one that is not halved. What is timed has its GPU for itself.
+# Calls follow one another within 30 s, or the machine goes back with all that is on it: on 2026-11-26 that happened twice,
+# once for a call that broke off and once for thinking. So start all lanes in the third call, look every five minutes, and
+# write the next call before the last one ends. A machine lives 30 minutes; one GPU counts half, four count as one that is
+# not halved. What is timed has its GPU for itself.
 #
-# What is open of sweeps: whether tries ahead gain on an idle GPU (sweeps-1; hashes are equal); when kernels are loaded and
-# shards begin (sweeps-2); how a GPU is shared where shards queue, 16 or 32 at once (sweeps-3); what users get (sweeps-4),
-# and on 2 and 4 GPUs (scaling, all GPUs idle: 164, 97 and 74 s on 2026-11-26); which kernel takes the time (slices).
-# Training on 1, 2 and 4 GPUs: few, then training with COUNTS=1,2,4, all GPUs idle. Of free motion: bending alone beside twist, and fewer threads at a time,
-# whose memory then fits the cache (free). golden compiles three kernels of 20 s each (200 s until 2026-11-26).
+# What is open of sweeps: how a GPU is shared where shards queue, 16 or 32 at once (sweeps-3), and which kernel takes the
+# time (slices). Of touch: noisy taxels as they are now (touch; .143 to .151 ms in an experiment). Training on several
+# GPUs: few, then training with COUNTS=1,2,4 on cards that hold a batch of 1,024 (H200), all GPUs idle.
 set -eu
 
 # Part, its limit in seconds, its command.
@@ -41,11 +39,10 @@ scaling   480  python3 -m benchmarks.whiskers.public_rate --objects procedural-2
 slices    150  python3 -m benchmarks.whiskers.slices --objects procedural-24:2 --device cuda --write
 free      150  python3 -m benchmarks.whiskers.throughput --only free --blocks 64,256,320 --bounds 0,64x6
 touch     320  python3 -m benchmarks.tactile.throughput --device cuda --part sensors --input inputs/pyramid.npz --write
-variants  300  python3 -m benchmarks.tactile.variants --device cuda --input inputs/pyramid.npz
 friction  150  python3 -m benchmarks.tactile.friction_cost --device cuda --write
 gradients 500  python3 -m benchmarks.whiskers.gradient_cost --device cuda --each 1 --input inputs/gradients.npz --write
 teachers  590  python3 -m benchmarks.policies.jobs run $JOB --minutes ${MINUTES:-7.5}
-students-for 1500  for one in $PLAN; do python3 -m benchmarks.policies.students --teacher $TEACHER --config careful --seed ${one%%:*} --arms $(echo ${one#*:} | tr , ' ') ${AGENTS---no-agents} --evaluations 1 --device cuda --envs 4096 --iterations 110 --learning-rate 5e-4 --episodes 512 --together 2 --end $(($(cat /w/t0) + 1670)) --reserve 60 --out /tmp/run/students-${one%%:*}; done
+students-for 1500  for one in $PLAN; do python3 -m benchmarks.policies.students --teacher ${TEACHER:-in_palm_rotate.teacher} --config careful --seed ${one%%:*} --arms $(echo ${one#*:} | tr , ' ') ${AGENTS---no-agents} --evaluations 1 --device cuda --envs 4096 --iterations 110 --learning-rate 5e-4 --episodes 512 --together 2 --end $(($(cat /w/t0) + 1670)) --reserve 60 --out /tmp/run/students-${one%%:*}; done
 few       240  python3 -m brainbench stimuli sweep thesis-low procedural:30 --split sweep --device cuda $P --out /tmp/few
 training  300  python3 -m benchmarks.models.data_parallel /tmp/few --counts $COUNTS --networks zhuang-intersection-ln+gpt.supervised --out /w/out/data-parallel-$COUNTS.json
 TABLE
@@ -91,6 +88,9 @@ look() {
   for run in /tmp/run/*/; do  # the newest model of each teacher
     local model; model=$(ls -v "$run"model_*.safetensors 2>/dev/null | tail -n 1)
     [ -z "$model" ] || tar czf "$OUT/$(basename "$run").tar.gz" -C "$run" "$(basename "$model")" $(cd "$run" && ls config.json 2>/dev/null)
+  done
+  for run in /tmp/run/students-*/ft_hand/seed*/; do  # students that were evaluated and may ship
+    [ ! -e "$run/evaluation.json" ] || tar czf "$OUT/ft_hand-$(basename "$run").tar.gz" -C "$run" model.safetensors config.json evaluation.json
   done; cp /w/out/*.json "$OUT" 2>/dev/null || true
 }
 
