@@ -182,3 +182,16 @@ def test_without_the_package_for_training_nothing_is_distilled(tmp_path, monkeyp
     with pytest.raises(MissingDependencyError, match=r"rsl-rl-lib.*policies"):
         _run(tmp_path, iterations=1)
     assert not (tmp_path / "config.json").exists()
+
+
+def test_a_student_begins_with_the_weights_of_another(tmp_path) -> None:
+    _run(tmp_path / "first", iterations=4, learning_rate=5e-3)
+    first, _ = load_student(tmp_path / "first")
+    _run(tmp_path / "second", iterations=1, learning_rate=1e-12, start=str(tmp_path / "first"), seed=5)
+    second, _ = load_student(tmp_path / "second")
+    for name, value in first.named_parameters():
+        torch.testing.assert_close(second.get_parameter(name), value, rtol=0, atol=1e-6, msg=name)
+    with pytest.raises(DataError, match=r"has 'core\..*start from one that feels and acts alike"):
+        _run(tmp_path / "third", iterations=1, encoder="rnn", start=str(tmp_path / "first"))
+    with pytest.raises(UsageError, match="student 'nobody'"):
+        _run(tmp_path / "fourth", iterations=1, start="nobody")
