@@ -82,12 +82,12 @@ def test_learning_goes_on_from_a_shipped_teacher() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("name", "success", "goals"), [("in_palm_rotate.teacher", 0.85, 9.0), ("in_palm_rotate.student", 0.65, 3.0)]
+    ("name", "success", "goals"), [("in_palm_rotate.teacher", 0.9, 10.0), ("in_palm_rotate.student", 0.55, 2.0)]
 )
 def test_a_shipped_policy_turns_the_block_on_c_mujoco(name: str, success: float, goals: float) -> None:
     task = with_contacts_of(tasks.load("in_palm_rotate"), [name])
     env = tasks.make(task, num_envs=34, seed=5, **touch_of([name]))
     found = evaluate(env, agent_of(name, env), episodes=68, seed=7)
-    # Measured: teacher 0.964 [0.937, 0.980] and 11.0 goals of 306 episodes, student 0.824 [0.777, 0.862] and 4.4.
+    # Measured: teacher 0.987 [0.967, 0.995] and 12.2 goals of 306 episodes, student 0.673 [0.619, 0.723] and 2.8.
     assert found.success_rate > success
     assert found.mean("goals")[0] > goals
