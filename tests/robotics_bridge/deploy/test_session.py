@@ -99,7 +99,6 @@ def test_a_deployed_policy_sees_and_does_what_evaluation_does(tmp_path: Path) ->
     hand = _TaskHand(env, Policy(student), clock)
     limits = {"margin": 1.0, "pressure": 1000.0}
     controller = read_deployed(found.path).controller(hand, limits=limits, clock=clock)
-    controller.limits = replace(controller.limits, speed=np.full(len(hand.joints), 1e6))
     report = controller.run(0.5)
     assert (report.status, report.ticks) == ("finished", 20)
     sent, wanted = (np.array(part) for part in zip(*hand.pairs, strict=True))
