@@ -22,7 +22,6 @@ from unittest.mock import patch
 
 import torch
 from safetensors.torch import load_file
-from zoo_jobs import SMALL
 
 from benchmarks.report import table, write_section
 from brainbench.datasets import WhiskingDataset
@@ -32,6 +31,11 @@ from brainbench.models.training.objectives import make_learner
 
 BATCH = 24
 MODEL = "resnet18-small"
+SMALL = (
+    "zhuang-intersection-ln-small", "zhuang-small", "resnet18-small", "s4-small+gpt", "zhuang-small+mamba",
+    "resnet18-small+gpt",
+)  # fmt: skip
+"""Encoders with memory of three kinds and none; attenders GPT, Mamba and none."""
 MOMENTS = (0.15, 0.85)
 """Kills fall between these shares of what an unbroken run takes."""
 
