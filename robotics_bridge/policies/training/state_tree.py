@@ -83,3 +83,10 @@ def load(path: str | os.PathLike[str], device: str = "cpu") -> Any:
     if not isinstance(tree, dict):
         raise DataError(f"{str(path)!r} is damaged or not one of ours: it holds no names and values.")
     return tree
+
+
+def odd_shape(found: Mapping[str, torch.Tensor], own: Mapping[str, torch.Tensor]) -> tuple[str, Any, Any] | None:
+    """Return the first name whose shape differs, with both shapes (None where it is missing); None if all agree."""
+    theirs, mine = ({name: tuple(value.shape) for name, value in tree.items()} for tree in (found, own))
+    names = (name for name in {**mine, **theirs} if mine.get(name) != theirs.get(name))
+    return next(((name, theirs.get(name), mine.get(name)) for name in names), None)

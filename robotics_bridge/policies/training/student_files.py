@@ -19,6 +19,7 @@ from robotics_bridge.policies.schema import Values
 from robotics_bridge.policies.shipped import policy_path
 from robotics_bridge.policies.student import TACTILE, TactilePolicy
 from robotics_bridge.policies.training.distill_config import DistillConfig
+from robotics_bridge.policies.training.state_tree import odd_shape
 
 CONFIG, MODEL = "config.json", "model.safetensors"
 
@@ -46,16 +47,15 @@ def begin_with(student: TactilePolicy, start: str | Path) -> None:
         UsageError: there is no such folder or name.
         DataError: it has no weights, or those of another network.
     """
-    path, own = policy_path("student", start) / MODEL, student.state_dict()
+    path = policy_path("student", start) / MODEL
     with readable(path, "student", "It is damaged, or of another student."):
         found = read_tensors(path, "file of weights (safetensors)")
-    for name in {**own, **found}:
-        theirs, mine = (list(weights[name].shape) if name in weights else None for weights in (found, own))
-        if theirs != mine:
-            raise DataError(
-                f"The student {str(start)!r} has {name!r} of shape {theirs}, here {mine}: start from one that feels "
-                "and acts alike."
-            )
+    if odd := odd_shape(found, student.state_dict()):
+        name, theirs, mine = odd
+        raise DataError(
+            f"The student {str(start)!r} has {name!r} of shape {theirs}, here {mine}: start from one that feels and "
+            "acts alike."
+        )
     student.load_state_dict(found)
 
 

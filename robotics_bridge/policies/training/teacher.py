@@ -156,12 +156,11 @@ class Trainer:
         found, own = state_tree.load(file), self.algorithm.save()
         for name in ("actor", "critic"):
             trees = (found[name], own[f"{name}_state_dict"])
-            theirs, mine = ({k: tuple(v.shape) for k, v in tree.items()} for tree in trees)
-            if theirs != mine:
-                odd = next(key for key in {**mine, **theirs} if mine.get(key) != theirs.get(key))
+            if odd := state_tree.odd_shape(*trees):
+                key, theirs, mine = odd
                 raise DataError(
-                    f"The {name} of {str(file)!r} does not fit: {odd!r} has the shape {theirs.get(odd)}, here "
-                    f"{mine.get(odd)}. Take a run of a task with the same observations, actions and layers."
+                    f"The {name} of {str(file)!r} does not fit: {key!r} has the shape {theirs}, here {mine}. Take a "
+                    "run of a task with the same observations, actions and layers."
                 )
             own[f"{name}_state_dict"] = found[name]
         parts = {"actor": True, "critic": True, "optimizer": False, "iteration": False, "rnd": False}
