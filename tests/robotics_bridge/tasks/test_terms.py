@@ -50,6 +50,22 @@ def test_a_slow_turn_towards_the_goal_pays_in_full_and_a_quick_one_less(config: 
     assert paid(task, quick) < 0.2 * weight
 
 
+@pytest.mark.parametrize(("config", "reaching_pays"), [("published", False), ("default", True)])
+def test_an_orientation_is_worth_more_reached_than_nearly_reached(config: str, reaching_pays: bool) -> None:
+    task = tasks.load("in_hand_repose", config)
+    assert task.goal is not None
+    moment: Any = SimpleNamespace(
+        dt=DT, goal_angle=torch.tensor([1.05 * task.goal.threshold]), reached=torch.tensor([True]),
+        missed=torch.tensor([True]),
+    )  # fmt: skip
+
+    def value(name: str) -> float:
+        return float(task.rewards[name].weight * task.rewards[name].term(moment, **task.rewards[name].params))
+
+    waiting = task.goal.deadline[1] * (value("track_orientation_gaussian") + value("track_orientation_inv_l2"))
+    assert (DT * value("success_bonus") > waiting + DT * value("goal_timeout_penalty")) is reaching_pays
+
+
 def test_a_term_of_rotation_counts_nothing_beyond_the_tilt_that_the_goal_allows() -> None:
     moment: Any = SimpleNamespace(off_axis=torch.tensor([0.7]), allowed_off_axis=0.5, axis_rate=torch.tensor([2.0]))
     assert float(terms.rotation_progress(moment, clip=6.0, penalty_scale=5.0)) == pytest.approx(-1.0)
