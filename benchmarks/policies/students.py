@@ -14,8 +14,9 @@ whenever one is done. Run again with the same folder, students that were stopped
         [--write] [--records FOLDER]
 
 lays out what came back, several training seeds of an arm and several folders together: tables of arms, of every
-student and of the differences between arms; with ``--write`` a section of RESULTS.md and two pictures, with
-``--records`` records for a leaderboard, whose commands name the teacher as it is shipped.
+student and of the differences between arms (what came back of earlier sessions lies in
+``benchmarks/policies/records/students-DATE.tar.xz``, to unpack and name too); with ``--write`` a section of RESULTS.md
+and two pictures, with ``--records`` records for a leaderboard, whose commands name the teacher as it is shipped.
 """
 
 from __future__ import annotations
