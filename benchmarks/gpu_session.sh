@@ -87,12 +87,14 @@ look() {
   tail -n "${2:-15}" /w/out/lane-*.log
   nvidia-smi --query-gpu=utilization.gpu,memory.used --format=csv,noheader
   cd / && tar czf "$OUT/seen.tar.gz" w/out/*.log w/head/benchmarks/results $(find tmp/run -maxdepth 4 -name '*.json' -o -name '*.jsonl' -o -name log.csv 2>/dev/null)
-  for run in /tmp/run/*/; do  # the newest model of each teacher
-    local model; model=$(ls -v "$run"model_*.safetensors 2>/dev/null | tail -n 1)
-    [ -z "$model" ] || tar czf "$OUT/$(basename "$run").tar.gz" -C "$run" "$(basename "$model")" $(cd "$run" && ls config.json 2>/dev/null)
+  # The newest model of each teacher, and students that were evaluated and may ship: eight files may come back.
+  local model runs=()
+  for run in /tmp/run/*/; do
+    model=$(ls -v "$run"model_*.safetensors 2>/dev/null | tail -n 1); [ -z "$model" ] || runs+=("$model" "$run"config.json)
   done
-  for run in /tmp/run/students-*/ft_hand/seed*/; do  # students that were evaluated and may ship
-    [ ! -e "$run/evaluation.json" ] || tar czf "$OUT/ft_hand-$(basename "$run").tar.gz" -C "$run" model.safetensors config.json evaluation.json
+  [ -z "${runs[*]}" ] || tar czf "$OUT/teachers.tar.gz" "${runs[@]}"
+  for run in /tmp/run/students-*/{ft_hand,reservoir}/seed*/; do
+    [ ! -e "$run/evaluation.json" ] || tar czf "$OUT/$(basename "$(dirname "$run")")-$(basename "$run").tar.gz" -C "$run" model.safetensors config.json evaluation.json
   done; cp /w/out/*.json "$OUT" 2>/dev/null || true
 }
 
