@@ -76,7 +76,8 @@ class NoiseModel:
         Raises:
             DataError: the covariance is singular.
         """
-        eye = library(self.scale).eye(len(self.scale), **_like(self.scale))
+        xp = library(self.scale)
+        eye = xp.diag(xp.ones_like(self.scale))
         if not self.weight:
             inner = eye / self.ridge
         elif self.dual:
@@ -226,10 +227,6 @@ def _inverse(factor: Array) -> Array:
     (invert,) = get_lapack_funcs(("potri",), (factor,))
     lower, _ = invert(factor, lower=1)
     return np.tril(lower) + np.tril(lower, -1).T
-
-
-def _like(array: Array) -> dict[str, object]:
-    return {"dtype": array.dtype, "device": array.device} if is_tensor(array) else {}
 
 
 _METHODS: dict[str, Callable[[Array, int], NoiseModel]] = {

@@ -194,16 +194,6 @@ def mean_patterns(
     return means, spread
 
 
-def chunk_size(sessions: list[SortedTrials], count: int, method: str) -> int:
-    """Return how many splits are computed at once."""
-    width = sum(min(session.responses.shape) for session in sessions)
-    step = _CHUNK_BYTES // (8 * count * max(width, count))
-    if method == "correlation":
-        # It forms the patterns of all units; other distances come in slices of units.
-        step = min(step, _PATTERN_BYTES // (8 * count * sum(session.responses.shape[1] for session in sessions)))
-    return max(1, step)
-
-
 def members(random: Hashes) -> Floats:
     """Return 1 for the trials [..., n] of the first half: the lower half of the random numbers."""
     count = random.shape[-1]
@@ -230,7 +220,12 @@ def split_members(session: SortedTrials, count: int, index: Ints, seed: int) -> 
 def half_rdms(sessions: list[SortedTrials], count: int, method: str, index: Ints, seed: int) -> tuple[Floats, Floats]:
     """Return the RDMs [S, P] of both halves of the splits ``index`` [S]."""
     every = SplitRDMs(sessions, count, method)
-    step = chunk_size(sessions, count, method)
+    width = sum(min(session.responses.shape) for session in sessions)
+    step = _CHUNK_BYTES // (8 * count * max(width, count))
+    if method == "correlation":
+        # It forms the patterns of all units; other distances come in slices of units.
+        step = min(step, _PATTERN_BYTES // (8 * count * sum(session.responses.shape[1] for session in sessions)))
+    step = max(1, step)
     parts = [
         every.halves([split_members(session, count, index[start : start + step], seed) for session in sessions])
         for start in range(0, len(index), step)
