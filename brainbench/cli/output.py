@@ -7,13 +7,13 @@ import math
 import sys
 import threading
 import time as clock
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from brainbench.core.files import to_json
-from brainbench.core.progress import Progress
+from brainbench.core.progress import Item, Progress, track
 
 if TYPE_CHECKING:
     from brainbench.core.records import Interval
@@ -156,6 +156,12 @@ def progress_bar(what: str = "") -> Iterator[Progress]:
             bar.update(tasks[what], completed=done, total=total)
 
         yield update
+
+
+def tracked(items: Sequence[Item], what: str) -> Iterator[Item]:
+    """Yield items while progress shows how many of them are done."""
+    with progress_bar() as progress:
+        yield from track(items, what, progress)
 
 
 class ProgressLines:
