@@ -14,7 +14,6 @@ import msgspec
 from brainbench.cli.options import SCORE, SCORE_FLAGS, as_flags, option_fields
 from brainbench.core.errors import DataError, UsageError, listing, shown, unknown_name
 from brainbench.core.files import to_json, to_plain
-from brainbench.core.progress import Progress
 from brainbench.core.reading.ranges import check_number
 from brainbench.core.reading.texts import read_toml
 from brainbench.core.records import ESTIMATOR_VERSION, ResultRecord
@@ -53,20 +52,11 @@ def jobs_of(patterns: Sequence[str], seeds: Sequence[int], options: dict[str, An
     ]
 
 
-def score_again(
-    record: ResultRecord,
-    *,
-    recordings: str | None = None,
-    trust_code: bool = False,
-    progress: Progress | None = None,
-) -> ResultRecord:
+def score_again(record: ResultRecord, *, recordings: str | None = None, trust_code: bool = False) -> ResultRecord:
     """Repeat a record's computation from its provenance.
 
-    Args:
-        record: The record.
-        recordings: Where its recordings are; only demo recordings are found without, since records keep no folders.
-        trust_code: Also run code and weights that do not come with this package.
-        progress: Called with (done, total, what).
+    Only demo recordings are found without ``recordings``, since records keep no folders. ``trust_code`` also runs code
+    and weights that do not come with this package.
 
     Raises:
         DataError: the record does not say enough.
@@ -89,7 +79,7 @@ def score_again(
             f"The record was made with the recordings {str(source)[:80]!r}; give them with --recordings PATH."
         )
     options = ScoreOptions.stated_in(origin.settings, recordings=recordings or source, match=origin.pairs or None)
-    return score_record(model, options, progress=progress)
+    return score_record(model, options)
 
 
 def _check_kinds(record: ResultRecord, model: Any, source: Any) -> None:

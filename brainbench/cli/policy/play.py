@@ -124,7 +124,7 @@ def play(
                 goals, turned = goals + int(info["goals"]), turned + float(info["turned"])
             progress(step + 1, steps, "playing")
         if video is not None:
-            drawing.write_video(video, film, len(film), size, 1 / (every * env.step_dt))
+            drawing.write_video(video, film, size, 1 / (every * env.step_dt))
         if strip is not None:
             drawing.write_strip(strip, stills, times)
     told = {
