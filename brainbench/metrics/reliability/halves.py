@@ -112,9 +112,16 @@ class SplitRDMs:
         if self._method == "crossnobis":
             present &= np.isfinite(variances)
         weight = present.astype(np.float64)
-        both = upper(weight @ np.swapaxes(weight, -1, -2))
+        shared = weight @ np.swapaxes(weight, -1, -2)
+        both = upper(shared)
         if self._method == "crossnobis":
-            return _unbiased_distances(patterns, variances), both
+            # E‖x̂_i − x̂_j‖² = ‖x_i − x_j‖² + v_i + v_j: the noise of both means is taken away, over the units that both
+            # have, which is the crossnobis distance with every trial as its own fold.
+            own = np.where(present, variances, 0.0) @ np.swapaxes(weight, -1, -2)
+            seen = np.where(present, patterns, np.nan)
+            with np.errstate(invalid="ignore", divide="ignore"):
+                noise = upper((own + np.swapaxes(own, -1, -2)) / shared)
+                return product_distances(seen, seen, missing=True) - noise, both
         if self._method == "poisson":
             rates = poisson_rates(patterns)
             return product_distances(rates, np.log(rates), missing=True), both
@@ -147,22 +154,6 @@ class _Sums:
         for name in ("number", "units", "squares"):
             setattr(other, name, getattr(self, name) - getattr(half, name))
         return other
-
-
-def _unbiased_distances(patterns: Floats, variances: Floats) -> Floats:
-    """Return squared distances per unit [..., P] less what the noise of the patterns [..., K, F] adds to them.
-
-    With ``variances`` [..., K, F] of the patterns (sample variance over trials / trials) this is the
-    crossnobis distance with every trial as its own fold; units without either value are left out of a pair.
-    """
-    # E‖x̂_i − x̂_j‖² = ‖x_i − x_j‖² + v_i + v_j: the noise of both means is taken away, over the units that both have.
-    present = np.isfinite(patterns) & np.isfinite(variances)
-    weight = present.astype(np.float64)
-    own = np.where(present, variances, 0.0) @ np.swapaxes(weight, -1, -2)
-    both = weight @ np.swapaxes(weight, -1, -2)
-    seen = np.where(present, patterns, np.nan)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        return product_distances(seen, seen, missing=True) - upper((own + np.swapaxes(own, -1, -2)) / both)
 
 
 def mean_patterns(
