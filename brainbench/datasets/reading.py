@@ -6,10 +6,10 @@ session is adapted by its layout.
 
 from __future__ import annotations
 
-import contextlib
 import glob
 import os
 from collections.abc import Iterator, Sequence
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -87,8 +87,7 @@ def resolve_selection(select: Selection | str) -> Selection:
     return Selection.parse(select)
 
 
-@contextlib.contextmanager
-def open_file(path: Path) -> Iterator[h5py.File]:
+def open_file(path: Path) -> AbstractContextManager[h5py.File]:
     """Open an HDF5 file for reading; failures inside the block name the file too.
 
     Raises:
@@ -99,8 +98,7 @@ def open_file(path: Path) -> Iterator[h5py.File]:
             f"{path} is an .npz file: published recordings are opened one at a time and without a layout, to be "
             "inspected, checked and scored; they hold no spike times to join or copy."
         )
-    with open_hdf5(path, "recording", "brainbench reads NWB 2.x and its own HDF5 layout.") as file:
-        yield file
+    return open_hdf5(path, "recording", "brainbench reads NWB 2.x and its own HDF5 layout.")
 
 
 def suitable_files(paths: Sequence[Path], *, strict: bool = False) -> tuple[list[Path], list[str]]:
