@@ -140,15 +140,13 @@ def find_models(patterns: Sequence[str]) -> list[str]:
     names = [*list_models(), *shipped()]
     found: dict[str, None] = {}
     for pattern in patterns:
-        plain = not any(mark in pattern for mark in "*?[")
-        if plain and (pattern in names or is_path(pattern) or Architecture.parse(pattern).tag is not None):
+        if any(mark in pattern for mark in "*?["):
+            some = list_models() if Architecture.parse(pattern).tag is None else shipped()
+            found |= dict.fromkeys(name for name in some if fnmatchcase(name, pattern))
+        elif pattern in names or is_path(pattern) or Architecture.parse(pattern).tag is not None:
             found[pattern] = None
-            continue
-        trained = Architecture.parse(pattern).tag is not None
-        hits = [name for name in (shipped() if trained else list_models()) if fnmatchcase(name, pattern)]
-        if plain and not hits:
+        else:
             raise unknown_name("model", pattern, names)
-        found |= dict.fromkeys(hits)
     return list(found)
 
 
