@@ -8,11 +8,12 @@ import sys
 import threading
 import time as clock
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from brainbench.core.files import to_json
+from brainbench.core.files import to_json, write_json
 from brainbench.core.progress import Item, Progress, track
 
 if TYPE_CHECKING:
@@ -30,8 +31,10 @@ def list_without_command(app: typer.Typer, command: Callable[[], None]) -> None:
             command()
 
 
-def emit(data: Any, text: str, *, as_json: bool) -> None:
-    """Print ``data`` as JSON, or ``text`` for people, on stdout."""
+def emit(data: Any, text: str, *, as_json: bool, out: Path | None = None) -> None:
+    """Print ``data`` as JSON, or ``text`` for people, on stdout; write the JSON into a file too if there is one."""
+    if out is not None:
+        write_json(out, data)
     print(to_json(data) if as_json else text)
 
 

@@ -164,7 +164,6 @@ def evaluate(
     task) ended.
     """
     from brainbench.core.errors import UsageError
-    from brainbench.core.files import write_json
     from robotics_bridge.policies.evaluate import evaluate as run
     from robotics_bridge.tasks.contact_model import contacts_name
 
@@ -182,8 +181,6 @@ def evaluate(
                 env, agent_of(name, env), episodes=episodes, seed=tuple(range(seeds)), name=name, progress=progress
             )
             found.append({**result.summary(), "contacts": contacts})
-    if out is not None:
-        write_json(out, found)
     columns = {
         "agent": "{0[agent]}",
         ">episodes": "{0[episodes]}",
@@ -197,7 +194,7 @@ def evaluate(
         ">diverged": "{0[diverged]}",
         ">by object": lambda item: _by_kind(item["objects"]),
     }
-    emit(found, table_of(f"{env.task.text}; contacts: {contacts}", found, columns), as_json=as_json)
+    emit(found, table_of(f"{env.task.text}; contacts: {contacts}", found, columns), as_json=as_json, out=out)
 
 
 def _by_kind(objects: Mapping[str, Mapping[str, float]]) -> str:

@@ -109,11 +109,7 @@ def fit(
         if picture is not None:
             draw_fit(trial, result, picture)
         data, text = result.summary(), _text(result, measured)
-    if out is not None:
-        from brainbench.core.files import write_json
-
-        write_json(out, data)
-    emit(data, text, as_json=as_json)
+    emit(data, text, as_json=as_json, out=out)
 
 
 def _contacts(measured: xr.Dataset, whisker: Whisker, noise: float | None, frames: int) -> tuple[dict[str, Any], str]:
