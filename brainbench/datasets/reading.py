@@ -161,7 +161,8 @@ def _expand(source: str) -> list[Path]:
     if path.is_file():
         return [path]
     if path.is_dir():
-        visible = [item for item in path.rglob("*") if _visible(item, path)]
+        inside = [item for item in path.rglob("*") if item.is_file()]
+        visible = [item for item in inside if not any(part.startswith(".") for part in item.relative_to(path).parts)]
         for endings in SUFFIXES:
             if found := [item for item in visible if item.suffix.lower() in endings]:
                 return found
@@ -181,7 +182,3 @@ def _expand(source: str) -> list[Path]:
     siblings = [item.name for item in path.parent.iterdir()] if path.parent.is_dir() else []
     guess = nearest(path.name, siblings)
     raise DataFileNotFoundError(f"There is no file {source!r}{f'; did you mean {guess!r}?' if guess else '.'}")
-
-
-def _visible(path: Path, root: Path) -> bool:
-    return path.is_file() and not any(part.startswith(".") for part in path.relative_to(root).parts)

@@ -147,10 +147,6 @@ def rdm(
         return fetch(_METHODS[method](_Responses(matrix, count, codes, folds, precision, where)))
 
 
-def _correlation(given: _Responses) -> Array:
-    return correlation_distances(given.patterns(), missing=given.missing, device=given.device)
-
-
 def _sqeuclidean(given: _Responses) -> Array:
     patterns = given.patterns()
     return product_distances(patterns, patterns, missing=given.missing, device=given.device)
@@ -234,7 +230,7 @@ def poisson_rates(rates: Array) -> Array:
 
 
 _METHODS: dict[str, Callable[[_Responses], Array]] = {
-    "correlation": _correlation,
+    "correlation": lambda given: correlation_distances(given.patterns(), missing=given.missing, device=given.device),
     "sqeuclidean": _sqeuclidean,
     "mahalanobis": _mahalanobis,
     "crossnobis": _crossnobis,

@@ -168,10 +168,6 @@ def estimate_noise(trials: Any, codes: Ints, count: int, method: str, *, device:
     return _METHODS[method](residuals if device is None else place(residuals, device), freedom)
 
 
-def _diag(residuals: Array, freedom: int) -> NoiseModel:
-    return NoiseModel("diag", _deviation(residuals, freedom), 1.0, residuals, 0.0)
-
-
 def _full(residuals: Array, freedom: int) -> NoiseModel:
     ones = library(residuals).ones_like(residuals[0])
     return NoiseModel("full", ones, 0.0, residuals, 1.0 / freedom)
@@ -232,7 +228,7 @@ def _inverse(factor: Array) -> Array:
 _METHODS: dict[str, Callable[[Array, int], NoiseModel]] = {
     "shrinkage_diag": _shrinkage_diag,
     "shrinkage_eye": _shrinkage_eye,
-    "diag": _diag,
+    "diag": lambda residuals, freedom: NoiseModel("diag", _deviation(residuals, freedom), 1.0, residuals, 0.0),
     "full": _full,
 }
 
