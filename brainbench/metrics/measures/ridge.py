@@ -38,7 +38,6 @@ class RidgeEncoding(PatternMetric):
 
     name = "ridge"
     title = "share of explainable variance that ridge regression predicts for stimuli left out"
-    corrected = True
     orders_between = 39
 
     def compare(self, model: Floats, brain: SubjectRDM) -> float:
