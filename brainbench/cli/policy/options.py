@@ -79,23 +79,6 @@ def in_world(command: Callable[..., None]) -> Callable[..., None]:
     return filled_from(command, "world", own, lambda values: World(**values))
 
 
-def check_paths(video: Path | None, strip: Path | None) -> None:
-    """Check before anything is played that a film and a strip can be written.
-
-    Raises:
-        UsageError: a path has another ending than .mp4 or .gif (film) or .png (strip), or cannot be written.
-        MissingDependencyError: what writes this format is not installed.
-    """
-    from brainbench.core.figures.style import check_format
-    from brainbench.core.files import check_folder
-    from brainbench.stimuli.figures.films import require_writer
-
-    for path, endings, option in ((video, (".mp4", ".gif"), "--video"), (strip, (".png",), "--strip")):
-        if path is not None:
-            require_writer(check_format(path, endings))
-            check_folder(path.parent, option)
-
-
 def agent_of(name: str, env: Env, *, seed: int = 0) -> Any:
     """Return the agent ``zero`` or ``random``, a shipped policy, or the teacher or student of a run's folder."""
     from robotics_bridge.policies import evaluate

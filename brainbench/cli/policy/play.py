@@ -19,7 +19,6 @@ from brainbench.cli.policy.options import (
     EnvsOption,
     World,
     agent_of,
-    check_paths,
     in_world,
     touch_of,
 )
@@ -80,6 +79,7 @@ def play(
 ) -> None:
     """Run an agent in one environment of a task and show what happens, as numbers and as a film."""
     from brainbench.core.errors import UsageError
+    from brainbench.core.figures.style import check_format
     from robotics_bridge.tasks.contact_model import contacts_name
 
     if not (seconds > 0 and math.isfinite(seconds) and rate > 0 and width >= 64):
@@ -89,8 +89,10 @@ def play(
         )
     world.check([agent])
     pictures = [path for path in (video, strip) if path is not None]
+    for path, endings in ((video, (".mp4", ".gif")), (strip, (".png",))):
+        if path is not None:
+            check_format(path, endings)
     if pictures:
-        check_paths(video, strip)
         from brainbench.cli.policy import pictures as drawing
     options |= touch_of([agent])
     env = world.make([agent], num_envs=1, threads=1, **options)
