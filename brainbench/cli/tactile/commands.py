@@ -37,11 +37,11 @@ def demo(
     for name, job in tracked(list(jobs.items()), "drawing"):
         path = out / f"tactile-{name}.png"
         made[name] = {"picture": path, **job(path)}
-
-    def shown(item: dict[str, Any]) -> str:
-        return ", ".join(f"{key} {value:.3g}" for key, value in item.items() if key != "picture")
-
-    text = table_of("", made.values(), {"picture": "{0[picture]}", "shows": shown})
+    columns = {
+        "picture": "{0[picture]}",
+        "shows": lambda item: ", ".join(f"{key} {value:.3g}" for key, value in item.items() if key != "picture"),
+    }
+    text = table_of("", made.values(), columns)
     if not made["forces"]["in contact"]:
         text += f"\n\nNo taxel of {hand} touched the ball: closed, its fingers do not reach it. "
         text += f"Its probes are listed by: brainbench tactile layouts --hand {hand}"
@@ -172,15 +172,12 @@ def calibrate(
     found = fit(read_log(log), max_delay=max_delay)
     if out is not None:
         found.save(out, log=log.name)
-
-    def span(estimate: Any) -> str:
-        known = math.isfinite(estimate.low) and math.isfinite(estimate.high)
-        return f"{estimate.low:.4g} … {estimate.high:.4g}" if known else ""
-
     columns = {
         "knob": "{0[0]}",
         ">value": "{0[1].value:.4g}",
-        "95 % interval": lambda item: span(item[1]),
+        "95 % interval": lambda item: (
+            "{0.low:.4g} … {0.high:.4g}".format(item[1]) if math.isfinite(item[1].low + item[1].high) else ""
+        ),
         "from": "{0[1].how}",
     }
     about = found.about
