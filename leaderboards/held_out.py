@@ -16,7 +16,7 @@ from typing import Literal
 import msgspec
 
 from brainbench.core.errors import DataError
-from brainbench.core.files import file_hash, read_json, write_json, write_text
+from brainbench.core.files import file_hash, read_json, write_text
 from brainbench.core.reading.ranges import check_number
 from brainbench.core.reading.texts import read_text
 
@@ -49,10 +49,6 @@ class Commitment:
         for name in ("held", "kept"):
             check_number(f"{name!r} in {os.fspath(path)!r}", getattr(found, name), least=1, whole=True)
         return found
-
-    def write(self, path: str | os.PathLike[str]) -> Path:
-        """Write it as JSON, to be published."""
-        return write_json(path, self)
 
     def open(self, secret: str | os.PathLike[str]) -> Path:
         """Return the held-out file of a secret folder, after checking that it is the one committed to.

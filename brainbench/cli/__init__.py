@@ -37,13 +37,11 @@ def main() -> None:
     try:
         _run()
     except KeyboardInterrupt:
-        _say_interrupted()
         _leave()
         sys.exit(INTERRUPTED)
     except SystemExit as stop:
         # typer turns Ctrl-C into this status, without a word.
         if stop.code == INTERRUPTED:
-            _say_interrupted()
             _leave()
         raise
     except BrokenPipeError:
@@ -65,16 +63,13 @@ def _run() -> None:
         sys.exit(error.exit_code)
 
 
-def _say_interrupted() -> None:
-    print(f"\nbrainbench: {GO_ON}", file=sys.stderr)
-
-
 def _leave() -> None:
-    """End at once if a compiler runs in a thread: it cannot be stopped, and Python would wait for it for seconds."""
+    """Say so, and end at once if a compiler runs in a thread: it cannot be stopped, and Python would wait for it."""
     import threading
 
     from brainbench.core.progress import PREPARATION
 
+    print(f"\nbrainbench: {GO_ON}", file=sys.stderr)
     if any(thread.name == PREPARATION for thread in threading.enumerate()):
         sys.stdout.flush()
         sys.stderr.flush()

@@ -33,11 +33,9 @@ ELSEWHERE = {"export": "models"}
 
 
 def build(words: Sequence[str] | None = None) -> typer.Typer:
-    """Return the command line.
+    """Return the command line: the command that ``words`` begin with alone; without words all, complete.
 
-    Args:
-        words: What was typed. The command that it begins with is complete and alone; before any command is named, all
-            stand there with their help alone. Everything is complete without words.
+    Before any command is named in the words, all stand there with their help alone.
     """
     asked = None if words is None else next((word for word in words if not word.startswith("-")), "")
     # To read options of its own costs typer a tenth of a second: they stand there where they are used or shown.

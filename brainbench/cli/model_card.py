@@ -15,13 +15,10 @@ UNTRAINED = "untrained: random weights, drawn from --seed (0 unless you say othe
 
 
 def model_card(name: str, model: ModelDescription, recipe: PublishedTraining | None, twin: str | None) -> str:
-    """Lay out a model.
+    """Lay out a model by the name that was asked for.
 
-    Args:
-        name: Name as it was asked for.
-        model: What is known of it.
-        recipe: How it was trained in the published study, where its weights are not here.
-        twin: Sentence about the untrained twin of trained weights.
+    ``recipe`` says how it was trained in the published study, where its weights are not here; ``twin`` is a sentence
+    about the untrained twin of trained weights.
     """
     from brainbench.models.user_models import FAMILY
 

@@ -10,9 +10,8 @@ import typer
 
 from brainbench.cli.destinations import out_file_option, out_folder_option
 from brainbench.cli.model_card import model_card
-from brainbench.cli.output import JsonOption, emit, facts, list_without_command, progress_bar, table, table_of
+from brainbench.cli.output import JsonOption, emit, facts, list_without_command, progress_bar, table, table_of, tracked
 from brainbench.core.files import to_plain
-from brainbench.core.progress import track
 
 if TYPE_CHECKING:
     from brainbench.models.registry import ModelDescription
@@ -35,8 +34,7 @@ def list_(
 
     here = shipped()
     names = [*list_models(pattern), *(name for name in here if fnmatchcase(name, pattern))]
-    with progress_bar() as progress:
-        records = [describe_model(name) for name in track(names, "measuring models", progress)]
+    records = [describe_model(name) for name in tracked(names, "measuring models")]
     if as_json:
         tags = {name: [str(Architecture.parse(one).tag) for one in list_recipes(f"{name}.*")] for name in names}
         emit([{**to_plain(item), "recipes": tags[item.name]} for item in records], "", as_json=True)

@@ -11,8 +11,8 @@ import ast
 import inspect
 import math
 import re
-from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, fields
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, fields, replace
 from functools import cache
 from importlib import import_module
 from importlib.util import find_spec
@@ -106,39 +106,50 @@ def with_options(
         help: One help for all of them, in place of their docstrings.
     """
     known = option_fields(kind)
-    chosen = list(known if names is None else names)
+    module, _, wanted = kind.partition(":")
+    parameters = []
+    for name in known if names is None else names:
+        field, default = known[name], None if given else known[name].default
+        if help is not None:
+            field = replace(field, help=help)
+        parameters.append(field.parameter(name, (flags or {}).get(name, ()), default))
 
-    def decorate(command: Callable[..., None]) -> Callable[..., None]:
-        parameters = []
-        # The dataclass is named in the signature and not imported.
-        unloaded = {kind.partition(":")[2]: Any}
-        for own in inspect.signature(command, locals=unloaded, eval_str=True).parameters.values():
-            if own.name != "options":
-                parameters.append(own.replace(kind=inspect.Parameter.KEYWORD_ONLY))
-                continue
-            for name in chosen:
-                field, default = known[name], None if given else known[name].default
-                if help is not None:
-                    field = OptionField(field.kind, field.several, field.default, help)
-                parameters.append(field.parameter(name, (flags or {}).get(name, ()), default))
+    def make(values: dict[str, Any]) -> Any:
+        options = {name: known[name].value(value) for name, value in values.items()}
+        if build:
+            # Defaults that are tuples are not read from the source; the dataclass has them.
+            options = {n: value for n, value in options.items() if not (known[n].several and value is None)}
+        if given:
+            options = {name: value for name, value in options.items() if value is not None}
+        return getattr(import_module(module), wanted)(**options) if build and not given else options
 
-        def run(**values: Any) -> None:
-            options = {name: known[name].value(values.pop(name)) for name in chosen}
-            if build:
-                # Defaults that are tuples are not read from the source; the dataclass has them.
-                options = {n: value for n, value in options.items() if not (known[n].several and value is None)}
-            if given:
-                options = {name: value for name, value in options.items() if value is not None}
-            module, _, wanted = kind.partition(":")
-            made = getattr(import_module(module), wanted)(**options) if build and not given else options
-            command(options=made, **values)
+    # The dataclass is named in the signature of a command and not imported.
+    return lambda command: filled_from(command, "options", parameters, make, **{wanted: Any})
 
-        run.__doc__, run.__name__ = command.__doc__, command.__name__
-        run.__signature__ = inspect.Signature(parameters)  # pyright: ignore[reportFunctionMemberAccess]
-        run.__annotations__ = {item.name: item.annotation for item in parameters}
-        return run
 
-    return decorate
+def filled_from(
+    command: Callable[..., None],
+    parameter: str,
+    options: Sequence[inspect.Parameter],
+    make: Callable[[dict[str, Any]], Any],
+    **unloaded: Any,
+) -> Callable[..., None]:
+    """Return a command that has options in place of one parameter, which ``make`` makes of their values.
+
+    ``unloaded`` stand for names of its annotations that are not imported.
+    """
+    own = inspect.signature(command, locals=unloaded, eval_str=True).parameters.values()
+    every = [item for one in own for item in (options if one.name == parameter else [one])]
+    every = [item.replace(kind=inspect.Parameter.KEYWORD_ONLY) for item in every]
+
+    def run(**values: Any) -> None:
+        made = make({item.name: values.pop(item.name) for item in options})
+        command(**{parameter: made}, **values)
+
+    run.__doc__, run.__name__ = command.__doc__, command.__name__
+    run.__signature__ = inspect.Signature(every)  # pyright: ignore[reportFunctionMemberAccess]
+    run.__annotations__ = {item.name: item.annotation for item in every}
+    return run
 
 
 def option(kind: str, name: str, *flags: str) -> Any:

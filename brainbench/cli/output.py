@@ -7,13 +7,14 @@ import math
 import sys
 import threading
 import time as clock
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from brainbench.core.files import to_json
-from brainbench.core.progress import Progress
+from brainbench.core.files import to_json, write_json
+from brainbench.core.progress import Item, Progress, track
 
 if TYPE_CHECKING:
     from brainbench.core.records import Interval
@@ -30,18 +31,17 @@ def list_without_command(app: typer.Typer, command: Callable[[], None]) -> None:
             command()
 
 
-def emit(data: Any, text: str, *, as_json: bool) -> None:
-    """Print ``data`` as JSON, or ``text`` for people, on stdout."""
+def emit(data: Any, text: str, *, as_json: bool, out: Path | None = None) -> None:
+    """Print ``data`` as JSON, or ``text`` for people, on stdout; write the JSON into a file too if there is one."""
+    if out is not None:
+        write_json(out, data)
     print(to_json(data) if as_json else text)
 
 
 def spanned(value: float, interval: Interval | None = None, *, most: float = math.inf) -> str:
     """Return ``value [low, high]`` with as many digits as the interval carries: two of its half-width.
 
-    Args:
-        value: NaN is shown as a dash.
-        interval: Its interval; two digits are shown without one.
-        most: Largest value that can exist, where the interval is cut.
+    A value without interval has two digits, NaN is a dash. The interval is cut at ``most``, the largest possible value.
 
     >>> from brainbench.core.records import Interval
     >>> spanned(0.14021, Interval(0.0409, 0.2391)), spanned(0.97, Interval(0.9412, 1.1), most=1.0)
@@ -57,13 +57,10 @@ def spanned(value: float, interval: Interval | None = None, *, most: float = mat
 
 
 def table_of(title: str, items: Iterable[Any], columns: Mapping[str, str | Callable[[Any], object]]) -> str:
-    """Lay out one row per item.
+    """Lay out one row per item below a title, if there is one.
 
-    Args:
-        title: Line above the table; none if empty.
-        items: What is shown.
-        columns: Heading → format of an item (``"{0.error:.2%}"``, ``"{0[cost]:.3g}"``) or function of it. A heading
-            that begins with ``>`` is set flush right.
+    ``columns`` maps a heading, set flush right if it begins with ``>``, to a format of an item (``"{0.error:.2%}"``,
+    ``"{0[cost]:.3g}"``) or a function of it.
     """
     rows = [
         [cell.format(item) if isinstance(cell, str) else str(cell(item)) for cell in columns.values()] for item in items
@@ -128,8 +125,7 @@ FIRST_LINE, NEXT_LINE = 2.0, 10.0
 def progress_bar(what: str = "") -> Iterator[Progress]:
     """Yield a progress callback that draws a bar on stderr when that is a terminal, and else writes a line at times.
 
-    Args:
-        what: What is being done, for a job that does not count its steps.
+    ``what`` says what is done by a job that does not count its steps.
     """
     if not sys.stderr.isatty():
         lines, done = ProgressLines(what), threading.Event()
@@ -156,6 +152,12 @@ def progress_bar(what: str = "") -> Iterator[Progress]:
             bar.update(tasks[what], completed=done, total=total)
 
         yield update
+
+
+def tracked(items: Sequence[Item], what: str) -> Iterator[Item]:
+    """Yield items while progress shows how many of them are done."""
+    with progress_bar() as progress:
+        yield from track(items, what, progress)
 
 
 class ProgressLines:

@@ -8,7 +8,7 @@ from typing import Annotated, Any
 import typer
 
 from brainbench.cli.options import option_fields, with_options
-from brainbench.cli.output import JsonOption, emit, progress_bar, table_of
+from brainbench.cli.output import JsonOption, emit, progress_bar, table_of, tracked
 from brainbench.core.errors import UsageError
 from brainbench.core.files import to_plain
 
@@ -53,17 +53,14 @@ def power(
     number, origin = _dimensions(dimensions, recordings, conditions, model)
     designs = [replace(design, dimensions=number) for design in designs]
     found = []
-    with progress_bar() as progress:
-        for index, design in enumerate(designs):
-            progress(index, len(designs), "simulating experiments")
-            enough = {
-                vary: experiments.needed(design, vary, target=target, simulations=simulations, seed=seed)
-                if design.effect > 0
-                else None
-                for vary in ("stimuli", "animals")
-            }
-            found.append((experiments.power(design, simulations=max(simulations, 1000), seed=seed), enough))
-        progress(len(designs), len(designs), "simulating experiments")
+    for design in tracked(designs, "simulating experiments"):
+        enough = {
+            vary: experiments.needed(design, vary, target=target, simulations=simulations, seed=seed)
+            if design.effect > 0
+            else None
+            for vary in ("stimuli", "animals")
+        }
+        found.append((experiments.power(design, simulations=max(simulations, 1000), seed=seed), enough))
 
     def told(item: Any, vary: str) -> str:
         return str(item[1][vary] or "none tried") if item[0].design.effect > 0 else ""

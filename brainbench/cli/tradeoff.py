@@ -12,6 +12,10 @@ from brainbench.cli.options import items, numbers
 from brainbench.cli.output import JsonOption, emit, progress_bar, table_of
 from brainbench.stimuli.engines import DEFAULT_ENGINE
 
+PlotOption = Annotated[
+    Path | None, typer.Option(callback=picture_file, help="Also draw error against cost (.png, .svg, .pdf).")
+]
+
 app = typer.Typer(no_args_is_help=True, help="Measure accuracy against cost.")
 
 
@@ -28,9 +32,7 @@ def whisker(
         str, typer.Option(help="dynamic, quasistatic (of the backend rod), or both, comma-separated.")
     ] = "dynamic",
     csv: Annotated[Path | None, typer.Option(callback=out_file, help="Also write the table as CSV.")] = None,
-    plot: Annotated[
-        Path | None, typer.Option(callback=picture_file, help="Also draw error against cost (.png, .svg, .pdf).")
-    ] = None,
+    plot: PlotOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Measure error and cost of whisker simulations over links, time step, solver, backend and collision geometry.
@@ -164,9 +166,7 @@ def model(
 @app.command("tactile")
 def tactile(
     out: Annotated[Path, out_file_option("Table (.json).")] = Path("tactile-tradeoff.json"),
-    plot: Annotated[
-        Path | None, typer.Option(callback=picture_file, help="Also draw error against cost (.png, .svg, .pdf).")
-    ] = None,
+    plot: PlotOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Measure error and cost of tactile queries over backend, resolution, surface points and taxels.

@@ -56,7 +56,7 @@ def write_recordings(path: str | os.PathLike[str], recordings: xr.Dataset | Sess
     Args:
         path: file to write, usually ``*.h5``.
         recordings: a recordings data set (kind "counts") or sessions (kind "spikes"; build them with
-            :func:`~brainbench.datasets.make_session`).
+            :func:`~brainbench.datasets.sessions.make_session`).
 
     Raises:
         DataError: the data set does not fulfil the contract, or a session has no units.

@@ -6,10 +6,10 @@ session is adapted by its layout.
 
 from __future__ import annotations
 
-import contextlib
 import glob
 import os
 from collections.abc import Iterator, Sequence
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -87,8 +87,7 @@ def resolve_selection(select: Selection | str) -> Selection:
     return Selection.parse(select)
 
 
-@contextlib.contextmanager
-def open_file(path: Path) -> Iterator[h5py.File]:
+def open_file(path: Path) -> AbstractContextManager[h5py.File]:
     """Open an HDF5 file for reading; failures inside the block name the file too.
 
     Raises:
@@ -99,8 +98,7 @@ def open_file(path: Path) -> Iterator[h5py.File]:
             f"{path} is an .npz file: published recordings are opened one at a time and without a layout, to be "
             "inspected, checked and scored; they hold no spike times to join or copy."
         )
-    with open_hdf5(path, "recording", "brainbench reads NWB 2.x and its own HDF5 layout.") as file:
-        yield file
+    return open_hdf5(path, "recording", "brainbench reads NWB 2.x and its own HDF5 layout.")
 
 
 def suitable_files(paths: Sequence[Path], *, strict: bool = False) -> tuple[list[Path], list[str]]:
@@ -163,7 +161,8 @@ def _expand(source: str) -> list[Path]:
     if path.is_file():
         return [path]
     if path.is_dir():
-        visible = [item for item in path.rglob("*") if _visible(item, path)]
+        inside = [item for item in path.rglob("*") if item.is_file()]
+        visible = [item for item in inside if not any(part.startswith(".") for part in item.relative_to(path).parts)]
         for endings in SUFFIXES:
             if found := [item for item in visible if item.suffix.lower() in endings]:
                 return found
@@ -183,7 +182,3 @@ def _expand(source: str) -> list[Path]:
     siblings = [item.name for item in path.parent.iterdir()] if path.parent.is_dir() else []
     guess = nearest(path.name, siblings)
     raise DataFileNotFoundError(f"There is no file {source!r}{f'; did you mean {guess!r}?' if guess else '.'}")
-
-
-def _visible(path: Path, root: Path) -> bool:
-    return path.is_file() and not any(part.startswith(".") for part in path.relative_to(root).parts)

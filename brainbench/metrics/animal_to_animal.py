@@ -11,7 +11,7 @@ import numpy as np
 
 from brainbench.core.errors import UsageError
 from brainbench.core.provenance import Provenance
-from brainbench.core.records import Interval, Score, Status, SubjectScore
+from brainbench.core.records import Score, Status, SubjectScore
 from brainbench.core.statistics import two_factor_interval
 from brainbench.metrics.animals import Animals, ceiling_of, gather, mean_rdm, mean_reliability
 from brainbench.metrics.comparisons import LayerComparisons
@@ -63,13 +63,17 @@ def score_agreement(
         without = np.stack([pair.without_each()[:, 0, 0] for pair in pairs], axis=1) @ weights / len(weights)
         if count >= SMALLEST_STIMULI:
             null = _null(metric, animals, weights, seed)
-            chance = _chance(metric, pairs, weights, seed)
+            # The others' stimuli are permuted together, as those of a model are.
+            orders = list(label_orders(count, seed, exact=0, draws=metric.orders_between))[1:]
+            chance = float(np.mean([np.mean(next(pair.under(lambda: orders))) for pair in pairs] * weights))
     smallest = smallest_p_of_animals(count, max(2, len(compared)), metric.orders_between)
     status, reasons = _verdict(metric, animals, factors, found, count, smallest)
     reliability, reliability_interval = mean_reliability(animals)
     value = float(parts.mean()) if found else math.nan
     scored = [animals.subjects[i] for i in found]
     attainable = float(np.mean(metric.attainable(scored, seed) * animals.factors(found))) if found else math.nan
+    # The two values of two animals are one and the same.
+    span = two_factor_interval(value, parts, without) if len(parts) > 2 and without.size else None
     made = Score(
         name="animal-to-animal",
         value=value,
@@ -78,7 +82,7 @@ def score_agreement(
         r=float(np.mean([raw[i] for i in found])) if found else math.nan,
         reliability=reliability,
         reliability_interval=reliability_interval,
-        interval=_interval(value, parts, without),
+        interval=span and replace(span, method=f"{span.method}; approximate, since animals meet one another"),
         p=float((null >= null[0] - TIE).mean()) if null.size else math.nan,
         p_method=f"one-sided, every animal's labels permuted {metric.orders_between:,} times, (b+1)/(n+1)",
         p_smallest=smallest,
@@ -106,12 +110,6 @@ def score_agreement(
         provenance=Provenance.of({"seed": seed, "reliability_gate": RELIABILITY_GATE}),
     )
     return held_to_scale(made)
-
-
-def _chance(metric: Metric, pairs: Sequence[LayerComparisons], factors: Floats, seed: int) -> float:
-    """Return the mean agreement when the others' stimuli are permuted together, as those of a model are."""
-    orders = list(label_orders(pairs[0].animals[0].count, seed, exact=0, draws=metric.orders_between))[1:]
-    return float(np.mean([np.mean(next(pair.under(lambda: orders))) for pair in pairs] * factors))
 
 
 def _null(metric: Metric, animals: Animals, factors: Floats, seed: int) -> Floats:
@@ -149,12 +147,6 @@ def _verdict(
         told += interval_reasons(len(found), count)
     trusted = animals.reliable and count >= SMALLEST_STIMULI and all(factors[i].status == "ok" for i in factors)
     return "ok" if trusted else "unreliable", told + animals.reasons + metric.reasons
-
-
-def _interval(value: float, values: Floats, without: Floats) -> Interval | None:
-    """Return the interval; the two values of two animals are one and the same."""
-    found = two_factor_interval(value, values, without) if len(values) > 2 and without.size else None
-    return found and replace(found, method=f"{found.method}; approximate, since animals meet one another")
 
 
 def smallest_p_of_animals(stimuli: int, animals: int, draws: int) -> float:

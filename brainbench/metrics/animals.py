@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from brainbench.core.errors import UsageError, check_name
-from brainbench.core.records import Ceiling, Interval, Status
+from brainbench.core.records import Ceiling, Interval
 from brainbench.core.statistics import t_interval
 from brainbench.metrics.inference.permutation import canonical_order
 from brainbench.metrics.rdms.pairs import Floats, Ints
@@ -44,10 +44,6 @@ class Animals:
     def factors(self, index: Sequence[int]) -> Floats:
         """Return correction factors [len(index)]."""
         return np.array([self.corrections[i].value for i in index])
-
-    def status(self, index: int) -> Status:
-        """Return the status of one subject."""
-        return self.corrections[index].status
 
     @cached_property
     def order(self) -> Ints:

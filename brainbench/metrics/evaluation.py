@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -114,12 +115,8 @@ def _test(judged: LayerComparisons, rule: LayerRule, weights: Floats, seed: int)
         reason = f"{count} stimuli allow no p below {smallest:.3g}; at least {SMALLEST_STIMULI} are needed"
         return PermutationTest(math.nan, smallest, True, 0, math.nan, np.empty(0), reason), np.empty((0, 0))
     step = max(1, _CHUNK_ELEMENTS // (len(judged.layers) * max(count * count, len(judged.animals))))
-
-    def orders() -> Iterator[Ints]:
-        return label_orders(count, seed, exact=exact, draws=draws, step=step)
-
     null, means = [], []
-    for r in judged.under(orders):
+    for r in judged.under(partial(label_orders, count, seed, exact=exact, draws=draws, step=step)):
         null.append(rule.held(r) @ weights / len(weights))
         means.append((r * weights).mean(axis=-1))
     found = np.concatenate(null)

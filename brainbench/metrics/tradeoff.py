@@ -71,7 +71,10 @@ def measure_tradeoff(
         prepared = [metric.animal(str(i), [block], 6, seed=seed, splits=count) for i, block in enumerate(blocks)]
         return metric.score({"a": features}, prepared, name="x", stimuli=list("abcdef")).value
 
-    model, brain, threshold = _p_near_five_percent()
+    # RDMs of more stimuli than are permuted exactly, and the statistic whose p is .05.
+    rng = np.random.default_rng(1)
+    model, brain = (rdm(rng.normal(size=(_STIMULI, 10))) for _ in range(2))
+    threshold = float(np.quantile(_permuted(model, brain, 20_000, 2), 0.95))
 
     def p(seed: int, count: int) -> float:
         # (b + 1)/(n + 1): the given order counts among the random ones.
@@ -100,13 +103,6 @@ def _permuted(model: Floats, brain: Floats, count: int, seed: int) -> Floats:
     # The given order, yielded first, is left out: what remains are random orders.
     orders = np.concatenate(chunks)
     return compare(model[permuted_pairs(orders)], brain)
-
-
-def _p_near_five_percent() -> tuple[Floats, Floats, float]:
-    """Return RDMs of more stimuli than are permuted exactly, and the statistic whose p is .05."""
-    rng = np.random.default_rng(1)
-    model, brain = (rdm(rng.normal(size=(_STIMULI, 10))) for _ in range(2))
-    return model, brain, float(np.quantile(_permuted(model, brain, 20_000, 2), 0.95))
 
 
 def _data(animals: int, units: int, trials: int) -> tuple[list[Trials], Floats]:

@@ -14,13 +14,7 @@ from brainbench.scoring.options import ScoreOptions
 
 
 def record_path(model: str, options: ScoreOptions, command: str) -> Path | None:
-    """Return where the cache keeps the record of a score; None for one that depends on files of the user.
-
-    Args:
-        model: what is scored, as typed.
-        options: how it is scored.
-        command: the command line, which stands in the record.
-    """
+    """Return where the cache keeps the record of a model's score; None for one that depends on files of the user."""
     from brainbench.models.registry import locate_model
 
     # A path, or FILE.py:NAME, has characters that no name of the package has.

@@ -7,22 +7,14 @@ from typing import Any
 
 import numpy as np
 
-from brainbench.core.errors import DataError, UsageError
+from brainbench.core.errors import DataError
 from brainbench.core.progress import Progress, stages
-from brainbench.metrics.measures.registry import get_metric, list_metrics
 from brainbench.metrics.measures.rsa import RSA
 from brainbench.metrics.reliability.units import reliable_units
 from brainbench.metrics.time import AnimalMovie, TimeCourse, animal_movie, layer_movie, score_over_time
 from brainbench.scoring.model_responses import ModelResponses
 from brainbench.scoring.neural_responses import NeuralResponses
 from brainbench.scoring.options import ScoreOptions
-
-
-def check_metric(metric: Any) -> None:
-    """Raise UsageError unless a metric compares RDMs, which can be made at each time."""
-    if not isinstance(metric, RSA):
-        known = [name for name in list_metrics() if isinstance(get_metric(name), RSA)]
-        raise UsageError(f"Scores over time compare RDMs; the metric {metric.name!r} has none; choose from {known}.")
 
 
 def time_course(

@@ -214,8 +214,8 @@ def _doubted(score: Score, doubt: str) -> Score:
 
 def _metric(options: ScoreOptions) -> Metric:
     """Return the metric, checked against the other options."""
-    from brainbench.metrics import get_metric
-    from brainbench.scoring.over_time import check_metric
+    from brainbench.metrics import get_metric, list_metrics
+    from brainbench.metrics.measures.rsa import RSA
 
     metric = get_metric(options.metric)
     if metric.name == "rsa" and (options.explain or options.estimator != "default"):
@@ -224,6 +224,7 @@ def _metric(options: ScoreOptions) -> Metric:
     check_name(f"estimator of the metric {metric.name!r}", options.estimator, metric.estimators)
     if options.explain and metric.name != "rsa-correlation":
         raise UsageError(f"The published estimator is one of RSA; the metric {metric.name!r} has none to explain.")
-    if options.over_time:
-        check_metric(metric)
+    if options.over_time and not isinstance(metric, RSA):
+        known = [name for name in list_metrics() if isinstance(get_metric(name), RSA)]
+        raise UsageError(f"Scores over time compare RDMs; the metric {metric.name!r} has none; choose from {known}.")
     return metric

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import base64
-import math
 import struct
 import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from html import escape
-from itertools import combinations
 
 import numpy as np
 
@@ -133,21 +131,22 @@ def rdm_picture(pairs: Sequence[float], labels: Sequence[str]) -> RdmPicture | N
     size = len(labels)
     if size < 2 or len(pairs) != size * (size - 1) // 2:
         return None
-    places = list(combinations(range(size), 2))
-    finite = [(value, place) for value, place in zip(pairs, places, strict=True) if math.isfinite(value)]
-    if not finite:
+    values, places = np.asarray(pairs, dtype=np.float64), np.column_stack(np.triu_indices(size, k=1))
+    known = np.isfinite(values)
+    if not known.any():
         return None
-    (low, alike), (high, apart) = min(finite), max(finite)
+    low, high = float(values[known].min()), float(values[known].max())
+    alike, apart = places[values == low][0], places[values == high][-1]
     scale = (_LEVELS - 1) / (high - low) if high > low else 0.0
-    cells: list[list[int | None]] = [[None] * size for _ in range(size)]
-    for value, (i, j) in zip(pairs, places, strict=True):
-        cells[i][j] = cells[j][i] = round((value - low) * scale) if math.isfinite(value) else _LEVELS
+    cells = np.where(np.eye(size), -1, _LEVELS)
+    rows, columns = places[known].T
+    cells[rows, columns] = cells[columns, rows] = np.rint((values[known] - low) * scale)
     description = (
         f"{size} by {size} matrix of dissimilarities from {low:.3g} to {high:.3g}; most alike are "
         f"{labels[alike[0]]} and {labels[alike[1]]}, most different {labels[apart[0]]} and {labels[apart[1]]}."
     )
-    if len(finite) < len(pairs):
-        description += f" Undefined pairs: {len(pairs) - len(finite)}."
+    if not known.all():
+        description += f" Undefined pairs: {np.sum(~known)}."
     return RdmPicture(_png(cells), tuple(labels), low, high, description)
 
 
@@ -166,29 +165,24 @@ def draw_rdm(drawing: Drawing, x: float, y: float, side: float, picture: RdmPict
     )
 
 
-def _png(cells: list[list[int | None]]) -> str:
-    """Encode colour levels (None: transparent) as an indexed PNG (W3C recommendation, third edition).
+def _png(cells: np.ndarray) -> str:
+    """Encode colour levels (−1: transparent) as an indexed PNG (W3C recommendation, third edition).
 
     The palette holds only the colours in use: most RDMs are small, and a page holds hundreds.
     """
-    used = sorted({level for row in cells for level in row if level is not None})
-    index = {None: 0} | {level: i for i, level in enumerate(used, start=1)}
+    used, index = np.unique(cells, return_inverse=True)
+    stops = np.array([list(bytes.fromhex(stop)) for stop in _VIRIDIS]).T
+    shares = used / (_LEVELS - 1) * (len(_VIRIDIS) - 1)
+    palette = np.rint([np.interp(shares, range(len(_VIRIDIS)), stop) for stop in stops]).T
+    palette[used < 0], palette[used == _LEVELS] = 0, 128
+    rows = np.pad(index.reshape(cells.shape), ((0, 0), (1, 0)))
     data = b"\x89PNG\r\n\x1a\n"
     for kind, body in (
         (b"IHDR", struct.pack(">IIBBBBB", len(cells), len(cells), 8, 3, 0, 0, 0)),
-        (b"PLTE", bytes(3) + b"".join(map(_colour, used))),
+        (b"PLTE", palette.astype(np.uint8).tobytes()),
         (b"tRNS", b"\x00"),
-        (b"IDAT", zlib.compress(b"".join(b"\x00" + bytes(index[level] for level in row) for row in cells), 9)),
+        (b"IDAT", zlib.compress(rows.astype(np.uint8).tobytes(), 9)),
         (b"IEND", b""),
     ):
         data += struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body))
     return "data:image/png;base64," + base64.b64encode(data).decode()
-
-
-def _colour(level: int) -> bytes:
-    if level >= _LEVELS:
-        return b"\x80\x80\x80"
-    place = level / (_LEVELS - 1) * (len(_VIRIDIS) - 1)
-    index = min(int(place), len(_VIRIDIS) - 2)
-    first, second = bytes.fromhex(_VIRIDIS[index]), bytes.fromhex(_VIRIDIS[index + 1])
-    return bytes(round(a + (b - a) * (place - index)) for a, b in zip(first, second, strict=True))

@@ -1,4 +1,4 @@
 """Reports of records for a paper.
 
-:mod:`paper` writes methods, tables and figures with the works that :mod:`citations` finds; :mod:`pdf` prints them.
+:mod:`paper` writes methods, tables and figures with the works that :mod:`citations` finds.
 """

@@ -115,7 +115,8 @@ def _section(board: Board, place: int, path: Path) -> dict[str, Any]:
         figures = _single(entries[0]) + [figure for figure in figures if figure.key in ("fit", "rdms")]
     tables = [_models(entries), _baselines(board)]
     if len(entries) == 1:
-        tables += [_animals(entries[0]), _card(entries[0])]
+        stated = (*words.card_rows(entries[0].card), *words.training_rows(entries[0].card))
+        tables += [_animals(entries[0]), PaperTable("The model.", ("statement", "stated"), stated)]
     folder = path.with_name(f"{path.stem}-figures")
     return {
         "title": board_label(board),
@@ -181,8 +182,3 @@ def _animals(entry: Entry) -> PaperTable:
         for item in entry.score.subjects
     ]  # fmt: skip
     return PaperTable("Animals, each at the layer chosen on the others.", columns, tuple(rows))
-
-
-def _card(entry: Entry) -> PaperTable:
-    rows = (*words.card_rows(entry.card), *words.training_rows(entry.card))
-    return PaperTable("The model.", ("statement", "stated"), tuple(rows))

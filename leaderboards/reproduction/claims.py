@@ -9,9 +9,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from itertools import combinations
 
+import msgspec
 import numpy as np
 
 from brainbench.core.statistics import wilson_interval
@@ -65,11 +66,7 @@ class Judgement:
 
 def published_claims() -> list[PublishedClaim]:
     """Return the claims in the order of the study."""
-    known = [item.name for item in fields(PublishedClaim)]
-    return [
-        PublishedClaim(**{name: told[name] for name in known if name in told})
-        for told in measures.published()["claims"]
-    ]
+    return msgspec.convert(measures.published()["claims"], list[PublishedClaim])
 
 
 def judge_accuracy(campaign: Campaign) -> list[Judgement]:

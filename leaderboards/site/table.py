@@ -8,7 +8,7 @@ import math
 from collections.abc import Iterable, Sequence
 from typing import Any
 
-from brainbench.core.records import Interval, Score
+from brainbench.core.records import Score
 from leaderboards.boards import Baseline, Board
 from leaderboards.conclusions import conclusions
 from leaderboards.entries import Entry
@@ -152,11 +152,9 @@ def _baseline_row(baseline: Baseline) -> dict[str, Any]:
 
 
 def _score_row(score: Score) -> dict[str, Any]:
-    def ends(interval: Interval | None, prefix: str) -> dict[str, float]:
-        return dict(zip((f"{prefix}low", f"{prefix}high"), interval_ends(interval), strict=False))
-
     row = {name: getattr(score, name) for name in ("scaled", "value", "p", "r", "reliability", "layer")}
-    row |= ends(score.interval, "") | ends(score.scaled_interval, "scaled_")
+    row |= zip(("low", "high"), interval_ends(score.interval), strict=False)
+    row |= zip(("scaled_low", "scaled_high"), interval_ends(score.scaled_interval), strict=False)
     row |= {"animals": len(score.subjects) or None}
     if score.ceiling:
         row |= {"ceiling_lower": score.ceiling.lower, "ceiling_upper": score.ceiling.upper}

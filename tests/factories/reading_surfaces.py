@@ -18,7 +18,7 @@ from safetensors.torch import save_file
 from brainbench.cli.leaderboard.scoring import parse_seeds, read_batch
 from brainbench.cli.options import numbers as option_numbers
 from brainbench.core.errors import DataError
-from brainbench.core.files import read_mapping
+from brainbench.core.files import read_mapping, write_json
 from brainbench.core.labels import read_match
 from brainbench.core.records import ResultRecord, record_identity
 from brainbench.datasets import export, open_recordings, write_recordings
@@ -312,7 +312,7 @@ def _site(folder: Path) -> Path:
 
 
 def _commitment(folder: Path) -> Path:
-    return Commitment("animals", 3, 8, "9f3c2a7be1d04455", "0f" * 32).write(folder / "held-out.json")
+    return write_json(folder / "held-out.json", Commitment("animals", 3, 8, "9f3c2a7be1d04455", "0f" * 32))
 
 
 def _bad_trainings(trainings: Any) -> bool:

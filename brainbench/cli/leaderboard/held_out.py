@@ -69,7 +69,7 @@ def hold_out(
         write_recordings(out / "public.h5", public),
         # Stimuli without recordings are left out only where the pairs are named.
         write_json(out / "match.json", {name: name for name in public.attrs["vocabulary"]}),
-        commitment.write(out / "held-out.json"),
+        write_json(out / "held-out.json", commitment),
     ]
     text = f"published  {out}: {', '.join(path.name for path in files)}\nkept back  {secret}: {held_count} {kind}"
     emit({"published": files, "secret": secret, "commitment": commitment}, text, as_json=as_json)

@@ -14,7 +14,6 @@ import msgspec
 from brainbench.cli.options import SCORE, SCORE_FLAGS, as_flags, option_fields
 from brainbench.core.errors import DataError, UsageError, listing, shown, unknown_name
 from brainbench.core.files import to_json, to_plain
-from brainbench.core.progress import Progress
 from brainbench.core.reading.ranges import check_number
 from brainbench.core.reading.texts import read_toml
 from brainbench.core.records import ESTIMATOR_VERSION, ResultRecord
@@ -53,20 +52,11 @@ def jobs_of(patterns: Sequence[str], seeds: Sequence[int], options: dict[str, An
     ]
 
 
-def score_again(
-    record: ResultRecord,
-    *,
-    recordings: str | None = None,
-    trust_code: bool = False,
-    progress: Progress | None = None,
-) -> ResultRecord:
+def score_again(record: ResultRecord, *, recordings: str | None = None, trust_code: bool = False) -> ResultRecord:
     """Repeat a record's computation from its provenance.
 
-    Args:
-        record: The record.
-        recordings: Where its recordings are; only demo recordings are found without, since records keep no folders.
-        trust_code: Also run code and weights that do not come with this package.
-        progress: Called with (done, total, what).
+    Only demo recordings are found without ``recordings``, since records keep no folders. ``trust_code`` also runs code
+    and weights that do not come with this package.
 
     Raises:
         DataError: the record does not say enough.
@@ -89,7 +79,7 @@ def score_again(
             f"The record was made with the recordings {str(source)[:80]!r}; give them with --recordings PATH."
         )
     options = ScoreOptions.stated_in(origin.settings, recordings=recordings or source, match=origin.pairs or None)
-    return score_record(model, options, progress=progress)
+    return score_record(model, options)
 
 
 def _check_kinds(record: ResultRecord, model: Any, source: Any) -> None:
@@ -150,15 +140,13 @@ def find_models(patterns: Sequence[str]) -> list[str]:
     names = [*list_models(), *shipped()]
     found: dict[str, None] = {}
     for pattern in patterns:
-        plain = not any(mark in pattern for mark in "*?[")
-        if plain and (pattern in names or is_path(pattern) or Architecture.parse(pattern).tag is not None):
+        if any(mark in pattern for mark in "*?["):
+            some = list_models() if Architecture.parse(pattern).tag is None else shipped()
+            found |= dict.fromkeys(name for name in some if fnmatchcase(name, pattern))
+        elif pattern in names or is_path(pattern) or Architecture.parse(pattern).tag is not None:
             found[pattern] = None
-            continue
-        trained = Architecture.parse(pattern).tag is not None
-        hits = [name for name in (shipped() if trained else list_models()) if fnmatchcase(name, pattern)]
-        if plain and not hits:
+        else:
             raise unknown_name("model", pattern, names)
-        found |= dict.fromkeys(hits)
     return list(found)
 
 

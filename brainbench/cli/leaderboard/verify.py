@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
-from brainbench.cli.output import JsonOption, emit, progress_bar, table_of
+from brainbench.cli.output import JsonOption, emit, table_of, tracked
 from brainbench.core.errors import BrainbenchError
 
 
@@ -49,24 +49,22 @@ def verify(
     stored = read_records(records)
     doubts = remarks(stored)
     results: list[dict[str, Any]] = []
-    with progress_bar() as progress:
-        for index, item in enumerate(stored):
-            progress(index, len(stored), "records verified")
-            result: dict[str, Any] = {"record": item.path.name, "verdict": "refused", "problem": item.problem}
-            if item.record is not None:
-                result |= {"verdict": "intact", "doubts": doubts.get(item.record.identity, ())}
-                try:
-                    if score:
-                        again = score_again(item.record, recordings=recordings, trust_code=trust_code)
-                        found = differences(item.record, again, tolerance=tolerance)
-                        result |= {"verdict": "differs" if found else "confirmed", "differences": found}
-                        result |= {"value": again.score.value}
-                    if told is not None and result["verdict"] in ("intact", "confirmed"):
-                        refuse_foreign_code(item.record, trusted=trust_code)
-                        result |= score_held_out(item.record, told, secret)
-                except BrainbenchError as error:
-                    result |= {"verdict": "not repeated", "problem": str(error)}
-            results.append(result)
+    for item in tracked(stored, "records verified"):
+        result: dict[str, Any] = {"record": item.path.name, "verdict": "refused", "problem": item.problem}
+        if item.record is not None:
+            result |= {"verdict": "intact", "doubts": doubts.get(item.record.identity, ())}
+            try:
+                if score:
+                    again = score_again(item.record, recordings=recordings, trust_code=trust_code)
+                    found = differences(item.record, again, tolerance=tolerance)
+                    result |= {"verdict": "differs" if found else "confirmed", "differences": found}
+                    result |= {"value": again.score.value}
+                if told is not None and result["verdict"] in ("intact", "confirmed"):
+                    refuse_foreign_code(item.record, trusted=trust_code)
+                    result |= score_held_out(item.record, told, secret)
+            except BrainbenchError as error:
+                result |= {"verdict": "not repeated", "problem": str(error)}
+        results.append(result)
     emit(results, "\n".join(_verdict(result) for result in results), as_json=as_json)
     if any(result["verdict"] in ("refused", "differs", "not repeated") for result in results):
         raise typer.Exit(1)

@@ -5,11 +5,12 @@ from __future__ import annotations
 import inspect
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from functools import wraps
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+
+from brainbench.cli.options import filled_from
 
 if TYPE_CHECKING:
     from robotics_bridge.envs import Env
@@ -75,36 +76,7 @@ class World:
 def in_world(command: Callable[..., None]) -> Callable[..., None]:
     """Decorate a command so that its parameter ``world`` is filled from an argument and options."""
     own = list(inspect.signature(World, eval_str=True).parameters.values())
-    names = {item.name for item in own}
-    parameters = []
-    for item in inspect.signature(command, eval_str=True).parameters.values():
-        several = own if item.name == "world" else [item]
-        parameters += [one.replace(kind=inspect.Parameter.KEYWORD_ONLY) for one in several]
-
-    @wraps(command)
-    def run(**values: Any) -> None:
-        rest = {name: value for name, value in values.items() if name not in names}
-        command(world=World(**{name: values[name] for name in names}), **rest)
-
-    run.__signature__ = inspect.Signature(parameters)  # pyright: ignore[reportAttributeAccessIssue]
-    return run
-
-
-def check_paths(video: Path | None, strip: Path | None) -> None:
-    """Check before anything is played that a film and a strip can be written.
-
-    Raises:
-        UsageError: a path has another ending than .mp4 or .gif (film) or .png (strip), or cannot be written.
-        MissingDependencyError: what writes this format is not installed.
-    """
-    from brainbench.core.figures.style import check_format
-    from brainbench.core.files import check_folder
-    from brainbench.stimuli.figures.films import require_writer
-
-    for path, endings, option in ((video, (".mp4", ".gif"), "--video"), (strip, (".png",), "--strip")):
-        if path is not None:
-            require_writer(check_format(path, endings))
-            check_folder(path.parent, option)
+    return filled_from(command, "world", own, lambda values: World(**values))
 
 
 def agent_of(name: str, env: Env, *, seed: int = 0) -> Any:

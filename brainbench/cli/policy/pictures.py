@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -35,13 +35,7 @@ _VIEW = (0.85, -0.75, 0.95)
 
 
 class Stage:
-    """Draws one environment of a batch; the camera stands still.
-
-    Args:
-        env: the environments.
-        size: width and height [pixels].
-        number: which environment.
-    """
+    """Draws one environment of a batch, of ``size`` (width, height) in pixels; the camera stands still."""
 
     def __init__(self, env: Env, size: tuple[int, int] = (480, 400), number: int = 0) -> None:
         self._env, self._number = env, number
@@ -82,13 +76,10 @@ class Stage:
         return FACES[2 * axis + sign]
 
 
-def write_video(
-    path: Path, frames: Iterable[NDArray[np.uint8]], count: int, size: tuple[int, int], rate: float
-) -> None:
+def write_video(path: Path, frames: Sequence[NDArray[np.uint8]], size: tuple[int, int], rate: float) -> None:
     """Write frames to an ``.mp4`` or ``.gif``."""
-    kept = list(frames) if path.suffix.lower() == ".gif" else frames
-    sample: Sequence[Any] = kept[:: max(1, count // 4)] if isinstance(kept, list) else ()
-    write_film(path, kept, count, Style(size=size, frames_per_second=rate), palette_from=sample)
+    style, sample = Style(size=size, frames_per_second=rate), frames[:: max(1, len(frames) // 4)]
+    write_film(path, frames, len(frames), style, palette_from=sample)
 
 
 def write_strip(path: Path, frames: Sequence[NDArray[np.uint8]], times: Sequence[float]) -> None:

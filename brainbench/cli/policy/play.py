@@ -19,7 +19,6 @@ from brainbench.cli.policy.options import (
     EnvsOption,
     World,
     agent_of,
-    check_paths,
     in_world,
     touch_of,
 )
@@ -80,6 +79,7 @@ def play(
 ) -> None:
     """Run an agent in one environment of a task and show what happens, as numbers and as a film."""
     from brainbench.core.errors import UsageError
+    from brainbench.core.figures.style import check_format
     from robotics_bridge.tasks.contact_model import contacts_name
 
     if not (seconds > 0 and math.isfinite(seconds) and rate > 0 and width >= 64):
@@ -89,8 +89,10 @@ def play(
         )
     world.check([agent])
     pictures = [path for path in (video, strip) if path is not None]
+    for path, endings in ((video, (".mp4", ".gif")), (strip, (".png",))):
+        if path is not None:
+            check_format(path, endings)
     if pictures:
-        check_paths(video, strip)
         from brainbench.cli.policy import pictures as drawing
     options |= touch_of([agent])
     env = world.make([agent], num_envs=1, threads=1, **options)
@@ -124,7 +126,7 @@ def play(
                 goals, turned = goals + int(info["goals"]), turned + float(info["turned"])
             progress(step + 1, steps, "playing")
         if video is not None:
-            drawing.write_video(video, film, len(film), size, 1 / (every * env.step_dt))
+            drawing.write_video(video, film, size, 1 / (every * env.step_dt))
         if strip is not None:
             drawing.write_strip(strip, stills, times)
     told = {
@@ -164,7 +166,6 @@ def evaluate(
     task) ended.
     """
     from brainbench.core.errors import UsageError
-    from brainbench.core.files import write_json
     from robotics_bridge.policies.evaluate import evaluate as run
     from robotics_bridge.tasks.contact_model import contacts_name
 
@@ -182,8 +183,6 @@ def evaluate(
                 env, agent_of(name, env), episodes=episodes, seed=tuple(range(seeds)), name=name, progress=progress
             )
             found.append({**result.summary(), "contacts": contacts})
-    if out is not None:
-        write_json(out, found)
     columns = {
         "agent": "{0[agent]}",
         ">episodes": "{0[episodes]}",
@@ -197,7 +196,7 @@ def evaluate(
         ">diverged": "{0[diverged]}",
         ">by object": lambda item: _by_kind(item["objects"]),
     }
-    emit(found, table_of(f"{env.task.text}; contacts: {contacts}", found, columns), as_json=as_json)
+    emit(found, table_of(f"{env.task.text}; contacts: {contacts}", found, columns), as_json=as_json, out=out)
 
 
 def _by_kind(objects: Mapping[str, Mapping[str, float]]) -> str:

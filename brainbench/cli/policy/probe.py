@@ -41,7 +41,6 @@ def probe(
     from dataclasses import replace
 
     from brainbench.core.errors import UsageError
-    from brainbench.core.files import write_json
     from robotics_bridge.hands.layouts import write_probes
     from robotics_bridge.policies.readouts import probe as readouts
     from robotics_bridge.tasks.contact_model import contacts_name
@@ -63,13 +62,11 @@ def probe(
             told |= {"place": options.place, **readouts.placements(placed)}
             if layout is not None:
                 write_probes(layout, chosen)
-    if out is not None:
-        write_json(out, told)
     size = "features" if options.place is None else "taxels"
     text = _table("R² on environments left out, by object quantity", told["arms"], size, "draws")
     if told["differences"]:
         text += "\n" + _table("Differences of R²", told["differences"], "less", sign="+")
-    emit(told, text, as_json=as_json)
+    emit(told, text, as_json=as_json, out=out)
 
 
 def _table(title: str, rows: list[dict[str, Any]], *more: str, sign: str = "") -> str:

@@ -97,7 +97,7 @@ def _pairs(results: Sequence[StudentResult]) -> list[dict[str, Any]]:
         model, pairs = mixed_model(group), list(combinations(group, 2))
         tested = [model.contrast(one.name, other.name) for one, other in pairs]
         for (one, other), item, p in zip(pairs, tested, adjust([item.p for item in tested], "holm"), strict=True):
-            names = [_short(result, place) for result in (one, other)]
+            names = [result.name.removeprefix("_".join(place[:2]) + "_") for result in (one, other)]
             interval = None if item.interval is None else (item.interval.low, item.interval.high)
             found.append(
                 {
@@ -107,7 +107,3 @@ def _pairs(results: Sequence[StudentResult]) -> list[dict[str, Any]]:
                 }
             )  # fmt: skip
     return found
-
-
-def _short(result: StudentResult, place: tuple[str, str, str]) -> str:
-    return result.name.removeprefix("_".join(place[:2]) + "_")

@@ -117,26 +117,18 @@ def distill(
         student = train_student(
             config, folder, device=device, episodes=episodes, stop_after=stop_after, stop_at=stop_at, progress=progress
         )
-    told = describe(student)
-    lines = [f"{key}: {value}" for key, value in told.items() if value not in ("", None)]
-    emit(told, "\n".join(lines), as_json=as_json)
-    if student.result.status == "diverged":
-        raise typer.Exit(1)
-
-
-def describe(student: Any) -> dict[str, Any]:
-    """Return what is printed about a student."""
     success = [value for item in student.evaluations for value in item["success"]]
-    return {
+    told = {
         "folder": str(student.folder),
-        "status": student.result.status,
-        "reason": student.result.reason,
-        "iterations": student.result.iterations,
-        "loss": student.result.loss,
+        **{name: getattr(student.result, name) for name in ("status", "reason", "iterations", "loss")},
         "success": sum(success) / len(success) if success else None,
         "episodes": len(success),
         "seconds": round(student.result.seconds, 1),
     }
+    lines = [f"{key}: {value}" for key, value in told.items() if value not in ("", None)]
+    emit(told, "\n".join(lines), as_json=as_json)
+    if student.result.status == "diverged":
+        raise typer.Exit(1)
 
 
 def sweep(

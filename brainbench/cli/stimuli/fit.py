@@ -94,40 +94,22 @@ def fit(
     if contacts:
         data, text = _contacts(measured, start, noise, frames)
     else:
-        result = _fit(measured, start, whisker, chosen, parameters, bounds, deflection, options, picture)
+        from brainbench.stimuli.fitting import Trial
+        from brainbench.stimuli.fitting import fit as run
+        from brainbench.stimuli.fitting.figure import draw_fit
+
+        trial = (
+            Trial.ringdown(start, measured, 1e-3 * deflection)
+            if chosen is None
+            else Trial.of_scene(chosen, measured, whisker, start=start)
+        )
+        limits = {key: _span(value) for key, value in _pairs(bounds, "--bounds", text=True).items()}
+        with progress_bar("fitting"):
+            result = run(trial, items(parameters), bounds=limits, options=options)
+        if picture is not None:
+            draw_fit(trial, result, picture)
         data, text = result.summary(), _text(result, measured)
-    if out is not None:
-        from brainbench.core.files import write_json
-
-        write_json(out, data)
-    emit(data, text, as_json=as_json)
-
-
-def _fit(
-    measured: xr.Dataset,
-    start: Whisker,
-    name: str,
-    scene: Any,
-    parameters: str,
-    bounds: str,
-    deflection: float,
-    options: FitOptions,
-    picture: Path | None,
-) -> FitResult:
-    from brainbench.stimuli.fitting import Trial
-    from brainbench.stimuli.fitting import fit as run
-    from brainbench.stimuli.fitting.figure import draw_fit
-
-    if scene is None:
-        trial = Trial.ringdown(start, measured, 1e-3 * deflection)
-    else:
-        trial = Trial.of_scene(scene, measured, name, start=start)
-    limits = {key: _span(value) for key, value in _pairs(bounds, "--bounds", text=True).items()}
-    with progress_bar("fitting"):
-        result = run(trial, items(parameters), bounds=limits, options=options)
-    if picture is not None:
-        draw_fit(trial, result, picture)
-    return result
+    emit(data, text, as_json=as_json, out=out)
 
 
 def _contacts(measured: xr.Dataset, whisker: Whisker, noise: float | None, frames: int) -> tuple[dict[str, Any], str]:

@@ -3,24 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
 from brainbench.cli.destinations import out_file_option, out_folder_option
-from brainbench.cli.output import JsonOption, emit, progress_bar, table, table_of
+from brainbench.cli.output import JsonOption, emit, table, table_of, tracked
 from brainbench.cli.policy.options import HandOption
-
-
-def _tracked(items: Sequence[Any], what: str) -> Iterator[Any]:
-    """Yield items while a bar shows how many are done."""
-    with progress_bar() as progress:
-        for index, item in enumerate(items):
-            progress(index, len(items), what)
-            yield item
-        progress(len(items), len(items), what)
 
 
 def demo(
@@ -44,14 +34,14 @@ def demo(
         "sound": scenes.sound,
     }
     made: dict[str, Any] = {}
-    for name, job in _tracked(list(jobs.items()), "drawing"):
+    for name, job in tracked(list(jobs.items()), "drawing"):
         path = out / f"tactile-{name}.png"
         made[name] = {"picture": path, **job(path)}
-
-    def shown(item: dict[str, Any]) -> str:
-        return ", ".join(f"{key} {value:.3g}" for key, value in item.items() if key != "picture")
-
-    text = table_of("", made.values(), {"picture": "{0[picture]}", "shows": shown})
+    columns = {
+        "picture": "{0[picture]}",
+        "shows": lambda item: ", ".join(f"{key} {value:.3g}" for key, value in item.items() if key != "picture"),
+    }
+    text = table_of("", made.values(), columns)
     if not made["forces"]["in contact"]:
         text += f"\n\nNo taxel of {hand} touched the ball: closed, its fingers do not reach it. "
         text += f"Its probes are listed by: brainbench tactile layouts --hand {hand}"
@@ -122,7 +112,7 @@ def bench(
     grip.run(60)
     results = [
         scenes.time_class(grip, name, resolution, placement, noisy=noisy, repeats=repeats)
-        for name in _tracked(list(scenes.CLASSES), "timing sensors")
+        for name in tracked(list(scenes.CLASSES), "timing sensors")
     ]
     noise = ", published noise" if noisy else ""
     columns = {
@@ -145,7 +135,7 @@ def check(
     from robotics_bridge.sensors.checks import CHECKS
 
     results = []
-    for name, run in _tracked(list(CHECKS.items()), "checking"):
+    for name, run in tracked(list(CHECKS.items()), "checking"):
         found, truth, tolerance = run(device)
         error = abs(found - truth) / max(abs(truth), 1e-30)
         results.append({"check": name, "found": found, "truth": truth, "error": error, "passed": error <= tolerance})
@@ -182,15 +172,12 @@ def calibrate(
     found = fit(read_log(log), max_delay=max_delay)
     if out is not None:
         found.save(out, log=log.name)
-
-    def span(estimate: Any) -> str:
-        known = math.isfinite(estimate.low) and math.isfinite(estimate.high)
-        return f"{estimate.low:.4g} … {estimate.high:.4g}" if known else ""
-
     columns = {
         "knob": "{0[0]}",
         ">value": "{0[1].value:.4g}",
-        "95 % interval": lambda item: span(item[1]),
+        "95 % interval": lambda item: (
+            "{0.low:.4g} … {0.high:.4g}".format(item[1]) if math.isfinite(item[1].low + item[1].high) else ""
+        ),
         "from": "{0[1].how}",
     }
     about = found.about

@@ -125,10 +125,7 @@ def ensure_rodgers_demo(
 ) -> Path:
     """Return the folder of the recordings, making them if this machine has none; see :func:`make_rodgers_demo`."""
     numbers = str(check_stimulus_set(stimuli).attrs["content_hash"])
-
-    def make(folder: Path) -> None:
-        make_rodgers_demo(folder, stimuli, seed=seed, animals=animals, progress=progress)
-
+    make = partial(make_rodgers_demo, stimuli=stimuli, seed=seed, animals=animals, progress=progress)
     return ensure_recordings("demo-rodgers", numbers, _definition(stimuli, seed, animals), make=make)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -105,12 +106,14 @@ def count_session(session: Session, options: ReadingOptions) -> SessionCounts:
     kept = tally.apply(kept, covered.any(axis=1), "trials: outside the recorded span")
     unit_kept = tally.apply(unit_kept, covered[kept].any(axis=0) | ~kept.any(), "units: recorded in no kept trial")
 
-    rows = _rows_in_order(np.flatnonzero(kept), table)
-    units = _units_in_order(np.flatnonzero(unit_kept), session.units, spikes)
+    # Trials by start time, then id, and units by id, so that the order of rows in the file changes nothing. Equal ids
+    # of units (several probes) are told apart by number of spikes and first spike.
+    start, ids, unit_ids = table.times("start_time"), as_labels(table.ids()), as_labels(session.units.ids())
+    rows = _sorted(kept, lambda row: (start[row], natural_key(ids[row])))
+    units = _sorted(unit_kept, lambda one: (natural_key(unit_ids[one]), len(spikes[one]), spikes[one][:1].tolist()))
     counts, duration = count(
         [spikes[unit] for unit in units], edges[rows], covered[np.ix_(rows, units)], options.bin, options.window.length
     )
-    ids, unit_ids = as_labels(table.ids()), as_labels(session.units.ids())
     return SessionCounts(
         subject=session.subject,
         session=session.session,
@@ -286,23 +289,9 @@ def _merged(spans: NDArray[np.float64]) -> list[tuple[float, float]]:
     return merged
 
 
-def _rows_in_order(rows: NDArray[np.int64], table: SessionTable) -> NDArray[np.int64]:
-    """Sort trials by start time, then id, so that the order of rows in the file changes nothing."""
-    starts, ids = table.times("start_time"), as_labels(table.ids()).tolist()
-    return np.array(sorted(rows.tolist(), key=lambda row: (starts[row], natural_key(ids[row]))), dtype=np.int64)
-
-
-def _units_in_order(
-    rows: NDArray[np.int64], units: SessionTable, spikes: list[NDArray[np.float64]]
-) -> NDArray[np.int64]:
-    """Sort units by id; equal ids (several probes) by their spikes."""
-    ids = as_labels(units.ids()).tolist()
-
-    def key(row: int) -> tuple[Any, ...]:
-        """Return the id in natural order, then number of spikes and first spike (s), which tell equal ids apart."""
-        return natural_key(ids[row]), len(spikes[row]), spikes[row][:1].tolist()
-
-    return np.array(sorted(rows.tolist(), key=key), dtype=np.int64)
+def _sorted(kept: NDArray[np.bool_], key: Callable[[int], Any]) -> NDArray[np.int64]:
+    """Return the numbers of the rows that are kept, in order."""
+    return np.array(sorted(np.flatnonzero(kept).tolist(), key=key), dtype=np.int64)
 
 
 def missing_column(kind: type, units: int) -> NDArray[Any]:

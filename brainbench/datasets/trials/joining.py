@@ -84,6 +84,9 @@ def join_sessions(
         {"counts": (("trial", "time", "unit"), counts), "duration": (("trial", "time"), duration)}, coordinates
     )
     recipes = {part.stimuli for part in everything}
+    # What makes the data; all else (window, selection, file names) only says how they came about.
+    names = [(part.subject, part.session, part.labels, part.trial_ids, part.unit_ids) for part in parts]
+    content = [item for part, own in zip(parts, names, strict=True) for item in (part.counts, part.duration, own)]
     dataset.attrs = {
         "vocabulary": list(vocabulary),
         "conditions": str(options.conditions),
@@ -98,7 +101,7 @@ def join_sessions(
         "synthetic": any(part.synthetic for part in everything),
         # The recipe that all sessions name; "" where they name none, or different ones.
         "stimuli": recipes.pop() if len(recipes) == 1 else "",
-        "content_hash": content_hash(vocabulary, *(item for part in parts for item in _content(part))),
+        "content_hash": content_hash(vocabulary, *content),
     }
     dataset.attrs["missing"] = missing_labels(dataset)
     return dataset
@@ -107,12 +110,6 @@ def join_sessions(
 def _covariate(parts: list[SessionCounts], name: str) -> NDArray[np.float64]:
     """Return one covariate of all trials; NaN in sessions that do not tell it."""
     return np.concatenate([part.covariates.get(name, np.full(len(part.labels), np.nan)) for part in parts])
-
-
-def _content(part: SessionCounts) -> tuple[Any, ...]:
-    """Return what makes the data: all else (window, selection, file names) only says how they came about."""
-    names = (part.subject, part.session, part.labels, part.trial_ids, part.unit_ids)
-    return part.counts, part.duration, names
 
 
 def _about(part: SessionCounts) -> dict[str, Any]:

@@ -114,7 +114,9 @@ class Selection:
                 )
             column, values = match["column"], match["values"]
             if column == "min_spikes":
-                selection = replace(selection, min_spikes=_integer(values))
+                if not (values.isdecimal() and len(values) < 16):
+                    raise UsageError(f"min_spikes is a whole number from 0; received {shown(values)}.")
+                selection = replace(selection, min_spikes=int(values))
             elif column == "subjects":
                 selection = replace(selection, subjects=_values(values))
             else:
@@ -186,9 +188,3 @@ def _number(source: str) -> float | None:
         return float(source) if source else None
     except ValueError as error:
         raise UsageError(f"{shown(source)} is not a number; a range is written low..high.") from error
-
-
-def _integer(source: str) -> int:
-    if not (source.isdecimal() and len(source) < 16):
-        raise UsageError(f"min_spikes is a whole number from 0; received {shown(source)}.")
-    return int(source)

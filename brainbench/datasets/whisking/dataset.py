@@ -135,8 +135,11 @@ class WhiskingDataset:
         self.epoch = 0
         """Number of the epoch that the next batch belongs to, from 0."""
         self._batch = 0
-        if view == "grid":
-            self._check_grid()
+        frames, cells = self._shards[0].shape[0], self._shards[0].cells
+        if view == "grid" and (substeps < 1 or frames % substeps):
+            raise UsageError(f"{frames} frames do not divide into time steps of {substeps} sub-steps.")
+        if view == "grid" and len(np.unique(cells)) < len(cells):
+            raise UsageError("The data set has two whiskers in one cell of the grid; read it with view='raw'.")
         if not len(self):
             raise UsageError(
                 f"The {self.sweeps} sweeps of the split {split!r} make no batch of {batch_size} for each of {part[1]} "
@@ -323,13 +326,6 @@ class WhiskingDataset:
         """Put per-shard columns together for the sweeps that can be used."""
         starts = np.cumsum([0, *(len(column) for column in columns)])
         return np.concatenate(columns)[starts[self._where] + self._row]
-
-    def _check_grid(self) -> None:
-        frames = self._shards[0].shape[0]
-        if self.substeps < 1 or frames % self.substeps:
-            raise UsageError(f"{frames} frames do not divide into time steps of {self.substeps} sub-steps.")
-        if len(np.unique(self._shards[0].cells)) < len(self._shards[0].cells):
-            raise UsageError("The data set has two whiskers in one cell of the grid; read it with view='raw'.")
 
     @cached_property
     def _columns(self) -> tuple[torch.Tensor, torch.Tensor]:

@@ -118,9 +118,8 @@ def open_shard(path: Path, entry: Mapping[str, Any], manifest: Mapping[str, Any]
     Raises:
         DataError: the file is missing, damaged, or another one.
     """
-    again = "remove it and give the command that made the data set again"
     if not path.is_file():
-        raise DataFileNotFoundError(f"The shard {str(path)!r} of the manifest is missing; {again}.")
+        raise DataFileNotFoundError(f"The shard {str(path)!r} of the manifest is missing. {_AGAIN}")
     with open_hdf5(path, "shard", _AGAIN) as opened:
         file: Any = opened
         wrench = file["wrench"]
@@ -145,9 +144,9 @@ def open_shard(path: Path, entry: Mapping[str, Any], manifest: Mapping[str, Any]
         )
         config = str(file.attrs["config_hash"])
     if path.stat().st_size < end:
-        raise DataError(f"The shard {str(path)!r} is damaged: it ends before its last force; {again}.")
+        raise DataError(f"The shard {str(path)!r} is damaged: it ends before its last force. {_AGAIN}")
     if config != manifest["config_hash"] or sweeps != entry["sweeps"] or channels != CHANNELS:
-        raise DataError(f"The shard {str(path)!r} does not belong to the manifest beside it; {again}.")
+        raise DataError(f"The shard {str(path)!r} does not belong to the manifest beside it. {_AGAIN}")
     return shard
 
 

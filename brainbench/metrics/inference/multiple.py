@@ -77,7 +77,7 @@ def compare_models(
     Raises:
         UsageError: no models or animals, RDMs that do not fit, unknown names.
     """
-    check_correction(correction)
+    check_name("correction for multiple tests", correction, CORRECTIONS)
     if not models:
         raise UsageError("There are no models to compare; give the layers' RDMs of at least one.")
     check_comparison(compare)
@@ -129,7 +129,7 @@ def adjust(p: ArrayLike, correction: str) -> Floats:
     >>> adjust([0.01, 0.04, 0.03], "fdr").round(3).tolist()
     [0.03, 0.04, 0.04]
     """
-    check_correction(correction)
+    check_name("correction for multiple tests", correction, CORRECTIONS)
     result = np.array(p, dtype=np.float64)
     known = np.isfinite(result)
     # Benjamini and Hochberg's step-up procedure, which controls the share of false discoveries.
@@ -143,8 +143,3 @@ def adjust(p: ArrayLike, correction: str) -> Floats:
         scaled = np.maximum.accumulate(result[order] * np.arange(len(order), 0, -1))
         result[order] = np.minimum(scaled, 1.0)
     return result
-
-
-def check_correction(correction: str) -> None:
-    """Raise UsageError with the nearest name unless ``correction`` is known."""
-    check_name("correction for multiple tests", correction, CORRECTIONS)

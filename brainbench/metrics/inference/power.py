@@ -17,7 +17,6 @@ with the mean distance taken away, which has the same permutations as the whiten
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -118,9 +117,11 @@ def power(design: ExperimentDesign, *, simulations: int = SIMULATIONS, seed: int
     orders = np.concatenate(list(label_orders(design.stimuli, seed, exact=_EXACT_STIMULI, draws=draws)))
     # A square matrix read row by row: the entry (i, j) comes from (order[i], order[j]).
     places = (orders[:, :, None] * design.stimuli + orders[:, None, :]).reshape(len(orders), -1)
-    found = 0
-    for size in _chunks(simulations, design, len(places)):
-        model, brain = simulate_experiments(generator, design, size)
+    # Bounds the models' moved entries and the comparisons, held at once over experiments and orders.
+    each = len(places) * design.layers * max(design.stimuli**2, design.animals)
+    step, found = max(1, _CHUNK_ELEMENTS // each), 0
+    for start in range(0, simulations, step):
+        model, brain = simulate_experiments(generator, design, min(step, simulations - start))
         null = _statistics(model, brain, places)
         found += int((tail_p(null.T) <= design.alpha).sum())
     interval = wilson_interval(found, simulations, over="simulated experiments")
@@ -149,14 +150,6 @@ def needed(
         if power(changed, simulations=simulations, seed=seed).power >= target:
             return number
     return None
-
-
-def _chunks(simulations: int, design: ExperimentDesign, orders: int) -> Iterator[int]:
-    # Bounds the models' moved entries and the comparisons, held at once over experiments and orders.
-    each = design.layers * max(design.stimuli**2, design.animals)
-    step = max(1, _CHUNK_ELEMENTS // (orders * each))
-    for start in range(0, simulations, step):
-        yield min(step, simulations - start)
 
 
 def simulate_experiments(generator: np.random.Generator, design: ExperimentDesign, size: int) -> tuple[Floats, Floats]:

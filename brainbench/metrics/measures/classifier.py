@@ -103,7 +103,8 @@ class Decoder:
 
     def __call__(self, codes: Ints) -> list[float]:
         """Return the share of each stimulus' rows decoded rightly [K], with classes ``codes`` [K]."""
-        partition = _partition(codes)
+        seen: dict[int, int] = {}
+        partition = tuple(seen.setdefault(code, len(seen)) for code in codes.tolist())
         if partition not in self._known:
             self._known[partition] = [_correct(fold, codes, self._rows, self._penalty) for fold in self._folds]
         return self._known[partition]
@@ -158,9 +159,3 @@ def fit_softmax(features: Floats, target: Ints, classes: int, penalty: float) ->
 
     found = minimize(loss, np.zeros((width + 1) * classes), jac=True, method="L-BFGS-B").x.reshape(width + 1, classes)
     return found[:-1], found[-1]
-
-
-def _partition(codes: Ints) -> tuple[int, ...]:
-    """Give the classes numbers in order of first appearance."""
-    seen: dict[int, int] = {}
-    return tuple(seen.setdefault(code, len(seen)) for code in codes.tolist())

@@ -110,7 +110,17 @@ class LabelDecoding(Metric):
         exact = most_exact(self.orders)
         orders = np.concatenate(list(label_orders(len(layer.features), seed, exact=exact, draws=self.orders)))
         values = np.stack([layer.right(order).mean(axis=1) for order in orders])
-        return {"decoding": _by_property(layer.classes, values)}
+        found = [
+            {
+                "property": name,
+                "accuracy": float(column[0]),
+                "chance": 1 / (int(codes.max()) + 1),
+                "expected": float(column.mean()),
+                "p": float(tail_p(column)),
+            }
+            for (name, codes), column in zip(layer.classes.items(), values.T, strict=True)
+        ]
+        return {"decoding": found}
 
     def score(self, features: Mapping[str, ArrayLike], animals: Sequence[SubjectRDM], **options: Any) -> Score:
         """Score a model by the features [K, F] of its layers; options are those of :meth:`Metric.score`."""
@@ -163,17 +173,3 @@ class _BoundDecoding(LabelDecoding):
             moved = given[:, np.argsort(given[0])]
             found.append([layer.right(order).mean() for order in moved])
         return np.mean(found, axis=0)
-
-
-def _by_property(properties: Mapping[str, Ints], values: Floats) -> list[dict[str, Any]]:
-    """Describe accuracies [N, properties], the observed ones first."""
-    return [
-        {
-            "property": name,
-            "accuracy": float(column[0]),
-            "chance": 1 / (int(codes.max()) + 1),
-            "expected": float(column.mean()),
-            "p": float(tail_p(column)),
-        }
-        for (name, codes), column in zip(properties.items(), values.T, strict=True)
-    ]

@@ -39,8 +39,6 @@ class Metric:
     """Name on the command line."""
     title = ""
     """Comparison and its correction for noise, in one line."""
-    corrected = False
-    """True when values are corrected for noise."""
     comparison = "whitened-cosine"
     """Comparison of RDMs on which an animal's reliability rests."""
     brain_method = "crossnobis"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -68,11 +68,11 @@ def centred_products(patterns: Floats) -> Floats:
     return centred @ centred.T
 
 
-def unit_products(patterns: Floats) -> Floats:
-    """Return the products [K, K] of centred patterns, of unit length; NaN for constant ones."""
+def unit_products(patterns: Floats, size: Callable[[Floats], Any] = np.linalg.norm) -> Floats:
+    """Return the products [K, K] of centred patterns, of unit length or another size; NaN for constant ones."""
     products = centred_products(patterns)
-    size = float(np.linalg.norm(products))
-    return products / size if size > 0 else np.full(products.shape, np.nan)
+    length = float(size(products))
+    return products / length if length > 0 else np.full(products.shape, np.nan)
 
 
 class Procrustes(PatternMetric):
@@ -92,22 +92,14 @@ class Procrustes(PatternMetric):
         """Return ‖XᵀY‖∗ of centred, scaled patterns."""
         if not np.isfinite(model).all() or not np.isfinite(brain).all():
             return math.nan
-        return float(_similarities(_unit(model), _unit(brain)[None])[0])
+        return float(_similarities(unit_products(model, np.trace), unit_products(brain, np.trace)[None])[0])
 
     def compare_orders(self, model: Floats, animals: Sequence[SubjectRDM], orders: Ints) -> Floats:
         """Return values [N, A] with the model's stimuli in each order [N, K]."""
         # Moving the model's stimuli is moving the animals' products [K, K] by the inverse order.
         place = np.argsort(orders, axis=1)
-        left = _unit(model)
-        columns = [_similarities(left, _unit(a.patterns)[place[:, :, None], place[:, None, :]]) for a in animals]
-        return np.stack(columns, axis=1)
-
-
-def _unit(patterns: Floats) -> Floats:
-    """Return the products [K, K] of centred patterns of unit size; NaN for constant ones."""
-    products = centred_products(patterns)
-    size = float(np.trace(products))
-    return products / size if size > 0 else np.full(products.shape, np.nan)
+        left, *right = (unit_products(part, np.trace) for part in (model, *(animal.patterns for animal in animals)))
+        return np.stack([_similarities(left, part[place[:, :, None], place[:, None, :]]) for part in right], axis=1)
 
 
 def _similarities(left: Floats, right: Floats) -> Floats:

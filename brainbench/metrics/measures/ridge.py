@@ -38,7 +38,6 @@ class RidgeEncoding(PatternMetric):
 
     name = "ridge"
     title = "share of explainable variance that ridge regression predicts for stimuli left out"
-    corrected = True
     orders_between = 39
 
     def compare(self, model: Floats, brain: SubjectRDM) -> float:
@@ -81,11 +80,6 @@ def _share(error: Floats, base: Floats, animals: Sequence[SubjectRDM], noise: Fl
         return value * np.array([_explainable(animal) for animal in animals])
 
 
-def _folds(count: int) -> Ints:
-    """Return the fold [K] of each stimulus: every tenth in the order that the animals give the stimuli."""
-    return np.arange(count) % min(count, FOLDS)
-
-
 def _explainable(animal: SubjectRDM) -> float:
     """Return the share of an animal's variance between stimuli that is not noise, whatever the folds."""
     # Deviations from the mean of the K − 1 other stimuli are K/(K − 1) of those from the mean of all.
@@ -97,7 +91,8 @@ def _explainable(animal: SubjectRDM) -> float:
 def _errors(model: Floats, animals: Sequence[SubjectRDM], orders: Ints) -> tuple[Floats, Floats]:
     """Return squared errors of the prediction and of the training mean [N, A, K], by the stimulus of the model."""
     count = len(model)
-    folds, kernel = _folds(count), centred_products(model)
+    # Every tenth stimulus, in the order that the animals give them, is of one fold.
+    folds, kernel = np.arange(count) % min(count, FOLDS), centred_products(model)
     # Brain stimulus i stands at the model's stimulus order[i]: products are moved to the model's places.
     place = np.argsort(orders, axis=1)
     products = np.stack([centred_products(animal.patterns) for animal in animals])

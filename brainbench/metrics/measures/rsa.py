@@ -44,7 +44,6 @@ class RSA(Metric):
     comparison: str = "whitened-cosine"
     splits: int = 300
 
-    corrected = True
     of_rdms = True
     orders = 1999
     orders_between = 499

@@ -68,10 +68,7 @@ def compare(a: ArrayLike, b: ArrayLike, *, method: str = "pearson") -> Floats:
         raise UsageError(f"RDMs of shapes {left.shape} and {right.shape} do not broadcast.") from error
     if not (np.isfinite(left).all() and np.isfinite(right).all()):
         return _compare_present(np.broadcast_to(left, shape), np.broadcast_to(right, shape), method)
-    if method in _BY_SORTING and left.shape[-1] > _SIGN_LIMIT:
-        return _each(np.broadcast_to(left, shape), np.broadcast_to(right, shape), _BY_SORTING[method])
-    # The broadcast product of all comparisons and all pairs is never formed.
-    return np.einsum("...p,...p->...", features(left, method), features(right, method))
+    return _compare_complete(left, right, method)
 
 
 def compare_all(a: Floats, b: Floats, *, method: str = "pearson") -> Floats:
@@ -200,6 +197,16 @@ COMPARISONS = tuple(_METHODS)
 """Names that ``method`` of :func:`compare` takes."""
 
 
+def _compare_complete(left: Floats, right: Floats, method: str) -> Floats:
+    """Compare RDMs [..., P] that broadcast and lack no pair."""
+    if method in _BY_SORTING and left.shape[-1] > _SIGN_LIMIT:
+        shape = np.broadcast_shapes(left.shape, right.shape)
+        a, b = (np.broadcast_to(rdms, shape).reshape(-1, shape[-1]) for rdms in (left, right))
+        return np.array(list(map(_BY_SORTING[method], a, b))).reshape(shape[:-1])
+    # The broadcast product of all comparisons and all pairs is never formed.
+    return np.einsum("...p,...p->...", features(left, method), features(right, method))
+
+
 def _compare_present(left: Floats, right: Floats, method: str) -> Floats:
     """Compare over the pairs present in both RDMs, together for all comparisons that lack the same pairs."""
     shape = left.shape[:-1]
@@ -212,12 +219,10 @@ def _compare_present(left: Floats, right: Floats, method: str) -> Floats:
             continue
         rows = np.flatnonzero(member.ravel() == index)
         a, b = left[np.ix_(rows, np.flatnonzero(keep))], right[np.ix_(rows, np.flatnonzero(keep))]
-        if method in _BY_SORTING and keep.sum() > _SIGN_LIMIT:
-            result[rows] = _each(a, b, _BY_SORTING[method])
-        elif method.startswith("whitened") and not keep.all():
+        if method.startswith("whitened") and not keep.all():
             result[rows] = _whitened_present(a, b, keep, centre=method == "whitened-pearson")
         else:
-            result[rows] = np.einsum("np,np->n", features(a, method), features(b, method))
+            result[rows] = _compare_complete(a, b, method)
     return result.reshape(shape)
 
 
@@ -238,12 +243,6 @@ def _whitened_present(a: Floats, b: Floats, keep: np.ndarray, *, centre: bool) -
     floor = (_CONSTANT**2 * (a * a).sum(axis=1)) * (_CONSTANT**2 * (b * b).sum(axis=1))
     product = np.einsum("np,np->n", x, solved_y)
     return np.divide(product, np.sqrt(size), out=np.full(len(x), np.nan), where=size > floor)
-
-
-def _each(left: Floats, right: Floats, one: Callable[[Floats, Floats], float]) -> Floats:
-    shape = left.shape[:-1]
-    left, right = left.reshape(-1, left.shape[-1]), right.reshape(-1, right.shape[-1])
-    return np.array([one(x, y) for x, y in zip(left, right, strict=True)]).reshape(shape)
 
 
 def _sorted_tau_b(x: Floats, y: Floats) -> float:

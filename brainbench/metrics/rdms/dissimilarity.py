@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from brainbench.core.errors import DataError, UsageError, check_name, unknown_name
+from brainbench.core.errors import DataError, UsageError, check_name
 from brainbench.metrics.arrays import Array, fetch, find_device, library, place
 from brainbench.metrics.rdms.distances import (
     correlation_distances,
@@ -132,20 +132,8 @@ def rdm(
         raise UsageError(f"folds are for method='crossnobis'; method={method!r} averages all trials; leave them out.")
     if precision is not None and method not in ("mahalanobis", "crossnobis"):
         raise UsageError(f"A noise precision is for 'mahalanobis' and 'crossnobis'; method={method!r} does not use it.")
-    if isinstance(precision, str) and precision not in NOISE_METHODS:
-        raise unknown_name("noise covariance method", precision, NOISE_METHODS)
-    given = _prepare(responses, labels, folds, precision, device)
-    with np.errstate(invalid="ignore", over="ignore"):
-        return fetch(_METHODS[method](given))
-
-
-def _prepare(
-    responses: ArrayLike,
-    labels: ArrayLike | None,
-    folds: ArrayLike | None,
-    precision: ArrayLike | str | None,
-    device: Any,
-) -> _Responses:
+    if isinstance(precision, str):
+        check_name("noise covariance method", precision, NOISE_METHODS)
     where = find_device(device, responses, precision)
     if labels is None:
         matrix, codes = response_matrix(responses, "stimuli"), None
@@ -155,11 +143,8 @@ def _prepare(
         count = len(names)
     if count < 2:
         raise UsageError(f"An RDM compares at least 2 stimuli; received {count}.")
-    return _Responses(matrix, count, codes, folds, precision, where)
-
-
-def _correlation(given: _Responses) -> Array:
-    return correlation_distances(given.patterns(), missing=given.missing, device=given.device)
+    with np.errstate(invalid="ignore", over="ignore"):
+        return fetch(_METHODS[method](_Responses(matrix, count, codes, folds, precision, where)))
 
 
 def _sqeuclidean(given: _Responses) -> Array:
@@ -245,7 +230,7 @@ def poisson_rates(rates: Array) -> Array:
 
 
 _METHODS: dict[str, Callable[[_Responses], Array]] = {
-    "correlation": _correlation,
+    "correlation": lambda given: correlation_distances(given.patterns(), missing=given.missing, device=given.device),
     "sqeuclidean": _sqeuclidean,
     "mahalanobis": _mahalanobis,
     "crossnobis": _crossnobis,

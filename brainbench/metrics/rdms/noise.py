@@ -76,7 +76,8 @@ class NoiseModel:
         Raises:
             DataError: the covariance is singular.
         """
-        eye = library(self.scale).eye(len(self.scale), **_like(self.scale))
+        xp = library(self.scale)
+        eye = xp.diag(xp.ones_like(self.scale))
         if not self.weight:
             inner = eye / self.ridge
         elif self.dual:
@@ -167,10 +168,6 @@ def estimate_noise(trials: Any, codes: Ints, count: int, method: str, *, device:
     return _METHODS[method](residuals if device is None else place(residuals, device), freedom)
 
 
-def _diag(residuals: Array, freedom: int) -> NoiseModel:
-    return NoiseModel("diag", _deviation(residuals, freedom), 1.0, residuals, 0.0)
-
-
 def _full(residuals: Array, freedom: int) -> NoiseModel:
     ones = library(residuals).ones_like(residuals[0])
     return NoiseModel("full", ones, 0.0, residuals, 1.0 / freedom)
@@ -228,14 +225,10 @@ def _inverse(factor: Array) -> Array:
     return np.tril(lower) + np.tril(lower, -1).T
 
 
-def _like(array: Array) -> dict[str, object]:
-    return {"dtype": array.dtype, "device": array.device} if is_tensor(array) else {}
-
-
 _METHODS: dict[str, Callable[[Array, int], NoiseModel]] = {
     "shrinkage_diag": _shrinkage_diag,
     "shrinkage_eye": _shrinkage_eye,
-    "diag": _diag,
+    "diag": lambda residuals, freedom: NoiseModel("diag", _deviation(residuals, freedom), 1.0, residuals, 0.0),
     "full": _full,
 }
 

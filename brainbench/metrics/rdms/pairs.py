@@ -73,16 +73,12 @@ def permuted_pairs(orders: Any, count: int | None = None) -> Any:
 
     Orders may name some of ``count`` stimuli only.
     """
-    xp, size = library(orders), orders.shape[-1]
-    total = size if count is None else count
-    rows, cols = _pair_indices(total, orders)
-    where = {"device": orders.device} if is_tensor(orders) else {}
-    # table[i, j] is the place of the pair {i, j}: permuting an RDM is one look-up, without square matrices.
-    table = xp.zeros((total, total), dtype=xp.int64, **where)
-    table[rows, cols] = table[cols, rows] = xp.arange(len(rows), **where)
-    if size != total:
-        rows, cols = _pair_indices(size, orders)
-    # Pair (i, j) of the permuted RDM is the pair (order[i], order[j]) of the given one.
+    size = orders.shape[-1]
+    table: Any = _pair_places(size if count is None else count)
+    if is_tensor(orders):
+        table = library(orders).tensor(table, device=orders.device)
+    rows, cols = _pair_indices(size, orders)
+    # Pair (i, j) of the permuted RDM is the pair (order[i], order[j]) of the given one, which is one look-up.
     return table[orders[..., rows], orders[..., cols]]
 
 

@@ -41,13 +41,10 @@ def denoised(patterns: Floats, noise: Floats) -> Floats:
     return mean + (vectors[:, kept] * np.sqrt(values)) @ (left @ right).T
 
 
-def simulated_animals(animal: SubjectRDM, seed: int, count: int = SIMULATIONS) -> tuple[Floats, list[SubjectRDM]]:
+def simulated_animals(animal: SubjectRDM, seed: int) -> tuple[Floats, list[SubjectRDM]]:
     """Return an animal's responses without noise [K, U], and copies of the animal with new noise on them."""
     truth = denoised(animal.patterns, animal.noise)
     generator = np.random.default_rng(seed)
     spread = np.sqrt(np.maximum(animal.noise, 0.0))
-    copies = []
-    for _ in range(count):
-        patterns = truth + spread * generator.standard_normal(truth.shape)
-        copies.append(replace(animal, patterns=patterns))
-    return truth, copies
+    drawn = (truth + spread * generator.standard_normal(truth.shape) for _ in range(SIMULATIONS))
+    return truth, [replace(animal, patterns=patterns) for patterns in drawn]

@@ -112,9 +112,16 @@ class SplitRDMs:
         if self._method == "crossnobis":
             present &= np.isfinite(variances)
         weight = present.astype(np.float64)
-        both = upper(weight @ np.swapaxes(weight, -1, -2))
+        shared = weight @ np.swapaxes(weight, -1, -2)
+        both = upper(shared)
         if self._method == "crossnobis":
-            return _unbiased_distances(patterns, variances), both
+            # E‖x̂_i − x̂_j‖² = ‖x_i − x_j‖² + v_i + v_j: the noise of both means is taken away, over the units that both
+            # have, which is the crossnobis distance with every trial as its own fold.
+            own = np.where(present, variances, 0.0) @ np.swapaxes(weight, -1, -2)
+            seen = np.where(present, patterns, np.nan)
+            with np.errstate(invalid="ignore", divide="ignore"):
+                noise = upper((own + np.swapaxes(own, -1, -2)) / shared)
+                return product_distances(seen, seen, missing=True) - noise, both
         if self._method == "poisson":
             rates = poisson_rates(patterns)
             return product_distances(rates, np.log(rates), missing=True), both
@@ -149,22 +156,6 @@ class _Sums:
         return other
 
 
-def _unbiased_distances(patterns: Floats, variances: Floats) -> Floats:
-    """Return squared distances per unit [..., P] less what the noise of the patterns [..., K, F] adds to them.
-
-    With ``variances`` [..., K, F] of the patterns (sample variance over trials / trials) this is the
-    crossnobis distance with every trial as its own fold; units without either value are left out of a pair.
-    """
-    # E‖x̂_i − x̂_j‖² = ‖x_i − x_j‖² + v_i + v_j: the noise of both means is taken away, over the units that both have.
-    present = np.isfinite(patterns) & np.isfinite(variances)
-    weight = present.astype(np.float64)
-    own = np.where(present, variances, 0.0) @ np.swapaxes(weight, -1, -2)
-    both = weight @ np.swapaxes(weight, -1, -2)
-    seen = np.where(present, patterns, np.nan)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        return product_distances(seen, seen, missing=True) - upper((own + np.swapaxes(own, -1, -2)) / both)
-
-
 def mean_patterns(
     session: SortedTrials, members: Floats, count: int, *, variances: bool, units: slice = slice(None)
 ) -> tuple[Floats, Floats]:
@@ -194,16 +185,6 @@ def mean_patterns(
     return means, spread
 
 
-def chunk_size(sessions: list[SortedTrials], count: int, method: str) -> int:
-    """Return how many splits are computed at once."""
-    width = sum(min(session.responses.shape) for session in sessions)
-    step = _CHUNK_BYTES // (8 * count * max(width, count))
-    if method == "correlation":
-        # It forms the patterns of all units; other distances come in slices of units.
-        step = min(step, _PATTERN_BYTES // (8 * count * sum(session.responses.shape[1] for session in sessions)))
-    return max(1, step)
-
-
 def members(random: Hashes) -> Floats:
     """Return 1 for the trials [..., n] of the first half: the lower half of the random numbers."""
     count = random.shape[-1]
@@ -230,7 +211,12 @@ def split_members(session: SortedTrials, count: int, index: Ints, seed: int) -> 
 def half_rdms(sessions: list[SortedTrials], count: int, method: str, index: Ints, seed: int) -> tuple[Floats, Floats]:
     """Return the RDMs [S, P] of both halves of the splits ``index`` [S]."""
     every = SplitRDMs(sessions, count, method)
-    step = chunk_size(sessions, count, method)
+    width = sum(min(session.responses.shape) for session in sessions)
+    step = _CHUNK_BYTES // (8 * count * max(width, count))
+    if method == "correlation":
+        # It forms the patterns of all units; other distances come in slices of units.
+        step = min(step, _PATTERN_BYTES // (8 * count * sum(session.responses.shape[1] for session in sessions)))
+    step = max(1, step)
     parts = [
         every.halves([split_members(session, count, index[start : start + step], seed) for session in sessions])
         for start in range(0, len(index), step)

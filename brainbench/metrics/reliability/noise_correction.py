@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -32,6 +33,10 @@ median of ratios fare no better there, so a low reliability is reported instead 
 
 THESIS_FILTER = 0.5
 """The published estimator drops split halves whose raw correlation is below this."""
+
+
+_Estimator = Callable[[Floats, Floats, Floats | None, list[float]], tuple[float, int, str]]
+"""Makes value, number of splits and reason of r_xy, the halves of both sides and their reliabilities."""
 
 
 @dataclass(frozen=True)
@@ -136,28 +141,24 @@ def _default(r_xy: Floats, halves: Floats, others: Floats | None, sides: list[fl
     return float(finite_mean(r_xy)) / math.sqrt(math.prod(sides)), int(np.isfinite(halves).sum()), ""
 
 
-def _thesis(r_xy: Floats, halves: Floats, others: Floats | None, sides: list[float]) -> tuple[float, int, str]:
-    ratio, _ = corrected_splits(r_xy, halves, others)
-    # As published for models: splits below the filter are dropped, which keeps the lucky ones.
-    kept = ratio[np.broadcast_to(halves >= THESIS_FILTER, ratio.shape) & np.isfinite(ratio)]
-    if not kept.size:
-        return math.nan, 0, f"no split half has a raw correlation of at least {THESIS_FILTER}"
-    return float(kept.mean()), kept.size, ""
+def _by_split(average: Callable[[Floats], Any], least: float, lacking: str) -> _Estimator:
+    """Return a published estimator: the average ratio of splits whose raw correlation is at least ``least``."""
+
+    def corrected(r_xy: Floats, halves: Floats, others: Floats | None, sides: list[float]) -> tuple[float, int, str]:
+        ratio, _ = corrected_splits(np.where(halves >= least, r_xy, np.nan), halves, others)
+        # Imaginary ratios vanish, as published.
+        kept = ratio[np.isfinite(ratio)]
+        return (float(average(kept)), kept.size, "") if kept.size else (math.nan, 0, lacking)
+
+    return corrected
 
 
-def _thesis_input(r_xy: Floats, halves: Floats, others: Floats | None, sides: list[float]) -> tuple[float, int, str]:
-    ratio, _ = corrected_splits(r_xy, halves, others)
-    # As published for the raw input: imaginary ratios vanish, and the median is taken of the others.
-    kept = ratio[np.isfinite(ratio)]
-    if not kept.size:
-        return math.nan, 0, "no split half has a positive reliability"
-    return float(np.median(kept)), kept.size, ""
-
-
-_ESTIMATORS: dict[str, Callable[[Floats, Floats, Floats | None, list[float]], tuple[float, int, str]]] = {
+_ESTIMATORS: dict[str, _Estimator] = {
     "default": _default,
-    "thesis": _thesis,
-    "thesis-input": _thesis_input,
+    # For models: splits below the filter are dropped, which keeps the lucky ones.
+    "thesis": _by_split(np.mean, THESIS_FILTER, f"no split half has a raw correlation of at least {THESIS_FILTER}"),
+    # For the raw input.
+    "thesis-input": _by_split(np.median, -math.inf, "no split half has a positive reliability"),
 }
 
 ESTIMATORS = tuple(_ESTIMATORS)

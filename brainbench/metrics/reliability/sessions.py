@@ -64,11 +64,6 @@ class SortedTrials(Trials):
         return bool(np.isfinite(self.responses).all())
 
     @cached_property
-    def identity(self) -> int:
-        """A number that depends on the trials, not on their order."""
-        return int(self.hashes.sum(dtype=np.uint64))
-
-    @cached_property
     def factor(self) -> Floats:
         """[R, ≤ R] patterns with the same inner products as the trials' responses, and no more columns than trials."""
         if self.responses.shape[1] <= len(self.labels):

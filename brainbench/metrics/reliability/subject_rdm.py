@@ -22,6 +22,7 @@ from brainbench.core.errors import DataError, UsageError, check_name
 from brainbench.core.records import Interval
 from brainbench.core.trials import Trials
 from brainbench.metrics.rdms.comparison import check_comparison, compare
+from brainbench.metrics.rdms.dissimilarity import RDM_METHODS
 from brainbench.metrics.rdms.pairs import Floats, Ints, permuted_pairs, stimulus_count
 from brainbench.metrics.reliability.halves import SplitRDMs, half_rdms
 from brainbench.metrics.reliability.noise_correction import spearman_brown
@@ -31,8 +32,6 @@ from brainbench.metrics.stimulus_labels import membership, stimulus_means
 
 SPLITS = 1000
 """Random split halves per animal."""
-
-SUBJECT_METHODS = ("correlation", "sqeuclidean", "mahalanobis", "crossnobis", "poisson")
 
 _CHUNK_BYTES = 1 << 24
 _HALVES_BYTES = 1 << 26
@@ -117,7 +116,7 @@ def subject_rdm(
 
     An animal whose data cannot be used comes back with ``problem`` (for example ``no trials of 'convex-far'``) instead
     of an error, so the others can still be scored. ``n_stimuli`` is K; names of the ``stimuli`` are for messages.
-    ``method`` is one of :data:`SUBJECT_METHODS`. ``noise`` is the noise covariance of ``mahalanobis`` and
+    ``method`` is one of :func:`brainbench.metrics.rdm`. ``noise`` is the noise covariance of ``mahalanobis`` and
     ``crossnobis``: ``none`` or one of :func:`brainbench.metrics.noise_precision`. ``diag``, ``none`` and ``full`` leave
     crossnobis unbiased; shrinkage leaves a bias of up to .01 per unit (docs/calibration.md).
 
@@ -125,7 +124,7 @@ def subject_rdm(
         UsageError: unknown method, bad shapes or labels, repeated trial keys, no positive ``splits``.
         DataError: infinite responses, or negative ones for ``poisson``.
     """
-    check_name("RDM method of an animal", method, SUBJECT_METHODS)
+    check_name("RDM method of an animal", method, RDM_METHODS)
     check_comparison(comparison)
     if splits < 1 or n_stimuli < 2:
         raise UsageError(f"Split halves need splits ≥ 1 and 2 or more stimuli; received {splits} and {n_stimuli}.")

@@ -67,7 +67,7 @@ def unit_reliability(
 
 
 def reliable_units(
-    blocks: Sequence[Trials], n_stimuli: int, *, least: float = UNIT_GATE, splits: int = _SPLITS, seed: int = 0
+    blocks: Sequence[Trials], n_stimuli: int, *, least: float = UNIT_GATE, seed: int = 0
 ) -> tuple[tuple[Trials, ...], str]:
     """Return the sessions with the units whose reliability is at least ``least``, and what was left out in words.
 
@@ -76,7 +76,7 @@ def reliable_units(
     Raises:
         UsageError: as :func:`unit_reliability`.
     """
-    values = unit_reliability(blocks, n_stimuli, splits=splits, seed=seed)
+    values = unit_reliability(blocks, n_stimuli, seed=seed)
     kept = []
     for block, value in zip(blocks, values, strict=True):
         good = value >= least

@@ -15,7 +15,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from brainbench.core.errors import DataError, unknown_name
+from brainbench.core.errors import DataError, check_name
 from brainbench.metrics.rdms.noise import NOISE_METHODS, NoiseModel, estimate_noise
 from brainbench.metrics.rdms.pairs import Floats, Ints
 from brainbench.metrics.reliability.sessions import SortedTrials
@@ -51,10 +51,9 @@ def whitened(session: SortedTrials, count: int, noise: str) -> tuple[SortedTrial
     Raises:
         UsageError: unknown ``noise`` method.
     """
+    check_name("noise covariance method", noise, ("none", *NOISE_METHODS))
     if noise == "none":
         return session, ""
-    if noise not in NOISE_METHODS:
-        raise unknown_name("noise covariance method", noise, ("none", *NOISE_METHODS))
     varies, power, number = (np.concatenate(part) for part in zip(*_noise(session, count), strict=True))
     usable = varies if noise == "diag" else varies & np.isfinite(session.responses).all(axis=0)
     told = (

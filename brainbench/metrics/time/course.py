@@ -117,7 +117,10 @@ def score_over_time(
     assert chosen is not None
     # The first order is the given one.
     course, value, match = (np.concatenate(parts) for parts in (courses, values, matches))
-    p, over_all = _largest_p(course)
+    # Each time is judged by the largest over all times in each permutation.
+    z = standardised(course)
+    largest_z = z.max(axis=1)
+    p = np.where(np.isfinite(course[0]), tail_p(largest_z[:, None], z[0]), np.nan)
     observed = joined.compared()
     own = held_out_course(observed)[0][0] * factors
     left_out = [joined.without_stimulus(stimulus) for stimulus in range(joined.stimuli)]
@@ -147,7 +150,7 @@ def score_over_time(
     return TimeCourse(
         points=points,
         latencies=latencies,
-        p=over_all,
+        p=float(tail_p(largest_z)),
         layer=names[most_chosen(chosen // len(joined.lags))],
         bin=width,
         largest_lag=largest * width,
@@ -177,14 +180,6 @@ def _checked(layers: Mapping[str, ArrayLike], animals: Sequence[AnimalMovie], wi
             "choose smaller bins (--bin) or a longer window."
         )
     return movies
-
-
-def _largest_p(null: Floats) -> tuple[Floats, float]:
-    """Return p of every entry of statistics [N, M], corrected by the largest in each permutation, and of the best."""
-    z = standardised(null)
-    largest = z.max(axis=1)
-    p = np.where(np.isfinite(null[0]), tail_p(largest[:, None], z[0]), np.nan)
-    return p, float(tail_p(largest))
 
 
 def _reasons(animals: Sequence[AnimalMovie], points: tuple[TimePoint, ...], stimuli: int) -> tuple[str, ...]:

@@ -93,15 +93,12 @@ def recover(
         if progress is not None:
             progress(done, total, "scoring boards")
     every = sorted((board for job in jobs for board in found[job]), key=lambda one: (one.true, one.number))
-    return Recovery(tuple(item.name for item in candidates), design, _shown(candidates, design), tuple(every))
+    shown = design.stimuli or len(candidates[0].stimuli)
+    return Recovery(tuple(item.name for item in candidates), design, shown, tuple(every))
 
 
 def _make_boards(candidates: tuple[Candidate, ...], design: RecoveryDesign, job: _Job) -> list[RecoveryBoard]:
     return [make_board(candidates, design, job.true, number) for number in job.numbers]
-
-
-def _shown(candidates: Sequence[Candidate], design: RecoveryDesign) -> int:
-    return design.stimuli or len(candidates[0].stimuli)
 
 
 def check_candidates(candidates: Sequence[Candidate], design: RecoveryDesign, boards: int) -> None:
@@ -112,7 +109,7 @@ def check_candidates(candidates: Sequence[Candidate], design: RecoveryDesign, bo
     pool = len(candidates[0].stimuli)
     if any(item.stimuli != candidates[0].stimuli for item in candidates):
         raise UsageError("The candidates saw different stimuli; run all of them on the same ones in the same order.")
-    if _shown(candidates, design) > pool:
+    if design.stimuli is not None and design.stimuli > pool:
         raise UsageError(f"A board of {design.stimuli} stimuli was asked for; the pool has {pool}.")
     if get_metric(design.metric).of_model_alone:
         raise UsageError(
