@@ -13,8 +13,10 @@
 #   device, 4…: bash /w/gpu.sh run PART …                             each at most as long as it says; all below 600 s
 #   or, on a machine of several GPUs, parts in the background, one after the other on each GPU, and a look at them:
 #               PLAN="0:ft_hand,reservoir_50 3:ft_hand" bash /w/gpu.sh lane 0 students-for; bash /w/gpu.sh look SECOND
-#               (PLAN: seed:arms …, TEACHER a run's folder; JOB=NAME-0 … lane 1 teachers; SECOND of the machine's life;
-#               policies/jobs.toml says what to compare; on a fresh machine two minutes go into compiling)
+#               (PLAN: seed:arms …, TEACHER a run's folder; JOB=NAME-0 … lane 1 teachers; TASK=screwdriver NAME=-a
+#               WITH="--seed 1" … lane 2a teacher-of, and another as 2b beside it: two teachers of 4,096 environments
+#               share a GPU well; SECOND of the machine's life; policies/jobs.toml says what to compare; on a fresh
+#               machine two minutes go into compiling; kill what fails by `pkill -f "run/NAME-[b]"`, not by its own name)
 #   here:       git checkout -f main && git branch -D device; python -m benchmarks.report after copying results/*.json
 #
 # Calls follow one another within 30 s, or the machine goes back with all that is on it: on 2026-11-26 that happened twice,
@@ -22,9 +24,8 @@
 # write the next call before the last one ends. A machine lives 30 minutes; one GPU counts half, four count as one that is
 # not halved. What is timed has its GPU for itself.
 #
-# What is open of sweeps: how a GPU is shared where shards queue, 16 or 32 at once (sweeps-3), and which kernel takes the
-# time (slices). Of touch: noisy taxels as they are now (touch; .143 to .151 ms in an experiment). Training on several
-# GPUs: few, then training with COUNTS=1,2,4 on cards that hold a batch of 1,024 (H200), all GPUs idle.
+# Open: training on several GPUs, few, then training with COUNTS=1,2,4 on cards that hold a batch of 1,024 (H200), all
+# GPUs idle.
 set -eu
 
 # Part, its limit in seconds, its command.
@@ -43,7 +44,7 @@ friction  150  python3 -m benchmarks.tactile.friction_cost --device cuda --write
 gradients 500  python3 -m benchmarks.whiskers.gradient_cost --device cuda --each 1 --input inputs/gradients.npz --write
 teachers  590  python3 -m benchmarks.policies.jobs run $JOB --minutes ${MINUTES:-7.5}
 students-for 1500  for one in $PLAN; do python3 -m benchmarks.policies.students --teacher ${TEACHER:-in_palm_rotate.teacher} --config careful --seed ${one%%:*} --arms $(echo ${one#*:} | tr , ' ') ${AGENTS---no-agents} --evaluations 1 --device cuda --envs 4096 --iterations 110 --learning-rate 5e-4 --episodes 512 --together 2 --end $(($(cat /w/t0) + 1670)) --reserve 60 --out /tmp/run/students-${one%%:*}; done
-teacher-of 1650 python3 -m brainbench policy train $TASK $WITH --envs ${ENVS:-8192} --minutes $(python3 -c "print(max(0.05, ($(cat /w/t0) + ${UNTIL:-1500} - $(date +%s)) / 60))") --loggers csv --device cuda --out /tmp/run/$TASK${NAME:-} && python3 -m brainbench policy evaluate $TASK /tmp/run/$TASK${NAME:-} $WITH --envs 1024 --episodes 1024 --seeds 1 --device cuda --out /tmp/run/$TASK${NAME:-}/evaluated.json
+teacher-of 1650 python3 -m brainbench policy train $TASK $WITH --envs ${ENVS:-8192} --minutes $(python3 -c "print(max(0.05, ($(cat /w/t0) + ${UNTIL:-1500} - $(date +%s)) / 60))") --loggers csv --device cuda --out /tmp/run/$TASK${NAME:-} && python3 -m brainbench policy evaluate $TASK /tmp/run/$TASK${NAME:-} --envs 1024 --episodes 1024 --seeds 1 --device cuda --out /tmp/run/$TASK${NAME:-}/evaluated.json
 shipped   150  python3 -m brainbench policy evaluate in_palm_rotate in_palm_rotate.teacher in_palm_rotate.student --config careful --envs 1024 --episodes 1024 --seeds 1 --device cuda --out /w/out/shipped.json
 few       240  python3 -m brainbench stimuli sweep thesis-low procedural:30 --split sweep --device cuda $P --out /tmp/few
 training  300  python3 -m benchmarks.models.data_parallel /tmp/few --counts $COUNTS --networks zhuang-intersection-ln+gpt.supervised --out /w/out/data-parallel-$COUNTS.json
@@ -78,14 +79,15 @@ run() {
 }
 
 lane() {
-  local gpu=$1; shift
-  OUT=/w/out CUDA_VISIBLE_DEVICES=$gpu setsid bash /w/gpu.sh run "$@" >>"/w/out/lane-$gpu.log" 2>&1 </dev/null &
+  local name=$1; shift  # the number of the GPU, and a letter where several share it
+  OUT=/w/out CUDA_VISIBLE_DEVICES=${name%%[a-z]*} setsid bash /w/gpu.sh run "$@" >>"/w/out/lane-$name.log" 2>&1 </dev/null &
 }
 
 look() {
   while [ $(($(date +%s) - $(cat /w/t0))) -lt "$1" ]; do sleep 1; done
   tail -n "${2:-15}" /w/out/lane-*.log
   nvidia-smi --query-gpu=utilization.gpu,memory.used --format=csv,noheader
+  set +e  # files change while they are packed, and the rest shall come back all the same
   cd / && tar czf "$OUT/seen.tar.gz" w/out/*.log w/head/benchmarks/results $(find tmp/run -maxdepth 4 -name '*.json' -o -name '*.jsonl' -o -name log.csv 2>/dev/null)
   # The newest model of each teacher, and students that were evaluated and may ship: eight files may come back.
   local model runs=()
@@ -93,8 +95,8 @@ look() {
     model=$(ls -v "$run"model_*.safetensors 2>/dev/null | tail -n 1); [ -z "$model" ] || runs+=("$model" "$run"config.json)
   done
   [ -z "${runs[*]}" ] || tar czf "$OUT/teachers.tar.gz" "${runs[@]}"
-  for run in /tmp/run/students-*/{ft_hand,reservoir}/seed*/; do
-    [ ! -e "$run/evaluation.json" ] || tar czf "$OUT/$(basename "$(dirname "$run")")-$(basename "$run").tar.gz" -C "$run" model.safetensors config.json evaluation.json
+  for run in /tmp/run/students-*/raw_rnn/seed*/; do
+    [ ! -e "$run/evaluation.json" ] || tar cJf "$OUT/raw_rnn-$(basename "$run").tar.xz" -C "$run" model.safetensors config.json evaluation.json
   done; cp /w/out/*.json "$OUT" 2>/dev/null || true
 }
 
