@@ -69,7 +69,8 @@ CONTRASTS = (
     ("ead_simclr", "ead_supervised"), ("ead_simclr", "ead_untrained"), ("ead_supervised", "ead_untrained"),
     ("ead_simclr", "reservoir"), ("ead_supervised", "reservoir"), ("ft_hand", "ead_simclr"), ("ft_hand", "reservoir"),
     ("ft_hand", "none_memory"), ("reservoir", "none_memory"), ("ead_simclr", "none_memory"), ("none_memory", "none"),
-    ("reservoir_50", "reservoir"),
+    ("reservoir_50", "reservoir"), ("bool_hand", "none_memory"), ("raw_rnn", "ft_hand"), ("raw_rnn", "reservoir"),
+    ("ead_finetuned", "ead_scratch"), ("ead_finetuned", "ead_simclr"), ("ead_finetuned", "ft_hand"),
 )  # fmt: skip
 """Arms whose differences are tested."""
 RANDOM, TRAINED = ("reservoir", "ead_untrained"), ("ead_simclr", "ead_supervised")
@@ -228,7 +229,7 @@ def lay_out(options: argparse.Namespace) -> None:
 
     from benchmarks.report import table, write_section
     from leaderboards import write_record
-    from robotics_bridge.policies import report
+    from robotics_bridge.policies import report, student_figure
 
     results = report.read_results(options.lay_out, at_least=options.at_least)
     agents = report.read_agents(options.lay_out)
@@ -246,7 +247,7 @@ def lay_out(options: argparse.Namespace) -> None:
     body = "\n\n".join(parts)
     print(body)
     if options.write:
-        report.draw(results, _PICTURES / "policy-students.png", agents=agents)
+        student_figure.draw(results, _PICTURES / "policy-students.png", agents=agents)
         command = f"python -m benchmarks.policies.students --teacher {options.teacher} --config careful"
         write_section(f"Students of {options.task}", command, body, where=options.device, subject="policies")
     if options.records is not None:

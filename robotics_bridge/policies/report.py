@@ -20,7 +20,6 @@ import msgspec
 import numpy as np
 
 from brainbench.core.errors import DataError, DataFileNotFoundError, shown
-from brainbench.core.figures.style import COLORS, PALE, panels, save_figure
 from brainbench.core.files import content_hash, provenance, read_json
 from brainbench.core.provenance import Provenance
 from brainbench.core.reading.regular import reason
@@ -303,18 +302,25 @@ def _span(interval: Interval | None) -> str:
     return "" if interval is None else f" [{interval.low:.3f}, {interval.high:.3f}]"
 
 
+def sense(config: DistillConfig) -> tuple[str, str, str, str]:
+    """Return placement, resolution, noise and encoder of a student's touch in words; dashes without touch."""
+    tactile = config.tactile
+    if tactile is None:
+        return "–", "–", "–", "–"
+    learning = f" ({tactile.learning})" if "learning" in config.encoder_settings else ""
+    # A layout of one's own is a file; its name tells it apart.
+    resolution = Path(config.resolution).stem if config.resolution.endswith(".json") else config.resolution
+    return config.placement, resolution, "noisy" if config.noisy else "clean", tactile.arm + learning
+
+
 def rows(results: Sequence[StudentResult]) -> list[list[str]]:
     """Return the table of the results as text, in the order of :data:`COLUMNS`."""
     found = []
     for result in results:
-        config, tactile = result.config, result.config.tactile
-        where = ["–", "–", "–", "–"]
-        if tactile is not None:
-            learning = f" ({tactile.learning})" if "learning" in config.encoder_settings else ""
-            where = [config.placement, config.resolution, "noisy" if config.noisy else "clean", tactile.arm + learning]
+        config = result.config
         found.append(
             [
-                *result.world, config.felt, *where,
+                *result.world, config.felt, *sense(config),
                 _learned(result.learned) or "–", str(len(result.seeds)),
                 f"{result.value:.3f}{_span(result.interval)}",
                 "–" if result.gain is None else f"{result.gain:+.3f}{_span(result.difference)}",
@@ -460,60 +466,3 @@ def records(results: Sequence[StudentResult]) -> list[ResultRecord]:
         )  # fmt: skip
         found.append(ResultRecord(score, card=card))
     return found
-
-
-def draw(results: Sequence[StudentResult], path: str | Path, *, agents: Sequence[Mapping[str, Any]] = ()) -> Path:
-    """Draw success and rotation with intervals, two panels per task, hand and contacts; other agents as lines.
-
-    A mark is a mean, a dot the success of one training seed.
-    """
-    groups: dict[tuple[str, str, str], list[StudentResult]] = defaultdict(list)
-    for result in results:
-        groups[result.world].append(result)
-    longest = max(len(found) for found in groups.values())
-    turning = any("turn_rate" in result.graded for result in results)
-    size = (5.4 + 3.6 * turning, (1.7 + 0.38 * longest) * len(groups))
-    figure, axes = panels(len(groups), 1 + turning, size, sharey="row")
-    for row, ((task, hand, contacts), found) in zip(axes, groups.items(), strict=True):
-        for height, result in enumerate(reversed(found)):
-            interval = result.interval
-            low, high = (result.value,) * 2 if interval is None else (interval.low, interval.high)
-            color = PALE if result.config.observe == "none" else COLORS[0]
-            marks = [(row[0], result.value, low, high)]
-            if "turn_rate" in result.graded:
-                mean, half = result.graded["turn_rate"]
-                marks.append((row[1], mean, mean - half, mean + half))
-            for axis, mean, low, high in marks:
-                axis.plot([low, high], [height, height], color=color, lw=1.5)
-                axis.plot(mean, height, "|", color=color, ms=11, mew=2)
-            row[0].plot(result.success, [height] * len(result.success), "o", color=color, ms=4, mec="white", mew=0.5)
-        # Agents of versions that did not state it were evaluated under the contacts of their students.
-        others = [item for item in agents if item["task"] == task and item.get("contacts", contacts) == contacts]
-        for number, item in enumerate(others, start=1):
-            name, color = Path(item["agent"]).name, COLORS[number % len(COLORS)]
-            label = {"zero": "no movement", "random": "random movement"}.get(name, name)
-            lines = [(row[0], item["success_rate"], *item["success_interval"])]
-            if turning and "turn_rate" in item:
-                mean, half = item["turn_rate"], item.get("turn_rate_half_width", 0.0)
-                lines.append((row[1], mean, mean - half, mean + half))
-            for axis, mean, low, high in lines:
-                axis.axvline(mean, color=color, lw=1, ls=(0, (4, 2)), label=label)
-                axis.axvspan(low, high, color=color, alpha=0.15, lw=0)
-        row[0].set_yticks(range(len(found)), [_label(result) for result in reversed(found)])
-        row[0].set_xlabel("share of successful episodes")
-        row[0].set_title(f"task {task}, hand {hand}, contacts {contacts}")
-        if turning:
-            row[1].set_xlabel("rotation about the axis (rad/s)")
-        if others:
-            place = {"loc": "upper left", "bbox_to_anchor": (0, -0.18), "ncols": len(others)}
-            row[0].legend(fontsize=8.5, frameon=False, **place)
-    return save_figure(figure, Path(path), dpi=130)
-
-
-def _label(result: StudentResult) -> str:
-    config, tactile = result.config, result.config.tactile
-    seeds = f"{len(result.seeds)} seeds" if len(result.seeds) > 1 else "one seed"
-    if tactile is None:
-        return f"{config.felt}\n{seeds}"
-    noise = ", noisy" if config.noisy else ""
-    return f"{config.felt}, {config.placement}, {config.resolution}{noise}\n{tactile.arm}, {seeds}"

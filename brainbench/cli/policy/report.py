@@ -49,7 +49,9 @@ def report(
     first = columns.index("success")
     text = table(title, columns, rows, right=tuple(range(first, len(columns))))
     if picture is not None:
-        students.draw(results, picture, agents=agents)
+        from robotics_bridge.policies.student_figure import draw
+
+        draw(results, picture, agents=agents)
     written = []
     if records is not None:
         from leaderboards import write_record

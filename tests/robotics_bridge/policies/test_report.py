@@ -19,13 +19,13 @@ from robotics_bridge.policies.report import (
     agent_rows,
     command,
     concise,
-    draw,
     read_agents,
     read_results,
     records,
     remarks,
     rows,
 )
+from robotics_bridge.policies.student_figure import draw
 from robotics_bridge.policies.training.distill_config import DistillConfig
 from robotics_bridge.tasks.task import TASK_VERSION
 
