@@ -1,23 +1,20 @@
-"""Speed of the dexterous tasks and the campaign that trains their teachers, on one GPU or on processors.
+"""Speed of the dexterous tasks, of their teachers and students, on one GPU or on processors.
 
     python -m benchmarks.policies.tasks --part speed --device cuda --out $OUT  # environment steps/s per task and sense
     python -m benchmarks.policies.tasks --part split --device cuda --out $OUT       # a PPO iteration in its parts
     # an iteration of a student in its parts
     python -m benchmarks.policies.tasks --part student --device cuda --out $OUT
-    python -m benchmarks.policies.tasks --part teacher --device cuda --out $OUT --minutes 7.5 [--resume FOLDER]
-        [--start RUN --start-std 0.5] [--change is_dropped=-300 goal.start_threshold=0.4 entropy=0]
     python -m benchmarks.policies.tasks --part tables --out FOLDER --write          # lay out what was measured
 
-Every row is printed and appended to ``$OUT/policy.jsonl`` when it is measured; small sizes come first. The teacher
-keeps ``$OUT/teacher-<task>/``: log.jsonl, small checkpoints of every save, and what it needs to go on; at the end it is
-held against the agents zero and random over three seeds. Needs torch, warp, mujoco, mujoco_warp, rsl_rl, tensordict.
+Every row is printed and appended to ``$OUT/policy.jsonl`` when it is measured; small sizes come first. Needs torch,
+warp, mujoco, mujoco_warp, rsl_rl, tensordict. Teachers are trained by ``brainbench policy train``; teachers.py lays them
+out.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
-import shutil
 import tempfile
 import time
 from collections.abc import Callable
@@ -30,9 +27,7 @@ import torch
 from benchmarks.report import table, write_section
 from robotics_bridge import tasks
 from robotics_bridge.envs import Env
-from robotics_bridge.policies.evaluate import agent, evaluate
 from robotics_bridge.policies.training import teacher
-from robotics_bridge.tasks.overrides import apply_overrides
 
 SENSES = ("none", "force_torque", "encoder-small", "encoder")
 ENCODERS = {"encoder-small": "zhuang-intersection-ln-small", "encoder": "zhuang-intersection-ln"}
@@ -235,49 +230,6 @@ def profiled(work: Callable[[], Any], device: str) -> None:
     print(found.key_averages().table(sort_by=by, row_limit=24, max_name_column_width=70), flush=True)
 
 
-def train(options: argparse.Namespace, out: Path) -> None:
-    """Train a teacher for some minutes, then hold it against zero and random."""
-    (name,) = options.tasks[:1]
-    envs = options.envs[-1]
-    task = apply_overrides(tasks.load(name, options.config), options.change)
-    run = out / f"teacher-{name}"
-    if options.resume and not run.exists():
-        shutil.copytree(options.resume, run)
-    env = tasks.make(task, num_envs=envs, device=options.device, seed=options.seed)
-    put(out, {"part": "teacher", "task": name, "config": options.config, "changes": options.change})
-    began = time.perf_counter()
-
-    def tell(iteration: int, _total: int, _word: str) -> None:
-        if iteration % 10 == 0:
-            with (run / "log.jsonl").open(encoding="utf-8") as file:
-                row = json.loads(file.readlines()[-1])
-            kept = ("iteration", "steps", "reward", "curiosity", "std", "threshold", "learning_rate", "collect_s")
-            kept += ("learn_s", "episode/return", "episode/success")
-            kept += ("episode/metric", "episode/length", "episode/diverged")
-            put(
-                out, {"part": "teacher", "task": name, "s": time.perf_counter() - began} | {k: row.get(k) for k in kept}
-            )
-
-    settings = replace(task.teacher, num_envs=envs)
-    extent = teacher.TeacherRun(
-        iterations=options.iterations, minutes=options.minutes, seed=options.seed,
-        start=options.start, start_std=options.start_std,
-    )  # fmt: skip
-    result = teacher.train(env, run, extent, settings=settings, progress=tell)
-    put(out, {"part": "teacher", "task": name, "iterations": result.iterations, "control_steps": result.steps})
-    kept = sorted(run.glob("model_*.safetensors"), key=lambda path: int(path.stem.split("_")[1]))
-    for path in kept[:-2]:
-        path.unlink()
-    if not options.episodes:
-        return
-    env = tasks.make(task, num_envs=min(envs, 512), device=options.device, seed=options.seed + 1)
-    for who, act in (
-        ("teacher", teacher.load_teacher(run, env)), ("zero", agent("zero", env)), ("random", agent("random", env)),
-    ):  # fmt: skip
-        found = evaluate(env, act, episodes=options.episodes, seed=(0, 1, 2), name=who)
-        put(out, {"part": "evaluation", "control_steps": result.steps} | found.summary())
-
-
 def tables(options: argparse.Namespace, out: Path) -> None:
     """Print tables of the rows in a folder; ``--write`` puts them into RESULTS.md."""
     rows = [json.loads(line) for line in (out / "policy.jsonl").read_text(encoding="utf-8").splitlines()]
@@ -304,26 +256,17 @@ def tables(options: argparse.Namespace, out: Path) -> None:
     ]
     if learned:
         parts.append(table([name.replace("_", " ") for name in columns], learned))
-    found = []
-    for r in (row for row in rows if row["part"] == "evaluation"):
-        interval = "{:.3f}–{:.3f}".format(*r["success_interval"])
-        value = f"{r['returns']:.3g} ± {r['returns_half_width']:.2g}"
-        line = [r["task"], r["agent"], f"{r.get('control_steps', 0):,}", str(r["episodes"])]
-        found.append([*line, f"{r['success_rate']:.3f}", interval, f"{r['metric']:.3g}", value])
-    if found:
-        columns = ["task", "agent", "control steps", "episodes", "success", "95 %", "metric", "return"]
-        parts.append(table(columns, found))
     body = "\n\n".join(parts)
     print(body)
     if options.write:
         devices = sorted({r["device"] for r in rows if "device" in r})
-        title = f"Dexterous tasks: speed and teachers ({', '.join(devices) or 'processors'})"
+        title = f"Dexterous tasks: speed ({', '.join(devices) or 'processors'})"
         write_section(title, f"python -m benchmarks.policies.tasks --device {options.device}", body, subject="policies")
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--part", choices=["speed", "split", "student", "teacher", "tables"], required=True)
+    parser.add_argument("--part", choices=["speed", "split", "student", "tables"], required=True)
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--out", type=Path, default=Path("policy-bench"))
     parser.add_argument("--tasks", nargs="+", default=["in_palm_rotate", "in_hand_repose", "screwdriver"])
@@ -333,24 +276,14 @@ def main() -> None:
     parser.add_argument("--repeats", type=int, default=20)
     parser.add_argument("--felt", nargs="+", default=list(FELT), choices=list(FELT), help="of students")
     parser.add_argument("--profile", choices=list(FELT), help="also print what this student's time goes into")
-    parser.add_argument("--minutes", type=float, default=7.5)
-    parser.add_argument("--iterations", type=int, default=1_000_000)
-    parser.add_argument("--episodes", type=int, default=512, help="per seed; 0 does not evaluate")
-    parser.add_argument("--config", default="default")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--resume", type=Path, help="folder teacher-<task> of an earlier machine")
-    parser.add_argument("--start", type=Path, help="another run or model, whose networks a new teacher begins with")
-    parser.add_argument("--start-std", type=float, help="standard deviation of its actions to begin with")
-    parser.add_argument("--change", nargs="*", default=[], help="name=value, see robotics_bridge.tasks.overrides")
     parser.add_argument("--write", action="store_true")
     options = parser.parse_args()
     options.envs = options.envs or ([1024, 8192] if options.device != "cpu" else [16, 64])
     options.out.mkdir(parents=True, exist_ok=True)
     if options.device == "cpu":
         torch.set_num_threads(1)
-    {"speed": speed, "split": split, "student": student, "teacher": train, "tables": tables}[options.part](
-        options, options.out
-    )
+    {"speed": speed, "split": split, "student": student, "tables": tables}[options.part](options, options.out)
 
 
 if __name__ == "__main__":

@@ -1,14 +1,10 @@
-"""Tables and picture of teachers: of in_palm_rotate with three seeds, and first ones of other tasks.
+"""Tables and picture of teachers: of in_palm_rotate with three seeds, and those of other tasks.
 
-    brainbench policy evaluate in_palm_rotate RUN --config careful --episodes 102 --envs 34 --seeds 3 --out FILE
-    python -m benchmarks.policies.teachers --evaluated ENGINE=FILE … [--curves SEED=LOG.csv …] [--notes FILE] [--write]
+    brainbench policy evaluate TASK RUN … --episodes 102 --envs 34 --seeds 3 --out FILE
+    python -m benchmarks.policies.teachers --evaluated ENGINE=FILE … [--curves NAME=LOG.csv …] [--notes FILE] [--write]
 
-is the section of the teacher of in_palm_rotate: its evaluations, kept in ``records``, and how it learned.
-
-    python -m benchmarks.policies.teachers --first TASK=FOLDER … [--notes FILE] [--write]
-
-is the section of first teachers, one run per task, with what their episodes of training were like on the way. A folder
-is what ``--out`` named.
+is the section of the teacher of in_palm_rotate: its evaluations, kept in ``records``, and how it learned. With
+``--others`` it is that of the other tasks: evaluations, and what episodes of training were like on the way.
 """
 
 from __future__ import annotations
@@ -33,10 +29,6 @@ GOALS = {"success": 0.85, "quarter turns": 5.0, "dropped": 0.15}
 """What the teacher should reach, as the picture marks it."""
 
 
-def lines(path: Path) -> list[dict[str, Any]]:
-    return [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
-
-
 def pairs(words: list[str]) -> dict[str, str]:
     return {name: value for name, _, value in (word.rpartition("=") for word in words)}
 
@@ -45,36 +37,34 @@ def share(found: dict[str, Any]) -> str:
     return "{:.3f} [{:.3f}, {:.3f}]".format(found["success_rate"], *found["success_interval"])
 
 
-def first(runs: dict[str, Path]) -> str:
-    """One row per task and agent, and one per task and moment of training."""
+def logged(path: Path) -> list[dict[str, float]]:
+    """Return the rows of a log.csv; NaN where nothing stands."""
+    with path.open(encoding="utf-8", newline="") as stream:
+        return [{key: float(value or "nan") for key, value in row.items()} for row in csv.DictReader(stream)]
+
+
+def others(files: dict[str, Path], curves: dict[str, Path]) -> str:
+    """One row per task, engine and agent, and one per run and moment of training."""
     found, way = [], []
-    for task, folder in runs.items():
-        (log,) = folder.glob("teacher-*/log.jsonl")
-        logged = lines(log)
-        minutes = sum(row["collect_s"] + row["learn_s"] for row in logged) / 60
-        for row in (row for row in lines(folder / "policy.jsonl") if row["part"] == "evaluation"):
-            trained = row["agent"] == "teacher"
-            steps = [f"{row['control_steps'] / 1e6:.1f}e6", f"{minutes:.1f}"] if trained else ["–", "–"]
-            names = ("metric", "seconds", "returns")
-            found.append(
-                [task, row["agent"], *steps, share(row)]
-                + [f"{row[name]:.2f} ± {row[f'{name}_half_width']:.2f}" for name in names]
-            )
-        rows = [row for row in logged if row.get("episode/episodes")]
+    names = ("metric", "seconds", "dropped")
+    for engine, file in files.items():
+        for row in json.loads(file.read_text(encoding="utf-8")):
+            means = [f"{row[name]:.2f} ± {row[f'{name}_half_width']:.2f}" for name in names]
+            found.append([row["task"], engine, Path(row["agent"]).name, str(row["episodes"]), share(row), *means])
+    for name, path in curves.items():
+        rows = [row for row in logged(path) if row["episode/episodes"] > 0]
         # Powers of two show where it stopped changing.
         numbers = [2**power for power in range(3, 12) if 2**power < len(rows) - _SMOOTH / 2] + [len(rows)]
         for number in numbers:
             own = rows[max(number - _SMOOTH, 0) : number]
             weights = [row["episode/episodes"] for row in own]
-            keys = ("episode/success", "episode/metric", "episode/length", "episode/return")
-            means = [float(np.average([row[key] for row in own], weights=weights)) for key in keys]
-            means[2] *= STEP
-            way.append(
-                [task, f"{own[-1]['steps'] / 1e6:.1f}e6", f"{means[0]:.3f}"]
-                + [f"{value:.2f}" for value in (*means[1:], own[-1]["std"])]
-            )
-    columns = ["task", "agent", "control steps", "minutes", "success", "goals, or rad turned", "s", "return"]
-    moments = ["task", "control steps", "success in training", "goals, or rad turned", "s", "return", "action std"]
+            keys = ("episode/success", "episode/metric", "episode/length")
+            won, metric, length = (float(np.average([row[key] for row in own], weights=weights)) for key in keys)
+            width = f"{own[-1]['threshold']:.2f}" if "threshold" in own[-1] else "–"
+            steps, seconds, spread = f"{own[-1]['steps'] / 1e6:.1f}e6", f"{STEP * length:.2f}", f"{own[-1]['std']:.2f}"
+            way.append([name, steps, f"{won:.3f}", f"{metric:.2f}", seconds, width, spread])
+    columns = ["task", "engine", "agent", "episodes", "success", "goals, or rad turned", "s", "dropped"]
+    moments = ["run", "control steps", "success in training", "goals, or rad turned", "s", "goal, rad", "action std"]
     return f"{table(columns, found)}\n\n{table(moments, way)}"
 
 
@@ -104,8 +94,7 @@ def draw(curves: dict[str, Path]) -> None:
     """Draw success, quarter turns and drops of the episodes of training over control steps, a line a seed."""
     figure, (axes,) = panels(1, 3, (11.0, 3.2))
     for color, (seed, path) in zip(COLORS, curves.items(), strict=False):
-        with path.open(encoding="utf-8", newline="") as stream:
-            rows = [{key: float(value or "nan") for key, value in row.items()} for row in csv.DictReader(stream)]
+        rows = logged(path)
         parts = [rows[at : at + _SMOOTH] for at in range(0, len(rows) - _SMOOTH + 1, _SMOOTH)]
         steps = [part[-1]["steps"] / 1e6 for part in parts]
         # The penalty of a drop, -200, is counted as a sum over the episode in control steps of 25 ms.
@@ -126,32 +115,31 @@ def draw(curves: dict[str, Path]) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--evaluated", nargs="+", default=[])
-    parser.add_argument("--first", nargs="+", default=[], help="one run per task, in place of --evaluated")
-    parser.add_argument("--curves", nargs="*", default=[], help="log.csv of each seed")
+    parser.add_argument("--evaluated", nargs="+", required=True)
+    parser.add_argument("--others", action="store_true", help="of other tasks than in_palm_rotate")
+    parser.add_argument("--curves", nargs="*", default=[], help="log.csv of each run")
     parser.add_argument("--notes", type=Path, help="text that follows the table")
     parser.add_argument("--device", default="one NVIDIA H200 per run")
     parser.add_argument("--write", action="store_true")
     options = parser.parse_args()
-    if bool(options.evaluated) == bool(options.first):
-        parser.error("give --evaluated or --first")
-    found = {name: Path(path) for name, path in pairs(options.evaluated or options.first).items()}
-    text = evaluated(found) if options.evaluated else first(found)
+    files, curves = ({name: Path(path) for name, path in pairs(words).items()} for words in
+                     (options.evaluated, options.curves))  # fmt: skip
+    text = others(files, curves) if options.others else evaluated(files)
     if options.notes:
         text += "\n\n" + options.notes.read_text(encoding="utf-8").strip()
     print(text)
-    if options.write and options.evaluated:
-        draw({seed: Path(path) for seed, path in pairs(options.curves).items()})
-        command = (
-            "brainbench policy evaluate in_palm_rotate in_palm_rotate.teacher --config careful --out FILE; "
-            "python -m benchmarks.policies.teachers --evaluated ENGINE=FILE … --curves SEED=LOG.csv … --write"
-        )
-        write_section("Teacher of in_palm_rotate", command, text, where=options.device, subject="policies")
-    elif options.write:
-        command = (
-            f"python -m benchmarks.policies.tasks --part teacher --device cuda --tasks {' '.join(found)} --envs 8192 …"
-        )
-        write_section("First teachers of other tasks", command, text, where=options.device, subject="policies")
+    if not options.write:
+        return
+    title, what = "Teacher of in_palm_rotate", "in_palm_rotate in_palm_rotate.teacher --config careful"
+    if options.others:
+        title, what = "Teachers of other tasks", "TASK RUN …"
+    else:
+        draw(curves)
+    command = (
+        f"brainbench policy evaluate {what} --out FILE; python -m benchmarks.policies.teachers "
+        f"{'--others ' * options.others}--evaluated ENGINE=FILE … --curves NAME=LOG.csv … --write"
+    )
+    write_section(title, command, text, where=options.device, subject="policies")
 
 
 if __name__ == "__main__":
