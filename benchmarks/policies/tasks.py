@@ -7,8 +7,7 @@
     python -m benchmarks.policies.tasks --part tables --out FOLDER --write          # lay out what was measured
 
 Every row is printed and appended to ``$OUT/policy.jsonl`` when it is measured; small sizes come first. Needs torch,
-warp, mujoco, mujoco_warp, rsl_rl, tensordict. Teachers are trained by ``brainbench policy train``; teachers.py lays them
-out.
+warp, mujoco, mujoco_warp, rsl_rl, tensordict. Teachers: ``brainbench policy train``, laid out by teachers.py.
 """
 
 from __future__ import annotations
