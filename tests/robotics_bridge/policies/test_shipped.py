@@ -42,7 +42,7 @@ def test_every_student_reads_what_a_hand_measures_and_exports(name: str, tmp_pat
     assert kept["teacher"] in list_policies("teacher")
     assert {group for group, _ in facts["groups"]} <= set(MEASURED)
     assert f"# {name}\n" in (FOLDER / name / "README.md").read_text(encoding="utf-8")
-    assert sum(path.stat().st_size for path in (FOLDER / name).iterdir()) < 1.7e6
+    assert sum(path.stat().st_size for path in (FOLDER / name).iterdir()) < 4.5e6
     senses = {key: kept[key] for key in ("observe", "placement", "resolution", "noisy")}
     env = tasks.make(kept["task"], num_envs=2, hand=kept["hand"], threads=1, **senses)
     assert torch.isfinite(Policy(student)(env.reset())).all()
@@ -82,12 +82,16 @@ def test_learning_goes_on_from_a_shipped_teacher() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("name", "success", "goals"), [("in_palm_rotate.teacher", 0.9, 10.0), ("in_palm_rotate.student", 0.55, 2.0)]
-)
-def test_a_shipped_policy_turns_the_block_on_c_mujoco(name: str, success: float, goals: float) -> None:
-    task = with_contacts_of(tasks.load("in_palm_rotate"), [name])
+    ("name", "success", "metric"),
+    [
+        ("in_palm_rotate.teacher", 0.9, 10.0), ("in_palm_rotate.student", 0.7, 5.5), ("screwdriver.teacher", 0.8, 17.0),
+        ("in_hand_repose.teacher", 0.5, 1.2),
+    ],
+)  # fmt: skip
+def test_a_shipped_policy_does_its_task_on_c_mujoco(name: str, success: float, metric: float) -> None:
+    task = with_contacts_of(tasks.load(name.partition(".")[0]), [name])
     env = tasks.make(task, num_envs=34, seed=5, **touch_of([name]))
     found = evaluate(env, agent_of(name, env), episodes=68, seed=7)
-    # Measured: teacher 0.987 [0.967, 0.995] and 12.2 goals of 306 episodes, student 0.673 [0.619, 0.723] and 2.8.
+    # Measured over 306 episodes: the cards say it, with intervals. Goals reached, or rad turned.
     assert found.success_rate > success
-    assert found.mean("goals")[0] > goals
+    assert found.mean("metric")[0] > metric
