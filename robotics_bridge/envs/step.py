@@ -5,7 +5,7 @@ Letters: B environment, A action, K object.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
@@ -40,6 +40,10 @@ class ActionMap:
     def targets(self, action: np.ndarray) -> np.ndarray:
         """Return the targets [..., A] (rad) of actions [..., A]."""
         return np.clip(self.default + self.scale * action, self.low, self.high)
+
+    def plain(self) -> dict[str, list[Any]]:
+        """Return the map as files hold it."""
+        return {field.name: np.asarray(getattr(self, field.name)).tolist() for field in fields(self)}
 
 
 def apply_action(state: EnvState) -> None:

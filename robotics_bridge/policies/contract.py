@@ -15,8 +15,8 @@ from typing import Any
 from brainbench.core.errors import DataError, UsageError
 from brainbench.core.files import to_json
 from robotics_bridge.hands.observations import OBSERVATIONS
-from robotics_bridge.policies.fit import trained_contacts
 from robotics_bridge.policies.schema import Values
+from robotics_bridge.tasks.contact_model import CONTACTS, ContactModel
 
 RATE = (1.0, 1000.0)
 """Control steps per second [Hz]."""
@@ -93,7 +93,7 @@ class PolicyContract:
         inputs, joints = found.shapes("inputs", MOST_NUMBERS), given.texts("joints", JOINTS)
         if (numbers := sum(map(math.prod, inputs.values()))) > MOST_NUMBERS:
             raise found.error("inputs", f"at most {MOST_NUMBERS:,} numbers", numbers)
-        moved, action_map = _action_map(given.part("action_map"))
+        moved, action_map = read_action_map(given.part("action_map"))
         still = given.part("frozen")
         frozen = {name: still.number(name, *ANGLE) for name in still.values}
         if sorted((*moved, *frozen)) != sorted(joints):
@@ -126,7 +126,26 @@ class PolicyContract:
         )  # fmt: skip
 
 
-def _action_map(given: Values) -> tuple[tuple[str, ...], dict[str, tuple[float, ...]]]:
+def trained_contacts(described: Mapping[str, Any], where: str = "config.json") -> ContactModel:
+    """Return the contact model in which the policy of a ``config.json`` was trained.
+
+    Runs of versions that did not state it had the published one.
+
+    Raises:
+        DataError: a value is of another kind, or out of range.
+    """
+    if described.get("contacts") is None:
+        return CONTACTS["published"]
+    found = Values(where, described).part("contacts").fields(ContactModel)
+    plain: dict[str, Any] = {key: tuple(value) if isinstance(value, list) else value for key, value in found.items()}
+    try:
+        return ContactModel(**plain)
+    except UsageError as error:
+        raise DataError(f"{where!r} is damaged: {error}") from error
+
+
+def read_action_map(given: Values) -> tuple[tuple[str, ...], dict[str, tuple[float, ...]]]:
+    """Return the joints that actions move, and by name the numbers of each; DataError where they make no map."""
     moved = given.texts("names", JOINTS)
     ranges = {"default": ANGLE, "scale": SCALE, "low": ANGLE, "high": ANGLE}
     numbers = {name: given.numbers(name, len(moved), *ends) for name, ends in ranges.items()}

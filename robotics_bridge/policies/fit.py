@@ -9,33 +9,18 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from brainbench.core.errors import DataError, UsageError
+from robotics_bridge.policies.contract import read_action_map, trained_contacts
 from robotics_bridge.policies.schema import Values
 from robotics_bridge.policies.shipped import stored
-from robotics_bridge.tasks.contact_model import CONTACTS, ContactModel, contacts_name
+from robotics_bridge.tasks.contact_model import contacts_name
 from robotics_bridge.tasks.task import MEASURED, TASK_VERSION, Task
 
 if TYPE_CHECKING:
     from robotics_bridge.envs.env import Env
 
 _LOG = logging.getLogger(__name__)
-
-
-def trained_contacts(described: Mapping[str, Any], where: str = "config.json") -> ContactModel:
-    """Return the contact model in which the policy of a ``config.json`` was trained.
-
-    Runs of versions that did not state it had the published one.
-
-    Raises:
-        DataError: a value is of another kind, or out of range.
-    """
-    if described.get("contacts") is None:
-        return CONTACTS["published"]
-    found = Values(where, described).part("contacts").fields(ContactModel)
-    plain: dict[str, Any] = {key: tuple(value) if isinstance(value, list) else value for key, value in found.items()}
-    try:
-        return ContactModel(**plain)
-    except UsageError as error:
-        raise DataError(f"{where!r} is damaged: {error}") from error
+_SAME_ANGLE = 1e-4
+"""Difference of two rest positions that is rounding [rad]."""
 
 
 def with_contacts_of(task: Task, policies: Iterable[str]) -> Task:
@@ -69,6 +54,30 @@ def check_version(described: Mapping[str, Any], name: str) -> None:
         )
 
 
+def check_actions(described: Mapping[str, Any], env: Env, name: str) -> None:
+    """Check that an action means the target that it meant in training; raise UsageError where it does not.
+
+    Tasks and their configurations differ in the pose from which actions are counted. Earlier runs do not state theirs.
+    """
+    given = Values(name, described)
+    given = given.part("deployment") if "deployment" in described else given
+    if "action_map" not in given.values:
+        return
+    names, own = read_action_map(given.part("action_map"))
+    here = env.action_map
+    if names != here.names:
+        raise UsageError(
+            f"The policy {name!r} moves {', '.join(names)} (task {str(given.values.get('task'))[:80]!r}), and the task "
+            f"{env.task.name!r} moves {', '.join(here.names)}: take the task in which it was trained."
+        )
+    for joint, trained, rest in zip(names, own["default"], here.default.tolist(), strict=True):
+        if abs(trained - rest) > _SAME_ANGLE:
+            raise UsageError(
+                f"Actions of the policy {name!r} are counted from {joint} = {trained:g} rad, and here from {rest:g} "
+                "rad: take the task and the configuration (--config) in which it was trained."
+            )
+
+
 def check_fit(described: Mapping[str, Any], env: Env, name: str) -> None:
     """Check what the ``config.json`` of a teacher or student says against an environment.
 
@@ -77,7 +86,7 @@ def check_fit(described: Mapping[str, Any], env: Env, name: str) -> None:
 
     Raises:
         DataError: the policy is of another version of the tasks.
-        UsageError: it was trained for another hand.
+        UsageError: it was trained for another hand, or with actions that meant other targets.
     """
     check_version(described, name)
     student = described.get("distill")
@@ -87,6 +96,7 @@ def check_fit(described: Mapping[str, Any], env: Env, name: str) -> None:
             f"The policy {name!r} was trained for the hand {hand[:80]!r}; received {env.hand.name!r}: make the "
             "environment with that hand."
         )
+    check_actions(described, env, name)
     if unmeasured := [group for group, _ in described.get("groups", ()) if group not in MEASURED]:
         _LOG.warning("The student %r reads %s, which only the simulation knows.", name, ", ".join(unmeasured))
     if (own := trained_contacts(described)) != env.task.contacts:

@@ -110,7 +110,9 @@ def test_a_policy_plays_in_the_contacts_that_it_was_trained_in_unless_told_other
 
     firm = ("--change", "contacts=firm")
     assert contacts("random") == contacts("in_palm_rotate.teacher") == contacts(other, *firm) == "firm"
-    assert contacts(other) == contacts("in_palm_rotate.teacher", "--config", "published") == "published"
+    assert contacts(other) == contacts("in_palm_rotate.teacher", "--change", "contacts=published") == "published"
+    with pytest.raises(UsageError, match="counted from"):
+        contacts("in_palm_rotate.teacher", "--config", "published")
     with pytest.raises(UsageError, match="different contacts"):
         _run("evaluate", "in_palm_rotate", other, "in_palm_rotate.teacher")
 

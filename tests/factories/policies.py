@@ -57,9 +57,10 @@ def export_small(folder: Path) -> Path:
 
 
 def teacher_in(contacts: str, folder: Path) -> Path:
-    """Write a copy of the shipped teacher that says it was trained in other contacts."""
+    """Write a copy of the shipped teacher that says it was trained in other contacts, and not from where it acts."""
     shutil.copytree(FOLDER / "in_palm_rotate.teacher", folder)
     described = {**read_json(folder / "config.json"), "contacts": asdict(CONTACTS[contacts])}
+    del described["action_map"]
     write_json(folder / "config.json", described)
     return folder
 

@@ -27,7 +27,7 @@ from brainbench.cli.policy.options import (
 def list_tasks(as_json: JsonOption = False) -> None:
     """List the tasks with their success, length, observation groups, and the policies that come with the package."""
     from robotics_bridge import tasks
-    from robotics_bridge.policies.fit import trained_contacts
+    from robotics_bridge.policies.contract import trained_contacts
     from robotics_bridge.policies.shipped import list_policies, stored
     from robotics_bridge.tasks.contact_model import contacts_name
 
@@ -176,12 +176,12 @@ def evaluate(
     env = world.make(agents or (), num_envs=envs, device=device, **touch)
     contacts = contacts_name(env.task.contacts)
     names = ["zero", "random", *(name for name in agents or [] if name not in ("zero", "random"))]
+    # All are read before the first one runs: an unfit last one would else be told after minutes.
+    acting = {name: agent_of(name, env) for name in names}
     found: list[dict[str, Any]] = []
     with progress_bar() as progress:
-        for name in names:
-            result = run(
-                env, agent_of(name, env), episodes=episodes, seed=tuple(range(seeds)), name=name, progress=progress
-            )
+        for name, act in acting.items():
+            result = run(env, act, episodes=episodes, seed=tuple(range(seeds)), name=name, progress=progress)
             found.append({**result.summary(), "contacts": contacts})
     columns = {
         "agent": "{0[agent]}",

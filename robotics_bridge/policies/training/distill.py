@@ -342,7 +342,6 @@ class _Run:
 
 def describe_run(config: DistillConfig, student: TactilePolicy, env: Any) -> dict[str, Any]:
     """Return what a run's ``config.json`` holds: the student, its input, and what a robot needs to run it."""
-    actions = env.action_map
     return {
         "brainbench_student": 1,
         "task_version": TASK_VERSION,
@@ -361,7 +360,7 @@ def describe_run(config: DistillConfig, student: TactilePolicy, env: Any) -> dic
             "twist": env.task.taxel_twist,
             "contacts": asdict(env.task.contacts),
             "joints": list(env.joint_names),
-            "action_map": {key: getattr(actions, key) for key in ("names", "default", "scale", "low", "high")},
+            "action_map": env.action_map.plain(),
             "frozen": dict(env.frozen),
             "links": list(env.touch.links) if env.touch is not None else [],
         },

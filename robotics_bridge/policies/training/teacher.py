@@ -280,8 +280,8 @@ def _train(
         "kind": "teacher", "task": env.task.name, "hand": env.hand.name, "hand_path": str(env.hand.path or ""),
         "num_envs": env.num_envs, "seed": options.seed, "settings": asdict(settings), "rsl_rl": trainer.config,
         "observation_shapes": {name: list(shape) for name, shape in env.observation_shapes.items()},
-        "action_names": list(env.action_names), "start": origin, "task_version": TASK_VERSION,
-        "contacts": asdict(env.task.contacts), "observe": list(options.observe),
+        "action_names": list(env.action_names), "action_map": env.action_map.plain(), "start": origin,
+        "task_version": TASK_VERSION, "contacts": asdict(env.task.contacts), "observe": list(options.observe),
     }  # fmt: skip
     _resume(trainer, run, facts)
     writer = Loggers(run, options.loggers, facts)

@@ -13,7 +13,9 @@ import pytest
 from brainbench.core.errors import DataError, UsageError
 from brainbench.core.files import to_plain, write_json
 from robotics_bridge import tasks
-from robotics_bridge.policies.fit import check_fit, trained_contacts, with_contacts_of
+from robotics_bridge.policies.contract import trained_contacts
+from robotics_bridge.policies.fit import check_fit, with_contacts_of
+from robotics_bridge.policies.shipped import stored
 from robotics_bridge.tasks.contact_model import CONTACTS, ContactModel
 from robotics_bridge.tasks.task import TASK_VERSION
 from tests.factories.policies import teacher_in
@@ -32,6 +34,18 @@ def test_another_version_of_the_tasks_or_another_hand_is_refused() -> None:
     for described in ({"hand": "sharpa"}, {"distill": {"hand": "sharpa"}}):
         with pytest.raises(UsageError, match="'sharpa'; received 'xhand1'"):
             check_fit({"task_version": TASK_VERSION, **described}, _env(), "other")
+
+
+def test_actions_counted_from_another_pose_are_refused() -> None:
+    for name in ("in_palm_rotate.teacher", "in_palm_rotate.student"):
+        described = stored(name)
+        check_fit(described, tasks.make("in_palm_rotate", num_envs=1, threads=1), name)
+        with pytest.raises(UsageError, match=r"thumb_bend_joint = 1\.2 rad, and here from 0 rad.*--config"):
+            check_fit(described, tasks.make("in_palm_rotate", config="published", num_envs=1, threads=1), name)
+        with pytest.raises(UsageError, match="take the task in which it was trained"):
+            check_fit(described, tasks.make("screwdriver", num_envs=1, threads=1), name)
+    with pytest.raises(DataError, match="action_map"):
+        check_fit({**stored("in_palm_rotate.teacher"), "action_map": {"names": ["a"]}}, _env(), "damaged")
 
 
 def test_other_contacts_are_told(caplog: pytest.LogCaptureFixture) -> None:

@@ -8,7 +8,7 @@ import pytest
 
 from brainbench.core.errors import UsageError
 from brainbench.core.files import read_json, write_json
-from robotics_bridge.policies.fit import trained_contacts
+from robotics_bridge.policies.contract import trained_contacts
 from robotics_bridge.policies.training.distill_config import DistillConfig
 from robotics_bridge.policies.training.students import calibrated, train_student
 from robotics_bridge.tasks.contact_model import CONTACTS

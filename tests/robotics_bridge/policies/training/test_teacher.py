@@ -185,6 +185,12 @@ def test_a_folder_of_another_run_is_refused(tmp_path: Path) -> None:
 def test_a_policy_of_another_task_is_refused(tmp_path: Path) -> None:
     train(_env(), tmp_path, settings=SMALL, iterations=1)
     other = tasks.make("in_hand_repose", num_envs=2, threads=1)
+    with pytest.raises(UsageError, match=r"'in_palm_rotate'.*'in_hand_repose' moves"):
+        load_teacher(tmp_path, other)
+    # Runs that do not state their actions are told by their weights.
+    described = json.loads((tmp_path / "config.json").read_text())
+    del described["action_map"]
+    (tmp_path / "config.json").write_text(json.dumps(described))
     with pytest.raises(DataError, match=r"'in_palm_rotate' .*'in_hand_repose'"):
         load_teacher(tmp_path, other)
     with pytest.raises(DataError, match=r"/nothing' .*model_"):
