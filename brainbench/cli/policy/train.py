@@ -21,7 +21,7 @@ from brainbench.cli.policy.options import (
 
 @with_options(
     "robotics_bridge.policies.training.teacher:TeacherRun",
-    ("iterations", "minutes", "start", "start_std", "observe", "loggers", "save_every", "seed"),
+    ("iterations", "minutes", "start", "start_std", "observe", "encoder", "loggers", "save_every", "seed"),
 )
 @in_world
 def train(

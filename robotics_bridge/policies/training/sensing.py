@@ -34,7 +34,9 @@ def sensed_groups(observe: Iterable[str]) -> tuple[str, ...]:
     return tuple(found)
 
 
-def sensing_policy(env: Env, settings: TeacherSettings, seed: int, observe: tuple[str, ...]) -> DistillConfig:
+def sensing_policy(
+    env: Env, settings: TeacherSettings, seed: int, observe: tuple[str, ...], encoder: str
+) -> DistillConfig:
     """Return what a policy that reads some observations is as a student: its touch and network, and its memory.
 
     Raises:
@@ -47,7 +49,9 @@ def sensing_policy(env: Env, settings: TeacherSettings, seed: int, observe: tupl
     o, named = env.options, contacts_name(env.task.contacts)
     senses: dict[str, Any] = {"observe": "none"}
     if "touch" in observe:
-        senses = {name: getattr(o, name) for name in ("observe", "placement", "resolution", "noisy")}
+        senses = {name: getattr(o, name) for name in ("observe", "placement", "resolution", "noisy")} | {
+            "encoder": encoder
+        }
     return DistillConfig(
         task=env.task.name, hand=str(env.hand.path or env.hand.name), embedder="lstm", hidden=settings.hidden,
         num_envs=env.num_envs, seed=seed, contacts=named if named in CONTACTS else None, **senses,

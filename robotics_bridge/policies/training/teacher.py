@@ -72,7 +72,13 @@ class Trainer:
     """
 
     def __init__(
-        self, env: Env, settings: TeacherSettings | None = None, *, seed: int = 0, observe: tuple[str, ...] = ()
+        self,
+        env: Env,
+        settings: TeacherSettings | None = None,
+        *,
+        seed: int = 0,
+        observe: tuple[str, ...] = (),
+        encoder: str = "rnn",
     ) -> None:
         try:
             from rsl_rl.algorithms import PPO
@@ -81,7 +87,7 @@ class Trainer:
         self.env, self.settings = RslRlEnv(env), settings or env.task.teacher
         torch.manual_seed(seed)
         groups = {name: tuple(groups) for name, groups in env.task.groups.items()}
-        self.sensing = sensing_policy(env, self.settings, seed, observe) if observe else None
+        self.sensing = sensing_policy(env, self.settings, seed, observe, encoder) if observe else None
         """What a policy that senses is as a student; None for a teacher."""
         actor = None
         if self.sensing is not None:
@@ -106,7 +112,11 @@ class Trainer:
         self.algorithm.train_mode()
 
     def iterate(self) -> dict[str, float]:
-        """Collect steps, learn from them, and return losses, episode means and seconds spent."""
+        """Collect steps, learn from them, and return losses, episode means and seconds spent.
+
+        Raises:
+            DataError: weights are no longer numbers.
+        """
         env, algorithm, steps = self.env, self.algorithm, self.config["num_steps_per_env"]
         start = _now(env.device)
         reward = torch.zeros((), device=env.device)
@@ -121,7 +131,12 @@ class Trainer:
                     curiosity += algorithm.intrinsic_rewards.mean()
             algorithm.compute_returns(self._observations)
         collected = _now(env.device)
-        losses = algorithm.update()
+        try:
+            losses = algorithm.update()
+        except (RuntimeError, ValueError) as error:
+            self._check_weights(error)
+            raise
+        self._check_weights()
         self.iteration += 1
         row = {
             "iteration": self.iteration, "steps": self.iteration * steps * env.num_envs,
@@ -135,6 +150,16 @@ class Trainer:
         if self._curriculum:
             row["threshold"] = float(env.unwrapped.goals.threshold)
         return row | {f"episode/{name}": value for name, value in env.unwrapped.statistics().items()}
+
+    def _check_weights(self, cause: Exception | None = None) -> None:
+        weights = [weight for model in (self.algorithm.actor, self.algorithm.critic) for weight in model.parameters()]
+        # One number to wait for: a sum of norms is one only if all weights are.
+        if not bool(torch.stack(torch._foreach_norm(weights)).sum().isfinite()):
+            raise DataError(
+                f"Learning diverged: after iteration {self.iteration + 1} weights are no numbers. The last "
+                "checkpoint stands; go on from that with a smaller rate (--change learning_rate=1e-4), or begin with "
+                "another encoder."
+            ) from cause
 
     def policy(self) -> Policy:
         """Return the present actor."""
@@ -232,6 +257,9 @@ class TeacherRun:
     observe: tuple[str, ...] = ()
     """What the policy reads, with memory, in place of a teacher's groups: proprio, touch, command, …; the critic, which
     only training needs, keeps its own."""
+    encoder: str = "rnn"
+    """Network of the touch that it reads. Those with layer norm may diverge: at places that nothing touches it enlarges
+    the gradient once for each step back in time."""
     loggers: tuple[str, ...] = ("tensorboard",)
     """Loggers beside log.jsonl: tensorboard, csv (log.csv), wandb (offline)."""
 
@@ -269,7 +297,7 @@ def _train(
     env: Env, run: Path, options: TeacherRun, settings: TeacherSettings, progress: Progress | None
 ) -> TeacherResult:
     total = options.iterations or settings.iterations
-    trainer = Trainer(env, settings, seed=options.seed, observe=options.observe)
+    trainer = Trainer(env, settings, seed=options.seed, observe=options.observe, encoder=options.encoder)
     env.goals.start_curriculum()
     origin = None
     if options.start is not None and not (run / RESUME).is_file():
