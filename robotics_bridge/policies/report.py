@@ -153,7 +153,7 @@ def read_results(folders: Iterable[str | Path], *, at_least: int = 0) -> list[St
     crossed = {result.world for result in results if len(set(result.seeds)) < len(result.seeds)}
     models = {world: mixed_model([r for r in results if r.world == world]) for world in crossed}
     results = [
-        r if r.world not in models else replace(r, interval=models[r.world].mean(r.name).interval or r.interval)
+        r if r.world not in models else replace(r, interval=_share(models[r.world].mean(r.name).interval or r.interval))
         for r in results
     ]
     # With memory and without, the better of the two is what touch has to beat.
@@ -238,9 +238,14 @@ def _result(members: Sequence[_Member], left_out: tuple[LeftOut, ...]) -> Studen
     if fewest is not None and first.iterations is not None and fewest < first.iterations:
         note = "; ".join(filter(None, (note, f"{_STOPPED} {_learned(learned)} of {first.iterations} iterations")))
     return StudentResult(
-        first, seeds, tuple(shares), episodes, metric, interval, note, graded=graded, iterations=fewest,
+        first, seeds, tuple(shares), episodes, metric, _share(interval), note, graded=graded, iterations=fewest,
         learned=learned, left_out=left_out, configs=tuple(member.config for member in members),
     )  # fmt: skip
+
+
+def _share(interval: Interval | None) -> Interval | None:
+    """Return the interval of a share, which lies within 0 and 1; of few seeds a t interval goes beyond."""
+    return interval and replace(interval, low=max(interval.low, 0.0), high=min(interval.high, 1.0))
 
 
 def _learned(learned: Iterable[int | None]) -> str:

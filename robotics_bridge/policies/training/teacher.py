@@ -153,8 +153,8 @@ class Trainer:
 
     def _check_weights(self, cause: Exception | None = None) -> None:
         weights = [weight for model in (self.algorithm.actor, self.algorithm.critic) for weight in model.parameters()]
-        # One number to wait for: a sum of norms is one only if all weights are.
-        if not bool(torch.stack(torch._foreach_norm(weights)).sum().isfinite()):
+        # One number to wait for: the norm of all weights is one only if each is.
+        if not bool(torch.nn.utils.get_total_norm(weights).isfinite()):
             raise DataError(
                 f"Learning diverged: after iteration {self.iteration + 1} weights are no numbers. The last "
                 "checkpoint stands; go on from that with a smaller rate (--change learning_rate=1e-4), or begin with "

@@ -58,7 +58,9 @@ def test_success_and_gain_have_t_intervals_over_training_seeds(tmp_path) -> None
     reference = stats.ttest_1samp([0.8, 0.9, 0.7], 0).confidence_interval()
     assert felt.value == pytest.approx(0.8)
     assert felt.interval is not None
-    assert (felt.interval.low, felt.interval.high) == pytest.approx(tuple(reference))
+    # Of three seeds the interval of the mean passes 1, which no share does.
+    assert reference.high > 1
+    assert (felt.interval.low, felt.interval.high) == pytest.approx((reference.low, 1.0))
     paired = stats.ttest_rel([0.8, 0.9, 0.7], [0.5, 0.55, 0.45]).confidence_interval()
     assert felt.difference is not None
     assert (felt.difference.low, felt.difference.high) == pytest.approx(tuple(paired))
