@@ -6,6 +6,9 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, fields
 from typing import Any
 
+from brainbench.core.errors import listing
+from brainbench.core.files import content_hash
+
 
 @dataclass(frozen=True, eq=False)
 class Provenance(Mapping[str, Any]):
@@ -79,6 +82,12 @@ class Provenance(Mapping[str, Any]):
         That of their configuration is equal on every machine; the numbers differ in their last digits.
         """
         return _text(self.stimuli.get("config_hash")) or _text(self.stimuli.get("content_hash")) or None
+
+    @property
+    def pairing(self) -> str:
+        """Name of the pairing of labels that are not equal on both sides; empty where all are."""
+        other = [f"{label} = {stimulus}" for label, stimulus in self.pairs.items() if label != stimulus]
+        return f"{listing(other, limit=1)}; {content_hash(other, length=8)}" if other else ""
 
     @property
     def time_rule(self) -> str:

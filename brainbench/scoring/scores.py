@@ -87,7 +87,7 @@ def score_record(
 
     started = clock.perf_counter()
     stage_done = stages(STAGES, "scoring", progress)
-    options = ScoreOptions.of({**vars(options or ScoreOptions()), **changes})
+    options = _options(model, {**vars(options or ScoreOptions()), **changes})
     # The simulation gets ready in a thread while the network loads, if any will be needed.
     if isinstance(options.recordings, str) and options.recordings in DEMOS:
         prepare_stimuli(DEMOS[options.recordings], progress=progress)
@@ -148,6 +148,16 @@ def score_record(
     if between is not None:
         between = replace(between, brain_rdm=(), provenance=replace(origin, statistics=between.provenance.statistics))
     return ResultRecord(first, between, {item.name: item for item in others}, network.card, brain.synthetic)
+
+
+def _options(model: Any, values: Mapping[str, Any]) -> ScoreOptions:
+    """Return the options that values state; a seed that would not reach the weights is refused."""
+    from brainbench.scoring.model_responses import follows_seed
+
+    options = ScoreOptions.of(values)
+    if options.weights_seed not in (None, options.seed) and not follows_seed(model):
+        raise UsageError("weights_seed is that of untrained weights, and those of this model are given; leave it out.")
+    return options
 
 
 def _check_labels(resolved: ResolvedModel, brain: NeuralResponses, options: ScoreOptions) -> None:
