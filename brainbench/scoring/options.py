@@ -12,7 +12,7 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from brainbench.core.errors import UsageError, check_name, shown
+from brainbench.core.errors import UsageError, check_name, check_once, shown
 from brainbench.core.reading.ranges import check_fields
 
 if TYPE_CHECKING:
@@ -105,6 +105,7 @@ class ScoreOptions:
                 raise UsageError(f"{name} must be a text; received {shown(getattr(self, name))}.")
         check_fields(self, "seed", "weights_seed", least=0, whole=True)
         check_fields(self, "bin", above=0)
+        check_once("layers", self.layers or ())
         check_name("time rule", self.time, TIME_RULES)
         check_name("readout", self.readout, READOUTS)
         if self.readout == "published" and (self.time != "mean" or self.over_time):

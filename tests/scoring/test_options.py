@@ -35,6 +35,11 @@ def test_an_option_is_a_flag_with_help_a_keyword_and_a_setting(name: str):
     assert name in ELSEWHERE or name in ScoreOptions().settings
 
 
+def test_a_layer_is_named_once():
+    with pytest.raises(UsageError, match="'conv1' more than once"):
+        ScoreOptions(layers=("conv1", "fc", "conv1"))
+
+
 def test_a_wrong_keyword_is_answered_with_the_nearest():
     with pytest.raises(UsageError, match="did you mean 'metric'"):
         brainbench.score("zhuang-small", metrik="rsa")

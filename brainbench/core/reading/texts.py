@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from brainbench.core.errors import DataError, missing_dependency, shown
+from brainbench.core.errors import DataError, listing, missing_dependency, repeats, shown
 from brainbench.core.reading.regular import MOST_TEXT, check_file, readable, reason
 
 MOST_LEVELS = 64
@@ -34,12 +34,19 @@ def parse_json(text: str, name: str) -> Any:
     """Parse JSON text; ``name`` is that of its file in messages.
 
     Raises:
-        DataError: it is not valid, nested too deeply, or holds a number that is not finite or too large.
+        DataError: it is not valid, nested too deeply, names a value twice, or holds a number that is not finite or too
+            large.
     """
+
+    def unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+        if len(found := dict(pairs)) < len(pairs):
+            raise DataError(f"{shown(name)} has {listing(repeats(key for key, _ in pairs))} twice in one object.")
+        return found
+
     # Python's parser takes NaN and Infinity, which JSON does not know, and 1e400, which is infinite.
     with readable(name, "JSON"):
         try:
-            return check_values(json.loads(text), name)
+            return check_values(json.loads(text, object_pairs_hook=unique), name)
         except json.JSONDecodeError as error:
             raise DataError(f"{shown(name)} is not valid JSON ({reason(error)}).") from error
 

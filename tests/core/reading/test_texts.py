@@ -17,6 +17,7 @@ from brainbench.core.reading.texts import parse_json, parse_toml, read_mapping
         ("[" * 100_000, "deep"),
         ('{"a": ["\\ud800"]}', r"a\[0\]"),
         ('{"\\udfff": 1}', "file"),
+        ('[{"a": {"b": 1, "c": 2, "b": 1}}]', "'b' twice"),
     ],
 )
 def test_json_is_bounded_in_digits_depth_and_range(text, told):
