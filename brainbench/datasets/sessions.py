@@ -292,17 +292,21 @@ def _label(value: Any) -> str:
     return str(value).strip()
 
 
+def as_number(text: str) -> float:
+    """Return the number that a text states; NaN where it states none."""
+    try:
+        return float(text)
+    except ValueError:
+        return math.nan
+
+
 def natural_key(label: str) -> tuple[Any, ...]:
     """Return a sort key that puts numbers in numeric order, alone or inside text.
 
     >>> sorted(["10", "9", "b10", "b2"], key=natural_key)
     ['9', '10', 'b2', 'b10']
     """
-    try:
-        number = float(label)
-    except ValueError:
-        number = math.nan
-    if math.isfinite(number):
+    if math.isfinite(number := as_number(label)):
         return (0, number, (), label)
     # The odd parts are the digits; the label itself keeps "01" and "1" apart.
     parts = re.split(r"(\d+)", label)

@@ -17,7 +17,9 @@ CONTACTS = re.compile(r"^(?:.*/)?contacts_by_whisker_(?P<whisker>\w+)$")
 """Names of the interval tables that hold one whisker's contacts."""
 _ANCHORS = {"start": "start_time", "stop": "stop_time", "choice": "choice_time"}
 # The name is matched lazily, so that it may hold a hyphen (first-contact) and yet leaves a signed number at the end.
-_EDGE = re.compile(r"^(?P<name>.*?)(?P<offset>[+-]\d*\.?\d+)?$")
+_EDGE = re.compile(r"^(?P<name>.*?)(?P<offset>[+-](\d+\.?\d*|\.\d+)(e[+-]?\d+)?)?$", re.IGNORECASE)
+_NO_NAME = re.compile(r"[+−–]|\.\.|^-|-(inf|infinity|nan)$", re.IGNORECASE)
+"""Signs of a number that was not read: no event has them in its name."""
 
 _UNITS = {"s": 1.0, "sec": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6}
 _WITH_UNIT = re.compile(r"(?P<number>[+-]\d*\.?\d+) ?(?P<unit>s|sec|ms|us|µs)$", re.IGNORECASE)
@@ -82,6 +84,12 @@ class Window:
                 f"The window {shown(source)} cannot be read; write FROM..TO or FROM..+SECONDS, such as "
                 f"'first-contact..choice' or 'start+0.2..+0.5'."
             )
+        for edge in (begin["name"], end["name"]):
+            if _NO_NAME.search(edge):
+                raise UsageError(
+                    f"The window {shown(source)} has {shown(edge)} where an event stands, such as 'choice', or a "
+                    f"finite number of seconds after its sign, such as 'choice-0.5' or '+0.5'."
+                )
         window = {"anchor": begin["name"], "offset": float(begin["offset"] or 0)}
         if end["name"]:
             return cls(**window, stop=end["name"], stop_offset=float(end["offset"] or 0))

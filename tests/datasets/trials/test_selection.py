@@ -60,7 +60,22 @@ def test_rules_are_read_from_text():
 
 @pytest.mark.parametrize(
     ("source", "message"),
-    [("outcome", "cannot be read"), ("depth!=1..2", "range cannot be refused"), ("min_spikes=few", "whole number")],
+    [
+        ("outcome", "cannot be read"),
+        ("depth!=1..2", "range cannot be refused"),
+        ("min_spikes=few", "whole number"),
+        ("outcome=|", "'outcome' has an empty value"),
+        ("outcome=correct|", "'outcome' has an empty value"),
+        ("units.layer!=|", "'layer' has an empty value"),
+        ("depth=..", "'depth' has an empty value"),
+        ("depth=5..2", "depth=5..2 keeps nothing"),
+        ("subjects=|", "subjects are names"),
+        ("subjects=m1|", "subjects are names"),
+        ("subjects!=m1", "subjects is written subjects="),
+        ("min_spikes!=5", "min_spikes is written min_spikes="),
+        ("subjects=m1; subjects=m2", "'subjects' more than once"),
+        ("min_spikes=5; min_spikes=9", "'min_spikes' more than once"),
+    ],
 )
 def test_unreadable_rules_show_the_form(source, message):
     with pytest.raises(UsageError, match=message):
