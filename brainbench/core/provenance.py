@@ -32,8 +32,8 @@ class Provenance(Mapping[str, Any]):
     ``config_hash`` of the demo, which names it on every machine."""
     stimuli: Mapping[str, Any] = field(default_factory=dict)
     """``description``, ``content_hash``, ``config_hash`` and ``backend``; empty for features computed elsewhere."""
-    pairs: Mapping[str, str] = field(default_factory=dict)
-    """Recording label → stimulus label."""
+    pairs: Mapping[str, str | None] = field(default_factory=dict)
+    """Recording label → stimulus label; None for one that was dropped."""
     settings: Mapping[str, Any] = field(default_factory=dict)
     """Options of the run, from which the same score can be computed again."""
     statistics: Mapping[str, Any] = field(default_factory=dict)
@@ -86,7 +86,7 @@ class Provenance(Mapping[str, Any]):
     @property
     def pairing(self) -> str:
         """Name of the pairing of labels that are not equal on both sides; empty where all are."""
-        other = [f"{label} = {stimulus}" for label, stimulus in self.pairs.items() if label != stimulus]
+        other = [f"{label} = {stimulus}" for label, stimulus in self.pairs.items() if stimulus not in (None, label)]
         return f"{listing(other, limit=1)}; {content_hash(other, length=8)}" if other else ""
 
     @property

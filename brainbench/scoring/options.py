@@ -41,7 +41,8 @@ class ScoreOptions:
     """Options of scoring a model against recordings.
 
     Raises:
-        UsageError: an unknown rule for time or readout, or a reliability outside (−1, 1).
+        UsageError: an unknown rule for time or readout, a reliability outside (−1, 1), no layer among ``layers``, or
+            a choice of trials or bins for recordings in memory, which are counted.
     """
 
     recordings: str | os.PathLike[str] | Sequence[str | os.PathLike[str]] | xr.Dataset = "demo"
@@ -105,7 +106,13 @@ class ScoreOptions:
                 raise UsageError(f"{name} must be a text; received {shown(getattr(self, name))}.")
         check_fields(self, "seed", "weights_seed", least=0, whole=True)
         check_fields(self, "bin", above=0)
+        if self.layers is not None and not self.layers:
+            raise UsageError("layers names none; leave it out for all.")
         check_once("layers", self.layers or ())
+        if not isinstance(self.recordings, (str, os.PathLike, Sequence)):
+            for name in ("conditions", "select", "window", "bin"):
+                if getattr(self, name) is not None:
+                    raise UsageError(f"Recordings in memory are counted already, so {name} cannot apply; leave it out.")
         check_name("time rule", self.time, TIME_RULES)
         check_name("readout", self.readout, READOUTS)
         if self.readout == "published" and (self.time != "mean" or self.over_time):
@@ -127,7 +134,7 @@ class ScoreOptions:
             isinstance(layers, (list, tuple)) and all(isinstance(name, str) for name in layers)
         ):
             raise UsageError(f"layers must be a list of names; received {shown(layers)}.")
-        return cls(**{**values, "layers": tuple(layers) if layers else None})
+        return cls(**{**values, "layers": None if layers is None else tuple(layers)})
 
     @classmethod
     def stated_in(cls, settings: Mapping[str, Any], **others: Any) -> ScoreOptions:

@@ -103,7 +103,7 @@ def score_record(
     stage_done()
     # Recordings name the stimuli that the animals felt; the caller's choice goes first.
     options = replace(options, stimuli=brain.stimuli if options.stimuli is None else options.stimuli)
-    _check_labels(resolved, brain, options)
+    _check_inputs(resolved, brain, options)
     network = resolved.respond(options, progress=progress)
     stage_done()
     pairs = brain.pairs(network.labels, options.match)
@@ -122,7 +122,7 @@ def score_record(
         provenance(
             **network.origin,
             recordings=brain.origin,
-            pairs=pairs,
+            pairs=brain.stated_pairs(pairs),
             settings=options.settings | settings,
             seconds=round(clock.perf_counter() - started, 2),
             **({"command": command} if command else {}),
@@ -160,11 +160,15 @@ def _options(model: Any, values: Mapping[str, Any]) -> ScoreOptions:
     return options
 
 
-def _check_labels(resolved: ResolvedModel, brain: NeuralResponses, options: ScoreOptions) -> None:
-    """Refuse labels that do not match before anything is simulated, where they are known by then."""
+def _check_inputs(resolved: ResolvedModel, brain: NeuralResponses, options: ScoreOptions) -> None:
+    """Refuse what does not fit before anything is simulated: labels, where they are known by then."""
     from brainbench.scoring.model_responses import DEFAULT_STIMULI
     from brainbench.stimuli.sources import known_labels
 
+    if brain.published and options.estimator != "default" and options.units_reliability is not None:
+        raise UsageError(
+            f"The estimator {options.estimator!r} takes all units of a published file; leave out units_reliability."
+        )
     source = DEFAULT_STIMULI if options.stimuli is None else options.stimuli
     if resolved.labels is not None or (shown := known_labels(source)) is None:
         return

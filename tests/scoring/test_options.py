@@ -36,6 +36,8 @@ def test_an_option_is_a_flag_with_help_a_keyword_and_a_setting(name: str):
 
 
 def test_a_layer_is_named_once():
+    with pytest.raises(UsageError, match="layers names none"):
+        ScoreOptions.of({"layers": []})
     with pytest.raises(UsageError, match="'conv1' more than once"):
         ScoreOptions(layers=("conv1", "fc", "conv1"))
 

@@ -205,7 +205,7 @@ def missing(jobs: Sequence[ScoringJob], records: Iterable[ResultRecord]) -> list
         # Features with labels of their own were made of stimuli that nobody here knows.
         felt = None if model.labels else stimuli.config_hash or stimuli.content_hash
         pairs = brain.pairs(model.labels or stimuli.labels, job.options.match)
-        asked = [pairs, job.options.title, job.options.explain]
+        asked = [brain.stated_pairs(pairs), job.options.title, job.options.explain]
         given = [model.card.name, model.card.weights, brain.origin["content_hash"], felt, *asked]
         wanted = [*given, __version__, ESTIMATOR_VERSION]
         if to_json([*wanted, full_settings(job.options.settings, without=_IN_HASHES)]) not in known:
