@@ -139,8 +139,12 @@ class ScoreOptions:
     @classmethod
     def stated_in(cls, settings: Mapping[str, Any], **others: Any) -> ScoreOptions:
         """Return the options that the settings of a provenance state, and others that they do not hold."""
+        from brainbench.stimuli.sources import is_finished
+
         known = {item.name for item in fields(cls)} - {*_ELSEWHERE}
         stated = {name: value for name, value in settings.items() if name in known and value is not None}
+        if is_finished(stated.get("stimuli", "")):  # of an earlier record, which states one all the same
+            stated.pop("fidelity", None)
         if isinstance(stated.get("fidelity"), Mapping):  # of the caller's own: its fields, as JSON states a dataclass
             from brainbench.stimuli import Fidelity
 
@@ -164,11 +168,15 @@ class ScoreOptions:
 
     @property
     def settings(self) -> dict[str, Any]:
-        """Options as a record states them: texts and numbers."""
+        """Options as a record states them: texts and numbers; no fidelity for finished stimuli."""
+        from brainbench.stimuli.sources import is_finished
+
         stated = {item.name: getattr(self, item.name) for item in fields(self) if item.name not in _ELSEWHERE}
         # Stimuli in memory have no name; their hash stands in the provenance.
         named = isinstance(self.stimuli, (str, os.PathLike, type(None)))
         texts = {"select": self.select, "window": self.window, "stimuli": self.stimuli if named else "data"}
         stated |= {name: value if value is None else str(value) for name, value in texts.items()}
         metric = self.metric if isinstance(self.metric, str) else self.metric.name
-        return stated | {"fidelity": self.fidelity or "balanced", "metric": metric, "weights_seed": self.model_seed}
+        finished = self.stimuli is not None and is_finished(self.stimuli)
+        fidelity = None if finished else self.fidelity or "balanced"
+        return stated | {"fidelity": fidelity, "metric": metric, "weights_seed": self.model_seed}

@@ -151,12 +151,15 @@ def score_record(
 
 
 def _options(model: Any, values: Mapping[str, Any]) -> ScoreOptions:
-    """Return the options that values state; a seed that would not reach the weights is refused."""
+    """Return the options that values state; a seed or a fidelity that would reach nothing is refused."""
     from brainbench.scoring.model_responses import follows_seed
+    from brainbench.stimuli.sources import is_finished
 
     options = ScoreOptions.of(values)
     if options.weights_seed not in (None, options.seed) and not follows_seed(model):
         raise UsageError("weights_seed is that of untrained weights, and those of this model are given; leave it out.")
+    if options.stimuli is not None and is_finished(options.stimuli) and options.fidelity not in (None, "balanced"):
+        raise UsageError("fidelity is that of a simulation, and these stimuli are finished; leave it out.")
     return options
 
 

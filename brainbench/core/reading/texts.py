@@ -82,7 +82,7 @@ def read_yaml(path: str | os.PathLike[str], kind: str = "file") -> Any:
 
     Raises:
         DataFileNotFoundError: there is no such file.
-        DataError: it cannot be parsed, repeats values by alias, or see :func:`parse_json`.
+        DataError: it cannot be parsed, repeats values by alias or names, or see :func:`parse_json`.
         MissingDependencyError: no reader of YAML is installed.
     """
     try:
@@ -100,9 +100,20 @@ def read_yaml(path: str | os.PathLike[str], kind: str = "file") -> Any:
                     raise DataError(f"{shown(name)} is nested too deeply: more than {MOST_LEVELS} levels.")
                 if isinstance(event, yaml.AliasEvent):
                     raise DataError(f"{shown(name)} repeats values by alias (*name); write them out instead.")
+            _check_keys(yaml.compose(text, yaml.SafeLoader), name)
             return check_values(yaml.safe_load(text), name)
         except yaml.YAMLError as error:
             raise DataError(f"{shown(name)} is not valid YAML ({reason(error)}).") from error
+
+
+def _check_keys(node: Any, name: str) -> None:
+    """Raise DataError if a mapping inside a node of YAML has a key twice."""
+    inside = node.value if node is not None and node.id != "scalar" else []
+    pairs = inside if inside and node.id == "mapping" else [(None, item) for item in inside]
+    if twice := repeats(key.value for key, _ in pairs if key is not None and key.id == "scalar"):
+        raise DataError(f"{shown(name)} has {listing(twice)} twice in one mapping.")
+    for _, item in pairs:
+        _check_keys(item, name)
 
 
 def read_mapping(path: str | os.PathLike[str], kind: str = "file") -> dict[str, Any]:

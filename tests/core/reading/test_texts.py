@@ -45,6 +45,7 @@ def test_the_ending_tells_the_language_and_aliases_are_refused(tmp_path):
     for text, told in (
         (laughs, "alias"),
         ("a: .nan", "nan"),
+        ("x: [{b: 1, c: 2, b: 3}]", "'b' twice"),
         ("a: " + "[" * 50_000, "deep"),
         ("a: [", "YAML"),
     ):
