@@ -108,8 +108,9 @@ def read_yaml(path: str | os.PathLike[str], kind: str = "file") -> Any:
 
 def _check_keys(node: Any, name: str) -> None:
     """Raise DataError if a mapping inside a node of YAML has a key twice."""
-    inside = node.value if node is not None and node.id != "scalar" else []
-    pairs = inside if inside and node.id == "mapping" else [(None, item) for item in inside]
+    if node is None or node.id == "scalar":
+        return
+    pairs = node.value if node.id == "mapping" else [(None, item) for item in node.value]
     if twice := repeats(key.value for key, _ in pairs if key is not None and key.id == "scalar"):
         raise DataError(f"{shown(name)} has {listing(twice)} twice in one mapping.")
     for _, item in pairs:
