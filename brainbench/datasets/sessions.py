@@ -279,10 +279,11 @@ def as_labels(values: NDArray[Any]) -> NDArray[np.str_]:
     if not len(values):
         return np.zeros(0, "U1")
     unique, inverse = np.unique(values, return_inverse=True)
-    return np.array([_label(item) for item in unique.tolist()], dtype=str)[inverse]
+    return np.array([as_label(item) for item in unique.tolist()], dtype=str)[inverse]
 
 
-def _label(value: Any) -> str:
+def as_label(value: Any) -> str:
+    """Write a value as the text a person would use; what is missing becomes ""."""
     if isinstance(value, bool):
         return str(value).lower()
     if isinstance(value, float):

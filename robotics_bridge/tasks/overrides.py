@@ -27,7 +27,7 @@ def apply_overrides(task: Task, words: Iterable[str]) -> Task:
             not of its kind.
     """
     words = list(words)
-    check_once("The changes of a task", [word.partition("=")[0] for word in words])
+    check_once("--change", [word.partition("=")[0] for word in words])
     for word in words:
         name, sign, value = word.partition("=")
         if not (name and sign and value):

@@ -268,7 +268,7 @@ def read_batch(path: Path) -> list[ScoringJob]:
         if not isinstance(models, list) or not models or not all(isinstance(name, str) for name in models):
             raise DataError(f"'models' of {str(path)!r} is a list of one or more names; received {shown(models)}.")
         if seeds is not None and (not isinstance(seeds, list) or not seeds):
-            raise DataError(f"'seeds' of {str(path)!r} is a list of whole numbers; received {shown(seeds)}.")
+            raise DataError(f"'seeds' of {str(path)!r} is a list of whole numbers, not empty; received {shown(seeds)}.")
         for seed in seeds or ():
             check_number("A seed of a batch", seed, least=0, whole=True)
         jobs += jobs_of(models, seeds, options)

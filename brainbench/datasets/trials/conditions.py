@@ -36,7 +36,7 @@ class Conditions:
                 f"The conditions {shown(source)} cannot be read; write TABLE:COLUMN or TABLE:COLUMN,COLUMN, such as "
                 f"'trials:stimulus'. `brainbench recordings inspect FILE` proposes some."
             )
-        check_once(f"The conditions {shown(source)}", columns)
+        check_once(f"The text {shown(source)} for the conditions", columns)
         return cls(table.strip(), columns)
 
     def __str__(self) -> str:

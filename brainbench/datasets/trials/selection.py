@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from brainbench.core.errors import UsageError, check_once, nearest, shown, unknown_name
 from brainbench.core.reading.ranges import check_fields
-from brainbench.datasets.sessions import SessionTable, as_labels, natural_key
+from brainbench.datasets.sessions import SessionTable, as_label, as_labels, natural_key
 
 _TRUTH = {"true": ("true", "1"), "false": ("false", "0")}
 _RULE = re.compile(r"^\s*(?:(?P<scope>trials|units)\.)?(?P<column>[^=!<>]+?)\s*(?P<sign>!=|=)\s*(?P<values>.+?)\s*$")
@@ -58,7 +58,7 @@ class Rule:
         if self.refuse:
             parts.append(f"{self.column}!={'|'.join(self.refuse)}")
         if self.low is not None or self.high is not None:
-            low, high = ("" if bound is None else f"{bound:g}" for bound in (self.low, self.high))
+            low, high = ("" if bound is None else as_label(float(bound)) for bound in (self.low, self.high))
             parts.append(f"{self.column}={low}..{high}")
         return " and ".join(parts)
 
@@ -148,6 +148,12 @@ class Selection:
                 (units if match["scope"] == "units" else trials).append(rule)
         check_once("The selection", own)
         return replace(selection, trials=tuple(trials), units=tuple(units))
+
+    def __str__(self) -> str:
+        """Return its name, or the text from which :meth:`parse` reads its rules."""
+        rules = [*map(str, self.trials), *(f"units.{rule}" for rule in self.units), f"min_spikes={self.min_spikes}"]
+        rules += [f"subjects={'|'.join(self.subjects)}"] if self.subjects else []
+        return "; ".join(rules) if self.name == type(self).name else self.name
 
     def lines(self) -> Iterator[str]:
         """Yield every rule, one line each."""

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -56,6 +58,14 @@ def test_rules_are_read_from_text():
     assert selection.min_spikes == 9
     assert Selection.parse("subjects=a|b").subjects == ("a", "b")
     assert next(iter(selection.lines())) == "trials: outcome=correct|error"
+
+
+def test_a_selection_made_in_python_is_read_from_its_text():
+    made = Selection(
+        (Rule("outcome", refuse=("spoil",)),), (Rule("depth", low=100.0, high=123.4567891),), 5, ("m1", "m2")
+    )
+    assert replace(Selection.parse(str(made)), name=made.name) == made
+    assert str(Selection.parse("outcome=correct")) == "outcome=correct"
 
 
 @pytest.mark.parametrize(

@@ -23,7 +23,15 @@ def edges(window, session):
 
 
 @pytest.mark.parametrize(
-    "source", ["first-contact..choice", "start+0.2..stop-0.1", "cue_time-0.5..+1.5", "choice-1..choice"]
+    "source",
+    [
+        "first-contact..choice",
+        "start+0.2..stop-0.1",
+        "cue_time-0.5..+1.5",
+        "choice-1..choice",
+        "start..stop-1 or +0.5",
+        "cue-1e-07..+0.123456789",
+    ],
 )
 def test_windows_are_read_from_text_and_written_back(source):
     assert str(Window.parse(source)) == source
@@ -52,7 +60,7 @@ def test_offsets_may_have_an_exponent_but_no_infinite_value():
         Window.parse("start+1e400..+1")
 
 
-@pytest.mark.parametrize("source", ["start", "..stop", "start..", "5"])
+@pytest.mark.parametrize("source", ["start", "..stop", "start..", "5", "start..+1 or +2", "start..stop or choice"])
 def test_unreadable_windows_show_the_form(source):
     with pytest.raises(UsageError, match=rf"'{re.escape(source)}' .*FROM\.\.\+SECONDS"):
         Window.parse(source)
