@@ -2,7 +2,7 @@
 
 A record is **stale** when something newer exists than what made it: the layout, the package, the default
 estimator, or the definition behind a fidelity's name. Two records **conflict** when they state the same
-computation (recordings, stimuli, weights, seeds, settings) and different numbers.
+computation (recordings, stimuli, their pairing, weights, seeds, settings) and different numbers.
 """
 
 from __future__ import annotations
@@ -64,6 +64,7 @@ def computation(record: ResultRecord) -> tuple[Any, ...]:
     inputs = (origin.recordings_hash, origin.stimuli_hash, score.stimuli, card.weights if card else None)
     return (
         *inputs,
+        origin.pairing,
         *(score.estimator, score.metric, score.name, origin.version),
         *(str(origin.settings.get(name)) for name in _SETTINGS),
         *(str(origin.recordings.get(name)) for name in ("window", "selection")),

@@ -1,9 +1,9 @@
 """Boards of comparable scores, each with its entries in the order in which people read them.
 
-Scores are comparable only within a **board**: same recordings and units, same stimuli, same estimator, same metric,
-same use of the time axis. Models that are not told apart (:mod:`leaderboards.ranking`) are tied, so a rank is a range.
-Not ranked are scores that are not reliable, models that nobody here can run again, and whole boards with too few
-animals or stimuli.
+Scores are comparable only within a **board**: same recordings and units, same stimuli paired alike, same estimator,
+same metric, same use of the time axis. Models that are not told apart (:mod:`leaderboards.ranking`) are tied, so a rank
+is a range. Not ranked are scores that are not reliable, models that nobody here can run again, and whole boards with
+too few animals or stimuli.
 """
 
 from __future__ import annotations
@@ -82,6 +82,8 @@ def rank(records: Iterable[ResultRecord], remarks: Mapping[str, Sequence[str]] |
         # Other units make other RDMs of the same recordings.
         if (least := origin.settings.get("units_reliability")) is not None:
             estimator += f", units of reliability {least} and more"
+        if origin.pairing:
+            estimator += f", labels paired otherwise ({origin.pairing})"
         brain, shown = origin.recordings_hash, origin.stimuli_hash
         groups[brain, shown, score.stimuli, origin.time_rule, estimator, score.metric].append(record)
     boards = [_board(key, group, remarks or {}) for key, group in groups.items()]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shlex
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -13,6 +14,7 @@ from brainbench.cli import destinations
 from brainbench.cli.destinations import out_folder_option
 from brainbench.cli.options import SCORE, SCORE_FLAGS, with_options
 from brainbench.cli.output import JsonOption, emit, progress_bar
+from brainbench.core.errors import UsageError
 
 if TYPE_CHECKING:
     from brainbench.scoring.options import ScoreOptions
@@ -56,6 +58,8 @@ def score(
     if options.explain and Path(model).suffix == ".npz":
         from brainbench.metrics.explain import explain_file
 
+        if options != replace(type(options)(), explain=True) or report_file is not None:
+            raise UsageError("A file of stored splits is explained by itself; leave out all options but --json.")
         steps = to_plain(explain_file(model))
         emit({"estimator_walk": steps}, walk_text(steps), as_json=as_json)
         return

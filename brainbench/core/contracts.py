@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from brainbench.core.errors import DataError, listing
+from brainbench.core.errors import DataError, listing, repeats
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -83,7 +83,7 @@ def check_recordings(dataset: xr.Dataset) -> xr.Dataset:
     ``synthetic``, ``content_hash``.
 
     Raises:
-        DataError: something of this is missing.
+        DataError: something of this is missing, or labels are not of the vocabulary, which names each once.
     """
     _check(
         dataset,
@@ -93,6 +93,11 @@ def check_recordings(dataset: xr.Dataset) -> xr.Dataset:
         coordinates=("stimulus", "subject", "session", "trial_id", "unit_subject", "unit_session", "unit_id"),
         attributes=("vocabulary", "window", "selection", "removed", "source", "synthetic", "content_hash"),
     )
+    vocabulary = [*map(str, dataset.attrs["vocabulary"])]
+    if twice := repeats(vocabulary):
+        raise DataError(f"The vocabulary of a recordings data set names {listing(twice, limit=4)} twice.")
+    if other := sorted({*map(str, dataset["stimulus"].values.tolist())} - {*vocabulary}):
+        raise DataError(f"Trials have labels that the vocabulary of the recordings lacks: {listing(other, limit=4)}.")
     return dataset
 
 

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterable
+from collections import Counter
+from collections.abc import Hashable, Iterable
+from typing import Any
 
 
 class BrainbenchError(Exception):
@@ -104,6 +106,26 @@ def check_name(kind: str, name: object, options: Iterable[str], *, hint: str = "
     """Raise the error of :func:`unknown_name` unless a name is among the options."""
     if name not in (choices := list(options)):
         raise unknown_name(kind, name, choices, hint=hint)
+
+
+def repeats(names: Iterable[Hashable]) -> list[Any]:
+    """Return what occurs more than once, in order of appearance.
+
+    >>> repeats(["b", "a", "b", "a", "c"])
+    ['b', 'a']
+    """
+    return [name for name, count in Counter(names).items() if count > 1]
+
+
+def check_once(where: str, names: Iterable[str]) -> None:
+    """Raise a :class:`UsageError` if a name stands more than once.
+
+    >>> check_once("--known", ["density", "density"])
+    Traceback (most recent call last):
+    brainbench.core.errors.UsageError: --known names 'density' more than once; only one would count.
+    """
+    if twice := repeats(names):
+        raise UsageError(f"{where} names {listing(twice, limit=4)} more than once; only one would count.")
 
 
 def choose_name(kind: str, wanted: str | None, options: Iterable[str], *, how: str = "") -> str:

@@ -33,7 +33,7 @@ _UNWRITABLE = (
 def cache_dir(*parts: str) -> Path:
     """Return (and create) the cache folder, ``$BRAINBENCH_CACHE`` or the platform's own."""
     root = os.environ.get(CACHE_VARIABLE)
-    if root is None:
+    if not root:
         import platformdirs
 
         root = platformdirs.user_cache_dir("brainbench", appauthor=False)

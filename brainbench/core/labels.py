@@ -6,7 +6,7 @@ import os
 from collections.abc import Mapping
 from pathlib import Path
 
-from brainbench.core.errors import UsageError, listing
+from brainbench.core.errors import UsageError, check_once, listing, repeats
 
 
 def join_labels(
@@ -47,12 +47,8 @@ def join_labels(
             f"{len(pairs) - len(alone)}). Pair them with --match FILE, a line for each label of the recordings as in "
             f"'{next(iter(alone or vocabulary), 'label')},{free}' (.csv; nothing after the comma drops the label)."
         )
-    partners = list(pairs.values())
-    for partner in partners:
-        if partners.count(partner) > 1:
-            raise UsageError(
-                f"Two recording labels are paired with the stimulus {partner!r}; pairs must be one to one."
-            )
+    if twice := repeats(pairs.values()):
+        raise UsageError(f"Two recording labels are paired with the stimulus {twice[0]!r}; pairs must be one to one.")
     return {label: str(partner) for label, partner in pairs.items()}
 
 
@@ -60,7 +56,7 @@ def read_match(path: str | os.PathLike[str]) -> dict[str, str | None]:
     """Read label pairs from JSON or TOML (an object) or CSV (two columns; an empty second one drops).
 
     Raises:
-        UsageError: the file is missing, of another kind, or holds something else.
+        UsageError: the file is missing, of another kind, names a label twice, or holds something else.
         DataError: it is no valid JSON or TOML.
     """
     import csv
@@ -80,6 +76,7 @@ def read_match(path: str | os.PathLike[str]) -> dict[str, str | None]:
             rows = [row for row in csv.reader(lines) if row]
         if any(len(row) != 2 for row in rows):
             raise UsageError(f"{str(path)!r} must have two columns: recording label, stimulus label.")
+        check_once(repr(str(path)), [row[0] for row in rows])
         pairs = dict(rows)
     else:
         raise UsageError(f"A match file ends in .json, .toml or .csv; received {path.name!r}.")

@@ -6,6 +6,9 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, fields
 from typing import Any
 
+from brainbench.core.errors import listing
+from brainbench.core.files import content_hash
+
 
 @dataclass(frozen=True, eq=False)
 class Provenance(Mapping[str, Any]):
@@ -29,8 +32,8 @@ class Provenance(Mapping[str, Any]):
     ``config_hash`` of the demo, which names it on every machine."""
     stimuli: Mapping[str, Any] = field(default_factory=dict)
     """``description``, ``content_hash``, ``config_hash`` and ``backend``; empty for features computed elsewhere."""
-    pairs: Mapping[str, str] = field(default_factory=dict)
-    """Recording label → stimulus label."""
+    pairs: Mapping[str, str | None] = field(default_factory=dict)
+    """Recording label → stimulus label; None for one that was dropped."""
     settings: Mapping[str, Any] = field(default_factory=dict)
     """Options of the run, from which the same score can be computed again."""
     statistics: Mapping[str, Any] = field(default_factory=dict)
@@ -79,6 +82,12 @@ class Provenance(Mapping[str, Any]):
         That of their configuration is equal on every machine; the numbers differ in their last digits.
         """
         return _text(self.stimuli.get("config_hash")) or _text(self.stimuli.get("content_hash")) or None
+
+    @property
+    def pairing(self) -> str:
+        """Name of the pairing of labels that are not equal on both sides; empty where all are."""
+        other = [f"{label} = {stimulus}" for label, stimulus in self.pairs.items() if stimulus not in (None, label)]
+        return f"{listing(other, limit=1)}; {content_hash(other, length=8)}" if other else ""
 
     @property
     def time_rule(self) -> str:

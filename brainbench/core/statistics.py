@@ -223,5 +223,5 @@ def paired_differences(first: Score, second: Score) -> tuple[NDArray[np.float64]
     without = []
     if set(first.stimuli) == set(second.stimuli):
         one, two = (dict(zip(x.stimuli, x.without_stimulus, strict=False)) for x in (first, second))
-        without = [first.on_scale(one[k]) - second.on_scale(two[k]) for k in one.keys() & two.keys()]
+        without = [first.on_scale(one[k]) - second.on_scale(two[k]) for k in one if k in two]
     return np.array(pairs, dtype=np.float64), np.array(without, dtype=np.float64)

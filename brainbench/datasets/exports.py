@@ -15,14 +15,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from brainbench.core.errors import DataError, UsageError, unknown_name
+from brainbench.core.errors import DataError, UsageError, check_name
 from brainbench.datasets.hdf5 import write_recordings
 from brainbench.datasets.nwb_writer import write_nwb
 from brainbench.datasets.reading import Source, each_session, find_recordings, open_file, resolve_selection
 from brainbench.datasets.sessions import OBSERVED, SPIKES, Session, SessionTable, decode, ragged
 from brainbench.datasets.trials.counting import has_units, read_spikes, recorded_span
 from brainbench.datasets.trials.covariates import LICKS, lick_times
-from brainbench.datasets.trials.selection import EVERYTHING, Selection, Tally
+from brainbench.datasets.trials.selection import EVERYTHING, Selection, Tally, check_values
 
 
 def export(source: Source, target: str | os.PathLike[str], *, select: Selection | str | None = None) -> list[Path]:
@@ -44,17 +44,19 @@ def export(source: Source, target: str | os.PathLike[str], *, select: Selection 
     """
     layout, paths = find_recordings(source)
     chosen = EVERYTHING if select is None else resolve_selection(select)
-    sessions, skipped = [], []
+    sessions, subjects, tallies = [], set(), []
     for path in paths:
         with open_file(path) as file:
             for session, found in each_session(file, path, layout):
-                if chosen.subjects and session.subject not in chosen.subjects:
-                    skipped.append(session.subject)
-                elif has_units(session):
-                    sessions.append(subset(session, chosen, found.conditions.table if found else "trials"))
+                subjects.add(session.subject)
+                if has_units(session) and session.subject in (chosen.subjects or subjects):
+                    tallies.append(Tally())
+                    table = found.conditions.table if found else "trials"
+                    sessions.append(subset(session, chosen, table, tallies[-1]))
+    for subject in chosen.subjects:
+        check_name("subject", subject, sorted(subjects))
+    check_values(tallies)
     if not sessions:
-        if skipped:
-            raise unknown_name("subject", chosen.subjects[0], sorted(set(skipped)))
         raise DataError(f"None of the {len(paths)} files of {source} holds units with spike times; nothing to copy.")
     target = Path(target)
     if target.suffix in (".h5", ".hdf5"):
@@ -71,8 +73,12 @@ def export(source: Source, target: str | os.PathLike[str], *, select: Selection 
     return [write_nwb(target / name, session) for name, session in files.items()]
 
 
-def subset(session: Session, selection: Selection = EVERYTHING, table: str = "trials") -> Session:
+def subset(
+    session: Session, selection: Selection = EVERYTHING, table: str = "trials", tally: Tally | None = None
+) -> Session:
     """Read a session into memory: spikes, tables and plain columns of the rows that a selection keeps.
+
+    ``tally`` takes what the rules removed and met.
 
     Raises:
         DataError: units or tables are damaged, or no unit is left.
@@ -81,7 +87,7 @@ def subset(session: Session, selection: Selection = EVERYTHING, table: str = "tr
     units = session.units
     if units is None:
         raise DataError(f"{session.source} has no units table; there are no spikes to copy.")
-    tally = Tally()
+    tally = tally or Tally()
     spikes = read_spikes(units, tally.notes)
     kept = tally.select(units, selection.units, "units")
     kept &= np.array([len(times) for times in spikes]) >= selection.min_spikes

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
 from brainbench.core.contracts import check_recordings
-from brainbench.core.errors import DataError, UsageError, listing, unknown_name
+from brainbench.core.errors import DataError, UsageError, check_name, listing, unknown_name
 from brainbench.core.progress import Progress, track
 from brainbench.datasets import hdf5
 from brainbench.datasets.inspection import propose
@@ -127,12 +127,14 @@ class _Reader:
     without_units: list[str] = field(default_factory=list)
     other_tables: dict[str, str] = field(default_factory=dict)
     """Why each session without the table of the conditions is left out, by one of the tables that it has."""
-    other_subjects: set[str] = field(default_factory=set)
+    subjects: set[str] = field(default_factory=set)
+    """Names of all animals of the files, also of those that are not chosen."""
 
     def read(self, path: Path) -> None:
         """Count the sessions of one file."""
         with open_file(path) as file:
             for session, found in each_session(file, path, self.layout if self.named else None):
+                self.subjects.add(session.subject)
                 if not has_units(session):
                     if self.strict:
                         raise DataError(no_units(session))
@@ -146,7 +148,6 @@ class _Reader:
                 self._refuse_twins(session)
                 options = self._options_for(session, found)
                 if options.selection.subjects and session.subject not in options.selection.subjects:
-                    self.other_subjects.add(session.subject)
                     continue
                 self.notes += session.notes
                 self.counted.append(count_session(session, options))
@@ -193,11 +194,13 @@ class _Reader:
         if self.options is None:
             more = f" ({len(self.without_units) - 1} more files likewise)" if len(self.without_units) > 1 else ""
             raise DataError(f"{self.without_units[0]}{more}" if self.without_units else "The file holds no session.")
+        for subject in self.options.selection.subjects:
+            check_name("subject", subject, sorted(self.subjects))
+        skipped = self.skipped + self.without_units + [*dict.fromkeys(self.other_tables.values())]
         if not self.counted:
-            raise unknown_name("subject", self.options.selection.subjects[0], sorted(self.other_subjects))
+            raise DataError(f"No session of the chosen subjects can be counted. {skipped[0]}")
         name = self.layout.name if self.layout else ""
         name += "" if self.named or not name else " (detected from its columns)"
-        skipped = self.skipped + self.without_units + [*dict.fromkeys(self.other_tables.values())]
         made = join_sessions(self.counted, self.options, source=source, layout=name, notes=self.notes + skipped)
         made.attrs["skipped"] = skipped
         return check_recordings(made)

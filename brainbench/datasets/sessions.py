@@ -279,10 +279,11 @@ def as_labels(values: NDArray[Any]) -> NDArray[np.str_]:
     if not len(values):
         return np.zeros(0, "U1")
     unique, inverse = np.unique(values, return_inverse=True)
-    return np.array([_label(item) for item in unique.tolist()], dtype=str)[inverse]
+    return np.array([as_label(item) for item in unique.tolist()], dtype=str)[inverse]
 
 
-def _label(value: Any) -> str:
+def as_label(value: Any) -> str:
+    """Write a value as the text a person would use; what is missing becomes ""."""
     if isinstance(value, bool):
         return str(value).lower()
     if isinstance(value, float):
@@ -292,17 +293,21 @@ def _label(value: Any) -> str:
     return str(value).strip()
 
 
+def as_number(text: str) -> float:
+    """Return the number that a text states; NaN where it states none."""
+    try:
+        return float(text)
+    except ValueError:
+        return math.nan
+
+
 def natural_key(label: str) -> tuple[Any, ...]:
     """Return a sort key that puts numbers in numeric order, alone or inside text.
 
     >>> sorted(["10", "9", "b10", "b2"], key=natural_key)
     ['9', '10', 'b2', 'b10']
     """
-    try:
-        number = float(label)
-    except ValueError:
-        number = math.nan
-    if math.isfinite(number):
+    if math.isfinite(number := as_number(label)):
         return (0, number, (), label)
     # The odd parts are the digits; the label itself keeps "01" and "1" apart.
     parts = re.split(r"(\d+)", label)

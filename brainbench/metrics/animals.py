@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from brainbench.core.errors import UsageError, check_name
+from brainbench.core.errors import UsageError, check_name, repeats
 from brainbench.core.records import Ceiling, Interval
 from brainbench.core.statistics import t_interval
 from brainbench.metrics.inference.permutation import canonical_order
@@ -67,9 +67,8 @@ def gather(metric: Metric, subjects: Sequence[SubjectRDM], stimuli: int, *, esti
         raise UsageError("There are no animals to score against; give at least one SubjectRDM.")
     ordered = tuple(sorted(subjects, key=lambda subject: subject.subject))
     names = [subject.subject for subject in ordered]
-    if len(set(names)) < len(names):
-        repeated = next(name for name in names if names.count(name) > 1)
-        raise UsageError(f"Subject {repeated!r} appears twice; join the sessions of an animal in one SubjectRDM.")
+    if twice := repeats(names):
+        raise UsageError(f"Subject {twice[0]!r} appears twice; join the sessions of an animal in one SubjectRDM.")
     for subject in ordered:
         if subject.count != stimuli:
             raise UsageError(

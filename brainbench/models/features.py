@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from brainbench.core.errors import DataError, listing, shown
+from brainbench.core.errors import DataError, listing, repeats, shown
 from brainbench.core.reading.hdf5 import open_hdf5
 
 if TYPE_CHECKING:
@@ -71,9 +71,8 @@ def read_features(path: str | Path) -> Features:
                 "group 'activations' with one dataset [K, F] or [K, T, F] per layer."
             )
         labels = tuple(label.decode() if isinstance(label, bytes) else str(label) for label in np.ravel(labels[()]))
-        repeated = sorted({label for label in labels if labels.count(label) > 1})
-        if repeated:
-            raise DataError(f"{str(path)!r} has the label {repeated[0]!r} more than once; labels must be unique.")
+        if twice := repeats(labels):
+            raise DataError(f"{str(path)!r} has the label {twice[0]!r} more than once; labels must be unique.")
         layers = _layers(group, len(labels), str(path))
     if not layers:
         raise DataError(f"{str(path)!r} has no layer in its group 'activations'.")

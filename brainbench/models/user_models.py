@@ -113,7 +113,7 @@ def check_module(made: Any, target: str) -> nn.Module:
 def settings_file() -> Path:
     """Return the file of the added models, in ``$BRAINBENCH_CONFIG`` or the platform's folder of settings."""
     folder = os.environ.get(CONFIG_VARIABLE)
-    if folder is None:
+    if not folder:
         import platformdirs
 
         folder = platformdirs.user_config_dir("brainbench", appauthor=False)

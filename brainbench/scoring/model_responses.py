@@ -110,6 +110,19 @@ class ResolvedModel:
         return ModelResponses(card, labels, activations, options.time, model_input, origin, seconds)
 
 
+def follows_seed(model: Any) -> bool:
+    """Return whether the weights of a model follow from a seed: those of untrained networks, by name or from a file.
+
+    Trained weights, activations and models in memory are what they are.
+    """
+    from brainbench.models.architecture import Architecture, is_path
+    from brainbench.models.training.checkpoints import PREFIXES
+
+    if not isinstance(model, str) or model.startswith(PREFIXES) or Path(model).suffix.lower() in (".h5", ".hdf5"):
+        return False
+    return is_path(model) or Architecture.parse(model).tag is None
+
+
 def resolve_model(model: Any, *, seed: int = 0) -> ResolvedModel:
     """Find what ``model`` names, and load it; see :func:`brainbench.scoring.scores.score`.
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import glob
 import os
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -67,6 +68,17 @@ class NeuralResponses:
         """Reason why the labels cannot be trusted; empty where they can."""
         return str(self.dataset.attrs.get("label_doubt", ""))
 
+    @property
+    def published(self) -> bool:
+        """True for a published file of rates, whose zeros the published estimators count."""
+        from brainbench.datasets.layouts.published_npz import LAYOUT
+
+        return self.dataset.attrs.get("layout") == LAYOUT.name
+
+    def stated_pairs(self, pairs: Mapping[str, str]) -> dict[str, str | None]:
+        """Return pairs of labels as a record states them: None for labels that were dropped."""
+        return {label: pairs.get(label) for label in self.vocabulary}
+
     def pairs(self, stimuli: tuple[str, ...], match: Any) -> dict[str, str]:
         """Pair recording labels with stimuli; slots without names one by one, as the published code does.
 
@@ -85,9 +97,9 @@ class NeuralResponses:
 
     def zero_filled(self, kept: tuple[str, ...]) -> dict[str, NDArray[np.float64]] | None:
         """Return each animal's rates [R, K, U] as a published file holds them; None for other recordings."""
-        from brainbench.datasets.layouts.published_npz import LAYOUT, read_arrays
+        from brainbench.datasets.layouts.published_npz import read_arrays
 
-        if self.dataset.attrs.get("layout") != LAYOUT.name:
+        if not self.published:
             return None
         slots = [self.vocabulary.index(label) for label in kept]
         arrays, _ = read_arrays(Path(self.dataset.attrs["source"]))

@@ -12,7 +12,7 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from brainbench.core.errors import UsageError, check_name, shown
+from brainbench.core.errors import UsageError, check_name, check_once, shown
 from brainbench.core.reading.ranges import check_fields
 
 if TYPE_CHECKING:
@@ -41,7 +41,8 @@ class ScoreOptions:
     """Options of scoring a model against recordings.
 
     Raises:
-        UsageError: an unknown rule for time or readout, or a reliability outside (−1, 1).
+        UsageError: an unknown rule for time or readout, a reliability outside (−1, 1), no layer among ``layers``, or
+            a choice of trials or bins for recordings in memory, which are counted.
     """
 
     recordings: str | os.PathLike[str] | Sequence[str | os.PathLike[str]] | xr.Dataset = "demo"
@@ -105,6 +106,13 @@ class ScoreOptions:
                 raise UsageError(f"{name} must be a text; received {shown(getattr(self, name))}.")
         check_fields(self, "seed", "weights_seed", least=0, whole=True)
         check_fields(self, "bin", above=0)
+        if self.layers is not None and not self.layers:
+            raise UsageError("layers names none; leave it out for all.")
+        check_once("layers", self.layers or ())
+        if not isinstance(self.recordings, (str, os.PathLike, Sequence)):
+            for name in ("conditions", "select", "window", "bin"):
+                if getattr(self, name) is not None:
+                    raise UsageError(f"Recordings in memory are counted already, so {name} cannot apply; leave it out.")
         check_name("time rule", self.time, TIME_RULES)
         check_name("readout", self.readout, READOUTS)
         if self.readout == "published" and (self.time != "mean" or self.over_time):
@@ -126,13 +134,17 @@ class ScoreOptions:
             isinstance(layers, (list, tuple)) and all(isinstance(name, str) for name in layers)
         ):
             raise UsageError(f"layers must be a list of names; received {shown(layers)}.")
-        return cls(**{**values, "layers": tuple(layers) if layers else None})
+        return cls(**{**values, "layers": None if layers is None else tuple(layers)})
 
     @classmethod
     def stated_in(cls, settings: Mapping[str, Any], **others: Any) -> ScoreOptions:
         """Return the options that the settings of a provenance state, and others that they do not hold."""
+        from brainbench.stimuli.sources import is_finished
+
         known = {item.name for item in fields(cls)} - {*_ELSEWHERE}
         stated = {name: value for name, value in settings.items() if name in known and value is not None}
+        if is_finished(stated.get("stimuli", "")):  # of an earlier record, which states one all the same
+            stated.pop("fidelity", None)
         if isinstance(stated.get("fidelity"), Mapping):  # of the caller's own: its fields, as JSON states a dataclass
             from brainbench.stimuli import Fidelity
 
@@ -156,11 +168,15 @@ class ScoreOptions:
 
     @property
     def settings(self) -> dict[str, Any]:
-        """Options as a record states them: texts and numbers."""
+        """Options as a record states them: texts and numbers; no fidelity for finished stimuli."""
+        from brainbench.stimuli.sources import is_finished
+
         stated = {item.name: getattr(self, item.name) for item in fields(self) if item.name not in _ELSEWHERE}
         # Stimuli in memory have no name; their hash stands in the provenance.
         named = isinstance(self.stimuli, (str, os.PathLike, type(None)))
         texts = {"select": self.select, "window": self.window, "stimuli": self.stimuli if named else "data"}
         stated |= {name: value if value is None else str(value) for name, value in texts.items()}
         metric = self.metric if isinstance(self.metric, str) else self.metric.name
-        return stated | {"fidelity": self.fidelity or "balanced", "metric": metric, "weights_seed": self.model_seed}
+        finished = self.stimuli is not None and is_finished(self.stimuli)
+        fidelity = None if finished else self.fidelity or "balanced"
+        return stated | {"fidelity": fidelity, "metric": metric, "weights_seed": self.model_seed}

@@ -87,7 +87,7 @@ def score_record(
 
     started = clock.perf_counter()
     stage_done = stages(STAGES, "scoring", progress)
-    options = ScoreOptions.of({**vars(options or ScoreOptions()), **changes})
+    options = _options(model, {**vars(options or ScoreOptions()), **changes})
     # The simulation gets ready in a thread while the network loads, if any will be needed.
     if isinstance(options.recordings, str) and options.recordings in DEMOS:
         prepare_stimuli(DEMOS[options.recordings], progress=progress)
@@ -103,7 +103,7 @@ def score_record(
     stage_done()
     # Recordings name the stimuli that the animals felt; the caller's choice goes first.
     options = replace(options, stimuli=brain.stimuli if options.stimuli is None else options.stimuli)
-    _check_labels(resolved, brain, options)
+    _check_inputs(resolved, brain, options)
     network = resolved.respond(options, progress=progress)
     stage_done()
     pairs = brain.pairs(network.labels, options.match)
@@ -122,7 +122,7 @@ def score_record(
         provenance(
             **network.origin,
             recordings=brain.origin,
-            pairs=pairs,
+            pairs=brain.stated_pairs(pairs),
             settings=options.settings | settings,
             seconds=round(clock.perf_counter() - started, 2),
             **({"command": command} if command else {}),
@@ -150,11 +150,28 @@ def score_record(
     return ResultRecord(first, between, {item.name: item for item in others}, network.card, brain.synthetic)
 
 
-def _check_labels(resolved: ResolvedModel, brain: NeuralResponses, options: ScoreOptions) -> None:
-    """Refuse labels that do not match before anything is simulated, where they are known by then."""
+def _options(model: Any, values: Mapping[str, Any]) -> ScoreOptions:
+    """Return the options that values state; a seed or a fidelity that would reach nothing is refused."""
+    from brainbench.scoring.model_responses import follows_seed
+    from brainbench.stimuli.sources import is_finished
+
+    options = ScoreOptions.of(values)
+    if options.weights_seed not in (None, options.seed) and not follows_seed(model):
+        raise UsageError("weights_seed is that of untrained weights, and those of this model are given; leave it out.")
+    if options.stimuli is not None and is_finished(options.stimuli) and options.fidelity not in (None, "balanced"):
+        raise UsageError("fidelity is that of a simulation, and these stimuli are finished; leave it out.")
+    return options
+
+
+def _check_inputs(resolved: ResolvedModel, brain: NeuralResponses, options: ScoreOptions) -> None:
+    """Refuse what does not fit before anything is simulated: labels, where they are known by then."""
     from brainbench.scoring.model_responses import DEFAULT_STIMULI
     from brainbench.stimuli.sources import known_labels
 
+    if brain.published and options.estimator != "default" and options.units_reliability is not None:
+        raise UsageError(
+            f"The estimator {options.estimator!r} takes all units of a published file; leave out units_reliability."
+        )
     source = DEFAULT_STIMULI if options.stimuli is None else options.stimuli
     if resolved.labels is not None or (shown := known_labels(source)) is None:
         return

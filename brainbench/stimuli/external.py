@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -11,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brainbench.core.contracts import check_stimulus_set
-from brainbench.core.errors import DataError, listing
+from brainbench.core.errors import DataError, listing, repeats
 from brainbench.core.files import to_json
 from brainbench.stimuli.scenes.frames import Frames
 from brainbench.stimuli.stimulus_set import hash_stimulus_set, new_stimulus_set
@@ -59,7 +58,7 @@ def assemble_stimulus_set(
         DataError: two stimuli have the same label.
     """
     labels = [source["label"] for source in sources]
-    if twice := [label for label, count in Counter(labels).items() if count > 1]:
+    if twice := repeats(labels):
         raise DataError(f"Several stimuli are called {listing(twice)}; each needs a name of its own.")
     text = functools.partial(to_json, indent=None)
     grid, over_time = ("stimulus", "whisker"), ("stimulus", "time", "whisker")

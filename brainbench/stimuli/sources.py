@@ -108,6 +108,11 @@ def load_stimuli(
     raise unknown_name("stimuli", os.fspath(source), list_recipes(), hint=hint)
 
 
+def is_finished(source: object) -> bool:
+    """Return whether a source is finished stimuli, in memory or in an HDF5 file, which no fidelity changes."""
+    return not isinstance(source, (str, os.PathLike)) or Path(source).suffix in _HDF5
+
+
 def known_labels(source: object) -> tuple[str, ...] | None:
     """Return the labels of a packaged recipe or a scene file, before its scenes are built; None for anything else."""
     with contextlib.suppress(BrainbenchError, OSError, KeyError, TypeError):

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from brainbench.core.errors import DataError
+from brainbench.core.errors import DataError, check_once
 from brainbench.core.reading.ranges import check_fields
 from robotics_bridge import hands
 from robotics_bridge.deploy.driver import HandReading
@@ -72,8 +72,9 @@ class Faults:
         """Return the faults of texts such as ``drop=0.2``.
 
         Raises:
-            UsageError: a fault is unknown or its value is no number.
+            UsageError: a fault is unknown or given twice, or its value is no number.
         """
+        check_once("--fault", [text.partition("=")[0].replace("-", "_") for text in texts])
         faults = cls()
         for text in texts:
             name, _, value = text.partition("=")

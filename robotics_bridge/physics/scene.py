@@ -5,7 +5,6 @@ Letters: G geometry, L link. Lengths in metres; quaternions here are (w, x, y, z
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -15,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from brainbench.core.devices import mujoco_module
-from brainbench.core.errors import UsageError, check_name
+from brainbench.core.errors import UsageError, check_name, repeats
 from brainbench.geometry import Mesh
 
 mujoco = mujoco_module()
@@ -139,9 +138,8 @@ class TouchScene:
 
     def __post_init__(self) -> None:
         for what, names in (("link", self.links), ("geometry", [g.name for g in self.geometries])):
-            repeated = [name for name, count in Counter(names).items() if name and count > 1]
-            if repeated:
-                raise UsageError(f"The scene has two of the {what} {repeated[0]!r}; names must differ.")
+            if twice := repeats(filter(None, names)):
+                raise UsageError(f"The scene has two of the {what} {twice[0]!r}; names must differ.")
         for geometry in self.geometries:
             check_name("link", geometry.link, self.links, hint=f"Geometry {geometry.name!r} is fixed to it.")
 

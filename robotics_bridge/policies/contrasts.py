@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import stdtr, stdtrit
 
-from brainbench.core.errors import UsageError, check_name
+from brainbench.core.errors import UsageError, check_name, repeats
 from brainbench.core.records import Interval
 
 MARGIN = 0.05
@@ -85,8 +85,8 @@ class MixedModel:
 
     def __post_init__(self) -> None:
         cells = [(one.arm, one.draw, one.seed) for one in self.policies]
-        if twice := next((cell for cell in cells if cells.count(cell) > 1), None):
-            raise UsageError(f"The policy of arm {twice[0]!r}, draw {twice[1]!r} and seed {twice[2]} is given twice.")
+        for arm, draw, seed in repeats(cells):
+            raise UsageError(f"The policy of arm {arm!r}, draw {draw!r} and seed {seed} is given twice.")
         if len(cells) <= len(self.arms):
             raise UsageError(
                 "Every student has one training seed, which tells nothing of the spread between seeds; train one more "

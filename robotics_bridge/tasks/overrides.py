@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import fields, is_dataclass, replace
 from typing import Any
 
-from brainbench.core.errors import UsageError, check_name, shown, unknown_name
+from brainbench.core.errors import UsageError, check_name, check_once, shown, unknown_name
 from robotics_bridge.tasks.contact_model import CONTACTS, ContactModel
 from robotics_bridge.tasks.task import Ending, Reward, Task
 
@@ -23,8 +23,11 @@ def apply_overrides(task: Task, words: Iterable[str]) -> Task:
     names begin so; named twice, they are twice as many).
 
     Raises:
-        UsageError: a word is not of this form, names nothing of the task, or the value is not of its kind.
+        UsageError: a word is not of this form, names nothing of the task or what another one names, or the value is
+            not of its kind.
     """
+    words = list(words)
+    check_once("--change", [word.partition("=")[0] for word in words])
     for word in words:
         name, sign, value = word.partition("=")
         if not (name and sign and value):

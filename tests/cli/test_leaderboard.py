@@ -11,6 +11,7 @@ import pytest
 from brainbench.cli.leaderboard.scoring import find_models, parse_seeds, read_batch
 from brainbench.core.errors import DataError, UsageError
 from brainbench.core.records import ResultRecord
+from brainbench.scoring import score
 from leaderboards.store import read_record
 
 PARTS = ("--conditions", "trials:texture")
@@ -154,14 +155,30 @@ def test_a_site_is_opened_in_a_browser_and_its_place_is_said_where_there_is_none
 def test_only_a_score_of_the_same_question_is_known_or_replaced(run, files, tmp_path):
     to, batch = tmp_path / "board", tmp_path / "batch.toml"
     given = f'recordings = "{files["recordings"]}"\nstimuli = "{files["arrays"]}"\nconditions = "trials:texture"\n'
+    (tmp_path / "match.csv").write_text("a,b\nb,a\n")
+    paired = f"match = '{tmp_path / 'match.csv'}'"
     states = []
-    for option in ("", "layer = 'gru'", "normalize = false", "window = 'start..+0.3'", ""):
+    for option in ("", "layer = 'gru'", "normalize = false", "window = 'start..+0.3'", paired, "", paired):
         batch.write_text(f'[options]\n{given}{option}\n[[entries]]\nmodels = ["{files["model"]}"]\n')
         result = run("leaderboard", "add", "--batch", str(batch), "--to", str(to), "--prune", "--json")
         assert result.status == 0, result.err
         states += [item["state"] for item in json.loads(result.out)["results"]]
-    assert states == ["scored"] * 4 + ["known"]
-    assert len(list(to.glob("*.json"))) == 4
+    assert states == ["scored"] * 5 + ["known"] * 2
+    assert len(list(to.glob("*.json"))) == 5
+    copied = run("leaderboard", "add", str(to), "--to", str(tmp_path / "copy"), "--json")
+    assert {item["state"] for item in json.loads(copied.out)["results"]} == {"added"}
+
+
+def test_features_with_labels_of_their_own_are_scored_once(run, files, tmp_path):
+    batch, given = tmp_path / "batch.toml", f'recordings = "{files["recordings"]}"\nconditions = "trials:texture"\n'
+    states = []
+    entry = f'[[entries]]\nmodels = ["{files["features"]}"]\nseeds = [0, 1]\n'
+    for title in ("", "", "title = 'pilot'", "title = 'pilot'"):
+        batch.write_text(f"[options]\n{given}{title}\n{entry}{entry}")
+        result = run("leaderboard", "add", "--batch", str(batch), "--to", str(tmp_path / "board"), "--json")
+        assert result.status == 0, result.err
+        states += [item["state"] for item in json.loads(result.out)["results"]]
+    assert states == ["scored", "known", "scored", "known"]
 
 
 @pytest.mark.parametrize("option", [("--metric", "cka"), ("--seed", "1")])
@@ -213,8 +230,39 @@ def test_seeds_and_batches_are_read_or_refused(tmp_path):
     batch.write_text('[[entries]]\nmodels = ["s4-small"]\nseeds = [0, 1]\n')
     assert [(job.model, job.options.model_seed) for job in read_batch(batch)] == [("s4-small", 0), ("s4-small", 1)]
     assert read_batch(batch)[1].command == "brainbench score s4-small --weights-seed 1"
+    batch.write_text('[[entries]]\nmodels = ["s4-small"]\nseeds = [3, 3]\n')
+    assert [job.options.model_seed for job in read_batch(batch)] == [3]
+    batch.write_text('[options]\nseed = 5\nweights_seed = 2\n[[entries]]\nmodels = ["s4-small"]\n')
+    assert [(job.options.seed, job.options.model_seed) for job in read_batch(batch)] == [(5, 2)]
     batch.write_text("[options]\ncolour = 1\n")
     with pytest.raises(UsageError, match="Unknown option of a score 'colour'"):
         read_batch(batch)
     with pytest.raises(DataError, match=r"none\.toml"):
         read_batch(tmp_path / "none.toml")
+
+
+def test_only_weights_that_follow_a_seed_are_scored_for_several(tmp_path):
+    batch = tmp_path / "batch.toml"
+    shipped = find_models(["*.*"])[0]
+    batch.write_text(f'[[entries]]\nmodels = ["{shipped}", "mine.py:net", "s4-small"]\nseeds = [1, 2]\n')
+    jobs = read_batch(batch)
+    assert [(job.model, job.options.model_seed) for job in jobs] == [
+        (shipped, 0), ("mine.py:net", 1), ("mine.py:net", 2), ("s4-small", 1), ("s4-small", 2)
+    ]  # fmt: skip
+    with pytest.raises(UsageError, match="weights_seed"):
+        score(shipped, weights_seed=1)
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("", "names no model"),
+        ("[[entries]]\nmodels = []\n", "'models'"),
+        ("[[entries]]\nmodels = ['s4-small']\nseeds = []\n", "'seeds'"),
+        ("[[entries]]\nmodels = ['s4-small', 'zzz*']\n", "No model matches 'zzz\\*'"),
+    ],
+)
+def test_a_batch_that_asks_for_nothing_is_refused(tmp_path, text, said):
+    (tmp_path / "batch.toml").write_text(text)
+    with pytest.raises((DataError, UsageError), match=said):
+        read_batch(tmp_path / "batch.toml")

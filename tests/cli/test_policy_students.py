@@ -112,6 +112,7 @@ def test_deploy_asks_for_what_is_missing_before_a_hand_is_started(tmp_path, monk
         (("--input", "command=nan"), "nan"),
         (("--input", "command=inf"), "inf"),
         (("--input", "command=1,2"), "2.0"),
+        ((*TOLD, *TOLD), "'command' more than once"),
         ((*TOLD, "--seconds", "nan"), "nan"),
         ((*TOLD, "--seconds", -1), "-1"),
         ((*TOLD, "--record", tmp_path / "full"), "full"),

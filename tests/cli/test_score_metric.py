@@ -59,5 +59,8 @@ def test_stored_splits_are_walked_through(run, tmp_path):
     found = run("score", str(path), "--explain-estimator")
     assert found.status == 0, found.err
     assert "as published for the raw input" in found.out
+    refused = run("score", str(path), "--explain-estimator", "--metric", "cka")
+    assert refused.status == 2
+    assert "leave out all options" in refused.err
     np.savez(path, r_xy=np.full(100, 0.3))
     assert "lacks the array 'r_yy'" in run("score", str(path), "--explain-estimator").err

@@ -58,6 +58,8 @@ def test_contacts_of_a_track_are_printed(run, tmp_path):
         (["--known", "arc_length"], "NAME=VALUE"),
         (["--known", "arc_lenth=0.02"], "arc_length"),
         (["--bounds", "young_modulus=5"], "LOW:HIGH"),
+        (["--known", "density=1200,density=1300"], "'density' more than once"),
+        (["--bounds", "density=1:2,density=1:3"], "'density' more than once"),
         (["--contacts"], "takes a track"),
         (["--intervals", "laplac"], "laplace"),
     ],

@@ -114,6 +114,14 @@ def test_the_cache_folder_follows_the_environment(tmp_path: Path, monkeypatch: p
     assert (tmp_path / "mine" / "stimuli").is_dir()
 
 
+def test_an_empty_variable_does_not_make_the_working_folder_the_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "usual"))
+    monkeypatch.setenv(files.CACHE_VARIABLE, "")
+    assert tmp_path / "usual" in files.cache_dir("stimuli").parents
+    assert not (tmp_path / "stimuli").exists()
+
+
 def test_provenance_names_version_packages_and_time():
     origin = files.provenance(seed=3)
     assert {"version", "python", "packages", "machine", "time"} <= set(origin)

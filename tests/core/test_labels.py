@@ -55,6 +55,8 @@ def test_match_files_of_three_kinds_say_the_same(tmp_path: Path):
         ("m.txt", "", "ends in .json, .toml or .csv"),
         ("m.csv", "a,b,c\n", "two columns"),
         ("m.json", "[1]", "holds a list"),
+        ("m.csv", "a,x\nb,y\na,z\n", "'a' more than once"),
+        ("m.json", '{"a": "x", "b": "y", "a": "z"}', "'a' twice"),
         ("m.toml", "= 3", "not valid TOML"),
     ],
 )

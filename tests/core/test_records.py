@@ -20,6 +20,8 @@ from brainbench.core.records import (
     Score,
     SubjectScore,
 )
+from brainbench.datasets import open_recordings, write_recordings
+from tests.factories.recordings import make_simple_session
 
 
 def _make_score(**changes: object) -> Score:
@@ -177,3 +179,10 @@ def test_recordings_without_duration_are_refused():
     dataset = xr.Dataset({"counts": (("trial", "time", "unit"), np.zeros((1, 1, 1)))})
     with pytest.raises(DataError, match=r"recordings .*'duration'"):
         check_recordings(dataset)
+
+
+def test_labels_of_recordings_are_those_of_the_vocabulary_each_once(tmp_path):
+    good = open_recordings(write_recordings(tmp_path / "a.h5", make_simple_session()), conditions="trials:stimulus")
+    for vocabulary, told in ((["a", "b", "c", "a"], "'a' twice"), (["a", "b"], "lacks: 'c'")):
+        with pytest.raises(DataError, match=told):
+            check_recordings(good.assign_attrs(vocabulary=vocabulary))

@@ -2,7 +2,8 @@ import numpy as np
 import pytest
 
 from brainbench.core.errors import DataError
-from brainbench.core.statistics import t_interval, two_factor_error, wilson_interval
+from brainbench.core.records import Score
+from brainbench.core.statistics import paired_differences, t_interval, two_factor_error, wilson_interval
 
 
 def test_wilson_equals_a_published_value():
@@ -35,3 +36,12 @@ def test_one_factor_without_spread_leaves_the_other():
     assert 4.302653 * error == pytest.approx((interval.high - interval.low) / 2, rel=1e-6)
     assert freedom == pytest.approx(2.0)
     assert np.isnan(two_factor_error([0.2], np.full(8, 0.3))[0])
+
+
+def test_paired_differences_follow_the_stimuli_of_the_first_score_on_every_run():
+    # The order of a set of strings changes with PYTHONHASHSEED, and with it the last digits of a sum.
+    stimuli = tuple(f"stimulus-{index}" for index in range(12))
+    first = Score("a", 0.5, "ok", stimuli=stimuli, without_stimulus=tuple(range(12)), chance=0.0, attainable=1.0)
+    second = Score("b", 0.5, "ok", stimuli=stimuli[::-1], without_stimulus=(0.0,) * 12, chance=0.0, attainable=1.0)
+    _, without = paired_differences(first, second)
+    assert without.tolist() == list(range(12))

@@ -170,8 +170,52 @@ def test_one_condition_only_is_refused(tmp_path):
 
 
 def test_no_trial_left_tells_which_rules_removed_them(tmp_path):
-    with pytest.raises(DataError, match=r"stimulus=z .*12"):
-        open_recordings(write(tmp_path / "a.h5"), conditions="trials:stimulus", select="stimulus=z")
+    with pytest.raises(DataError, match=r"start_time=99\.\. .*12"):
+        open_recordings(write(tmp_path / "a.h5"), conditions="trials:stimulus", select="start_time=99..")
+
+
+@pytest.mark.parametrize("job", ["open", "export"])
+def test_a_misspelt_name_among_several_is_refused(tmp_path, job):
+    def read(path, select):
+        if job == "export":
+            return export(path, tmp_path / "copies", select=select)
+        return open_recordings(path, conditions="trials:stimulus", select=select)
+
+    write(tmp_path / "a.h5", subject="m1", columns={"light": ["on", "off"] * 6})
+    write(tmp_path / "b.h5", subject="m2", seed=1, columns={"light": ["off", "off"] * 6})
+    with pytest.raises(UsageError, match="subject 'm3'; did you mean 'm"):
+        read(tmp_path, "subjects=m1|m3")
+    with pytest.raises(UsageError, match=r"stimulus value 'zz'.*'a', 'b', 'c'"):
+        read(tmp_path, "stimulus=a|b|zz")
+    # In one of the sessions is enough.
+    read(tmp_path, "light=On|off; subjects=m1|m2")
+
+
+def test_a_misspelt_value_to_remove_is_told_and_one_that_is_absent_is_not(tmp_path):
+    path = write(tmp_path / "a.h5", columns={"texture": ["rough", "smooth"] * 6})
+    notes = open_recordings(path, conditions="trials:stimulus", select="texture!=smoth|spoil").attrs["notes"]
+    assert [note for note in notes if "'smoth'" in note and "did you mean 'smooth'" in note]
+    assert not [note for note in notes if "'spoil'" in note]
+
+
+def test_a_chosen_animal_without_units_is_told_and_not_called_unknown(tmp_path):
+    write_nwb(tmp_path / "a.nwb", subject="m1", units=False)
+    export(write(tmp_path / "b.h5", subject="m2"), tmp_path / "b.nwb")
+    with pytest.raises(DataError, match=r"a\.nwb has no units table"):
+        open_recordings(tmp_path, conditions="trials:stimulus", select="subjects=m1")
+
+
+def test_depths_are_numbers_whatever_type_a_session_stores_them_in(tmp_path):
+    columns = {"depth": [100.0, 400.0, 500.0], "inhibitory": [True, False, True]}
+    write(tmp_path / "a.h5", session="1", unit_columns=columns)
+    columns = {"depth": ["150", "unknown", ""], "inhibitory": ["True", "false", "?"]}
+    write(tmp_path / "b.h5", session="2", seed=1, unit_columns=columns)
+    found = open_recordings(tmp_path, conditions="trials:stimulus")
+    np.testing.assert_array_equal(found["depth"].values, [100.0, 400.0, 500.0, 150.0, np.nan, np.nan])
+    np.testing.assert_array_equal(found["inhibitory"].values, [1.0, 0.0, 1.0, 1.0, 0.0, np.nan])
+    notes = " ".join(found.attrs["notes"])
+    assert re.search(r"b\.h5.*'depth'.*'unknown'", notes)
+    assert "'inhibitory' holds numbers; missing where it says '?'" in notes
 
 
 def test_unsorted_spikes_are_sorted_and_said(tmp_path):

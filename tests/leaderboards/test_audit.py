@@ -10,6 +10,7 @@ import pytest
 from brainbench.core import records
 from leaderboards import audit
 from leaderboards.audit import MOST_NAMED, conflicting, remarks
+from leaderboards.boards import rank
 from leaderboards.store import StoredRecord
 
 
@@ -53,6 +54,16 @@ def test_stimuli_of_an_earlier_definition_of_a_fidelity_are_stale(make_record, t
     found = remarks([_stored(record, tmp_path) for record in (old, new, coarse)])
     assert list(found) == [old.identity]
     assert "another engine or an earlier definition of fidelity 'balanced'" in found[old.identity][0]
+
+
+def test_another_pairing_of_labels_is_another_computation_and_another_board(make_record, tmp_path):
+    straight = {"convex": "convex", "concave": "concave"}
+    one = _with(make_record("a", 0.5), pairs=straight)
+    other = _with(make_record("a", 0.6), pairs={"convex": "concave", "concave": "convex"})
+    assert remarks([_stored(record, tmp_path) for record in (one, other)]) == {}
+    assert [len(board.entries) for board in rank([one, other])] == [1, 1]
+    # A record of an earlier version, without pairs, paired equal labels.
+    assert list(conflicting(_with(make_record("a", 0.6)), [one])) == [one]
 
 
 def test_the_same_computation_with_other_numbers_is_a_conflict_on_both_sides(make_record, tmp_path):

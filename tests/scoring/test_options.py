@@ -35,6 +35,23 @@ def test_an_option_is_a_flag_with_help_a_keyword_and_a_setting(name: str):
     assert name in ELSEWHERE or name in ScoreOptions().settings
 
 
+def test_finished_stimuli_state_no_fidelity():
+    stated = ScoreOptions(stimuli="set.h5").settings
+    assert stated["fidelity"] is None
+    # An earlier record stated one that did nothing.
+    assert ScoreOptions.stated_in({**stated, "fidelity": "fast"}).fidelity == "balanced"
+    assert ScoreOptions.stated_in({**stated, "stimuli": "objects", "fidelity": "fast"}).fidelity == "fast"
+    with pytest.raises(UsageError, match="these stimuli are finished"):
+        brainbench.score("zhuang-small", stimuli="set.h5", fidelity="fast")
+
+
+def test_a_layer_is_named_once():
+    with pytest.raises(UsageError, match="layers names none"):
+        ScoreOptions.of({"layers": []})
+    with pytest.raises(UsageError, match="'conv1' more than once"):
+        ScoreOptions(layers=("conv1", "fc", "conv1"))
+
+
 def test_a_wrong_keyword_is_answered_with_the_nearest():
     with pytest.raises(UsageError, match="did you mean 'metric'"):
         brainbench.score("zhuang-small", metrik="rsa")

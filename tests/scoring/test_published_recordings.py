@@ -54,6 +54,11 @@ def test_zeros_of_other_slots_enter_no_default_score(file, arrays):
             np.testing.assert_allclose(session.responses[:, 0], block[np.arange(len(block)), slots], rtol=1e-6)
 
 
+def test_published_estimators_take_no_choice_of_units(file, features):
+    with pytest.raises(UsageError, match="units_reliability"):
+        brainbench.score(features, recordings=file, estimator="thesis", units_reliability=0.5)
+
+
 @pytest.mark.parametrize("estimator", ["thesis", "thesis-input"])
 def test_published_estimators_take_the_array_as_it_is(file, arrays, features, estimator):
     found = brainbench.score(features, recordings=file, estimator=estimator)

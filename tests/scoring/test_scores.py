@@ -10,11 +10,13 @@ import xarray as xr
 from torch import nn
 
 import brainbench
+from brainbench.cli.leaderboard.scoring import score_again
 from brainbench.core.errors import UsageError
 from brainbench.datasets import open_recordings, write_recordings
 from brainbench.datasets.sessions import make_session
 from brainbench.models.features import write_features
 from brainbench.scoring.scores import score_record
+from leaderboards.changes import differences
 
 LABELS = ("a", "b", "c", "d", "e", "f")
 TRIALS = 30
@@ -150,6 +152,21 @@ def test_dropped_labels_leave_the_comparison(truth: Path, recordings: xr.Dataset
     score = brainbench.score(str(truth), recordings=recordings, match={"f": None})
     assert score.stimuli == LABELS[:5]
     assert len(score.model_rdm) == 10
+
+
+def test_a_record_with_a_dropped_label_is_repeated_without_it(truth: Path, folder: Path):
+    how = {"recordings": str(folder), "conditions": "trials:stimulus"}
+    record = score_record(str(truth), match={"f": None}, **how)
+    again = score_again(record, recordings=str(folder), trust_code=True)
+    assert differences(record, again) == []
+
+
+@pytest.mark.parametrize(
+    "choice", [{"select": "stimulus=a|b"}, {"window": "start..+0.1"}, {"conditions": "trials:stimulus"}, {"bin": 0.1}]
+)
+def test_a_choice_that_recordings_in_memory_cannot_follow_is_refused(truth: Path, recordings: xr.Dataset, choice):
+    with pytest.raises(UsageError, match=f"{next(iter(choice))} cannot apply"):
+        brainbench.score(str(truth), recordings=recordings, **choice)
 
 
 def test_unmatched_labels_are_an_error_that_lists_both_sides(recordings: xr.Dataset, tmp_path: Path):

@@ -62,14 +62,11 @@ def add(
         raise UsageError(f"--to is a folder; {str(to)!r} is a file.")
     jobs = []
     if model:
-        first, *others = parse_seeds(seeds or "0")
-        # Trained weights do not depend on a seed.
-        jobs = jobs_of(model, [first], options)
-        jobs += [job for job in jobs_of(model, others, options) if "." not in job.model]
-        if not jobs:
-            raise UsageError(f"No model matches {', '.join(map(repr, model))}; see them with: brainbench models list")
+        jobs += jobs_of(model, parse_seeds(seeds) if seeds else None, options)
     if batch is not None:
         jobs += read_batch(batch)
+    # Patterns, entries and both flags may name a model twice.
+    jobs = list({job.command: job for job in jobs}.values())
     done = take_in(record_files(records or []), to, keep_both=keep_both)
     done += score_jobs(jobs, to, prune=prune, workers=workers, scheduler=scheduler)
     states = [item["state"] for item in done]

@@ -78,7 +78,7 @@ def _present(to: Path) -> list[tuple[Path, ResultRecord]]:
 def _question(record: ResultRecord) -> str:
     """Return what two records share when they answer the same question, the old one with what has since changed."""
     origin = record.score.provenance
-    return to_json([record.score.name, origin.recordings.get("source"), full_settings(origin.settings)])
+    return to_json([record.score.name, origin.recordings.get("source"), origin.pairing, full_settings(origin.settings)])
 
 
 def score_jobs(

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import msgspec
 
@@ -17,7 +17,12 @@ from brainbench.core.files import to_json, to_plain
 from brainbench.core.reading.ranges import check_number
 from brainbench.core.reading.texts import read_toml
 from brainbench.core.records import ESTIMATOR_VERSION, ResultRecord
+from brainbench.scoring.model_responses import follows_seed
 from brainbench.scoring.options import ScoreOptions
+
+if TYPE_CHECKING:
+    from brainbench.scoring.neural_responses import NeuralResponses
+    from brainbench.stimuli import Stimuli
 
 _IN_HASHES = ("stimuli", "conditions", "select", "window", "bin", "fidelity", "whiskers")
 """Settings that the hashes of recordings and stimuli hold."""
@@ -42,13 +47,24 @@ class ScoringJob:
         return score_record(self.model, self.options, command=self.command)
 
 
-def jobs_of(patterns: Sequence[str], seeds: Sequence[int], options: dict[str, Any]) -> list[ScoringJob]:
-    """Return the scores of the models that the patterns match, for each seed of untrained weights."""
+def jobs_of(patterns: Sequence[str], seeds: Sequence[int] | None, options: Mapping[str, Any]) -> list[ScoringJob]:
+    """Return the scores of the models that the patterns match, for each seed of untrained weights.
+
+    Without ``seeds`` the options state one. Weights that follow no seed are scored once.
+
+    Raises:
+        UsageError: a pattern matches no model, or an option does not exist.
+    """
     common = ScoreOptions.of(options)
+    by_seed = {
+        seed: replace(common, weights_seed=None if seed == common.seed else seed)
+        for seed in ([common.model_seed] if seeds is None else seeds)
+    }
+    fixed = [replace(common, weights_seed=None)]
     return [
-        ScoringJob(name, replace(common, weights_seed=None if seed == common.seed else seed))
+        ScoringJob(name, seeded)
         for name in find_models(patterns)
-        for seed in seeds
+        for seeded in (by_seed.values() if follows_seed(name) else fixed)
     ]
 
 
@@ -131,7 +147,7 @@ def find_models(patterns: Sequence[str]) -> list[str]:
     means architectures, one with a dot trained models: ``*-small`` and ``*-small.*``.
 
     Raises:
-        UsageError: an architecture does not exist.
+        UsageError: an architecture does not exist, or a pattern matches nothing.
     """
     from brainbench.models.architecture import Architecture, is_path
     from brainbench.models.registry import list_models
@@ -142,7 +158,9 @@ def find_models(patterns: Sequence[str]) -> list[str]:
     for pattern in patterns:
         if any(mark in pattern for mark in "*?["):
             some = list_models() if Architecture.parse(pattern).tag is None else shipped()
-            found |= dict.fromkeys(name for name in some if fnmatchcase(name, pattern))
+            if not (alike := [name for name in some if fnmatchcase(name, pattern)]):
+                raise UsageError(f"No model matches {shown(pattern)}; see them with: brainbench models list")
+            found |= dict.fromkeys(alike)
         elif pattern in names or is_path(pattern) or Architecture.parse(pattern).tag is not None:
             found[pattern] = None
         else:
@@ -154,7 +172,10 @@ def missing(jobs: Sequence[ScoringJob], records: Iterable[ResultRecord]) -> list
     """Return the jobs whose score is not among the records.
 
     A record counts only if made by this version of the package and of the estimator from the same weights,
-    recordings, stimuli and settings, so that a batch also renews what has become stale.
+    recordings, stimuli, pairs of labels and settings, so that a batch also renews what has become stale.
+
+    Raises:
+        UsageError: the labels of recordings and stimuli do not match.
     """
     from brainbench import __version__
     from brainbench.scoring.model_responses import DEFAULT_STIMULI, resolve_model
@@ -162,25 +183,31 @@ def missing(jobs: Sequence[ScoringJob], records: Iterable[ResultRecord]) -> list
     from brainbench.stimuli import load_stimuli
 
     # Jobs of --model and of a batch file may have other recordings and stimuli.
-    inputs: dict[str, list[Any]] = {}
+    inputs: dict[str, tuple[NeuralResponses, Stimuli]] = {}
     for options in (job.options for job in jobs):
         if (key := _asked_for(options)) not in inputs:
             brain = open_neural_responses(options.recordings, progress=None, **options.selection)
             source = options.stimuli or brain.stimuli or DEFAULT_STIMULI
-            shown = load_stimuli(source, whiskers=options.whiskers, fidelity=options.fidelity)
-            inputs[key] = [brain.origin["content_hash"], shown.config_hash or shown.content_hash]
+            inputs[key] = brain, load_stimuli(source, whiskers=options.whiskers, fidelity=options.fidelity)
     known = set()
     for record in records:
         origin = record.score.provenance
         hashes = origin.stimuli.get("config_hash") or origin.stimuli.get("content_hash")
         versions = [origin.version, origin.settings.get("estimator_version")]
         weights = record.card.weights if record.card else None
-        made = [record.score.name, weights, origin.recordings.get("content_hash"), hashes, *versions]
+        asked = [origin.pairs, origin.recordings.get("title"), "estimator_walk" in origin.statistics]
+        made = [record.score.name, weights, origin.recordings.get("content_hash"), hashes, *asked, *versions]
         known.add(to_json([*made, full_settings(origin.settings, without=_IN_HASHES)]))
     found = []
     for job in jobs:
-        weights = resolve_model(job.model, seed=job.options.model_seed).card.weights
-        wanted = [job.model, weights, *inputs[_asked_for(job.options)], __version__, ESTIMATOR_VERSION]
+        model = resolve_model(job.model, seed=job.options.model_seed)
+        brain, stimuli = inputs[_asked_for(job.options)]
+        # Features with labels of their own were made of stimuli that nobody here knows.
+        felt = None if model.labels else stimuli.config_hash or stimuli.content_hash
+        pairs = brain.pairs(model.labels or stimuli.labels, job.options.match)
+        asked = [brain.stated_pairs(pairs), job.options.title, job.options.explain]
+        given = [model.card.name, model.card.weights, brain.origin["content_hash"], felt, *asked]
+        wanted = [*given, __version__, ESTIMATOR_VERSION]
         if to_json([*wanted, full_settings(job.options.settings, without=_IN_HASHES)]) not in known:
             found.append(job)
     return found
@@ -237,12 +264,14 @@ def read_batch(path: Path) -> list[ScoringJob]:
     for entry in entries:
         if not isinstance(entry, dict) or set(entry) - {"models", "seeds"} or "models" not in entry:
             raise DataError(f"An entry of {str(path)!r} has 'models' and maybe 'seeds'; received {shown(entry)}.")
-        models, seeds = entry["models"], entry.get("seeds", [0])
-        if not isinstance(models, list) or not all(isinstance(name, str) for name in models):
-            raise DataError(f"'models' of {str(path)!r} is a list of names; received {shown(models)}.")
-        if not isinstance(seeds, list):
-            raise DataError(f"'seeds' of {str(path)!r} is a list of whole numbers; received {shown(seeds)}.")
-        for seed in seeds:
+        models, seeds = entry["models"], entry.get("seeds")
+        if not isinstance(models, list) or not models or not all(isinstance(name, str) for name in models):
+            raise DataError(f"'models' of {str(path)!r} is a list of one or more names; received {shown(models)}.")
+        if seeds is not None and (not isinstance(seeds, list) or not seeds):
+            raise DataError(f"'seeds' of {str(path)!r} is a list of whole numbers, not empty; received {shown(seeds)}.")
+        for seed in seeds or ():
             check_number("A seed of a batch", seed, least=0, whole=True)
         jobs += jobs_of(models, seeds, options)
+    if not jobs:
+        raise DataError(f'{str(path)!r} names no model; give [[entries]] with models = ["NAME"].')
     return jobs

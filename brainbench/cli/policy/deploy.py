@@ -133,7 +133,7 @@ def deploy(
 
 def _inputs(deployed: DeployedPolicy, words: list[str]) -> dict[str, Any]:
     """Return group → its constant, as --input gives them."""
-    from brainbench.core.errors import UsageError, check_name
+    from brainbench.core.errors import UsageError, check_name, check_once
     from robotics_bridge.deploy.session import constant
 
     wanted = [name for name in deployed.groups if name != "proprio"]
@@ -144,6 +144,7 @@ def _inputs(deployed: DeployedPolicy, words: list[str]) -> dict[str, Any]:
             found[name] = [float(number) for number in text.split(",")]
         except ValueError:
             raise UsageError(f"An input is NAME=NUMBER or NAME=NUMBER,NUMBER…; received {word[:80]!r}.") from None
+    check_once("--input", [word.partition("=")[0] for word in words])
     for name in found:
         check_name("input that the policy reads and a constant can replace", name, wanted)
     return {name: constant(name, values, deployed.groups[name]) for name, values in found.items()}

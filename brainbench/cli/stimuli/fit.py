@@ -12,7 +12,7 @@ from brainbench.cli.options import items, option, with_options
 from brainbench.cli.output import JsonOption, emit, progress_bar, table_of
 from brainbench.cli.stimuli import scenes
 from brainbench.cli.stimuli.scenes import StimulusOption
-from brainbench.core.errors import UsageError, shown
+from brainbench.core.errors import UsageError, check_once, shown
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -182,16 +182,17 @@ def _whisker(name: str, scene: Any, known: dict[str, Any]) -> Whisker:
 
 def _pairs(given: str, flag: str, *, text: bool = False) -> dict[str, Any]:
     """Return NAME=VALUE pairs with commas between them; values are numbers, or texts."""
-    found: dict[str, Any] = {}
+    found: list[tuple[str, Any]] = []
     for item in items(given):
         name, sign, value = item.partition("=")
         try:
-            found[name.strip()] = value.strip() if text else float(value)
+            found.append((name.strip(), value.strip() if text else float(value)))
         except ValueError:
             sign = ""
         if not sign:
             raise UsageError(f"{flag} takes NAME=VALUE pairs with commas between them; received {shown(item)}.")
-    return found
+    check_once(flag, [name for name, _ in found])
+    return dict(found)
 
 
 def _span(text: str) -> tuple[float, float]:

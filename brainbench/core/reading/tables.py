@@ -9,7 +9,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from brainbench.core.errors import DataError, shown
+from brainbench.core.errors import DataError, listing, repeats, shown
 from brainbench.core.reading.regular import MOST_TABLE, readable
 from brainbench.core.reading.texts import read_text
 
@@ -28,9 +28,11 @@ def read_columns(
 
     Raises:
         DataFileNotFoundError: there is no such file.
-        DataError: something is no finite number, or lines differ in length.
+        DataError: two columns have one name, something is no finite number, or lines differ in length.
     """
     header, *rows = (read_rows(path, kind) if gaps else _trimmed(path, kind)) or [[]]
+    if twice := repeats(filter(None, header)):
+        raise DataError(f"{shown(os.fspath(path))} has several columns {listing(twice, limit=4)}; a name stands once.")
     table = to_numbers(rows, path, kind, first=2, columns=len(header), gaps=gaps)
     if not gaps and not np.isfinite(table).all():
         row, column = np.argwhere(~np.isfinite(table))[0]

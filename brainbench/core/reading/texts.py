@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from brainbench.core.errors import DataError, missing_dependency, shown
+from brainbench.core.errors import DataError, listing, missing_dependency, repeats, shown
 from brainbench.core.reading.regular import MOST_TEXT, check_file, readable, reason
 
 MOST_LEVELS = 64
@@ -34,12 +34,19 @@ def parse_json(text: str, name: str) -> Any:
     """Parse JSON text; ``name`` is that of its file in messages.
 
     Raises:
-        DataError: it is not valid, nested too deeply, or holds a number that is not finite or too large.
+        DataError: it is not valid, nested too deeply, names a value twice, or holds a number that is not finite or too
+            large.
     """
+
+    def unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+        if len(found := dict(pairs)) < len(pairs):
+            raise DataError(f"{shown(name)} has {listing(repeats(key for key, _ in pairs))} twice in one object.")
+        return found
+
     # Python's parser takes NaN and Infinity, which JSON does not know, and 1e400, which is infinite.
     with readable(name, "JSON"):
         try:
-            return check_values(json.loads(text), name)
+            return check_values(json.loads(text, object_pairs_hook=unique), name)
         except json.JSONDecodeError as error:
             raise DataError(f"{shown(name)} is not valid JSON ({reason(error)}).") from error
 
@@ -75,7 +82,7 @@ def read_yaml(path: str | os.PathLike[str], kind: str = "file") -> Any:
 
     Raises:
         DataFileNotFoundError: there is no such file.
-        DataError: it cannot be parsed, repeats values by alias, or see :func:`parse_json`.
+        DataError: it cannot be parsed, repeats values by alias or names, or see :func:`parse_json`.
         MissingDependencyError: no reader of YAML is installed.
     """
     try:
@@ -93,9 +100,21 @@ def read_yaml(path: str | os.PathLike[str], kind: str = "file") -> Any:
                     raise DataError(f"{shown(name)} is nested too deeply: more than {MOST_LEVELS} levels.")
                 if isinstance(event, yaml.AliasEvent):
                     raise DataError(f"{shown(name)} repeats values by alias (*name); write them out instead.")
+            _check_keys(yaml.compose(text, yaml.SafeLoader), name)
             return check_values(yaml.safe_load(text), name)
         except yaml.YAMLError as error:
             raise DataError(f"{shown(name)} is not valid YAML ({reason(error)}).") from error
+
+
+def _check_keys(node: Any, name: str) -> None:
+    """Raise DataError if a mapping inside a node of YAML has a key twice."""
+    if node is None or node.id == "scalar":
+        return
+    pairs = node.value if node.id == "mapping" else [(None, item) for item in node.value]
+    if twice := repeats(key.value for key, _ in pairs if key is not None and key.id == "scalar"):
+        raise DataError(f"{shown(name)} has {listing(twice)} twice in one mapping.")
+    for _, item in pairs:
+        _check_keys(item, name)
 
 
 def read_mapping(path: str | os.PathLike[str], kind: str = "file") -> dict[str, Any]:

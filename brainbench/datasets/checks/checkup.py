@@ -12,11 +12,11 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from brainbench.core.errors import DataError
+from brainbench.core.errors import DataError, repeats
 from brainbench.core.progress import Progress, track
 from brainbench.datasets import hdf5
 from brainbench.datasets.checks.clock import check_clock
-from brainbench.datasets.checks.findings import SEVERITIES, Finding, repeats, some
+from brainbench.datasets.checks.findings import SEVERITIES, Finding, some
 from brainbench.datasets.checks.labels import check_labels
 from brainbench.datasets.checks.published import check_published
 from brainbench.datasets.checks.spikes import check_spikes

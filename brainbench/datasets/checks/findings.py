@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
@@ -32,11 +31,6 @@ class Finding:
 def share(part: int, whole: int) -> str:
     """Return a part of a whole for a message: ``"3 of 40 (8 %)"``."""
     return f"{part} of {whole} ({100 * part / max(whole, 1):.0f} %)"
-
-
-def repeats(names: list[str]) -> list[str]:
-    """Return the names that occur more than once, sorted."""
-    return sorted(name for name, number in Counter(names).items() if number > 1)
 
 
 def some(names: list[str], limit: int = 5) -> str:

@@ -7,7 +7,8 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from brainbench.datasets.checks.findings import LONGEST_SESSION, Finding, Severity, repeats, share, some
+from brainbench.core.errors import repeats
+from brainbench.datasets.checks.findings import LONGEST_SESSION, Finding, Severity, share, some
 from brainbench.datasets.sessions import Session, as_labels
 from brainbench.datasets.trials.counting import recorded_span
 

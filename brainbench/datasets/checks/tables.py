@@ -8,8 +8,8 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from brainbench.core.errors import BrainbenchError, DataError
-from brainbench.datasets.checks.findings import LONGEST_SESSION, Finding, Severity, repeats, share, some
+from brainbench.core.errors import BrainbenchError, DataError, repeats
+from brainbench.datasets.checks.findings import LONGEST_SESSION, Finding, Severity, share, some
 from brainbench.datasets.layouts.registry import RecordingLayout
 from brainbench.datasets.sessions import Session, SessionTable, as_labels
 from brainbench.datasets.trials.conditions import Conditions

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from brainbench.core.errors import DataError, UsageError, shown
+from brainbench.core.errors import DataError, UsageError, check_once, repeats, shown
 from brainbench.datasets.sessions import SessionTable, as_labels, natural_key
 
 
@@ -27,7 +27,7 @@ class Conditions:
         ('stimulus', 'servo_position')
 
         Raises:
-            UsageError: the text is not of this form.
+            UsageError: the text is not of this form, or names a column twice.
         """
         table, colon, rest = source.rpartition(":")
         columns = tuple(item.strip() for item in rest.split(","))
@@ -36,6 +36,7 @@ class Conditions:
                 f"The conditions {shown(source)} cannot be read; write TABLE:COLUMN or TABLE:COLUMN,COLUMN, such as "
                 f"'trials:stimulus'. `brainbench recordings inspect FILE` proposes some."
             )
+        check_once(f"The text {shown(source)} for the conditions", columns)
         return cls(table.strip(), columns)
 
     def __str__(self) -> str:
@@ -65,7 +66,6 @@ def natural_vocabulary(values: Iterable[tuple[str, ...]]) -> tuple[str, ...]:
     # Sorted, not in order of appearance: that depends on the session that comes first, and RDMs would not share axes.
     ordered = sorted(set(values), key=lambda row: [natural_key(item) for item in row])
     labels = ["-".join(row) for row in ordered]
-    if len(set(labels)) < len(labels):
-        twice = next(label for label in labels if labels.count(label) > 1)
-        raise DataError(f"Two combinations of condition values both read {twice!r}; choose fewer columns.")
+    if twice := repeats(labels):
+        raise DataError(f"Two combinations of condition values both read {twice[0]!r}; choose fewer columns.")
     return tuple(labels)

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from brainbench.core.errors import DataError, UsageError
+from brainbench.core.errors import DataError, UsageError, listing
 from brainbench.core.reading.ranges import check_number
-from brainbench.datasets.sessions import OBSERVED, SPIKES, Session, SessionTable, as_labels, natural_key
+from brainbench.datasets.sessions import OBSERVED, SPIKES, Session, SessionTable, as_labels, as_number, natural_key
 from brainbench.datasets.trials.conditions import Conditions, joined_labels
 from brainbench.datasets.trials.covariates import trial_covariates
 from brainbench.datasets.trials.selection import Selection, Tally
@@ -21,6 +21,7 @@ from brainbench.datasets.trials.windows import Window
 UNIT_COLUMNS = {"depth": float, "layer": str, "inhibitory": float}
 """Unit columns carried along where present, with the type that can say "missing"."""
 
+_TRUTH = {"true": 1.0, "false": 0.0}
 _MOST_COUNTS = 1 << 32
 """Counts of one session that are made at most: 16 GiB."""
 
@@ -125,7 +126,9 @@ def count_session(session: Session, options: ReadingOptions) -> SessionCounts:
         edges=edges[rows],
         counts=counts,
         duration=duration,
-        columns={name: _unit_column(session.units, name, kind, units) for name, kind in UNIT_COLUMNS.items()},
+        columns={
+            name: _unit_column(session.units, name, kind, units, tally.notes) for name, kind in UNIT_COLUMNS.items()
+        },
         covariates=trial_covariates(session, table, rows, edges[rows]),
         tally=tally,
         trials=len(table),
@@ -299,8 +302,17 @@ def missing_column(kind: type, units: int) -> NDArray[Any]:
     return np.full(units, np.nan) if kind is float else np.full(units, "", dtype="U1")
 
 
-def _unit_column(units: SessionTable, name: str, kind: type, rows: NDArray[np.int64]) -> NDArray[Any]:
+def _unit_column(units: SessionTable, name: str, kind: type, rows: NDArray[np.int64], notes: list[str]) -> NDArray[Any]:
+    """Return a unit column of the kept units, of one type in all sessions: a text that is no number is NaN."""
     if name not in units:
         return missing_column(kind, len(rows))
     values = units.column(name)[rows]
-    return values.astype(np.float64) if kind is float and values.dtype.kind in "biuf" else as_labels(values)
+    if kind is not float:
+        return as_labels(values)
+    if values.dtype.kind != "U":
+        return values.astype(np.float64)
+    texts = np.char.lower(as_labels(values)).tolist()
+    numbers = np.array([_TRUTH.get(text, as_number(text)) for text in texts], dtype=np.float64)
+    if lost := sorted({text for text, number in zip(texts, numbers, strict=True) if text and np.isnan(number)}):
+        notes.append(f"{units.label}: column {name!r} holds numbers; missing where it says {listing(lost, limit=4)}")
+    return numbers

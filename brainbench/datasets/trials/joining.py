@@ -14,6 +14,7 @@ from brainbench.datasets.sessions import natural_key
 from brainbench.datasets.trials.conditions import natural_vocabulary
 from brainbench.datasets.trials.counting import UNIT_COLUMNS, ReadingOptions, SessionCounts
 from brainbench.datasets.trials.covariates import COVARIATES
+from brainbench.datasets.trials.selection import check_values
 from brainbench.datasets.trials.session_trials import missing_labels
 
 if TYPE_CHECKING:
@@ -28,12 +29,14 @@ def join_sessions(
     ``source`` is what the user asked for, ``layout`` the name of the layout with how it was chosen, or "".
 
     Raises:
+        UsageError: no row of any session has a value that a rule keeps.
         DataError: no trial, no unit or only one condition remains.
     """
     import xarray as xr
 
     # The order must not depend on that of the files: equal data then have equal content hashes.
     parts = sorted(parts, key=lambda part: (natural_key(part.subject), natural_key(part.session)))
+    notes = [*notes, *check_values(part.tally for part in parts)]
     removed: Counter[str] = Counter()
     for part in parts:
         removed.update(part.tally.removed)

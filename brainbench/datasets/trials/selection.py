@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from brainbench.core.errors import UsageError, shown
-from brainbench.datasets.sessions import SessionTable, as_labels
+from brainbench.core.errors import UsageError, check_once, nearest, shown, unknown_name
+from brainbench.core.reading.ranges import check_fields
+from brainbench.datasets.sessions import SessionTable, as_label, as_labels, natural_key
 
 _TRUTH = {"true": ("true", "1"), "false": ("false", "0")}
 _RULE = re.compile(r"^\s*(?:(?P<scope>trials|units)\.)?(?P<column>[^=!<>]+?)\s*(?P<sign>!=|=)\s*(?P<values>.+?)\s*$")
@@ -25,6 +26,9 @@ class Rule:
 
     Values are compared as text, so ``1``, ``"1"`` and ``1.0`` agree, and ``"true"`` also matches 1.
     A row without a value fails ``allow``, ``low`` and ``high`` and passes ``refuse``.
+
+    Raises:
+        UsageError: it states nothing, an empty value, or a range that no number is in.
     """
 
     column: str
@@ -39,6 +43,14 @@ class Rule:
     required: bool = True
     """False: a table without the column passes, and the result says that the rule did not apply."""
 
+    def __post_init__(self) -> None:
+        values = (*self.allow, *self.refuse)
+        if not all(values) or (not values and self.low is None and self.high is None):
+            raise UsageError(f"The rule on {self.column!r} has an empty value; write a|b or low..high.")
+        check_fields(self, "low", "high", of=f"{{}} of the rule on {self.column!r}")
+        if self.low is not None and self.high is not None and self.low > self.high:
+            raise UsageError(f"The rule {self} keeps nothing: the lower end of a range stands first.")
+
     def __str__(self) -> str:
         parts = []
         if self.allow:
@@ -46,12 +58,14 @@ class Rule:
         if self.refuse:
             parts.append(f"{self.column}!={'|'.join(self.refuse)}")
         if self.low is not None or self.high is not None:
-            low, high = ("" if bound is None else f"{bound:g}" for bound in (self.low, self.high))
+            low, high = ("" if bound is None else as_label(float(bound)) for bound in (self.low, self.high))
             parts.append(f"{self.column}={low}..{high}")
         return " and ".join(parts)
 
-    def keep(self, table: SessionTable) -> NDArray[np.bool_] | None:
+    def keep(self, table: SessionTable, seen: dict[Rule, set[str]] | None = None) -> NDArray[np.bool_] | None:
         """Return which rows of ``table`` pass [rows], or None where an optional column is absent.
+
+        ``seen`` takes the values that the column has, for :func:`check_values`.
 
         Raises:
             UsageError: a required column is absent (the nearest is named).
@@ -62,7 +76,10 @@ class Rule:
                 table.require(self.column)
             return None
         values = table.column(self.column)
-        labels = np.char.lower(as_labels(values))
+        labels = as_labels(values)
+        if seen is not None and (self.allow or self.refuse):
+            seen.setdefault(self, set()).update(labels.tolist())
+        labels = np.char.lower(labels)
         keep = np.ones(len(labels), dtype=bool)
         if self.allow:
             keep &= np.isin(labels, _spellings(self.allow))
@@ -100,10 +117,11 @@ class Selection:
         50
 
         Raises:
-            UsageError: a part is not of this form.
+            UsageError: a part is not of this form, or subjects or spikes are stated twice.
         """
         trials: list[Rule] = []
         units: list[Rule] = []
+        own: list[str] = []
         selection = cls(name=source.strip())
         for part in filter(None, (item.strip() for item in source.split(";"))):
             match = _RULE.match(part)
@@ -113,16 +131,29 @@ class Selection:
                     f"COLUMN=low..high, with units. before columns of the units table, and ';' between rules."
                 )
             column, values = match["column"], match["values"]
+            if match["scope"] is None and column in ("min_spikes", "subjects"):
+                own.append(column)
+                if match["sign"] != "=":
+                    raise UsageError(f"{column} is written {column}=…, and cannot be refused; received {shown(part)}.")
             if column == "min_spikes":
                 if not (values.isdecimal() and len(values) < 16):
                     raise UsageError(f"min_spikes is a whole number from 0; received {shown(values)}.")
                 selection = replace(selection, min_spikes=int(values))
             elif column == "subjects":
-                selection = replace(selection, subjects=_values(values))
+                if not all(subjects := _values(values)):
+                    raise UsageError(f"subjects are names with | between them; received {shown(values)}.")
+                selection = replace(selection, subjects=subjects)
             else:
                 rule = _rule(column, match["sign"], values)
                 (units if match["scope"] == "units" else trials).append(rule)
+        check_once("The selection", own)
         return replace(selection, trials=tuple(trials), units=tuple(units))
+
+    def __str__(self) -> str:
+        """Return its name, or the text from which :meth:`parse` reads its rules."""
+        rules = [*map(str, self.trials), *(f"units.{rule}" for rule in self.units), f"min_spikes={self.min_spikes}"]
+        rules += [f"subjects={'|'.join(self.subjects)}"] if self.subjects else []
+        return "; ".join(rules) if self.name == type(self).name else self.name
 
     def lines(self) -> Iterator[str]:
         """Yield every rule, one line each."""
@@ -146,6 +177,8 @@ class Tally:
 
     removed: dict[str, int] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
+    seen: dict[Rule, set[str]] = field(default_factory=dict)
+    """Values that the columns of the rules have."""
 
     def apply(self, kept: NDArray[np.bool_], passes: Any, rule: str) -> NDArray[np.bool_]:
         """Return the rows that remain and count those that only now fell out."""
@@ -156,12 +189,38 @@ class Tally:
         """Apply rules in order to all rows of a table; returns which remain [rows]."""
         kept = np.ones(len(table), dtype=bool)
         for rule in rules:
-            passes = rule.keep(table)
+            passes = rule.keep(table, self.seen)
             if passes is None:
                 self.notes.append(f"{table.label}: no column {rule.column!r}, so the rule {rule} did not apply")
             else:
                 kept = self.apply(kept, passes, f"{scope}: {rule}")
         return kept
+
+
+def check_values(tallies: Iterable[Tally]) -> list[str]:
+    """Check the values of rules against those of all sessions.
+
+    Returns:
+        A note for each value to remove that no row has but that is spelt nearly as one that rows have.
+
+    Raises:
+        UsageError: no row has a value to keep (the nearest is named).
+    """
+    found: dict[Rule, set[str]] = {}
+    for tally in tallies:
+        for rule, values in tally.seen.items():
+            found.setdefault(rule, set()).update(values)
+    notes = []
+    for rule, values in found.items():
+        known = sorted(values - {""}, key=natural_key)
+        for value in (*rule.allow, *rule.refuse):
+            if any(item.lower() in _spellings((value,)) for item in known):
+                continue
+            if value in rule.allow:
+                raise unknown_name(f"{rule.column} value", value, known)
+            if guess := nearest(value, known):
+                notes.append(f"no row has the value {value!r} that the rule {rule} removes; did you mean {guess!r}?")
+    return notes
 
 
 def _spellings(values: tuple[str, ...]) -> list[str]:
@@ -178,7 +237,7 @@ def _rule(column: str, sign: str, values: str) -> Rule:
 
 
 def _values(source: str) -> tuple[str, ...]:
-    return tuple(item.strip() for item in source.split("|") if item.strip())
+    return tuple(item.strip() for item in source.split("|"))
 
 
 def _number(source: str) -> float | None:

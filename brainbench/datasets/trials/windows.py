@@ -10,14 +10,16 @@ from numpy.typing import NDArray
 
 from brainbench.core.errors import DataError, UsageError, shown, unknown_name
 from brainbench.core.reading.ranges import check_fields
-from brainbench.datasets.sessions import Session, SessionTable
+from brainbench.datasets.sessions import Session, SessionTable, as_label
 
 FIRST_CONTACT = "first-contact"
 CONTACTS = re.compile(r"^(?:.*/)?contacts_by_whisker_(?P<whisker>\w+)$")
 """Names of the interval tables that hold one whisker's contacts."""
 _ANCHORS = {"start": "start_time", "stop": "stop_time", "choice": "choice_time"}
 # The name is matched lazily, so that it may hold a hyphen (first-contact) and yet leaves a signed number at the end.
-_EDGE = re.compile(r"^(?P<name>.*?)(?P<offset>[+-]\d*\.?\d+)?$")
+_EDGE = re.compile(r"(?P<name>.*?)(?P<offset>[+-](\d+\.?\d*|\.\d+)(e[+-]?\d+)?)?", re.IGNORECASE | re.DOTALL)
+_NO_NAME = re.compile(r"[+−–]|\.\.|^-|-(inf|infinity|nan)$", re.IGNORECASE)
+"""Signs of a number that was not read: no event has them in its name."""
 
 _UNITS = {"s": 1.0, "sec": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6}
 _WITH_UNIT = re.compile(r"(?P<number>[+-]\d*\.?\d+) ?(?P<unit>s|sec|ms|us|µs)$", re.IGNORECASE)
@@ -59,7 +61,7 @@ class Window:
 
     @classmethod
     def parse(cls, source: str) -> Window:
-        """Read a window from text ``FROM[±s]..TO[±s]`` or ``FROM[±s]..+LENGTH``.
+        """Read a window from text ``FROM[±s]..TO[±s]``, ``FROM[±s]..+LENGTH`` or ``FROM[±s]..TO[±s] or +LENGTH``.
 
         >>> str(Window.parse("first-contact..choice"))
         'first-contact..choice'
@@ -70,26 +72,33 @@ class Window:
             UsageError: the text is not of this form.
         """
         first, dots, last = (part.strip() for part in source.partition(".."))
+        last, _, most = (part.strip() for part in last.partition(" or "))
         if with_unit := _WITH_UNIT.search(first) or _WITH_UNIT.search(last):
             seconds = float(with_unit["number"]) * _UNITS[with_unit["unit"].lower()]
             raise UsageError(
                 f"The window {shown(source)} has a time with a unit, {with_unit[0]!r}; times are seconds without a "
                 f"unit, here {seconds:+g}."
             )
-        begin, end = _EDGE.match(first), _EDGE.match(last)
-        if not dots or begin is None or end is None or not begin["name"] or not last:
+        (anchor, offset), (stop, stop_offset), (other, length) = map(_edge, (first, last, most))
+        if not dots or not anchor or not last or other or (most and not stop):
             raise UsageError(
                 f"The window {shown(source)} cannot be read; write FROM..TO or FROM..+SECONDS, such as "
                 f"'first-contact..choice' or 'start+0.2..+0.5'."
             )
-        window = {"anchor": begin["name"], "offset": float(begin["offset"] or 0)}
-        if end["name"]:
-            return cls(**window, stop=end["name"], stop_offset=float(end["offset"] or 0))
-        return cls(**window, length=float(end["offset"]))
+        for name in (anchor, stop):
+            if _NO_NAME.search(name):
+                raise UsageError(
+                    f"The window {shown(source)} has {shown(name)} where an event stands, such as 'choice', or a "
+                    f"finite number of seconds after its sign, such as 'choice-0.5' or '+0.5'."
+                )
+        if not stop:
+            return cls(anchor, float(offset or 0), length=float(stop_offset))
+        longest = float(length) if length else None
+        return cls(anchor, float(offset or 0), stop, float(stop_offset or 0), longest)
 
     def __str__(self) -> str:
         ends = [f"{self.stop}{_signed(self.stop_offset)}"] if self.stop else []
-        ends += [f"+{self.length:g}"] if self.length is not None else []
+        ends += [_signed(self.length)] if self.length is not None else []
         return f"{self.anchor}{_signed(self.offset)}..{' or '.join(ends)}"
 
     def edges(self, session: Session, table: SessionTable, notes: list[str]) -> NDArray[np.float64]:
@@ -154,5 +163,12 @@ def _event(table: SessionTable, anchor: str) -> NDArray[np.float64]:
     return table.times(column)
 
 
+def _edge(text: str) -> tuple[str, str]:
+    """Return the name of an event and the signed number behind it; either may be empty."""
+    found = _EDGE.fullmatch(text)
+    assert found is not None, text
+    return found["name"], found["offset"] or ""
+
+
 def _signed(seconds: float) -> str:
-    return f"{seconds:+g}" if seconds else ""
+    return f"{'+' * (seconds > 0)}{as_label(float(seconds))}" if seconds else ""

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from brainbench.core.errors import UsageError, listing, unknown_name
+from brainbench.core.errors import UsageError, listing, repeats, unknown_name
 from brainbench.core.files import content_hash
 from brainbench.core.progress import Progress, track
 from brainbench.datasets.synthetic.geometry import ResponseGeometry, principal_axes
@@ -121,9 +121,8 @@ def open_candidates(
     # Whatever can be wrong with a name is found before stimuli are simulated.
     resolved = [resolve_model(model, seed=options.model_seed) for model in models]
     names = [item.card.name for item in resolved]
-    if len(set(names)) < len(names):
-        twice = next(name for name in names if names.count(name) > 1)
-        raise UsageError(f"The candidate {twice!r} is given twice; candidates have different names.")
+    if twice := repeats(names):
+        raise UsageError(f"The candidate {twice[0]!r} is given twice; candidates have different names.")
     if any(item.labels is None for item in resolved):
         shown = load_stimuli(
             options.stimuli or "objects", whiskers=options.whiskers, fidelity=options.fidelity, progress=progress

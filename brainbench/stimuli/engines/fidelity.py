@@ -12,7 +12,7 @@ from functools import cache
 from importlib import resources
 from typing import Any, Literal
 
-from brainbench.core.errors import UsageError, check_name, shown
+from brainbench.core.errors import UsageError, check_name, check_once, shown
 from brainbench.core.reading.ranges import check_fields, check_number
 from brainbench.core.tradeoffs import TradeoffPoint, cheapest
 from brainbench.stimuli.engines import DEFAULT_ENGINE
@@ -82,11 +82,12 @@ class Fidelity:
         preset is :meth:`auto`.
 
         Raises:
-            UsageError: there is no such preset or field, or a value lies outside its range.
+            UsageError: there is no such preset or field, a field stands twice, or a value lies outside its range.
         """
         preset, *changes = (item.strip() for item in text.split(","))
         names = {item.name: item for item in fields(cls)}
         values: dict[str, Any] = {}
+        check_once(f"The fidelity {shown(text)}", [change.partition("=")[0].strip() for change in changes])
         for change in changes:
             name, _, value = (part.strip() for part in change.partition("="))
             check_name("fidelity setting", name, names)

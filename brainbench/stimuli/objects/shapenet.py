@@ -17,7 +17,7 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
-from brainbench.core.errors import DataError, DataFileNotFoundError, UsageError, listing, shown
+from brainbench.core.errors import DataError, DataFileNotFoundError, UsageError, listing, repeats, shown
 from brainbench.core.reading.tables import read_rows
 from brainbench.core.reading.texts import read_json, read_text
 from brainbench.stimuli.objects.mesh_solids import mesh_solid
@@ -177,7 +177,7 @@ def _checked(names: Iterable[str], where: str) -> tuple[str, ...]:
             raise UsageError(
                 f"A ShapeNet model is named SYNSET/MODEL, such as 02691156/1a04e3; {where} has {shown(name)}."
             )
-    if twice := [name for name, count in Counter(checked).items() if count > 1]:
+    if twice := repeats(checked):
         raise UsageError(f"ShapeNet models occur twice in {where}: {listing(twice, limit=4)}.")
     return checked
 

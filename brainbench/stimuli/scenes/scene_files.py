@@ -61,7 +61,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from brainbench.core.errors import BrainbenchError, UsageError
+from brainbench.core.errors import BrainbenchError, UsageError, repeats
 from brainbench.core.reading.regular import readable
 from brainbench.core.reading.texts import read_toml
 from brainbench.stimuli.scenes.frames import Frames
@@ -133,9 +133,8 @@ def _recipe(path: Path, data: dict[str, Any], whiskers: str) -> Recipe:
         raise UsageError("the file has no [[scene]].")
     whole = [_scene(entry, array, others, shared, common, path.parent) for entry in entries]
     scenes = [replace(scene, twist=twist).select(whiskers) for scene in whole]
-    repeated = sorted({scene.label for scene in scenes if [s.label for s in scenes].count(scene.label) > 1})
-    if repeated:
-        raise UsageError(f"several scenes have the label {repeated[0]!r}; labels must differ.")
+    if twice := repeats(scene.label for scene in scenes):
+        raise UsageError(f"several scenes have the label {twice[0]!r}; labels must differ.")
     return Recipe(path.stem, description, tuple(scenes))
 
 

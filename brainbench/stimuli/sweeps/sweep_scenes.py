@@ -7,13 +7,12 @@ asked for.
 from __future__ import annotations
 
 import math
-from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any, overload
 
 import numpy as np
 
-from brainbench.core.errors import UsageError, listing
+from brainbench.core.errors import UsageError, listing, repeats
 from brainbench.core.rotations import euler_matrix
 from brainbench.stimuli.objects.solid import Solid
 from brainbench.stimuli.scenes.frames import Frames
@@ -39,7 +38,7 @@ class SweepScenes(Sequence[Scene]):
         """Take ``objects`` as solids, or as a mapping from names to solids or to functions that load them."""
         pairs: list[Any] = list(objects.items()) if isinstance(objects, Mapping) else [(o.name, o) for o in objects]
         self._objects: dict[str, Solid | Callable[[], Solid]] = dict(pairs)
-        if twice := [name for name, count in Counter(name for name, _ in pairs).items() if count > 1]:
+        if twice := repeats(name for name, _ in pairs):
             raise UsageError(f"Several objects are called {listing(twice)}; give a mapping from names to objects.")
         if not pairs:
             raise UsageError("Sweeps need at least one object to move past the whiskers.")

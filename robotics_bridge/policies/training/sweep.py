@@ -14,7 +14,7 @@ from itertools import product
 from pathlib import Path
 from typing import Any
 
-from brainbench.core.errors import UsageError, check_name, shown
+from brainbench.core.errors import UsageError, check_name, repeats, shown
 from brainbench.core.reading.regular import readable
 from brainbench.core.reading.texts import read_toml
 from robotics_bridge.hands.layouts import check_names
@@ -81,9 +81,8 @@ class StudentSweep:
         check_name("subset of the sweep", subset, (*SUBSETS, *every))
         each = product(self.entries, self.seeds)
         found = [student for entry, seed in each for student in self._of_entry(entry, seed, subset, every)]
-        names = Counter(student.name for student in found)
-        if repeated := [name for name, count in names.items() if count > 1]:
-            raise UsageError(f"The sweep {self.name!r} names the student {repeated[0]!r} twice.")
+        if twice := repeats(student.name for student in found):
+            raise UsageError(f"The sweep {self.name!r} names the student {twice[0]!r} twice.")
         return found
 
     def _of_entry(self, entry: SweepEntry, seed: int, subset: str, every: Sequence[str]) -> list[DistillConfig]:

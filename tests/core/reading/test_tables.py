@@ -25,6 +25,7 @@ def test_a_table_with_names_has_finite_numbers_alone(tmp_path):
         ("a,b\n1,nan\n", "'b' in row 2"),
         ("a,b\n1\n", "row 2"),
         ("a,b\n", "no table"),
+        ("a,b,a\n1,2,3\n", "columns 'a'"),
         ("", "no table"),
     ):
         path.write_text(text)

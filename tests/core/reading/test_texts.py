@@ -17,6 +17,7 @@ from brainbench.core.reading.texts import parse_json, parse_toml, read_mapping
         ("[" * 100_000, "deep"),
         ('{"a": ["\\ud800"]}', r"a\[0\]"),
         ('{"\\udfff": 1}', "file"),
+        ('[{"a": {"b": 1, "c": 2, "b": 1}}]', "'b' twice"),
     ],
 )
 def test_json_is_bounded_in_digits_depth_and_range(text, told):
@@ -44,6 +45,7 @@ def test_the_ending_tells_the_language_and_aliases_are_refused(tmp_path):
     for text, told in (
         (laughs, "alias"),
         ("a: .nan", "nan"),
+        ("x: [{b: 1, c: 2, b: 3}]", "'b' twice"),
         ("a: " + "[" * 50_000, "deep"),
         ("a: [", "YAML"),
     ):

@@ -18,6 +18,11 @@ def test_unreadable_conditions_show_the_form(source):
         Conditions.parse(source)
 
 
+def test_a_column_is_named_once():
+    with pytest.raises(UsageError, match="'a' more than once"):
+        Conditions.parse("trials:a,a")
+
+
 def test_a_missing_value_leaves_no_label():
     assert joined_labels(np.array([["a", "1"], ["b", ""]])) == ["a-1", ""]
 

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -58,9 +60,32 @@ def test_rules_are_read_from_text():
     assert next(iter(selection.lines())) == "trials: outcome=correct|error"
 
 
+def test_a_selection_made_in_python_is_read_from_its_text():
+    made = Selection(
+        (Rule("outcome", refuse=("spoil",)),), (Rule("depth", low=100.0, high=123.4567891),), 5, ("m1", "m2")
+    )
+    assert replace(Selection.parse(str(made)), name=made.name) == made
+    assert str(Selection.parse("outcome=correct")) == "outcome=correct"
+
+
 @pytest.mark.parametrize(
     ("source", "message"),
-    [("outcome", "cannot be read"), ("depth!=1..2", "range cannot be refused"), ("min_spikes=few", "whole number")],
+    [
+        ("outcome", "cannot be read"),
+        ("depth!=1..2", "range cannot be refused"),
+        ("min_spikes=few", "whole number"),
+        ("outcome=|", "'outcome' has an empty value"),
+        ("outcome=correct|", "'outcome' has an empty value"),
+        ("units.layer!=|", "'layer' has an empty value"),
+        ("depth=..", "'depth' has an empty value"),
+        ("depth=5..2", "depth=5..2 keeps nothing"),
+        ("subjects=|", "subjects are names"),
+        ("subjects=m1|", "subjects are names"),
+        ("subjects!=m1", "subjects is written subjects="),
+        ("min_spikes!=5", "min_spikes is written min_spikes="),
+        ("subjects=m1; subjects=m2", "'subjects' more than once"),
+        ("min_spikes=5; min_spikes=9", "'min_spikes' more than once"),
+    ],
 )
 def test_unreadable_rules_show_the_form(source, message):
     with pytest.raises(UsageError, match=message):

@@ -23,13 +23,44 @@ def edges(window, session):
 
 
 @pytest.mark.parametrize(
-    "source", ["first-contact..choice", "start+0.2..stop-0.1", "cue_time-0.5..+1.5", "choice-1..choice"]
+    "source",
+    [
+        "first-contact..choice",
+        "start+0.2..stop-0.1",
+        "cue_time-0.5..+1.5",
+        "choice-1..choice",
+        "start..stop-1 or +0.5",
+        "cue-1e-07..+0.123456789",
+    ],
 )
 def test_windows_are_read_from_text_and_written_back(source):
     assert str(Window.parse(source)) == source
 
 
-@pytest.mark.parametrize("source", ["start", "..stop", "start..", "5"])
+@pytest.mark.parametrize(
+    ("source", "part"),
+    [
+        ("start..+inf", "+inf"),
+        ("choice..choice+nan", "choice+nan"),
+        ("choice-inf..choice", "choice-inf"),
+        ("start+0.1x..stop", "start+0.1x"),
+        ("start..+0.5..+0.6", "+0.5.."),
+        ("start..choice..stop", "choice..stop"),
+        ("start−0.5..+1", "start−0.5"),
+    ],
+)
+def test_a_malformed_number_is_no_event(source, part):
+    with pytest.raises(UsageError, match=f"has {re.escape(repr(part))} where an event stands"):
+        Window.parse(source)
+
+
+def test_offsets_may_have_an_exponent_but_no_infinite_value():
+    assert Window.parse("start+2e-1..+5E-1") == Window("start", offset=0.2, length=0.5)
+    with pytest.raises(UsageError, match=r"offset .*finite"):
+        Window.parse("start+1e400..+1")
+
+
+@pytest.mark.parametrize("source", ["start", "..stop", "start..", "5", "start..+1 or +2", "start..stop or choice"])
 def test_unreadable_windows_show_the_form(source):
     with pytest.raises(UsageError, match=rf"'{re.escape(source)}' .*FROM\.\.\+SECONDS"):
         Window.parse(source)

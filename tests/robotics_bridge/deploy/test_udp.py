@@ -150,6 +150,8 @@ def test_faults_are_read_from_words() -> None:
     assert Faults.parse(["drop=0.2", "silent-after=1"]) == Faults(drop=0.2, silent_after=1.0)
     with pytest.raises(UsageError, match="did you mean 'drop'"):
         Faults.parse(["drp=0.2"])
+    with pytest.raises(UsageError, match="'silent_after' more than once"):
+        Faults.parse(["silent-after=1", "silent_after=2"])
     with pytest.raises(UsageError, match="received 'often'"):
         Faults.parse(["drop=often"])
     with pytest.raises(UsageError, match=r"^drop .*received 2"):

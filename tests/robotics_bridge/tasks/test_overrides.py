@@ -62,3 +62,8 @@ def test_words_reach_rewards_their_parameters_endings_learning_and_the_task() ->
 def test_words_that_name_nothing_or_hold_no_such_value_are_refused(word: str, message: str) -> None:
     with pytest.raises(UsageError, match=message):
         apply_overrides(TASK, [word])
+
+
+def test_a_number_is_changed_once() -> None:
+    with pytest.raises(UsageError, match="'episode' more than once"):
+        apply_overrides(TASK, ["episode=15", "entropy=0", "episode=20"])

@@ -101,6 +101,7 @@ def test_a_preset_in_a_text_may_be_changed_value_by_value():
     [
         ("balancd", "balanced"),
         ("fast,link=3", "'links'"),
+        ("fast,links=9,twist=true,links=12", "'links' more than once"),
         ("fast,links=many", r"links .*received 'many'"),
         ("fast,time_step=", r"time_step .*received ''"),
         ("fast,solver=static", "quasistatic"),
