@@ -1,9 +1,11 @@
-"""The sixteen cells of thesis figure 4.8 by a scripted hand that touches the hot ball and holds on.
+"""The sixteen cells of thesis figure 4.8 by a hand that touches the hot ball and holds on.
 
     python -m benchmarks.tactile.hot_ball --envs 6 --write
+    python -m benchmarks.tactile.hot_ball --envs 24 --config default --agent hot_ball.teacher --write
 
-The script knows which ball is hot, so it asks only what the materials decide: does the latch fire, when, and for how
-long is the ball then held (S, equation 4.42). All cells feel the same physics, with both laws of contact conduction.
+The hand is scripted, or a trained teacher's. Both know which ball is hot, so this asks only what the materials decide:
+does the latch fire, when, and for how long is the ball then held (S, equation 4.42). All cells feel the same physics,
+with both laws of contact conduction.
 """
 
 from __future__ import annotations
@@ -18,7 +20,8 @@ import torch
 from benchmarks.report import table, write_section
 from robotics_bridge import tasks
 from robotics_bridge.envs import Env
-from robotics_bridge.tasks.hot_ball import CELLS, published
+from robotics_bridge.policies.training.teacher import load_teacher
+from robotics_bridge.tasks.hot_ball import CELLS, DIAMETER
 from robotics_bridge.tasks.task import Success
 from robotics_bridge.tasks.thermometers import ThermalSettings, Thermometers
 
@@ -49,7 +52,7 @@ class TouchAndHold:
 
         env = self.env
         rows = torch.arange(env.num_envs)
-        ball = env.object_pose[rows, env.target, :3]
+        ball = env.object_pose[rows, env.state.episode.target, :3]
         pose = env.simulation.state.pose_torch[:, self._tip]
         quat = torch.cat((pose[:, 6:], pose[:, 3:6]), dim=1)
         tip = pose[:, :3] + rotate(quat, self._end)
@@ -73,24 +76,22 @@ class TouchAndHold:
         return action
 
 
-def run(envs: int, seconds: float, seed: int) -> list[dict[str, Any]]:
-    """Return one record per cell and conduction law."""
+def run(envs: int, seconds: float, seed: int, config: str, agent: str | None) -> list[dict[str, Any]]:
+    """Return one record per cell and conduction law, under the script or a teacher."""
     torch.set_num_threads(1)
-    task = replace(
-        published(),
-        task_state=None,
-        actuators=None,
-        groups={},
-        rewards={},
-        success=Success(metric="goals"),
-        episode=1e4,
-    )
+    task = replace(tasks.load("hot_ball", config), episode=1e4)
+    radius = DIAMETER / 2 if config == "default" else ThermalSettings().contact_radius
+    if agent is None:
+        bare = {"task_state": None, "actuators": None, "groups": {}, "rewards": {}, "success": Success(metric="goals")}
+        task = replace(task, **bare)
     env = tasks.make(task, num_envs=envs, seed=seed)
     env.state.episode.target.copy_(torch.arange(envs) % task.copies)
     grids = {
         (law, *cell): Thermometers(
             env.state,
-            ThermalSettings(conductivity=cell[0], emissivity=cell[1], heat=cell[2], conduction=law),
+            ThermalSettings(
+                conductivity=cell[0], emissivity=cell[1], heat=cell[2], conduction=law, contact_radius=radius
+            ),
             chooses=False,
         )
         for law in ("thesis", "physical")
@@ -100,13 +101,13 @@ def run(envs: int, seconds: float, seed: int) -> list[dict[str, Any]]:
     for grid in grids.values():
         grid.reset(torch.ones(envs, dtype=torch.bool))
     felt = next(iter(grids.values())).touching
-    act = TouchAndHold(env, felt)
+    act = load_teacher(agent, env) if agent else TouchAndHold(env, felt)
     warmest = {key: torch.full((envs,), -1e9) for key in grids}
     touched = torch.zeros(envs)
     trace: dict[Any, list[float]] = {key: [] for key in grids}
     steps = round(seconds / env.step_dt)
     for step in range(steps):
-        env.step(act(None))
+        env.step(act(env.observations))
         for key, grid in grids.items():
             grid.after_physics_step(env.step_dt)
             grid.update_latch(env.step_dt)
@@ -158,9 +159,11 @@ def main() -> None:
     parser.add_argument("--envs", type=int, default=6)
     parser.add_argument("--seconds", type=float, default=20.0)
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--config", choices=("published", "default"), default="published")
+    parser.add_argument("--agent", help="a shipped teacher or the folder of a run, in place of the script")
     parser.add_argument("--write", action="store_true", help="table in RESULTS.md and the figure")
     options = parser.parse_args()
-    records = run(options.envs, options.seconds, options.seed)
+    records = run(options.envs, options.seconds, options.seed, options.config, options.agent)
     rows = []
     for r in records:
         cell = (r["conductivity"], r["emissivity"], r["heat"])
@@ -185,16 +188,22 @@ def main() -> None:
     print(body)
     print(f"touching the ball for {records[0]['touched_s']:.1f} s (median)")
     if options.write:
-        draw(records, 0.025)
+        own = ["--config default"] if options.config == "default" else []
+        own += [f"--agent {options.agent}"] if options.agent else []
+        if not own:
+            draw(records, 0.025)
         note = (
-            f"Medians over {options.envs} episodes of {options.seconds:g} s by a script that knows the hot ball and "
-            f"touches it for {records[0]['touched_s']:.1f} s; thermometers step with the control (25 ms). A finger "
-            "whose warmest cell reaches 42.24 °C latches; S counts seconds of contact after that. Density, heat "
-            "capacity, cells and the balls' material are not published (aluminium throughout).\n\n"
+            f"Medians over {options.envs} episodes of {options.seconds:g} s by {options.agent or 'a script'}, which "
+            f"knows the hot ball and touches it for {records[0]['touched_s']:.1f} s, in the {options.config} task; "
+            "thermometers step with the control (25 ms). A finger whose warmest cell reaches 42.24 °C latches; S "
+            "counts seconds of contact after that. Density, heat capacity, cells, the radius of contacts and the "
+            "balls' material are not published (aluminium throughout).\n\n"
         )
+        by = f" ({options.agent or 'script'}, {options.config} task)" if own else ""
         write_section(
-            "hot_ball: the cells of figure 4.8 by touch and hold",
-            f"python -m benchmarks.tactile.hot_ball --envs {options.envs} --write", note + body, subject="tactile",
+            f"hot_ball: the cells of figure 4.8 by touch and hold{by}",
+            " ".join([f"python -m benchmarks.tactile.hot_ball --envs {options.envs}", *own, "--write"]), note + body,
+            subject="tactile",
         )  # fmt: skip
 
 

@@ -149,8 +149,10 @@ class EnvState:
         # An action of 1 is the same share of every joint's range.
         self.action_scale = self.task.action_ratio * (self.high - self.low)[self.moved]
         """[A] change of a target per unit of action (rad)."""
-        self.target_step = floats(self.step_dt * self.hand.rated_speeds(model.moved)) if self.task.rated_speed else None
-        """[A] largest change of a target in a control step (rad); None where it may jump."""
+        slides = [name.startswith("carriage_") for name in model.moved]
+        speeds = np.where(slides, self.task.carriage_speed, self.hand.rated_speeds(model.moved))
+        self.target_step = floats(self.step_dt * speeds) if self.task.rated_speed else None
+        """[A] largest change of a target in a control step (rad or m); None where it may jump."""
         bodies = [first.body(name).id for name in model.objects]
         self.object_bodies = integers(bodies)
         """[K] numbers of the objects' bodies."""

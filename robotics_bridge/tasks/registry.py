@@ -53,11 +53,6 @@ def bounded(task: Task) -> Task:
     )  # fmt: skip
 
 
-def register_bounded(name: str, published: Maker) -> None:
-    """Register the default, on which we train: the published task, :func:`bounded`."""
-    register(name)(lambda: bounded(published()))
-
-
 def forget(name: str) -> None:
     """Remove a task that was registered; raise UsageError for any other, since tasks of the package stay."""
     if name not in _MADE or name in _OWN:

@@ -184,6 +184,8 @@ class Task:
     """Adds fixed things to the ``mujoco.MjSpec`` of the scene."""
     carriage: Mapping[str, tuple[Range, float, float, float]] = field(default_factory=dict)
     """Slides that carry the palm: world axis (x, y, z) → range [m], stiffness [N/m], damping [N·s/m], effort [N]."""
+    carriage_speed: float = 0.5
+    """How fast targets of the slides move at most, where ``rated_speed`` holds [m/s]."""
     starts: str | None = None
     """``grasps``: start from sampled grasps instead of the placement."""
     solver: Solver = Solver()
@@ -235,7 +237,7 @@ class Task:
     def __post_init__(self) -> None:
         of = f"of task {self.name!r}"
         own = f"{{}} {of}"
-        check_fields(self, "episode", "density", "action_limit", above=0, of=own)
+        check_fields(self, "episode", "density", "action_limit", "carriage_speed", above=0, of=own)
         check_fields(self, "copies", "turn_window", least=1, whole=True, of=own)
         check_fields(self, "friction", "action_ratio", least=0, of=own)
         check_fields(self.noise, "position", "velocity", least=0, of=f"noise.{own}")

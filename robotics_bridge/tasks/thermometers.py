@@ -54,6 +54,9 @@ class ThermalSettings:
     """Contact law: the published heuristic (4.38, 4.39), or with the resistance of ball and cells."""
     convection: float = 10.0
     """[W/(m²·K)]; not published."""
+    contact_radius: float = 0.005
+    """Radius of the finger where it is touched, which with the overlap gives the area of a contact [m]; not
+    published."""
 
     def __post_init__(self) -> None:
         if not self.hot > self.ambient:
@@ -103,6 +106,7 @@ class Thermometers:
                 ambient_temperature=thermal.ambient, source=source, bodies=bodies,
                 other=ThermalBody("plastic", thermal.ambient),
                 conduction=thermal.conduction, convection=thermal.convection,
+                contact_radius=thermal.contact_radius,
             )  # fmt: skip
         self.suite = SensorSuite(scene, sensors, num_envs=env.num_envs, device=env.simulation.warp_device)
         self._cells = [self.suite.read(link) for link in links]
@@ -162,6 +166,7 @@ class Thermometers:
         target = self._env.target_pose[:, :3]
         context.extras["progress"] = progress(self.temperature().amax(dim=1), self.thermal)
         context.extras["holding"] = (self.latched & self.touching).float()
+        context.extras["touching"] = self.touching.float()
         context.extras["latched"] = self.latched.float()
         context.extras["reach"] = (tips - target.unsqueeze(1)).norm(dim=2).amin(dim=1)
 

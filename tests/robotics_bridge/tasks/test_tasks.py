@@ -204,3 +204,46 @@ def test_the_latch_needs_the_heat_of_the_hot_ball() -> None:
     assert env.state.episode.metric.tolist() == [0.0, 0.0]
     with pytest.raises(UsageError, match=r"received 10\.0 and 22\.0"):
         ThermalSettings(hot=10.0)
+
+
+def test_a_hand_that_holds_the_hot_ball_succeeds_by_default_alone() -> None:
+    from robotics_bridge.tasks.thermometers import ThermalSettings, Thermometers
+
+    env = tasks.make("hot_ball", num_envs=4, seed=0, threads=1)
+    thermometers: Any = env.state.task_state
+    published = Thermometers(env.state, ThermalSettings(), chooses=False)
+    slides = [env.action_names.index(f"carriage_{axis}") for axis in "xyz"]
+    scale = torch.as_tensor(env.action_map.scale[slides], dtype=torch.float32)
+    middle = env.state.contacts.tip_links[list(env.model.tips).index("right_hand_mid_link2")]
+    at, pressed, held = torch.zeros(4, 3), torch.zeros(4), torch.zeros(4)
+    for step in range(400):
+        # The middle finger follows the ball from above, and is pressed down once it is there.
+        way = env.state.target_pose[:, :3] - env.state.simulation.pose[:, middle, :3]
+        over = way[:, :2].norm(dim=1) < 0.02
+        pressed = torch.where(over, pressed + 0.0015 * ~thermometers.touching, torch.zeros(4)) if step > 60 else pressed
+        way[:, 2] += torch.where(over, 0.075 - pressed.clamp(max=0.05), torch.tensor(0.12))
+        at = at + 0.2 * way.clamp(-0.05, 0.05) * (step > 60)
+        action = torch.zeros(4, env.num_actions)
+        action[:, slides] = at / scale
+        _, _, _, _, info = env.step(action)
+        published.after_physics_step(env.step_dt)
+        published.update_latch(env.step_dt)
+        held += env.step_dt * thermometers.touching
+    assert (held > 3).all()
+    assert (info["metric"] > 0).float().mean() >= 0.75
+    assert not published.latched.any()
+
+
+def test_the_carriage_moves_no_faster_than_an_arm() -> None:
+    task = tasks.load("hot_ball")
+    env = tasks.make(task, num_envs=2, threads=1)
+    slides = [env.action_names.index(f"carriage_{axis}") for axis in "xyz"]
+    targets = env.state.actuators.target
+    before = targets[:, slides].clone()
+    env.step(torch.full((2, env.num_actions), 2.0))
+    most = task.carriage_speed * env.step_dt
+    assert (targets[:, slides] - before).flatten().tolist() == pytest.approx([most] * 6)
+    # As high as published, counted from a lower start.
+    published = tasks.load("hot_ball", "published")
+    reach = [t.hand_poses["xhand1"][0][2] + np.array(t.carriage["z"][0]) for t in (task, published)]
+    assert reach[0] == pytest.approx(reach[1])
