@@ -133,6 +133,8 @@ def main() -> None:
     if options.record:
         record(options.record)
         return
+    if not options.input:
+        parser.error("give --record FILE, which needs Genesis, or --input FILE")
     from benchmarks.report import table, write_section
 
     columns = ["sensor", "unit", "numbers", "largest", "largest difference", "of the largest", "taxels at the rim"]
