@@ -267,6 +267,11 @@ class Task:
         return self.solver.timestep * self.solver.decimation
 
     @property
+    def turns(self) -> bool:
+        """True where rotation about an axis is counted."""
+        return self.turn_axis is not None or (self.goal is not None and self.goal.axis is not None)
+
+    @property
     def max_episode_length(self) -> int:
         """Control steps after which an episode is cut off."""
         return math.ceil(self.episode / self.step_dt)

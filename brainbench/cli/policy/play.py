@@ -136,8 +136,10 @@ def play(
     }  # fmt: skip
     shown: dict[str, object] = {
         "task": told["task"], "hand": told["hand"], "contacts": contacts, "agent": agent,
-        "simulated": f"{told['seconds']:g} s", "goals reached": goals,
-        "turned": f"{round(turned, 2) + 0:.2f} rad about the commanded axis",
+        "simulated": f"{told['seconds']:g} s",
+        # What a task does not count stays unsaid.
+        **({"goals reached": goals} if env.task.goal is not None else {}),
+        **({"turned": f"{round(turned, 2) + 0:.2f} rad about the commanded axis"} if env.task.turns else {}),
         "dropped": f"{dropped} times", "episodes ended": ended, "reward": f"{sum(rewards):.3g}",
     }  # fmt: skip
     shown |= {"files": ", ".join(map(str, pictures))} if pictures else {}
