@@ -86,7 +86,7 @@ class LaunchContext:
     clock: UpdateClock
 
     def __post_init__(self) -> None:
-        self._launcher = Launcher(self.device)
+        self.launch = Launcher(self.device)
 
     def array(self, values: Any, dtype: Any) -> Any:
         """Copy values to the device as a Warp array."""
@@ -95,10 +95,6 @@ class LaunchContext:
     def zeros(self, shape: int | Sequence[int], dtype: Any = float) -> Any:
         """Return a Warp array of zeros on the device."""
         return warp().zeros(shape, dtype=dtype, device=self.device)
-
-    def launch(self, kernel: Any, dim: int | Sequence[int], *inputs: Any) -> None:
-        """Run a kernel on the device."""
-        self._launcher(kernel, dim, *inputs)
 
 
 @dataclass(eq=False)

@@ -142,21 +142,16 @@ def _dead(stuck: NDArray, values: NDArray, knobs: dict[str, Any], estimates: dic
 def _gain(fit: Fit, knobs: dict[str, Any], estimates: dict[str, Estimate], notes: list[str]) -> None:
     """Enter the range of the gains: the extremes, moved out by their mean distance from the ends."""
     gains, count = np.sort(fit.gains), len(fit.gains)
-    if count < 2:
-        knobs["gain"] = (float(gains[0]),) * 2
-        error = Z95 * float(fit.gain_errors[0])
-        estimates["gain_low"] = estimates["gain_high"] = Estimate(
-            float(gains[0]), float(gains[0]) - error, float(gains[0]) + error, "one probe: no range"
-        )
-        return
     span = float(gains[-1] - gains[0])
     noise = float(np.median(fit.gain_errors))
-    if span < 6 * noise:
-        middle = float(np.average(fit.gains, weights=1 / fit.gain_errors**2))
+    if count < 2 or span < 6 * noise:
+        middle, how = float(gains[0]), "one probe: no range"
+        if count > 1:
+            middle = float(np.average(fit.gains, weights=1 / fit.gain_errors**2))
+            how = "gains are equal within their errors"
         error = Z95 * noise / math.sqrt(count)
         knobs["gain"] = (middle, middle)
-        for name in ("gain_low", "gain_high"):
-            estimates[name] = Estimate(middle, middle - error, middle + error, "gains are equal within their errors")
+        estimates["gain_low"] = estimates["gain_high"] = Estimate(middle, middle - error, middle + error, how)
         return
     # For uniform gains the extremes lie inside the range by its width / (n + 1) on average, which is span / (n − 1).
     out = span / (count - 1)

@@ -53,7 +53,12 @@ def sample_field(mesh: Mesh, resolution: int = 64, device: Any = "cpu") -> Field
     kept = read_sealed(path, "distance field")
     if kept is not None and kept["values"].shape == tuple(counts):
         return Field(kept["values"], origin, spacing)
-    values = _sample(mesh, origin, spacing, counts, device)
+    wp, tree = warp(), mesh_tree(mesh, device, winding=True)
+    samples = wp.zeros(tuple(int(n) for n in counts), dtype=wp.float32, device=device)
+    reach = 4 * float(spacing * counts.max())
+    inputs = [tree.id, wp.vec3f(*origin.tolist()), spacing, reach, samples]
+    wp.launch(distance.sample_field, dim=samples.shape, inputs=inputs, device=device)
+    values = samples.numpy()
     write_sealed(path, "distance field", {"values": values})
     return Field(values, origin, spacing)
 
@@ -66,13 +71,3 @@ def mesh_tree(mesh: Mesh, device: Any, *, winding: bool = False) -> Any:
         indices=wp.array(mesh.faces.astype(np.int32).ravel(), dtype=wp.int32, device=device),
         support_winding_number=winding,
     )
-
-
-def _sample(mesh: Mesh, origin: NDArray, spacing: float, counts: NDArray, device: Any) -> NDArray[np.float32]:
-    wp = warp()
-    tree = mesh_tree(mesh, device, winding=True)
-    values = wp.zeros(tuple(int(n) for n in counts), dtype=wp.float32, device=device)
-    reach = 4 * float(spacing * counts.max())
-    inputs = [tree.id, wp.vec3f(*origin.tolist()), spacing, reach, values]
-    wp.launch(distance.sample_field, dim=values.shape, inputs=inputs, device=device)
-    return values.numpy()

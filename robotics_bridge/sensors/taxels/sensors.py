@@ -24,11 +24,6 @@ ENGINE_RUNTIME = "robotics_bridge.sensors.taxels.contact_load:ContactLoadRuntime
 CONVENTIONS = ("physical", "thesis")
 
 
-def _check_convention(value: str) -> None:
-    """Refuse an unknown force convention with UsageError."""
-    check_name("force convention", value, CONVENTIONS)
-
-
 @dataclass(frozen=True, kw_only=True)
 class KinematicTaxel(QuerySensor):
     """Force (N) and torque (N·m) on the sensor [N, 6], in the link frame, torques about the link's origin.
@@ -84,14 +79,13 @@ class KinematicTaxel(QuerySensor):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        _check_convention(self.convention)
+        check_name("force convention", self.convention, CONVENTIONS)
         check_name("total of a force field", self.total, ("law", "engine"))
         if self.twist is None:
             radius = float(self.probes.radius.max(initial=0.0))
             published = self.convention == "thesis"
             object.__setattr__(self, "twist", PUBLISHED_TWIST if published else self.shear * radius**2 / 2)
-        check_fields(self, "exponent", above=0)
-        check_fields(self, "grip", above=0)
+        check_fields(self, "exponent", "grip", above=0)
         check_fields(self, "friction", least=0)
         if self.sticky and self.convention == "thesis":
             raise UsageError("The published law has no friction at rest; leave out friction or convention='thesis'.")
@@ -134,5 +128,5 @@ class ProximityTaxel(ProbeSensor):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        _check_convention(self.convention)
+        check_name("force convention", self.convention, CONVENTIONS)
         check_fields(self, "points", least=1, whole=True)

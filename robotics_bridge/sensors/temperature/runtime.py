@@ -62,10 +62,11 @@ class TemperatureRuntime(Runtime):
         """Warp structure of contacts, bodies and fields."""
         self._buffers = [context.zeros(shape, wp.float64) for _ in range(2)]
         self.lasting = [*self._buffers, heat.temperature, heat.element, heat.touched, heat.covered]
-        self.lasting += [heat.conductance, heat.inflow]
-        self.lasting += [heat.number, heat.kept, heat.link_temperature]
+        self.lasting += [heat.conductance, heat.inflow, heat.number, heat.kept, heat.link_temperature]
         self._axes = [axis for axis in range(3) if any(sensor.cells[axis] > 1 for sensor in self._sensors)]
-        if not self.noisy and any(_lags(sensor) for sensor in self._sensors):
+        # What the element shows differs from the cell where it lags, or where its range ends.
+        limits = [value for sensor in self._sensors for value in (sensor.warm_range, sensor.cold_range)]
+        if not self.noisy and (min(limits) < math.inf or any(sensor.tau > 0 for sensor in self._sensors)):
             self._measured = self.io.measured = wp.zeros_like(self._truth)
         self._dt = math.nan
         self._set_step(1e-2)
@@ -146,10 +147,6 @@ def diffusion(cells: int, edge: float, spread: float) -> NDArray[np.float64]:
     modes /= np.linalg.norm(modes, axis=0)
     rate = 2 * (1 - np.cos(np.pi * np.arange(cells) / cells)) / edge**2
     return np.maximum((modes * np.exp(-spread * rate)) @ modes.T, 0.0)
-
-
-def _lags(sensor: TemperatureGrid) -> bool:
-    return sensor.tau > 0 or math.isfinite(sensor.warm_range) or math.isfinite(sensor.cold_range)
 
 
 def _body(sensors: list[TemperatureGrid], link: str) -> ThermalBody:
