@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from robotics_bridge.deploy import frames
 from robotics_bridge.deploy.frames import Frame
-from robotics_bridge.deploy.receiver import MAX_AGE, Receiver
+from robotics_bridge.deploy.receiver import Receiver
 from robotics_bridge.deploy.udp import MOST_AT_ONCE
 
 
@@ -24,12 +24,11 @@ class HandLink:
         key: Shared key (:func:`~robotics_bridge.deploy.frames.read_key`).
         joints: J.
         fingers: F.
-        max_age: Oldest command that is followed (s).
     """
 
-    def __init__(self, link: socket.socket, key: bytes, joints: int, fingers: int, *, max_age: float = MAX_AGE) -> None:
+    def __init__(self, link: socket.socket, key: bytes, joints: int, fingers: int) -> None:
         link.setblocking(False)
-        self.link, self.joints, self.fingers, self.max_age = link, joints, fingers, max_age
+        self.link, self.joints, self.fingers = link, joints, fingers
         self.peer: Any = ()
         """Address of the controller; empty without a session."""
         self.stopped = True
@@ -90,7 +89,7 @@ class HandLink:
         offered, ours, theirs = self._offered
         if sender != offered or (frame := frames.decode(data, ours)) is None or frame.kind != frames.START:
             return False
-        self._receiver, self._send_key, self._sequence = Receiver(ours, self.max_age), theirs, 0
+        self._receiver, self._send_key, self._sequence = Receiver(ours), theirs, 0
         self._receiver.judge(frame, now)
         self.peer, self.stopped = sender, False
         # Used once: what was recorded of this session starts no other.

@@ -64,11 +64,7 @@ class Explored:
 
     def shape(self) -> Geometry:
         """Return the geometry that the physics uses."""
-        if self.mesh is not None:
-            return Geometry(name=OBJECT, link=OBJECT, kind="mesh", mesh=self.mesh)
-        if self.geometry is None:
-            raise UsageError(f"The object {self.label!r} has no shape.")
-        return self.geometry
+        return self.geometry or Geometry(name=OBJECT, link=OBJECT, kind="mesh", mesh=self.mesh)
 
 
 @dataclass(frozen=True, eq=False)
@@ -233,12 +229,9 @@ class _World:
         self._place = model.body(OBJECT).pos.copy()
         self._drives = [model.actuator(name).id for name in self.hand.joints] if all(self.hand.joints) else slice(None)
         self._closed = closing(self.hand, 1.0)
-        self._bottoms = {id(item): self._bottom(item) for item in kinds}
-
-    def _bottom(self, item: Explored) -> float:
-        """Return how far the lowest point of a held object lies below its body's origin (m)."""
-        # Support function downwards: row 2 of the rotation is the vertical in the object's frame.
-        return float(item.shape().reach(-to_matrices(item.quaternion)[2]))
+        # How far the lowest point of a held object lies below its body's origin (m), by the support function downwards:
+        # row 2 of the rotation is the vertical in the object's frame.
+        self._bottoms = {id(item): float(item.shape().reach(-to_matrices(item.quaternion)[2])) for item in kinds}
 
     def move(self, conditions: Sequence[tuple[Explored, Procedure]], time: float) -> None:
         """Put every object where it is at a time (0 to 1 of its procedure), and step the hand once."""

@@ -138,8 +138,9 @@ def read_results(folders: Iterable[str | Path], *, at_least: int = 0) -> list[St
             if described.get("task_version", 1) != TASK_VERSION:
                 _LOG.warning("%s is of another version of the tasks, and left out.", path.parent)
                 continue
-            member = _Member(DistillConfig.of(described["distill"]), tuple(_evaluations(path)))
-            groups[member.config.name.rpartition("_seed")[0]].append(member)
+            config = DistillConfig.of(described["distill"])
+            evaluations = _listed(path, _Evaluation, "evaluations with 'seed' and 'success'")
+            groups[config.name.rpartition("_seed")[0]].append(_Member(config, tuple(evaluations)))
     if not groups:
         raise DataFileNotFoundError(
             "No evaluated student was found; brainbench policy distill evaluates what it has trained."
@@ -202,10 +203,6 @@ def _counted(members: Sequence[_Member], at_least: int) -> tuple[list[_Member], 
         else:
             best[cell] = member
     return [best[cell] for cell in sorted(best)], tuple(others)
-
-
-def _evaluations(path: Path) -> list[dict[str, Any]]:
-    return _listed(path, _Evaluation, "evaluations with 'seed' and 'success'")
 
 
 def _listed(path: Path, kind: type, what: str) -> list[dict[str, Any]]:
@@ -341,12 +338,9 @@ def read_agents(folders: Iterable[str | Path]) -> list[dict[str, Any]]:
     Raises:
         DataError: a file is damaged.
     """
-    found = []
-    for root in folders:
-        for path in sorted(Path(root).rglob(AGENTS)):
-            summaries = _listed(path, _Agent, "evaluated agents; brainbench policy evaluate --out writes one")
-            found += summaries
-    return found
+    files = [path for root in folders for path in sorted(Path(root).rglob(AGENTS))]
+    what = "evaluated agents; brainbench policy evaluate --out writes one"
+    return [summary for path in files for summary in _listed(path, _Agent, what)]
 
 
 def agent_rows(agents: Sequence[Mapping[str, Any]]) -> list[list[str]]:

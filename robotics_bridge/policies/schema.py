@@ -82,8 +82,7 @@ class Values:
 
         return tuple(map(float, self.get(name, good, f"{count} numbers from {low:.4g} to {high:.4g}")))
 
-    def shape(self, name: str, received: Any, most: int) -> tuple[int, ...]:
-        """Return a shape of one to three axes with at most so many numbers, given as a list."""
+    def _shape(self, name: str, received: Any, most: int) -> tuple[int, ...]:
         sizes = received if _list(received, 1, 3) else [0]
         count = 1
         for size in sizes:
@@ -101,7 +100,7 @@ class Values:
             return all(isinstance(key, str) and key for key in names) and len(set(names)) == len(names) > 0
 
         found = self.get(name, good, "a list of [group, shape], each group once")
-        return {key: self.shape(f"{name}.{key}", shape, most) for key, shape in found}
+        return {key: self._shape(f"{name}.{key}", shape, most) for key, shape in found}
 
     def fields(self, kind: type) -> dict[str, Any]:
         """Return all values as those of a dataclass's fields, by the annotation of each; UsageError for others."""

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import torch
 
@@ -18,6 +17,7 @@ from robotics_bridge.policies.encoders.front_end import FrontEnd
 from robotics_bridge.policies.encoders.posture import PostureTurn
 from robotics_bridge.policies.encoders.reservoir import EchoState
 from robotics_bridge.policies.encoders.taxel_grid import TaxelGrid
+from robotics_bridge.policies.encoders.timing import Time
 from robotics_bridge.policies.readouts.rollout import TouchRollout
 
 NETWORK = "zhuang-intersection-ln-small"
@@ -57,12 +57,12 @@ def bits(rollout: TouchRollout, links: Sequence[int]) -> Features:
     return torch.stack(parts, -1).float().flatten(2)
 
 
-def network(rollout: TouchRollout, grid: TaxelGrid, calibration: HandCalibration, **options: Any) -> Features:
+def network(
+    rollout: TouchRollout, grid: TaxelGrid, calibration: HandCalibration, *, model: str, time: Time, seed: int
+) -> Features:
     """Return the features of a network that steps through the rollout, its memory forgotten where episodes begin."""
-    time = options.pop("time", "native")
-    front = FrontEnd(
-        options.pop("model"), grid, time=time, calibration=calibration, options={"unroll": "full"}, **options
-    ).to(rollout.taxels.device)
+    front = FrontEnd(model, grid, time=time, calibration=calibration, seed=seed, options={"unroll": "full"})
+    front = front.to(rollout.taxels.device)
     state, found = front.init_state(rollout.taxels.shape[1]), []
     for reading, first in zip(rollout.taxels, rollout.begun, strict=True):
         features, state = front(reading, torch.where(first[:, None], 0.0, state))
@@ -102,9 +102,8 @@ class Subject:
     """Of the first reservoir."""
 
 
-def _networks(time: str, name: str, one: Subject, seeds: Sequence[int] = (0,)) -> list[Features]:
-    made = {"model": name, "time": time}
-    return [network(one.rollout, one.grid, one.calibration, seed=seed, **made) for seed in seeds]
+def _networks(time: Time, name: str, one: Subject, seeds: Sequence[int] = (0,)) -> list[Features]:
+    return [network(one.rollout, one.grid, one.calibration, model=name, time=time, seed=seed) for seed in seeds]
 
 
 def grid(one: Subject) -> Features:
