@@ -187,7 +187,6 @@ class Controller:
         )  # fmt: skip
 
     def _wait(self) -> str | None:
-        """Wait for the first report."""
         start = self.clock()
         while self.driver.read() is None:
             if self.clock() - start > self.limits.start_timeout:

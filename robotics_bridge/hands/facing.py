@@ -85,7 +85,7 @@ def _opposite(model: Any, data: Any, body: int, others: list[int]) -> NDArray[np
     length = float(np.linalg.norm(away))
     if length < 1e-6:
         return None
-    slide = joint_of(model, body, mujoco.mjtJoint.mjJNT_SLIDE)
+    slide = slide_of(model, body)
     if slide >= 0:
         axis = data.xmat[model.jnt_bodyid[slide]].reshape(3, 3) @ model.jnt_axis[slide]
         along = float(axis @ away)
@@ -96,11 +96,10 @@ def _opposite(model: Any, data: Any, body: int, others: list[int]) -> NDArray[np
     return np.sign(cosine[face]) * axes[face] if abs(cosine[face]) > _SNAP else away / length
 
 
-def joint_of(model: Any, body: int, kind: Any) -> int:
-    """Return the joint that moves a body, of its own or of what it is fixed to, if it is of a kind; −1 otherwise."""
-    body = int(model.body_weldid[body])
-    joint = int(model.body_jntadr[body])
-    return joint if joint >= 0 and int(model.jnt_type[joint]) == int(kind) else -1
+def slide_of(model: Any, body: int) -> int:
+    """Return the joint that moves a body, of its own or of what it is fixed to, if it slides; −1 otherwise."""
+    joint = int(model.body_jntadr[model.body_weldid[body]])
+    return joint if joint >= 0 and model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_SLIDE else -1
 
 
 def _flexed(
@@ -109,8 +108,7 @@ def _flexed(
     """Return where a body goes [3] (world) when its joint flexes; None if that is not known."""
     own = link_points(model, body)
     joint = _flexion(model, body)
-    slides = joint_of(model, body, mujoco.mjtJoint.mjJNT_SLIDE) >= 0
-    if joint < 0 or slides or not len(own):
+    if joint < 0 or slide_of(model, body) >= 0 or not len(own):
         return None
     low, high = (float(value) for value in model.jnt_range[joint])
     if not symmetric and abs(high + low) < 0.2 * (high - low):

@@ -12,7 +12,7 @@ from brainbench.core.devices import mujoco_module
 from brainbench.core.errors import UsageError
 from brainbench.core.reading.ranges import check_number
 from brainbench.core.rotations import to_matrices
-from robotics_bridge.hands.facing import half_open, joint_of, link_middle, palmar_directions
+from robotics_bridge.hands.facing import half_open, link_middle, palmar_directions, slide_of
 from robotics_bridge.hands.hand import Hand
 
 mujoco = mujoco_module()
@@ -84,7 +84,7 @@ def jaw_ends(hand: Hand) -> dict[int, tuple[float, float]]:
     data, ends = half_open(model), {}
     for chain in hand.fingers.values():
         for link in (link for link in chain if link in facing):
-            joint = joint_of(model, model.body(link).id, mujoco.mjtJoint.mjJNT_SLIDE)
+            joint = slide_of(model, model.body(link).id)
             if joint >= 0 and model.jnt_limited[joint]:
                 axis = data.xmat[model.jnt_bodyid[joint]].reshape(3, 3) @ model.jnt_axis[joint]
                 inward = float(axis @ (data.body(link).xmat.reshape(3, 3) @ facing[link]))

@@ -196,8 +196,6 @@ class MixedModel:
 
 @dataclass(frozen=True, eq=False)
 class _Fit:
-    """REML estimates."""
-
     parts: dict[str, NDArray[np.float64]]
     """Name → V_k [n, n]: 1 where two policies share a level; the residual is first."""
     variances: NDArray[np.floating]

@@ -161,7 +161,6 @@ def _along(
 
 
 def _lay_sites(axes: FingerAxes, reference: Layout) -> None:
-    """Fill in edges and centres."""
     columns = GRID_SHAPE[1]
     parts = []
     for link, probes in reference.items():

@@ -129,7 +129,6 @@ def _scatter(axes: FingerAxes, link: str, probes: Probes, observe: str) -> NDArr
 
 
 def _cross(vector: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the matrix [3, 3] of v ×."""
     x, y, z = vector
     return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
 

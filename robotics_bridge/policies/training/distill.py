@@ -197,7 +197,6 @@ class _Run:
 
     @torch.no_grad()
     def _act(self, share: float) -> Rollout:
-        """Collect a rollout."""
         recorder = Recorder(self.config.steps_per_env, self.memory)
         targets = [head.target for head in self.decoders]
         kept = [name for name in (*self.groups, *targets) if self.front is None or name != TACTILE]
@@ -296,8 +295,8 @@ class _Run:
             known = read_mapping(path)
             check_version(known, str(self.out))
             check_same(self.out, known.get("distill"), mine, "student")
-            return
-        write_json(path, describe_run(self.config, self.student, self.env))
+        else:
+            write_json(path, describe_run(self.config, self.student, self.env))
 
     def _world(self) -> dict[str, torch.Tensor]:
         # The memory of noisy sensors is in no file, so such a run starts new episodes at every state it saves.
