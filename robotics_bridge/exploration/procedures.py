@@ -42,7 +42,6 @@ _ABOVE, _PRESSED, _LIGHT = 0.008, -0.002, -0.001
 
 
 def _ramp(time: float, start: float, end: float) -> float:
-    """Return a smooth step from 0 to 1."""
     # 3 s² − 2 s³: starts and ends at rest, so that prescribed objects do not jerk.
     share = min(max((time - start) / (end - start), 0.0), 1.0)
     return share * share * (3 - 2 * share)

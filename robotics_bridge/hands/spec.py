@@ -183,7 +183,6 @@ _SOLIDS = {frozenset(kind.__dataclass_fields__): kind for kind in (CapsuleGeomet
 
 
 def _tuples(value: Any) -> Any:
-    """Return data with tuples in place of lists."""
     if isinstance(value, dict):
         return {key: _tuples(item) for key, item in value.items()}
     return tuple(map(_tuples, value)) if isinstance(value, list) else value

@@ -179,8 +179,6 @@ def mixed_model(results: Sequence[StudentResult]) -> MixedModel:
 
 @dataclass(frozen=True)
 class _Member:
-    """One student and its evaluations, one per evaluation seed."""
-
     config: DistillConfig
     evaluations: tuple[dict[str, Any], ...]
 

@@ -194,8 +194,6 @@ class RunningScale(nn.Module):
 
 
 class _Learned(TactileEncoder):
-    """An encoder that is learned with the policy."""
-
     def __init__(self, config: EncoderConfig) -> None:
         super().__init__(config)
         self.scale = RunningScale(self.shape[2])
