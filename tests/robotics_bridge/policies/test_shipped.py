@@ -26,7 +26,7 @@ def test_every_teacher_fits_its_task_and_has_a_card(name: str) -> None:
     assert facts["task"] == name.partition(".")[0]
     assert name in list_policies("teacher", facts["task"])
     assert f"# {name}\n" in (FOLDER / name / "README.md").read_text(encoding="utf-8")
-    assert sum(path.stat().st_size for path in (FOLDER / name).iterdir()) < 1.7e6
+    assert sum(path.stat().st_size for path in (FOLDER / name).iterdir()) < 1.8e6
     env = tasks.make(facts["task"], num_envs=2, hand=facts["hand"], threads=1)
     assert list(env.action_names) == facts["action_names"]
     action = load_teacher(name, env).act(env.reset())
@@ -85,7 +85,7 @@ def test_learning_goes_on_from_a_shipped_teacher() -> None:
     ("name", "success", "metric"),
     [
         ("in_palm_rotate.teacher", 0.9, 10.0), ("in_palm_rotate.student", 0.7, 5.5), ("screwdriver.teacher", 0.8, 17.0),
-        ("in_hand_repose.teacher", 0.5, 1.2),
+        ("in_hand_repose.teacher", 0.5, 1.2), ("hot_ball.teacher", 0.6, 6.0),
     ],
 )  # fmt: skip
 def test_a_shipped_policy_does_its_task_on_c_mujoco(name: str, success: float, metric: float) -> None:
