@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brainbench.core.errors import UsageError, check_name
+from brainbench.core.reading.ranges import check_fields
 from robotics_bridge.deploy.driver import HandReading
 from robotics_bridge.hands import Hand
 
@@ -52,11 +53,7 @@ class SafetyLimits:
         if not (np.isfinite(ends).all() and (ends[0] < ends[1]).all() and (ends[2] > 0).all()):
             raise UsageError("Every joint needs a finite lower limit below its upper one and a finite positive speed.")
         for name, most in LIMITS.items():
-            value = getattr(self, name)
-            if not (isinstance(value, (int, float)) and 0 < value <= most):
-                raise UsageError(
-                    f"The safety limit {name!r} is a number above 0, at most {most:g}; received {value!r}."
-                )
+            check_fields(self, name, of="The safety limit '{}'", above=0, most=most)
 
     @classmethod
     def of_hand(cls, hand: Hand, joints: tuple[str, ...], **changes: float) -> SafetyLimits:

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from brainbench.core.errors import UsageError
+from brainbench.core.errors import UsageError, check_name
 from robotics_bridge.deploy.driver import HandReading
 
 REAL_TYPES = ("agg_bool", "agg_force")
@@ -74,7 +74,8 @@ class RealTouch:
         fallback: Where the hand senses nothing; None leaves those items zero.
 
     Raises:
-        UsageError: the type cannot be measured and nothing is simulated in its place.
+        UsageError: the type cannot be measured and nothing is simulated in its place, or the calibration names a finger
+            that the hand does not report.
     """
 
     def __init__(
@@ -90,6 +91,8 @@ class RealTouch:
     ) -> None:
         self.observe, self.shape, self.fallback = observe, shape, fallback
         self.calibration, self.fingers = calibration or PressureCalibration(), fingers
+        for finger in self.calibration.per_finger:
+            check_name("finger of a pressure calibration", finger, fingers)
         sensed = [(item, tips.get(link, "")) for item, link in enumerate(links)]
         self.measured = [(item, fingers.index(finger)) for item, finger in sensed if finger in fingers]
         real = observe in REAL_TYPES

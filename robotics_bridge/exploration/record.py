@@ -21,6 +21,7 @@ from brainbench.core.contracts import CHANNELS, GRID_SHAPE, check_stimulus_set
 from brainbench.core.errors import UsageError
 from brainbench.core.files import content_hash, to_json
 from brainbench.core.progress import Progress
+from brainbench.core.reading.ranges import check_fields
 from brainbench.core.rotations import from_matrices, from_rpy, to_matrices
 from brainbench.geometry import Mesh
 from brainbench.models.network import SUB_STEP_SECONDS, SUB_STEPS
@@ -46,7 +47,11 @@ _DENSE = 2e5
 
 @dataclass(frozen=True, eq=False)
 class Explored:
-    """An object to explore; neither or both of geometry and mesh is a :class:`UsageError`."""
+    """An object to explore.
+
+    Raises:
+        UsageError: neither or both of geometry and mesh are given, or the orientation or the retreat is not valid.
+    """
 
     label: str
     geometry: Geometry | None = None
@@ -61,6 +66,12 @@ class Explored:
     def __post_init__(self) -> None:
         if (self.geometry is None) == (self.mesh is None):
             raise UsageError(f"The object {self.label!r} needs a geometry or a mesh, and not both.")
+        if np.shape(self.quaternion) != (4,) or not 1e-6 < float(np.linalg.norm(self.quaternion)) < np.inf:
+            raise UsageError(
+                f"The orientation of {self.label!r} is a quaternion (w, x, y, z) that is finite and not zero; received "
+                f"{self.quaternion!r}."
+            )
+        check_fields(self, "retreat")
 
     def shape(self) -> Geometry:
         """Return the geometry that the physics uses."""

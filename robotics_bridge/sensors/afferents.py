@@ -16,7 +16,7 @@ import numpy as np
 from scipy.signal import butter, sosfilt_zi
 
 from brainbench.core.errors import UsageError, check_name
-from brainbench.core.reading.ranges import check_fields
+from brainbench.core.reading.ranges import check_fields, check_number
 
 if TYPE_CHECKING:
     import torch
@@ -86,6 +86,7 @@ class AfferentFilter:
         *,
         rectify: bool = False,
     ) -> None:
+        check_number("rate (Hz)", rate, above=0)
         if not isinstance(bands, Mapping):
             for name in bands:
                 check_name("afferent", name, AFFERENTS)

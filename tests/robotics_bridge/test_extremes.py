@@ -111,7 +111,7 @@ def test_rates_and_durations_out_of_range_are_refused(rate) -> None:
 
 @pytest.mark.parametrize("name", list(LIMITS))
 def test_safety_limits_have_ranges(name) -> None:
-    for value in (*NOT_FINITE, 0, -1.0, 1e9, "1", None):
+    for value in (*NOT_FINITE, 0, -1.0, 1e9, "1", None, True):
         with pytest.raises(UsageError, match=name):
             SafetyLimits(-np.ones(1), np.ones(1), np.ones(1), **{name: value})
     with pytest.raises(UsageError, match="did you mean"):

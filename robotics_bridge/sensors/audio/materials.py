@@ -86,8 +86,10 @@ class Modes:
                 f"Modes need as many frequencies as decays and gains; received {len(self.frequency)}, "
                 f"{len(self.decay)} and {len(self.gain)}."
             )
-        if not all(f > 0 and d >= 0 and math.isfinite(g) for f, d, g in self.rows()):
-            raise UsageError("A mode has a positive frequency, a decay that is not negative and a finite gain.")
+        for frequency, decay, gain in self.rows():
+            check_number("frequency of a mode", frequency, above=0)
+            check_number("decay of a mode", decay, least=0)
+            check_number("gain of a mode", gain)
 
     def rows(self) -> Sequence[tuple[float, float, float]]:
         """Return (frequency, decay, gain) of each mode."""

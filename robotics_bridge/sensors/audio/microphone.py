@@ -10,7 +10,7 @@ import torch
 
 from brainbench.core.devices import warp
 from brainbench.core.errors import UsageError
-from brainbench.core.reading.ranges import check_fields
+from brainbench.core.reading.ranges import check_fields, check_number
 from robotics_bridge.physics.state import HandState
 from robotics_bridge.sensors.audio.kernels import sound as k
 from robotics_bridge.sensors.audio.sensors import AudioSensor
@@ -41,6 +41,10 @@ class Microphone:
     """Longest distance that is rendered with its full delay [m]; sets the memory."""
 
     def __post_init__(self) -> None:
+        if len(self.position) != 3:
+            raise UsageError(f"The position of a microphone is three numbers (m); received {self.position!r}.")
+        for value in self.position:
+            check_number("position", value)
         check_fields(self, "speed_of_sound", "nearest", "reach", above=0)
         check_fields(self, "power", least=0)
 
@@ -51,6 +55,8 @@ class Microphone:
 
 class Listener:
     """Renders what a microphone hears, block by block.
+
+    An environment in which a source is not finite reads NaN until its reset; the others do not notice.
 
     Args:
         microphone: Where it is and which sources it hears; all of the suite if it names none.
@@ -77,6 +83,8 @@ class Listener:
         self._links = c.array([scene.link_index(suite.sensors[name].link) for name in self._sources], int)
         self._now, self._before = (c.zeros((suite.num_envs, len(self._sources))) for _ in range(2))
         self._out = c.zeros((self.samples, suite.num_envs))
+        self.diverged = torch.zeros(suite.num_envs, dtype=torch.bool, device=warp().to_torch(self._out).device)
+        """Mask [B] of environments in which a source was not finite since their reset; their blocks are NaN."""
         self._ring: Any = None
         self._slot = 0
 
@@ -94,14 +102,18 @@ class Listener:
             self._ring = c.zeros((blocks * self.samples, envs, len(self._sources)))
         if self._ring.shape[0] != blocks * self.samples:
             raise UsageError(f"The time step of a microphone stays as it was; received another, {dt:g} s.")
+        self.diverged &= warp().to_torch(age) > 0
         for index, (name, runtime) in enumerate(self._sources.items()):
             part = runtime.slices[name]
+            # The ring takes silence in place of what is not finite, and later blocks hear it late.
+            self.diverged |= ~warp().to_torch(runtime.truth())[:, :, part.span].sum(dim=2).isfinite().all(dim=0)
             c.launch(k.record_source, block, runtime.truth(), part.start, part.count, self._slot, index, self._ring)
         # Lengths at the start and the end of the block: the kernel lets them change evenly in between.
         place, paths = warp().vec3f(*m.position), [self._now, self._before]
         c.launch(k.measure_paths, self._now.shape, state.pose, self._links, self._link, place, age, *paths)
         inputs = [self._ring, self._slot, self.samples, rate, m.speed_of_sound, m.nearest, m.power, age]
         c.launch(k.mix_sources, block, *inputs, *paths, self._out)
+        warp().to_torch(self._out).masked_fill_(self.diverged, math.nan)
         self._slot = (self._slot + self.samples) % self._ring.shape[0]
 
     def read(self) -> torch.Tensor:

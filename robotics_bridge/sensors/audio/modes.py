@@ -43,7 +43,8 @@ class ElasticSolid:
         needed = {"box": 3, "sphere": 1, "ellipsoid": 3, "cylinder": 2, "mesh": 0}
         if self.shape not in needed:
             raise unknown_name("solid", self.shape, SHAPES)
-        if len(self.size) < needed[self.shape] or not all(value > 0 for value in self.size[: needed[self.shape]]):
+        sizes = self.size[: needed[self.shape]]
+        if len(sizes) < needed[self.shape] or not all(0 < value < np.inf for value in sizes):
             raise UsageError(f"A {self.shape} needs {needed[self.shape]} positive sizes (m); received {self.size}.")
         if self.shape == "mesh" and self.mesh is None:
             raise UsageError("A solid of shape 'mesh' needs its mesh.")

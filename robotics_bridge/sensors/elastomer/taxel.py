@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar, Literal
 
 from brainbench.core.errors import UsageError, check_name
-from brainbench.core.reading.ranges import check_fields
+from brainbench.core.reading.ranges import check_fields, check_number
 from robotics_bridge.sensors.noise.model import TAXEL_KNOBS
 from robotics_bridge.sensors.sensor import QueryRequirements, QuerySensor
 
@@ -42,8 +43,12 @@ class Layer:
         check_fields(self, "softening", above=0)
         check_fields(self, "thickness", least=0)
         check_fields(self, "recoil", least=0, most=2)
-        if self.frame is not None and not min(self.frame) > 0:
-            raise UsageError(f"The half widths of a frame are positive (m); received {self.frame!r}.")
+        widening = self.expansion if isinstance(self.expansion, tuple) else (self.expansion,) * 2
+        for name, pair, above in (("expansion", widening, -math.inf), ("frame", self.frame or (1.0, 1.0), 0)):
+            if len(pair) != 2:
+                raise UsageError(f"{name} is two numbers, along and across; received {pair!r}.")
+            for value in pair:
+                check_number(name, value, above=above)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -55,7 +60,8 @@ class ElastomerTaxel(QuerySensor):
     parameters; ``layer`` replaces the Gaussian shear kernel by that of an elastic layer.
 
     Raises:
-        UsageError: the way to sum dilation is unknown or does not fit the probes or the layer, or a length is negative.
+        UsageError: the way to sum dilation is unknown or does not fit the probes or the layer, or a number lies
+            outside its range.
     """
 
     dilate_scale: float = 100.0
@@ -95,7 +101,9 @@ class ElastomerTaxel(QuerySensor):
             )
         if self.dilation == "separable" and self.layer and self.layer.recoil:
             raise UsageError("A layer with recoil has no separable dilation; use dilation='auto', 'fft' or 'direct'.")
-        check_fields(self, "points", "dilate_spread", "shear_spread", "enter", "leave", least=0)
+        check_fields(self, "points", least=0, whole=True)
+        check_fields(self, "dilate_scale", "dilate_spread", "shear_scale", "shear_spread", "enter", "leave", least=0)
+        check_fields(self, "exponent", above=0)
 
     @property
     def planar(self) -> bool:

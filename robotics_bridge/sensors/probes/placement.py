@@ -48,6 +48,8 @@ class Probes:
             raise UsageError("Positions, normals and radii of probes must be finite numbers.")
         if (radius < 0).any():
             raise UsageError(f"The radius of a probe is positive, or 0 for a filler; received {radius.min():g} m.")
+        if self.pitch is not None and not all(0 <= step < math.inf for step in self.pitch):
+            raise UsageError(f"The pitch of a grid is finite and not negative (m); received {self.pitch!r}.")
         length = np.linalg.norm(normal, axis=1)
         if (length[radius > 0] < 1e-9).any():
             raise UsageError("The normal of a probe needs a length; received a zero vector.")

@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass
 from typing import ClassVar
 
-from brainbench.core.errors import UsageError
+from brainbench.core.reading.ranges import check_fields
 from robotics_bridge.sensors.noise.model import PROBE_KNOBS, TAXEL_KNOBS
 from robotics_bridge.sensors.sensor import QuerySensor
 
@@ -33,8 +33,8 @@ class SurfaceDistanceProbe(QuerySensor):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if not self.max_range > 0:
-            raise UsageError(f"max_range is a positive distance (m); received {self.max_range!r}.")
+        if self.max_range != math.inf:
+            check_fields(self, "max_range", above=0)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -65,8 +65,5 @@ class ContactProbe(QuerySensor):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.threshold < 0 or (self.release is not None and not 0 <= self.release <= self.threshold):
-            raise UsageError(
-                f"Contact ends at a depth between 0 and the threshold; received threshold={self.threshold!r} m and "
-                f"release={self.release!r} m."
-            )
+        check_fields(self, "threshold", least=0)
+        check_fields(self, "release", least=0, most=self.threshold)

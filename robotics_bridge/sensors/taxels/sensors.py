@@ -36,7 +36,7 @@ class KinematicTaxel(QuerySensor):
     minus signs. Defaults are the published parameters (4.10), but for k_ω in the physical convention.
 
     Raises:
-        UsageError: the convention or the total is unknown, or the exponent is not positive.
+        UsageError: the convention or the total is unknown, or a number lies outside its range.
     """
 
     stiffness: float = 500.0
@@ -81,12 +81,12 @@ class KinematicTaxel(QuerySensor):
         super().__post_init__()
         check_name("force convention", self.convention, CONVENTIONS)
         check_name("total of a force field", self.total, ("law", "engine"))
+        check_fields(self, "stiffness", "damping", "shear", "twist", "friction", least=0)
+        check_fields(self, "exponent", "grip", above=0)
         if self.twist is None:
             radius = float(self.probes.radius.max(initial=0.0))
             published = self.convention == "thesis"
             object.__setattr__(self, "twist", PUBLISHED_TWIST if published else self.shear * radius**2 / 2)
-        check_fields(self, "exponent", "grip", above=0)
-        check_fields(self, "friction", least=0)
         if self.sticky and self.convention == "thesis":
             raise UsageError("The published law has no friction at rest; leave out friction or convention='thesis'.")
 
@@ -107,7 +107,7 @@ class ProximityTaxel(ProbeSensor):
     −a and takes it about the link's origin, so that taxels add up to a wrench. Defaults: published parameters.
 
     Raises:
-        UsageError: the convention is unknown, or it follows no surface point.
+        UsageError: the convention is unknown, a number lies outside its range, or it follows no surface point.
     """
 
     stiffness: float = 300.0
@@ -129,4 +129,5 @@ class ProximityTaxel(ProbeSensor):
     def __post_init__(self) -> None:
         super().__post_init__()
         check_name("force convention", self.convention, CONVENTIONS)
+        check_fields(self, "stiffness", "coupling", "density", least=0)
         check_fields(self, "points", least=1, whole=True)

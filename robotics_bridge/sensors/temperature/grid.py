@@ -17,10 +17,10 @@ import numpy as np
 
 from brainbench.core.devices import warp
 from brainbench.core.errors import UsageError, check_name
-from brainbench.core.reading.ranges import check_fields
+from brainbench.core.reading.ranges import check_fields, check_number
 from brainbench.core.rotations import to_matrices
 from robotics_bridge.sensors.sensor import Sensor
-from robotics_bridge.sensors.temperature.materials import ThermalBody, ThermalMaterial, material
+from robotics_bridge.sensors.temperature.materials import ABSOLUTE_ZERO, ThermalBody, ThermalMaterial, material
 
 if TYPE_CHECKING:
     import torch
@@ -83,20 +83,27 @@ class TemperatureGrid(Sensor):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if len(self.cells) != 3 or any(int(n) != n or n < 1 for n in self.cells):
+        if len(self.cells) != 3:
             raise UsageError(f"A grid has three positive numbers of cells; received {self.cells!r}.")
+        for count in self.cells:
+            check_number("cells along an axis", count, least=1, whole=True)
         if (self.low is None) != (self.high is None):
             raise UsageError("Give both corners of the grid, low and high, or neither.")
-        if self.low is not None and self.high is not None and not all(a < b for a, b in zip(self.low, self.high)):  # noqa: B905
-            raise UsageError(f"The corners of the grid must differ along every axis; received {self.low}, {self.high}.")
-        for name in ("convection", "contact_conductance", "tau", "warm_range", "cold_range", "depth_weight"):
-            if not getattr(self, name) >= 0:  # infinite ones mean something
-                raise UsageError(f"{name} must be zero or positive; received {getattr(self, name)!r}.")
+        sides = () if self.low is None or self.high is None else zip(self.low, self.high, strict=False)
+        if not all(-math.inf < low < high < math.inf for low, high in sides):
+            raise UsageError(
+                f"The corners of the grid are finite and differ along every axis; received {self.low}, {self.high}."
+            )
+        limits = ("contact_conductance", "warm_range", "cold_range")
+        check_fields(self, *(name for name in limits if getattr(self, name) != math.inf), least=0)
+        check_fields(self, "convection", "tau", "depth_weight", least=0)
         check_fields(self, "contact_radius", above=0)
-        check_fields(self, "base_temperature", "ambient_temperature")
+        check_fields(self, "base_temperature", "ambient_temperature", least=ABSOLUTE_ZERO)
         check_name("conduction", self.conduction, ("physical", "thesis"))
         if np.shape(self.source) not in ((), tuple(self.cells)):
             raise UsageError(f"source is a number or an array {tuple(self.cells)}; received {np.shape(self.source)}.")
+        for value in np.ravel(self.source):
+            check_number("source", value)
         for body in (*self.bodies.values(), self.other):
             material(body.material)
         material(self.material)

@@ -5,8 +5,11 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from brainbench.core.errors import UsageError, check_name
+from brainbench.core.errors import check_name
 from brainbench.core.reading.ranges import check_fields
+
+ABSOLUTE_ZERO = -273.15
+"""[°C]."""
 
 
 @dataclass(frozen=True)
@@ -26,9 +29,7 @@ class ThermalMaterial:
     emissivity: float = 0.9
 
     def __post_init__(self) -> None:
-        for name in ("conductivity", "density", "specific_heat"):
-            if not (math.isfinite(getattr(self, name)) and getattr(self, name) > 0):
-                raise UsageError(f"The {name} of a material is positive; received {getattr(self, name)!r}.")
+        check_fields(self, "conductivity", "density", "specific_heat", above=0)
         check_fields(self, "emissivity", least=0, most=1)
 
     @property
@@ -71,8 +72,15 @@ def material(name: str | ThermalMaterial) -> ThermalMaterial:
 
 @dataclass(frozen=True)
 class ThermalBody:
-    """Material and temperature of a link that may be touched."""
+    """Material and temperature of a link that may be touched.
+
+    Raises:
+        UsageError: the temperature is not finite, or below absolute zero.
+    """
 
     material: str | ThermalMaterial = "plastic"
     temperature: float = 22.0
     """At the start [°C]; later through :func:`link_temperature`."""
+
+    def __post_init__(self) -> None:
+        check_fields(self, "temperature", least=ABSOLUTE_ZERO)

@@ -220,6 +220,13 @@ def test_real_values_fill_all_slots_and_simulated_ones_the_rest() -> None:
         RealTouch("agg_bool", links, (5, 4, 1), tips=tips, fingers=("thumb", "index"))
 
 
+@pytest.mark.parametrize("observe", ["agg_force", "agg_bool"])
+def test_a_calibration_of_a_finger_that_the_hand_lacks_is_refused(observe) -> None:
+    calibration = PressureCalibration(per_finger={"indx": 5.0})
+    with pytest.raises(UsageError, match="'indx'; did you mean 'index'"):
+        RealTouch(observe, ("palm",), (5, 1, 3), tips={}, fingers=("thumb", "index"), calibration=calibration)
+
+
 def test_what_does_not_fit_is_refused_before_anything_moves() -> None:
     with pytest.raises(UsageError, match="group 'command'"):
         _control(groups=("proprio", "command"))

@@ -82,6 +82,21 @@ def test_requests_that_make_no_sense_are_refused() -> None:
         Explored("nothing")
 
 
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_objects_are_held_in_some_way(value) -> None:
+    for place in range(4):
+        turned = [0.0] * 4
+        turned[place] = value
+        with pytest.raises(UsageError, match="'box' is a quaternion"):
+            _box(quaternion=tuple(turned))
+    for wrong in ((0, 0, 0, 0), (1, 0, 0)):
+        with pytest.raises(UsageError, match="'box' is a quaternion"):
+            _box(quaternion=wrong)
+    with pytest.raises(UsageError, match=rf"retreat .*received {value}"):
+        _box(retreat=value)
+    assert _box(quaternion=(2.0, 0, 0, 0), retreat=-1e-3).retreat < 0
+
+
 GRIPPER = """<mujoco model="jaws"><worldbody><body name="base"><geom type="box" size=".05 .03 .015"/>
   <body name="left" pos="-.03 0 .05"><joint name="slide_left" type="slide" axis="1 0 0" range="0 .028"/>
     <geom type="box" size=".005 .012 .035" mass=".05"/></body>

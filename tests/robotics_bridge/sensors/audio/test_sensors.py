@@ -253,6 +253,65 @@ def test_a_microphone_without_sources_and_wrong_settings_are_explained():
         Microphone(speed_of_sound=0.0)
 
 
+@pytest.mark.parametrize("place", range(3))
+@pytest.mark.parametrize("value", [np.nan, np.inf, True])
+def test_a_microphone_stands_somewhere(place, value):
+    position = [0.0, 0.0, 0.0]
+    position[place] = value
+    with pytest.raises(UsageError, match=rf"position .*received {value}"):
+        Microphone(position=tuple(position))
+    with pytest.raises(UsageError, match="three numbers"):
+        Microphone(position=(0.0, 1.0))  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -1.0, True])
+def test_modes_and_solids_have_finite_numbers(value):
+    for row in ((value, 1.0, 1.0), (1.0, value, 1.0)):
+        with pytest.raises(UsageError, match=rf"of a mode .*received {value}"):
+            Modes(*((number,) for number in row))
+    if value in (np.inf, -1.0) or np.isnan(value):
+        with pytest.raises(UsageError, match="positive sizes"):
+            ElasticSolid("box", (1.0, value, 1.0))
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_sound_that_is_not_finite_is_heard_as_nan_until_the_reset_and_not_as_silence(value):
+    suite = SensorSuite(_scene(), {"drive": ActuationAudio(link="box", joints=2, samples=K, hum=1.0)}, num_envs=2)
+    state = HandState.empty(2, 3, 4)
+    listener = Microphone(position=(1.0, 0.0, 0.0)).build(suite)
+    torque, _speed = joint_drive(suite, "drive")
+
+    def hear():
+        suite.update(state, DT)
+        listener.update(state, DT)
+        return listener.read()
+
+    assert hear().isfinite().all()
+    torque[1, 0] = value
+    for _ in range(3):
+        heard = hear()
+        assert heard[0].isfinite().all()
+        assert heard[1].isnan().all()
+    torque[:] = 0
+    # What was lost is still under way to the listener.
+    assert hear()[1].isnan().all()
+    assert listener.diverged.tolist() == [False, True]
+    suite.reset([1])
+    hear()
+    assert hear().abs().amax(dim=1).gt(0).all()
+    assert not listener.diverged.any()
+
+
+def test_a_state_that_diverged_is_heard_as_nan():
+    suite, state = _make(2)
+    listener = Microphone(position=(1.0, 0.0, 0.0)).build(suite)
+    state.pose_torch[1, 1, 0] = np.nan
+    suite.update(state, DT)
+    listener.update(state, DT)
+    assert suite.diverged.tolist() == listener.diverged.tolist() == [False, True]
+    assert listener.read().isnan().all(dim=1).tolist() == [False, True]
+
+
 _DROP = """
 <mujoco><option timestep="0.005"/><worldbody>
   <body name="slab"><geom name="slab" type="box" size="0.15 0.1 0.015"/></body>

@@ -220,7 +220,7 @@ def test_noise_and_radius_error_act_on_the_measured_branch_only() -> None:
         (lambda: _taxel(probes=Probes([[0, 0, 0]], [[0, 0, 1.0]], 0.01), dilation="fft"), "regular planar grid"),
         (lambda: _taxel(dilation="fast"), "separable"),
         (lambda: Layer(poisson=0.7), "poisson .*at most 0.5;"),
-        (lambda: Layer(frame=(0.0, 1.0)), "half widths"),
+        (lambda: Layer(frame=(0.0, 1.0)), r"frame .*above 0; received 0\.0"),
         (lambda: Layer(recoil=-0.1), "recoil .*at least 0"),
         (lambda: _taxel(layer=Layer(recoil=0.5), dilation="separable"), "no separable dilation"),
     ],

@@ -25,6 +25,12 @@ from tests.factories.sensor_episode import require_processor
 
 PLAIN = ThermalMaterial(2.0, 1000.0, 1000.0, 0.8)
 
+LIMITS = {"contact_conductance", "warm_range", "cold_range"}
+"""Numbers of a grid of which infinity means none."""
+NUMBERS = LIMITS | {
+    "base_temperature", "ambient_temperature", "convection", "source", "contact_radius", "depth_weight", "tau",
+}  # fmt: skip
+
 
 def _make(envs: int = 1, half: tuple[float, float, float] = (0.01, 0.02, 0.03), contacts: int = 0, **knobs):
     """Return a suite with one grid on a box, and a state; links are world, pad and object."""
@@ -350,12 +356,19 @@ def test_a_hot_ball_resting_on_a_plate_warms_the_cells_below_it():
 @pytest.mark.parametrize(
     ("knobs", "message"),
     [
-        ({"cells": (2, 0, 1)}, r"cells; received \(2, 0, 1\)"),
+        ({"cells": (2, 0, 1)}, r"cells along an axis .*received 0"),
         ({"low": (0, 0, 0)}, "both corners"),
         ({"low": (0, 0, 0), "high": (1, 0, 1)}, r"received \(0, 0, 0\), \(1, 0, 1\)"),
         ({"material": "alumium"}, "did you mean 'aluminium'"),
         ({"source": np.zeros((1, 2))}, r"source .*received \(1, 2\)"),
-        ({"tau": -1.0}, "tau must be zero or positive"),
+        ({"tau": -1.0}, r"tau .*at least 0; received -1\.0"),
+        *(({name: math.nan}, rf"{name} .*received nan") for name in NUMBERS),
+        *(({name: math.inf}, rf"{name} .*received inf") for name in NUMBERS - LIMITS),
+        *(({name: -300.0}, rf"{name} .*received -300") for name in NUMBERS - {"source"}),
+        *(({name: True}, rf"{name} .*received True") for name in NUMBERS),
+        ({"cells": (2, math.nan, 1)}, r"cells .*received nan"),
+        ({"source": np.array([[[1.0, math.nan]] * 2] * 2)}, r"source .*received nan"),
+        ({"low": (-math.inf, 0, 0), "high": (1, 1, 1)}, r"corners .*received \(-inf, 0, 0\)"),
         ({"conduction": "real"}, "Unknown conduction"),
         ({"bodies": {"object": ThermalBody("woood")}}, "did you mean 'wood'"),
         ({"noise": Noise(gain=(0.5, 2.0))}, "TemperatureGrid has no noise knob 'gain'"),
@@ -364,6 +377,20 @@ def test_a_hot_ball_resting_on_a_plate_warms_the_cells_below_it():
 def test_wrong_settings_are_explained(knobs, message):
     with pytest.raises(UsageError, match=message):
         TemperatureGrid(link="pad", **knobs)
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, -300.0, True])
+def test_touched_bodies_and_materials_have_ranges(value):
+    with pytest.raises(UsageError, match=rf"temperature .*received {value}"):
+        ThermalBody(temperature=value)
+    for name in ("conductivity", "density", "specific_heat"):
+        with pytest.raises(UsageError, match=rf"{name} .*received {value}"):
+            ThermalMaterial(**{"conductivity": 1.0, "density": 1.0, "specific_heat": 1.0, name: value})
+
+
+def test_limits_of_a_grid_may_be_infinite():
+    grid = TemperatureGrid(link="pad", **dict.fromkeys(LIMITS, math.inf), source=-1.0)
+    assert all(getattr(grid, name) == math.inf for name in LIMITS)
 
 
 def test_a_grid_needs_finite_geometry_or_corners():
