@@ -259,10 +259,12 @@ class _Run:
 
     def _views(self, x: torch.Tensor, step: int) -> tuple[torch.Tensor, ...]:
         """Return augmented copies of a batch, which depend on nothing but the seed and a step's number."""
-        return tuple(
-            self.augmentation(x, _generator(self.config.seed, step, view), part=self.where.part)
-            for view in range(self.learner.views)
-        )
+        views = []
+        for view in range(self.learner.views):
+            # Distinct numbers for every step and view of a run; the modulus keeps negative steps (validation) valid.
+            seed = ((self.config.seed * 1_000_003 + step) * 2 + view) % 2**63
+            views.append(self.augmentation(x, torch.Generator().manual_seed(seed), part=self.where.part))
+        return tuple(views)
 
     def _end_epoch(self) -> None:
         loss = self.at.total / max(self.at.count, 1)
@@ -442,9 +444,3 @@ class _Run:
 
 def _evaluations(plain: Mapping[str, Any]) -> dict[str, Evaluation]:
     return {name: Evaluation.from_plain(found) for name, found in plain.items()}
-
-
-def _generator(seed: int, step: int, view: int) -> torch.Generator:
-    """Return random numbers that depend on nothing but where training stands, so that no state need be kept."""
-    # Distinct numbers for every step and view of a run; the modulus keeps negative steps (validation) valid.
-    return torch.Generator().manual_seed(((seed * 1_000_003 + step) * 2 + view) % 2**63)
