@@ -18,14 +18,8 @@ if TYPE_CHECKING:
 
 LICENCE = "MIT"
 
-CELLS = {
-    None: ("time-decay", "time-decay memory"),
-    "ugrnn": ("ugrnn", "UGRNN"),
-    "intersection": ("intersection", "IntersectionRNN"),
-    "gru": ("gru", "GRU"),
-    "lstm": ("lstm", "LSTM"),
-}
-"""Name part → cell of :mod:`brainbench.models.cells` and words."""
+GATED = {"ugrnn": "UGRNN", "intersection": "IntersectionRNN", "gru": "GRU", "lstm": "LSTM"}
+"""Gated cell of :mod:`brainbench.models.cells` → words; an architecture that names none has time-decay memory."""
 
 CITATION = (
     "Zhuang, Kubilius, Hartmann & Yamins 2017, Toward goal-driven neural network models for the rodent "
@@ -58,7 +52,7 @@ def description(item: Architecture) -> str:
     elif item.cell == "feedforward":
         text = "Convolutional encoder without memory or feedback"
     else:
-        text = f"Recurrent convolutional encoder, {CELLS[item.cell][1]}"
+        text = f"Recurrent convolutional encoder, {GATED[item.cell] if item.cell else 'time-decay memory'}"
     words = {None: "", "gpt": ", GPT attender", "mamba": ", Mamba attender"}[item.attender]
     return f"{text}{', LayerNorm' if item.layer_norm else ''}{words}{', 3/16 width' if item.small else ''}"
 
@@ -109,9 +103,9 @@ def _encoder(item: Architecture) -> Encoder:
     from brainbench.models.encoders.zhuang import zhuang_graph
     from brainbench.models.graph.temporal_graph import TemporalGraph
 
-    feedforward = item.cell == "feedforward"
-    cell = "time-decay" if feedforward else CELLS[item.cell][0]
-    return TemporalGraph(zhuang_graph(cell, item.layer_norm, item.small, feedforward=feedforward))
+    if item.cell == "feedforward":
+        return TemporalGraph(zhuang_graph(small=item.small, feedforward=True))
+    return TemporalGraph(zhuang_graph(item.cell or "time-decay", item.layer_norm, item.small))
 
 
 def _attender(item: Architecture, features: int) -> Attender | None:
@@ -131,7 +125,7 @@ def architectures() -> Iterator[Architecture]:
     """Yield every architecture, full sizes first."""
     for small in (False, True):
         for attender in ATTENDERS:
-            for cell in CELLS:
+            for cell in (None, *GATED):
                 for layer_norm in (False, True):
                     yield Architecture("zhuang", cell, layer_norm, small, attender)
             yield Architecture("zhuang", "feedforward", small=small, attender=attender)
