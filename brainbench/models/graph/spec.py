@@ -150,10 +150,6 @@ class Node:
     resize: bool = True
     """Resize inputs to the node's grid (bilinear, antialiased); otherwise sizes must agree."""
 
-    def output_shape(self, shape: Shape) -> Shape:
-        """Return the node's output shape for its concatenated input."""
-        return self.stages(shape)[-1]
-
     def stages(self, shape: Shape) -> list[Shape]:
         """Return the shapes after the operation, after the pool and after each step of the chain."""
         shapes = [shape if self.operation is None else self.operation.output_shape(shape)]
@@ -251,7 +247,7 @@ class GraphSpec:
 
     def delays(self, unroll: Unroll) -> dict[tuple[str, str], int]:
         """Return how many steps each connection (source, target) takes: 1, or 0 within a step."""
-        check_unroll(unroll)
+        check_name("unrolling", unroll, UNROLLS)
         return {(e.source, e.target): 1 if unroll == "biological" or e.feedback else 0 for e in self.edges}
 
     def shapes(self) -> tuple[dict[str, Shape], dict[str, Shape]]:
@@ -268,7 +264,7 @@ class GraphSpec:
             grids[name] = self._grid(name, outputs)
             node = self.by_name[name]
             channels = self._channels(name, outputs) if node.operation is None else 1
-            outputs[name] = node.output_shape((channels, *grids[name]))
+            outputs[name] = node.stages((channels, *grids[name]))[-1]
             if min(outputs[name]) < 1:
                 raise UsageError(
                     f"Node {name!r} has nothing left of a grid of {list(grids[name])}: its output would be "
@@ -356,8 +352,3 @@ class GraphSpec:
         )
         # A component that reaches another comes first, and it reaches strictly more nodes.
         return tuple(sorted(unique, key=lambda group: -len(reach[group[0]])))
-
-
-def check_unroll(unroll: str) -> None:
-    """Raise :class:`UsageError` unless ``unroll`` is one of :data:`UNROLLS`."""
-    check_name("unrolling", unroll, UNROLLS)
