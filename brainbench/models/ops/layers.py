@@ -62,12 +62,6 @@ def activation(name: str | None) -> nn.Module:
     return ACTIVATIONS[name.lower()]()
 
 
-def same_padding(kernel_size: tuple[int, int]) -> tuple[int, int, int, int]:
-    """Return (left, right, top, bottom) zeros that keep the grid's size; odd ones go right and below."""
-    rows, columns = kernel_size
-    return (columns - 1) // 2, columns // 2, (rows - 1) // 2, rows // 2
-
-
 @torch.no_grad()
 def initialise(
     layer: nn.Conv2d | nn.Linear, *, gain: float, bias: float | None, method: Mapping[str, Any] | None
@@ -165,7 +159,8 @@ class Conv2d(nn.Conv2d):
         """Place for what the gradient of the weights needs of each step; None outside of a deferring pass."""
         symmetric = (0, 0) if isinstance(padding, str) else padding
         if padding == "same":
-            left, right, top, bottom = same_padding(kernel_size)
+            rows, columns = kernel_size
+            left, right, top, bottom = (columns - 1) // 2, columns // 2, (rows - 1) // 2, rows // 2
             symmetric = (top, left)
             # PyTorch pads both sides of a convolution alike, so uneven zeros (even kernels) are added before it.
             if (left, top) != (right, bottom):
