@@ -49,7 +49,7 @@ def deviation(
         inside: a coarser mesh of the same solid that decides what is inside, to save time.
     """
     rng = np.random.default_rng(seed)
-    areas = np.array([_areas(piece).sum() for piece in pieces])
+    areas = np.array([piece.to_trimesh().area for piece in pieces])
     shares = np.maximum(8, np.ceil(samples * areas / areas.sum())).astype(int)
     points = []
     for piece, share in zip(pieces, shares, strict=True):
@@ -177,16 +177,10 @@ def _planes(piece: Mesh) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     return a[good], normal[good] / length[good, None]
 
 
-def _areas(mesh: Mesh) -> NDArray[np.float64]:
-    from trimesh.triangles import area
-
-    return area(mesh.vertices[mesh.faces])
-
-
 def sample_surface(mesh: Mesh, count: int, rng: np.random.Generator) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     """Return points [count, 3] spread evenly by area over a surface, and the faces [count] they lie on."""
     # Faces are drawn by area; (1 − √u, √u (1 − v), √u v) is then uniform on a triangle.
-    ends = np.cumsum(_areas(mesh))
+    ends = np.cumsum(mesh.to_trimesh().area_faces)
     face = np.minimum(np.searchsorted(ends, rng.random(count) * ends[-1]), len(ends) - 1)
     u, v = np.sqrt(rng.random((count, 1))), rng.random((count, 1))
     a, b, c = np.moveaxis(mesh.vertices[mesh.faces[face]], 1, 0)
