@@ -61,9 +61,8 @@ def read_weights(path: str | os.PathLike[str]) -> ForeignWeights:
             f"found {listing(map(str, content)) if content else 'nothing'}."
         )
     check_stored(state, os.fspath(path))
-    counts = {ours: content.get(theirs) for ours, theirs in (("epoch", "epoch"), ("step", "global_step"))}
-    counts = {name: value if isinstance(value, int) else None for name, value in counts.items()}
-    return ForeignWeights(_prefixed(state), path, file_hash(path, length=64), **counts)
+    counts = [value if isinstance(value := content.get(name), int) else None for name in ("epoch", "global_step")]
+    return ForeignWeights(_prefixed(state), path, file_hash(path, length=64), *counts)
 
 
 def read_settings(path: str | os.PathLike[str]) -> Settings:
