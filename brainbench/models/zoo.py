@@ -16,25 +16,18 @@ if TYPE_CHECKING:
     from brainbench.models.network import EncoderAttenderDecoder
     from brainbench.models.parts import Attender, Encoder
 
-LICENCE = "MIT"
-
 GATED = {"ugrnn": "UGRNN", "intersection": "IntersectionRNN", "gru": "GRU", "lstm": "LSTM"}
 """Gated cell of :mod:`brainbench.models.cells` → words; an architecture that names none has time-decay memory."""
 
-CITATION = (
-    "Zhuang, Kubilius, Hartmann & Yamins 2017, Toward goal-driven neural network models for the rodent "
-    "whisker-trigeminal system, NeurIPS 30"
-)
 CITATIONS = {
-    "zhuang": CITATION,
+    "zhuang": "Zhuang, Kubilius, Hartmann & Yamins 2017, Toward goal-driven neural network models for the rodent "
+    "whisker-trigeminal system, NeurIPS 30",
     "resnet18": "He, Zhang, Ren & Sun 2016, Deep residual learning for image recognition, CVPR",
     "s4": "Gu, Goel & Ré 2022, Efficiently modeling long sequences with structured state spaces, ICLR",
     "gpt": "Radford, Wu, Child, Luan, Amodei & Sutskever 2019, Language models are unsupervised multitask learners",
     "mamba": "Gu & Dao 2023, Mamba: linear-time sequence modeling with selective state spaces, arXiv:2312.00752",
 }
 """Papers that the parts come from."""
-
-ATTENDERS = (None, "gpt", "mamba")
 
 
 def family(item: Architecture) -> str:
@@ -55,11 +48,6 @@ def description(item: Architecture) -> str:
         text = f"Recurrent convolutional encoder, {GATED[item.cell] if item.cell else 'time-decay memory'}"
     words = {None: "", "gpt": ", GPT attender", "mamba": ", Mamba attender"}[item.attender]
     return f"{text}{', LayerNorm' if item.layer_norm else ''}{words}{', 3/16 width' if item.small else ''}"
-
-
-def citation(item: Architecture) -> str:
-    """Return the papers of the encoder and the attender."""
-    return "; ".join(CITATIONS[part] for part in (item.encoder, item.attender) if part)
 
 
 def build(
@@ -124,7 +112,7 @@ def _attender(item: Architecture, features: int) -> Attender | None:
 def architectures() -> Iterator[Architecture]:
     """Yield every architecture, full sizes first."""
     for small in (False, True):
-        for attender in ATTENDERS:
+        for attender in (None, "gpt", "mamba"):
             for cell in (None, *GATED):
                 for layer_norm in (False, True):
                     yield Architecture("zhuang", cell, layer_norm, small, attender)
@@ -136,5 +124,6 @@ def architectures() -> Iterator[Architecture]:
 def register() -> None:
     """Enter every architecture into the registry."""
     for item in architectures():
-        text = {"family": family(item), "description": description(item), "citation": citation(item)}
-        register_model(str(item), licence=LICENCE, **text)(partial(build, item))
+        papers = "; ".join(CITATIONS[part] for part in (item.encoder, item.attender) if part)
+        text = {"family": family(item), "description": description(item), "citation": papers}
+        register_model(str(item), licence="MIT", **text)(partial(build, item))
