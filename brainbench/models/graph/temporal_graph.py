@@ -114,7 +114,12 @@ class TemporalGraph(nn.Module):
                 "from the first stimulus instead.",
                 list(self.input_shape),
             )
-            self._resize_operations(resized)
+            for _, key, operation in self._weighted():
+                if shape := resized.get(key):
+                    operation.weight = nn.Parameter(operation.weight.new_empty(shape))
+                    setattr(operation, "in_features" if len(shape) == 2 else "in_channels", shape[1])
+            # The grid shows in the weights only as a product, so it stays open until a stimulus arrives.
+            self._open_grid = True
         copy_named(self.tnn_parameters(), state)
 
     def tnn_parameters(self) -> dict[str, torch.Tensor]:
@@ -148,14 +153,6 @@ class TemporalGraph(nn.Module):
             if isinstance(node.operation, (Conv2d, Linear)):
                 kind = "lin" if isinstance(node.operation, Linear) else "conv"
                 yield name, f"{name}._pre_memory.{kind}.weight", node.operation
-
-    def _resize_operations(self, resized: Mapping[str, tuple[int, ...]]) -> None:
-        for _, key, operation in self._weighted():
-            if shape := resized.get(key):
-                operation.weight = nn.Parameter(operation.weight.new_empty(shape))
-                setattr(operation, "in_features" if len(shape) == 2 else "in_channels", shape[1])
-        # The grid shows in the weights only as a product, so it stays open until a stimulus arrives.
-        self._open_grid = True
 
     def _accept(self, shape: Shape) -> None:
         """Check one step's shape (C, H, W) against the graph; an open grid takes it on."""

@@ -17,7 +17,7 @@ import torch
 from torch import nn
 from torch.nn import functional
 
-from brainbench.core.errors import UsageError, unknown_name
+from brainbench.core.errors import unknown_name
 
 if TYPE_CHECKING:
     from brainbench.models.ops.convolution import DeferredWeightGrad
@@ -39,18 +39,6 @@ ACTIVATIONS: Mapping[str, type[nn.Module]] = {
 
 INITIALISERS = ("kaiming_normal_", "kaiming_uniform_", "orthogonal_", "xavier_normal_", "xavier_uniform_")
 """Initialisers of :mod:`torch.nn.init` that a configuration may name."""
-
-
-def pair(value: int | tuple[int, int] | list[int], what: str) -> tuple[int, int]:
-    """Return (rows, columns) from one number or two.
-
-    Raises:
-        UsageError: it is neither.
-    """
-    values = (value, value) if isinstance(value, int) else tuple(value)
-    if len(values) != 2 or not all(isinstance(item, int) and item > 0 for item in values):
-        raise UsageError(f"The {what} must be a positive integer or a pair of them; received {value!r}.")
-    return values
 
 
 def activation(name: str | None) -> nn.Module:
