@@ -149,8 +149,13 @@ def _farthest_from(pieces: Sequence[Mesh], points: NDArray) -> float:
     # The height over the highest face plane bounds the distance from below, and is it above that face.
     bounds = np.empty((len(points), len(pieces)))
     for index, piece in enumerate(pieces):
-        corner, normal = _planes(piece)
-        bounds[:, index] = (points @ normal.T - np.einsum("fi,fi->f", corner, normal)).max(axis=1)
+        a, b, c = np.moveaxis(piece.vertices[piece.faces], 1, 0)
+        normal = np.cross(b - a, c - a)
+        length = np.linalg.norm(normal, axis=1)
+        # A face without an area has no plane.
+        good = length > 1e-12 * piece.diagonal**2
+        normal = normal[good] / length[good, None]
+        bounds[:, index] = (points @ normal.T - np.einsum("fi,fi->f", a[good], normal)).max(axis=1)
     size = max(piece.diagonal for piece in pieces)
     left = bounds.min(axis=1) > 1e-7 * size
     if not left.any():
@@ -166,15 +171,6 @@ def _farthest_from(pieces: Sequence[Mesh], points: NDArray) -> float:
             near = point_triangle_distance(*pairs).reshape(len(mine), -1).min(axis=1)
             best[mine] = np.minimum(best[mine], near)
     return float(best.max())
-
-
-def _planes(piece: Mesh) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return a corner [F, 3] and the outward unit normal [F, 3] of every face with an area."""
-    a, b, c = np.moveaxis(piece.vertices[piece.faces], 1, 0)
-    normal = np.cross(b - a, c - a)
-    length = np.linalg.norm(normal, axis=1)
-    good = length > 1e-12 * piece.diagonal**2
-    return a[good], normal[good] / length[good, None]
 
 
 def sample_surface(mesh: Mesh, count: int, rng: np.random.Generator) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
