@@ -30,12 +30,6 @@ CITATIONS = {
 """Papers that the parts come from."""
 
 
-def family(item: Architecture) -> str:
-    """Return the encoder and attender, for grouping on leaderboards."""
-    base = f"{item.encoder}-feedforward" if item.cell == "feedforward" else item.encoder
-    return f"{base}+{item.attender}" if item.attender else base
-
-
 def description(item: Architecture) -> str:
     """Return one line for people."""
     if item.encoder == "resnet18":
@@ -125,5 +119,8 @@ def register() -> None:
     """Enter every architecture into the registry."""
     for item in architectures():
         papers = "; ".join(CITATIONS[part] for part in (item.encoder, item.attender) if part)
-        text = {"family": family(item), "description": description(item), "citation": papers}
+        # Encoder and attender, for grouping on leaderboards.
+        family = f"{item.encoder}-feedforward" if item.cell == "feedforward" else item.encoder
+        family += f"+{item.attender}" if item.attender else ""
+        text = {"family": family, "description": description(item), "citation": papers}
         register_model(str(item), licence="MIT", **text)(partial(build, item))
