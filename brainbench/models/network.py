@@ -90,10 +90,8 @@ class EncoderAttenderDecoder(nn.Module):
         self._unroll: dict[str, Any] = {}
         if isinstance(encoder, TemporalGraph):
             self._unroll = {"unroll": unroll}
-            field, latency = (
-                encoder.spec.receptive_field(unroll),
-                encoder.spec.first_response(unroll)[encoder.spec.output],
-            )
+            field = encoder.spec.receptive_field(unroll)
+            latency = encoder.spec.first_response(unroll)[encoder.spec.output]
         elif unroll != "biological":
             raise UsageError(f"Only temporal graphs can be unrolled otherwise; {type(encoder).__name__} cannot.")
         self.normaliser = normaliser or Normaliser.physical(SUB_STEPS)

@@ -168,7 +168,6 @@ def _product(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
 
 
 def _real_product(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
-    """Return the real part of the product of complex numbers [..., 2]."""
     return a[..., 0] * b[..., 0] - a[..., 1] * b[..., 1]
 
 
