@@ -67,6 +67,7 @@ class DecompositionSettings:
         check_fields(self, "most_pieces", least=1, whole=True)
         if self.most_pieces is not None and self.method == "vhacd":
             raise UsageError("V-HACD in PyBullet has no limit on the number of pieces; use method = 'coacd' for one.")
+        check_fields(self, "seed", least=0, whole=True)
         check_fields(self, "most_faces", least=500, whole=True)
         check_fields(self, "seconds", "memory", above=0)
 

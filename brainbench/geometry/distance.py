@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from brainbench.core.reading.ranges import check_number
 from brainbench.geometry.mesh import Mesh
 
 _NEIGHBOURS = 24
@@ -47,7 +48,11 @@ def deviation(
         solid, pieces: the mesh, inside where its winding number exceeds one half; convex meshes.
         samples, seed: points in each direction, on top of the vertices of the pieces; equal seeds give equal numbers.
         inside: a coarser mesh of the same solid that decides what is inside, to save time.
+
+    Raises:
+        UsageError: there are no samples.
     """
+    check_number("The number of samples", samples, least=1, whole=True)
     rng = np.random.default_rng(seed)
     areas = np.array([piece.to_trimesh().area for piece in pieces])
     shares = np.maximum(8, np.ceil(samples * areas / areas.sum())).astype(int)
@@ -63,7 +68,12 @@ def deviation(
 
 
 def hausdorff(first: Mesh, second: Mesh, *, samples: int = 4000, seed: int = 0) -> float:
-    """Return the sampled two-sided distance [m] between two surfaces (not the bodies inside them)."""
+    """Return the sampled two-sided distance [m] between two surfaces (not the bodies inside them).
+
+    Raises:
+        UsageError: there are no samples.
+    """
+    check_number("The number of samples", samples, least=1, whole=True)
     rng = np.random.default_rng(seed)
     there = _Surface(second, rng).distance(sample_surface(first, samples, rng)[0])
     back = _Surface(first, rng).distance(sample_surface(second, samples, rng)[0])
