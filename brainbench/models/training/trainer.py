@@ -34,7 +34,7 @@ from brainbench.models.training.batches import Batches, BatchOptions, Data
 from brainbench.models.training.card import checkpoint_info, model_card
 from brainbench.models.training.checkpoints import WEIGHTS, load_weights, save_checkpoint
 from brainbench.models.training.config import TrainingConfig, config_warnings
-from brainbench.models.training.evaluation import TWIN, Evaluation, baselines, evaluate, fit_probe
+from brainbench.models.training.evaluation import TWIN, Evaluation, baselines, evaluate, fit_probe, sweeps_hash
 from brainbench.models.training.gradients import Gradients, compiled
 from brainbench.models.training.objectives import make_learner
 from brainbench.models.training.optimizers import make_optimizer, rate_factor
@@ -354,7 +354,9 @@ class _Run:
         if features is None or train is None or not self.config.probe_epochs:
             return {}
         probe: dict[str, Any] = {"epochs": self.config.probe_epochs, "seed": self.config.seed}
-        key = {**probe, "classes": list(self.data.classes), "data": result.data, "twin": self.twin}
+        # The probes are fitted to the training sweeps; where their data set names no hash, their content is hashed.
+        fitted = dict(self.data.summary) or sweeps_hash(self._batches("train", shuffle=False, part=False) or ())
+        key = {**probe, "classes": list(self.data.classes), "data": result.data, "train": fitted, "twin": self.twin}
         if self.controls_file.is_file() and (kept := read_mapping(self.controls_file)).get("of") == key:
             return _evaluations(kept["controls"])
         self.progress(self._steps, self._steps, "probing raw input, random features and the untrained twin")
