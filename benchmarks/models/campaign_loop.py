@@ -23,13 +23,14 @@ from brainbench.core.cuda_graphs import record_step
 from brainbench.core.files import read_json, to_plain, write_json
 from brainbench.datasets import WhiskingDataset
 from brainbench.models.normaliser import Normaliser
+from brainbench.models.ops.parameters import copy_named
 from brainbench.models.ops.seeding import seeded
 from brainbench.models.registry import describe_model, load_model
 from brainbench.models.training.augmentation import Augmentation
 from brainbench.models.training.card import checkpoint_info, model_card
 from brainbench.models.training.checkpoints import WEIGHTS, load_weights, save_checkpoint
 from brainbench.models.training.evaluation import baselines, evaluate, fit_probe
-from brainbench.models.training.gradients import PARTS, copy_state, fuse
+from brainbench.models.training.gradients import PARTS, fuse
 from brainbench.models.training.objectives import make_learner
 from brainbench.models.training.optimizers import make_optimizer, rate_factor
 from brainbench.models.training.twins import describe_twin
@@ -149,7 +150,7 @@ class Trainer:
 
     def restart(self) -> None:
         """Put network and optimiser back to where training begins."""
-        copy_state(self.learner, self.start)
+        copy_named(self.learner.state_dict(), self.start)
         reset_optimizer(self.optimizer)
         self.skipped.zero_()
 
@@ -279,7 +280,7 @@ def _train(job: Job, data: Resident, device: torch.device, out: Path, known_rate
             log.flush()
             if status == "diverged":
                 break
-    copy_state(trainer.learner, trainer.kept)
+    copy_named(trainer.learner.state_dict(), trainer.kept)
     model = trainer.model.to(memory_format=torch.contiguous_format)
     result = _described(job, data) | {
         "learning_rate": rate,

@@ -67,6 +67,7 @@ class DecompositionSettings:
         check_fields(self, "most_pieces", least=1, whole=True)
         if self.most_pieces is not None and self.method == "vhacd":
             raise UsageError("V-HACD in PyBullet has no limit on the number of pieces; use method = 'coacd' for one.")
+        check_fields(self, "seed", least=0, whole=True)
         check_fields(self, "most_faces", least=500, whole=True)
         check_fields(self, "seconds", "memory", above=0)
 
@@ -159,7 +160,6 @@ def _decimated(mesh: Mesh, most: int) -> tuple[Mesh, float]:
 
 
 def _run(mesh: Mesh, settings: DecompositionSettings) -> list[np.ndarray]:
-    """Run the worker and return the points of each piece."""
     worker = Path(__file__).with_name("decomposition_worker.py")
     with tempfile.TemporaryDirectory(prefix="brainbench-") as folder:
         source, target = Path(folder, "mesh.npz"), Path(folder, "pieces.npz")
@@ -193,7 +193,6 @@ def _run(mesh: Mesh, settings: DecompositionSettings) -> list[np.ndarray]:
 
 
 def _failed(mesh: Mesh, settings: DecompositionSettings, fault: str) -> DataError:
-    """Return the error of a decomposition that ended with a fault, with what to do about it."""
     return DataError(
         f"The decomposition of {mesh.name!r} ({len(mesh.faces):,} triangles) {fault}; raise the threshold "
         f"({settings.threshold:g}), lower most_faces ({settings.most_faces:,}), raise the limit, or use collision = "

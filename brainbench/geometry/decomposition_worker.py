@@ -17,7 +17,12 @@ def main(source: str, target: str, method: str, threshold: str, most: str, seed:
     with np.load(source, allow_pickle=False) as stored:
         vertices, faces = stored["vertices"], stored["faces"]
     if method == "coacd":
-        pieces = _coacd(vertices, faces, float(threshold), int(most), int(seed), int(memory))
+        import coacd
+
+        _limit(int(memory))
+        coacd.set_log_level("error")
+        limits = {"threshold": float(threshold), "max_convex_hull": int(most), "seed": int(seed)}
+        pieces = [np.asarray(points, float) for points, _ in coacd.run_coacd(coacd.Mesh(vertices, faces), **limits)]
     else:
         pieces = _vhacd(vertices, faces, int(memory))
     np.savez(target, points=np.concatenate(pieces), sizes=[len(piece) for piece in pieces])
@@ -30,17 +35,6 @@ def _limit(memory: int) -> None:
         return
     # A limit of the address space: an allocation beyond it fails in the library instead of filling the machine.
     resource.setrlimit(resource.RLIMIT_AS, (memory, memory))
-
-
-def _coacd(
-    vertices: np.ndarray, faces: np.ndarray, threshold: float, most: int, seed: int, memory: int
-) -> list[np.ndarray]:
-    import coacd
-
-    _limit(memory)
-    coacd.set_log_level("error")
-    found = coacd.run_coacd(coacd.Mesh(vertices, faces), threshold=threshold, max_convex_hull=most, seed=seed)
-    return [np.asarray(points, float) for points, _ in found]
 
 
 def _vhacd(vertices: np.ndarray, faces: np.ndarray, memory: int) -> list[np.ndarray]:

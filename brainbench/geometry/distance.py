@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from brainbench.core.reading.ranges import check_number
 from brainbench.geometry.mesh import Mesh
 
 _NEIGHBOURS = 24
@@ -47,9 +48,13 @@ def deviation(
         solid, pieces: the mesh, inside where its winding number exceeds one half; convex meshes.
         samples, seed: points in each direction, on top of the vertices of the pieces; equal seeds give equal numbers.
         inside: a coarser mesh of the same solid that decides what is inside, to save time.
+
+    Raises:
+        UsageError: there are no samples.
     """
+    check_number("The number of samples", samples, least=1, whole=True)
     rng = np.random.default_rng(seed)
-    areas = np.array([_areas(piece).sum() for piece in pieces])
+    areas = np.array([piece.to_trimesh().area for piece in pieces])
     shares = np.maximum(8, np.ceil(samples * areas / areas.sum())).astype(int)
     points = []
     for piece, share in zip(pieces, shares, strict=True):
@@ -63,7 +68,12 @@ def deviation(
 
 
 def hausdorff(first: Mesh, second: Mesh, *, samples: int = 4000, seed: int = 0) -> float:
-    """Return the sampled two-sided distance [m] between two surfaces (not the bodies inside them)."""
+    """Return the sampled two-sided distance [m] between two surfaces (not the bodies inside them).
+
+    Raises:
+        UsageError: there are no samples.
+    """
+    check_number("The number of samples", samples, least=1, whole=True)
     rng = np.random.default_rng(seed)
     there = _Surface(second, rng).distance(sample_surface(first, samples, rng)[0])
     back = _Surface(first, rng).distance(sample_surface(second, samples, rng)[0])
@@ -149,8 +159,13 @@ def _farthest_from(pieces: Sequence[Mesh], points: NDArray) -> float:
     # The height over the highest face plane bounds the distance from below, and is it above that face.
     bounds = np.empty((len(points), len(pieces)))
     for index, piece in enumerate(pieces):
-        corner, normal = _planes(piece)
-        bounds[:, index] = (points @ normal.T - np.einsum("fi,fi->f", corner, normal)).max(axis=1)
+        a, b, c = np.moveaxis(piece.vertices[piece.faces], 1, 0)
+        normal = np.cross(b - a, c - a)
+        length = np.linalg.norm(normal, axis=1)
+        # A face without an area has no plane.
+        good = length > 1e-12 * piece.diagonal**2
+        normal = normal[good] / length[good, None]
+        bounds[:, index] = (points @ normal.T - np.einsum("fi,fi->f", a[good], normal)).max(axis=1)
     size = max(piece.diagonal for piece in pieces)
     left = bounds.min(axis=1) > 1e-7 * size
     if not left.any():
@@ -168,25 +183,10 @@ def _farthest_from(pieces: Sequence[Mesh], points: NDArray) -> float:
     return float(best.max())
 
 
-def _planes(piece: Mesh) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return a corner [F, 3] and the outward unit normal [F, 3] of every face with an area."""
-    a, b, c = np.moveaxis(piece.vertices[piece.faces], 1, 0)
-    normal = np.cross(b - a, c - a)
-    length = np.linalg.norm(normal, axis=1)
-    good = length > 1e-12 * piece.diagonal**2
-    return a[good], normal[good] / length[good, None]
-
-
-def _areas(mesh: Mesh) -> NDArray[np.float64]:
-    from trimesh.triangles import area
-
-    return area(mesh.vertices[mesh.faces])
-
-
 def sample_surface(mesh: Mesh, count: int, rng: np.random.Generator) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     """Return points [count, 3] spread evenly by area over a surface, and the faces [count] they lie on."""
     # Faces are drawn by area; (1 − √u, √u (1 − v), √u v) is then uniform on a triangle.
-    ends = np.cumsum(_areas(mesh))
+    ends = np.cumsum(mesh.to_trimesh().area_faces)
     face = np.minimum(np.searchsorted(ends, rng.random(count) * ends[-1]), len(ends) - 1)
     u, v = np.sqrt(rng.random((count, 1))), rng.random((count, 1))
     a, b, c = np.moveaxis(mesh.vertices[mesh.faces[face]], 1, 0)

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from brainbench.core.errors import DataError, check_name, unknown_name
+from brainbench.core.errors import DataError, UsageError, check_name, shown, unknown_name
 from brainbench.core.reading.ranges import check_number
 from brainbench.core.reading.regular import check_file, readable
 
@@ -141,8 +141,19 @@ class Mesh:
         return Mesh(self.vertices * factor, self.faces, self.name)
 
     def transformed(self, rotation: ArrayLike, translation: ArrayLike = (0.0, 0.0, 0.0)) -> Mesh:
-        """Return the mesh rotated by a matrix [3, 3] and then moved by ``translation`` [3] (m)."""
-        return Mesh(self.vertices @ np.asarray(rotation).T + np.asarray(translation), self.faces, self.name)
+        """Return the mesh rotated by a matrix [3, 3] and then moved by ``translation`` [3] (m).
+
+        Raises:
+            UsageError: the matrix is no rotation.
+        """
+        turn = np.asarray(rotation, dtype=float)
+        # Orthonormal up to the rounding of single precision; a reflection has determinant -1.
+        if turn.shape != (3, 3) or not np.allclose(turn @ turn.T, np.eye(3), atol=1e-5) or np.linalg.det(turn) < 0:
+            raise UsageError(
+                "A mesh is turned by a rotation matrix [3, 3], orthonormal with determinant 1; "
+                f"received {shown(turn.tolist())}."
+            )
+        return Mesh(self.vertices @ turn.T + np.asarray(translation), self.faces, self.name)
 
     def hull(self) -> Mesh:
         """Return the convex hull; a flat mesh, which has none, is a :class:`DataError`."""

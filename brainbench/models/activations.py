@@ -25,8 +25,6 @@ _log = logging.getLogger(__name__)
 
 OUTPUT = "output"
 """Layer name of a user model's own output."""
-READOUTS = ("default", "published")
-"""Ways to read a network's layers."""
 
 
 class Activations(dict[str, np.ndarray]):
@@ -83,7 +81,7 @@ def extract(
             f"{list(values.shape)} and chunk {chunk}."
         )
     like = next((p for p in model.parameters() if p.is_floating_point()), torch.zeros(()))
-    check_name("readout", readout, READOUTS)
+    check_name("readout", readout, ("default", "published"))
     if readout == "published":
         from brainbench.models.published.readout import published_activations
 
@@ -193,7 +191,6 @@ def named_reader(model: nn.Module, layers: Collection[str] | None) -> Any:
 
 
 def _hooked(model: nn.Module, layers: Collection[str] | None) -> dict[str, nn.Module]:
-    """Return the submodules to read by name."""
     every = {name: module for name, module in model.named_modules() if name}
     if layers is None:
         leaves = {name: module for name, module in every.items() if not any(True for _ in module.children())}

@@ -6,19 +6,13 @@ from typing import TYPE_CHECKING, Any
 
 from brainbench.core.records import GraphEdge, GraphNode, ModelGraph
 from brainbench.models.graph.spec import Convolution, Dense, Node
+from brainbench.models.zoo import GATED
 
 if TYPE_CHECKING:
     from torch import nn
 
     from brainbench.models.graph.temporal_graph import TemporalGraph
 
-_CELLS = {
-    "time-decay": "time decay",
-    "ugrnn": "UGRNN",
-    "intersection": "IntersectionRNN",
-    "gru": "GRU",
-    "lstm": "LSTM",
-}
 _KINDS = {
     "ResNet18Encoder": {"conv1": "convolution 7×7", "fc": "linear"},
     "S4Encoder": {"embed": "linear", "fc": "linear"},
@@ -65,7 +59,7 @@ def _temporal(encoder: TemporalGraph, nodes: list[GraphNode], edges: list[GraphE
     for name in spec.order:
         node = spec.by_name[name]
         count = sum(parameter.numel() for parameter in modules[name].parameters())
-        memory = _CELLS[node.memory.kind] + ", LN" * node.memory.layer_norm if node.memory else ""
+        memory = GATED.get(node.memory.kind, "time decay") + ", LN" * node.memory.layer_norm if node.memory else ""
         nodes.append(GraphNode(f"encoder.{name}", "encoder", _operation(node), memory, tuple(shapes[name]), count))
     edges += [GraphEdge("input", f"encoder.{name}") for name in spec.inputs]
     edges += [GraphEdge(f"encoder.{e.source}", f"encoder.{e.target}", e.feedback) for e in spec.edges]

@@ -1,7 +1,7 @@
 """Features computed elsewhere: an HDF5 file of activations that can be scored like a model.
 
 Layout, version 1: a dataset ``labels`` [K] of stimulus labels (strings) and a group ``activations``
-with one dataset per layer, [K, F] or [K, T, F], any numeric type. Layers are read in the order of
+with one dataset per layer, [K, F] or [K, T, F], of real numbers; whole ones below 2⁵³. Layers are read in the order of
 their creation when the file tracks it, else by name.
 """
 
@@ -88,9 +88,17 @@ def _layers(group: h5py.Group, rows: int, path: str) -> dict[str, NDArray[np.flo
         if not isinstance(item, h5py.Dataset):
             return
         _check_shape(name, item.shape, rows, path)
-        if not np.issubdtype(item.dtype, np.number):
-            raise DataError(f"Layer {name!r} of {path!r} has type {item.dtype}; activations must be numbers.")
-        values = item.astype(np.float64 if item.dtype == np.float64 else np.float32)[()]
+        whole = np.issubdtype(item.dtype, np.integer)
+        if not whole and not np.issubdtype(item.dtype, np.floating):
+            raise DataError(f"Layer {name!r} of {path!r} has type {item.dtype}; activations must be real numbers.")
+        # Single precision where it holds every value of the type.
+        single = np.result_type(item.dtype, np.float32) == np.float32
+        values = item.astype(np.float32 if single else np.float64)[()]
+        if whole and (np.abs(values) >= 2**53).any():
+            raise DataError(
+                f"Layer {shown(name)} of {shown(path)} has whole numbers of 2**53 or more, which floating point "
+                "rounds; scale them or write them as floating point."
+            )
         if infinite := int(np.isinf(values).sum()):
             raise DataError(
                 f"Layer {shown(name)} of {shown(path)} has {infinite:,} infinite values; missing ones are NaN."
@@ -107,3 +115,5 @@ def _check_shape(layer: str, shape: tuple[int, ...], rows: int, path: str) -> No
         raise DataError(
             f"Layer {layer!r} of {path!r} has shape {list(shape)}; expected [K, F] or [K, T, F] with K = {rows} labels."
         )
+    if 0 in shape[1:]:
+        raise DataError(f"Layer {layer!r} of {path!r} has shape {list(shape)}; expected at least one feature.")

@@ -15,9 +15,9 @@ from torch import nn
 
 from brainbench.core.contracts import CHANNELS
 from brainbench.core.errors import UsageError, check_name
-from brainbench.models.graph.spec import Unroll, check_unroll
+from brainbench.models.graph.spec import UNROLLS, Unroll
 from brainbench.models.graph.temporal_graph import TemporalGraph
-from brainbench.models.heads.decoders import AllStepsDecoder, linear_decoder
+from brainbench.models.heads.decoders import AllStepsDecoder, make_decoder
 from brainbench.models.normaliser import Normaliser
 from brainbench.models.parts import Attender, Encoder
 
@@ -85,21 +85,24 @@ class EncoderAttenderDecoder(nn.Module):
         unroll: Unroll = "biological",
     ) -> None:
         super().__init__()
-        check_unroll(unroll)
+        check_name("unrolling", unroll, UNROLLS)
         field, latency = encoder.receptive_field, encoder.latency
         self._unroll: dict[str, Any] = {}
         if isinstance(encoder, TemporalGraph):
             self._unroll = {"unroll": unroll}
-            field, latency = (
-                encoder.spec.receptive_field(unroll),
-                encoder.spec.first_response(unroll)[encoder.spec.output],
-            )
+            field = encoder.spec.receptive_field(unroll)
+            latency = encoder.spec.first_response(unroll)[encoder.spec.output]
         elif unroll != "biological":
             raise UsageError(f"Only temporal graphs can be unrolled otherwise; {type(encoder).__name__} cannot.")
         self.normaliser = normaliser or Normaliser.physical(SUB_STEPS)
         self.encoder = encoder
         self.attender = attender
-        self.decoder = decoder or linear_decoder(self.features)
+        self.decoder = decoder or make_decoder("linear", self.features)
+        linear = [module for module in self.decoder.modules() if isinstance(module, nn.Linear)]
+        if not linear:
+            raise UsageError(
+                f"A decoder must end in a linear layer; received {type(self.decoder).__name__} without any."
+            )
         every = isinstance(self.decoder, AllStepsDecoder)
         limits = [attender.max_steps if attender is not None else None, self.decoder.steps if every else None]
         self.spec = ModelSpec(
@@ -113,7 +116,7 @@ class EncoderAttenderDecoder(nn.Module):
             receptive_field=None if attender is not None or every else field,
             latency=latency,
             max_steps=min((limit for limit in limits if limit is not None), default=None),
-            outputs=_outputs(self.decoder),
+            outputs=linear[-1].out_features,
         )
         attended = [f"attender.{name}" for name in attender.layers] if attender is not None else []
         self.layers: tuple[str, ...] = (*(f"encoder.{name}" for name in encoder.layers), *attended, "decoder")
@@ -233,13 +236,6 @@ class EncoderAttenderDecoder(nn.Module):
 
     def _expected(self, *leading: str) -> str:
         return f"[{', '.join((*leading, *map(str, self.spec.input_shape)))}]"
-
-
-def _outputs(decoder: nn.Module) -> int:
-    linear = [module for module in decoder.modules() if isinstance(module, nn.Linear)]
-    if not linear:
-        raise UsageError(f"A decoder must end in a linear layer; received {type(decoder).__name__} without any.")
-    return linear[-1].out_features
 
 
 def _named(

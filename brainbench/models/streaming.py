@@ -116,22 +116,6 @@ def _graph_part(graph: TemporalGraph, unroll: Any) -> _Part:
     return _Part(graph, pack, unpack, unroll=unroll)
 
 
-def _s4_part(encoder: S4Encoder) -> _Part:
-    with torch.no_grad():
-        systems = [system for _, system in encoder.init_state(1)]
-    return _Part(
-        encoder, lambda state: [memory for memory, _ in state], lambda parts: tuple(zip(parts, systems, strict=True))
-    )
-
-
-def _mamba_part(attender: MambaAttender) -> _Part:
-    return _Part(
-        attender,
-        lambda state: [item for memory in state for item in memory],
-        lambda parts: tuple(MambaMemory(*pair) for pair in zip(parts[::2], parts[1::2], strict=True)),
-    )
-
-
 class _GPTPart(nn.Module):
     """The transformer with a cache of fixed size; per row a count of the tokens seen."""
 
@@ -173,10 +157,18 @@ class _GPTPart(nn.Module):
 def _part_of(part: Any, unroll: Any) -> Any:
     if isinstance(part, TemporalGraph):
         return _graph_part(part, unroll)
-    if isinstance(part, S4Encoder):
-        return _s4_part(part)
     if isinstance(part, GPTAttender):
         return _GPTPart(part)
+    if isinstance(part, S4Encoder):
+        with torch.no_grad():
+            systems = [system for _, system in part.init_state(1)]
+        return _Part(
+            part, lambda state: [memory for memory, _ in state], lambda parts: tuple(zip(parts, systems, strict=True))
+        )
     if isinstance(part, MambaAttender):
-        return _mamba_part(part)
+        return _Part(
+            part,
+            lambda state: [item for memory in state for item in memory],
+            lambda parts: tuple(MambaMemory(*pair) for pair in zip(parts[::2], parts[1::2], strict=True)),
+        )
     return _Part(part, lambda state: [], lambda parts: ())

@@ -16,37 +16,18 @@ if TYPE_CHECKING:
     from brainbench.models.network import EncoderAttenderDecoder
     from brainbench.models.parts import Attender, Encoder
 
-LICENCE = "MIT"
+GATED = {"ugrnn": "UGRNN", "intersection": "IntersectionRNN", "gru": "GRU", "lstm": "LSTM"}
+"""Gated cell of :mod:`brainbench.models.cells` → words; an architecture that names none has time-decay memory."""
 
-CELLS = {
-    None: ("time-decay", "time-decay memory"),
-    "ugrnn": ("ugrnn", "UGRNN"),
-    "intersection": ("intersection", "IntersectionRNN"),
-    "gru": ("gru", "GRU"),
-    "lstm": ("lstm", "LSTM"),
-}
-"""Name part → cell of :mod:`brainbench.models.cells` and words."""
-
-CITATION = (
-    "Zhuang, Kubilius, Hartmann & Yamins 2017, Toward goal-driven neural network models for the rodent "
-    "whisker-trigeminal system, NeurIPS 30"
-)
 CITATIONS = {
-    "zhuang": CITATION,
+    "zhuang": "Zhuang, Kubilius, Hartmann & Yamins 2017, Toward goal-driven neural network models for the rodent "
+    "whisker-trigeminal system, NeurIPS 30",
     "resnet18": "He, Zhang, Ren & Sun 2016, Deep residual learning for image recognition, CVPR",
     "s4": "Gu, Goel & Ré 2022, Efficiently modeling long sequences with structured state spaces, ICLR",
     "gpt": "Radford, Wu, Child, Luan, Amodei & Sutskever 2019, Language models are unsupervised multitask learners",
     "mamba": "Gu & Dao 2023, Mamba: linear-time sequence modeling with selective state spaces, arXiv:2312.00752",
 }
 """Papers that the parts come from."""
-
-ATTENDERS = (None, "gpt", "mamba")
-
-
-def family(item: Architecture) -> str:
-    """Return the encoder and attender, for grouping on leaderboards."""
-    base = f"{item.encoder}-feedforward" if item.cell == "feedforward" else item.encoder
-    return f"{base}+{item.attender}" if item.attender else base
 
 
 def description(item: Architecture) -> str:
@@ -58,14 +39,9 @@ def description(item: Architecture) -> str:
     elif item.cell == "feedforward":
         text = "Convolutional encoder without memory or feedback"
     else:
-        text = f"Recurrent convolutional encoder, {CELLS[item.cell][1]}"
+        text = f"Recurrent convolutional encoder, {GATED[item.cell] if item.cell else 'time-decay memory'}"
     words = {None: "", "gpt": ", GPT attender", "mamba": ", Mamba attender"}[item.attender]
     return f"{text}{', LayerNorm' if item.layer_norm else ''}{words}{', 3/16 width' if item.small else ''}"
-
-
-def citation(item: Architecture) -> str:
-    """Return the papers of the encoder and the attender."""
-    return "; ".join(CITATIONS[part] for part in (item.encoder, item.attender) if part)
 
 
 def build(
@@ -109,9 +85,9 @@ def _encoder(item: Architecture) -> Encoder:
     from brainbench.models.encoders.zhuang import zhuang_graph
     from brainbench.models.graph.temporal_graph import TemporalGraph
 
-    feedforward = item.cell == "feedforward"
-    cell = "time-decay" if feedforward else CELLS[item.cell][0]
-    return TemporalGraph(zhuang_graph(cell, item.layer_norm, item.small, feedforward=feedforward))
+    if item.cell == "feedforward":
+        return TemporalGraph(zhuang_graph(small=item.small, feedforward=True))
+    return TemporalGraph(zhuang_graph(item.cell or "time-decay", item.layer_norm, item.small))
 
 
 def _attender(item: Architecture, features: int) -> Attender | None:
@@ -130,8 +106,8 @@ def _attender(item: Architecture, features: int) -> Attender | None:
 def architectures() -> Iterator[Architecture]:
     """Yield every architecture, full sizes first."""
     for small in (False, True):
-        for attender in ATTENDERS:
-            for cell in CELLS:
+        for attender in (None, "gpt", "mamba"):
+            for cell in (None, *GATED):
                 for layer_norm in (False, True):
                     yield Architecture("zhuang", cell, layer_norm, small, attender)
             yield Architecture("zhuang", "feedforward", small=small, attender=attender)
@@ -142,5 +118,9 @@ def architectures() -> Iterator[Architecture]:
 def register() -> None:
     """Enter every architecture into the registry."""
     for item in architectures():
-        text = {"family": family(item), "description": description(item), "citation": citation(item)}
-        register_model(str(item), licence=LICENCE, **text)(partial(build, item))
+        papers = "; ".join(CITATIONS[part] for part in (item.encoder, item.attender) if part)
+        # Encoder and attender, for grouping on leaderboards.
+        family = f"{item.encoder}-feedforward" if item.cell == "feedforward" else item.encoder
+        family += f"+{item.attender}" if item.attender else ""
+        text = {"family": family, "description": description(item), "citation": papers}
+        register_model(str(item), licence="MIT", **text)(partial(build, item))

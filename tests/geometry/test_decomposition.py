@@ -116,6 +116,8 @@ def test_a_missing_package_names_its_extra(monkeypatch, method, package, extra):
         ({"most_pieces": 4, "method": "vhacd"}, "no limit on the number of pieces"),
         ({"most_faces": 10}, "at least 500"),
         ({"seconds": 0}, "seconds .*above 0;"),
+        ({"seed": 1.5}, "seed .*whole number.*; received 1.5"),
+        ({"seed": -1}, "seed .*at least 0; received -1"),
     ],
 )
 def test_impossible_settings_are_refused(values, message):

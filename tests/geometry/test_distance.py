@@ -9,6 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
+from brainbench.core.errors import UsageError
 from brainbench.geometry import Mesh, deviation, hausdorff, winding_number
 from brainbench.geometry.distance import point_triangle_distance
 
@@ -143,3 +144,11 @@ def test_filling_the_hole_of_a_ring_counts_by_its_depth():
     # The middle of the lid over the hole lies √(1² + .2²) − .2 from the tube, the centre of the hole 0.8.
     assert 0.78 < found.outward <= np.hypot(1, 0.2) - 0.2 + 0.01
     assert found.inward == pytest.approx(0, abs=1e-9)
+
+
+@pytest.mark.parametrize("samples", [0, -5, 1.5])
+def test_no_distance_is_told_without_a_sample(samples):
+    box = _box(1, 1, 1)
+    for measure in (lambda: deviation(box, [box], samples=samples), lambda: hausdorff(box, box, samples=samples)):
+        with pytest.raises(UsageError, match=f"samples .*at least 1; received {samples}"):
+            measure()

@@ -139,3 +139,14 @@ def test_the_volume_of_a_closed_mesh_is_signed():
     box = trimesh.creation.box(extents=(1, 2, 3))
     assert Mesh(box.vertices + 10, box.faces).volume == pytest.approx(6)
     assert Mesh(box.vertices, box.faces[:, ::-1]).volume == pytest.approx(-6)
+
+
+def test_a_turned_mesh_keeps_its_size_and_its_outside():
+    solid = trimesh.creation.box(extents=(1, 2, 3))
+    box = Mesh(solid.vertices, solid.faces)
+    turned = box.transformed([[0, -1, 0], [1, 0, 0], [0, 0, 1]], (0, 0, 5))
+    np.testing.assert_allclose(turned.bounds, [[-1, -0.5, 3.5], [1, 0.5, 6.5]])
+    assert turned.volume == pytest.approx(6)
+    for matrix in (np.diag([1, 1, -1]), 2 * np.eye(3), np.eye(2), np.full((3, 3), np.nan)):
+        with pytest.raises(UsageError, match=r"rotation matrix .*; received \[\["):
+            box.transformed(matrix)

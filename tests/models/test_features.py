@@ -47,3 +47,33 @@ def test_bad_files_are_refused_in_words(tmp_path: Path):
         file.create_group("activations")
     with pytest.raises(DataError, match=r"empty\.h5' .*'activations'"):
         read_features(tmp_path / "empty.h5")
+    with pytest.raises(DataError, match=r"\[2, 0\]; .*one feature"):
+        write_features(tmp_path / "d.h5", ["x", "y"], {"fc": np.ones((2, 0))})
+
+
+def _layer(path: Path, values):
+    with h5py.File(path, "w") as file:
+        file["labels"] = np.array([b"x", b"y"])
+        file["activations/fc"] = values
+    return read_features(path).activations["fc"].ravel()
+
+
+@pytest.mark.parametrize("kind", [np.int16, np.int32, np.uint32, np.int64, np.float16, np.float32, np.float64])
+def test_numbers_are_read_without_rounding(tmp_path: Path, kind):
+    largest = 2**53 - 1 if np.dtype(kind).itemsize == 8 else np.iinfo(kind).max if kind(0.5) == 0 else 2**11 - 1
+    assert _layer(tmp_path / "a.h5", np.array([[largest], [3]], dtype=kind)).tolist() == [largest, 3]
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        (np.array([[2**60 + 1], [3]]), r"'fc' .*2\*\*53"),
+        (np.array([[-(2**53) - 1], [3]]), r"'fc' .*2\*\*53"),
+        (np.array([[1 + 2j], [3]]), "'fc' .*complex128; .*real"),
+        (np.zeros((2, 0)), r"\[2, 0\]; .*one feature"),
+        (np.zeros((2, 0, 3)), r"\[2, 0, 3\]; .*one feature"),
+    ],
+)
+def test_activations_that_cannot_be_kept_are_refused(tmp_path: Path, values, message):
+    with pytest.raises(DataError, match=message):
+        _layer(tmp_path / "a.h5", values)

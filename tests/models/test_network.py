@@ -8,7 +8,7 @@ from brainbench.core.errors import UsageError
 from brainbench.models.attenders.gpt import GPTAttender
 from brainbench.models.encoders.zhuang import zhuang_graph
 from brainbench.models.graph.temporal_graph import TemporalGraph
-from brainbench.models.heads.decoders import mlp_decoder
+from brainbench.models.heads.decoders import make_decoder
 from brainbench.models.network import EncoderAttenderDecoder
 from tests.factories.training_sweeps import SCALE, random_sweeps
 
@@ -87,7 +87,7 @@ def test_the_answer_is_blind_to_steps_within_the_latency():
 
 
 def test_any_decoder_fits():
-    network = _network(decoder=mlp_decoder(96, 4))
+    network = _network(decoder=make_decoder("mlp", 96, 4))
     assert network(random_sweeps(2, 6)).shape == (2, 4)
     assert network.spec.outputs == 4
     with pytest.raises(UsageError, match="received Identity"):

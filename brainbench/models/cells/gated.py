@@ -8,9 +8,10 @@ from typing import TYPE_CHECKING, ClassVar, cast
 import torch
 from torch import nn
 
+from brainbench.core.errors import UsageError
 from brainbench.models.cells.cell import FORGET_BIAS, Cell, CellStep, ChannelNorm, Projected
 from brainbench.models.ops import dispatch
-from brainbench.models.ops.layers import Conv2d, pair
+from brainbench.models.ops.layers import Conv2d
 
 if TYPE_CHECKING:
     from brainbench.models.ops.gates import DeferredNormGrad
@@ -37,7 +38,11 @@ class GatedCell(Cell):
         self.norms = nn.ModuleDict({name: ChannelNorm(out_channels) for name in normalised})
 
     def _convolution(self, gates: int, kernel_size: Pair) -> Conv2d:
-        size = pair(kernel_size, "kernel size of a cell")
+        size = (kernel_size, kernel_size) if isinstance(kernel_size, int) else tuple(kernel_size)
+        if len(size) != 2 or not all(isinstance(item, int) and item > 0 for item in size):
+            raise UsageError(
+                f"The kernel size of a cell must be a positive integer or a pair of them; received {kernel_size!r}."
+            )
         return Conv2d(self.in_channels + self.out_channels, gates * self.out_channels, kernel_size=size, gain=1.0)
 
     @property

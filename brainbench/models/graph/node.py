@@ -63,7 +63,6 @@ def _normed(what: Operation | None, channels: int) -> nn.Module:
 
 
 def _step(step: str | Pool | Operation, shape: Shape) -> nn.Module:
-    """Build one step of a chain for its input shape."""
     if isinstance(step, str):
         return activation(step)
     if isinstance(step, Pool):

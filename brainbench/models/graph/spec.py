@@ -12,12 +12,20 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, Literal
 
-from brainbench.core.errors import UsageError, check_name, listing
+from brainbench.core.errors import UsageError, check_name, listing, shown
+from brainbench.core.reading.ranges import check_number
 
 Shape = tuple[int, ...]
 Unroll = Literal["biological", "full"]
 UNROLLS: tuple[Unroll, ...] = ("biological", "full")
 MEMORIES = ("time-decay", "ugrnn", "intersection", "gru", "lstm")
+
+
+def _check_pair(what: str, pair: Any, *, least: int = 1) -> None:
+    if not isinstance(pair, (tuple, list)) or len(pair) != 2:
+        raise UsageError(f"The {what} must be two whole numbers (rows, columns); received {shown(pair)}.")
+    for item in pair:
+        check_number(f"The {what}", item, least=least, whole=True)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,7 +51,7 @@ class Operation:
 
 @dataclass(frozen=True)
 class Convolution(Operation):
-    """2-D convolution of the concatenated inputs."""
+    """2-D convolution of the concatenated inputs; a size out of its range is a :class:`UsageError`."""
 
     channels: int
     kernel_size: tuple[int, int] = (2, 2)
@@ -52,6 +60,12 @@ class Convolution(Operation):
     """Rows, columns."""
     padding: Literal["same", "valid"] | tuple[int, int] = "same"
     """Zeros at every edge (rows, columns); ``same`` keeps the grid, ``valid`` adds none."""
+
+    def __post_init__(self) -> None:
+        _check_pair("kernel size of a convolution", self.kernel_size)
+        _check_pair("stride of a convolution", self.stride)
+        if self.padding not in ("same", "valid"):
+            _check_pair("padding of a convolution, unless 'same' or 'valid',", self.padding, least=0)
 
     def output_shape(self, shape: Shape) -> Shape:
         """Return (C, H, W) for an input (C, H, W)."""
@@ -101,7 +115,11 @@ class Memory:
 
 @dataclass(frozen=True)
 class Pool:
-    """Pooling at the end of a node: ``max``, or ``average`` to a fixed output size."""
+    """Pooling at the end of a node: ``max``, or ``average`` to a fixed output size.
+
+    Raises:
+        UsageError: a size is out of its range.
+    """
 
     kind: Literal["max", "average"]
     size: tuple[int, int]
@@ -114,6 +132,12 @@ class Pool:
     """Let a window of a maximum reach beyond the edge."""
     flatten: bool = False
     """Give one vector in place of a grid."""
+
+    def __post_init__(self) -> None:
+        _check_pair("size of a pool", self.size)
+        if self.stride is not None:
+            _check_pair("stride of a pool", self.stride)
+        _check_pair("padding of a pool", self.padding, least=0)
 
     def output_shape(self, shape: Shape) -> Shape:
         """Return the shape after pooling (C, H, W)."""
@@ -149,10 +173,6 @@ class Node:
     the latest feedforward predecessor."""
     resize: bool = True
     """Resize inputs to the node's grid (bilinear, antialiased); otherwise sizes must agree."""
-
-    def output_shape(self, shape: Shape) -> Shape:
-        """Return the node's output shape for its concatenated input."""
-        return self.stages(shape)[-1]
 
     def stages(self, shape: Shape) -> list[Shape]:
         """Return the shapes after the operation, after the pool and after each step of the chain."""
@@ -251,7 +271,7 @@ class GraphSpec:
 
     def delays(self, unroll: Unroll) -> dict[tuple[str, str], int]:
         """Return how many steps each connection (source, target) takes: 1, or 0 within a step."""
-        check_unroll(unroll)
+        check_name("unrolling", unroll, UNROLLS)
         return {(e.source, e.target): 1 if unroll == "biological" or e.feedback else 0 for e in self.edges}
 
     def shapes(self) -> tuple[dict[str, Shape], dict[str, Shape]]:
@@ -268,7 +288,7 @@ class GraphSpec:
             grids[name] = self._grid(name, outputs)
             node = self.by_name[name]
             channels = self._channels(name, outputs) if node.operation is None else 1
-            outputs[name] = node.output_shape((channels, *grids[name]))
+            outputs[name] = node.stages((channels, *grids[name]))[-1]
             if min(outputs[name]) < 1:
                 raise UsageError(
                     f"Node {name!r} has nothing left of a grid of {list(grids[name])}: its output would be "
@@ -356,8 +376,3 @@ class GraphSpec:
         )
         # A component that reaches another comes first, and it reaches strictly more nodes.
         return tuple(sorted(unique, key=lambda group: -len(reach[group[0]])))
-
-
-def check_unroll(unroll: str) -> None:
-    """Raise :class:`UsageError` unless ``unroll`` is one of :data:`UNROLLS`."""
-    check_name("unrolling", unroll, UNROLLS)

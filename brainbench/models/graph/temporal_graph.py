@@ -19,9 +19,9 @@ from typing import Any, cast
 import torch
 from torch import nn
 
-from brainbench.core.errors import UsageError, unknown_name
+from brainbench.core.errors import UsageError, check_name
 from brainbench.models.graph.node import NodeModule
-from brainbench.models.graph.spec import GraphSpec, Shape, Unroll, check_unroll
+from brainbench.models.graph.spec import UNROLLS, GraphSpec, Shape, Unroll
 from brainbench.models.graph.tnn_import import read_graph
 from brainbench.models.graph.unrolling import UnrolledSweep, needed_steps
 from brainbench.models.ops.layers import Conv2d, Linear
@@ -114,7 +114,12 @@ class TemporalGraph(nn.Module):
                 "from the first stimulus instead.",
                 list(self.input_shape),
             )
-            self._resize_operations(resized)
+            for _, key, operation in self._weighted():
+                if shape := resized.get(key):
+                    operation.weight = nn.Parameter(operation.weight.new_empty(shape))
+                    setattr(operation, "in_features" if len(shape) == 2 else "in_channels", shape[1])
+            # The grid shows in the weights only as a product, so it stays open until a stimulus arrives.
+            self._open_grid = True
         copy_named(self.tnn_parameters(), state)
 
     def tnn_parameters(self) -> dict[str, torch.Tensor]:
@@ -148,14 +153,6 @@ class TemporalGraph(nn.Module):
             if isinstance(node.operation, (Conv2d, Linear)):
                 kind = "lin" if isinstance(node.operation, Linear) else "conv"
                 yield name, f"{name}._pre_memory.{kind}.weight", node.operation
-
-    def _resize_operations(self, resized: Mapping[str, tuple[int, ...]]) -> None:
-        for _, key, operation in self._weighted():
-            if shape := resized.get(key):
-                operation.weight = nn.Parameter(operation.weight.new_empty(shape))
-                setattr(operation, "in_features" if len(shape) == 2 else "in_channels", shape[1])
-        # The grid shows in the weights only as a product, so it stays open until a stimulus arrives.
-        self._open_grid = True
 
     def _accept(self, shape: Shape) -> None:
         """Check one step's shape (C, H, W) against the graph; an open grid takes it on."""
@@ -232,7 +229,7 @@ class TemporalGraph(nn.Module):
         Raises:
             UsageError: the stimulus has another shape, or the unrolling is unknown.
         """
-        check_unroll(unroll)
+        check_name("unrolling", unroll, UNROLLS)
         if x.ndim != 4:
             raise UsageError(f"A step expects [batch, channels, rows, columns]; received {list(x.shape)}.")
         self._accept(tuple(x.shape[1:]))
@@ -276,8 +273,10 @@ class TemporalGraph(nn.Module):
         Raises:
             UsageError: the shape does not fit, or a node or unrolling does not exist.
         """
-        check_unroll(unroll)
-        asked = self._wanted(return_activations)
+        check_name("unrolling", unroll, UNROLLS)
+        asked = set(wanted(self.layers, return_activations))
+        for name in asked:
+            check_name("node", name, self.layers)
         if x.ndim != 5 or x.shape[1] < 1:
             raise UsageError(
                 f"A temporal graph expects [batch, time, channels, rows, columns]; received {list(x.shape)}."
@@ -311,17 +310,6 @@ class TemporalGraph(nn.Module):
     def activations(self, x: torch.Tensor, layers: Collection[str] | None = None) -> dict[str, torch.Tensor]:
         """Return ``{node: [B, T, ...]}`` of the biological unrolling for the nodes asked for (all by default)."""
         return self(x, return_activations=True if layers is None else tuple(layers))[1]
-
-    def _wanted(self, asked: bool | Collection[str]) -> set[str]:
-        names = set(wanted(self.layers, asked))
-        for name in names.difference(self.layers):
-            raise unknown_name("node", name, self.layers)
-        return names
-
-    @property
-    def draws_random(self) -> bool:
-        """True where nodes draw random numbers, which every stimulus then needs for itself."""
-        return self.training and any(node.dropout.p > 0 for _, node in self.named_nodes())
 
     def named_nodes(self) -> list[tuple[str, NodeModule]]:
         """Return the names and modules of the nodes in feedforward order."""

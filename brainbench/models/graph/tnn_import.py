@@ -11,6 +11,7 @@ from graphlib import CycleError, TopologicalSorter
 from typing import Any
 
 from brainbench.core.errors import DataError, check_name, listing, shown, unknown_name
+from brainbench.core.reading.ranges import check_number
 from brainbench.core.reading.regular import readable
 from brainbench.core.reading.texts import read_json, read_mapping
 from brainbench.models.graph.spec import Convolution, Dense, Edge, GraphSpec, Memory, Node, Operation, Pool
@@ -55,6 +56,20 @@ class _Section:
                     f"{choices[0]!r} is supported."
                 )
 
+    def flag(self, key: str, default: bool) -> bool:
+        """Take true or false."""
+        value = self.take(key, default)
+        if not isinstance(value, bool):
+            raise DataError(f"{key!r} in {self.where} must be true or false; found {shown(value)}.")
+        return value
+
+    def number(self, key: str, default: Any = _REQUIRED, **bounds: Any) -> Any:
+        """Take a number within bounds; None passes where it is the default."""
+        value = self.take(key, default)
+        if value is not None or default is not None:
+            check_number(f"{key!r} in {self.where}", value, **bounds)
+        return value
+
     def size(self, key: str, default: Any = _REQUIRED, *, or_else: tuple[Any, ...] = ()) -> Any:
         """Take a pair of whole numbers (or one for both), or one of other values."""
         value = self.take(key, default)
@@ -92,7 +107,7 @@ def read_graph(source: Mapping[str, Any] | str | os.PathLike[str]) -> GraphSpec:
 
     Raises:
         DataError: the file is missing or not JSON, or a key is missing or unsupported.
-        UsageError: the graph itself is not valid.
+        UsageError: the graph itself is not valid, or a number is out of its range.
     """
     if isinstance(source, Mapping):
         return _graph(source)
@@ -137,9 +152,7 @@ def _node(item: Any) -> Node:
     name = str(node.take("name"))
     node.where = f"node {name!r}"
     node.only(residual=(None, False))
-    channels = node.take("out_channels")
-    if not _is_size(channels):
-        raise DataError(f"Node {name!r} needs 'out_channels' from 1 to {_LARGEST:,}; found {shown(channels)}.")
+    channels = node.number("out_channels", least=1, most=_LARGEST, whole=True)
     harbor = _Section(node.take("harbor_policy"), f"the harbor policy of {name!r}")
     policy = harbor.take("name")
     check_name(f"harbor policy of node {name!r}", policy, ("ResizeConcat", "Identity"))
@@ -164,18 +177,23 @@ def _operation(part: _Section) -> Convolution | Dense | None:
         return None
     check_name(f"module in {part.where}", kind, ("Conv2dCell", "FullyConnected", "Identity"))
     common = {
-        "use_bias": part.take("use_bias", True),
-        "bias": part.take("bias", None),
-        "dropout": part.take("dropout", 0.0),
+        "use_bias": part.flag("use_bias", True),
+        "bias": part.number("bias", None),
+        "dropout": part.number("dropout", 0.0, least=0, most=1),
         # Left out, PyTorchTNN's dense layers rectify and its convolutions do not.
         "activation": part.take("activation", "ReLU" if kind == "FullyConnected" else None),
         "initialiser": _initialiser(part),
     }
     part.only(activation_func_kwargs=({}, None), batchnorm_timevary=False)
-    channels, norm = part.take("out_channels"), part.take("batchnorm", None)
-    if norm is not None and kind == "Conv2dCell" and norm != channels:
-        raise DataError(f"The batch norm in {part.where} has {norm} channels, its convolution {channels}.")
-    common["batch_norm"] = norm is not None
+    channels = part.number("out_channels", least=1, most=_LARGEST, whole=True)
+    norm = part.take("batchnorm", None)
+    # PyTorchTNN's dense layers ask whether there is one, its convolutions how many channels it has.
+    common["batch_norm"] = norm is not None and norm is not False
+    whole = type(norm) is int and norm == channels
+    if common["batch_norm"] and not whole and not (norm is True and kind == "FullyConnected"):
+        raise DataError(
+            f"'batchnorm' in {part.where} must be false or the number of channels, {channels}; found {shown(norm)}."
+        )
     if kind == "FullyConnected":
         operation: Convolution | Dense = Dense(channels, **common)
     else:
@@ -207,13 +225,13 @@ def _memory(part: _Section) -> Memory | None:
     check_name(f"cell in {part.where}", kind, ("IdentityCell", *_MEMORIES))
     part.only(init_dict=None)
     if kind == "TimeDecayRecurrentCell":
-        memory = Memory("time-decay", tau=part.take("tau", 0.0), trainable=bool(part.take("trainable", True)))
+        memory = Memory("time-decay", tau=part.number("tau", 0.0), trainable=part.flag("trainable", True))
     else:
         part.only(stride=1, padding="same", dilation=1, groups=1, padding_mode="zeros")
         part.only(use_bias=True, forget_bias=1.0, activation="Tanh", activation_func_kwargs={})
         # Only the initial value of a bias that load_tnn_state or training replaces.
         part.only(bias=(None, 0, 0.0))
-        memory = Memory(_MEMORIES[kind], part.size("ksize"), bool(part.take("layernorm", False)))
+        memory = Memory(_MEMORIES[kind], part.size("ksize"), part.flag("layernorm", False))
     part.done(*_OVERWRITTEN, "out_channels")
     return memory
 
@@ -243,8 +261,8 @@ def _layer(part: _Section) -> tuple[str | None, Pool | None]:
     elif kind == "MaxPool":
         size, stride = part.size("ksize"), part.size("stride", None, or_else=(None,))
         part.only(dilation=1, return_indices=False)
-        pool = Pool("max", size, stride, part.size("padding", 0), bool(part.take("ceil_mode", False)))
+        pool = Pool("max", size, stride, part.size("padding", 0), part.flag("ceil_mode", False))
     elif kind == "AdaptiveAvgPool":
-        pool = Pool("average", part.size("output_size", 6), flatten=bool(part.take("flatten", False)))
+        pool = Pool("average", part.size("output_size", 6), flatten=part.flag("flatten", False))
     part.done(*_OVERWRITTEN)
     return activation, pool

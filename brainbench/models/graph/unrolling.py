@@ -67,15 +67,26 @@ class UnrolledSweep:
         self.batch = len(x)
         self.delay = graph.spec.delays(unroll)
         # Dropout gives every stimulus its own mask, so no step can be computed once and shared.
-        self.arrival = dict.fromkeys(graph.layers, 0) if graph.draws_random else graph.spec.first_response(unroll)
+        random = graph.training and any(node.dropout.p > 0 for _, node in graph.named_nodes())
+        self.arrival = dict.fromkeys(graph.layers, 0) if random else graph.spec.first_response(unroll)
         self.kept: dict[str, tuple[int, torch.Tensor]] = {}
 
     def run(self, wanted: Collection[str]) -> dict[str, tuple[int, torch.Tensor]]:
         """Compute every group of nodes in turn; drop what no later one reads."""
-        if torch.is_grad_enabled() and dispatch.usable(self.x):
-            with dispatch.deferring(self._deferred()):
-                return self._run(wanted)
-        return self._run(wanted)
+        groups = self.graph.spec.groups
+        deferred = self._deferred() if torch.is_grad_enabled() and dispatch.usable(self.x) else ()
+        with dispatch.deferring(deferred):
+            for position, group in enumerate(groups):
+                later = {name for other in groups[position + 1 :] for name in other}
+                read = {e.source for name in later for e in self.graph.spec.predecessors[name]} | set(wanted)
+                cyclic = any(edge.source in group for name in group for edge in self.graph.spec.predecessors[name])
+                if cyclic:
+                    self._loop(group, read)
+                elif self.steps[group[0]][1]:
+                    self._sweep(group[0])
+                for name in [name for name in self.kept if name not in read]:
+                    del self.kept[name]
+        return self.kept
 
     def _deferred(self) -> Iterator[tuple[nn.Module, Any]]:
         """Yield convolutions and cells, each with the place where it leaves what its gradients need."""
@@ -93,20 +104,6 @@ class UnrolledSweep:
                     yield conv, DeferredWeightGrad(conv, grid, stimuli)
             if isinstance(memory, IntersectionRNN):
                 yield memory, DeferredNormGrad([memory.norm(gate) for gate in memory.gates] if memory.norms else [])
-
-    def _run(self, wanted: Collection[str]) -> dict[str, tuple[int, torch.Tensor]]:
-        groups = self.graph.spec.groups
-        for position, group in enumerate(groups):
-            later = {name for other in groups[position + 1 :] for name in other}
-            read = {e.source for name in later for e in self.graph.spec.predecessors[name]} | set(wanted)
-            cyclic = any(edge.source in group for name in group for edge in self.graph.spec.predecessors[name])
-            if cyclic:
-                self._loop(group, read)
-            elif self.steps[group[0]][1]:
-                self._sweep(group[0])
-            for name in [name for name in self.kept if name not in read]:
-                del self.kept[name]
-        return self.kept
 
     def _window(self, source: str, first: int, stop: int) -> torch.Tensor:
         """Return the outputs of a node at steps first to stop [B, stop − first, ...]; before its first step, zeros."""

@@ -16,16 +16,6 @@ CLASSES = 117
 """Object categories of the whisking data set (Zhuang et al. 2017)."""
 
 
-def linear_decoder(features: int, classes: int = CLASSES) -> nn.Module:
-    """Return one linear layer (60,021 parameters for 512 features)."""
-    return Linear(features, classes)
-
-
-def mlp_decoder(features: int, classes: int = CLASSES) -> nn.Module:
-    """Return linear layers 1024, 512 and ``classes`` with ReLU between (1,110,133 parameters for 512 features)."""
-    return perceptron(features, 1024, 512, classes)
-
-
 class AllStepsDecoder(nn.Module):
     """The MLP decoder of all steps at once: features [B, T, F] of at most ``steps`` steps → [B, classes].
 
@@ -78,11 +68,12 @@ class AllStepsDecoder(nn.Module):
 
 
 DECODERS: Mapping[str, Callable[..., nn.Module]] = {
-    "linear": linear_decoder,
-    "mlp": mlp_decoder,
+    "linear": Linear,
+    "mlp": lambda features, classes: perceptron(features, 1024, 512, classes),
     "all-steps": AllStepsDecoder,
 }
-"""Decoders by name; each takes (features, classes)."""
+"""Decoders by name; each takes (features, classes). ``linear`` is one layer (60,021 parameters for 512 features),
+``mlp`` linear layers 1024, 512 and ``classes`` with ReLU between (1,110,133)."""
 
 
 def make_decoder(name: str, features: int, classes: int = CLASSES) -> nn.Module:

@@ -32,6 +32,7 @@ from brainbench.models.ops.layers import Conv2d
 if TYPE_CHECKING:
     from brainbench.models.cells import IntersectionRNN
 
+_TRITON = importlib.util.find_spec("triton") is not None
 _wanted: ContextVar[bool] = ContextVar("brainbench_kernels", default=True)
 
 
@@ -41,7 +42,7 @@ def usable(x: torch.Tensor) -> bool:
         return False
     # Under autocast inputs may still be single: what counts is the precision that convolutions compute in.
     half = torch.get_autocast_dtype("cuda") if torch.is_autocast_enabled("cuda") else x.dtype
-    return half == torch.bfloat16 and _installed()
+    return half == torch.bfloat16 and _TRITON
 
 
 def selective_scan(x: torch.Tensor) -> Any:
@@ -117,8 +118,3 @@ def _mamba_kernel() -> Any:
     except ImportError:
         return None
     return selective_scan_fn
-
-
-@functools.cache
-def _installed() -> bool:
-    return importlib.util.find_spec("triton") is not None

@@ -17,7 +17,7 @@ import torch
 from torch import nn
 from torch.nn import functional
 
-from brainbench.core.errors import UsageError, unknown_name
+from brainbench.core.errors import unknown_name
 
 if TYPE_CHECKING:
     from brainbench.models.ops.convolution import DeferredWeightGrad
@@ -41,18 +41,6 @@ INITIALISERS = ("kaiming_normal_", "kaiming_uniform_", "orthogonal_", "xavier_no
 """Initialisers of :mod:`torch.nn.init` that a configuration may name."""
 
 
-def pair(value: int | tuple[int, int] | list[int], what: str) -> tuple[int, int]:
-    """Return (rows, columns) from one number or two.
-
-    Raises:
-        UsageError: it is neither.
-    """
-    values = (value, value) if isinstance(value, int) else tuple(value)
-    if len(values) != 2 or not all(isinstance(item, int) and item > 0 for item in values):
-        raise UsageError(f"The {what} must be a positive integer or a pair of them; received {value!r}.")
-    return values
-
-
 def activation(name: str | None) -> nn.Module:
     """Build an activation by name (:data:`ACTIVATIONS`, any case); None is the identity."""
     if name is None:
@@ -60,12 +48,6 @@ def activation(name: str | None) -> nn.Module:
     if name.lower() not in ACTIVATIONS:
         raise unknown_name("activation", name, ACTIVATIONS)
     return ACTIVATIONS[name.lower()]()
-
-
-def same_padding(kernel_size: tuple[int, int]) -> tuple[int, int, int, int]:
-    """Return (left, right, top, bottom) zeros that keep the grid's size; odd ones go right and below."""
-    rows, columns = kernel_size
-    return (columns - 1) // 2, columns // 2, (rows - 1) // 2, rows // 2
 
 
 @torch.no_grad()
@@ -165,7 +147,8 @@ class Conv2d(nn.Conv2d):
         """Place for what the gradient of the weights needs of each step; None outside of a deferring pass."""
         symmetric = (0, 0) if isinstance(padding, str) else padding
         if padding == "same":
-            left, right, top, bottom = same_padding(kernel_size)
+            rows, columns = kernel_size
+            left, right, top, bottom = (columns - 1) // 2, columns // 2, (rows - 1) // 2, rows // 2
             symmetric = (top, left)
             # PyTorch pads both sides of a convolution alike, so uneven zeros (even kernels) are added before it.
             if (left, top) != (right, bottom):

@@ -7,9 +7,6 @@ from contextlib import contextmanager
 
 from brainbench.core.errors import UsageError
 
-_LARGEST = 2**63 - 1
-"""PyTorch keeps seeds as signed 64-bit numbers."""
-
 
 @contextmanager
 def seeded(seed: int) -> Iterator[None]:
@@ -18,7 +15,8 @@ def seeded(seed: int) -> Iterator[None]:
     Raises:
         UsageError: the seed is not a whole number from 0 to 2**63 − 1.
     """
-    if isinstance(seed, bool) or not isinstance(seed, int) or not 0 <= seed <= _LARGEST:
+    # PyTorch keeps seeds as signed 64-bit numbers.
+    if isinstance(seed, bool) or not isinstance(seed, int) or not 0 <= seed < 2**63:
         raise UsageError(f"A seed must be a whole number of 0 or more, below 2**63; received {seed!r}.")
     import torch
 

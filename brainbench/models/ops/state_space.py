@@ -164,12 +164,10 @@ def _both(values: torch.Tensor) -> torch.Tensor:
 
 def _product(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
     """Multiply complex numbers given as real and imaginary parts [..., 2]."""
-    real = a[..., 0] * b[..., 0] - a[..., 1] * b[..., 1]
-    return torch.stack((real, a[..., 0] * b[..., 1] + a[..., 1] * b[..., 0]), -1)
+    return torch.stack((_real_product(a, b), a[..., 0] * b[..., 1] + a[..., 1] * b[..., 0]), -1)
 
 
 def _real_product(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
-    """Return the real part of the product of complex numbers [..., 2]."""
     return a[..., 0] * b[..., 0] - a[..., 1] * b[..., 1]
 
 

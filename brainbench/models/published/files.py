@@ -18,7 +18,7 @@ from brainbench.models.graph.tnn_import import read_graph
 
 # Values of their settings; what they mean here.
 _OBJECTIVES = {"SimCLRLoss": "simclr", "SimSiamLoss": "simsiam", "AutoEncoderLoss": "ae"}
-_CELLS = {"ugrnn", "gru", "lstm", "intersection"}
+_CELLS = {"": "time-decay", "ln": "time-decay"} | {name: name for name in ("ugrnn", "gru", "lstm", "intersection")}
 
 
 @dataclass(frozen=True)
@@ -61,9 +61,8 @@ def read_weights(path: str | os.PathLike[str]) -> ForeignWeights:
             f"found {listing(map(str, content)) if content else 'nothing'}."
         )
     check_stored(state, os.fspath(path))
-    counts = {ours: content.get(theirs) for ours, theirs in (("epoch", "epoch"), ("step", "global_step"))}
-    counts = {name: value if isinstance(value, int) else None for name, value in counts.items()}
-    return ForeignWeights(_prefixed(state), path, file_hash(path, length=64), **counts)
+    counts = [value if isinstance(value := content.get(name), int) else None for name in ("epoch", "global_step")]
+    return ForeignWeights(_prefixed(state), path, file_hash(path, length=64), *counts)
 
 
 def read_settings(path: str | os.PathLike[str]) -> Settings:
@@ -81,7 +80,9 @@ def read_settings(path: str | os.PathLike[str]) -> Settings:
     cell, objective = None, _OBJECTIVES.get(str(_inner(values, "train", "ssl")))
     if graph := _inner(values, "model", "encoder", "model_config_file"):
         words = Path(str(graph)).stem.removeprefix("rnn_fdb_converted_modern").strip("_").split("_")
-        cell = (words[0] if words[0] in _CELLS else "time-decay") + ("-ln" if "ln" in words else "")
+        # A name of another pattern says nothing; the weights tell the cell, or the user is asked.
+        if known := _CELLS.get(words[0]):
+            cell = known + ("-ln" if "ln" in words else "")
     if cell is None and objective is None:
         raise DataError(
             f"{shown(os.fspath(path))} says nothing of a network: expected 'model.encoder.model_config_file', "

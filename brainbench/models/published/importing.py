@@ -7,7 +7,6 @@ import os
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, cast
 
 import torch
 
@@ -18,6 +17,7 @@ from brainbench.models.encoders.s4 import S4Encoder
 from brainbench.models.network import EncoderAttenderDecoder
 from brainbench.models.normaliser import PUBLISHED_FORCE_SCALE, Normaliser
 from brainbench.models.ops.parameters import check_named, copy_named
+from brainbench.models.ops.state_space import StateSpace
 from brainbench.models.published.files import ForeignWeights, read_settings, read_weights
 from brainbench.models.published.names import published_names, stored_readout
 from brainbench.models.published.recognition import Recognised, recognise
@@ -114,8 +114,8 @@ def build_published(state: Mapping[str, torch.Tensor], found: Recognised) -> tup
         raise DataError(f"{name!r} is no architecture of the study, so published weights cannot be read into it.")
     targets = matched_entries(state, model, found)
     copy_named(targets, {key: state[key].reshape(target.shape) for key, target in targets.items()})
-    if isinstance(model.encoder, S4Encoder):
-        _adapt_s4(model.encoder, state)
+    for index, block in enumerate(model.encoder.blocks if isinstance(model.encoder, S4Encoder) else ()):
+        _adapt_s4(block.memory, int(state.get(f"model.encoder.s4_layers.{index}.layer.kernel.l_kernel", 0)))
     model.normaliser.load_state_dict(Normaliser.physical(force=PUBLISHED_FORCE_SCALE).state_dict())
     return model, set(targets)
 
@@ -140,14 +140,12 @@ def matched_entries(
     return targets
 
 
-def _adapt_s4(encoder: S4Encoder, state: Mapping[str, torch.Tensor]) -> None:
-    """Turn the stored form of S4's poles and readout into ours."""
-    with torch.no_grad():
-        for index, block in enumerate(encoder.blocks):
-            memory = cast(Any, block).memory
-            memory.frequency.neg_()  # theirs are the poles with negative frequency
-            if steps := int(state.get(f"model.encoder.s4_layers.{index}.layer.kernel.l_kernel", 0)):
-                memory.readout.copy_(stored_readout(memory.transition(), memory.readout, steps, undo=True))
+@torch.no_grad()
+def _adapt_s4(memory: StateSpace, steps: int) -> None:
+    """Turn the stored form of poles and readout into ours."""
+    memory.frequency.neg_()  # theirs are the poles with negative frequency
+    if steps:
+        memory.readout.copy_(stored_readout(memory.transition(), memory.readout, steps, undo=True))
 
 
 def _others(state: Mapping[str, torch.Tensor], used: Iterable[str]) -> list[str]:
@@ -161,7 +159,6 @@ def _squeezed(value: torch.Tensor) -> tuple[int, ...]:
 
 
 def _card(weights: ForeignWeights, found: Recognised, left: Mapping[str, int]) -> str:
-    """Return the text of the model card, in Markdown."""
     rows = {
         "architecture": found.architecture,
         "objective": found.objective or "not told by the file",

@@ -86,8 +86,12 @@ def _encode(model: EncoderAttenderDecoder, x: torch.Tensor, names: Iterable[str]
         maps, y = _through(x.flatten(0, 1), _resnet_layers(encoder))
         return y.unflatten(0, x.shape[:2]), {name: value.unflatten(0, x.shape[:2]) for name, value in maps.items()}
     if isinstance(encoder, TemporalGraph):
-        y, nodes = encoder(x, unroll=model.unroll, return_activations=True)
-        return y, {name: value[:, _first_step(name, value.shape[1]) :] for name, value in nodes.items()}
+        y, found = encoder(x, unroll=model.unroll, return_activations=True)
+        for name, value in found.items():
+            # A node is read from the step that the first number in its name sets, if the sweep is that long.
+            if number := re.search(r"\d+", name):
+                found[name] = value[:, min(max(int(number[0]) - 1, 0), value.shape[1] - 1) :]
+        return y, found
     y, activations = encoder(x, return_activations=True)
     found = dict(zip(names, activations.values(), strict=False))
     return y, {name: value.transpose(1, 2) if "_l" in name else value for name, value in found.items()}
@@ -132,9 +136,3 @@ def _through(x: torch.Tensor, layers: Layers) -> tuple[Named, torch.Tensor]:
     for name, layer in layers:
         x = found[name] = layer(x)
     return found, x
-
-
-def _first_step(name: str, steps: int) -> int:
-    """Return the step from which a node is read: the first number in its name less one, if the sweep is that long."""
-    number = re.search(r"\d+", name)
-    return 0 if number is None else min(max(int(number[0]) - 1, 0), steps - 1)

@@ -51,9 +51,6 @@ class Augmentation:
                 f"The share of masked time steps lies between 0 and 1, 1 excluded; received {self.masking!r}."
             )
 
-    def __str__(self) -> str:
-        return self.kind + (f" + {self.masking:.0%} masking" if self.masking else "")
-
     def __call__(self, x: torch.Tensor, generator: torch.Generator, *, part: tuple[int, int] = (0, 1)) -> torch.Tensor:
         """Return an augmented copy of sweeps [B, T, S·C, 5, 7] in SI.
 
@@ -78,10 +75,6 @@ class SampledAugmentation:
         """Return numbers in [0, 1) [count, *shape], or those of another of torch's generators."""
         every = draw(count * self.parts, *shape, generator=self.generator, device=self.generator.device)
         return every[self.rank :: self.parts]
-
-    def for_all(self, count: int, device: torch.device) -> torch.Tensor:
-        """Return numbers in [0, 1) [count] that are the same for the whole batch."""
-        return torch.rand(count, generator=self.generator, device=self.generator.device).to(device)
 
     def coins(self, x: torch.Tensor, probability: float = 0.5) -> torch.Tensor:
         """Return one truth value per sweep of ``x``, shaped to broadcast against it."""
@@ -152,7 +145,7 @@ def _physical(x: torch.Tensor, draw: SampledAugmentation) -> torch.Tensor:
 
 
 def _thesis(x: torch.Tensor, draw: SampledAugmentation) -> torch.Tensor:
-    drawn = draw.for_all(4, x.device)
+    drawn = torch.rand(4, generator=draw.generator, device=draw.generator.device).to(x.device)
     rows, columns = x.shape[3:]
     # Nothing is read back from the device: every outcome is a table, and the one drawn is looked up.
     vertical, horizontal = (drawn[:2] < 0.5).long()

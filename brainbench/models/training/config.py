@@ -15,9 +15,6 @@ from brainbench.models.training.checkpoints import DTYPES
 PRECISIONS = ("auto", "float32", "bf16")
 COMPILE = ("off", "parts", "default", "graphs")
 AUGMENTATIONS = ("none", "physical", "thesis", "image")
-CONTRASTIVE = ("simclr", "simsiam")
-PLAYED_BACKWARDS = ("physical", "thesis")
-"""Augmentations that reverse time."""
 
 
 @dataclass(frozen=True)
@@ -144,7 +141,7 @@ def config_warnings(config: TrainingConfig, model: Any) -> list[str]:
     Of its network ``spec.receptive_field`` is read, if there is one.
     """
     found: list[str] = []
-    if config.objective not in CONTRASTIVE:
+    if config.objective not in ("simclr", "simsiam"):
         return found
     if config.augmentation == "none" and not config.masking:
         found.append(
@@ -153,7 +150,8 @@ def config_warnings(config: TrainingConfig, model: Any) -> list[str]:
             "augmentation, or masking."
         )
     seen = getattr(getattr(model, "spec", None), "receptive_field", None)
-    if seen is not None and config.augmentation in PLAYED_BACKWARDS:
+    # These augmentations reverse time.
+    if seen is not None and config.augmentation in ("physical", "thesis"):
         steps = "the last step" if seen == 1 else f"the last {seen} steps"
         found.append(
             f"{config.model} has no memory: its last answer sees {steps} of a sweep alone. The augmentation "

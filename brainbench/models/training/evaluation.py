@@ -75,6 +75,18 @@ def topk(answers: torch.Tensor, labels: torch.Tensor, k: int) -> int:
     return int(((ahead < k) & torch.isfinite(own[:, 0])).sum())
 
 
+def sweeps_hash(batches: Iterable[tuple[torch.Tensor, torch.Tensor]]) -> str:
+    """Return the hash of labelled sweeps that :attr:`Evaluation.data` of them would have."""
+    digest = hashlib.sha256()
+    for x, labels in batches:
+        _add(digest, x, labels)
+    return digest.hexdigest()[:16]
+
+
+def _add(digest: Any, x: torch.Tensor, labels: torch.Tensor) -> None:
+    digest.update(x.contiguous().cpu().numpy().tobytes() + labels.cpu().long().numpy().tobytes())
+
+
 def collapse(predicted: int, classes: int, spread: float) -> str:
     """Return why a network counts as collapsed: one class for everything, or features in one point; else ''."""
     if predicted == 1 and classes > 1:
@@ -97,7 +109,7 @@ def evaluate(model: nn.Module, batches: Iterable[tuple[Any, Any]], *, device: An
     moments: torch.Tensor | None = None
     with evaluating(model), torch.no_grad():
         for x, labels in batches:
-            digest.update(x.contiguous().cpu().numpy().tobytes() + labels.cpu().long().numpy().tobytes())
+            _add(digest, x, labels)
             x, labels = x.to(device), labels.to(device).long()
             if encode is not None and decoder is not None:
                 # Encoded once for both, the accuracy and the spread of the features.

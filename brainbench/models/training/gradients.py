@@ -19,6 +19,7 @@ from brainbench.models.cells.cell import Cell
 from brainbench.models.cells.gated import GatedCell
 from brainbench.models.encoders.resnet import BasicBlock
 from brainbench.models.encoders.s4 import S4Block
+from brainbench.models.ops.parameters import copy_named
 
 PARTS = (Cell, GPTBlock, MambaBlock, S4Block, BasicBlock)
 """Modules that are compiled on their own: called at every step or block, with few shapes."""
@@ -49,14 +50,6 @@ def fuse(module: nn.Module, on: bool = True) -> None:
         torch._dynamo.config.recompile_limit = max(torch._dynamo.config.recompile_limit, 64)
     for cell in cells:
         cell.fuse(on)
-
-
-@torch.no_grad()
-def copy_state(module: nn.Module, state: dict[str, torch.Tensor]) -> None:
-    """Copy parameters and buffers by name into a module without moving them."""
-    own = module.state_dict()
-    for name, value in state.items():
-        own[name].copy_(value)
 
 
 class Gradients:
@@ -150,4 +143,4 @@ class Gradients:
             torch.cuda.set_rng_state(random, device)
         else:
             torch.set_rng_state(random)
-        copy_state(self.module, buffers)
+        copy_named(dict(self.module.named_buffers()), buffers)

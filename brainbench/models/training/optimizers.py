@@ -10,11 +10,12 @@ import torch
 from torch import nn
 from torch.optim import Optimizer
 
-from brainbench.core.errors import UsageError, check_name
+from brainbench.core.errors import check_name
 from brainbench.core.reading.ranges import check_number
 
 MOMENTUM = 0.9
 WEIGHT_DECAY = 1e-4
+TRUST = 1e-3
 STEP_EPOCHS = 30
 STEP_FACTOR = 0.1
 WARMUP_RATIO = 1e-4
@@ -26,34 +27,15 @@ class LARS(Optimizer):
     trust = η ‖w‖ / (‖g + λ w‖), v ← m v + trust (g + λ w), w ← w − lr v, with momentum m, weight decay λ and ``trust``
     η. Biases and norm parameters (tensors of fewer than two axes) are excluded: they take plain momentum steps without
     decay, as in SimCLR.
-
-    Raises:
-        UsageError: a number is negative.
     """
 
-    def __init__(
-        self,
-        parameters: Iterable[Any],
-        lr: float,
-        *,
-        momentum: float = MOMENTUM,
-        weight_decay: float = WEIGHT_DECAY,
-        trust: float = 1e-3,
-    ) -> None:
-        if min(lr, momentum, weight_decay, trust) < 0:
-            raise UsageError(
-                "LARS needs numbers of 0 or more; received "
-                f"lr {lr}, momentum {momentum}, weight decay {weight_decay}, trust {trust}."
-            )
-        super().__init__(parameters, {"lr": lr, "momentum": momentum, "weight_decay": weight_decay, "trust": trust})
+    def __init__(self, parameters: Iterable[Any], lr: float) -> None:
+        options = {"lr": lr, "momentum": MOMENTUM, "weight_decay": WEIGHT_DECAY, "trust": TRUST}
+        super().__init__(parameters, options)
 
     @torch.no_grad()
-    def step(self, closure: Callable[[], float] | None = None) -> float | None:  # pyright: ignore[reportIncompatibleMethodOverride]
-        """Take one step; evaluate ``closure`` first if there is one."""
-        loss = None
-        if closure is not None:
-            with torch.enable_grad():
-                loss = closure()
+    def step(self) -> None:  # pyright: ignore[reportIncompatibleMethodOverride]
+        """Take one step."""
         for group in self.param_groups:
             for weight in group["params"]:
                 if weight.grad is None:
@@ -70,14 +52,13 @@ class LARS(Optimizer):
                     state["velocity"] = torch.zeros_like(weight)
                 state["velocity"].mul_(group["momentum"]).add_(update)
                 weight.sub_(group["lr"] * state["velocity"])
-        return loss
 
 
 OPTIMIZERS: Mapping[str, Callable[..., Optimizer]] = {
     "sgd": lambda p, lr: torch.optim.SGD(p, lr=lr, momentum=MOMENTUM, weight_decay=WEIGHT_DECAY),
     "adam": lambda p, lr: torch.optim.Adam(p, lr=lr, weight_decay=WEIGHT_DECAY),
     "adamw": lambda p, lr: torch.optim.AdamW(p, lr=lr, weight_decay=WEIGHT_DECAY),
-    "lars": lambda p, lr: LARS(p, lr=lr),
+    "lars": LARS,
 }
 """Optimisers by name; each takes parameters and a learning rate."""
 

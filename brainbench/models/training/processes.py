@@ -61,8 +61,8 @@ class Processes:
             return value
         total = torch.tensor([value], dtype=torch.float64, device=self.device)
         # Every process must come here equally often, or the others wait for ever.
-        torch.distributed.all_reduce(total)
-        return float(total) / self.count
+        self.average(total)
+        return float(total)
 
     def any(self, *flags: bool) -> tuple[bool, ...]:
         """Return for each flag whether it is up in any process."""

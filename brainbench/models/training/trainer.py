@@ -34,7 +34,7 @@ from brainbench.models.training.batches import Batches, BatchOptions, Data
 from brainbench.models.training.card import checkpoint_info, model_card
 from brainbench.models.training.checkpoints import WEIGHTS, load_weights, save_checkpoint
 from brainbench.models.training.config import TrainingConfig, config_warnings
-from brainbench.models.training.evaluation import TWIN, Evaluation, baselines, evaluate, fit_probe
+from brainbench.models.training.evaluation import TWIN, Evaluation, baselines, evaluate, fit_probe, sweeps_hash
 from brainbench.models.training.gradients import Gradients, compiled
 from brainbench.models.training.objectives import make_learner
 from brainbench.models.training.optimizers import make_optimizer, rate_factor
@@ -259,10 +259,12 @@ class _Run:
 
     def _views(self, x: torch.Tensor, step: int) -> tuple[torch.Tensor, ...]:
         """Return augmented copies of a batch, which depend on nothing but the seed and a step's number."""
-        return tuple(
-            self.augmentation(x, _generator(self.config.seed, step, view), part=self.where.part)
-            for view in range(self.learner.views)
-        )
+        views = []
+        for view in range(self.learner.views):
+            # Distinct numbers for every step and view of a run; the modulus keeps negative steps (validation) valid.
+            seed = ((self.config.seed * 1_000_003 + step) * 2 + view) % 2**63
+            views.append(self.augmentation(x, torch.Generator().manual_seed(seed), part=self.where.part))
+        return tuple(views)
 
     def _end_epoch(self) -> None:
         loss = self.at.total / max(self.at.count, 1)
@@ -352,7 +354,9 @@ class _Run:
         if features is None or train is None or not self.config.probe_epochs:
             return {}
         probe: dict[str, Any] = {"epochs": self.config.probe_epochs, "seed": self.config.seed}
-        key = {**probe, "classes": list(self.data.classes), "data": result.data, "twin": self.twin}
+        # The probes are fitted to the training sweeps; where their data set names no hash, their content is hashed.
+        fitted = dict(self.data.summary) or sweeps_hash(self._batches("train", shuffle=False, part=False) or ())
+        key = {**probe, "classes": list(self.data.classes), "data": result.data, "train": fitted, "twin": self.twin}
         if self.controls_file.is_file() and (kept := read_mapping(self.controls_file)).get("of") == key:
             return _evaluations(kept["controls"])
         self.progress(self._steps, self._steps, "probing raw input, random features and the untrained twin")
@@ -442,9 +446,3 @@ class _Run:
 
 def _evaluations(plain: Mapping[str, Any]) -> dict[str, Evaluation]:
     return {name: Evaluation.from_plain(found) for name, found in plain.items()}
-
-
-def _generator(seed: int, step: int, view: int) -> torch.Generator:
-    """Return random numbers that depend on nothing but where training stands, so that no state need be kept."""
-    # Distinct numbers for every step and view of a run; the modulus keeps negative steps (validation) valid.
-    return torch.Generator().manual_seed(((seed * 1_000_003 + step) * 2 + view) % 2**63)

@@ -44,6 +44,22 @@ def test_a_wrong_graph_is_answered_in_one_sentence(edges, changes, message):
 
 
 @pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: Convolution(3, padding=(-1, 0)), "padding of a convolution.* at least 0; received -1"),
+        (lambda: Convolution(3, padding="sam"), "padding of a convolution.*'same'.* received 'sam'"),
+        (lambda: Convolution(3, (0, 2)), "kernel size of a convolution .*at least 1; received 0"),
+        (lambda: Convolution(3, stride=(1, 1.5)), "stride of a convolution .*whole number.*received 1.5"),
+        (lambda: Pool("max", (2, 2), padding=(0, -1)), "padding of a pool .*received -1"),
+        (lambda: Pool("average", 6), "size of a pool .*rows, columns.*received 6"),
+    ],
+)
+def test_impossible_sizes_are_refused(make, message):
+    with pytest.raises(UsageError, match=message):
+        make()
+
+
+@pytest.mark.parametrize(
     ("nodes", "edges", "message"),
     [
         ((Node("a", Convolution(2, (6, 2), padding="valid")),), (), r"'a' has nothing left of a grid of \[5, 7\]"),

@@ -106,7 +106,13 @@ def test_an_unsupported_node_is_refused_in_one_sentence(change, message):
 @pytest.mark.parametrize(
     ("key", "value", "message"),
     [
-        ("batchnorm", 5, r"batch norm in the pre-memory of 'a' has 5 channels, its convolution 4"),
+        ("batchnorm", 5, r"'batchnorm' in the pre-memory of 'a' .* 4; found 5"),
+        ("batchnorm", True, r"'batchnorm' .*'a' .* 4; found True"),
+        ("use_bias", "false", r"'use_bias' .*'a' must be true or false; found 'false'"),
+        ("bias", float("nan"), r"'bias' .*'a' must be a finite number; received nan"),
+        ("dropout", True, r"'dropout' .*'a' .*at least 0 and at most 1; received True"),
+        ("dropout", -1, r"'dropout' .*'a' .*; received -1"),
+        ("out_channels", "4", r"'out_channels' .*'a' .*whole number.*; received '4'"),
         ("batchnorm_timevary", True, r"'batchnorm_timevary': True .*'a'"),
         ("dilation", 2, "'dilation': 2"),
         ("ksize", "3", r"'ksize' .*'a' .*'3'"),
@@ -121,6 +127,33 @@ def test_an_unsupported_operation_is_refused_in_one_sentence(key, value, message
     node["pre_memory"] = node["pre_memory"] | {key: value}
     with pytest.raises((DataError, UsageError), match=message):
         read_graph(_config(node, edges=()))
+
+
+@pytest.mark.parametrize(
+    ("part", "module", "message"),
+    [
+        ("recurrent_cell", {"name": "TimeDecayRecurrentCell", "trainable": "false"}, "'trainable' .*'a' .*'false'"),
+        ("recurrent_cell", {"name": "TimeDecayRecurrentCell", "tau": "0.5"}, "'tau' .*'a' .*finite number.*'0.5'"),
+        ("recurrent_cell", {"name": "TimeDecayRecurrentCell", "tau": float("nan")}, "'tau' .*'a' .*received nan"),
+        ("recurrent_cell", {"name": "UGRNNCell", "ksize": 2, "layernorm": "no"}, "'layernorm' .*'a' .*'no'"),
+        ("post_memory", {"name": "AdaptiveAvgPool", "flatten": "no"}, "'flatten' .*'a' .*'no'"),
+        ("post_memory", {"name": "MaxPool", "ksize": 2, "ceil_mode": "false"}, "'ceil_mode' .*'a' .*'false'"),
+    ],
+)
+def test_values_of_another_type_are_refused(part, module, message):
+    with pytest.raises((DataError, UsageError), match=message):
+        read_graph(_config(_node("a", None, **{part: module}), edges=()))
+
+
+def test_a_dense_layer_has_the_batch_norm_that_is_asked_for():
+    def read(norm):
+        dense = {"name": "FullyConnected", "out_channels": 4, "batchnorm": norm}
+        return read_graph(_config(_node("a", None, pre_memory=dense), edges=())).nodes[0].operation.batch_norm
+
+    assert [read(norm) for norm in (None, False, True, 4)] == [False, False, True, True]
+    for norm in (99, 0, "no"):
+        with pytest.raises(DataError, match=r"'batchnorm' .*'a' .* 4; found"):
+            read(norm)
 
 
 @pytest.mark.parametrize("key", ["nodes", "edges", "input_nodes", "output_node", "input_shape"])

@@ -10,7 +10,8 @@ from torch import nn
 from torch.nn import functional
 
 from brainbench.core.errors import UsageError
-from brainbench.models.ops.layers import Conv2d, Linear, activation, draw_silent_biases, pair
+from brainbench.models.cells import UGRNN
+from brainbench.models.ops.layers import Conv2d, Linear, activation, draw_silent_biases
 from brainbench.models.ops.seeding import seeded
 
 
@@ -59,7 +60,7 @@ def test_an_unknown_activation_names_the_nearest():
 @pytest.mark.parametrize("value", [0, (2, 0), (1, 2, 3), (2.0, 2)])
 def test_a_bad_kernel_size_says_what_was_received(value):
     with pytest.raises(UsageError, match="kernel size .*received " + re.escape(str(value))):
-        pair(value, "kernel size")
+        UGRNN(3, 3, kernel_size=value)
 
 
 @torch.no_grad()

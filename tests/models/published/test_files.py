@@ -69,6 +69,9 @@ def test_what_holds_no_finite_weights_is_refused(tmp_path):
         ("modern_gru", "gru"),
         ("modern_lstm_ln", "lstm-ln"),
         ("modern_intersection", "intersection"),
+        ("modern_ln", "time-decay-ln"),
+        ("modern_lsmt", None),
+        ("classic", None),
     ],
 )
 def test_settings_name_the_cell_and_the_objective(tmp_path, stem, cell):
@@ -88,6 +91,9 @@ def test_settings_are_yaml_too(tmp_path):
         read_settings(path)
     path.write_text("learning_rate: 0.1\n")
     with pytest.raises(DataError, match="learning_rate"):
+        read_settings(path)
+    path.write_text("model: {encoder: {model_config_file: rnn_fdb_converted_modern_lsmt.json}}\n")
+    with pytest.raises(DataError, match="says nothing of a network"):
         read_settings(path)
     with pytest.raises(DataFileNotFoundError, match=r"none\.yaml"):
         read_settings(tmp_path / "none.yaml")

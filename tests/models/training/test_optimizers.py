@@ -10,7 +10,7 @@ from brainbench.models.training.optimizers import LARS, OPTIMIZERS, make_optimiz
 
 def _stepped(weight, gradient, steps=1, **options):
     parameter = nn.Parameter(weight.clone())
-    optimizer = LARS([parameter], lr=0.5, **options)
+    optimizer = LARS([{"params": [parameter], **options}], lr=0.5)
     for _ in range(steps):
         parameter.grad = gradient.clone()
         optimizer.step()
@@ -59,8 +59,8 @@ def test_wrong_choices_are_refused():
         make_optimizer("larz", [], 0.1)
     with pytest.raises(UsageError, match="received nan"):
         make_optimizer("sgd", [nn.Parameter(torch.zeros(1))], math.nan)
-    with pytest.raises(UsageError, match="received lr -1"):
-        LARS([nn.Parameter(torch.zeros(1))], lr=-1)
+    with pytest.raises(UsageError, match="received -1"):
+        make_optimizer("lars", [nn.Parameter(torch.zeros(1))], -1)
     with pytest.raises(UsageError, match=r"'stepp'.*'step'"):
         rate_factor("stepp", 0, epochs=1)
 

@@ -176,7 +176,18 @@ def test_a_run_is_compared_with_raw_input_random_features_and_its_twin_once(tmp_
     assert first.controls == other.controls == again.controls
     assert not computed
     train(_config(epochs=1), tiny(test=6), out=shared / "c", controls=shared, device="cpu")
-    assert computed  # other sweeps
+    assert computed.pop()  # other sweeps
+    train(_config(epochs=1), tiny(train=21, test=6), out=shared / "d", controls=shared, device="cpu")
+    assert computed.pop()  # other training sweeps, the same test
+    told = tiny(train=21, test=6)
+    told.summary = {"hash": "a", "classes": 3, "left_out": 0, "train": 21, "validation": 9, "test": 6}
+    train(_config(epochs=1), told, out=shared / "e", controls=shared, device="cpu")
+    computed.clear()
+    train(_config(epochs=1), told, out=shared / "f", controls=shared, device="cpu")
+    assert not computed
+    told.summary = told.summary | {"hash": "b"}
+    train(_config(epochs=1), told, out=shared / "g", controls=shared, device="cpu")
+    assert computed
 
 
 def test_the_random_state_of_others_is_left_alone(tmp_path):
