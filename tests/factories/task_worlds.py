@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from robotics_bridge.envs.step import ActionMap
 from robotics_bridge.hands.observations import observation_type
 from robotics_bridge.policies.encoders.arms import EncoderConfig
 from robotics_bridge.tasks.contact_model import ContactModel
@@ -20,9 +21,7 @@ class TouchWorld:
         self.num_envs, self.num_actions, self.device = num_envs, 2, torch.device("cpu")
         self.step_dt, self.decimation, self.max_episode_length = 0.025, 5, 8
         self.joint_names, self.frozen = ("a", "b"), {"c": 0.5}
-        self.action_map = SimpleNamespace(
-            names=("a", "b"), default=np.zeros(2), scale=np.ones(2), low=-np.ones(2), high=np.ones(2)
-        )
+        self.action_map = ActionMap(("a", "b"), np.zeros(2), np.ones(2), -np.ones(2), np.ones(2))
         self.touch: Any = None
         if observation_type(observe).sensor is not None:
             self.touch = SimpleNamespace(links=tuple(f"tip{i}" for i in range(5)))
