@@ -53,8 +53,9 @@ def draw(results: Sequence[StudentResult], path: str | Path, *, agents: Sequence
         row[0].set_title(f"task {task}, hand {hand}, contacts {contacts}", loc="left", fontsize=9)
         if turning:
             row[1].set_xlabel("rotation about the axis (rad/s)")
-    lines = {line.get_label(): line for line in axes[0][0].get_lines() if not line.get_label().startswith("_")}
-    if lines:
+    # One legend below, of the agents of all rows.
+    named = [line for row in axes for line in row[0].get_lines() if not line.get_label().startswith("_")]
+    if lines := {line.get_label(): line for line in named}:
         figure.legend(lines.values(), lines, loc="outside lower center", ncols=len(lines), fontsize=8.5, frameon=False)
     return save_figure(figure, Path(path), dpi=130)
 

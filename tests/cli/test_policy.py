@@ -11,7 +11,7 @@ import pytest
 from typer.testing import CliRunner
 
 from brainbench.cli import app
-from brainbench.core.errors import DataError, UsageError
+from brainbench.core.errors import DataError, MissingDependencyError, UsageError
 from tests.factories.policies import teacher_in
 
 SMALL = """
@@ -99,6 +99,15 @@ def test_shipped_policies_are_listed_with_the_contacts_that_they_were_trained_in
     assert found == {"in_palm_rotate.teacher": "firm", "in_palm_rotate.student": "firm"}
     told = [line.split() for line in _run("tasks").splitlines() if line.startswith("in_palm_rotate.")]
     assert {name: model for name, _, model, *_ in told} == found
+
+
+def test_a_film_that_cannot_be_written_is_told_before_anything_plays(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
+    monkeypatch.setattr("brainbench.cli.policy.options.World.make", lambda *_, **__: pytest.fail("it was begun"))
+    with pytest.raises(MissingDependencyError, match="imageio-ffmpeg"):
+        _run("play", "in_palm_rotate", "--agent", "zero", "--video", str(tmp_path / "turn.mp4"))
 
 
 def test_a_policy_plays_in_the_contacts_that_it_was_trained_in_unless_told_otherwise(tmp_path: Path) -> None:
