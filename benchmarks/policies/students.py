@@ -55,6 +55,15 @@ ARMS: dict[str, dict[str, Any]] = {
     "reservoir": {"observe": "force_torque", "placement": "hand", "encoder": "reservoir"},
     "reservoir_50": {"observe": "force_torque", "placement": "hand", "encoder": "reservoir", "resolution": CHOSEN},
     "raw_rnn": {"observe": "force_torque", "placement": "hand", "encoder": "rnn"},
+    # As many parameters as ft_hand; and those that have as many as raw_rnn.
+    "raw_rnn_small": {
+        "observe": "force_torque", "placement": "hand", "encoder": "rnn", "encoder_settings": {"units": 9},
+        "hidden": (128, 128, 128),
+    },
+    "ft_hand_large": {"observe": "force_torque", "placement": "hand", "hidden": (1376, 1024, 128)},
+    "reservoir_large": {
+        "observe": "force_torque", "placement": "hand", "encoder": "reservoir", "hidden": (1376, 1024, 128),
+    },
     "ead_finetuned": {
         "observe": "force_torque", "placement": "hand", "encoder": f"{NETWORK}.simclr",
         "encoder_settings": {"learning": "finetuned"},
@@ -64,6 +73,16 @@ ARMS: dict[str, dict[str, Any]] = {
         "encoder_settings": {"learning": "finetuned"},
     },
 }  # fmt: skip
+NETWORKS: dict[str, dict[str, Any]] = {
+    name: {"observe": "force_torque", "placement": "hand", "encoder": name}
+    for name in (
+        "zhuang-small", "zhuang-ln-small", "zhuang-ugrnn-small", "zhuang-gru-small", "zhuang-lstm-small",
+        "zhuang-intersection-small", "zhuang-feedforward-small", "resnet18-small", "s4-small", "zhuang-small+mamba",
+        f"{NETWORK}+mamba", "zhuang-small.simclr", "zhuang-small.supervised", "resnet18-small.supervised",
+    )
+}  # fmt: skip
+"""The other frozen networks of the default board, for the correlation of score and success (point 9 of issue 23). Those
+with a transformer are left out: a policy runs without end."""
 CONTRASTS = (
     ("ft_hand", "ft_tips"), ("bool_hand", "bool_tips"), ("ft_tips", "bool_tips"), ("ft_hand", "bool_hand"),
     ("ead_simclr", "ead_supervised"), ("ead_simclr", "ead_untrained"), ("ead_supervised", "ead_untrained"),
@@ -71,6 +90,8 @@ CONTRASTS = (
     ("ft_hand", "none_memory"), ("reservoir", "none_memory"), ("ead_simclr", "none_memory"), ("none_memory", "none"),
     ("reservoir_50", "reservoir"), ("bool_hand", "none_memory"), ("raw_rnn", "ft_hand"), ("raw_rnn", "reservoir"),
     ("ead_finetuned", "ead_scratch"), ("ead_finetuned", "ead_simclr"), ("ead_finetuned", "ft_hand"),
+    ("raw_rnn_small", "ft_hand"), ("raw_rnn", "ft_hand_large"), ("raw_rnn", "reservoir_large"),
+    ("ft_hand_large", "ft_hand"), ("reservoir_large", "reservoir"),
 )  # fmt: skip
 """Arms whose differences are tested."""
 RANDOM, TRAINED = ("reservoir", "ead_untrained"), ("ead_simclr", "ead_supervised")
@@ -97,12 +118,14 @@ def train(options: argparse.Namespace) -> None:
     from robotics_bridge.policies.training.distill_config import DistillConfig
     from robotics_bridge.policies.training.students import train_student
 
-    settings = dict(ARMS[options.arm])
+    settings = dict((ARMS | NETWORKS)[options.arm])
     if "encoder" in settings:
         # A draw of a random arm is its seed; networks answer without added latency.
         own = {"seed": options.draw if options.draw is not None else options.seed}
         if _is_network(settings):
-            own |= {"learning": "frozen", "options": {"unroll": "full"}}
+            # Networks without a graph know no latency.
+            graph = settings["encoder"].startswith("zhuang")
+            own |= {"learning": "frozen"} | ({"options": {"unroll": "full"}} if graph else {})
         if options.pretrained is not None and settings["encoder"].startswith(f"{NETWORK}."):
             own["pretrained"] = str(options.pretrained)
         settings["encoder_settings"] = own | settings.get("encoder_settings", {})
@@ -231,7 +254,10 @@ def lay_out(options: argparse.Namespace) -> None:
     from leaderboards import write_record
     from robotics_bridge.policies import report, student_figure
 
-    results = report.read_results(options.lay_out, at_least=options.at_least)
+    results = [
+        result for result in report.read_results(options.lay_out, at_least=options.at_least)
+        if arm_of(result.config) not in NETWORKS
+    ]  # fmt: skip
     agents = report.read_agents(options.lay_out)
     title, columns, rows = report.concise([*report.rows(results), *report.agent_rows(agents)])
     named = {arm: result for arm in ARMS for result in results if arm_of(result.config) == arm}
@@ -257,21 +283,22 @@ def lay_out(options: argparse.Namespace) -> None:
 
 
 def _is_network(settings: dict[str, Any]) -> bool:
-    return settings.get("encoder", "").startswith(NETWORK)
+    return settings.get("encoder", "").startswith(NETWORK) or settings.get("encoder") in NETWORKS
 
 
 def arm_of(config: DistillConfig) -> str | None:
     """Return the arm that a student belongs to; None where it belongs to none of them."""
     from robotics_bridge.policies.training.distill_config import DistillConfig
 
-    for arm, settings in ARMS.items():
+    for arm, settings in (ARMS | NETWORKS).items():
         learning = settings.get("encoder_settings", {}).get("learning", "frozen" if _is_network(settings) else None)
         plain = {name: value for name, value in settings.items() if name != "encoder_settings"}
         wanted = DistillConfig(task=config.task, **plain)
         felt = () if config.observe == "none" else ("placement", "resolution", "encoder")
-        same = ("observe", "embedder", *felt)
+        same = ("observe", "embedder", "hidden", *felt)
         if all(getattr(config, name) == getattr(wanted, name) for name in same) and (
             config.encoder_settings.get("learning") == learning
+            and config.encoder_settings.get("units") == settings.get("encoder_settings", {}).get("units")
         ):
             return arm
     return None
@@ -371,7 +398,7 @@ def main() -> None:
     parser.add_argument("--contacts", choices=list(CONTACTS), help="by default those of the teacher")
     parser.add_argument("--draw", type=int, help="seed of untrained networks and reservoirs; by default the student's")
     parser.add_argument("--pretrained", type=Path, help="weights of one training, for arms with a trained network")
-    parser.add_argument("--arms", nargs="+", default=list(ARMS), choices=list(ARMS))
+    parser.add_argument("--arms", nargs="+", default=list(ARMS), choices=[*ARMS, *NETWORKS])
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--gpus", type=int, default=1)
     parser.add_argument("--no-agents", action="store_true", help="do not evaluate the teacher, zero and random again")

@@ -37,6 +37,10 @@ EVALUATION, AGENTS = "evaluation.json", "agents.json"
 GRADED = ("metric", "goals", "turn_rate", "seconds", "returns", "dropped")
 """Quantities of an episode beside its success."""
 _STOPPED = "stopped after"
+_DRAWN = ("seed", "pretrained", "calibration")
+"""Settings of an encoder that differ between its draws, or were measured in each run."""
+_FREE = {"seed", "teacher", "iterations", "save_interval"}
+"""Settings in which students of one arm may differ; of how many iterations they learned the report tells."""
 FEWEST_SEEDS = 3
 """Training seeds below which an interval says little about a new student."""
 
@@ -145,6 +149,8 @@ def read_results(folders: Iterable[str | Path], *, at_least: int = 0) -> list[St
         raise DataFileNotFoundError(
             "No evaluated student was found; brainbench policy distill evaluates what it has trained."
         )
+    for name, members in groups.items():
+        _check_same(name, members)
     results = [result for members in groups.values() if (result := _result(*_counted(members, at_least))) is not None]
     if not results:
         longest = max(member.learned or 0 for members in groups.values() for member in members)
@@ -186,6 +192,21 @@ class _Member:
     def learned(self) -> int | None:
         """Iterations; None where no evaluation says how many."""
         return min((item["iterations"] for item in self.evaluations if item.get("iterations")), default=None)
+
+
+def _check_same(name: str, members: Sequence[_Member]) -> None:
+    """Check that students of one name differ in nothing but seed, draw and what does not reach their weights."""
+    told = [member.config.plain() for member in members]
+    for plain in told:
+        own = plain.pop("encoder_settings")
+        plain |= {f"encoder_settings.{key}": own[key] for key in own if key not in _DRAWN}
+    for key in sorted({key for plain in told for key in plain} - _FREE):
+        values = {shown(plain.get(key)): None for plain in told}
+        if len(values) > 1:
+            raise DataError(
+                f"Students of the arm {name!r} differ in {key!r} ({', '.join(values)}), so they are no seeds of one "
+                "arm; report their folders one at a time."
+            )
 
 
 def _counted(members: Sequence[_Member], at_least: int) -> tuple[list[_Member], tuple[LeftOut, ...]]:
@@ -307,10 +328,12 @@ def sense(config: DistillConfig) -> tuple[str, str, str, str]:
     tactile = config.tactile
     if tactile is None:
         return "–", "–", "–", "–"
-    learning = f" ({tactile.learning})" if "learning" in config.encoder_settings else ""
+    own = config.encoder_settings
+    told = ([tactile.learning] if "learning" in own else []) + ([f"{own['units']} units"] if "units" in own else [])
     # A layout of one's own is a file; its name tells it apart.
     resolution = Path(config.resolution).stem if config.resolution.endswith(".json") else config.resolution
-    return config.placement, resolution, "noisy" if config.noisy else "clean", tactile.arm + learning
+    encoder = f"{tactile.arm} ({', '.join(told)})" if told else tactile.arm
+    return config.placement, resolution, "noisy" if config.noisy else "clean", encoder
 
 
 def rows(results: Sequence[StudentResult]) -> list[list[str]]:

@@ -14,8 +14,8 @@ AGENTS = ("zero", "random")
 """Agents that every trained one is held against."""
 FOLDER = Path(__file__).parent / "trained"
 """A run's folder per policy, with a model card."""
-
-
+SENSING = "policy"
+"""Folder in a teacher's run with the policy as a student's, where it trained on what a hand measures."""
 RETIRED = {
     "in_palm_rotate.careful": "in_palm_rotate.teacher",
     "in_palm_rotate.firm": "in_palm_rotate.teacher",
@@ -41,8 +41,13 @@ def list_policies(kind: str, task: str | None = None) -> list[str]:
 def stored(name: str | os.PathLike[str]) -> dict[str, Any]:
     """Return what the ``config.json`` of a policy by name, folder or model file says; nothing for other agents."""
     path = Path(name) if Path(name).exists() else FOLDER / str(name)
-    path = (path if path.is_dir() else path.parent) / "config.json"
+    path = student_folder(path if path.is_dir() else path.parent) / "config.json"
     return dict(Values.read(path).values) if path.is_file() else {}
+
+
+def student_folder(run: Path) -> Path:
+    """Return the folder of a run's student: that of :data:`SENSING` where there is one, else the run's own."""
+    return run / SENSING if (run / SENSING).is_dir() else run
 
 
 def policy_path(kind: str, name: str | os.PathLike[str]) -> Path:

@@ -58,6 +58,8 @@ class EncoderConfig:
     """S, physics steps in a control step."""
     features: int = 32
     """F: size of the embedding that the head gets."""
+    units: int = _HIDDEN
+    """Units of the LSTM of the arm ``rnn``."""
     time: Time = "native"
     """Clock of a network (:mod:`~robotics_bridge.policies.encoders.timing`)."""
     learning: Learning = "frozen"
@@ -73,7 +75,10 @@ class EncoderConfig:
 
     def __post_init__(self) -> None:
         check_number("'slots' of a tactile encoder", self.slots, least=1, most=1000, whole=True)
-        check_number("'features' of a tactile encoder", self.features, least=1, most=8192, whole=True)
+        for name in ("features", "units"):
+            check_number(f"{name!r} of a tactile encoder", getattr(self, name), least=1, most=8192, whole=True)
+        if self.units != _HIDDEN and self.arm != "rnn":
+            raise UsageError(f"'units' is of the tactile encoder 'rnn'; {self.arm!r} has none. Leave it out.")
 
     @classmethod
     def of(cls, value: Mapping[str, Any] | EncoderConfig) -> EncoderConfig:
@@ -224,13 +229,12 @@ class _Flat(_Learned):
 class _Recurrent(_Learned):
     """An LSTM on all values; published hidden size 64."""
 
-    state_size = 2 * _HIDDEN
-
     def __init__(self, config: EncoderConfig) -> None:
         super().__init__(config)
         slots, items, channels = self.shape
-        self.cell = nn.LSTMCell(slots * items * channels, _HIDDEN)
-        self.head = nn.Linear(_HIDDEN, self.features)
+        self.state_size = 2 * config.units
+        self.cell = nn.LSTMCell(slots * items * channels, config.units)
+        self.head = nn.Linear(config.units, self.features)
 
     def forward(self, taxels: torch.Tensor, h_in: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         # Both states of the LSTM travel in one array, as exported policies pass all memory through one input.

@@ -17,6 +17,7 @@ from robotics_bridge.policies.student import EMBEDDERS
 from robotics_bridge.tasks.contact_model import CONTACTS
 from robotics_bridge.tasks.settings import StudentSettings
 
+_HIDDEN = (512, 256, 128)
 LOSSES = ("mse", "inv_var_mse")
 """``inv_var_mse``: each action's squared error over the variance of the teacher's action in the rollout."""
 MOST = {"learning_rate": 1.0, "clip": 100.0, "max_grad_norm": 1e6}
@@ -53,7 +54,7 @@ class DistillConfig:
     """Further fields of :class:`~robotics_bridge.policies.encoders.arms.EncoderConfig`: time, learning, seed, …"""
     embedder: str = "mlp"
     """Embedder of joints and goal: ``none``, ``mlp`` or ``lstm``."""
-    hidden: tuple[int, ...] = (512, 256, 128)
+    hidden: tuple[int, ...] = _HIDDEN
     """Widths of the head's layers."""
     num_envs: int = 4096
     """Environments at once."""
@@ -140,8 +141,13 @@ class DistillConfig:
 
     @property
     def felt(self) -> str:
-        """Observation type, with the embedder of joints where that is not the usual one."""
-        return self.observe if self.embedder == "mlp" else f"{self.observe} ({self.embedder})"
+        """Observation type, with the embedder of joints and the widths of the head where those are not the usual."""
+        told = ", ".join([self.embedder] * (self.embedder != "mlp") + [self._head] * bool(self._head))
+        return f"{self.observe} ({told})" if told else self.observe
+
+    @property
+    def _head(self) -> str:
+        return "" if self.hidden == _HIDDEN else f"head-{'-'.join(map(str, self.hidden))}"
 
     @property
     def name(self) -> str:
@@ -150,6 +156,7 @@ class DistillConfig:
         if self.tactile is not None:
             learning = f"-{self.tactile.learning}" if "learning" in self.encoder_settings else ""
             arm = self.tactile.arm.replace("/", "-").replace(":", "-")
+            arm += f"-{units}-units" if (units := self.encoder_settings.get("units")) else ""
             parts += [
                 self.placement,
                 Path(self.resolution).stem,
@@ -157,6 +164,7 @@ class DistillConfig:
                 f"{arm}{learning}",
             ]
         parts += [] if self.embedder == "mlp" else [self.embedder]
+        parts += [self._head] if self._head else []
         parts += [] if self.contacts in (None, "firm") else [self.contacts]
         parts.append(f"seed{self.seed}")
         drawn = self.encoder_settings.get("pretrained") or self.encoder_settings.get("seed", self.seed)

@@ -15,8 +15,6 @@ from robotics_bridge.tasks.task import GROUPS, check_measured
 if TYPE_CHECKING:
     from robotics_bridge.envs.env import Env
 
-POLICY = "policy"
-"""Folder in a run of ``observe`` with the policy as a student's, which plays, is evaluated, exported and deployed."""
 SENSES = {
     "proprio": "proprio", "touch": TACTILE, "command": "command", "link_pose": "link_pose", "thermal": "thermal"
 }  # fmt: skip

@@ -16,7 +16,7 @@ from robotics_bridge.policies.contract import JOINTS, MOST_NUMBERS
 from robotics_bridge.policies.encoders.arms import EncoderConfig
 from robotics_bridge.policies.fit import check_version
 from robotics_bridge.policies.schema import Values
-from robotics_bridge.policies.shipped import policy_path
+from robotics_bridge.policies.shipped import policy_path, student_folder
 from robotics_bridge.policies.student import TACTILE, TactilePolicy
 from robotics_bridge.policies.training.distill_config import DistillConfig
 from robotics_bridge.policies.training.state_tree import odd_shape
@@ -68,7 +68,7 @@ def load_student(folder: str | Path, *, device: str = "cpu") -> tuple[TactilePol
         UsageError: there is no such folder or name.
         DataError: the folder holds no student, or a value or weight is damaged, out of range or not finite.
     """
-    folder = policy_path("student", folder)
+    folder = student_folder(policy_path("student", folder))
     described = Values.read(folder / CONFIG)
     if described.values.get("brainbench_student") != 1:
         raise DataError(f"{str(folder)!r} holds no student; brainbench policy distill makes one.")

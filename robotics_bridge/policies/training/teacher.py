@@ -32,11 +32,11 @@ from robotics_bridge.policies.acting import ActingModel
 from robotics_bridge.policies.evaluate import Policy
 from robotics_bridge.policies.fit import check_fit, check_version
 from robotics_bridge.policies.schema import Values
-from robotics_bridge.policies.shipped import policy_path
+from robotics_bridge.policies.shipped import SENSING, policy_path
 from robotics_bridge.policies.training import state_tree
 from robotics_bridge.policies.training.distill import describe_run
 from robotics_bridge.policies.training.loggers import Loggers, check_loggers
-from robotics_bridge.policies.training.sensing import POLICY, sensed_groups, sensing_policy
+from robotics_bridge.policies.training.sensing import sensed_groups, sensing_policy
 from robotics_bridge.policies.training.state_tree import write_tensors
 from robotics_bridge.policies.training.student_files import CONFIG, MODEL
 from robotics_bridge.tasks.settings import TeacherSettings
@@ -360,8 +360,8 @@ def _save(trainer: Trainer, run: Path) -> None:
     if trainer.sensing is not None:
         actor: Any = trainer.algorithm.get_policy()
         weights = {name: value for name, value in actor.state_dict().items() if not name.startswith("distribution.")}
-        write_tensors(run / POLICY / MODEL, weights)
-        write_json(run / POLICY / CONFIG, describe_run(trainer.sensing, actor, trainer.env.unwrapped))
+        write_tensors(run / SENSING / MODEL, weights)
+        write_json(run / SENSING / CONFIG, describe_run(trainer.sensing, actor, trainer.env.unwrapped))
     state_tree.save(run / RESUME, trainer.state())
 
 

@@ -10,16 +10,16 @@ from tests.factories.benchmark_programs import benchmark_program
 STUDENTS = benchmark_program("policies/students.py")
 
 
-@pytest.mark.parametrize("arm", STUDENTS.ARMS)
+@pytest.mark.parametrize("arm", STUDENTS.ARMS | STUDENTS.NETWORKS)
 def test_a_student_belongs_to_the_arm_that_it_was_trained_as(arm: str) -> None:
-    settings = dict(STUDENTS.ARMS[arm])
+    settings = dict((STUDENTS.ARMS | STUDENTS.NETWORKS)[arm])
     own = {"seed": 3} if "encoder" in settings else {}
-    if settings.get("encoder", "").startswith(STUDENTS.NETWORK):
-        own |= {"learning": "frozen", "options": {"unroll": "full"}}
+    if settings.get("encoder", "").startswith(("zhuang", "resnet", "s4")):
+        own |= {"learning": "frozen"}
     settings["encoder_settings"] = own | settings.get("encoder_settings", {})
     assert STUDENTS.arm_of(DistillConfig(task="in_palm_rotate", **settings)) == arm
 
 
 def test_a_student_of_another_network_belongs_to_no_arm() -> None:
-    config = DistillConfig(task="in_palm_rotate", encoder="s4-small", encoder_settings={"learning": "frozen"})
+    config = DistillConfig(task="in_palm_rotate", encoder="s4-small+gpt", encoder_settings={"learning": "frozen"})
     assert STUDENTS.arm_of(config) is None

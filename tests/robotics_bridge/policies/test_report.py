@@ -82,6 +82,23 @@ def test_students_with_and_without_memory_are_two_arms(tmp_path) -> None:
     assert [row[COLUMNS.index("touch")] for row in rows([felt, remembered])] == ["force_torque", "none (lstm)"]
 
 
+def test_students_of_other_sizes_are_other_arms(tmp_path) -> None:
+    _write(tmp_path, [0.9] * 3, observe="force_torque", encoder="rnn")
+    _write(tmp_path, [0.6] * 3, observe="force_torque", encoder="rnn", encoder_settings={"units": 9})
+    _write(tmp_path, [0.3] * 3, observe="force_torque", encoder="rnn", hidden=(1024, 256, 128))
+    table = rows(read_results([tmp_path]))
+    assert [row[COLUMNS.index("encoder")] for row in table] == ["rnn", "rnn (9 units)", "rnn"]
+    assert table[2][COLUMNS.index("touch")] == "force_torque (head-1024-256-128)"
+
+
+def test_students_that_learned_otherwise_are_no_seeds_of_one_arm(tmp_path) -> None:
+    _write(tmp_path / "one", [0.9] * 3, observe="none", learning_rate=5e-4)
+    _write(tmp_path / "other", [0.6] * 3, observe="none", learning_rate=1e-4, seed=1)
+    with pytest.raises(DataError, match=r"differ in 'learning_rate' \(0.0005, 0.0001\)"):
+        read_results([tmp_path])
+    assert len(read_results([tmp_path / "one"])) == 1
+
+
 def test_a_single_student_is_said_to_be_one(tmp_path) -> None:
     _write(tmp_path, [0.5, 0.6, 0.7], observe="bool", placement="tips")
     (only,) = read_results([tmp_path])

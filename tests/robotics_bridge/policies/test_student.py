@@ -280,3 +280,12 @@ def test_what_a_frozen_network_gave_needs_no_memory_of_touch() -> None:
         kept, after = policy.unroll(obs, policy.zeros(2, kept=True), None, torch.stack(features))
     assert after.shape == (2, policy.core.kept_size)
     torch.testing.assert_close(kept, whole, atol=1e-5, rtol=1e-4)
+
+
+def test_units_are_of_the_lstm_alone() -> None:
+    small, usual = (EncoderConfig(name="rnn", **own).build() for own in ({"units": 9}, {}))
+    assert (small.state_size, usual.state_size) == (18, 128)
+    count = [sum(weight.numel() for weight in each.parameters()) for each in (small, usual)]
+    assert count[0] < count[1] / 6
+    with pytest.raises(UsageError, match="'units' is of the tactile encoder 'rnn'"):
+        EncoderConfig(name="reservoir", units=9)

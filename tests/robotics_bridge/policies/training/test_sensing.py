@@ -17,8 +17,8 @@ from brainbench.core.errors import DataError, MissingDependencyError, UsageError
 from robotics_bridge import tasks
 from robotics_bridge.envs import Env
 from robotics_bridge.policies.evaluate import Policy, evaluate
+from robotics_bridge.policies.shipped import SENSING
 from robotics_bridge.policies.training.loggers import Loggers
-from robotics_bridge.policies.training.sensing import POLICY
 from robotics_bridge.policies.training.student_files import load_student
 from robotics_bridge.policies.training.teacher import TeacherRun, train
 
@@ -31,7 +31,7 @@ def _env(observe: str = "agg_bool") -> Env:
 def _run(folder: Path, iterations: int, **options: object) -> dict[str, torch.Tensor]:
     made = TeacherRun(iterations=iterations, save_every=1, observe=("proprio", "touch", "command"), **options)  # type: ignore[arg-type]
     train(_env(), folder, made)
-    student, _ = load_student(folder / POLICY)
+    student, _ = load_student(folder)
     return student.state_dict()
 
 
@@ -41,7 +41,7 @@ def test_a_policy_of_joints_and_touch_learns_goes_on_and_acts_as_a_student(tmp_p
     parts = _run(tmp_path / "parts", 2)
     for name, value in whole.items():
         torch.testing.assert_close(parts[name], value, rtol=0, atol=0, msg=name)
-    student, described = load_student(tmp_path / "whole" / POLICY)
+    student, described = load_student(tmp_path / "whole" / SENSING)
     assert [name for name, _ in described["groups"]] == ["proprio", "command", "tactile"]
     assert described["deployment"]["command"] == [1.0]
     # Memory: the same observation is answered otherwise after another past.
