@@ -43,8 +43,8 @@ touch     320  python3 -m benchmarks.tactile.throughput --device cuda --part sen
 friction  150  python3 -m benchmarks.tactile.friction_cost --device cuda --write
 gradients 500  python3 -m benchmarks.whiskers.gradient_cost --device cuda --each 1 --input inputs/gradients.npz --write
 teachers  590  python3 -m benchmarks.policies.jobs run $JOB --minutes ${MINUTES:-7.5}
-students-for 1500  for one in $PLAN; do python3 -m benchmarks.policies.students --teacher ${TEACHER:-in_palm_rotate.teacher} --config careful --seed ${one%%:*} --arms $(echo ${one#*:} | tr , ' ') ${AGENTS---no-agents} --evaluations 1 --device cuda --envs 4096 --iterations 110 --learning-rate 5e-4 --episodes 512 --together 2 --end $(($(cat /w/t0) + 1670)) --reserve 60 --out /tmp/run/students-${one%%:*}; done
-teacher-of 1650 python3 -m brainbench policy train $TASK $WITH --envs ${ENVS:-8192} --minutes $(python3 -c "print(max(0.05, ($(cat /w/t0) + ${UNTIL:-1500} - $(date +%s)) / 60))") --loggers csv --device cuda --out /tmp/run/$TASK${NAME:-} && python3 -m brainbench policy evaluate $TASK /tmp/run/$TASK${NAME:-} --envs 1024 --episodes 1024 --seeds 1 --device cuda --out /tmp/run/$TASK${NAME:-}/evaluated.json
+students-for 1500  for one in $PLAN; do python3 -m benchmarks.policies.students --teacher ${TEACHER:-in_palm_rotate.teacher} --config careful --seed ${one%%:*} --arms $(echo ${one#*:} | tr , ' ') ${AGENTS---no-agents} --evaluations 1 --device cuda --envs 4096 --iterations 110 --learning-rate 5e-4 --episodes 512 --together ${TOGETHER:-2} --end $(($(cat /w/t0) + 1670)) --reserve 60 --out /tmp/run/students-${one%%:*}${LANE:-}; done
+teacher-of 1650 python3 -m brainbench policy train $TASK $WITH --config ${CONFIG:-default} --envs ${ENVS:-8192} --minutes $(python3 -c "print(max(0.05, ($(cat /w/t0) + ${UNTIL:-1500} - $(date +%s)) / 60))") --loggers csv --device cuda --out /tmp/run/$TASK${NAME:-} && python3 -m brainbench policy evaluate $TASK /tmp/run/$TASK${NAME:-} --config ${CONFIG:-default} --envs 1024 --episodes 1024 --seeds 1 --device cuda --out /tmp/run/$TASK${NAME:-}/evaluated.json
 shipped   150  python3 -m brainbench policy evaluate in_palm_rotate in_palm_rotate.teacher in_palm_rotate.student --config careful --envs 1024 --episodes 1024 --seeds 1 --device cuda --out /w/out/shipped.json
 few       240  python3 -m brainbench stimuli sweep thesis-low procedural:30 --split sweep --device cuda $P --out /tmp/few
 training  300  python3 -m benchmarks.models.data_parallel /tmp/few --counts $COUNTS --networks zhuang-intersection-ln+gpt.supervised --out /w/out/data-parallel-$COUNTS.json
@@ -92,7 +92,7 @@ look() {
   # The newest model of each teacher, and students that were evaluated and may ship: eight files may come back.
   local model runs=()
   for run in /tmp/run/*/; do
-    model=$(ls -v "$run"model_*.safetensors 2>/dev/null | tail -n 1); [ -z "$model" ] || runs+=("$model" "$run"config.json)
+    model=$(ls -v "$run"model_*.safetensors 2>/dev/null | tail -n 1); [ -z "$model" ] || runs+=("$model" "$run"config.json); [ ! -d "$run"policy ] || runs+=("$run"policy)
   done
   [ -z "${runs[*]}" ] || tar czf "$OUT/teachers.tar.gz" "${runs[@]}"
   for run in /tmp/run/students-*/raw_rnn/seed*/; do
