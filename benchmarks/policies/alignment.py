@@ -7,7 +7,8 @@ Every network of the shipped board that can step through a hand's touch is read 
 on one rollout: features of the last step, all of the encoder's memory kept, a transformer over its last 22 steps. The
 whisker accuracy is that of a ridge classifier on the same features after a sweep, objects left out. One JSON file a
 network stands in the folder, and a network that stands there is not measured again. Seeds of one architecture are no
-independent networks, so a point is a network (architecture and training), averaged over its seeds.
+independent networks, so a point is a network (architecture and training), averaged over its seeds. With ``--write`` the
+points are kept in ``records``, for :mod:`benchmarks.policies.success`.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ from scipy.stats import rankdata
 from benchmarks.report import measure_once, table, write_section
 from brainbench.cli.policy.options import World, agent_of
 from brainbench.core.figures.style import COLORS, PALE, panels, save_figure
-from brainbench.core.files import read_json
+from brainbench.core.files import read_json, write_json
 from brainbench.datasets import WhiskingDataset
 from brainbench.models.architecture import Architecture
 from brainbench.models.graph.temporal_graph import TemporalGraph
@@ -38,6 +39,8 @@ from robotics_bridge.policies.readouts.rollout import TARGETS, TouchRollout, cal
 
 BOARD = Path(__file__).resolve().parents[2] / "leaderboards" / "results"
 PICTURE = Path(__file__).resolve().parents[2] / "docs" / "images" / "policy-alignment.png"
+RECORD = Path(__file__).parent / "records" / "networks-in_palm_rotate.json"
+"""What was measured last, a row for each network."""
 TASK, CONFIG, AGENT = "in_palm_rotate", "careful", "in_palm_rotate.teacher"
 WINDOW = 22
 """Steps that a transformer sees, as in its training."""
@@ -281,6 +284,7 @@ def main() -> None:
     print(body)
     if options.write:
         draw(found)
+        write_json(RECORD, found)
         more = f"--envs {options.envs} --seeds {options.seeds}{' --large' * options.large}"
         command = f"python -m benchmarks.policies.alignment --sweeps SWEEPS --out FOLDER {more} --write"
         write_section("Scores of networks and read-outs of touch", command, body, subject="policies")

@@ -1,0 +1,139 @@
+"""Do students succeed more with networks that score higher against the default recordings?
+
+    python -m benchmarks.policies.students --arms NETWORK … --iterations 110 --out STUDENTS
+    python -m benchmarks.policies.success --students STUDENTS … --at-least 110 [--notes FILE] [--device NAME] [--write]
+
+A student has a frozen network of the shipped board as its encoder (arms ``ead_*`` and the networks of
+:mod:`benchmarks.policies.students`). A point is a network: the mean over its students, and the score of the same
+weights on the board, an untrained network's initial states of the same seeds. Whisker accuracy and read-outs are those
+that :mod:`benchmarks.policies.alignment` measured.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.stats import norm
+
+from benchmarks.policies.alignment import RECORD, board, partial_spearman
+from benchmarks.policies.students import NETWORKS, arm_of
+from benchmarks.report import table, write_section
+from brainbench.core.figures.style import COLORS, PALE, panels, save_figure
+from brainbench.core.files import read_json
+from brainbench.models.architecture import Architecture
+from robotics_bridge.policies.report import StudentResult, read_results
+from robotics_bridge.policies.training.distill_config import DistillConfig
+
+PICTURE = Path(__file__).resolve().parents[2] / "docs" / "images" / "policy-score-success.png"
+OUTCOMES = {"success": "success", "goals": "quarter turns in 10 s"}
+GIVEN = ("accuracy", "position", "contact")
+"""What else may go with success: the whisker accuracy, and two read-outs of the object in the hand."""
+
+
+def networks(results: Sequence[StudentResult]) -> list[dict[str, Any]]:
+    """Return one row per network with students, highest score first; KeyError for one that is not on the board."""
+    known = board()
+    measured = {row["model"]: row for row in read_json(RECORD)}
+    found = []
+    for result in results:
+        if arm_of(result.config) not in {*NETWORKS, "ead_simclr", "ead_supervised", "ead_untrained"}:
+            continue
+        name = result.config.encoder
+        rows = [known[f"{name} seed {weights_seed(config)}"] for config in result.configs]
+        found.append(
+            {
+                "model": name, "students": len(result.seeds), "training": rows[0]["training"],
+                "score": float(np.mean([row["score"] for row in rows])),
+                "success": result.value, "goals": result.graded["goals"][0],
+                **{key: measured[name][key] for key in GIVEN},
+            }
+        )  # fmt: skip
+    return sorted(found, key=lambda row: -row["score"])
+
+
+def weights_seed(config: DistillConfig) -> int:
+    """Return the seed of a student's frozen weights as the board states it: 0 for weights with a tag."""
+    tactile = config.tactile
+    assert tactile is not None
+    return 0 if Architecture.parse(tactile.arm).tag else tactile.seed
+
+
+def interval(value: float, count: int) -> tuple[float, float]:
+    """Return the 95 % interval of Spearman's correlation of ``count`` points (Bonett & Wright 2000, equation 4)."""
+    half = norm.ppf(0.975) * np.sqrt((1 + value**2 / 2) / (count - 3))
+    return float(np.tanh(np.arctanh(value) - half)), float(np.tanh(np.arctanh(value) + half))
+
+
+def correlations(found: Sequence[Mapping[str, Any]]) -> list[list[str]]:
+    """Return a row for each set of networks and each quantity that may go with what students reach."""
+    sets = {"all": found, "untrained": [row for row in found if row["training"] == "untrained"]}
+    rows = []
+    for name, some in sets.items():
+        columns = {key: np.array([row[key] for row in some]) for key in ("score", *GIVEN, *OUTCOMES)}
+        for key, given in (("score", None), ("score", "accuracy"), *((other, None) for other in GIVEN)):
+            told = [name, str(len(some)), key, given or "–"]
+            for outcome in OUTCOMES:
+                value, p = partial_spearman(columns[key], columns[outcome], given and columns[given])
+                low, high = interval(value, len(some) - (given is not None))
+                told.append(f"{value:+.2f} [{low:+.2f}, {high:+.2f}] (p {p:.3f})")
+            rows.append(told)
+    return rows
+
+
+def draw(found: Sequence[Mapping[str, Any]]) -> None:
+    """Draw what students reach over the board's score, a network a point."""
+    figure, axes = panels(1, len(OUTCOMES), (9.6, 4.0))
+    for panel, (outcome, label) in zip(axes[0], OUTCOMES.items(), strict=True):
+        for row in found:
+            color = COLORS[0] if row["training"] != "untrained" else COLORS[1] if "+" in row["model"] else PALE
+            panel.plot(row["score"], row[outcome], "o", color=color, ms=5 + 2 * (row["students"] > 1))
+            panel.annotate(
+                row["model"].replace("-small", ""), (row["score"], row[outcome]), textcoords="offset points",
+                xytext=(4, 3), fontsize=6.5, color=PALE,
+            )  # fmt: skip
+        panel.set(xlabel="score on the board", ylabel=label)
+        panel.margins(x=0.15)
+    save_figure(figure, PICTURE, dpi=120)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--students", type=Path, nargs="+", required=True)
+    parser.add_argument("--at-least", type=int, default=0, help="iterations; what learned fewer is left out")
+    parser.add_argument("--notes", type=Path, help="text that follows the tables")
+    parser.add_argument("--device", default="", help="what trained the students")
+    parser.add_argument("--write", action="store_true")
+    options = parser.parse_args()
+    results = read_results(options.students, at_least=options.at_least)
+    found = networks(results)
+    several = [r for r in results if r.config.encoder in {row["model"] for row in found} and len(r.success) > 1]
+    spread = [np.std(result.success, ddof=1) for result in several if arm_of(result.config)]
+    keys = ("score", *GIVEN, *OUTCOMES)
+    heads = ["score", "whisker accuracy", "position (R²)", "contact (R²)", *OUTCOMES.values()]
+    rows = [[row["model"], str(row["students"]), *(f"{row[key]:.3f}" for key in keys)] for row in found]
+    between = np.std([row["success"] for row in found], ddof=1)
+    parts = [
+        f"{len(found)} frozen networks of the default board as encoders of students. Success differs between networks "
+        f"by {between:.3f} (standard deviation)"
+        + (f", between students of one network by {np.mean(spread):.3f}." if spread else "."),
+        table(["network", "students", *heads], rows),
+        "Spearman's correlations over networks with 95 % intervals (Bonett & Wright 2000), two-sided p of permuted "
+        "networks; `given` is partialled out of the ranks:",
+        table(["networks", "count", "quantity", "given", *OUTCOMES.values()], correlations(found)),
+    ]
+    if options.notes:
+        parts.append(options.notes.read_text(encoding="utf-8").strip())
+    body = "\n\n".join(parts)
+    print(body)
+    if options.write:
+        draw(found)
+        command = f"python -m benchmarks.policies.success --students STUDENTS … --at-least {options.at_least} --write"
+        write_section("Scores of networks and students", command, body, where=options.device, subject="policies")
+
+
+if __name__ == "__main__":
+    main()
