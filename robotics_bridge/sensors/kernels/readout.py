@@ -69,28 +69,24 @@ class ReadoutArrays:
 
 
 @wp.func
-def lost(io: ReadoutArrays, channels: int, env: int, n: int):
-    """Mark the reading of a probe in a diverged environment as NaN. Without noise both planes are one array."""
+def silenced(io: ReadoutArrays, channels: int, env: int, n: int, radius: float) -> bool:
+    """Write the reading of a filler (radius 0), zero, or in a diverged environment, NaN; return False for others."""
+    if radius > 0.0 and (io.status[env] & 1) == 0:
+        return False
     for channel in range(channels):
-        io.truth[channel, env, n] = wp.nan
-        io.measured[channel, env, n] = wp.nan
-
-
-@wp.func
-def idle(io: ReadoutArrays, channels: int, env: int, n: int):
-    """Write the reading of a filler: zero."""
-    for channel in range(channels):
-        io.truth[channel, env, n] = 0.0
-        io.measured[channel, env, n] = 0.0
+        # Without noise both planes are one array.
+        io.truth[channel, env, n] = wp.where(radius > 0.0, wp.nan, 0.0)
+        io.measured[channel, env, n] = wp.where(radius > 0.0, wp.nan, 0.0)
+    return True
 
 
 @cache
 def readout_functions(mode: int, hysteresis: bool, walk: bool, channels: int = 6) -> SimpleNamespace:
     """Return the functions that write a reading, compiled for what the group stores.
 
-    ``emit`` writes one channel, ``emit_six`` up to six, drawing all that they share once: ``fixed`` is what
-    ``episode_draw`` gave, ``lag`` and ``drift`` what ``recall_six`` read (before anything else, so that nothing waits
-    for memory). ``measure`` returns the measured value of one channel and stores its memories without writing it.
+    ``emit`` writes the one channel of a scalar, ``emit_six`` up to six, drawing all that they share once: ``fixed`` is
+    what ``episode_draw`` gave, ``lag`` and ``drift`` what ``recall_six`` read (before anything else, so that nothing
+    waits for memory). ``measure`` returns the measured value of a scalar and stores its memories without writing it.
 
     Args:
         mode: :data:`CLEAN`, :data:`FUSED` or :data:`STAGED`.
@@ -102,52 +98,32 @@ def readout_functions(mode: int, hysteresis: bool, walk: bool, channels: int = 6
     Normals = wp.types.matrix(shape=(pairs, 4), dtype=wp.float32)
 
     @wp.func
-    def measure(
-        io: ReadoutArrays,
-        knobs: NoiseParams,
-        env: int,
-        n: int,
-        probe: int,
-        channel: int,
-        age: int,
-        episode: int,
-        signal: float,
-    ) -> float:
+    def measure(io: ReadoutArrays, knobs: NoiseParams, env: int, n: int, probe: int, signal: float) -> float:
         lag = float(0.0)
         drift = float(0.0)
+        age = io.age[env]
         if age > 0:
             # Before the first update the memories count as zero, whatever the arrays hold: a reset has nothing to
             # clear.
             if wp.static(hysteresis):
-                lag = io.hysteresis[channel, env, n]
+                lag = io.hysteresis[0, env, n]
             if wp.static(walk):
-                drift = io.walk[channel, env, n]
+                drift = io.walk[0, env, n]
         # Hysteresis, drift, white noise, bias, quantisation and dead probes (4.22, 4.25–4.27), in this order.
-        y = apply_noise(knobs, signal, env + io.env_offset, probe, channel, age, episode, io.dt, lag, drift)
+        y = apply_noise(knobs, signal, env + io.env_offset, probe, 0, age, io.episode[env], io.dt, lag, drift)
         if wp.static(hysteresis):
-            io.hysteresis[channel, env, n] = y[1]
+            io.hysteresis[0, env, n] = y[1]
         if wp.static(walk):
-            io.walk[channel, env, n] = y[2]
+            io.walk[0, env, n] = y[2]
         return y[0]
 
     @wp.func
-    def emit(
-        io: ReadoutArrays,
-        knobs: NoiseParams,
-        env: int,
-        n: int,
-        probe: int,
-        channel: int,
-        age: int,
-        episode: int,
-        truth: float,
-        signal: float,
-    ):
-        io.truth[channel, env, n] = truth
+    def emit(io: ReadoutArrays, knobs: NoiseParams, env: int, n: int, probe: int, truth: float, signal: float):
+        io.truth[0, env, n] = truth
         if wp.static(mode == FUSED):
-            io.measured[channel, env, n] = measure(io, knobs, env, n, probe, channel, age, episode, signal)
+            io.measured[0, env, n] = measure(io, knobs, env, n, probe, signal)
         if wp.static(mode == STAGED):
-            io.measured[channel, env, n] = signal
+            io.measured[0, env, n] = signal
 
     @wp.func
     def recall_six(io: ReadoutArrays, env: int, n: int, age: int):

@@ -8,7 +8,7 @@ from functools import cache
 from typing import Any
 
 from brainbench.core.devices import warp
-from robotics_bridge.sensors.kernels.readout import ProbeArrays, ReadoutArrays, idle, lost, readout_functions
+from robotics_bridge.sensors.kernels.readout import ProbeArrays, ReadoutArrays, readout_functions, silenced
 from robotics_bridge.sensors.noise.kernels.noise import episode_draw, radius_noise
 from robotics_bridge.sensors.probes.kernels.probe import deepest_function
 from robotics_bridge.sensors.queries.kernels.distance import SolidArrays
@@ -305,11 +305,7 @@ def marker_kernel(
         n: int,
     ):
         """Read one marker."""
-        if probes.radius[n] <= 0.0:
-            idle(io, 3, env, n)
-        elif (io.status[env] & 1) != 0:
-            lost(io, 3, env, n)
-        else:
+        if not silenced(io, 3, env, n, probes.radius[n]):
             part = probes.part[n]
             probe = probes.probe[n]
             gel = pads.gels[part]

@@ -126,16 +126,6 @@ def radius_noise(p: NoiseParams, env: int, probe: int, age: int, episode: int) -
 
 
 @wp.func
-def gain(p: NoiseParams, env: int, probe: int, episode: int) -> float:
-    """Return the gain γ of a probe in this episode (4.24)."""
-    if p.gain_high <= p.gain_low:
-        return p.gain_low
-    # Age 0 in the counter: the same number in every update of the episode, without storing it.
-    w0, _w1, _w2, _w3 = draw(p, env, probe, 0, episode, wp.static(EPISODE))
-    return p.gain_low + (p.gain_high - p.gain_low) * uniform(w0)
-
-
-@wp.func
 def decay(t: float) -> float:
     """Return exp(−t) for t ≥ 0, by a series."""
     return power_of_two(float(0.0), wp.max(t * float(-1.4426950408889634), float(-150.0)))
@@ -152,9 +142,10 @@ def pair_normals(p: NoiseParams, env: int, probe: int, pair: int, age: int, epis
 
 @wp.func
 def episode_draw(p: NoiseParams, env: int, probe: int, episode: int) -> wp.vec3:
-    """Return what holds for an episode: (gain, 1 if the probe is dead, the value it is stuck at)."""
+    """Return what holds for an episode: (gain γ of 4.24, 1 if the probe is dead, the value it is stuck at)."""
     out = wp.vec3(p.gain_low, float(0.0), float(0.0))
     if p.gain_high > p.gain_low or p.dead_probability > float(0.0):
+        # Age 0 in the counter: the same numbers in every update of the episode, without storing them.
         w0, w1, w2, _w3 = draw(p, env, probe, 0, episode, wp.static(EPISODE))
         if p.gain_high > p.gain_low:
             out[0] = p.gain_low + (p.gain_high - p.gain_low) * uniform(w0)
@@ -279,7 +270,7 @@ def measure(
     number = env_offset + env
     scale = float(1.0)
     if gained == 0:
-        scale = gain(knobs, number, probe[n], episode[env])
+        scale = episode_draw(knobs, number, probe[n], episode[env])[0]
     for channel in range(x.shape[0]):
         lag = float(0.0)
         drift = float(0.0)

@@ -13,9 +13,8 @@ from robotics_bridge.sensors.kernels.readout import (
     FUSED,
     ProbeArrays,
     ReadoutArrays,
-    idle,
-    lost,
     readout_functions,
+    silenced,
 )
 from robotics_bridge.sensors.noise.kernels.noise import episode_draw, radius_noise
 from robotics_bridge.sensors.queries.kernels.pairs import PairArrays
@@ -136,11 +135,7 @@ def proximity_kernel(physical: bool, mode: int, hysteresis: bool, walk: bool) ->
     ):
         env, n = wp.tid()
         radius = probes.radius[n]
-        if radius <= 0.0:
-            idle(io, 6, env, n)
-        elif (io.status[env] & 1) != 0:
-            lost(io, 6, env, n)
-        else:
+        if not silenced(io, 6, env, n, radius):
             row = env % cells.shape.shape[0]
             slot = probes.slot[n]
             part = probes.part[n]
