@@ -91,8 +91,7 @@ class Noise:
     @property
     def set_knobs(self) -> tuple[str, ...]:
         """Names of the knobs that do something."""
-        off = Noise.__dataclass_fields__
-        names = [field.name for field in fields(self) if getattr(self, field.name) != off[field.name].default]
+        names = [field.name for field in fields(self) if getattr(self, field.name) != field.default]
         with_switch = {
             "dead_range": self.dead_probability,
             "hysteresis_tau": self.hysteresis,

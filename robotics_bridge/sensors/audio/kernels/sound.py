@@ -6,7 +6,7 @@ Letters: B environment, S source or sensor, K sample of a block, M mode, J joint
 from brainbench.core.devices import warp
 from robotics_bridge.physics.kernels.state import StateArrays, in_scene
 from robotics_bridge.sensors.kernels.readout import ReadoutArrays
-from robotics_bridge.sensors.noise.kernels.noise import normals, philox
+from robotics_bridge.sensors.noise.kernels.noise import draw, normals
 
 wp = warp()
 
@@ -109,10 +109,7 @@ def excite_modes(own: ContactSoundArrays, io: ReadoutArrays, samples: int):
         u = source.impact * rise * io.dt * (float(1.0) - wp.cos(phase)) / (float(source.pulse) + float(1.0))
     rub = own.rubbing[env, s]
     if rub > float(0.0) and source.scrape > float(0.0):
-        last = (wp.uint32(io.episode[env]) << wp.uint32(8)) | wp.uint32(wp.static(SCRAPE))
-        w0, w1, _w2, _w3 = philox(
-            wp.uint32(k), wp.uint32(io.env_offset + env), wp.uint32(io.age[env]), last, source.key_low, source.key_high
-        )
+        w0, w1, _w2, _w3 = draw(source, io.env_offset + env, k, io.age[env], io.episode[env], wp.static(SCRAPE))
         z = normals(w0, w1)
         # White noise of a density that does not depend on the sample rate.
         u = u + source.scrape * rub * z[0] * wp.sqrt(io.dt / float(samples))
@@ -218,7 +215,6 @@ def sound_drives(own: DriveSoundArrays, io: ReadoutArrays, samples: int):
         hum = float(0.0)
     h = io.dt / float(samples)
     nyquist = float(0.5) / h
-    last = (wp.uint32(io.episode[env]) << wp.uint32(8)) | wp.uint32(wp.static(FRICTION))
     for k in range(samples):
         # Loudness and speed change evenly within a block, and phases go on from the last one: steps between blocks
         # would click.
@@ -236,10 +232,8 @@ def sound_drives(own: DriveSoundArrays, io: ReadoutArrays, samples: int):
             weight = weight * d.rolloff
         value = (loud0 + share * (loud - loud0)) * tone
         if d.friction > float(0.0) and now > float(0.0):
-            at = wp.uint32(own.number[j]) + wp.uint32(k) * wp.uint32(4096)
-            w0, w1, _w2, _w3 = philox(
-                at, wp.uint32(io.env_offset + env), wp.uint32(io.age[env]), last, d.key_low, d.key_high
-            )
+            at = own.number[j] + k * 4096
+            w0, w1, _w2, _w3 = draw(d, io.env_offset + env, at, io.age[env], io.episode[env], wp.static(FRICTION))
             z = normals(w0, w1)
             value = value + d.friction * now * z[0]
         hum = hum + d.hum_frequency * h

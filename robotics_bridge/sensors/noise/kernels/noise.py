@@ -9,6 +9,8 @@ Order of the measured branch: radius noise and gain → crosstalk → hysteresis
 quantisation → dead taxels → (threshold, by the sensor) → delay. Letters: B environment, N probe, C channel.
 """
 
+from typing import Any
+
 from brainbench.core.devices import warp
 from robotics_bridge.sensors.kernels.series import power_of_two, split_log
 
@@ -72,8 +74,8 @@ def philox(a: wp.uint32, b: wp.uint32, c: wp.uint32, d: wp.uint32, key_low: wp.u
 
 
 @wp.func
-def draw(p: NoiseParams, env: int, probe: int, age: int, episode: int, purpose: int):
-    """Return four random words; ``env`` is the number in the whole experiment."""
+def draw(p: Any, env: int, probe: int, age: int, episode: int, purpose: int):
+    """Return four random words of a structure's key; ``env`` is the number in the whole experiment."""
     # The purpose takes the low eight bits, so that draws for different ends in one update never share a counter.
     last = (wp.uint32(episode) << wp.uint32(8)) | wp.uint32(purpose)
     return philox(wp.uint32(probe), wp.uint32(env), wp.uint32(age), last, p.key_low, p.key_high)
