@@ -95,10 +95,8 @@ def excite_modes(own: ContactSoundArrays, io: ReadoutArrays, samples: int):
     """Write the impulse of every sample (N s). Dim [K, B, S]; impacts start at the first sample."""
     k, env, s = wp.tid()
     source = own.sources[s]
-    earlier = own.before[env, s]
     # What is held when an episode begins was not struck: the first update only takes note of the force.
-    if io.age[env] == 0:
-        earlier = own.force[env, s]
+    earlier = wp.where(io.age[env] == 0, own.force[env, s], own.before[env, s])
     # Source and filter: a rise of force is an impact and excites the modes with an impulse, sliding excites them with
     # noise.
     rise = own.force[env, s] - earlier
@@ -282,9 +280,7 @@ def measure_paths(
     if listener >= 0:
         ear = wp.transform_point(pose[env, listener], place)
     r = wp.length(wp.transform_get_translation(pose[env, links[s]]) - ear)
-    before[env, s] = now[env, s]
-    if age[env] == 0:
-        before[env, s] = r
+    before[env, s] = wp.where(age[env] == 0, r, now[env, s])
     now[env, s] = r
 
 
@@ -315,12 +311,8 @@ def mix_sources(
         lag = wp.min(r / speed * rate, float(size - samples - 2))
         whole = int(wp.floor(lag))
         part = lag - float(whole)
-        here = float(0.0)
-        there = float(0.0)
         # What was before the reset is silence.
-        if whole <= known:
-            here = ring[(slot + k - whole + size) % size, env, s]
-        if whole + 1 <= known:
-            there = ring[(slot + k - whole - 1 + size) % size, env, s]
+        here = wp.where(whole <= known, ring[(slot + k - whole + size) % size, env, s], float(0.0))
+        there = wp.where(whole + 1 <= known, ring[(slot + k - whole - 1 + size) % size, env, s], float(0.0))
         total = total + (here + part * (there - here)) / wp.pow(wp.max(r, nearest), power)
     out[k, env] = total
