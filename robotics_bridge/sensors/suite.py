@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, NamedTuple, cast
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -27,14 +27,6 @@ from robotics_bridge.sensors.runtime import History, Runtime
 from robotics_bridge.sensors.sensor import QueryRequirements, Sensor
 
 wp = warp()
-
-
-class _RecordedUpdate(NamedTuple):
-    """An update as a CUDA graph, for one state and time step (s)."""
-
-    replay: Callable[[], None]
-    state: HandState
-    dt: float
 
 
 class SensorSuite:
@@ -122,7 +114,8 @@ class SensorSuite:
                 for name, sensor in self.sensors.items()
                 if sensor.history
             }
-        self._recorded: _RecordedUpdate | None = None
+        # An update as a CUDA graph, for one state and time step (s).
+        self._recorded: tuple[Callable[[], None], HandState, float] | None = None
         self._status: Any = None
         self._warned = False
 
@@ -147,11 +140,11 @@ class SensorSuite:
             if self._histories or not all(runtime.recordable for runtime in self.runtimes):
                 raise UsageError("Sensors with a history or with meshes that move cannot be part of another recording.")
             self._launch(state, dt)
-        elif self._recorded and self._recorded.state is state and self._recorded.dt == dt:
-            self._recorded.replay()
+        elif self._recorded and self._recorded[1] is state and self._recorded[2] == dt:
+            self._recorded[0]()
         elif self._recorded is None and self._status is state.status and all(r.recordable for r in self.runtimes):
             replay = record_launches(lambda: self._launch(state, dt), self.device)
-            self._recorded = _RecordedUpdate(replay, state, dt)
+            self._recorded = (replay, state, dt)
             replay()
         else:
             # The first update of a state compiles and allocates; the next ones replay what it does.

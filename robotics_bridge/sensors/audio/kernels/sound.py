@@ -123,11 +123,8 @@ def ring_modes(own: ContactSoundArrays, io: ReadoutArrays, samples: int):
     own.rubbing[env, s] = float(0.0)
     broken = (io.status[env] & 1) != 0
     for q in range(own.first.shape[0]):
-        a = own.y1[q, env, s]
-        b = own.y2[q, env, s]
-        if io.age[env] == 0:
-            a = wp.vec4(float(0.0), float(0.0), float(0.0), float(0.0))
-            b = a
+        a = wp.where(io.age[env] == 0, wp.vec4(), own.y1[q, env, s])
+        b = wp.where(io.age[env] == 0, wp.vec4(), own.y2[q, env, s])
         # y[k] = 2 r cos θ y[k−1] − r² y[k−2] + u[k] (4.32), with poles of radius r < 1, hence stable at any block
         # length.
         c1 = own.first[q, s]
@@ -144,7 +141,7 @@ def ring_modes(own: ContactSoundArrays, io: ReadoutArrays, samples: int):
             io.truth[k, env, s] = total
         # A resonator keeps a NaN for ever, so its memory is emptied.
         if broken or not wp.isfinite(wp.dot(a, a)):
-            a = wp.vec4(float(0.0), float(0.0), float(0.0), float(0.0))
+            a = wp.vec4()
             b = a
         own.y1[q, env, s] = a
         own.y2[q, env, s] = b
@@ -202,15 +199,11 @@ def sound_drives(own: DriveSoundArrays, io: ReadoutArrays, samples: int):
     d = own.settings[own.part[j]]
     loud = d.load * wp.abs(own.effort[env, j]) + d.power * wp.abs(own.effort[env, j] * own.speed[env, j])
     fast = wp.abs(own.speed[env, j])
-    loud0 = own.last_loud[env, j]
-    fast0 = own.last_speed[env, j]
-    turn = own.phase[env, j]
-    hum = own.hum_phase[env, j]
-    if io.age[env] == 0:
-        loud0 = loud
-        fast0 = fast
-        turn = float(0.0)
-        hum = float(0.0)
+    fresh = io.age[env] == 0
+    loud0 = wp.where(fresh, loud, own.last_loud[env, j])
+    fast0 = wp.where(fresh, fast, own.last_speed[env, j])
+    turn = wp.where(fresh, float(0.0), own.phase[env, j])
+    hum = wp.where(fresh, float(0.0), own.hum_phase[env, j])
     h = io.dt / float(samples)
     nyquist = float(0.5) / h
     for k in range(samples):

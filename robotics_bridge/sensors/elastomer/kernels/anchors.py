@@ -123,10 +123,9 @@ def anchor_kernel(kinds: frozenset[int], raycast: bool, side_by_side: bool) -> A
                     kept = pads.anchor[index, 0, env]
                 z = rotation @ (p - offset)
                 phi = float(0.0)
-                if wp.static(side_by_side):
-                    phi = height_over(solids, pads.own, gel, solid_row, z)
-                elif alone:
-                    phi = distance_to(solids.values, shape, turn @ p + shift, wp.vec3f(), limit)[3]
+                if alone:
+                    if wp.static(not side_by_side):
+                        phi = distance_to(solids.values, shape, turn @ p + shift, wp.vec3f(), limit)[3]
                 else:
                     phi = height_over(solids, pads.own, gel, solid_row, z)
                 # Two heights as in a Schmitt trigger: an anchor set at −enter is lost only above +leave, so that a

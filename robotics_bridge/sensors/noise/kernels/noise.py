@@ -226,11 +226,8 @@ def apply_noise(
     z = wp.vec4()
     if p.white > float(0.0) or p.walk > float(0.0):
         z = pair_normals(p, env, probe, channel // 2, age, episode)
-    white = z[0]
-    walk = z[1]
-    if channel % 2 == 1:
-        white = z[2]
-        walk = z[3]
+    white = wp.where(channel % 2 == 0, z[0], z[2])
+    walk = wp.where(channel % 2 == 0, z[1], z[3])
     fading = float(0.0)
     if p.hysteresis != float(0.0):
         fading = decay(dt / p.tau)
