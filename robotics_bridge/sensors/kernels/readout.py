@@ -11,8 +11,8 @@ from robotics_bridge.sensors.kernels.wide import load_planes, store_planes
 from robotics_bridge.sensors.noise.kernels.noise import (
     NoiseParams,
     apply_drawn,
-    apply_noise,
     decay,
+    episode_draw,
     pair_normals,
 )
 
@@ -84,9 +84,9 @@ def silenced(io: ReadoutArrays, channels: int, env: int, n: int, radius: float) 
 def readout_functions(mode: int, hysteresis: bool, walk: bool, channels: int = 6) -> SimpleNamespace:
     """Return the functions that write a reading, compiled for what the group stores.
 
-    ``emit`` writes the one channel of a scalar, ``emit_six`` up to six, drawing all that they share once: ``fixed`` is
-    what ``episode_draw`` gave, ``lag`` and ``drift`` what ``recall_six`` read (before anything else, so that nothing
-    waits for memory). ``measure`` returns the measured value of a scalar and stores its memories without writing it.
+    ``emit_six`` writes up to six channels, drawing all that they share once: ``fixed`` is what ``episode_draw`` gave,
+    ``lag`` and ``drift`` what ``recall_six`` read (before anything else, so that nothing waits for memory). ``emit``
+    does all of it for a scalar.
 
     Args:
         mode: :data:`CLEAN`, :data:`FUSED` or :data:`STAGED`.
@@ -98,37 +98,10 @@ def readout_functions(mode: int, hysteresis: bool, walk: bool, channels: int = 6
     Normals = wp.types.matrix(shape=(pairs, 4), dtype=wp.float32)
 
     @wp.func
-    def measure(io: ReadoutArrays, knobs: NoiseParams, env: int, n: int, probe: int, signal: float) -> float:
-        lag = float(0.0)
-        drift = float(0.0)
-        age = io.age[env]
-        if age > 0:
-            # Before the first update the memories count as zero, whatever the arrays hold: a reset has nothing to
-            # clear.
-            if wp.static(hysteresis):
-                lag = io.hysteresis[0, env, n]
-            if wp.static(walk):
-                drift = io.walk[0, env, n]
-        # Hysteresis, drift, white noise, bias, quantisation and dead probes (4.22, 4.25–4.27), in this order.
-        y = apply_noise(knobs, signal, env + io.env_offset, probe, 0, age, io.episode[env], io.dt, lag, drift)
-        if wp.static(hysteresis):
-            io.hysteresis[0, env, n] = y[1]
-        if wp.static(walk):
-            io.walk[0, env, n] = y[2]
-        return y[0]
-
-    @wp.func
-    def emit(io: ReadoutArrays, knobs: NoiseParams, env: int, n: int, probe: int, truth: float, signal: float):
-        io.truth[0, env, n] = truth
-        if wp.static(mode == FUSED):
-            io.measured[0, env, n] = measure(io, knobs, env, n, probe, signal)
-        if wp.static(mode == STAGED):
-            io.measured[0, env, n] = signal
-
-    @wp.func
     def recall_six(io: ReadoutArrays, env: int, n: int, age: int):
         lag = wp.spatial_vectorf()
         drift = wp.spatial_vectorf()
+        # Before the first update the memories count as zero, whatever the arrays hold: a reset has nothing to clear.
         if age > 0:
             if wp.static(hysteresis):
                 lag = load_planes(io.hysteresis, env, n, wp.static(channels))
@@ -175,7 +148,19 @@ def readout_functions(mode: int, hysteresis: bool, walk: bool, channels: int = 6
                 if wp.static(walk):
                     io.walk[channel, env, n] = y[2]
 
-    return SimpleNamespace(emit=emit, emit_six=emit_six, recall_six=recall_six, measure=measure)
+    @wp.func
+    def emit(io: ReadoutArrays, knobs: NoiseParams, env: int, n: int, probe: int, truth: float, signal: float):
+        age = io.age[env]
+        episode = io.episode[env]
+        fixed = wp.vec3f()
+        if wp.static(mode == FUSED):
+            fixed = episode_draw(knobs, env + io.env_offset, probe, episode)
+        lag, drift = recall_six(io, env, n, age)
+        all_truth = wp.spatial_vectorf(truth, 0.0, 0.0, 0.0, 0.0, 0.0)
+        all_signal = wp.spatial_vectorf(signal, 0.0, 0.0, 0.0, 0.0, 0.0)
+        emit_six(io, knobs, env, n, probe, age, episode, fixed, lag, drift, all_truth, all_signal)
+
+    return SimpleNamespace(emit=emit, emit_six=emit_six, recall_six=recall_six)
 
 
 @wp.kernel

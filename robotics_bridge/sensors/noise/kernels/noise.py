@@ -168,17 +168,18 @@ def apply_drawn(
     hysteresis_state: float,
     walk_state: float,
 ) -> wp.vec3:
-    """Return what :func:`apply_noise` does, from numbers drawn before.
+    """Return the measured value of one channel and the two memories to keep for the next update.
 
     Args:
         p: Knobs of the sensor.
-        x: The signal.
+        x: The signal after radius noise, gain and crosstalk. A value that is not finite is returned as it is, and the
+            memories as they were.
         white: Standard normal number of the white noise.
         walk: Standard normal number of the drift.
         fixed: Of :func:`episode_draw`.
         fading: e^(−Δt/τ).
-        hysteresis_state: As there.
-        walk_state: As there.
+        hysteresis_state: e^(−Δt/τ) ξ − x of the last update (0 at first), from which 4.26 follows.
+        walk_state: Drift d of the last update (0 at first).
     """
     # Equations 4.26 and 4.27: the state kept is e^(−Δt/τ) ξ − x, so ξ of this update needs no copy of the last signal.
     # Knobs that are off add zeros, which costs less than asking.
@@ -192,47 +193,6 @@ def apply_drawn(
     # A lost reading passes as it is and leaves the memories untouched, so that later readings are valid again.
     finite = wp.isfinite(x)
     return wp.vec3(wp.where(finite, y, x), wp.where(finite, lag, hysteresis_state), wp.where(finite, drift, walk_state))
-
-
-@wp.func
-def apply_noise(
-    p: NoiseParams,
-    x: float,
-    env: int,
-    probe: int,
-    channel: int,
-    age: int,
-    episode: int,
-    dt: float,
-    hysteresis_state: float,
-    walk_state: float,
-) -> wp.vec3:
-    """Return the measured value of one channel and the two memories to keep for the next update.
-
-    Args:
-        p: Knobs of the sensor.
-        x: The signal after radius noise, gain and crosstalk. A value that is not finite is returned as it
-            is, and the memories as they were.
-        env: Number of the environment in the whole experiment.
-        probe: Number of the probe within its sensor.
-        channel: Channel.
-        age: Updates since the reset, 0 at the first.
-        episode: Resets so far.
-        dt: Time step [s].
-        hysteresis_state: e^(−Δt/τ) ξ − x of the last update (0 at first), from which 4.26 follows.
-        walk_state: Drift d of the last update (0 at first).
-    """
-    # One call of Philox yields four words: white noise and drift of two neighbouring channels.
-    z = wp.vec4()
-    if p.white > float(0.0) or p.walk > float(0.0):
-        z = pair_normals(p, env, probe, channel // 2, age, episode)
-    white = wp.where(channel % 2 == 0, z[0], z[2])
-    walk = wp.where(channel % 2 == 0, z[1], z[3])
-    fading = float(0.0)
-    if p.hysteresis != float(0.0):
-        fading = decay(dt / p.tau)
-    fixed = episode_draw(p, env, probe, episode)
-    return apply_drawn(p, x, white, walk, fixed, fading, hysteresis_state, walk_state)
 
 
 @wp.func
@@ -267,10 +227,18 @@ def measure(
     knobs = p[part[n]]
     # Numbers belong to the environment of the whole experiment: splitting it over devices does not change them.
     number = env_offset + env
-    scale = float(1.0)
-    if gained == 0:
-        scale = episode_draw(knobs, number, probe[n], episode[env])[0]
+    fixed = episode_draw(knobs, number, probe[n], episode[env])
+    scale = wp.where(gained == 0, fixed[0], float(1.0))
+    fading = float(0.0)
+    if knobs.hysteresis != float(0.0):
+        fading = decay(dt / knobs.tau)
     for channel in range(x.shape[0]):
+        # One call of Philox yields four words: white noise and drift of two neighbouring channels.
+        z = wp.vec4()
+        if knobs.white > float(0.0) or knobs.walk > float(0.0):
+            z = pair_normals(knobs, number, probe[n], channel // 2, age[env], episode[env])
+        white = wp.where(channel % 2 == 0, z[0], z[2])
+        step = wp.where(channel % 2 == 0, z[1], z[3])
         lag = float(0.0)
         drift = float(0.0)
         if age[env] > 0:
@@ -278,9 +246,7 @@ def measure(
                 lag = hysteresis[channel, env, n]
             if walk.shape[1] > 0:
                 drift = walk[channel, env, n]
-        y = apply_noise(
-            knobs, scale * x[channel, env, n], number, probe[n], channel, age[env], episode[env], dt, lag, drift
-        )
+        y = apply_drawn(knobs, scale * x[channel, env, n], white, step, fixed, fading, lag, drift)
         out[channel, env, n] = y[0]
         if hysteresis.shape[1] > 0:
             hysteresis[channel, env, n] = y[1]

@@ -66,7 +66,7 @@ def distance_kernel(
     kinds: frozenset[int], raycast: bool, nearest: bool, mode: int, hysteresis: bool, walk: bool
 ) -> Any:
     """Return the kernel of SurfaceDistanceProbe. Dim [B, N]."""
-    deepest, emit = deepest_function(kinds, raycast), readout_functions(mode, hysteresis, walk).emit
+    deepest, emit = deepest_function(kinds, raycast), readout_functions(mode, hysteresis, walk, 1).emit
 
     @wp.kernel(module="unique")
     def surface_distance(
@@ -111,8 +111,7 @@ def latch(before: float, age: int, value: float, limits: wp.vec2f) -> float:
 @cache
 def depth_kernel(kinds: frozenset[int], raycast: bool, binary: bool, mode: int, hysteresis: bool, walk: bool) -> Any:
     """Return the kernel of ContactDepthProbe (4.2) or, ``binary``, of ContactProbe (4.3). Dim [B, N]."""
-    deepest, readout = deepest_function(kinds, raycast), readout_functions(mode, hysteresis, walk)
-    emit, measure = readout.emit, readout.measure
+    deepest, emit = deepest_function(kinds, raycast), readout_functions(mode, hysteresis, walk, 1).emit
 
     @wp.kernel(module="unique")
     def contact_depth(
@@ -139,13 +138,13 @@ def depth_kernel(kinds: frozenset[int], raycast: bool, binary: bool, mode: int, 
             # neither.
             fixed = episode_draw(io.knobs[part], env + io.env_offset, probe, episode)
             signal = wp.max(noisy - best, 0.0) * fixed[0]
+        true_bit = io.truth[0, env, n]
+        bit = io.measured[0, env, n]
+        emit(io, io.knobs[part], env, n, probe, truth, signal)
         if wp.static(binary):
+            # Each branch latches on its own last bit (4.3): noise must not switch the true contact.
             if wp.static(mode != CLEAN):
-                # Each branch latches on its own last bit (4.3): noise must not switch the true contact.
-                y = measure(io, io.knobs[part], env, n, probe, signal)
-                io.measured[0, env, n] = latch(io.measured[0, env, n], age, y, limits[part])
-            io.truth[0, env, n] = latch(io.truth[0, env, n], age, truth, limits[part])
-        else:
-            emit(io, io.knobs[part], env, n, probe, truth, signal)
+                io.measured[0, env, n] = latch(bit, age, io.measured[0, env, n], limits[part])
+            io.truth[0, env, n] = latch(true_bit, age, truth, limits[part])
 
     return contact_depth
