@@ -369,7 +369,7 @@ def marker_kernel(
                         at = packed // 64 - 1
                         rotation = wp.transpose(pairs.rotation[env, at])
                         offset = pairs.offset[env, at]
-                        first = block_of(cloud, pads.tracked, row, pairs.geometry[env, at], block - part * pads.blocks)
+                        start = block_of(cloud, pads.tracked, row, pairs.geometry[env, at], block - part * pads.blocks)
                         # Σ w (z − anchor) with z = rotation (p − offset): the pose of the block is applied once.
                         here = wp.transpose(rotation) @ x + offset
                         up = wp.transpose(rotation) @ normal
@@ -381,7 +381,7 @@ def marker_kernel(
                         for k in range(packed % 64):
                             own = int(pads.order[block * wp.static(BLOCK) + k, env])
                             index = block * wp.static(BLOCK) + own
-                            p = cloud.point[first * wp.static(BLOCK) + own]
+                            p = cloud.point[start * wp.static(BLOCK) + own]
                             strength = pads.drive[block * wp.static(BLOCK) + k, env]
                             kept = anchor_of(pads, index, env)
                             if wp.static(layered):
