@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, ClassVar, Literal
 from brainbench.core.errors import UsageError, check_name
 from brainbench.core.reading.ranges import check_fields
 from robotics_bridge.sensors.noise.model import TAXEL_KNOBS
-from robotics_bridge.sensors.sensor import QueryRequirements, QuerySensor
+from robotics_bridge.sensors.sensor import QuerySensor
 
 if TYPE_CHECKING:
     from robotics_bridge.physics.scene import TouchScene
@@ -120,6 +120,6 @@ class ElastomerTaxel(QuerySensor):
         """Return the geometries of its own link that can be indented."""
         return tuple(g for g in scene.geometries_of(self.link) if scene.geometries[g].kind != "other")
 
-    def requirements(self, scene: TouchScene) -> QueryRequirements:
-        """Return the fields or trees of what it tracks, and of its own link where points are followed."""
-        return super().requirements(scene) | self.require(self.own(scene) if self.points else ())
+    def queries(self, scene: TouchScene) -> frozenset[tuple[str, int]]:
+        """Return the queries of what it tracks, and of its own link where points are followed."""
+        return super().queries(scene) | {(self.query, geometry) for geometry in self.own(scene) if self.points}
