@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brainbench.core.errors import UsageError, check_name
+from brainbench.core.reading.ranges import check_fields, check_number
 from robotics_bridge.deploy.driver import HandReading
 
 REAL_TYPES = ("agg_bool", "agg_force")
@@ -42,12 +43,13 @@ class PressureCalibration:
     """Contact pressure, in the maker's unit, above which a finger touches (η_real of 4.31)."""
 
     def __post_init__(self) -> None:
-        factors = np.abs([self.scale, *self.per_finger.values(), *self.axes])
-        if not ((factors > 0) & (factors <= LARGEST_SCALE)).all() or not 0 < self.threshold <= LARGEST_SCALE:
-            raise UsageError(
-                f"A pressure calibration has scales and axes of ±{LARGEST_SCALE:g} at most and not 0, and a threshold "
-                f"above 0; received {self}."
-            )
+        check_fields(self, "threshold", above=0, most=LARGEST_SCALE)
+        check_fields(self, "axes", items=3)
+        factors = [("scale", self.scale), *self.per_finger.items(), *(("axes", factor) for factor in self.axes)]
+        for name, factor in factors:
+            check_number(name, factor, least=-LARGEST_SCALE, most=LARGEST_SCALE)
+            if factor == 0:
+                raise UsageError(f"{name} of a pressure calibration must not be 0; received {factor}.")
 
     def force(self, fingers: tuple[str, ...], pressure: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the simulator's ``agg_force`` [F, 3] of pressures [F, 3]."""

@@ -3,35 +3,19 @@
 from __future__ import annotations
 
 import abc
-from collections.abc import Hashable, Mapping
+from collections.abc import Hashable
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, ClassVar, Literal, Self
+from typing import TYPE_CHECKING, ClassVar, Literal
 
 from brainbench.core.errors import UsageError
-from brainbench.core.plugins import load_object
 from brainbench.core.reading.ranges import check_fields
 from robotics_bridge.sensors.noise.model import BASE_KNOBS, PROBE_KNOBS, Noise
 from robotics_bridge.sensors.probes.placement import Probes
 
 if TYPE_CHECKING:
     from robotics_bridge.physics.scene import TouchScene
-    from robotics_bridge.sensors.context import SuiteContext
-    from robotics_bridge.sensors.runtime import Runtime
 
 Convention = Literal["physical", "thesis"]
-
-
-@dataclass(frozen=True)
-class QueryRequirements:
-    """Geometries that must be prepared for a sensor's queries."""
-
-    fields: frozenset[int] = frozenset()
-    """Geometries whose signed distance it asks for (meshes among them get a sampled field)."""
-    trees: frozenset[int] = frozenset()
-    """Geometries whose triangles it asks for."""
-
-    def __or__(self, other: QueryRequirements) -> QueryRequirements:
-        return QueryRequirements(self.fields | other.fields, self.trees | other.trees)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,7 +41,7 @@ class Sensor(abc.ABC):
     shared: ClassVar[tuple[str, ...]] = ()
     """Attributes that sensors of its class have in common where one runtime and its kernels serve them."""
     runtime: ClassVar[str] = ""
-    """``package.module:Class`` of the runtime that serves it, imported when a suite is built."""
+    """``package.module:Class`` of the runtime that serves those of one group, imported when a suite is built."""
 
     def __post_init__(self) -> None:
         self.noise.check(self.knobs, type(self).__name__)
@@ -71,15 +55,10 @@ class Sensor(abc.ABC):
         """Return the values of :attr:`shared`."""
         return tuple(getattr(self, name) for name in self.shared)
 
-    def requirements(self, scene: TouchScene) -> QueryRequirements:
-        """Return what must be built for it."""
+    def queries(self, scene: TouchScene) -> frozenset[tuple[str, int]]:
+        """Return ``sdf`` or ``raycast`` and the geometry of every query that must be prepared for it."""
         del scene
-        return QueryRequirements()
-
-    @classmethod
-    def build(cls, sensors: Mapping[str, Self], context: SuiteContext) -> Runtime:
-        """Return the runtime that serves these sensors (by name) together."""
-        return load_object(cls.runtime, "runtime")(sensors, context)
+        return frozenset()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -141,11 +120,6 @@ class QuerySensor(ProbeSensor):
         """True if it meets only geometries that the engine reports in contact with its link."""
         return self.pairs == "contact"
 
-    def requirements(self, scene: TouchScene) -> QueryRequirements:
-        """Return the fields or trees of what it tracks."""
-        return self.require(self.tracked(scene))
-
-    def require(self, geometries: tuple[int, ...]) -> QueryRequirements:
-        """Return fields or trees of geometries, by the way of its queries."""
-        wanted = frozenset(geometries)
-        return QueryRequirements(fields=wanted) if self.query == "sdf" else QueryRequirements(trees=wanted)
+    def queries(self, scene: TouchScene) -> frozenset[tuple[str, int]]:
+        """Return the queries of what it tracks."""
+        return frozenset((self.query, geometry) for geometry in self.tracked(scene))

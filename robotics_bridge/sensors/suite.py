@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, NamedTuple, cast
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -13,6 +13,7 @@ import torch
 from brainbench.core.cuda_graphs import record_launches
 from brainbench.core.devices import pick_device, warp
 from brainbench.core.errors import UsageError, unknown_name
+from brainbench.core.plugins import load_object
 from robotics_bridge.physics.scene import TouchScene
 from robotics_bridge.physics.state import DIVERGED, MOST_ENVS, UNFELT, HandState
 from robotics_bridge.sensors.context import ReadoutSlice, SuiteContext, UpdateClock
@@ -24,17 +25,9 @@ from robotics_bridge.sensors.queries.kernels.pairs import count_update, reset_cl
 from robotics_bridge.sensors.queries.pairs import PairTable
 from robotics_bridge.sensors.queries.solids import Solids
 from robotics_bridge.sensors.runtime import History, Runtime
-from robotics_bridge.sensors.sensor import QueryRequirements, Sensor
+from robotics_bridge.sensors.sensor import Sensor
 
 wp = warp()
-
-
-class _RecordedUpdate(NamedTuple):
-    """An update as a CUDA graph, for one state and time step (s)."""
-
-    replay: Callable[[], None]
-    state: HandState
-    dt: float
 
 
 class SensorSuite:
@@ -101,18 +94,19 @@ class SensorSuite:
             scene.link_index(sensor.link)
             groups.setdefault((type(sensor), sensor.group()), {})[name] = sensor
         warn_of(scene, self.sensors)
-        required = QueryRequirements()
-        for sensor in self.sensors.values():
-            required |= sensor.requirements(scene)
+        queries = frozenset().union(*(sensor.queries(scene) for sensor in self.sensors.values()))
         with wp.ScopedDevice(self.device):
             age = wp.full(num_envs, -1, dtype=wp.int32, device=self.device)
             self.clock = UpdateClock(age, wp.zeros(num_envs, dtype=wp.int32, device=self.device), env_offset)
-            self.solids = Solids(scene, num_envs, self.device, required, resolution=resolution)
+            self.solids = Solids(scene, num_envs, self.device, queries, resolution=resolution)
             self.pairs = PairTable(self.solids, num_envs, self.device, listed)
             self.context = context = SuiteContext(
                 num_envs, self.device, seed, self.clock, scene, self.solids, self.pairs
             )
-            self.runtimes: list[Runtime] = [kind.build(members, context) for (kind, _group), members in groups.items()]
+            self.runtimes: list[Runtime] = [
+                load_object(next(iter(members.values())).runtime, "runtime")(members, context)
+                for members in groups.values()
+            ]
             self._owner = {name: runtime for runtime in self.runtimes for name in runtime.slices}
             self.pairs.freeze()
             self._updates = 0
@@ -122,7 +116,8 @@ class SensorSuite:
                 for name, sensor in self.sensors.items()
                 if sensor.history
             }
-        self._recorded: _RecordedUpdate | None = None
+        # An update as a CUDA graph, for one state and time step (s).
+        self._recorded: tuple[Callable[[], None], HandState, float] | None = None
         self._status: Any = None
         self._warned = False
 
@@ -147,11 +142,11 @@ class SensorSuite:
             if self._histories or not all(runtime.recordable for runtime in self.runtimes):
                 raise UsageError("Sensors with a history or with meshes that move cannot be part of another recording.")
             self._launch(state, dt)
-        elif self._recorded and self._recorded.state is state and self._recorded.dt == dt:
-            self._recorded.replay()
+        elif self._recorded and self._recorded[1] is state and self._recorded[2] == dt:
+            self._recorded[0]()
         elif self._recorded is None and self._status is state.status and all(r.recordable for r in self.runtimes):
             replay = record_launches(lambda: self._launch(state, dt), self.device)
-            self._recorded = _RecordedUpdate(replay, state, dt)
+            self._recorded = (replay, state, dt)
             replay()
         else:
             # The first update of a state compiles and allocates; the next ones replay what it does.

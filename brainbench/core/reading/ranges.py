@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import numbers
+from collections.abc import Iterable
 from dataclasses import fields
 from typing import Any
 
@@ -31,13 +32,18 @@ def check_number(
     )
 
 
-def check_fields(options: Any, *names: str, of: str = "{}", **bounds: Any) -> None:
+def check_fields(options: Any, *names: str, of: str = "{}", items: int = 0, **bounds: Any) -> None:
     """Check fields of a dataclass as :func:`check_number` does; None passes where the type of the field allows it.
 
-    Errors call a field by its name in place of the braces of ``of``.
+    Errors call a field by its name in place of the braces of ``of``. With ``items`` each field holds so many numbers.
     """
     kinds = {field.name: str(field.type) for field in fields(options)}
     for name in names:
-        value = getattr(options, name)
-        if value is not None or "None" not in kinds[name]:
-            check_number(of.format(name), value, **bounds)
+        value, told = getattr(options, name), of.format(name)
+        if value is None and "None" in kinds[name]:
+            continue
+        values = [value] if not items else list(value) if isinstance(value, Iterable) else []
+        if len(values) != max(items, 1):
+            raise UsageError(f"{told} holds {items} numbers; received {shown(value)}.")
+        for one in values:
+            check_number(told, one, **bounds)

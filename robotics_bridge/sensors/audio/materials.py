@@ -123,7 +123,7 @@ def preset_modes(material: str | ElasticMaterial, lowest: float, count: int = 16
             f"A body rings between 20 and 20000 Hz in at least one mode; received {lowest!r} Hz, {count!r} modes."
         )
     # Free bar: wave numbers near (2n + 1) π / 2L, and frequencies with their square.
-    every = [(n, lowest * (2 * n + 1) ** 2 / 9) for n in range(1, count + 1)]
-    heard = [(n, frequency) for n, frequency in every if frequency <= 20_000]
-    frequency = tuple(value for _n, value in heard)
-    return Modes(frequency, tuple(chosen.decay(value) for value in frequency), tuple(1 / n for n, _value in heard))
+    every = (lowest * (2 * n + 1) ** 2 / 9 for n in range(1, count + 1))
+    frequency = tuple(value for value in every if value <= 20_000)
+    gain = tuple(1 / n for n in range(1, len(frequency) + 1))
+    return Modes(frequency, tuple(chosen.decay(value) for value in frequency), gain)

@@ -10,7 +10,7 @@ import torch
 
 from brainbench.core.devices import warp
 from brainbench.core.errors import UsageError
-from brainbench.core.reading.ranges import check_fields, check_number
+from brainbench.core.reading.ranges import check_fields
 from robotics_bridge.physics.state import HandState
 from robotics_bridge.sensors.audio.kernels import sound as k
 from robotics_bridge.sensors.audio.sensors import AudioSensor
@@ -41,10 +41,7 @@ class Microphone:
     """Longest distance that is rendered with its full delay [m]; sets the memory."""
 
     def __post_init__(self) -> None:
-        if len(self.position) != 3:
-            raise UsageError(f"The position of a microphone is three numbers (m); received {self.position!r}.")
-        for value in self.position:
-            check_number("position", value)
+        check_fields(self, "position", items=3)
         check_fields(self, "speed_of_sound", "nearest", "reach", above=0)
         check_fields(self, "power", least=0)
 

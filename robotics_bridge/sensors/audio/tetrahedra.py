@@ -36,13 +36,13 @@ def box(half: tuple[float, float, float], cells: int) -> Any:
 def ball(half: tuple[float, float, float], cells: int) -> Any:
     """Return an ellipsoid of half axes (m), from a cube whose shells are pushed out to spheres."""
     mesh = box((1.0, 1.0, 1.0), cells)
-    return _moved(mesh, _rounded(mesh.p, 0.8) * np.array(half)[:, None])
+    return type(mesh)(_rounded(mesh.p, 0.8) * np.array(half)[:, None], mesh.t)
 
 
 def cylinder(radius: float, half_length: float, cells: int) -> Any:
     """Return a cylinder along z."""
     mesh = box((radius, radius, half_length), cells)
-    return _moved(mesh, np.concatenate([_rounded(mesh.p[:2] / radius, 0.85) * radius, mesh.p[2:]]))
+    return type(mesh)(np.concatenate([_rounded(mesh.p[:2] / radius, 0.85) * radius, mesh.p[2:]]), mesh.t)
 
 
 def _rounded(p: NDArray[np.float64], core: float) -> NDArray[np.float64]:
@@ -86,7 +86,7 @@ def voxels(surface: Mesh, cells: int) -> Any:
     p = mesh.p.copy()
     near = distance < 1.2 * edge
     p[:, skin[near]] = samples[nearest[near]].T
-    return _moved(mesh, _untangled(mesh, p))
+    return type(mesh)(_untangled(mesh, p), mesh.t)
 
 
 def _untangled(mesh: Any, target: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -107,7 +107,3 @@ def volumes(p: NDArray[np.float64], t: NDArray[np.int64]) -> NDArray[np.float64]
     """Return the signed volumes [n] of tetrahedra t [4, n] of points p [3, m]."""
     a, b, c, d = (p[:, t[i]] for i in range(4))
     return np.einsum("in,in->n", np.cross(b - a, c - a, axis=0), d - a) / 6
-
-
-def _moved(mesh: Any, p: NDArray[np.float64]) -> Any:
-    return type(mesh)(p, mesh.t)

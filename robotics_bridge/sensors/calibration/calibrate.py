@@ -58,7 +58,7 @@ def calibrate(log: Log, *, max_delay: float = 0.5) -> Calibration:
         max_delay: Longest delay that is tried [s].
 
     Raises:
-        DataError: no probe is alive, or the reference never changes.
+        DataError: no probe is alive, the reference never changes, or readings fall where it rises.
     """
     estimates: dict[str, Estimate] = {}
     notes = [f"Not fitted: {', '.join(NOT_FITTED)}."]
@@ -142,20 +142,22 @@ def _dead(stuck: NDArray, values: NDArray, knobs: dict[str, Any], estimates: dic
 def _gain(fit: Fit, knobs: dict[str, Any], estimates: dict[str, Estimate], notes: list[str]) -> None:
     """Enter the range of the gains: the extremes, moved out by their mean distance from the ends."""
     gains, count = np.sort(fit.gains), len(fit.gains)
+    mean = float(np.average(fit.gains, weights=1 / fit.gain_errors**2))
+    if mean <= 0:
+        raise DataError("The readings fall where the reference rises; turn the sign of one of them.")
     span = float(gains[-1] - gains[0])
     noise = float(np.median(fit.gain_errors))
     if count < 2 or span < 6 * noise:
         middle, how = float(gains[0]), "one probe: no range"
         if count > 1:
-            middle = float(np.average(fit.gains, weights=1 / fit.gain_errors**2))
-            how = "gains are equal within their errors"
+            middle, how = mean, "gains are equal within their errors"
         error = Z95 * noise / math.sqrt(count)
         knobs["gain"] = (middle, middle)
         estimates["gain_low"] = estimates["gain_high"] = Estimate(middle, middle - error, middle + error, how)
         return
     # For uniform gains the extremes lie inside the range by its width / (n + 1) on average, which is span / (n − 1).
     out = span / (count - 1)
-    knobs["gain"] = (float(gains[0] - out), float(gains[-1] + out))
+    knobs["gain"] = (max(float(gains[0] - out), 0.0), float(gains[-1] + out))
     # The end lies beyond the extreme by at most the span times a^(-1/(n-1)) - 1, at confidence 1 - a per end.
     reach = span * (0.025 ** (-1 / (count - 1)) - 1)
     how = f"extremes of {count} gains"

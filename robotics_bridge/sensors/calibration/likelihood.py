@@ -81,7 +81,6 @@ def maxwell(x: NDArray[np.float64], keep: float) -> NDArray[np.float64]:
 
 
 def _sine(values: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the orthonormal sine transform of differences along the first axis."""
     return np.asarray(dst(np.diff(values, axis=0), type=1, axis=0, norm="ortho"))
 
 

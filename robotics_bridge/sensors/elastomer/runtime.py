@@ -11,7 +11,7 @@ import torch
 
 from brainbench.core.devices import warp
 from robotics_bridge.physics.state import HandState
-from robotics_bridge.sensors.context import ReadoutSlice, SuiteContext
+from robotics_bridge.sensors.context import ReadoutSlice, SuiteContext, fill
 from robotics_bridge.sensors.elastomer.kernels.anchors import anchor_kernel
 from robotics_bridge.sensors.elastomer.kernels.dilation import (
     ElastomerArrays,
@@ -55,12 +55,11 @@ class ElastomerRuntime(ProbeRuntime):
         own = [sensor.own(scene) if self._followed else () for sensor in self._sensors]
         members = [g for one in own for g in one]
         self._own_kinds = context.solids.kinds_of(sorted(set(members)))
-        # Threads of a GPU are environments and want them side by side; a processor walks through the points of one.
+        # Threads of a GPU are environments and want them side by side. A processor walks through the points of one, and
+        # through its markers: a thread for each costs more.
         self.side_by_side = bool(context.device.is_cuda)
-        # A processor starts a thread for every marker at a cost that markers in turn do not have.
-        self._in_turn = not context.device.is_cuda
         # Only a processor finds a grid's shear cheaper by rows and columns than marker by marker.
-        self.apart = self._followed and self._way != "direct" and self._in_turn
+        self.apart = self._followed and self._way != "direct" and not self.side_by_side
         self._blocks = -(-total_points // BLOCK)
         total, blocks = max(count * self._blocks * BLOCK, 1), max(count * self._blocks, 1)
         rows, columns = (max(side) for side in zip(*map(_sides, self.slices.values()), strict=True))
@@ -96,55 +95,49 @@ class ElastomerRuntime(ProbeRuntime):
 
     def update(self, state: HandState, dt: float) -> None:
         """Read the state."""
-        c, pads = self.context, self.pads
+        c, pads, in_turn = self.context, self.pads, not self.side_by_side
         self.begin(state, dt)
         solids, pairs = c.solids.struct, c.pairs.struct
-        indent = indent_kernel(self.kinds, self._raycast, self._planes, self._in_turn)
+        indent = indent_kernel(self.kinds, self._raycast, self._planes, in_turn)
         self.launch(indent, self.probes, solids, pairs, self.io, pads)
         if self._way == "separable":
-            self.launch(spread_kernel(self._planes, self._in_turn), self.probes, self.io, pads)
+            self.launch(spread_kernel(self._planes, in_turn), self.probes, self.io, pads)
         elif self._way == "fft":
             self._transform()
         if self._followed:
-            kernel = anchor_kernel(self._own_kinds, self._raycast, self.side_by_side, self._in_turn)
+            kernel = anchor_kernel(self._own_kinds, self._raycast, self.side_by_side)
             dim = pads.held.shape if self.side_by_side else pads.held.shape[::-1]
             c.launch(kernel, dim, pads, solids, pairs, self.points, self.io)
         if self.apart:
             c.launch(sum_shear, c.num_envs, self.probes, self.io, pads, pairs, self.points)
         way = ("direct", "separable", "fft").index(self._way)
-        kernel = marker_kernel(way, self._layered, self._planes, self.mode, *self.stores, self._in_turn, self.apart)
+        kernel = marker_kernel(way, self._layered, self._planes, self.mode, *self.stores, in_turn, self.apart)
         self.launch(kernel, self.probes, self.io, pads, pairs, self.points)
         self.finish(dt)
 
     def launch(self, kernel: Any, *inputs: Any) -> None:
         """Run a kernel over all environments and markers."""
-        self.context.launch(kernel, (self.context.num_envs, 1 if self._in_turn else self.count), *inputs)
+        self.context.launch(kernel, (self.context.num_envs, self.count if self.side_by_side else 1), *inputs)
 
     def _describe(self, own: list[tuple[int, ...]]) -> Any:
         """Return the structures of the gels; ``own`` are the geometries of each pad."""
         gels, owned = [], 0
         for index, (sensor, place) in enumerate(zip(self._sensors, self.slices.values(), strict=True)):
-            gel, probes, layer = GelParams(), sensor.probes, sensor.layer or Layer()
+            probes, layer = sensor.probes, sensor.layer or Layer()
             rows, columns = _sides(place)
             widening = layer.expansion if isinstance(layer.expansion, tuple) else (layer.expansion,) * 2
-            for source, names in (
-                (sensor, ("exponent", "enter", "leave")),
-                (layer, ("poisson", "softening", "thickness", "recoil")),
-            ):
-                for name in names:
-                    setattr(gel, name, getattr(source, name))
-            gel.dilate, gel.shear = sensor.dilate_scale, sensor.shear_scale
-            gel.spread, gel.smear = sensor.dilate_spread, sensor.shear_spread
-            gel.layered = int(sensor.layer is not None)
-            gel.expansion_x, gel.expansion_y = widening
-            gel.frame_x, gel.frame_y = layer.frame or (0.0, 0.0)
-            gel.start, gel.rows, gel.columns = place.start, rows, columns
-            gel.step_y, gel.step_x = probes.pitch or (0.0, 0.0)
-            gel.link, gel.slot = self.context.scene.link_index(sensor.link), self.slots[index]
-            gel.own_first, owned = owned, owned + len(own[index])
-            gel.own_last = owned
-            gel.along, gel.across, gel.normal = (wp.vec3f(*axis.tolist()) for axis in _axes(sensor))
-            gel.center = wp.vec3f(*probes.position[probes.active].mean(axis=0).tolist())
+            frame, pitch = layer.frame or (0.0, 0.0), probes.pitch or (0.0, 0.0)
+            along, across, normal = (wp.vec3f(*axis.tolist()) for axis in _axes(sensor))
+            gel = fill(
+                GelParams, sensor, **vars(layer), dilate=sensor.dilate_scale, shear=sensor.shear_scale,
+                spread=sensor.dilate_spread, smear=sensor.shear_spread, layered=int(sensor.layer is not None),
+                expansion_x=widening[0], expansion_y=widening[1], frame_x=frame[0], frame_y=frame[1],
+                start=place.start, rows=rows, columns=columns, step_y=pitch[0], step_x=pitch[1],
+                link=self.context.scene.link_index(sensor.link), slot=self.slots[index], own_first=owned,
+                own_last=owned + len(own[index]), along=along, across=across, normal=normal,
+                center=wp.vec3f(*probes.position[probes.active].mean(axis=0).tolist()),
+            )  # fmt: skip
+            owned += len(own[index])
             gels.append(gel)
         return self.context.array(gels, GelParams)
 
@@ -190,7 +183,6 @@ class ElastomerRuntime(ProbeRuntime):
 
 
 def _sides(place: ReadoutSlice) -> tuple[int, int]:
-    """Return rows and columns of a sensor's markers."""
     return (place.layout[0], place.layout[1]) if len(place.layout) == 2 else (1, place.count)
 
 

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar, Literal
 
 from brainbench.core.errors import UsageError, check_name
-from brainbench.core.reading.ranges import check_fields, check_number
+from brainbench.core.reading.ranges import check_fields
 from robotics_bridge.sensors.noise.model import TAXEL_KNOBS
-from robotics_bridge.sensors.sensor import QueryRequirements, QuerySensor
+from robotics_bridge.sensors.sensor import QuerySensor
 
 if TYPE_CHECKING:
     from robotics_bridge.physics.scene import TouchScene
@@ -43,12 +42,8 @@ class Layer:
         check_fields(self, "softening", above=0)
         check_fields(self, "thickness", least=0)
         check_fields(self, "recoil", least=0, most=2)
-        widening = self.expansion if isinstance(self.expansion, tuple) else (self.expansion,) * 2
-        for name, pair, above in (("expansion", widening, -math.inf), ("frame", self.frame or (1.0, 1.0), 0)):
-            if len(pair) != 2:
-                raise UsageError(f"{name} is two numbers, along and across; received {pair!r}.")
-            for value in pair:
-                check_number(name, value, above=above)
+        check_fields(self, "expansion", items=2 if isinstance(self.expansion, tuple) else 0)
+        check_fields(self, "frame", items=2, above=0)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -125,6 +120,6 @@ class ElastomerTaxel(QuerySensor):
         """Return the geometries of its own link that can be indented."""
         return tuple(g for g in scene.geometries_of(self.link) if scene.geometries[g].kind != "other")
 
-    def requirements(self, scene: TouchScene) -> QueryRequirements:
-        """Return the fields or trees of what it tracks, and of its own link where points are followed."""
-        return super().requirements(scene) | self.require(self.own(scene) if self.points else ())
+    def queries(self, scene: TouchScene) -> frozenset[tuple[str, int]]:
+        """Return the queries of what it tracks, and of its own link where points are followed."""
+        return super().queries(scene) | {(self.query, geometry) for geometry in self.own(scene) if self.points}

@@ -11,8 +11,8 @@ from robotics_bridge.sensors.kernels.wide import load_planes, store_planes
 from robotics_bridge.sensors.noise.kernels.noise import (
     NoiseParams,
     apply_drawn,
-    apply_noise,
     decay,
+    episode_draw,
     pair_normals,
 )
 
@@ -69,28 +69,24 @@ class ReadoutArrays:
 
 
 @wp.func
-def lost(io: ReadoutArrays, channels: int, env: int, n: int):
-    """Mark the reading of a probe in a diverged environment as NaN. Without noise both planes are one array."""
+def silenced(io: ReadoutArrays, channels: int, env: int, n: int, radius: float) -> bool:
+    """Write the reading of a filler (radius 0), zero, or in a diverged environment, NaN; return False for others."""
+    if radius > 0.0 and (io.status[env] & 1) == 0:
+        return False
     for channel in range(channels):
-        io.truth[channel, env, n] = wp.nan
-        io.measured[channel, env, n] = wp.nan
-
-
-@wp.func
-def idle(io: ReadoutArrays, channels: int, env: int, n: int):
-    """Write the reading of a filler: zero."""
-    for channel in range(channels):
-        io.truth[channel, env, n] = 0.0
-        io.measured[channel, env, n] = 0.0
+        # Without noise both planes are one array.
+        io.truth[channel, env, n] = wp.where(radius > 0.0, wp.nan, 0.0)
+        io.measured[channel, env, n] = wp.where(radius > 0.0, wp.nan, 0.0)
+    return True
 
 
 @cache
 def readout_functions(mode: int, hysteresis: bool, walk: bool, channels: int = 6) -> SimpleNamespace:
     """Return the functions that write a reading, compiled for what the group stores.
 
-    ``emit`` writes one channel, ``emit_six`` up to six, drawing all that they share once: ``fixed`` is what
-    ``episode_draw`` gave, ``lag`` and ``drift`` what ``recall_six`` read (before anything else, so that nothing waits
-    for memory). ``measure`` returns the measured value of one channel and stores its memories without writing it.
+    ``emit_six`` writes up to six channels, drawing all that they share once: ``fixed`` is what ``episode_draw`` gave,
+    ``lag`` and ``drift`` what ``recall_six`` read (before anything else, so that nothing waits for memory). ``emit``
+    does all of it for a scalar.
 
     Args:
         mode: :data:`CLEAN`, :data:`FUSED` or :data:`STAGED`.
@@ -102,57 +98,10 @@ def readout_functions(mode: int, hysteresis: bool, walk: bool, channels: int = 6
     Normals = wp.types.matrix(shape=(pairs, 4), dtype=wp.float32)
 
     @wp.func
-    def measure(
-        io: ReadoutArrays,
-        knobs: NoiseParams,
-        env: int,
-        n: int,
-        probe: int,
-        channel: int,
-        age: int,
-        episode: int,
-        signal: float,
-    ) -> float:
-        lag = float(0.0)
-        drift = float(0.0)
-        if age > 0:
-            # Before the first update the memories count as zero, whatever the arrays hold: a reset has nothing to
-            # clear.
-            if wp.static(hysteresis):
-                lag = io.hysteresis[channel, env, n]
-            if wp.static(walk):
-                drift = io.walk[channel, env, n]
-        # Hysteresis, drift, white noise, bias, quantisation and dead probes (4.22, 4.25–4.27), in this order.
-        y = apply_noise(knobs, signal, env + io.env_offset, probe, channel, age, episode, io.dt, lag, drift)
-        if wp.static(hysteresis):
-            io.hysteresis[channel, env, n] = y[1]
-        if wp.static(walk):
-            io.walk[channel, env, n] = y[2]
-        return y[0]
-
-    @wp.func
-    def emit(
-        io: ReadoutArrays,
-        knobs: NoiseParams,
-        env: int,
-        n: int,
-        probe: int,
-        channel: int,
-        age: int,
-        episode: int,
-        truth: float,
-        signal: float,
-    ):
-        io.truth[channel, env, n] = truth
-        if wp.static(mode == FUSED):
-            io.measured[channel, env, n] = measure(io, knobs, env, n, probe, channel, age, episode, signal)
-        if wp.static(mode == STAGED):
-            io.measured[channel, env, n] = signal
-
-    @wp.func
     def recall_six(io: ReadoutArrays, env: int, n: int, age: int):
         lag = wp.spatial_vectorf()
         drift = wp.spatial_vectorf()
+        # Before the first update the memories count as zero, whatever the arrays hold: a reset has nothing to clear.
         if age > 0:
             if wp.static(hysteresis):
                 lag = load_planes(io.hysteresis, env, n, wp.static(channels))
@@ -199,7 +148,19 @@ def readout_functions(mode: int, hysteresis: bool, walk: bool, channels: int = 6
                 if wp.static(walk):
                     io.walk[channel, env, n] = y[2]
 
-    return SimpleNamespace(emit=emit, emit_six=emit_six, recall_six=recall_six, measure=measure)
+    @wp.func
+    def emit(io: ReadoutArrays, knobs: NoiseParams, env: int, n: int, probe: int, truth: float, signal: float):
+        age = io.age[env]
+        episode = io.episode[env]
+        fixed = wp.vec3f()
+        if wp.static(mode == FUSED):
+            fixed = episode_draw(knobs, env + io.env_offset, probe, episode)
+        lag, drift = recall_six(io, env, n, age)
+        all_truth = wp.spatial_vectorf(truth, 0.0, 0.0, 0.0, 0.0, 0.0)
+        all_signal = wp.spatial_vectorf(signal, 0.0, 0.0, 0.0, 0.0, 0.0)
+        emit_six(io, knobs, env, n, probe, age, episode, fixed, lag, drift, all_truth, all_signal)
+
+    return SimpleNamespace(emit=emit, emit_six=emit_six, recall_six=recall_six)
 
 
 @wp.kernel

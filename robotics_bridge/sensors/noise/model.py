@@ -9,7 +9,6 @@ probe and channel, and on nothing else. Letters: B environment, N probe, C chann
 from __future__ import annotations
 
 import hashlib
-import math
 import os
 from dataclasses import dataclass, fields
 from typing import Any
@@ -69,11 +68,13 @@ class Noise:
     """Standard deviation of that spread [taxels]."""
 
     def __post_init__(self) -> None:
+        check_fields(self, "gain", items=2, least=0)
+        check_fields(self, "dead_range", items=2)
         for name in ("gain", "dead_range"):
-            value = getattr(self, name)
-            if len(value) != 2 or not (math.isfinite(value[0]) and math.isfinite(value[1]) and value[0] <= value[1]):
-                raise UsageError(f"{name} is a range (low, high) with low ≤ high; received {value!r}.")
-            object.__setattr__(self, name, (float(value[0]), float(value[1])))
+            low, high = map(float, getattr(self, name))
+            if low > high:
+                raise UsageError(f"{name} is a range (low, high) with low ≤ high; received ({low}, {high}).")
+            object.__setattr__(self, name, (low, high))
         check_fields(self, "read_delay", "jitter", "white", "walk", "quantum", "radius", least=0)
         check_fields(self, "hysteresis_tau", "crosstalk_sigma", least=0)
         check_fields(self, "dead_probability", "crosstalk", least=0, most=1)
@@ -91,8 +92,7 @@ class Noise:
     @property
     def set_knobs(self) -> tuple[str, ...]:
         """Names of the knobs that do something."""
-        off = Noise.__dataclass_fields__
-        names = [field.name for field in fields(self) if getattr(self, field.name) != off[field.name].default]
+        names = [field.name for field in fields(self) if getattr(self, field.name) != field.default]
         with_switch = {
             "dead_range": self.dead_probability,
             "hysteresis_tau": self.hysteresis,

@@ -106,8 +106,6 @@ class NoiseStage:
     def launch(self, x: Any, out: Any, dt: float) -> None:
         """Measure the signal ``x`` [C, B, N] (after radius noise) into ``out``; ``dt`` is the time step [s]."""
         own, context = self._arrays, self._arrays.context
-        if own.total == 0 or context.num_envs == 0:
-            return
         signal = x
         if self._mixes:
             first, second = self._buffers
@@ -152,8 +150,6 @@ class DelayLine:
             UsageError: the time step became so short that the ring does not reach back far enough.
         """
         own, context = self._arrays, self._arrays.context
-        if own.total == 0 or context.num_envs == 0:
-            return
         # The small amount less than a slot keeps a delay of exactly n steps at n despite rounding of the quotient.
         slots = math.ceil(self._longest / dt - 1e-4) + 1
         if self._ring is None:

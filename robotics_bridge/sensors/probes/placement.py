@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from brainbench.core.errors import UsageError
+from brainbench.core.reading.ranges import check_fields, check_number
 from brainbench.geometry import Mesh
 
 
@@ -42,14 +43,15 @@ class Probes:
         shape = tuple(self.shape) or (count,)
         if not count:
             raise UsageError("A sensor needs at least one probe; received none.")
+        for side in shape:
+            check_number("a side of the shape", side, least=1, whole=True)
+        check_fields(self, "pitch", items=2, least=0)
         if len(normal) != count or math.prod(shape) != count or len(shape) > 2:
             raise UsageError(f"{count} positions do not go with {len(normal)} normals in the shape {shape}.")
         if not (np.isfinite(position).all() and np.isfinite(normal).all() and np.isfinite(radius).all()):
             raise UsageError("Positions, normals and radii of probes must be finite numbers.")
         if (radius < 0).any():
             raise UsageError(f"The radius of a probe is positive, or 0 for a filler; received {radius.min():g} m.")
-        if self.pitch is not None and not all(0 <= step < math.inf for step in self.pitch):
-            raise UsageError(f"The pitch of a grid is finite and not negative (m); received {self.pitch!r}.")
         length = np.linalg.norm(normal, axis=1)
         if (length[radius > 0] < 1e-9).any():
             raise UsageError("The normal of a probe needs a length; received a zero vector.")
@@ -132,8 +134,7 @@ class Probes:
         Raises:
             UsageError: no triangle is left.
         """
-        if isinstance(count, bool) or not isinstance(count, int | np.integer) or count < 1:
-            raise UsageError(f"count is a whole number of probes, at least 1; received {count!r}.")
+        check_number("count", count, least=1, whole=True)
         corners = mesh.vertices[mesh.faces]
         area, normal = face_areas(corners)
         keep = area > 0

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from typing import Any
 
 import numpy as np
@@ -15,7 +15,6 @@ from robotics_bridge.physics.scene import KINDS, Geometry, TouchScene
 from robotics_bridge.sensors.queries.distance_fields import Field, mesh_tree, sample_field
 from robotics_bridge.sensors.queries.kernels.distance import OTHER, WALL, SolidArrays
 from robotics_bridge.sensors.queries.walls import as_solid, wall_thickness
-from robotics_bridge.sensors.sensor import QueryRequirements
 
 _UNBOUNDED = 1.0e6
 
@@ -74,7 +73,7 @@ class Solids:
         scene: what there is.
         num_envs: B; geometries that differ between environments take one row each.
         device: where.
-        required: geometries whose distances or triangles are asked for.
+        queries: ``sdf`` or ``raycast`` and the geometry of all that is asked.
         resolution: of the fields.
     """
 
@@ -83,7 +82,7 @@ class Solids:
         scene: TouchScene,
         num_envs: int,
         device: Any,
-        required: QueryRequirements,
+        queries: Collection[tuple[str, int]],
         *,
         resolution: int = 64,
     ) -> None:
@@ -105,7 +104,7 @@ class Solids:
             for row in range(self.rows if index in scene.variants else 1):
                 geometry = scene.geometry_in(row, index)
                 if id(geometry) not in seen:
-                    asked = (index in required.fields, index in required.trees)
+                    asked = ("sdf", index) in queries, ("raycast", index) in queries
                     seen[id(geometry)] = self._describe(geometry, *asked, resolution)
                 rows = row if index in scene.variants else slice(None)
                 described = seen[id(geometry)]

@@ -72,7 +72,6 @@ class ContactLoadRuntime(KinematicRuntime):
         self.finish(dt)
 
     def _make_nodes(self, room: int) -> Any:
-        """Return the lists for a state with room for some contacts."""
         c, nodes = self.context, kernels.ContactNodes()
         nodes.head = c.zeros((c.num_envs, len(c.scene.links)), int)
         for name in ("follower", "felt", "other"):

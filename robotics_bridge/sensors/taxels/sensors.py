@@ -2,25 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar, Literal, Self
+from typing import ClassVar, Literal
 
 from brainbench.core.errors import UsageError, check_name
-from brainbench.core.plugins import load_object
 from brainbench.core.reading.ranges import check_fields
 from robotics_bridge.sensors.noise.model import GRID_KNOBS, TAXEL_KNOBS
 from robotics_bridge.sensors.sensor import Convention, ProbeSensor, QuerySensor
 
-if TYPE_CHECKING:
-    from robotics_bridge.sensors.context import SuiteContext
-    from robotics_bridge.sensors.runtime import Runtime
-
 PUBLISHED_TWIST = 2.0
 """k_ω of the published parameters (N·m·s): that of a disc of 1.4 m, which drowns every other moment when an object
 turns."""
-ENGINE_RUNTIME = "robotics_bridge.sensors.taxels.contact_load:ContactLoadRuntime"
-"""Serves taxels with ``total="engine"``."""
 CONVENTIONS = ("physical", "thesis")
 
 
@@ -68,14 +60,6 @@ class KinematicTaxel(QuerySensor):
     units: ClassVar[str] = "N, N m"
     knobs: ClassVar[frozenset[str]] = GRID_KNOBS
     shared: ClassVar[tuple[str, ...]] = ("query", "convention", "total", "sticky")
-    runtime: ClassVar[str] = "robotics_bridge.sensors.taxels.runtime:KinematicRuntime"
-
-    @classmethod
-    def build(cls, sensors: Mapping[str, Self], context: SuiteContext) -> Runtime:
-        """Return the runtime that serves these sensors (by name) together."""
-        if next(iter(sensors.values())).total == "law":
-            return super().build(sensors, context)
-        return load_object(ENGINE_RUNTIME, "runtime")(sensors, context)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -89,6 +73,12 @@ class KinematicTaxel(QuerySensor):
             object.__setattr__(self, "twist", PUBLISHED_TWIST if published else self.shear * radius**2 / 2)
         if self.sticky and self.convention == "thesis":
             raise UsageError("The published law has no friction at rest; leave out friction or convention='thesis'.")
+
+    @property
+    def runtime(self) -> str:  # type: ignore[override]
+        """``package.module:Class`` of the runtime that serves it."""
+        own = "contact_load:ContactLoadRuntime" if self.total == "engine" else "runtime:KinematicRuntime"
+        return f"robotics_bridge.sensors.taxels.{own}"
 
     @property
     def sticky(self) -> bool:

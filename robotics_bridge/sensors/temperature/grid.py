@@ -83,17 +83,12 @@ class TemperatureGrid(Sensor):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if len(self.cells) != 3:
-            raise UsageError(f"A grid has three positive numbers of cells; received {self.cells!r}.")
-        for count in self.cells:
-            check_number("cells along an axis", count, least=1, whole=True)
+        check_fields(self, "cells", items=3, least=1, whole=True)
+        check_fields(self, "low", "high", items=3)
         if (self.low is None) != (self.high is None):
             raise UsageError("Give both corners of the grid, low and high, or neither.")
-        sides = () if self.low is None or self.high is None else zip(self.low, self.high, strict=False)
-        if not all(-math.inf < low < high < math.inf for low, high in sides):
-            raise UsageError(
-                f"The corners of the grid are finite and differ along every axis; received {self.low}, {self.high}."
-            )
+        if any(low >= high for low, high in zip(self.low or (), self.high or (), strict=True)):
+            raise UsageError(f"The corners of the grid differ along every axis; received {self.low}, {self.high}.")
         limits = ("contact_conductance", "warm_range", "cold_range")
         check_fields(self, *(name for name in limits if getattr(self, name) != math.inf), least=0)
         check_fields(self, "convection", "tau", "depth_weight", least=0)

@@ -24,6 +24,7 @@ class Options:
     seed: int | None = 0
     epochs: int | None = None
     rate: float = 0.1
+    corner: tuple[float, float] | None = None
 
 
 def test_none_passes_where_the_type_of_a_field_allows_it():
@@ -36,3 +37,14 @@ def test_none_passes_where_the_type_of_a_field_allows_it():
 def test_the_culprit_is_named_with_its_bound(wrong: object):
     with pytest.raises(UsageError, match="epochs must be a whole number, at least 0; received"):
         check_fields(Options(epochs=wrong), "seed", "epochs", least=0, whole=True)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("corner", [(1, 2), [0.0, 1e9], None])
+def test_a_field_of_several_numbers_has_bounds_for_each(corner: object):
+    check_fields(Options(corner=corner), "corner", items=2, least=0)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("wrong", [1.0, (1.0,), (1, 2, 3), "12", (1, -1), (1, True), (1, "2"), ()])
+def test_a_field_of_several_numbers_takes_nothing_else(wrong: object):
+    with pytest.raises(UsageError, match=r"corner (holds 2 numbers|must be a finite number)"):
+        check_fields(Options(corner=wrong), "corner", items=2, least=0)  # type: ignore[arg-type]

@@ -220,6 +220,16 @@ def test_real_values_fill_all_slots_and_simulated_ones_the_rest() -> None:
         RealTouch("agg_bool", links, (5, 4, 1), tips=tips, fingers=("thumb", "index"))
 
 
+@pytest.mark.parametrize("value", [True, "1000", 0.0, float("nan"), 1e7, None])
+@pytest.mark.parametrize("name", ["scale", "per_finger", "axes"])
+def test_a_calibration_is_made_of_numbers_that_are_not_zero(name, value) -> None:
+    given = {"scale": value, "per_finger": {"index": value}, "axes": (-1.0, value, 1.0)}
+    with pytest.raises(UsageError, match=rf"{'index' if name == 'per_finger' else name} .*{value}"):
+        PressureCalibration(**{name: given[name]})
+    with pytest.raises(UsageError, match=rf"threshold .*{value}"):
+        PressureCalibration(threshold=value)
+
+
 @pytest.mark.parametrize("observe", ["agg_force", "agg_bool"])
 def test_a_calibration_of_a_finger_that_the_hand_lacks_is_refused(observe) -> None:
     calibration = PressureCalibration(per_finger={"indx": 5.0})

@@ -43,7 +43,7 @@ def test_both_numbers_of_a_layer_are_looked_at(name, value) -> None:
     for pair in ((1.0, value), (value, 1.0)):
         with pytest.raises(UsageError, match=rf"{name} .*received {value}"):
             Layer(**{name: pair})
-    with pytest.raises(UsageError, match=f"{name} is two numbers"):
+    with pytest.raises(UsageError, match=f"{name} holds 2 numbers"):
         Layer(**{name: (1.0,)})
 
 

@@ -6,7 +6,7 @@ Letters: B environment, S source or sensor, K sample of a block, M mode, J joint
 from brainbench.core.devices import warp
 from robotics_bridge.physics.kernels.state import StateArrays, in_scene
 from robotics_bridge.sensors.kernels.readout import ReadoutArrays
-from robotics_bridge.sensors.noise.kernels.noise import normals, philox
+from robotics_bridge.sensors.noise.kernels.noise import draw, normals
 
 wp = warp()
 
@@ -95,10 +95,8 @@ def excite_modes(own: ContactSoundArrays, io: ReadoutArrays, samples: int):
     """Write the impulse of every sample (N s). Dim [K, B, S]; impacts start at the first sample."""
     k, env, s = wp.tid()
     source = own.sources[s]
-    earlier = own.before[env, s]
     # What is held when an episode begins was not struck: the first update only takes note of the force.
-    if io.age[env] == 0:
-        earlier = own.force[env, s]
+    earlier = wp.where(io.age[env] == 0, own.force[env, s], own.before[env, s])
     # Source and filter: a rise of force is an impact and excites the modes with an impulse, sliding excites them with
     # noise.
     rise = own.force[env, s] - earlier
@@ -109,10 +107,7 @@ def excite_modes(own: ContactSoundArrays, io: ReadoutArrays, samples: int):
         u = source.impact * rise * io.dt * (float(1.0) - wp.cos(phase)) / (float(source.pulse) + float(1.0))
     rub = own.rubbing[env, s]
     if rub > float(0.0) and source.scrape > float(0.0):
-        last = (wp.uint32(io.episode[env]) << wp.uint32(8)) | wp.uint32(wp.static(SCRAPE))
-        w0, w1, _w2, _w3 = philox(
-            wp.uint32(k), wp.uint32(io.env_offset + env), wp.uint32(io.age[env]), last, source.key_low, source.key_high
-        )
+        w0, w1, _w2, _w3 = draw(source, io.env_offset + env, k, io.age[env], io.episode[env], wp.static(SCRAPE))
         z = normals(w0, w1)
         # White noise of a density that does not depend on the sample rate.
         u = u + source.scrape * rub * z[0] * wp.sqrt(io.dt / float(samples))
@@ -128,11 +123,8 @@ def ring_modes(own: ContactSoundArrays, io: ReadoutArrays, samples: int):
     own.rubbing[env, s] = float(0.0)
     broken = (io.status[env] & 1) != 0
     for q in range(own.first.shape[0]):
-        a = own.y1[q, env, s]
-        b = own.y2[q, env, s]
-        if io.age[env] == 0:
-            a = wp.vec4(float(0.0), float(0.0), float(0.0), float(0.0))
-            b = a
+        a = wp.where(io.age[env] == 0, wp.vec4(), own.y1[q, env, s])
+        b = wp.where(io.age[env] == 0, wp.vec4(), own.y2[q, env, s])
         # y[k] = 2 r cos θ y[k−1] − r² y[k−2] + u[k] (4.32), with poles of radius r < 1, hence stable at any block
         # length.
         c1 = own.first[q, s]
@@ -149,7 +141,7 @@ def ring_modes(own: ContactSoundArrays, io: ReadoutArrays, samples: int):
             io.truth[k, env, s] = total
         # A resonator keeps a NaN for ever, so its memory is emptied.
         if broken or not wp.isfinite(wp.dot(a, a)):
-            a = wp.vec4(float(0.0), float(0.0), float(0.0), float(0.0))
+            a = wp.vec4()
             b = a
         own.y1[q, env, s] = a
         own.y2[q, env, s] = b
@@ -207,18 +199,13 @@ def sound_drives(own: DriveSoundArrays, io: ReadoutArrays, samples: int):
     d = own.settings[own.part[j]]
     loud = d.load * wp.abs(own.effort[env, j]) + d.power * wp.abs(own.effort[env, j] * own.speed[env, j])
     fast = wp.abs(own.speed[env, j])
-    loud0 = own.last_loud[env, j]
-    fast0 = own.last_speed[env, j]
-    turn = own.phase[env, j]
-    hum = own.hum_phase[env, j]
-    if io.age[env] == 0:
-        loud0 = loud
-        fast0 = fast
-        turn = float(0.0)
-        hum = float(0.0)
+    fresh = io.age[env] == 0
+    loud0 = wp.where(fresh, loud, own.last_loud[env, j])
+    fast0 = wp.where(fresh, fast, own.last_speed[env, j])
+    turn = wp.where(fresh, float(0.0), own.phase[env, j])
+    hum = wp.where(fresh, float(0.0), own.hum_phase[env, j])
     h = io.dt / float(samples)
     nyquist = float(0.5) / h
-    last = (wp.uint32(io.episode[env]) << wp.uint32(8)) | wp.uint32(wp.static(FRICTION))
     for k in range(samples):
         # Loudness and speed change evenly within a block, and phases go on from the last one: steps between blocks
         # would click.
@@ -236,10 +223,8 @@ def sound_drives(own: DriveSoundArrays, io: ReadoutArrays, samples: int):
             weight = weight * d.rolloff
         value = (loud0 + share * (loud - loud0)) * tone
         if d.friction > float(0.0) and now > float(0.0):
-            at = wp.uint32(own.number[j]) + wp.uint32(k) * wp.uint32(4096)
-            w0, w1, _w2, _w3 = philox(
-                at, wp.uint32(io.env_offset + env), wp.uint32(io.age[env]), last, d.key_low, d.key_high
-            )
+            at = own.number[j] + k * 4096
+            w0, w1, _w2, _w3 = draw(d, io.env_offset + env, at, io.age[env], io.episode[env], wp.static(FRICTION))
             z = normals(w0, w1)
             value = value + d.friction * now * z[0]
         hum = hum + d.hum_frequency * h
@@ -288,9 +273,7 @@ def measure_paths(
     if listener >= 0:
         ear = wp.transform_point(pose[env, listener], place)
     r = wp.length(wp.transform_get_translation(pose[env, links[s]]) - ear)
-    before[env, s] = now[env, s]
-    if age[env] == 0:
-        before[env, s] = r
+    before[env, s] = wp.where(age[env] == 0, r, now[env, s])
     now[env, s] = r
 
 
@@ -321,12 +304,8 @@ def mix_sources(
         lag = wp.min(r / speed * rate, float(size - samples - 2))
         whole = int(wp.floor(lag))
         part = lag - float(whole)
-        here = float(0.0)
-        there = float(0.0)
         # What was before the reset is silence.
-        if whole <= known:
-            here = ring[(slot + k - whole + size) % size, env, s]
-        if whole + 1 <= known:
-            there = ring[(slot + k - whole - 1 + size) % size, env, s]
+        here = wp.where(whole <= known, ring[(slot + k - whole + size) % size, env, s], float(0.0))
+        there = wp.where(whole + 1 <= known, ring[(slot + k - whole - 1 + size) % size, env, s], float(0.0))
         total = total + (here + part * (there - here)) / wp.pow(wp.max(r, nearest), power)
     out[k, env] = total

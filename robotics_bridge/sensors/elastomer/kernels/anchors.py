@@ -17,7 +17,7 @@ wp = warp()
 
 
 @cache
-def anchor_kernel(kinds: frozenset[int], raycast: bool, side_by_side: bool, hoisted: bool = False) -> Any:
+def anchor_kernel(kinds: frozenset[int], raycast: bool, side_by_side: bool) -> Any:
     """Return the kernel that follows surface points inside the elastomer (before 4.20).
 
     A point sets its anchor where it sinks below −enter and loses it above +leave, or when its geometry no longer
@@ -28,8 +28,8 @@ def anchor_kernel(kinds: frozenset[int], raycast: bool, side_by_side: bool, hois
     Args:
         kinds: of the pad's geometries.
         raycast: ask triangles.
-        side_by_side: environments are neighbouring threads, dim [S · blocks, B]; otherwise dim [B, S · blocks].
-        hoisted: what a pad of one geometry asks for each point is worked out once per block (costs registers).
+        side_by_side: environments are neighbouring threads, dim [S · blocks, B]; otherwise dim [B, S · blocks], and
+            what a pad of one geometry asks for each point is worked out once per block (costs registers).
     """
     shapes = shape_functions(kinds, raycast)
     shape_of, distance_to, distance = shapes.shape_of, shapes.distance_to, shapes.distance
@@ -103,7 +103,7 @@ def anchor_kernel(kinds: frozenset[int], raycast: bool, side_by_side: bool, hois
         shift = wp.vec3f()
         limit = float(0.0)
         alone = False
-        if wp.static(hoisted):
+        if wp.static(not side_by_side):
             alone = gel.own_last - gel.own_first == 1
             if alone:
                 pad = pads.own[gel.own_first]
@@ -123,10 +123,9 @@ def anchor_kernel(kinds: frozenset[int], raycast: bool, side_by_side: bool, hois
                     kept = pads.anchor[index, 0, env]
                 z = rotation @ (p - offset)
                 phi = float(0.0)
-                if wp.static(not hoisted):
-                    phi = height_over(solids, pads.own, gel, solid_row, z)
-                elif alone:
-                    phi = distance_to(solids.values, shape, turn @ p + shift, wp.vec3f(), limit)[3]
+                if alone:
+                    if wp.static(not side_by_side):
+                        phi = distance_to(solids.values, shape, turn @ p + shift, wp.vec3f(), limit)[3]
                 else:
                     phi = height_over(solids, pads.own, gel, solid_row, z)
                 # Two heights as in a Schmitt trigger: an anchor set at −enter is lost only above +leave, so that a

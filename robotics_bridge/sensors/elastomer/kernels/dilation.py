@@ -8,7 +8,7 @@ from functools import cache
 from typing import Any
 
 from brainbench.core.devices import warp
-from robotics_bridge.sensors.kernels.readout import ProbeArrays, ReadoutArrays, idle, lost, readout_functions
+from robotics_bridge.sensors.kernels.readout import ProbeArrays, ReadoutArrays, readout_functions, silenced
 from robotics_bridge.sensors.noise.kernels.noise import episode_draw, radius_noise
 from robotics_bridge.sensors.probes.kernels.probe import deepest_function
 from robotics_bridge.sensors.queries.kernels.distance import SolidArrays
@@ -123,42 +123,6 @@ def indent_kernel(kinds: frozenset[int], raycast: bool, planes: int, in_turn: bo
     """
     deepest = deepest_function(kinds, raycast)
 
-    @wp.func
-    def indent_one(
-        probes: ProbeArrays,
-        solids: SolidArrays,
-        pairs: PairArrays,
-        io: ReadoutArrays,
-        pads: ElastomerArrays,
-        env: int,
-        n: int,
-    ):
-        """Ask how deep one marker lies."""
-        part = probes.part[n]
-        h = float(0.0)
-        noisy = float(0.0)
-        if probes.radius[n] > 0.0 and pairs.count[env, probes.slot[n]] > 0:
-            best, _normal, _place = deepest(probes, solids, pairs, env, n, 0.0)
-            h = wp.max(-best, 0.0)
-            if wp.static(planes == 2):
-                error = radius_noise(io.knobs[part], env + io.env_offset, probes.probe[n], io.age[env], io.episode[env])
-                noisy = wp.max(error - best, 0.0)
-            # A stamp in place of a flag needs no clearing: pads that nothing touches skip all later sums.
-            if h > 0.0 or noisy > 0.0:
-                pads.stamp[env, part] = mark_of(io, env)
-        pads.height[0, env, n] = h
-        if wp.static(planes == 2):
-            pads.height[1, env, n] = noisy
-        # The bulge h^α is asked for by many markers, so it is raised once.
-        for plane in range(wp.static(planes)):
-            value = h
-            if plane == 1:
-                value = noisy
-            raised = float(0.0)
-            if value > 0.0:
-                raised = wp.pow(value, pads.gels[part].exponent)
-            pads.height[wp.static(planes) + plane, env, n] = raised
-
     @wp.kernel(module="unique")
     def indent(
         probes: ProbeArrays,
@@ -167,12 +131,36 @@ def indent_kernel(kinds: frozenset[int], raycast: bool, planes: int, in_turn: bo
         io: ReadoutArrays,
         pads: ElastomerArrays,
     ):
-        env, n = wp.tid()
+        env, first = wp.tid()
+        end = first + 1
         if wp.static(in_turn):
-            for m in range(probes.radius.shape[0]):
-                indent_one(probes, solids, pairs, io, pads, env, m)
-        else:
-            indent_one(probes, solids, pairs, io, pads, env, n)
+            end = probes.radius.shape[0]
+        for n in range(first, end):
+            part = probes.part[n]
+            h = float(0.0)
+            noisy = float(0.0)
+            if probes.radius[n] > 0.0 and pairs.count[env, probes.slot[n]] > 0:
+                best, _normal, _place = deepest(probes, solids, pairs, env, n, 0.0)
+                h = wp.max(-best, 0.0)
+                if wp.static(planes == 2):
+                    number = env + io.env_offset
+                    error = radius_noise(io.knobs[part], number, probes.probe[n], io.age[env], io.episode[env])
+                    noisy = wp.max(error - best, 0.0)
+                # A stamp in place of a flag needs no clearing: pads that nothing touches skip all later sums.
+                if h > 0.0 or noisy > 0.0:
+                    pads.stamp[env, part] = mark_of(io, env)
+            pads.height[0, env, n] = h
+            if wp.static(planes == 2):
+                pads.height[1, env, n] = noisy
+            # The bulge h^α is asked for by many markers, so it is raised once.
+            for plane in range(wp.static(planes)):
+                value = h
+                if plane == 1:
+                    value = noisy
+                raised = float(0.0)
+                if value > 0.0:
+                    raised = wp.pow(value, pads.gels[part].exponent)
+                pads.height[wp.static(planes) + plane, env, n] = raised
 
     return indent
 
@@ -186,17 +174,20 @@ def spread_kernel(planes: int, in_turn: bool = False) -> Any:
     With one-dimensional weights w(k) = exp(−λ (k·pitch)²): Σ h w, Σ h k·pitch·w and Σ h^α w.
     """
 
-    @wp.func
-    def spread_one(
+    @wp.kernel(module="unique")
+    def spread(
         probes: ProbeArrays,
         io: ReadoutArrays,
         pads: ElastomerArrays,
-        env: int,
-        n: int,
     ):
-        """Sum over the columns around one marker."""
-        part = probes.part[n]
-        if pads.stamp[env, part] == mark_of(io, env):
+        env, first = wp.tid()
+        end = first + 1
+        if wp.static(in_turn):
+            end = probes.radius.shape[0]
+        for n in range(first, end):
+            part = probes.part[n]
+            if pads.stamp[env, part] != mark_of(io, env):
+                continue
             gel = pads.gels[part]
             place = probes.probe[n] % gel.columns
             row = n - place
@@ -220,19 +211,6 @@ def spread_kernel(planes: int, in_turn: bool = False) -> Any:
                 pads.spread[3 * plane, env, n] = plain
                 pads.spread[3 * plane + 1, env, n] = tilted
                 pads.spread[3 * plane + 2, env, n] = raised
-
-    @wp.kernel(module="unique")
-    def spread(
-        probes: ProbeArrays,
-        io: ReadoutArrays,
-        pads: ElastomerArrays,
-    ):
-        env, n = wp.tid()
-        if wp.static(in_turn):
-            for m in range(probes.radius.shape[0]):
-                spread_one(probes, io, pads, env, m)
-        else:
-            spread_one(probes, io, pads, env, n)
 
     return spread
 
@@ -294,22 +272,21 @@ def marker_kernel(
     readout = readout_functions(mode, hysteresis, walk, 3)
     emit_six, recall_six = readout.emit_six, readout.recall_six
 
-    @wp.func
-    def read_one(
+    @wp.kernel(module="unique")
+    def markers(
         probes: ProbeArrays,
         io: ReadoutArrays,
         pads: ElastomerArrays,
         pairs: PairArrays,
         cloud: CloudArrays,
-        env: int,
-        n: int,
     ):
-        """Read one marker."""
-        if probes.radius[n] <= 0.0:
-            idle(io, 3, env, n)
-        elif (io.status[env] & 1) != 0:
-            lost(io, 3, env, n)
-        else:
+        env, first = wp.tid()
+        end = first + 1
+        if wp.static(in_turn):
+            end = probes.radius.shape[0]
+        for n in range(first, end):
+            if silenced(io, 3, env, n, probes.radius[n]):
+                continue
             part = probes.part[n]
             probe = probes.probe[n]
             gel = pads.gels[part]
@@ -392,7 +369,7 @@ def marker_kernel(
                         at = packed // 64 - 1
                         rotation = wp.transpose(pairs.rotation[env, at])
                         offset = pairs.offset[env, at]
-                        first = block_of(cloud, pads.tracked, row, pairs.geometry[env, at], block - part * pads.blocks)
+                        start = block_of(cloud, pads.tracked, row, pairs.geometry[env, at], block - part * pads.blocks)
                         # Σ w (z − anchor) with z = rotation (p − offset): the pose of the block is applied once.
                         here = wp.transpose(rotation) @ x + offset
                         up = wp.transpose(rotation) @ normal
@@ -404,7 +381,7 @@ def marker_kernel(
                         for k in range(packed % 64):
                             own = int(pads.order[block * wp.static(BLOCK) + k, env])
                             index = block * wp.static(BLOCK) + own
-                            p = cloud.point[first * wp.static(BLOCK) + own]
+                            p = cloud.point[start * wp.static(BLOCK) + own]
                             strength = pads.drive[block * wp.static(BLOCK) + k, env]
                             kept = anchor_of(pads, index, env)
                             if wp.static(layered):
@@ -440,20 +417,5 @@ def marker_kernel(
             all_signal = wp.spatial_vectorf(signal[0], signal[1], signal[2], 0.0, 0.0, 0.0)
             lag, drift = recall_six(io, env, n, age)
             emit_six(io, io.knobs[part], env, n, probe, age, episode, fixed, lag, drift, all_truth, all_signal)
-
-    @wp.kernel(module="unique")
-    def markers(
-        probes: ProbeArrays,
-        io: ReadoutArrays,
-        pads: ElastomerArrays,
-        pairs: PairArrays,
-        cloud: CloudArrays,
-    ):
-        env, n = wp.tid()
-        if wp.static(in_turn):
-            for m in range(probes.radius.shape[0]):
-                read_one(probes, io, pads, pairs, cloud, env, m)
-        else:
-            read_one(probes, io, pads, pairs, cloud, env, n)
 
     return markers

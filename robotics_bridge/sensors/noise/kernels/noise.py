@@ -9,6 +9,8 @@ Order of the measured branch: radius noise and gain → crosstalk → hysteresis
 quantisation → dead taxels → (threshold, by the sensor) → delay. Letters: B environment, N probe, C channel.
 """
 
+from typing import Any
+
 from brainbench.core.devices import warp
 from robotics_bridge.sensors.kernels.series import power_of_two, split_log
 
@@ -72,8 +74,8 @@ def philox(a: wp.uint32, b: wp.uint32, c: wp.uint32, d: wp.uint32, key_low: wp.u
 
 
 @wp.func
-def draw(p: NoiseParams, env: int, probe: int, age: int, episode: int, purpose: int):
-    """Return four random words; ``env`` is the number in the whole experiment."""
+def draw(p: Any, env: int, probe: int, age: int, episode: int, purpose: int):
+    """Return four random words of a structure's key; ``env`` is the number in the whole experiment."""
     # The purpose takes the low eight bits, so that draws for different ends in one update never share a counter.
     last = (wp.uint32(episode) << wp.uint32(8)) | wp.uint32(purpose)
     return philox(wp.uint32(probe), wp.uint32(env), wp.uint32(age), last, p.key_low, p.key_high)
@@ -126,16 +128,6 @@ def radius_noise(p: NoiseParams, env: int, probe: int, age: int, episode: int) -
 
 
 @wp.func
-def gain(p: NoiseParams, env: int, probe: int, episode: int) -> float:
-    """Return the gain γ of a probe in this episode (4.24)."""
-    if p.gain_high <= p.gain_low:
-        return p.gain_low
-    # Age 0 in the counter: the same number in every update of the episode, without storing it.
-    w0, _w1, _w2, _w3 = draw(p, env, probe, 0, episode, wp.static(EPISODE))
-    return p.gain_low + (p.gain_high - p.gain_low) * uniform(w0)
-
-
-@wp.func
 def decay(t: float) -> float:
     """Return exp(−t) for t ≥ 0, by a series."""
     return power_of_two(float(0.0), wp.max(t * float(-1.4426950408889634), float(-150.0)))
@@ -152,9 +144,10 @@ def pair_normals(p: NoiseParams, env: int, probe: int, pair: int, age: int, epis
 
 @wp.func
 def episode_draw(p: NoiseParams, env: int, probe: int, episode: int) -> wp.vec3:
-    """Return what holds for an episode: (gain, 1 if the probe is dead, the value it is stuck at)."""
+    """Return what holds for an episode: (gain γ of 4.24, 1 if the probe is dead, the value it is stuck at)."""
     out = wp.vec3(p.gain_low, float(0.0), float(0.0))
     if p.gain_high > p.gain_low or p.dead_probability > float(0.0):
+        # Age 0 in the counter: the same numbers in every update of the episode, without storing them.
         w0, w1, w2, _w3 = draw(p, env, probe, 0, episode, wp.static(EPISODE))
         if p.gain_high > p.gain_low:
             out[0] = p.gain_low + (p.gain_high - p.gain_low) * uniform(w0)
@@ -175,17 +168,18 @@ def apply_drawn(
     hysteresis_state: float,
     walk_state: float,
 ) -> wp.vec3:
-    """Return what :func:`apply_noise` does, from numbers drawn before.
+    """Return the measured value of one channel and the two memories to keep for the next update.
 
     Args:
         p: Knobs of the sensor.
-        x: The signal.
+        x: The signal after radius noise, gain and crosstalk. A value that is not finite is returned as it is, and the
+            memories as they were.
         white: Standard normal number of the white noise.
         walk: Standard normal number of the drift.
         fixed: Of :func:`episode_draw`.
         fading: e^(−Δt/τ).
-        hysteresis_state: As there.
-        walk_state: As there.
+        hysteresis_state: e^(−Δt/τ) ξ − x of the last update (0 at first), from which 4.26 follows.
+        walk_state: Drift d of the last update (0 at first).
     """
     # Equations 4.26 and 4.27: the state kept is e^(−Δt/τ) ξ − x, so ξ of this update needs no copy of the last signal.
     # Knobs that are off add zeros, which costs less than asking.
@@ -199,50 +193,6 @@ def apply_drawn(
     # A lost reading passes as it is and leaves the memories untouched, so that later readings are valid again.
     finite = wp.isfinite(x)
     return wp.vec3(wp.where(finite, y, x), wp.where(finite, lag, hysteresis_state), wp.where(finite, drift, walk_state))
-
-
-@wp.func
-def apply_noise(
-    p: NoiseParams,
-    x: float,
-    env: int,
-    probe: int,
-    channel: int,
-    age: int,
-    episode: int,
-    dt: float,
-    hysteresis_state: float,
-    walk_state: float,
-) -> wp.vec3:
-    """Return the measured value of one channel and the two memories to keep for the next update.
-
-    Args:
-        p: Knobs of the sensor.
-        x: The signal after radius noise, gain and crosstalk. A value that is not finite is returned as it
-            is, and the memories as they were.
-        env: Number of the environment in the whole experiment.
-        probe: Number of the probe within its sensor.
-        channel: Channel.
-        age: Updates since the reset, 0 at the first.
-        episode: Resets so far.
-        dt: Time step [s].
-        hysteresis_state: e^(−Δt/τ) ξ − x of the last update (0 at first), from which 4.26 follows.
-        walk_state: Drift d of the last update (0 at first).
-    """
-    # One call of Philox yields four words: white noise and drift of two neighbouring channels.
-    z = wp.vec4()
-    if p.white > float(0.0) or p.walk > float(0.0):
-        z = pair_normals(p, env, probe, channel // 2, age, episode)
-    white = z[0]
-    walk = z[1]
-    if channel % 2 == 1:
-        white = z[2]
-        walk = z[3]
-    fading = float(0.0)
-    if p.hysteresis != float(0.0):
-        fading = decay(dt / p.tau)
-    fixed = episode_draw(p, env, probe, episode)
-    return apply_drawn(p, x, white, walk, fixed, fading, hysteresis_state, walk_state)
 
 
 @wp.func
@@ -277,10 +227,18 @@ def measure(
     knobs = p[part[n]]
     # Numbers belong to the environment of the whole experiment: splitting it over devices does not change them.
     number = env_offset + env
-    scale = float(1.0)
-    if gained == 0:
-        scale = gain(knobs, number, probe[n], episode[env])
+    fixed = episode_draw(knobs, number, probe[n], episode[env])
+    scale = wp.where(gained == 0, fixed[0], float(1.0))
+    fading = float(0.0)
+    if knobs.hysteresis != float(0.0):
+        fading = decay(dt / knobs.tau)
     for channel in range(x.shape[0]):
+        # One call of Philox yields four words: white noise and drift of two neighbouring channels.
+        z = wp.vec4()
+        if knobs.white > float(0.0) or knobs.walk > float(0.0):
+            z = pair_normals(knobs, number, probe[n], channel // 2, age[env], episode[env])
+        white = wp.where(channel % 2 == 0, z[0], z[2])
+        step = wp.where(channel % 2 == 0, z[1], z[3])
         lag = float(0.0)
         drift = float(0.0)
         if age[env] > 0:
@@ -288,9 +246,7 @@ def measure(
                 lag = hysteresis[channel, env, n]
             if walk.shape[1] > 0:
                 drift = walk[channel, env, n]
-        y = apply_noise(
-            knobs, scale * x[channel, env, n], number, probe[n], channel, age[env], episode[env], dt, lag, drift
-        )
+        y = apply_drawn(knobs, scale * x[channel, env, n], white, step, fixed, fading, lag, drift)
         out[channel, env, n] = y[0]
         if hysteresis.shape[1] > 0:
             hysteresis[channel, env, n] = y[1]

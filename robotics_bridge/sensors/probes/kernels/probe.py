@@ -8,15 +8,8 @@ from functools import cache
 from typing import Any
 
 from brainbench.core.devices import warp
-from robotics_bridge.sensors.kernels.readout import (
-    CLEAN,
-    ProbeArrays,
-    ReadoutArrays,
-    idle,
-    lost,
-    readout_functions,
-)
-from robotics_bridge.sensors.noise.kernels.noise import gain, radius_noise
+from robotics_bridge.sensors.kernels.readout import CLEAN, ProbeArrays, ReadoutArrays, readout_functions, silenced
+from robotics_bridge.sensors.noise.kernels.noise import episode_draw, radius_noise
 from robotics_bridge.sensors.queries.kernels.distance import FAR, WALL, SolidArrays, shape_functions
 from robotics_bridge.sensors.queries.kernels.pairs import PairArrays
 
@@ -73,7 +66,7 @@ def distance_kernel(
     kinds: frozenset[int], raycast: bool, nearest: bool, mode: int, hysteresis: bool, walk: bool
 ) -> Any:
     """Return the kernel of SurfaceDistanceProbe. Dim [B, N]."""
-    deepest, emit = deepest_function(kinds, raycast), readout_functions(mode, hysteresis, walk).emit
+    deepest, emit = deepest_function(kinds, raycast), readout_functions(mode, hysteresis, walk, 1).emit
 
     @wp.kernel(module="unique")
     def surface_distance(
@@ -85,22 +78,13 @@ def distance_kernel(
         points: wp.array3d(dtype=wp.float32),
     ):
         env, n = wp.tid()
-        if probes.radius[n] <= 0.0:
-            idle(io, 1, env, n)
+        if silenced(io, 1, env, n, probes.radius[n]):
             if wp.static(nearest):
                 for axis in range(3):
-                    points[axis, env, n] = 0.0
-            return
-        if (io.status[env] & 1) != 0:
-            lost(io, 1, env, n)
-            if wp.static(nearest):
-                for axis in range(3):
-                    points[axis, env, n] = wp.static(float("nan"))
+                    points[axis, env, n] = wp.where(probes.radius[n] > 0.0, wp.nan, 0.0)
             return
         part = probes.part[n]
         probe = probes.probe[n]
-        age = io.age[env]
-        episode = io.episode[env]
         best, normal, place = deepest(probes, solids, pairs, env, n, wp.static(FAR))
         if wp.static(nearest):
             # The gradient of a signed distance has unit length: one step of that distance along it ends on the surface.
@@ -110,8 +94,8 @@ def distance_kernel(
         d = wp.where(place >= 0, wp.min(best, limits[part]), limits[part])
         signal = d
         if wp.static(mode != CLEAN):
-            signal = d + radius_noise(io.knobs[part], env + io.env_offset, probe, age, episode)
-        emit(io, io.knobs[part], env, n, probe, 0, age, episode, d, signal)
+            signal = d + radius_noise(io.knobs[part], env + io.env_offset, probe, io.age[env], io.episode[env])
+        emit(io, io.knobs[part], env, n, probe, d, signal)
 
     return surface_distance
 
@@ -127,8 +111,7 @@ def latch(before: float, age: int, value: float, limits: wp.vec2f) -> float:
 @cache
 def depth_kernel(kinds: frozenset[int], raycast: bool, binary: bool, mode: int, hysteresis: bool, walk: bool) -> Any:
     """Return the kernel of ContactDepthProbe (4.2) or, ``binary``, of ContactProbe (4.3). Dim [B, N]."""
-    deepest, readout = deepest_function(kinds, raycast), readout_functions(mode, hysteresis, walk)
-    emit, measure = readout.emit, readout.measure
+    deepest, emit = deepest_function(kinds, raycast), readout_functions(mode, hysteresis, walk, 1).emit
 
     @wp.kernel(module="unique")
     def contact_depth(
@@ -140,11 +123,7 @@ def depth_kernel(kinds: frozenset[int], raycast: bool, binary: bool, mode: int, 
     ):
         env, n = wp.tid()
         radius = probes.radius[n]
-        if radius <= 0.0:
-            idle(io, 1, env, n)
-            return
-        if (io.status[env] & 1) != 0:
-            lost(io, 1, env, n)
+        if silenced(io, 1, env, n, radius):
             return
         part = probes.part[n]
         probe = probes.probe[n]
@@ -157,14 +136,15 @@ def depth_kernel(kinds: frozenset[int], raycast: bool, binary: bool, mode: int, 
             noisy = wp.max(radius + radius_noise(io.knobs[part], env + io.env_offset, probe, age, episode), 0.0)
             # Radius noise (4.23) and gain (4.24) act before anything else of the measured branch; the truth sees
             # neither.
-            signal = wp.max(noisy - best, 0.0) * gain(io.knobs[part], env + io.env_offset, probe, episode)
+            fixed = episode_draw(io.knobs[part], env + io.env_offset, probe, episode)
+            signal = wp.max(noisy - best, 0.0) * fixed[0]
+        true_bit = io.truth[0, env, n]
+        bit = io.measured[0, env, n]
+        emit(io, io.knobs[part], env, n, probe, truth, signal)
         if wp.static(binary):
+            # Each branch latches on its own last bit (4.3): noise must not switch the true contact.
             if wp.static(mode != CLEAN):
-                # Each branch latches on its own last bit (4.3): noise must not switch the true contact.
-                y = measure(io, io.knobs[part], env, n, probe, 0, age, episode, signal)
-                io.measured[0, env, n] = latch(io.measured[0, env, n], age, y, limits[part])
-            io.truth[0, env, n] = latch(io.truth[0, env, n], age, truth, limits[part])
-        else:
-            emit(io, io.knobs[part], env, n, probe, 0, age, episode, truth, signal)
+                io.measured[0, env, n] = latch(bit, age, io.measured[0, env, n], limits[part])
+            io.truth[0, env, n] = latch(true_bit, age, truth, limits[part])
 
     return contact_depth

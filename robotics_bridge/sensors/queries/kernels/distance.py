@@ -148,11 +148,7 @@ def ellipsoid(size: wp.vec3f, x: wp.vec3f) -> wp.vec4f:
         else:
             high = t
     t = 0.5 * (low + high)
-    near = wp.vec3f(
-        squares[0] * y[0] / (squares[0] + t),
-        squares[1] * y[1] / (squares[1] + t),
-        squares[2] * y[2] / (squares[2] + t),
-    )
+    near = wp.cw_div(wp.cw_mul(squares, y), squares + wp.vec3f(t))
     n = wp.normalize(wp.cw_div(near, squares))
     distance = wp.dot(y - near, n)
     sx = wp.where(x[0] < 0.0, -1.0, 1.0)

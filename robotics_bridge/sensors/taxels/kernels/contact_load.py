@@ -106,14 +106,9 @@ def list_contacts(
         return
     env = state.contact_env[c]
     # The normal leads from the first to the second, which it pushes away.
-    sign = float(-1.0)
-    own = pair[0]
-    other = pair[1]
-    if node % 2 == 1:
-        sign = float(1.0)
-        own = pair[1]
-        other = pair[0]
-    link = link_of[own]
+    sign = wp.where(node % 2 == 0, -1.0, 1.0)
+    other = pair[1 - node % 2]
+    link = link_of[pair[node % 2]]
     if plan.sensors[link, 0] < 0:
         return
     here = state.pose[env, link]

@@ -14,9 +14,8 @@ from robotics_bridge.sensors.kernels.readout import (
     STAGED,
     ProbeArrays,
     ReadoutArrays,
-    idle,
-    lost,
     readout_functions,
+    silenced,
 )
 from robotics_bridge.sensors.kernels.series import power as series_power
 from robotics_bridge.sensors.kernels.wide import entry_of, load_four, store_planes
@@ -174,10 +173,7 @@ def kinematic_kernel(
         n = span[0]
         if (io.status[env] & 1) != 0:
             while n < span[1]:
-                if probes.radius[n] > 0.0:
-                    lost(io, 6, env, n)
-                else:
-                    idle(io, 6, env, n)
+                silenced(io, 6, env, n, probes.radius[n])
                 n += span[2]
             return
         first = pairs.first[slot]
@@ -301,7 +297,7 @@ def kinematic_kernel(
             elif wp.static(summed):
                 press.total[env, n] = 0.0
             else:
-                idle(io, 6, env, n)
+                silenced(io, 6, env, n, radius)
             n += span[2]
             if wp.static(single):
                 # Told so, the compiler keeps nothing for further taxels in registers.

@@ -13,9 +13,8 @@ from robotics_bridge.sensors.kernels.readout import (
     FUSED,
     ProbeArrays,
     ReadoutArrays,
-    idle,
-    lost,
     readout_functions,
+    silenced,
 )
 from robotics_bridge.sensors.noise.kernels.noise import episode_draw, radius_noise
 from robotics_bridge.sensors.queries.kernels.pairs import PairArrays
@@ -117,13 +116,6 @@ def proximity_kernel(physical: bool, mode: int, hysteresis: bool, walk: bool) ->
             turn = wp.cross(x, f) - turn
         return wp.spatial_vectorf(f[0], f[1], f[2], turn[0], turn[1], turn[2])
 
-    @wp.func
-    def overlap(far: float, radius: float, noisy: float) -> wp.vec2f:
-        """Return the overlap of a point with the sensing sphere, and with that of the measured branch."""
-        if wp.static(mode == CLEAN):
-            return wp.vec2f(wp.max(radius - far, 0.0), 0.0)
-        return wp.vec2f(wp.max(radius - far, 0.0), wp.max(noisy - far, 0.0))
-
     @wp.kernel(module="unique", grid_stride=False, launch_bounds=(256, 2 if mode == FUSED else 3))
     def proximity(
         probes: ProbeArrays,
@@ -136,11 +128,7 @@ def proximity_kernel(physical: bool, mode: int, hysteresis: bool, walk: bool) ->
     ):
         env, n = wp.tid()
         radius = probes.radius[n]
-        if radius <= 0.0:
-            idle(io, 6, env, n)
-        elif (io.status[env] & 1) != 0:
-            lost(io, 6, env, n)
-        else:
+        if not silenced(io, 6, env, n, radius):
             row = env % cells.shape.shape[0]
             slot = probes.slot[n]
             part = probes.part[n]
@@ -186,8 +174,10 @@ def proximity_kernel(physical: bool, mode: int, hysteresis: bool, walk: bool) ->
                             away = cloud.point[cells.entry[entry]] - here
                             square = wp.dot(away, away)
                             if square < reach * reach:
-                                # P of 4.11, and Σ P (p − x) as the lever from which torque and slip follow.
-                                overlaps = overlap(wp.sqrt(square), radius, noisy)
+                                # P of 4.11 with the sensing sphere and with that of the measured branch, and
+                                # Σ P (p − x) as the lever from which torque and slip follow.
+                                far = wp.sqrt(square)
+                                overlaps = wp.vec2f(wp.max(radius - far, 0.0), wp.max(noisy - far, 0.0))
                                 own_mass += overlaps
                                 lever += overlaps[0] * away
                                 if wp.static(mode != CLEAN):

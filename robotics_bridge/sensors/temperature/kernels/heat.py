@@ -189,9 +189,7 @@ def conductance_of(
     across = wp.abs(facing[0]) * grid.cell[0] + wp.abs(facing[1]) * grid.cell[1] + wp.abs(facing[2]) * grid.cell[2]
     share = wp.min(heat.covered[env, index] * across / volume, float(1.0))
     # Mean of 1/√t over the step, which its middle misses by 29 % in the first one.
-    past = float(0.0)
-    if io.age[env] > 0:
-        past = heat.touched[env, index]
+    past = wp.where(io.age[env] > 0, heat.touched[env, index], float(0.0))
     root = float(0.5) * (wp.sqrt(past) + wp.sqrt(past + io.dt))
     spread = root * wp.sqrt(grid.diffusivity)
     length = slab_length(spread, across, share)
@@ -356,12 +354,8 @@ def exchange_heat(heat: HeatArrays, io: ReadoutArrays, out: wp.array2d(dtype=wp.
     if (io.status[env] & 1) != 0 or not wp.isfinite(inflow):
         out[env, n] = t
         return
-    if g > float(0.0) and io.age[env] > 0:
-        heat.touched[env, n] = heat.touched[env, n] + io.dt
-    elif g > float(0.0):
-        heat.touched[env, n] = io.dt
-    else:
-        heat.touched[env, n] = float(0.0)
+    past = wp.where(io.age[env] > 0, heat.touched[env, n], float(0.0))
+    heat.touched[env, n] = wp.where(g > float(0.0), past + io.dt, float(0.0))
     # Steps as short as 1e-5 s change less than single precision can hold.
     surroundings = grid.ambient + float(273.15)
     start = t

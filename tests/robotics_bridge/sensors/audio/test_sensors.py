@@ -260,7 +260,7 @@ def test_a_microphone_stands_somewhere(place, value):
     position[place] = value
     with pytest.raises(UsageError, match=rf"position .*received {value}"):
         Microphone(position=tuple(position))
-    with pytest.raises(UsageError, match="three numbers"):
+    with pytest.raises(UsageError, match="position holds 3 numbers"):
         Microphone(position=(0.0, 1.0))  # type: ignore[arg-type]
 
 

@@ -141,6 +141,19 @@ def test_a_preset_made_from_a_file_loads_again(tmp_path):
     assert [name for name, _estimate in describe(found)][:2] == ["gain_low", "gain_high"]
 
 
+def test_readings_that_fall_where_the_reference_rises_are_refused():
+    log = _log(Noise(white=0.02), steps=800, probes=3)
+    with pytest.raises(DataError, match="fall where the reference rises"):
+        calibrate(Log(log.time, -log.readings, log.reference))
+
+
+def test_no_gain_is_below_zero_however_few_probes_tell_its_range():
+    log = _log(Noise(white=0.01), steps=800, probes=3)
+    noise = calibrate(Log(log.time, log.readings * [0.05, 1.0, 2.0], log.reference)).noise
+    assert noise.gain[0] == 0
+    assert noise.gain[1] > 2
+
+
 def test_unusable_logs_are_explained(tmp_path):
     path = tmp_path / "log.csv"
     with pytest.raises(DataError, match=r"/log\.csv'"):

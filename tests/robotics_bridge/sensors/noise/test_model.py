@@ -285,6 +285,11 @@ def test_a_shorter_step_than_the_ring_has_room_for_is_refused():
     [
         ({"white": -1.0}, "white .*at least 0; received -1.0"),
         ({"gain": (1.2, 0.8)}, "gain is a range"),
+        ({"gain": (True, 1.0)}, "gain .*received True"),
+        ({"gain": (-0.5, 1.0)}, r"gain .*at least 0; received -0\.5"),
+        ({"gain": (0.5, 1.0, 1.5)}, "gain holds 2 numbers"),
+        ({"gain": 1.2}, r"gain holds 2 numbers; received 1\.2"),
+        ({"dead_range": (-1.0, math.inf)}, "dead_range .*received inf"),
         ({"dead_probability": 1.5}, r"dead_probability .*received 1\.5"),
         ({"jitter": 0.1}, "must not exceed read_delay"),
         ({"hysteresis": 0.5, "hysteresis_tau": 0.0}, "positive hysteresis_tau"),
