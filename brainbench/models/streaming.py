@@ -21,6 +21,7 @@ from brainbench.models.attenders.mamba import MambaAttender, MambaMemory
 from brainbench.models.encoders.s4 import S4Encoder
 from brainbench.models.graph.temporal_graph import GraphState, TemporalGraph
 from brainbench.models.network import EncoderAttenderDecoder
+from brainbench.models.ops.state_space import System
 
 _Tensors = list[torch.Tensor]
 
@@ -116,6 +117,44 @@ def _graph_part(graph: TemporalGraph, unroll: Any) -> _Part:
     return _Part(graph, pack, unpack, unroll=unroll)
 
 
+class _S4Part(nn.Module):
+    """The state-space encoder. Its systems are kept: to discretise the weights anew takes longer than a step."""
+
+    def __init__(self, encoder: S4Encoder) -> None:
+        super().__init__()
+        self.part = encoder
+        with torch.no_grad():
+            empty = encoder.init_state(1)
+        self.shapes = tuple(tuple(memory.shape[1:]) for memory, _ in empty)
+        for number, (_, system) in enumerate(empty):
+            for name, value in system._asdict().items():
+                self.register_buffer(f"{name}{number}", value, persistent=False)
+        super().train(encoder.training)
+
+    def train(self, mode: bool = True) -> _S4Part:
+        """Set training mode; for evaluation, keep the systems of the weights as they are now."""
+        super().train(mode)
+        if not mode:
+            with torch.no_grad():
+                for kept, block in zip(self._kept(), self.part.blocks, strict=True):
+                    for old, new in zip(kept, block.memory.system(), strict=True):
+                        old.copy_(new)
+        return self
+
+    def _kept(self) -> list[System]:
+        return [
+            System(*(getattr(self, f"{name}{number}") for name in System._fields))
+            for number in range(len(self.part.blocks))
+        ]
+
+    def forward(self, x: torch.Tensor, state: _Tensors) -> tuple[torch.Tensor, _Tensors]:
+        # Weights that learn are discretised in every step, so that gradients reach them.
+        learns = self.training or (torch.is_grad_enabled() and self.part.fc.weight.requires_grad)
+        systems = [block.memory.system() for block in self.part.blocks] if learns else self._kept()
+        y, after = self.part.step(x, tuple(zip(state, systems, strict=True)))
+        return y, [memory for memory, _ in after]
+
+
 class _GPTPart(nn.Module):
     """The transformer with a cache of fixed size; per row a count of the tokens seen."""
 
@@ -160,11 +199,7 @@ def _part_of(part: Any, unroll: Any) -> Any:
     if isinstance(part, GPTAttender):
         return _GPTPart(part)
     if isinstance(part, S4Encoder):
-        with torch.no_grad():
-            systems = [system for _, system in part.init_state(1)]
-        return _Part(
-            part, lambda state: [memory for memory, _ in state], lambda parts: tuple(zip(parts, systems, strict=True))
-        )
+        return _S4Part(part)
     if isinstance(part, MambaAttender):
         return _Part(
             part,

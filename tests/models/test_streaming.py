@@ -48,6 +48,51 @@ def test_a_full_context_gives_nan_until_it_is_reset():
     assert torch.isfinite(step(x, step.init_state(1))[0]).all()
 
 
+@torch.no_grad()
+def test_a_state_space_follows_its_weights_and_their_precision():
+    model, other, x = load_model("s4-small"), load_model("s4-small", seed=1), random_sweeps(2, 4)
+    step = StreamingStep(model)
+    model.load_state_dict(other.state_dict())
+    step.eval().double()
+    h = step.init_state(2)
+    for t in range(4):
+        features, h = step(x[:, t].double(), h)
+    assert features.dtype == torch.float64
+    torch.testing.assert_close(features, other.double().encode(x.double())[:, 3], atol=1e-4, rtol=1e-4)
+
+
+def test_a_state_space_learns_through_its_stream():
+    model, x = load_model("s4-small"), random_sweeps(2, 3)
+    step = StreamingStep(model)
+    h = step.init_state(2)
+    for t in range(3):
+        features, h = step(x[:, t], h)
+    features.square().sum().backward()
+    memory = model.encoder.blocks[0].memory
+    assert all(weight.grad is not None and weight.grad.abs().sum() > 0 for weight in memory.parameters())
+    streamed = {name: weight.grad.clone() for name, weight in memory.named_parameters()}
+    model.zero_grad()
+    model.encode(x)[:, 2].square().sum().backward()
+    for name, weight in memory.named_parameters():
+        torch.testing.assert_close(streamed[name], weight.grad, rtol=1e-3, atol=1e-3 * weight.grad.abs().max().item())
+
+
+@pytest.mark.gpu
+@torch.no_grad()
+@pytest.mark.parametrize("name", NAMES)
+def test_a_stream_moves_to_a_gpu(name):
+    step, x = StreamingStep(load_model(name)), random_sweeps(2, 2)
+    expected, h = [], step.init_state(2)
+    for t in range(2):
+        features, h = step(x[:, t], h)
+        expected.append(features)
+    step.cuda()
+    h = step.init_state(2)
+    for t in range(2):
+        features, h = step(x[:, t].cuda(), h)
+        torch.testing.assert_close(features.cpu(), expected[t], atol=1e-3, rtol=1e-3)
+
+
 def test_other_networks_are_refused():
     with pytest.raises(UsageError, match="received Linear"):
         StreamingStep(nn.Linear(2, 2))
