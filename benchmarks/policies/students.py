@@ -254,10 +254,8 @@ def lay_out(options: argparse.Namespace) -> None:
     from leaderboards import write_record
     from robotics_bridge.policies import report, student_figure
 
-    results = [
-        result for result in report.read_results(options.lay_out, at_least=options.at_least)
-        if arm_of(result.config) not in NETWORKS
-    ]  # fmt: skip
+    every = report.read_results(options.lay_out, at_least=options.at_least)
+    results = [result for result in every if arm_of(result.config) not in NETWORKS]
     agents = report.read_agents(options.lay_out)
     title, columns, rows = report.concise([*report.rows(results), *report.agent_rows(agents)])
     named = {arm: result for arm in ARMS for result in results if arm_of(result.config) == arm}
@@ -277,7 +275,7 @@ def lay_out(options: argparse.Namespace) -> None:
         command = f"python -m benchmarks.policies.students --teacher {options.teacher} --config careful"
         write_section(f"Students of {options.task}", command, body, where=options.device, subject="policies")
     if options.records is not None:
-        shipped = [replace(result, config=replace(result.config, teacher=str(options.teacher))) for result in results]
+        shipped = [replace(result, config=replace(result.config, teacher=str(options.teacher))) for result in every]
         for record in report.records(shipped):
             print(write_record(record, options.records))
 

@@ -29,6 +29,12 @@ from robotics_bridge.policies.report import StudentResult, read_results
 from robotics_bridge.policies.training.distill_config import DistillConfig
 
 PICTURE = Path(__file__).resolve().parents[2] / "docs" / "images" / "policy-score-success.png"
+FROZEN = (*NETWORKS, "ead_simclr", "ead_supervised", "ead_untrained")
+"""Arms whose encoder is a network of the board."""
+FEWEST = 6
+"""Networks below which a correlation says nothing."""
+_APART = 0.006
+"""Difference of success above which two names of the picture stand clear of one another."""
 OUTCOMES = {"success": "success", "goals": "quarter turns in 10 s"}
 GIVEN = ("accuracy", "position", "contact")
 """What else may go with success: the whisker accuracy, and two read-outs of the object in the hand."""
@@ -40,7 +46,7 @@ def networks(results: Sequence[StudentResult]) -> list[dict[str, Any]]:
     measured = {row["model"]: row for row in read_json(RECORD)}
     found = []
     for result in results:
-        if arm_of(result.config) not in {*NETWORKS, "ead_simclr", "ead_supervised", "ead_untrained"}:
+        if arm_of(result.config) not in FROZEN:
             continue
         name = result.config.encoder
         rows = [known[f"{name} seed {weights_seed(config)}"] for config in result.configs]
@@ -85,18 +91,22 @@ def correlations(found: Sequence[Mapping[str, Any]]) -> list[list[str]]:
 
 
 def draw(found: Sequence[Mapping[str, Any]]) -> None:
-    """Draw what students reach over the board's score, a network a point."""
-    figure, axes = panels(1, len(OUTCOMES), (9.6, 4.0))
-    for panel, (outcome, label) in zip(axes[0], OUTCOMES.items(), strict=True):
-        for row in found:
+    """Draw success over the board's score, and over the position that can be read out, a network a point."""
+    figure, axes = panels(1, 2, (11.0, 4.4), sharey=True, width_ratios=(1.5, 1))
+    rows = sorted(found, key=lambda row: row["success"])
+    for panel, key in zip(axes[0], ("score", "position"), strict=True):
+        for row in rows:
             color = COLORS[0] if row["training"] != "untrained" else COLORS[1] if "+" in row["model"] else PALE
-            panel.plot(row["score"], row[outcome], "o", color=color, ms=5 + 2 * (row["students"] > 1))
-            panel.annotate(
-                row["model"].replace("-small", ""), (row["score"], row[outcome]), textcoords="offset points",
-                xytext=(4, 3), fontsize=6.5, color=PALE,
-            )  # fmt: skip
-        panel.set(xlabel="score on the board", ylabel=label)
-        panel.margins(x=0.15)
+            panel.plot(row[key], row["success"], "o", color=color, ms=5 + 2 * (row["students"] > 1))
+            # A name among other points would be read as theirs; the table has them all.
+            alone = all(other is row or abs(other["success"] - row["success"]) > _APART for other in rows)
+            if key == "score" and alone:
+                panel.annotate(
+                    row["model"], (row[key], row["success"]), textcoords="offset points", xytext=(6, -2), fontsize=7,
+                    color=PALE,
+                )  # fmt: skip
+    axes[0, 0].set(xlabel="score on the board", ylabel="success of students")
+    axes[0, 1].set(xlabel="position that can be read out (R²)")
     save_figure(figure, PICTURE, dpi=120)
 
 
@@ -110,12 +120,14 @@ def main() -> None:
     options = parser.parse_args()
     results = read_results(options.students, at_least=options.at_least)
     found = networks(results)
-    several = [r for r in results if r.config.encoder in {row["model"] for row in found} and len(r.success) > 1]
-    spread = [np.std(result.success, ddof=1) for result in several if arm_of(result.config)]
+    several = [result for result in results if arm_of(result.config) in FROZEN and len(result.success) > 1]
+    spread = [np.std(result.success, ddof=1) for result in several]
     keys = ("score", *GIVEN, *OUTCOMES)
     heads = ["score", "whisker accuracy", "position (R²)", "contact (R²)", *OUTCOMES.values()]
     rows = [[row["model"], str(row["students"]), *(f"{row[key]:.3f}" for key in keys)] for row in found]
     between = np.std([row["success"] for row in found], ddof=1)
+    if len(found) < FEWEST:
+        parser.error(f"there are students of {len(found)} networks of the board; a correlation takes {FEWEST}")
     parts = [
         f"{len(found)} frozen networks of the default board as encoders of students. Success differs between networks "
         f"by {between:.3f} (standard deviation)"
