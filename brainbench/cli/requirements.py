@@ -1,4 +1,4 @@
-"""Requirements of each command beside its input: packages of extras, and a cache that can be written.
+"""Requirements of each command: packages of extras, a cache that can be written, and numbers that are numbers.
 
 One table for all commands; it is asked when the command line is read, before anything slow.
 """
@@ -6,6 +6,7 @@ One table for all commands; it is asked when the command line is read, before an
 from __future__ import annotations
 
 import functools
+import math
 import os
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
@@ -14,7 +15,7 @@ from typing import Any
 
 import typer
 
-from brainbench.core.errors import FileWriteError, missing_dependency, shown
+from brainbench.core.errors import FileWriteError, UsageError, missing_dependency, shown
 from brainbench.core.files import CACHE_VARIABLE, cache_dir
 
 
@@ -110,9 +111,14 @@ def check_requirements(command: str, values: Mapping[str, Any]) -> None:
     """Check what a command needs for the values of its parameters.
 
     Raises:
+        UsageError: a number is NaN or infinite, which no comparison with a limit would refuse.
         MissingDependencyError: a package of an extra is not installed.
         FileWriteError: the cache cannot be made or written.
     """
+    for name, value in values.items():
+        for number in value if isinstance(value, (list, tuple)) else [value]:
+            if isinstance(number, float) and not math.isfinite(number):
+                raise UsageError(f"The option {name!r} takes a finite number; received {number}.")
     lacking = {
         DISTRIBUTIONS.get(module, module): item
         for item in EXTRAS.get(command, ())
@@ -129,7 +135,7 @@ def check_requirements(command: str, values: Mapping[str, Any]) -> None:
 def guard(app: typer.Typer) -> None:
     """Let every command check what it needs before it runs; once, however often its command line is built."""
     for name, command in commands(app):
-        if command.callback is not None and (name in EXTRAS or name in CACHED) and not hasattr(command, "guarded"):
+        if command.callback is not None and not hasattr(command, "guarded"):
             command.guarded = True
             command.callback = _checked(name, command.callback)
 

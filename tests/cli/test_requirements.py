@@ -102,3 +102,26 @@ def _module(name):
     made = types.ModuleType(name)
     made.__spec__ = importlib.machinery.ModuleSpec(name, None)
     return made
+
+
+@pytest.mark.parametrize(
+    ("command", "option", "value"),
+    [
+        ("policy train", "--minutes", "nan"),
+        ("policy distill", "--stop-after", "inf"),
+        ("policy deploy", "--timeout", "nan"),
+        ("stimuli render", "--step", "nan"),
+        ("leaderboard verify", "--tolerance", "nan"),
+        ("power", "--target", "-inf"),
+        ("score", "--units-reliability", "nan"),
+    ],
+)
+def test_a_number_that_is_none_is_refused(run, command, option, value):
+    # Under --minutes nan a training went on without end: no time is later than that.
+    outcome = run(*command.split(), *WORDS[command], option, value)
+    assert outcome.status != 0
+    assert f"takes a finite number; received {float(value)}" in " ".join(outcome.err.split())
+
+
+def test_every_command_is_guarded():
+    assert all(getattr(command, "guarded", False) for _, command in commands(app))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any
@@ -82,7 +81,7 @@ def play(
     from brainbench.core.figures.style import check_format
     from robotics_bridge.tasks.contact_model import contacts_name
 
-    if not (seconds > 0 and math.isfinite(seconds) and rate > 0 and width >= 64):
+    if not (seconds > 0 and rate > 0 and width >= 64):
         raise UsageError(
             f"A film has a positive length and rate, and 64 pixels or more across; received {seconds} s, "
             f"{rate} frames/s and {width} pixels."
