@@ -143,7 +143,7 @@ class StudentSettings:
 
 @dataclass(frozen=True)
 class AuxiliaryDecoder:
-    """A head that predicts an observation group from the student's latent (table 4.5)."""
+    """A head that predicts an observation group from the student's latent (table 4.5); UsageError for a bad number."""
 
     target: str
     """Name of the group."""
@@ -153,3 +153,7 @@ class AuxiliaryDecoder:
     """Factor on the target."""
     hidden: tuple[int, ...] = field(default=(128, 64))
     """Widths of its layers."""
+
+    def __post_init__(self) -> None:
+        check_fields(self, "weight", least=0)
+        check_fields(self, "scale")

@@ -24,6 +24,7 @@ from torch import nn
 from brainbench.core.errors import DataError, UsageError
 from brainbench.core.files import read_mapping, write_json
 from brainbench.core.progress import Progress
+from brainbench.core.reading.ranges import check_number
 from brainbench.core.reading.regular import readable
 from brainbench.core.writing.locks import lock_folder
 from brainbench.models.activations import evaluating
@@ -112,6 +113,8 @@ def train(
         UsageError: the folder holds another run, or the configuration does not fit the data.
         DataError: the data set has no training sweeps, or a file of the run is damaged.
     """
+    if stop_after is not None:
+        check_number("stop_after", stop_after, least=0)
     with (
         processes(device) as where,
         lock_folder(Path(out), wait=False) if where.first else nullcontext(),

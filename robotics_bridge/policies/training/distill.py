@@ -25,6 +25,7 @@ from torch import nn
 from brainbench.core.errors import missing_dependency
 from brainbench.core.files import provenance, read_mapping, to_plain, write_json
 from brainbench.core.progress import Progress
+from brainbench.core.reading.ranges import check_number
 from brainbench.core.writing.locks import lock_folder
 from brainbench.core.writing.same_run import check_same
 from brainbench.models.training.run_folder import RunLog, load_state, save_state
@@ -91,6 +92,8 @@ def distill(
         DataError: a file of the run is damaged.
         MissingDependencyError: rsl-rl-lib is not installed.
     """
+    if stop_after is not None:
+        check_number("stop_after", stop_after, least=0)
     try:
         import rsl_rl.models  # noqa: F401
     except ImportError as error:  # without it a student can act, but not learn

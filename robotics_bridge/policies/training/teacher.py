@@ -22,6 +22,7 @@ import torch
 from brainbench.core.errors import BrainbenchError, DataError, DataFileNotFoundError, UsageError, missing_dependency
 from brainbench.core.files import file_hash, provenance, read_mapping, write_json
 from brainbench.core.progress import Progress
+from brainbench.core.reading.ranges import check_fields
 from brainbench.core.reading.regular import readable
 from brainbench.core.reading.tensors import check_finite
 from brainbench.core.writing.locks import lock_folder
@@ -237,7 +238,7 @@ class TeacherRun:
     """Extent of a training run, and what it begins with.
 
     Raises:
-        UsageError: ``start_std`` is not positive, there is no run to start from, or an observation or logger is not
+        UsageError: a number is out of range, ``start_std`` has no run to start from, or an observation or logger is not
             known.
         MissingDependencyError: the package of a logger is not installed.
     """
@@ -264,10 +265,11 @@ class TeacherRun:
     """Loggers beside log.jsonl: tensorboard, csv (log.csv), wandb (offline)."""
 
     def __post_init__(self) -> None:
-        if self.start_std is not None and (self.start is None or not self.start_std > 0):
-            raise UsageError(
-                f"start_std is a positive number and goes with a run to start from; received {self.start_std!r}."
-            )
+        check_fields(self, "iterations", "save_every", least=1, whole=True)
+        check_fields(self, "seed", least=0, whole=True)
+        check_fields(self, "minutes", "start_std", above=0)
+        if self.start_std is not None and self.start is None:
+            raise UsageError(f"start_std goes with a run to start from; received {self.start_std!r} alone.")
         sensed_groups(self.observe)
         check_loggers(self.loggers)
 

@@ -229,6 +229,8 @@ def test_a_damaged_state_is_named(tmp_path):
 
 
 def test_missing_data_and_devices_are_named(tmp_path):
+    with pytest.raises(UsageError, match=r"stop_after must be a finite number, at least 0; received nan"):
+        train(_config(), tiny(), out=tmp_path, device="cpu", stop_after=float("nan"))
     with pytest.raises(DataError, match="no split 'train'"):
         train(_config(), tiny(train=0), out=tmp_path, device="cpu")
     with pytest.raises(UsageError, match=r"'tpuu' .*cuda:N"):

@@ -172,6 +172,8 @@ def test_requests_that_do_not_fit_are_refused(tmp_path) -> None:
         DistillConfig.of({"task": "x", "placment": "tips"})
     with pytest.raises(UsageError, match=r"num_envs .*received 0"):
         _config(num_envs=0)
+    with pytest.raises(UsageError, match=r"stop_after must be a finite number, at least 0; received nan"):
+        distill(_config(), tmp_path, env=None, teacher=Follower(), stop_after=math.nan)
     (tmp_path / "config.json").write_text("{}")
     with pytest.raises(DataError, match=r"student; .*policy distill"):
         load_student(tmp_path)

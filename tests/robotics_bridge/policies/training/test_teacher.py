@@ -146,6 +146,15 @@ def test_exploration_may_begin_anew_with_the_networks_of_another(tmp_path: Path)
         train(_env(), tmp_path / "second", settings=SMALL, iterations=1, start_std=0.3)
 
 
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("minutes", float("nan")), ("minutes", 0), ("iterations", 0), ("iterations", 2.5), ("save_every", 0), ("seed", -1)],
+)
+def test_a_run_of_no_extent_is_refused(name: str, value: float) -> None:
+    with pytest.raises(UsageError, match=rf"{name} must be a .*received {value}"):
+        TeacherRun(**{name: value})  # type: ignore[arg-type]
+
+
 def test_a_run_of_before_a_setting_existed_goes_on(tmp_path: Path) -> None:
     train(_env(), tmp_path, settings=SMALL, iterations=1, save_every=1)
     config = json.loads((tmp_path / "config.json").read_text())
