@@ -357,6 +357,8 @@ class _Run:
         # The probes are fitted to the training sweeps; where their data set names no hash, their content is hashed.
         fitted = dict(self.data.summary) or sweeps_hash(self._batches("train", shuffle=False, part=False) or ())
         key = {**probe, "classes": list(self.data.classes), "data": result.data, "train": fitted, "twin": self.twin}
+        # Batches of another size bring the sweeps to the probes in another order.
+        key["batch_size"] = self.config.batch_size
         if self.controls_file.is_file() and (kept := read_mapping(self.controls_file)).get("of") == key:
             return _evaluations(kept["controls"])
         self.progress(self._steps, self._steps, "probing raw input, random features and the untrained twin")

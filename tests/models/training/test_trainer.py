@@ -175,6 +175,8 @@ def test_a_run_is_compared_with_raw_input_random_features_and_its_twin_once(tmp_
     again = train(_config(epochs=1), tiny(), out=shared / "a", controls=shared, device="cpu")
     assert first.controls == other.controls == again.controls
     assert not computed
+    train(_config(epochs=1, batch_size=6), tiny(), out=shared / "h", controls=shared, device="cpu")
+    assert computed.pop()  # the probes see the sweeps in another order
     train(_config(epochs=1), tiny(test=6), out=shared / "c", controls=shared, device="cpu")
     assert computed.pop()  # other sweeps
     train(_config(epochs=1), tiny(train=21, test=6), out=shared / "d", controls=shared, device="cpu")
