@@ -16,9 +16,9 @@ from pathlib import Path
 from typing import Any
 
 from brainbench.core.errors import DataError, DataFileNotFoundError
+from brainbench.core.files import write_text
 from brainbench.core.reading.texts import parse_json, read_text
 from brainbench.core.records import RECORD_SCHEMA, Interval, ResultRecord, Score, record_identity
-from leaderboards.writing import write_files
 
 _ROUNDING = 1e-6
 _LARGEST = 1e100
@@ -51,7 +51,7 @@ def write_record(record: ResultRecord, folder: str | os.PathLike[str]) -> Path:
     try:
         read_record(path)
     except DataError:  # absent, damaged or edited
-        write_files({path: text}, swept=False)
+        write_text(path, text)
     return path
 
 
