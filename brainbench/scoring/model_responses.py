@@ -188,14 +188,12 @@ def _trained(config: Mapping[str, Any] | None) -> dict[str, Any]:
     if config is None:
         return {}
     found, twin = config.get("evaluation") or {}, config.get("twin_evaluation") or {}
-    # Networks that came with the package before twins were hashed name theirs alone.
-    start = config.get("twin")
     stated = {name: config.get(name) for name in ("epochs", "published_epochs", "best_epoch", "licence", "version")}
     stated |= {f"{name} top-1": item.get("top1") for name, item in (config.get("baselines") or {}).items()}
     options = {name: value for name, value in (config.get("training") or {}).items() if name not in ("model", "seed")}
     return {
         **{name: config.get(name) for name in ("objective", "augmentation", "seed")},
-        "twin": start["name"] if isinstance(start, Mapping) else start,
+        "twin": (config.get("twin") or {}).get("name"),
         "layer": config.get("committed_layer"),
         **{name: found.get(name) for name in ("top1", "top5", "collapsed")},
         "accuracy_interval": Interval(**found["interval"]) if found.get("interval") else None,

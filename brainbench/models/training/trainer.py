@@ -191,8 +191,6 @@ class _Run:
             return now
         kept = read_mapping(self.out / RUN).get("twin")
         if kept is None:
-            if (self.out / STATE).is_file():  # of an earlier version, which kept no hash
-                del now["state"]
             mark(self.out, twin=now)
         elif told := difference(kept, now):
             _log.warning("The run goes on, but without its untrained twin: %s.", told)
