@@ -143,9 +143,9 @@ def open_neural_responses(recordings: Any, *, progress: Progress | None, **selec
     from brainbench.datasets import open_recordings
 
     if isinstance(recordings, xr.Dataset):
-        from brainbench.core.contracts import check_recordings
+        from brainbench.core.contracts import check_counts
 
-        return NeuralResponses(check_recordings(recordings), "data set")
+        return NeuralResponses(check_counts(recordings, "The data set"), "data set")
     if isinstance(recordings, str) and recordings in DEMOS:
         folder = demo_recordings(recordings, progress=progress)
         dataset = open_recordings(folder, **selection, progress=progress)
