@@ -14,6 +14,7 @@ from brainbench.core.contracts import CHANNELS
 from brainbench.core.errors import UsageError, check_name, unknown_name
 from brainbench.core.files import content_hash, file_hash
 from brainbench.core.progress import Progress
+from brainbench.core.reading.regular import readable
 from brainbench.core.records import Interval, ModelCard
 
 if TYPE_CHECKING:
@@ -143,7 +144,7 @@ def resolve_model(model: Any, *, seed: int = 0) -> ResolvedModel:
 
     from brainbench.models.diagram import graph_of
     from brainbench.models.registry import locate_model
-    from brainbench.models.training.checkpoints import PREFIXES
+    from brainbench.models.training.checkpoints import CONFIG, PREFIXES
     from brainbench.models.user_models import load_user_model
 
     if isinstance(model, torch.nn.Module):
@@ -169,7 +170,8 @@ def resolve_model(model: Any, *, seed: int = 0) -> ResolvedModel:
             seed=seed,
             citation=found.record.citation or None,
         )
-        card = replace(card, **_trained(found.trained))
+        with readable(f"{model}/{CONFIG}", "configuration of a trained model"):
+            card = replace(card, **_trained(found.trained))
     lazy = [name for name, value in module.named_parameters() if isinstance(value, torch.nn.UninitializedParameter)]
     if lazy:
         raise UsageError(

@@ -155,10 +155,10 @@ class _Run:
         self.progress = progress if progress is not None and where.first else (lambda done, total, what: None)
         self.started = self.saved = time.monotonic()
         self.options: dict[str, Any] = {"classes": len(data.classes), "decoder": config.decoder}
-        claim(out, {**config.identity, "classes": list(data.classes)}, write=where.first)
-        where.wait()
+        identity = {**config.identity, "classes": list(data.classes)}
+        claim(out, identity, write=False)
         model = load_model(config.model, seed=config.seed, **self.options).train()
-        self.twin = self._twin(describe_twin(config.model, config.seed, model))
+        start = describe_twin(config.model, config.seed, model)
         learner = make_learner(config.objective, model)
         if where.count > 1 and config.batch_size % where.count:
             raise UsageError(f"A batch of {config.batch_size} cannot be shared evenly by {where.count} processes.")
@@ -178,6 +178,10 @@ class _Run:
         if batches is None:
             raise DataError("The data set has no split 'train', so there is nothing to train on.")
         self.batches: Batches = batches
+        # What cannot be trained has ended by now, and takes no folder.
+        claim(out, identity, write=where.first)
+        where.wait()
+        self.twin = self._twin(start)
         self.at = _Position()
         if (out / STATE).exists():  # what is no file is refused there
             self._restore()
