@@ -185,7 +185,7 @@ def _labels(
 
 def entropy(seed: int | Sequence[int]) -> tuple[int, ...]:
     """Return a seed as the beginning of a list of integers; one that is none of 0 or more is a UsageError."""
-    several = tuple(seed) if isinstance(seed, (tuple, list)) else (seed,)
+    several = seed if isinstance(seed, (tuple, list)) else (seed,)
     for number in several:
         check_number("A seed", number, least=0, whole=True)
-    return several
+    return tuple(map(int, several))
