@@ -16,6 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -185,7 +186,7 @@ def _labels(
 
 def entropy(seed: int | Sequence[int]) -> tuple[int, ...]:
     """Return a seed as the beginning of a list of integers; one that is none of 0 or more is a UsageError."""
-    several = seed if isinstance(seed, (tuple, list)) else (seed,)
+    several: tuple[Any, ...] = tuple(seed) if isinstance(seed, (tuple, list)) else (seed,)
     for number in several:
         check_number("A seed", number, least=0, whole=True)
-    return tuple(map(int, several))
+    return several
