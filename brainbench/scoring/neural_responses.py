@@ -112,9 +112,7 @@ class NeuralResponses:
         animals = []
         for subject, sessions in self.trials(kept).items():
             trials = tuple(replace(item, responses=without_time(item.responses, options.time)) for item in sessions)
-            note = ""
-            if options.units_reliability is not None:
-                trials, note = reliable_units(trials, len(kept), least=options.units_reliability, seed=options.seed)
+            trials, note = reliable_units(trials, len(kept), least=options.units_reliability, seed=options.seed)
             animal = metric.animal(subject, trials, len(kept), stimuli=kept, seed=options.seed)
             if not trials and note:
                 animal = replace(animal, problem=note)
