@@ -15,7 +15,7 @@ from functools import cached_property
 
 import numpy as np
 
-from brainbench.core.files import content_hash
+from brainbench.core.files import content_hash, to_plain
 from brainbench.core.records import Interval, ModelCard, ResultRecord, Score
 from brainbench.core.statistics import is_finite
 from leaderboards.ranking import CHANCE_LEVEL, Sample
@@ -212,7 +212,7 @@ def _same_score(one: Score, other: Score) -> bool:
 def _asked(record: ResultRecord) -> dict[str, object]:
     """Return the settings of a score that are not the usual ones."""
     settings = record.score.provenance.settings
-    stated = {name: settings.get(name) for name in _ASKED}
+    stated = {name: to_plain(settings.get(name)) for name in _ASKED}
     return {name: value for name, value in stated.items() if value not in (None, _ASKED[name])}
 
 

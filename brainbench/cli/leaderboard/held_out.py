@@ -44,6 +44,8 @@ def hold_out(
     Anybody can score models on the public part; ``leaderboard verify --held-out`` scores a submission on the rest.
     """
     from brainbench.datasets import write_recordings
+    from brainbench.datasets.reading import find_recordings
+    from brainbench.scoring.demo import DEMOS
     from brainbench.scoring.neural_responses import open_neural_responses
     from leaderboards.held_out import DATA, Commitment, digest, new_salt
 
@@ -51,7 +53,8 @@ def hold_out(
         raise UsageError(f"Hold back either --animals or --stimuli; received {animals} and {stimuli}.")
     if secret.exists():
         raise UsageError(f"The folder {str(secret)!r} exists; name a new one, so that no earlier secret is lost.")
-    if Path(recordings).expanduser().resolve() == (out / PUBLIC).resolve():
+    sources = [] if recordings in DEMOS else find_recordings(recordings)[1]
+    if (out / PUBLIC).resolve() in [path.resolve() for path in sources]:
         raise UsageError(f"The public part would take the place of {recordings!r}, which it is of; give another --out.")
     kind = "animals" if animals else "stimuli"
     with progress_bar() as progress:
