@@ -1,8 +1,8 @@
 """Doubtful records of a set: stale ones, and those that contradict one another.
 
-A record is **stale** when something newer exists than what made it: the layout, the package, the default
-estimator, or the definition behind a fidelity's name. Two records **conflict** when they state the same
-computation (recordings, stimuli, their pairing, weights, seeds, settings) and different numbers.
+A record is **stale** when something newer exists than what made it: the package, the default estimator, or the
+definition behind a fidelity's name. Two records **conflict** when they state the same computation (recordings, stimuli,
+their pairing, weights, seeds, settings) and different numbers.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from typing import Any
 from packaging.version import InvalidVersion, Version
 
 from brainbench import __version__
-from brainbench.core.records import ESTIMATOR_VERSION, RECORD_SCHEMA, ResultRecord
+from brainbench.core.records import ESTIMATOR_VERSION, ResultRecord
 from leaderboards.store import StoredRecord
 
 TOLERANCE = 1e-3
@@ -33,12 +33,12 @@ def remarks(stored: Iterable[StoredRecord]) -> dict[str, tuple[str, ...]]:
 
     Every sentence begins with ``stale:`` or ``conflict:``.
     """
-    usable = [(item.record, item.schema) for item in stored if item.record is not None]
+    usable = [item.record for item in stored if item.record is not None]
     found: dict[str, list[str]] = defaultdict(list)
-    newest = _newest_stimuli([record for record, _ in usable])
+    newest = _newest_stimuli(usable)
     groups: dict[tuple[Any, ...], list[ResultRecord]] = defaultdict(list)
-    for record, schema in usable:
-        found[record.identity] += [f"stale: {reason}" for reason in _stale(record, schema, newest)]
+    for record in usable:
+        found[record.identity] += [f"stale: {reason}" for reason in _stale(record, newest)]
         groups[computation(record)].append(record)
     for group in groups.values():
         for one in group:
@@ -83,12 +83,10 @@ def older(version: str, than: str) -> bool:
         return False
 
 
-def _stale(record: ResultRecord, schema: int, newest: dict[tuple[Any, ...], tuple[str, str]]) -> list[str]:
+def _stale(record: ResultRecord, newest: dict[tuple[Any, ...], tuple[str, str]]) -> list[str]:
     score, version = record.score, record.score.provenance.version
     settings = score.provenance.settings
     reasons = []
-    if schema < RECORD_SCHEMA:
-        reasons.append(f"the file has the layout of version {schema}, now {RECORD_SCHEMA}")
     if older(version, __version__):
         reasons.append(f"made by brainbench {version}, this is {__version__}")
     estimator = settings.get("estimator_version")

@@ -16,9 +16,9 @@ from pathlib import Path
 from typing import Any
 
 from brainbench.core.errors import DataError, DataFileNotFoundError
+from brainbench.core.files import write_text
 from brainbench.core.reading.texts import parse_json, read_text
-from brainbench.core.records import RECORD_SCHEMA, Interval, ResultRecord, Score, record_identity
-from leaderboards.writing import write_files
+from brainbench.core.records import Interval, ResultRecord, Score, record_identity
 
 _ROUNDING = 1e-6
 _LARGEST = 1e100
@@ -34,8 +34,6 @@ class StoredRecord:
     record: ResultRecord | None
     problem: str | None = None
     """One sentence; None exactly when ``record`` can be used."""
-    schema: int = RECORD_SCHEMA
-    """Version of the layout on disk; an earlier one was brought to the present one in reading."""
 
 
 def write_record(record: ResultRecord, folder: str | os.PathLike[str]) -> Path:
@@ -51,7 +49,7 @@ def write_record(record: ResultRecord, folder: str | os.PathLike[str]) -> Path:
     try:
         read_record(path)
     except DataError:  # absent, damaged or edited
-        write_files({path: text}, swept=False)
+        write_text(path, text)
     return path
 
 
@@ -63,18 +61,14 @@ def record_text(record: ResultRecord) -> str:
 
 
 def read_record(path: str | os.PathLike[str]) -> ResultRecord:
-    """Read one record; one of an earlier schema version is brought to the present one.
+    """Read one record.
 
     Raises:
         DataFileNotFoundError: there is no such file.
-        DataError: the file is not JSON, not a record of a known schema version, contradicts itself, or
+        DataError: the file is not JSON, not a record of this schema version, contradicts itself, or
             its content does not fit the hash in its name (edited by hand, or renamed).
     """
-    return _read(Path(path))[0]
-
-
-def _read(path: Path) -> tuple[ResultRecord, int]:
-    """Return a record and the schema version of its file."""
+    path = Path(path)
     record, data = _parse(read_text(path, "result record"), path)
     # The hash is that of what the file says: a field that an earlier writer did not know is not in it.
     identity = record_identity(data)
@@ -84,7 +78,7 @@ def _read(path: Path) -> tuple[ResultRecord, int]:
             f"{path.name!r} was edited or renamed: its content has the hash {identity}, its name says "
             f"{named!r}; restore the original file or score the model again."
         )
-    return record, data["schema"]
+    return record
 
 
 def read_records(source: str | os.PathLike[str] | Iterable[str | os.PathLike[str]]) -> list[StoredRecord]:
@@ -111,11 +105,11 @@ def read_records(source: str | os.PathLike[str] | Iterable[str | os.PathLike[str
     stored: dict[str, StoredRecord] = {}
     for path in sorted(set(paths)):
         try:
-            record, schema = _read(path)
+            record = read_record(path)
         except DataError as error:
             stored[os.fspath(path)] = StoredRecord(path, None, str(error))
         else:
-            stored.setdefault(record.identity, StoredRecord(path, record, schema=schema))
+            stored.setdefault(record.identity, StoredRecord(path, record))
     return list(stored.values())
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -99,7 +98,7 @@ def show(
     if recipe:
         data["recipe"] = to_plain(recipe)
     twin = (record.trained or {}).get("twin")
-    if isinstance(twin, Mapping):
+    if twin:
         from brainbench.models.training.twins import draw_twin
 
         _, told = draw_twin(twin, data["trained"]["options"])

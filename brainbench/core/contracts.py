@@ -101,6 +101,25 @@ def check_recordings(dataset: xr.Dataset) -> xr.Dataset:
     return dataset
 
 
+def check_counts(dataset: xr.Dataset, name: str) -> xr.Dataset:
+    """Return recordings from outside, called ``name`` in messages, if they are valid and their numbers can be.
+
+    Raises:
+        DataError: see :func:`check_recordings`; or a number is not finite, negative, or none.
+    """
+    check_recordings(dataset)
+    found = [dataset[item].values for item in ("counts", "duration", "time") if item in dataset.variables]
+    if any(values.dtype.kind not in "fiu" for values in found):
+        raise DataError(f"{name} has counts, durations or times that are no numbers.")
+    counts, duration, *time = found
+    # NaN in the counts means that a unit was not recorded; fmin and fmax pass over it without a copy.
+    if counts.size and not (np.fmin.reduce(counts, None) >= 0 and np.fmax.reduce(counts, None) < np.inf):
+        raise DataError(f"{name} has counts below 0 or without end, or none at all; a count is 0 or more, or NaN.")
+    if not all(np.isfinite(values).all() for values in (duration, *time)) or (duration < 0).any():
+        raise DataError(f"{name} has times that are not finite or durations below 0.")
+    return dataset
+
+
 def _check(dataset: xr.Dataset, what: str, main: tuple[str, tuple[str, ...]], **needed: tuple[str, ...]) -> None:
     name, dims = main
     if name not in dataset:

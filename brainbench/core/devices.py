@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import tempfile
 import threading
 from contextlib import contextmanager
@@ -101,10 +102,10 @@ def pick_device(name: Any) -> Any:
         return wp.get_device(name)
     if name == "auto":
         name = "cuda" if not wp.is_cpu_available() and wp.is_cuda_available() else "cpu"
-    if name != "cpu" and name.split(":")[0] != "cuda":
-        raise UsageError(f"A device is 'cpu' or 'cuda'; received {name!r}.")
-    if name != "cpu" and not wp.is_cuda_available():
-        raise UsageError(f"No CUDA device was found, so {name!r} cannot be used; use 'cpu'.")
+    if not re.fullmatch(r"cpu|cuda(:\d{1,9})?", name):
+        raise UsageError(f"A device is 'cpu', 'cuda' or 'cuda:N'; received {name!r}.")
+    if name != "cpu" and int(name.partition(":")[2] or 0) >= (count := wp.get_cuda_device_count()):
+        raise UsageError(f"There are {count} CUDA devices here, so {name!r} cannot be used; use 'cpu' or another one.")
     if name == "cpu" and not wp.is_cpu_available():
         raise UsageError(
             "This build of warp-lang has no compiler for processors; install the one from PyPI, or use the engine "

@@ -67,6 +67,17 @@ def check_folder(path: str | os.PathLike[str], option: str) -> None:
 
 
 @contextlib.contextmanager
+def writable(target: str | os.PathLike[str]) -> Iterator[None]:
+    """Turn what forbids to write a file or folder (permission, space, something in the way) into FileWriteError."""
+    try:
+        yield
+    except OSError as error:
+        if error.errno not in _UNWRITABLE:
+            raise
+        raise FileWriteError(f"{shown(os.fspath(target))} cannot be written ({os.strerror(error.errno)}).") from error
+
+
+@contextlib.contextmanager
 def atomic_path(target: str | os.PathLike[str]) -> Iterator[Path]:
     """Yield a temporary path beside ``target`` that replaces it on success and vanishes on error.
 
@@ -78,18 +89,15 @@ def atomic_path(target: str | os.PathLike[str]) -> Iterator[Path]:
     target = Path(target)
     temporary = target
     try:
-        target.parent.mkdir(parents=True, exist_ok=True)
-        temporary = temporary_path(target)
-        # Made by hand: tempfile's files are private, and to read the umask is not safe among threads.
-        os.close(os.open(temporary, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
-        yield temporary
-        with temporary.open("rb") as stream:
-            os.fsync(stream.fileno())
-        temporary.replace(target)
-    except OSError as error:
-        if error.errno not in _UNWRITABLE:
-            raise
-        raise FileWriteError(f"{shown(str(target))} cannot be written ({os.strerror(error.errno)}).") from error
+        with writable(target):
+            target.parent.mkdir(parents=True, exist_ok=True)
+            temporary = temporary_path(target)
+            # Made by hand: tempfile's files are private, and to read the umask is not safe among threads.
+            os.close(os.open(temporary, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o666))
+            yield temporary
+            with temporary.open("rb") as stream:
+                os.fsync(stream.fileno())
+            temporary.replace(target)
     finally:
         if temporary != target:
             with contextlib.suppress(OSError):
@@ -146,6 +154,15 @@ def write_text(path: str | os.PathLike[str], text: str) -> Path:
     with atomic_path(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
     return Path(path)
+
+
+def write_together(files: Mapping[Path, str | bytes]) -> list[Path]:
+    """Write files so that all are whole before the first of them appears, and return their paths."""
+    with contextlib.ExitStack() as stack:
+        for path, content in files.items():
+            data = content.encode() if isinstance(content, str) else content
+            stack.enter_context(atomic_path(path)).write_bytes(data)
+    return list(files)
 
 
 def write_json(path: str | os.PathLike[str], value: Any) -> Path:

@@ -16,6 +16,10 @@ from typing import Any
 from brainbench.core.errors import BrainbenchError, DataError, DataFileNotFoundError, UsageError, unknown_name
 
 _LOG = logging.getLogger(__name__)
+_beside: dict[str, Path] = {}
+"""Modules that the last file imported from its own folder. The next file may mean others by these names."""
+_files: dict[Path, tuple[Path, ...]] = {}
+"""File of a user → that file, and those of its folder that it imported."""
 
 
 def load_object(target: str, kind: str) -> Any:
@@ -65,6 +69,11 @@ def load_module(path: str) -> ModuleType:
         raise DataError(f"Importing {path!r} failed with {type(error).__name__}: {error}.") from error
 
 
+def files_of(path: Path) -> tuple[Path, ...]:
+    """Return the files that made a module of a user: its own, and those of its folder that it imported, if loaded."""
+    return _files.get(path.resolve(), (path,))
+
+
 def load_entry_points(group: str, take: Callable[[str, Any], None]) -> None:
     """Hand every object of an entry-point group to ``take(name, object)``; a faulty one is logged and left out."""
     from importlib.metadata import entry_points
@@ -90,13 +99,25 @@ def _import_file(path: Path) -> ModuleType:
     except BaseException:
         del sys.modules[name]
         raise
+    _files[path] = (path, *sorted({*_beside.values()} - {path}))
     return module
 
 
 @contextmanager
 def _importable(folder: Path) -> Iterator[None]:
+    """Let modules be imported from a folder; those of an earlier folder or state of the files are forgotten first."""
+    for name in _beside:
+        sys.modules.pop(name, None)
+    _beside.clear()
+    before = set(sys.modules)
     sys.path.insert(0, str(folder))
+    importlib.invalidate_caches()
     try:
         yield
     finally:
         sys.path.remove(str(folder))
+        for name in sys.modules.keys() - before:
+            file, top = Path(getattr(sys.modules[name], "__file__", None) or ""), name.partition(".")[0]
+            # What is installed in an environment below the folder is not its own.
+            if file == folder / f"{top}.py" or file.is_relative_to(folder / top):
+                _beside[name] = file

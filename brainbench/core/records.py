@@ -25,7 +25,7 @@ Status = Literal["ok", "unreliable", "undefined"]
 it; ``undefined``: no number exists. The reason stands in words beside it."""
 
 RECORD_SCHEMA: Literal[2] = 2
-"""Version of the result-record JSON layout; :meth:`ResultRecord.from_json` also reads every earlier one."""
+"""Version of the result-record JSON layout."""
 
 ESTIMATOR_VERSION = 2
 """Raised whenever the same recordings and activations would get another number from the default estimator."""
@@ -118,17 +118,18 @@ class _Document:
 
     @classmethod
     def from_json(cls, source: str | Mapping[str, Any]) -> Self:
-        """Rebuild it from :meth:`to_json` or from the mapping inside it, of this schema version or an earlier one.
+        """Rebuild it from :meth:`to_json` or from the mapping inside it.
 
         Raises:
             DataError: a field is missing, unknown or of the wrong kind, or the schema version is not read here.
         """
         data = parse_json(source, "This text") if isinstance(source, str) else source
-        return _convert(cls, cls._migrated(data))
+        cls._check_version(data)
+        return _convert(cls, data)
 
     @classmethod
-    def _migrated(cls, data: Any) -> Any:
-        return data
+    def _check_version(cls, data: Any) -> None:
+        """Raise DataError for a layout that is not read here."""
 
 
 if TYPE_CHECKING:
@@ -356,8 +357,15 @@ class ResultRecord(_Document):
     schema: Literal[2] = RECORD_SCHEMA
 
     @classmethod
-    def _migrated(cls, data: Any) -> Any:
-        return migrate_record(data)
+    def _check_version(cls, data: Any) -> None:
+        version = data.get("schema") if isinstance(data, Mapping) else RECORD_SCHEMA
+        if type(version) is not int or version != RECORD_SCHEMA:
+            newer = isinstance(version, int) and version > RECORD_SCHEMA
+            advice = "update brainbench" if newer else "score the model again or use the version that wrote it"
+            raise DataError(
+                f"This result record has schema version {version!r}; this brainbench reads version {RECORD_SCHEMA}; "
+                f"{advice}."
+            )
 
     @cached_property
     def identity(self) -> str:
@@ -382,7 +390,7 @@ class ResultRecord(_Document):
 
 
 def record_identity(data: Mapping[str, Any]) -> str:
-    """Return the content hash of a record given as the mapping inside its JSON, of any schema version.
+    """Return the content hash of a record given as the mapping inside its JSON.
 
     What differs between two runs of one computation does not count: time, machine, packages, command.
     """
@@ -402,30 +410,6 @@ def _steady(score: Mapping[str, Any] | None) -> dict[str, Any] | None:
     volatile = ("time", "machine", "python", "packages", "seconds", "command")
     kept = {name: value for name, value in (score.get("provenance") or {}).items() if name not in volatile}
     return {**score, "provenance": kept}
-
-
-def migrate_record(data: Any) -> Any:
-    """Bring the mapping inside a record's JSON to :data:`RECORD_SCHEMA`.
-
-    Version 2 added to version 1 the model card's encoder, attender, training, graph and citation and the
-    layers' intervals; all of them may be absent, so nothing but the number changes.
-
-    Raises:
-        DataError: the version is unknown here.
-    """
-    if not isinstance(data, Mapping):
-        return data  # refused in words by whoever reads it
-    version = data.get("schema")
-    if version == 1 and not isinstance(version, bool):
-        return {**data, "schema": 2}
-    if version == RECORD_SCHEMA:
-        return data
-    newer = isinstance(version, int) and version > RECORD_SCHEMA
-    advice = "update brainbench" if newer else "score the model again or use the version that wrote it"
-    raise DataError(
-        f"This result record has schema version {version!r}; this brainbench reads versions 1 to "
-        f"{RECORD_SCHEMA}; {advice}."
-    )
 
 
 def _number(value: float) -> str:

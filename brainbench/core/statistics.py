@@ -116,15 +116,18 @@ def wilson_interval(successes: float, count: int, level: float = LEVEL, *, over:
 
     Raises:
         DataError: there is nothing to count.
-        UsageError: a level outside (0, 1).
+        UsageError: a level outside (0, 1), or not 0 to ``count`` successes.
     """
     from scipy.special import ndtri
 
     check_level(level)
     if count < 1:
         raise DataError("A proportion needs at least one observation.")
+    # A share times a count may lie beyond by its last digit.
+    if not -1e-9 <= successes <= count + 1e-9:
+        raise UsageError(f"Of {count:,} observations {successes} cannot be successes.")
     z = float(ndtri(0.5 + level / 2))
-    share = successes / count
+    share = min(max(successes / count, 0.0), 1.0)
     middle = (share + z * z / (2 * count)) / (1 + z * z / count)
     half = z / (1 + z * z / count) * math.sqrt(share * (1 - share) / count + z * z / (4 * count * count))
     return Interval(max(0.0, middle - half), min(1.0, middle + half), level, f"Wilson score over {count} {over}")

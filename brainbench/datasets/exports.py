@@ -40,7 +40,8 @@ def export(source: Source, target: str | os.PathLike[str], *, select: Selection 
 
     Raises:
         DataError: nothing is left, or a session cannot be stored as NWB.
-        UsageError: several sessions for one NWB file, another suffix, an unknown subject or rule.
+        UsageError: several sessions for one NWB file, another suffix, an unknown subject or rule, or the copy would
+            take the place of its source.
     """
     layout, paths = find_recordings(source)
     chosen = EVERYTHING if select is None else resolve_selection(select)
@@ -59,18 +60,19 @@ def export(source: Source, target: str | os.PathLike[str], *, select: Selection 
     if not sessions:
         raise DataError(f"None of the {len(paths)} files of {source} holds units with spike times; nothing to copy.")
     target = Path(target)
-    if target.suffix in (".h5", ".hdf5"):
-        return [write_recordings(target, sessions)]
-    if target.suffix == ".nwb":
-        if len(sessions) > 1:
-            raise UsageError(f"An NWB file holds one session, these are {len(sessions)}; name a folder or an .h5 file.")
-        return [write_nwb(target, sessions[0])]
-    if target.suffix:
+    together = target.suffix in (".h5", ".hdf5")
+    if target.suffix == ".nwb" and len(sessions) > 1:
+        raise UsageError(f"An NWB file holds one session, these are {len(sessions)}; name a folder or an .h5 file.")
+    if target.suffix and not together and target.suffix != ".nwb":
         raise UsageError(f"Recordings are written to .nwb, .h5 or a folder; received {target.name!r}.")
-    files = {f"sub-{_entity(session.subject)}_ses-{_entity(session.session)}.nwb": session for session in sessions}
-    if len(files) < len(sessions):
+    places = [target if target.suffix else target / _file_name(session) for session in sessions]
+    if len(set(places)) < len(places) and not together:
         raise UsageError("Two sessions would get the same file name; export to one .h5 file instead.")
-    return [write_nwb(target / name, session) for name, session in files.items()]
+    if lost := {place.resolve() for place in places} & {path.resolve() for path in paths}:
+        raise UsageError(f"The copy would take the place of its source {str(min(lost))!r}; name another target.")
+    if together:
+        return [write_recordings(target, sessions)]
+    return [write_nwb(place, session) for place, session in zip(places, sessions, strict=True)]
 
 
 def subset(
@@ -129,5 +131,6 @@ def _plain(table: SessionTable, rows: NDArray[np.bool_]) -> dict[str, NDArray[An
     return made
 
 
-def _entity(name: str) -> str:
-    return re.sub(r"[^A-Za-z0-9]+", "-", name)
+def _file_name(session: Session) -> str:
+    subject, name = (re.sub(r"[^A-Za-z0-9]+", "-", part) for part in (session.subject, session.session))
+    return f"sub-{subject}_ses-{name}.nwb"

@@ -36,7 +36,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from brainbench.core.contracts import check_recordings
+from brainbench.core.contracts import check_counts
 from brainbench.core.errors import DataError, UsageError, shown
 from brainbench.core.files import atomic_path, to_json
 from brainbench.core.reading.texts import parse_json
@@ -68,7 +68,7 @@ def write_recordings(path: str | os.PathLike[str], recordings: xr.Dataset | Sess
     with atomic_path(path) as temporary, h5py.File(temporary, "w") as file:
         file.attrs.update({"format": FORMAT, "version": VERSION})
         if isinstance(recordings, xr.Dataset):
-            _write_counts(file, check_recordings(recordings))
+            _write_counts(file, check_counts(recordings, "The data set"))
         else:
             _write_sessions(file, [recordings] if isinstance(recordings, Session) else list(recordings))
     return Path(path)
@@ -144,15 +144,7 @@ def read_counts(file: h5py.File, path: Path) -> xr.Dataset:
         dataset = xr.Dataset(variables, coordinates, attributes)
     except ValueError as error:
         raise DataError(f"{path} does not hold a consistent recordings data set ({error}).") from error
-    counts, duration, time = (dataset[name].values for name in ("counts", "duration", "time"))
-    if any(array.dtype.kind not in "fiu" for array in (counts, duration, time)):
-        raise DataError(f"{path} has counts, durations or times that are no numbers.")
-    # NaN in the counts means that a unit was not recorded; fmin and fmax pass over it without a copy.
-    if counts.size and not (np.fmin.reduce(counts, None) >= 0 and np.fmax.reduce(counts, None) < np.inf):
-        raise DataError(f"{path} has counts below 0 or without end, or none at all; a count is 0 or more, or NaN.")
-    if not (np.isfinite(time).all() and np.isfinite(duration).all() and (duration >= 0).all()):
-        raise DataError(f"{path} has times that are not finite or durations below 0.")
-    return check_recordings(dataset)
+    return check_counts(dataset, str(path))
 
 
 def _write_counts(file: h5py.File, dataset: xr.Dataset) -> None:

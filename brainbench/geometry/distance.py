@@ -50,9 +50,10 @@ def deviation(
         inside: a coarser mesh of the same solid that decides what is inside, to save time.
 
     Raises:
-        UsageError: there are no samples.
+        UsageError: there are no pieces, or no samples.
     """
     check_number("The number of samples", samples, least=1, whole=True)
+    check_number("The number of pieces", len(pieces), least=1, whole=True)
     rng = np.random.default_rng(seed)
     areas = np.array([piece.to_trimesh().area for piece in pieces])
     shares = np.maximum(8, np.ceil(samples * areas / areas.sum())).astype(int)

@@ -56,7 +56,10 @@ def response_matrix(responses: ArrayLike, rows: str) -> Any:
     Raises:
         UsageError: not a two-dimensional array of real numbers with at least one unit.
     """
-    array: Any = responses if is_tensor(responses) else np.asarray(responses)
+    try:
+        array: Any = responses if is_tensor(responses) else np.asarray(responses)
+    except ValueError as error:
+        raise UsageError(f"Responses must be real numbers [{rows}, units]; received rows of unequal length.") from error
     real = not array.dtype.is_complex if is_tensor(array) else array.dtype.kind in "fiub"
     if array.ndim != 2 or not real or array.shape[1] == 0:
         raise UsageError(

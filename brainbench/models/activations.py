@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from brainbench.core.errors import BrainbenchError, UsageError, check_name
+from brainbench.core.reading.ranges import check_number
 
 if TYPE_CHECKING:
     import torch
@@ -75,11 +76,11 @@ def extract(
 
     given = getattr(stimuli, "input", stimuli)
     values: Any = given if isinstance(given, torch.Tensor) else np.asanyarray(given)
-    if values.ndim < 2 or len(values) < 1 or chunk < 1:
-        raise UsageError(
-            f"Extraction needs stimuli [stimulus, time, ...] and a chunk of at least 1; received stimuli of shape "
-            f"{list(values.shape)} and chunk {chunk}."
-        )
+    check_number("The chunk of an extraction", chunk, least=1, whole=True)
+    if values.ndim < 2 or len(values) < 1:
+        raise UsageError(f"Extraction needs stimuli [stimulus, time, ...]; received shape {list(values.shape)}.")
+    if not isinstance(values, torch.Tensor) and values.dtype.kind not in "fiub":
+        raise UsageError(f"Stimuli are real numbers; received {values.dtype}.")
     like = next((p for p in model.parameters() if p.is_floating_point()), torch.zeros(()))
     check_name("readout", readout, ("default", "published"))
     if readout == "published":

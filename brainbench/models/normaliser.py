@@ -8,6 +8,7 @@ import torch
 from torch import nn
 
 from brainbench.core.contracts import CHANNELS
+from brainbench.core.reading.ranges import check_number
 
 FORCE_SCALE = 1e-4
 """N that become 1: the order of a whisker's base force in contact."""
@@ -21,6 +22,9 @@ class Normaliser(nn.Module):
     """(x − offset) / scale per channel of [B, T, C, H, W] or [B, C, H, W], in SI; buffers, not parameters.
 
     Without an offset silence stays silence.
+
+    Raises:
+        UsageError: a scale is not above 0 (a channel that never varies has none), or a number is not finite.
     """
 
     scale: torch.Tensor
@@ -28,6 +32,10 @@ class Normaliser(nn.Module):
 
     def __init__(self, scale: Sequence[float], offset: Sequence[float] | None = None) -> None:
         super().__init__()
+        for value in scale:
+            check_number("A scale of a normaliser", value, above=0)
+        for value in offset or ():
+            check_number("An offset of a normaliser", value)
         self.register_buffer("scale", torch.tensor(scale).view(-1, 1, 1))
         self.register_buffer("offset", torch.tensor(offset or [0.0] * len(scale)).view(-1, 1, 1))
 

@@ -21,6 +21,9 @@ SOURCE = "thesis, tables 3.2-3.5"
 EPOCHS = 100
 BATCH_SIZE = 256
 SIMSIAM_BATCH_SIZE = 1024
+OPTIMIZERS = ("sgd", "adam", "adamw", "lars")
+SCHEDULES = ("step", "constant", "cosine")
+"""``step``: a tenth every 30 epochs; ``constant``; ``cosine``: to zero, after a linear rise if there is a warm-up."""
 _RATES = (1e-1, 1e-2, 1e-3, 1e-4)
 
 
@@ -29,9 +32,9 @@ class TrainingSetting:
     """One point of a search space."""
 
     optimizer: str
-    """A name of :data:`brainbench.models.training.optimizers.OPTIMIZERS`."""
+    """A name of :data:`OPTIMIZERS`."""
     schedule: str
-    """A name of :data:`brainbench.models.training.optimizers.SCHEDULES`."""
+    """A name of :data:`SCHEDULES`."""
     learning_rate: float
     """Initial (highest) learning rate."""
     warmup_epochs: int = 0

@@ -15,8 +15,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from brainbench.core.errors import DataError, DataFileNotFoundError, UsageError, check_name
-from brainbench.core.files import check_folder, file_hash, read_json, write_json
-from brainbench.core.plugins import load_object
+from brainbench.core.files import check_folder, content_hash, read_json, write_json
+from brainbench.core.plugins import files_of, load_object
 from brainbench.models.architecture import check_new_name
 from brainbench.models.ops.seeding import seeded
 
@@ -38,7 +38,7 @@ class UserModel:
     target: str
     """``/path/to/FILE.py:NAME`` or ``package.module:NAME``."""
     hash: str = ""
-    """Hash of the file when it was added; empty for a module."""
+    """Hash of the file, and of what it imports from its folder, when it was added; empty for a module."""
 
     @property
     def path(self) -> Path | None:
@@ -47,24 +47,25 @@ class UserModel:
         return Path(place) if place.endswith(".py") else None
 
     def build(self, **options: Any) -> nn.Module:
-        """Build the model from its code as it is today; a changed file is told in a warning.
+        """Build the model from its code as it is today; a change since it was added is told in a warning.
 
         Raises:
             DataFileNotFoundError: the file is gone.
             UsageError: the code gives no module.
             DataError: the code fails.
         """
-        if self.path is not None:
-            if not self.path.is_file():
-                raise DataFileNotFoundError(
-                    f"The model {self.name!r} was added from {str(self.path)!r}, which is gone; put the file back, or "
-                    f"take the name away with: brainbench models remove {self.name}"
-                )
-            if file_hash(self.path) != self.hash:
-                _LOG.warning(
-                    "%s has changed since the model %r was added; the file is used as it is now.", self.path, self.name
-                )
-        return build_user_model(self.target, **options)
+        if self.path is not None and not self.path.is_file():
+            raise DataFileNotFoundError(
+                f"The model {self.name!r} was added from {str(self.path)!r}, which is gone; put the file back, or "
+                f"take the name away with: brainbench models remove {self.name}"
+            )
+        made = build_user_model(self.target, **options)
+        if self.path is not None and content_hash(*files_of(self.path)) != self.hash:
+            _LOG.warning(
+                "%s, or what it imports from its folder, has changed since the model %r was added; it is used as it is "
+                "now.", self.path, self.name,
+            )  # fmt: skip
+        return made
 
 
 def load_user_model(target: str, *, seed: int = 0) -> nn.Module:
@@ -157,7 +158,7 @@ def add_user_model(target: str, name: str, *, taken: Collection[str]) -> UserMod
         target = f"{place}:{part}"
     check_folder(settings_file().parent, CONFIG_VARIABLE)
     load_user_model(target)
-    made = UserModel(name, target, file_hash(place) if place.endswith(".py") else "")
+    made = UserModel(name, target, content_hash(*files_of(Path(place))) if place.endswith(".py") else "")
     _write({**known, name: made})
     return made
 

@@ -14,6 +14,7 @@ from brainbench.core.contracts import CHANNELS
 from brainbench.core.errors import UsageError, check_name, unknown_name
 from brainbench.core.files import content_hash, file_hash
 from brainbench.core.progress import Progress
+from brainbench.core.reading.regular import readable
 from brainbench.core.records import Interval, ModelCard
 
 if TYPE_CHECKING:
@@ -143,7 +144,7 @@ def resolve_model(model: Any, *, seed: int = 0) -> ResolvedModel:
 
     from brainbench.models.diagram import graph_of
     from brainbench.models.registry import locate_model
-    from brainbench.models.training.checkpoints import PREFIXES
+    from brainbench.models.training.checkpoints import CONFIG, PREFIXES
     from brainbench.models.user_models import load_user_model
 
     if isinstance(model, torch.nn.Module):
@@ -169,7 +170,8 @@ def resolve_model(model: Any, *, seed: int = 0) -> ResolvedModel:
             seed=seed,
             citation=found.record.citation or None,
         )
-        card = replace(card, **_trained(found.trained))
+        with readable(f"{model}/{CONFIG}", "configuration of a trained model"):
+            card = replace(card, **_trained(found.trained))
     lazy = [name for name, value in module.named_parameters() if isinstance(value, torch.nn.UninitializedParameter)]
     if lazy:
         raise UsageError(
@@ -188,14 +190,12 @@ def _trained(config: Mapping[str, Any] | None) -> dict[str, Any]:
     if config is None:
         return {}
     found, twin = config.get("evaluation") or {}, config.get("twin_evaluation") or {}
-    # Networks that came with the package before twins were hashed name theirs alone.
-    start = config.get("twin")
     stated = {name: config.get(name) for name in ("epochs", "published_epochs", "best_epoch", "licence", "version")}
     stated |= {f"{name} top-1": item.get("top1") for name, item in (config.get("baselines") or {}).items()}
     options = {name: value for name, value in (config.get("training") or {}).items() if name not in ("model", "seed")}
     return {
         **{name: config.get(name) for name in ("objective", "augmentation", "seed")},
-        "twin": start["name"] if isinstance(start, Mapping) else start,
+        "twin": (config.get("twin") or {}).get("name"),
         "layer": config.get("committed_layer"),
         **{name: found.get(name) for name in ("top1", "top5", "collapsed")},
         "accuracy_interval": Interval(**found["interval"]) if found.get("interval") else None,

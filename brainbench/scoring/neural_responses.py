@@ -112,9 +112,7 @@ class NeuralResponses:
         animals = []
         for subject, sessions in self.trials(kept).items():
             trials = tuple(replace(item, responses=without_time(item.responses, options.time)) for item in sessions)
-            note = ""
-            if options.units_reliability is not None:
-                trials, note = reliable_units(trials, len(kept), least=options.units_reliability, seed=options.seed)
+            trials, note = reliable_units(trials, len(kept), least=options.units_reliability, seed=options.seed)
             animal = metric.animal(subject, trials, len(kept), stimuli=kept, seed=options.seed)
             if not trials and note:
                 animal = replace(animal, problem=note)
@@ -143,9 +141,9 @@ def open_neural_responses(recordings: Any, *, progress: Progress | None, **selec
     from brainbench.datasets import open_recordings
 
     if isinstance(recordings, xr.Dataset):
-        from brainbench.core.contracts import check_recordings
+        from brainbench.core.contracts import check_counts
 
-        return NeuralResponses(check_recordings(recordings), "data set")
+        return NeuralResponses(check_counts(recordings, "The data set"), "data set")
     if isinstance(recordings, str) and recordings in DEMOS:
         folder = demo_recordings(recordings, progress=progress)
         dataset = open_recordings(folder, **selection, progress=progress)

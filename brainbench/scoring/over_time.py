@@ -50,9 +50,7 @@ def time_course(
     stage_done = stages(len(sessions) + len(network.activations), "RDMs over time", progress)
     animals, layers = [], {}
     for subject, blocks in sessions.items():
-        note = ""
-        if options.units_reliability is not None:
-            blocks, note = reliable_units(blocks, len(kept), least=options.units_reliability, seed=options.seed)
+        blocks, note = reliable_units(blocks, len(kept), least=options.units_reliability, seed=options.seed)
         if blocks:
             animals.append(animal_movie(subject, blocks, len(kept), stimuli=kept, seed=options.seed, **how))
         else:

@@ -80,19 +80,13 @@ def score_record(
     """
     from brainbench import metrics
     from brainbench.metrics.measures.rsa import RSA
-    from brainbench.scoring.demo import DEMOS
     from brainbench.scoring.model_responses import resolve_model
     from brainbench.scoring.neural_responses import open_neural_responses
-    from brainbench.stimuli.sources import prepare_stimuli
 
     started = clock.perf_counter()
     stage_done = stages(STAGES, "scoring", progress)
     options = _options(model, {**vars(options or ScoreOptions()), **changes})
-    # The simulation gets ready in a thread while the network loads, if any will be needed.
-    if isinstance(options.recordings, str) and options.recordings in DEMOS:
-        prepare_stimuli(DEMOS[options.recordings], progress=progress)
-    elif not isinstance(model, Mapping) and options.stimuli is not None:
-        prepare_stimuli(options.stimuli, whiskers=options.whiskers, fidelity=options.fidelity, progress=progress)
+    _prepare(model, options, progress)
     # Whatever can be wrong with a name or a file is found before the slow part, the simulation.
     metric = _metric(options)
     options = replace(options, metric=metric)
@@ -118,6 +112,10 @@ def score_record(
     scores, between = _compare(named, brain, animals, metric, kept, options, layer=layer, agreement=baselines)
     stage_done()
     settings = {"estimator_version": ESTIMATOR_VERSION, "model": model if isinstance(model, str) else None}
+    if (
+        resolved.labels is not None
+    ):  # features with labels of their own were computed elsewhere, of stimuli unknown here
+        settings |= dict.fromkeys(("stimuli", "whiskers", "fidelity"))
     origin = Provenance.of(
         provenance(
             **network.origin,
@@ -161,6 +159,17 @@ def _options(model: Any, values: Mapping[str, Any]) -> ScoreOptions:
     if options.stimuli is not None and is_finished(options.stimuli) and options.fidelity not in (None, "balanced"):
         raise UsageError("fidelity is that of a simulation, and these stimuli are finished; leave it out.")
     return options
+
+
+def _prepare(model: Any, options: ScoreOptions, progress: Progress | None) -> None:
+    """Let the simulation get ready in a thread while the network loads, if any will be needed."""
+    from brainbench.scoring.demo import DEMOS
+    from brainbench.stimuli.sources import prepare_stimuli
+
+    if isinstance(options.recordings, str) and options.recordings in DEMOS:
+        prepare_stimuli(DEMOS[options.recordings], progress=progress)
+    elif not isinstance(model, Mapping) and options.stimuli is not None:
+        prepare_stimuli(options.stimuli, whiskers=options.whiskers, fidelity=options.fidelity, progress=progress)
 
 
 def _check_inputs(resolved: ResolvedModel, brain: NeuralResponses, options: ScoreOptions) -> None:

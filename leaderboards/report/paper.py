@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from brainbench.core.errors import DataError, check_name, missing_dependency
+from brainbench.core.files import write_together
 from brainbench.core.records import ResultRecord
 from leaderboards import text as words
 from leaderboards.boards import Board, rank
@@ -26,7 +27,6 @@ from leaderboards.report.citations import references
 from leaderboards.site.page import render, render_markdown
 from leaderboards.site.table import board_label
 from leaderboards.store import StoredRecord
-from leaderboards.writing import write_files
 
 FORMATS = ("md", "html", "pdf")
 _WORDY = ("model", "baseline", "animal", "statement", "stated", "layer", "standing")
@@ -85,9 +85,9 @@ def write_paper(
     if kind == "md":
         drawn = [figure for section in paper["sections"] for figure in section["figures"]]
         figures = {place: standalone(figure.drawing) for figure, place in drawn}
-        return write_files({path: render_markdown("paper.md.j2", **paper), **bib, **figures})
+        return write_together({path: render_markdown("paper.md.j2", **paper), **bib, **figures})
     text = render("paper.html.j2", **paper, style_of_figures=STYLE)
-    return write_files({path: text if kind == "html" else _pdf(text, path), **bib})
+    return write_together({path: text if kind == "html" else _pdf(text, path), **bib})
 
 
 def _pdf(text: str, path: Path) -> bytes:

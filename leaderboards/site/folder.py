@@ -15,9 +15,9 @@ from pathlib import Path
 import msgspec
 
 from brainbench.core.errors import DataError, UsageError
-from brainbench.core.files import atomic_path, file_hash, read_json, write_json
+from brainbench.core.files import atomic_path, file_hash, read_json, writable, write_json
 from brainbench.core.writing.locks import lock_folder
-from leaderboards.writing import final_name, in_one_sentence, sweep
+from brainbench.core.writing.temporaries import is_temporary
 
 MANIFEST = "build-manifest.json"
 _Hashes = dict[str, list[str]]
@@ -36,29 +36,24 @@ def rebuilt(root: Path) -> Iterator[Callable[[str, str | bytes], Path]]:
         DataError: it cannot be written.
     """
     check_site(root)
-    with in_one_sentence(root):
-        root.mkdir(parents=True, exist_ok=True)
-        with lock_folder(root) as alone:
-            known, present = check_site(root)
-            if alone:
-                for folder in {root, *(path.parent for path in root.rglob(".*-*"))}:
-                    sweep(folder, lambda name: True)
-            _write(root, known)
-            new: _Hashes = {}
-            with ExitStack() as stack:
+    with writable(root), lock_folder(root):
+        known, present = check_site(root)
+        _write(root, known)
+        new: _Hashes = {}
+        with ExitStack() as stack:
 
-                def stage(name: str, content: str | bytes) -> Path:
-                    data = content.encode() if isinstance(content, str) else content
-                    stack.enter_context(atomic_path(root / name)).write_bytes(data)
-                    new[name] = [hashlib.sha256(data).hexdigest()]
-                    return root / name
+            def stage(name: str, content: str | bytes) -> Path:
+                data = content.encode() if isinstance(content, str) else content
+                stack.enter_context(atomic_path(root / name)).write_bytes(data)
+                new[name] = [hashlib.sha256(data).hexdigest()]
+                return root / name
 
-                yield stage
-                both = {name: known.get(name, []) + new.get(name, []) for name in known.keys() | new.keys()}
-                _write(root, both)
-            for name in present - new.keys():
-                (root / name).unlink(missing_ok=True)
-            _write(root, new)
+            yield stage
+            both = {name: known.get(name, []) + new.get(name, []) for name in known.keys() | new.keys()}
+            _write(root, both)
+        for name in present - new.keys():
+            (root / name).unlink(missing_ok=True)
+        _write(root, new)
 
 
 def check_site(root: Path) -> tuple[_Hashes, set[str]]:
@@ -74,7 +69,7 @@ def check_site(root: Path) -> tuple[_Hashes, set[str]]:
     known, present = _read(root), set()
     for name in sorted(_files(root)):
         path = root / name
-        temporary = (final_name(path.name) is not None and known is not None) or final_name(name) == MANIFEST
+        temporary = is_temporary(path.name) and (known is not None or name.startswith(f".{Path(MANIFEST).stem}-"))
         if name == MANIFEST or (temporary and not path.is_symlink()):
             continue
         listed = (known or {}).get(name, [])

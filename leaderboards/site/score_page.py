@@ -14,6 +14,7 @@ from itertools import combinations
 from pathlib import Path
 from typing import Any
 
+from brainbench.core.files import write_text
 from brainbench.core.records import ResultRecord
 from brainbench.core.statistics import compare_scores
 from leaderboards import text
@@ -26,7 +27,6 @@ from leaderboards.figures.time_course import draw_time_course
 from leaderboards.ranking import lacking
 from leaderboards.site.page import render
 from leaderboards.standing import not_repeatable, standing_of
-from leaderboards.writing import write_files
 
 _MOST_PAIRS = 100
 """An RDM with more pairs than this is shown as a picture only; its numbers are in the record."""
@@ -43,7 +43,7 @@ def write_report(record: ResultRecord, path: str | os.PathLike[str]) -> Path:
     embedded = base64.b64encode((record.to_json() + "\n").encode()).decode()
     link = f"data:application/json;base64,{embedded}"
     page = render("report.html.j2", **_score_view(record), record_link=link)
-    return write_files({Path(path): page})[0]
+    return write_text(path, page)
 
 
 def model_page(entry: Entry) -> str:

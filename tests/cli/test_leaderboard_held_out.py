@@ -74,6 +74,16 @@ def test_an_earlier_secret_is_not_overwritten(run, study):
     assert study["secret"] in again.err
 
 
+def test_the_public_part_does_not_take_the_place_of_the_recordings(run, study):
+    _hold_out(run, study, "--animals", "2")
+    public = Path(study["board"]) / "public.h5"
+    before = public.read_bytes()
+    for source in (public, public.parent):
+        again = _hold_out(run, study | {"data": str(source), "secret": study["secret"] + "2"}, "--animals", "2")
+        assert (again.status, public.read_bytes()) == (2, before)
+        assert "would take the place" in again.err
+
+
 @pytest.mark.parametrize(("what", "held"), [("animals", 2), ("stimuli", 4)])
 def test_a_submission_is_scored_on_what_is_held_out(run, study, what, held):
     _hold_out(run, study, f"--{what}", str(held))

@@ -145,3 +145,12 @@ def test_names_and_values_are_read_from_toml_and_json(tmp_path):
     (tmp_path / "c.json").write_text("[1]")
     with pytest.raises(DataError, match=r"/c\.json' .*list"):
         files.read_mapping(tmp_path / "c.json")
+
+
+def test_all_files_or_none(tmp_path):
+    (tmp_path / "b").mkdir()
+    with pytest.raises(DataError):
+        files.write_together({tmp_path / "a.txt": "new", tmp_path / "b": "a folder is in the way"})
+    assert not (tmp_path / "a.txt").exists()
+    paths = files.write_together({tmp_path / "a.txt": "new", tmp_path / "c.txt": b"too"})
+    assert [path.name for path in paths] == ["a.txt", "c.txt"]

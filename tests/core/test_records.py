@@ -77,8 +77,8 @@ def test_identity_ignores_when_and_where_but_not_what():
         ("{", "not valid JSON"),
         ("[1]", "the record is \\[1\\]"),
         ('{"schema": 99}', "schema version 99"),
-        ('{"schema": 1}', "lacks 'score'"),
-        ('{"schema": 1, "score": {"name": "x", "value": 1, "status": "ok", "colour": 2}}', "no field 'colour'"),
+        ('{"schema": 2}', "lacks 'score'"),
+        ('{"schema": 2, "score": {"name": "x", "value": 1, "status": "ok", "colour": 2}}', "no field 'colour'"),
     ],
 )
 def test_a_bad_record_is_refused_in_words(text: str, message: str):

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from brainbench.core.errors import DataError
+from brainbench.core.errors import DataError, UsageError
 from brainbench.core.records import Score
 from brainbench.core.statistics import paired_differences, t_interval, two_factor_error, wilson_interval
 
@@ -45,3 +45,10 @@ def test_paired_differences_follow_the_stimuli_of_the_first_score_on_every_run()
     second = Score("b", 0.5, "ok", stimuli=stimuli[::-1], without_stimulus=(0.0,) * 12, chance=0.0, attainable=1.0)
     _, without = paired_differences(first, second)
     assert without.tolist() == list(range(12))
+
+
+@pytest.mark.parametrize("successes", [4, -1, float("nan")])
+def test_more_successes_than_observations_are_refused(successes):
+    with pytest.raises(UsageError, match="3 observations"):
+        wilson_interval(successes, 3)
+    assert wilson_interval(3 * (1 + 1e-16), 3).high == 1

@@ -68,6 +68,17 @@ def test_a_folder_gets_one_file_per_session(tmp_path):
         export(path, tmp_path / "m3", select="subjects=m3")
 
 
+def test_a_copy_never_takes_the_place_of_its_source(tmp_path):
+    path = write_recordings(tmp_path / "a.h5", make_simple_session())
+    (nwb,) = export(path, tmp_path / "folder")
+    before = {file: file.read_bytes() for file in (path, nwb)}
+    (tmp_path / "link").symlink_to(tmp_path / "folder")
+    for source, target in ((path, path), (nwb, nwb), (nwb, nwb.parent), (nwb, tmp_path / "link")):
+        with pytest.raises(UsageError, match=f"place of its source .*{source.name}"):
+            export(source, target)
+    assert {file: file.read_bytes() for file in before} == before
+
+
 def test_what_cannot_be_written_is_refused_in_words(tmp_path):
     session = make_simple_session()
     path = write_recordings(tmp_path / "a.h5", [session, make_simple_session(session="2", seed=1)])

@@ -318,3 +318,9 @@ def test_globs_lists_and_layouts_name_sources(tmp_path):
         open_recordings("rodgers:demo")
     with pytest.raises(UsageError, match="simulated stimuli"):
         open_recordings("demo")
+
+
+@pytest.mark.parametrize("source", [3, None])
+def test_a_source_of_another_kind_is_refused(source):
+    with pytest.raises(UsageError, match=f"received {source}"):
+        open_recordings(source)

@@ -129,6 +129,11 @@ def test_exact_pieces_do_not_deviate_even_when_they_overlap_or_touch():
         assert found.largest == pytest.approx(0, abs=1e-9)
 
 
+def test_a_deviation_needs_pieces():
+    with pytest.raises(UsageError, match=r"pieces .*at least 1; received 0"):
+        deviation(_box(2, 1, 1), [])
+
+
 def test_what_is_added_and_what_is_missing_are_told_apart():
     whole = _box(2, 1, 1)
     assert deviation(whole, [_box(2.2, 1, 1)]).outward == pytest.approx(0.1, rel=0.02)

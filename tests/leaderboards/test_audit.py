@@ -14,8 +14,8 @@ from leaderboards.boards import rank
 from leaderboards.store import StoredRecord
 
 
-def _stored(record, path, schema=2):
-    return StoredRecord(path / "x.json", record, schema=schema)
+def _stored(record, path):
+    return StoredRecord(path / "x.json", record)
 
 
 def _with(record, **provenance):
@@ -27,16 +27,15 @@ def test_a_current_record_is_left_alone(make_record, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("change", "schema", "sentence"),
+    ("change", "sentence"),
     [
-        ({}, 1, "stale: the file has the layout of version 1, now 2"),
-        ({"version": "0.0.9"}, 2, "stale: made by brainbench 0.0.9, this is"),
-        ({"settings": {"estimator_version": 0}}, 2, "stale: version 0 of the default estimator, now 2"),
+        ({"version": "0.0.9"}, "stale: made by brainbench 0.0.9, this is"),
+        ({"settings": {"estimator_version": 0}}, "stale: version 0 of the default estimator, now 2"),
     ],
 )
-def test_what_an_older_toolkit_made_is_stale(make_record, tmp_path, change, schema, sentence):
+def test_what_an_older_toolkit_made_is_stale(make_record, tmp_path, change, sentence):
     record = _with(make_record(), **change)
-    ((found,),) = remarks([_stored(record, tmp_path, schema)]).values()
+    ((found,),) = remarks([_stored(record, tmp_path)]).values()
     assert found.startswith(sentence)
 
 

@@ -86,6 +86,19 @@ def test_a_second_record_of_a_seed_is_not_averaged_in():
     assert second.notes == ("an earlier record of a model that stands above or below once more",)
 
 
+@pytest.mark.parametrize("asked", [{"readout": "published"}, {"layer": "encoder.fc7"}, {"normalize": False}])
+def test_scores_that_were_asked_for_otherwise_are_no_seeds_of_one_entry(asked):
+    (record,) = draw_board({"net": 0.6})
+    other = _run(record, 1)
+    settings = {**other.score.provenance.settings, **asked}
+    score = replace(other.score, provenance={**other.score.provenance, "settings": settings})
+    entries = _entries(_run(record, 0), replace(other, score=score), _run(record, 2))
+    assert sorted(entry.seeds for entry in entries) == [1, 2]
+    assert [f"scored with {name} {value}" for name, value in asked.items()] == list(
+        next(entry for entry in entries if entry.seeds == 1).notes
+    )
+
+
 def test_one_seed_without_a_trusted_score_keeps_the_entry_from_being_ranked():
     (record,) = draw_board({"net": 0.6})
     bad = _run(record, 1)

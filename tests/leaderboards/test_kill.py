@@ -110,16 +110,6 @@ def test_additions_killed_at_many_instants_go_on_to_the_same_bytes(source, tmp_p
     _check_add(source, tmp_path, kills=20)
 
 
-def test_what_a_killed_addition_left_is_swept_by_the_next(source, tmp_path):
-    left = tmp_path / ".net-0--0123456789abcdef-0123456789abcdef.json"
-    left.write_text("{ half")
-    mine = tmp_path / ".notes"
-    mine.write_text("kept")
-    _seconds("add", source, "--to", tmp_path)
-    assert not left.exists()
-    assert mine.exists()
-
-
 def test_two_processes_build_one_site_and_fill_one_folder(source, tmp_path):
     halves = [sorted(source.iterdir())[part::2] for part in (0, 1)]
     site, board = tmp_path / "site", tmp_path / "board"

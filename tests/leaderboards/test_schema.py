@@ -7,7 +7,7 @@ import json
 from typing import Any
 
 import pytest
-from hypothesis import HealthCheck, assume, given, settings
+from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from jsonschema import Draft202012Validator
 
@@ -55,7 +55,7 @@ def test_a_written_record_fits_the_schema(make_record, status):
         (("synthetic",), "no", "synthetic is 'no'", "true or false"),
         (("baselines", "raw input"), None, "entry of baselines", "an object"),
         (("score", "colour"), "red", "score has no field 'colour'", "'ceiling'"),
-        (("schema",), True, "schema version True", "1 to 2"),
+        (("schema",), True, "schema version True", "version 2"),
         (("score", "p"), float("inf"), "score.p is inf", "<= 1"),
         (("score", "value"), float("inf"), "score.value is inf", "a number or null"),
         (("score", "subjects", 0, "units"), -1, "score.subjects[0].units is -1", ">= 0"),
@@ -91,7 +91,6 @@ def test_reading_agrees_with_jsonschema_on_damaged_records(make_record, data):
         del parent[path[-1]]
     else:
         parent[path[-1]] = value
-    assume(damaged.get("schema") != 1)  # an earlier layout: read, and not described by this schema
     assert (_fault(damaged) is None) == VALIDATOR.is_valid(damaged)
 
 

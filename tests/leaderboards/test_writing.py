@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import doctest
 import resource
 import sys
 from contextlib import contextmanager
@@ -11,9 +10,8 @@ from types import SimpleNamespace
 import pytest
 
 from brainbench.core.errors import DataError
-from leaderboards import build_leaderboard, write_record, writing
+from leaderboards import build_leaderboard, write_record
 from leaderboards.report.paper import write_paper
-from leaderboards.writing import write_files
 from tests.factories.sweep_batches import files_of
 
 
@@ -74,24 +72,3 @@ def test_a_failing_engine_leaves_the_old_pdf_and_its_citations(make_record, tmp_
         write_paper([make_record("new")], tmp_path / "a.pdf")
     assert "a font is missing" in str(caught.value)
     assert files_of(tmp_path) == before
-
-
-def test_all_files_or_none(tmp_path):
-    (tmp_path / "b").mkdir()
-    with pytest.raises(DataError):
-        write_files({tmp_path / "a.txt": "new", tmp_path / "b": "a folder is in the way"})
-    assert not (tmp_path / "a.txt").exists()
-    assert [path.name for path in write_files({tmp_path / "a.txt": "new", tmp_path / "c.txt": b"too"})] == [
-        "a.txt", "c.txt"
-    ]  # fmt: skip
-
-
-def test_leftovers_of_the_same_file_are_swept(tmp_path):
-    for name in (".a-0123456789abcdef.txt", ".other-0123456789abcdef.txt"):
-        (tmp_path / name).write_text("half")
-    write_files({tmp_path / "a.txt": "whole"})
-    assert {path.name for path in tmp_path.iterdir()} == {"a.txt", ".other-0123456789abcdef.txt"}
-
-
-def test_the_examples_hold():
-    assert doctest.testmod(writing).failed == 0

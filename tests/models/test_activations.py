@@ -221,9 +221,19 @@ def test_a_stimulus_that_does_not_fit_says_what_was_given_and_what_failed(stimul
     assert "[5, 4, 6, 5, 7] [stimulus, time, channel, row, column]" in str(caught.value)
 
 
-@pytest.mark.parametrize(("x", "chunk"), [(np.zeros((0, T, 30, 5, 7)), 4), (np.zeros(3), 4), (np.zeros((2, T, 3)), 0)])
-def test_nothing_to_extract_from_is_an_error(x, chunk):
-    with pytest.raises(UsageError, match=re.escape(f"{list(x.shape)} and chunk {chunk}")):
+@pytest.mark.parametrize(
+    ("x", "chunk", "told"),
+    [
+        (np.zeros((0, T, 30, 5, 7)), 4, "[0, 4, 30, 5, 7]"),
+        (np.zeros(3), 4, "[3]"),
+        (np.zeros((2, T, 3)), 0, "received 0"),
+        (np.zeros((2, T, 3)), 1.5, "received 1.5"),
+        (np.zeros((2, T, 3), complex), 4, "complex128"),
+        ([["a", "b"]], 4, "<U1"),
+    ],
+)
+def test_nothing_to_extract_from_is_an_error(x, chunk, told):
+    with pytest.raises(UsageError, match=re.escape(told)):
         extract(nn.Flatten(2), x, chunk=chunk)
 
 

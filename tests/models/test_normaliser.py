@@ -1,5 +1,7 @@
+import pytest
 import torch
 
+from brainbench.core.errors import UsageError
 from brainbench.models.normaliser import Normaliser
 
 
@@ -17,3 +19,11 @@ def test_numbers_are_saved_but_not_trained():
     normaliser = Normaliser.physical()
     assert set(normaliser.state_dict()) == {"scale", "offset"}
     assert not list(normaliser.parameters())
+
+
+@pytest.mark.parametrize("scale", [0.0, -1.0, float("nan")])
+def test_a_scale_that_gives_no_numbers_is_refused(scale):
+    with pytest.raises(UsageError, match="scale of a normaliser"):
+        Normaliser([1.0, scale])
+    with pytest.raises(UsageError, match="offset of a normaliser"):
+        Normaliser([1.0], [float("inf")])

@@ -4,9 +4,8 @@ import pytest
 
 from brainbench.core.errors import UsageError
 from brainbench.models.architecture import OBJECTIVES, Architecture
-from brainbench.models.recipes import find_recipe, list_recipes, recipe_for
+from brainbench.models.recipes import OPTIMIZERS, SCHEDULES, find_recipe, list_recipes, recipe_for
 from brainbench.models.registry import describe_model, list_models
-from brainbench.models.training.optimizers import OPTIMIZERS, SCHEDULES
 
 
 def test_there_are_as_many_recipes_as_published():

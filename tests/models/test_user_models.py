@@ -51,6 +51,24 @@ def test_a_file_may_import_its_neighbours_and_leaves_no_path_behind(tmp_path):
     assert sys.path == before
 
 
+def test_files_of_two_folders_have_neighbours_of_their_own(tmp_path):
+    paths = []
+    for width in (3, 5):
+        folder = tmp_path / str(width)
+        (folder / "parts").mkdir(parents=True)
+        (folder / "parts" / "__init__.py").write_text(f"WIDTH = {width}\n")
+        paths.append(_file(folder, "from parts import WIDTH\ndef make_model(): return nn.Linear(WIDTH, 1)\n"))
+    assert [load_user_model(f"{path}:make_model").in_features for path in paths] == [3, 5]
+
+
+def test_an_edited_neighbour_is_read_again(tmp_path):
+    (tmp_path / "edited_neighbour.py").write_text("WIDTH = 7\n")
+    path = _file(tmp_path, "from edited_neighbour import WIDTH\ndef make_model(): return nn.Linear(WIDTH, 1)\n")
+    assert load_user_model(f"{path}:make_model").in_features == 7
+    (tmp_path / "edited_neighbour.py").write_text("WIDTH = 77777\n")
+    assert load_user_model(f"{path}:make_model").in_features == 77777
+
+
 def test_an_edited_file_is_read_again(tmp_path):
     path = _file(tmp_path, "def make_model(): return nn.Linear(2, 1)\n")
     assert load_user_model(f"{path}:make_model").in_features == 2

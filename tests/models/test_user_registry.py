@@ -45,6 +45,22 @@ def test_a_file_that_is_gone_or_changed_is_told(still, caplog):
         load_model("still")
 
 
+def test_a_change_of_what_the_file_imports_beside_it_is_told(tmp_path, caplog):
+    (tmp_path / "sizes_of_mine.py").write_text("WIDTH = 2\n")
+    (tmp_path / "unrelated.py").write_text("WIDTH = 2\n")
+    path = tmp_path / "wide.py"
+    path.write_text("from sizes_of_mine import WIDTH\n" + CODE.replace("2", "WIDTH"))
+    add_user_model(f"{path}:make", "wide", taken=[])
+    (tmp_path / "unrelated.py").write_text("WIDTH = 5\n")
+    with caplog.at_level(logging.WARNING):
+        load_model("wide")
+    assert not caplog.text
+    (tmp_path / "sizes_of_mine.py").write_text("WIDTH = 33333\n")
+    with caplog.at_level(logging.WARNING):
+        assert load_model("wide").out_features == 33333
+    assert str(path) in caplog.text
+
+
 def test_nothing_is_stored_of_code_that_gives_no_module(tmp_path):
     path = tmp_path / "wrong.py"
     path.write_text("def make():\n    return 3\n")

@@ -51,6 +51,24 @@ def test_one_animal_has_a_score_without_an_interval_over_animals(features):
     assert [item.subject for item in found.subjects] == ["synthetic01"]
 
 
+@pytest.mark.parametrize(
+    ("name", "value"), [("counts", -1.0), ("counts", np.inf), ("duration", np.nan), ("duration", -0.5)]
+)
+def test_numbers_that_no_recording_has_are_refused_in_memory_too(features, tmp_path, name, value):
+    dataset = make_recordings().copy(deep=True)
+    dataset[name].values[0, 0] = value
+    for use in (
+        lambda: score(features(), recordings=dataset),
+        lambda: write_recordings(tmp_path / "x.h5", dataset),
+    ):
+        with pytest.raises(DataError, match=name):
+            use()
+    dataset = make_recordings()
+    dataset[name] = dataset[name].astype(str)
+    with pytest.raises(DataError, match="no numbers"):
+        score(features(), recordings=dataset)
+
+
 def test_two_stimuli_have_no_score(features):
     found = score(features(2), recordings=make_recordings(2))
     assert found.status == "undefined"

@@ -91,6 +91,16 @@ def test_the_true_geometry_scores_near_one_and_chooses_its_layer(truth: Path, re
     assert len(score.model_rdm) == len(score.brain_rdm) == 15
 
 
+def test_features_with_labels_of_their_own_state_no_stimuli(truth: Path, recordings: xr.Dataset):
+    from leaderboards.text import methods
+
+    record = score_record(str(truth), recordings=recordings, baselines=False)
+    origin = record.score.provenance
+    assert not origin.stimuli
+    assert [origin.settings[name] for name in ("stimuli", "whiskers", "fidelity")] == [None, None, None]
+    assert "idelity" not in methods([record])
+
+
 def test_an_unrelated_geometry_does_not(recordings: xr.Dataset, tmp_path: Path):
     path = write_features(tmp_path / "other.h5", LABELS, {"fc": _geometry(9)})
     score = brainbench.score(str(path), recordings=recordings)

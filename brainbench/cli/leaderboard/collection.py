@@ -12,10 +12,8 @@ from brainbench.cli.output import progress_bar
 from brainbench.core.errors import DataFileNotFoundError
 from brainbench.core.files import to_json
 from brainbench.core.records import ResultRecord
-from brainbench.core.writing.locks import lock_folder
 from leaderboards.audit import computation, conflicting, remarks
 from leaderboards.store import StoredRecord, read_records, write_record
-from leaderboards.writing import in_one_sentence, sweep
 
 
 def record_files(sources: list[Path]) -> list[Path]:
@@ -64,13 +62,8 @@ def _take_in_one(
 
 
 def _present(to: Path) -> list[tuple[Path, ResultRecord]]:
-    """Return the records of a folder; what killed writers left there is removed."""
-    if not to.is_dir():
-        return []
-    with in_one_sentence(to), lock_folder(to) as alone:
-        if alone:
-            sweep(to, lambda name: name.endswith(".json"))
-    if not any(to.rglob("*.json")):
+    """Return the records of a folder."""
+    if not to.is_dir() or not any(to.rglob("*.json")):
         return []
     return [(item.path, item.record) for item in read_records(to) if item.record is not None]
 

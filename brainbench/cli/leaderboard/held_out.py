@@ -21,6 +21,8 @@ if TYPE_CHECKING:
     from brainbench.core.records import ResultRecord, Score
     from leaderboards.held_out import Commitment
 
+PUBLIC = "public.h5"
+"""File of the public part."""
 FEWEST = {"animals": 2, "stimuli": 3}
 """Fewest on either side: less has no score."""
 
@@ -42,6 +44,8 @@ def hold_out(
     Anybody can score models on the public part; ``leaderboard verify --held-out`` scores a submission on the rest.
     """
     from brainbench.datasets import write_recordings
+    from brainbench.datasets.reading import find_recordings
+    from brainbench.scoring.demo import DEMOS
     from brainbench.scoring.neural_responses import open_neural_responses
     from leaderboards.held_out import DATA, Commitment, digest, new_salt
 
@@ -49,6 +53,9 @@ def hold_out(
         raise UsageError(f"Hold back either --animals or --stimuli; received {animals} and {stimuli}.")
     if secret.exists():
         raise UsageError(f"The folder {str(secret)!r} exists; name a new one, so that no earlier secret is lost.")
+    sources = [] if recordings in DEMOS else find_recordings(recordings)[1]
+    if (out / PUBLIC).resolve() in [path.resolve() for path in sources]:
+        raise UsageError(f"The public part would take the place of {recordings!r}, which it is of; give another --out.")
     kind = "animals" if animals else "stimuli"
     with progress_bar() as progress:
         whole = open_neural_responses(recordings, progress=progress, **options).dataset
@@ -66,7 +73,7 @@ def hold_out(
         kind, held_count, len(names) - held_count, str(whole.attrs["content_hash"]), digest(data, new_salt(secret))
     )
     files = [
-        write_recordings(out / "public.h5", public),
+        write_recordings(out / PUBLIC, public),
         # Stimuli without recordings are left out only where the pairs are named.
         write_json(out / "match.json", {name: name for name in public.attrs["vocabulary"]}),
         write_json(out / "held-out.json", commitment),

@@ -16,11 +16,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from brainbench.core.errors import UsageError
+from brainbench.core.reading.ranges import check_number
 from brainbench.core.trials import Trials
 from brainbench.datasets.synthetic.design import PopulationDesign
 from brainbench.datasets.synthetic.geometry import ResponseGeometry
@@ -183,5 +185,8 @@ def _labels(
 
 
 def entropy(seed: int | Sequence[int]) -> tuple[int, ...]:
-    """Return a seed as the beginning of a list of integers."""
-    return (seed,) if isinstance(seed, (int, np.integer)) else tuple(seed)
+    """Return a seed as the beginning of a list of integers; one that is none of 0 or more is a UsageError."""
+    several: tuple[Any, ...] = tuple(seed) if isinstance(seed, (tuple, list)) else (seed,)
+    for number in several:
+        check_number("A seed", number, least=0, whole=True)
+    return several

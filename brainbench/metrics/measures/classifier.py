@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from brainbench.core.errors import UsageError
+from brainbench.core.reading.ranges import check_number
 from brainbench.metrics.inference.permutation import label_orders, most_exact, tail_p
 from brainbench.metrics.rdms.pairs import Floats, Ints
 from brainbench.metrics.stimulus_labels import response_matrix
@@ -56,7 +57,7 @@ def decode(
 
     Raises:
         UsageError: shapes that do not fit, fewer than two classes, a class of a single stimulus (it
-            cannot be learnt once that is left out), or responses that are not finite.
+            cannot be learnt once that is left out), responses that are not finite, or no positive penalty.
 
     >>> decode([[0.], [1], [2], [10], [11], [12]], range(6), list("aaabbb")).accuracy
     1.0
@@ -75,6 +76,7 @@ def decode(
         )
     if not np.isfinite(matrix).all():
         raise UsageError("Responses to be decoded must be finite; leave out units or trials with missing values.")
+    check_number("The penalty of decoding", penalty, above=0)
     decoder = Decoder(matrix, rows, penalty=penalty)
     orders = np.concatenate(list(label_orders(len(codes), seed, exact=most_exact(ORDERS), draws=ORDERS)))
     accuracy = np.array([decoder(codes[order]) for order in orders])

@@ -98,7 +98,7 @@ def noise_corrected(
             None for models, which have no trial noise.
 
     Raises:
-        UsageError: unknown estimator, or numbers of splits that do not fit.
+        UsageError: unknown estimator, numbers of splits that do not fit, or numbers that are no correlations.
 
     >>> round(noise_corrected(0.6, [0.7, 0.8, 0.6]).value, 3)
     0.661
@@ -115,6 +115,8 @@ def noise_corrected(
             f"r_xy and the split-half correlations are single numbers or one per split; received {len(comparison)}, "
             f"{len(halves)}{'' if others is None else f', {len(others)}'}."
         )
+    if any((np.abs(part) > 1 + 1e-6).any() for part in (comparison, halves, others) if part is not None):
+        raise UsageError("Comparisons and split halves are correlations, from -1 to 1; others came.")
     r = float(finite_mean(comparison))
     sides = [float(spearman_brown(finite_mean(side))) for side in (halves, others) if side is not None]
     reliability = sides[0] if len(sides) == 1 else math.sqrt(math.prod(sides)) if min(sides) > 0 else min(sides)

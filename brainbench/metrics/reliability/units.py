@@ -67,15 +67,17 @@ def unit_reliability(
 
 
 def reliable_units(
-    blocks: Sequence[Trials], n_stimuli: int, *, least: float = UNIT_GATE, seed: int = 0
+    blocks: Sequence[Trials], n_stimuli: int, *, least: float | None = UNIT_GATE, seed: int = 0
 ) -> tuple[tuple[Trials, ...], str]:
     """Return the sessions with the units whose reliability is at least ``least``, and what was left out in words.
 
-    A session without such a unit is left out.
+    A session without such a unit is left out; without a ``least`` none is, and the words are empty.
 
     Raises:
         UsageError: as :func:`unit_reliability`.
     """
+    if least is None:
+        return tuple(blocks), ""
     values = unit_reliability(blocks, n_stimuli, seed=seed)
     kept = []
     for block, value in zip(blocks, values, strict=True):

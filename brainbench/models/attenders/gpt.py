@@ -16,6 +16,7 @@ from torch import nn
 from torch.nn import functional
 
 from brainbench.core.errors import UsageError
+from brainbench.core.reading.ranges import check_number
 from brainbench.models.ops.layers import Linear
 from brainbench.models.parts import wanted
 
@@ -87,7 +88,7 @@ class GPTAttender(nn.Module):
     parameters for 512 → 512; 6,532,608 for 512 → 256.
 
     Raises:
-        UsageError: the width is no multiple of the heads.
+        UsageError: the width is no multiple of the heads, or ``dropout`` no share.
     """
 
     def __init__(
@@ -101,7 +102,8 @@ class GPTAttender(nn.Module):
         dropout: float = 0.1,
     ) -> None:
         super().__init__()
-        if width % heads:
+        check_number("The share dropped by a GPT attender", dropout, least=0, most=1)
+        if width < 1 or width % heads:
             raise UsageError(f"The width of a GPT attender must be a multiple of its {heads} heads; received {width}.")
         self.features = width
         self.context = context

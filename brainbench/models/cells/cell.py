@@ -9,6 +9,7 @@ import torch
 from torch import nn
 
 from brainbench.core.errors import UsageError
+from brainbench.core.reading.ranges import check_number
 from brainbench.models.ops.parameters import load_named
 
 FORGET_BIAS = 1.0
@@ -104,7 +105,7 @@ class TimeDecay(Cell):
     ``kernel_size`` is unused.
 
     Raises:
-        UsageError: the numbers of channels differ.
+        UsageError: the numbers of channels differ, or ``tau`` is not finite.
     """
 
     keeps_channels = True
@@ -121,6 +122,7 @@ class TimeDecay(Cell):
         trainable: bool = True,
     ) -> None:
         super().__init__(in_channels, out_channels)
+        check_number("The time decay tau", tau)
         self.tau = nn.Parameter(torch.tensor(float(tau)), requires_grad=trainable)
         self.norm = ChannelNorm(out_channels) if layer_norm else nn.Identity()
 

@@ -14,6 +14,7 @@ import torch
 from torch import nn
 from torch.nn import functional
 
+from brainbench.core.reading.ranges import check_number
 from brainbench.models.encoders.zhuang import INPUT_SHAPE, small_width
 from brainbench.models.ops.layers import RECTIFIER_GAIN, Linear
 from brainbench.models.ops.state_space import StateSpace, System
@@ -64,6 +65,7 @@ class S4Encoder(nn.Module):
 
     def __init__(self, *, small: bool = False, dropout: float = 0.2) -> None:
         super().__init__()
+        check_number("The share dropped by S4", dropout, least=0, most=1)
         self.features = small_width(512) if small else 512
         self.embed = Linear(math.prod(self.input_shape), self.features, gain=RECTIFIER_GAIN)
         self.blocks: Any = nn.ModuleList(S4Block(self.features, dropout) for _ in range(len(self.layers) - 2))

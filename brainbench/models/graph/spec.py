@@ -13,7 +13,7 @@ from functools import cached_property
 from typing import Any, Literal
 
 from brainbench.core.errors import UsageError, check_name, listing, shown
-from brainbench.core.reading.ranges import check_number
+from brainbench.core.reading.ranges import check_fields, check_number
 
 Shape = tuple[int, ...]
 Unroll = Literal["biological", "full"]
@@ -30,7 +30,7 @@ def _check_pair(what: str, pair: Any, *, least: int = 1) -> None:
 
 @dataclass(frozen=True, kw_only=True)
 class Operation:
-    """Options that all operations share."""
+    """Options that all operations share; one out of its range is a :class:`UsageError`."""
 
     use_bias: bool = True
     bias: float | None = 0.0
@@ -43,6 +43,10 @@ class Operation:
     """Applied before the memory."""
     initialiser: Mapping[str, Any] | None = None
     """``{"method": name in torch.nn.init, **options}``; None is the He-uniform of this package."""
+
+    def __post_init__(self) -> None:
+        check_fields(self, "dropout", least=0, most=1)
+        check_fields(self, "bias")
 
     def output_shape(self, shape: Shape) -> Shape:
         """Return the shape of the output for an input (C, H, W) or (F,)."""
@@ -62,6 +66,8 @@ class Convolution(Operation):
     """Zeros at every edge (rows, columns); ``same`` keeps the grid, ``valid`` adds none."""
 
     def __post_init__(self) -> None:
+        super().__post_init__()
+        check_fields(self, "channels", least=1, whole=True)
         _check_pair("kernel size of a convolution", self.kernel_size)
         _check_pair("stride of a convolution", self.stride)
         if self.padding not in ("same", "valid"):
@@ -84,6 +90,10 @@ class Dense(Operation):
     bias: float | None = field(default=0.1, kw_only=True)
     """Initial bias; None draws it within 1/√fan_in."""
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_fields(self, "features", least=1, whole=True)
+
     def output_shape(self, shape: Shape) -> Shape:
         """Return (features,)."""
         del shape
@@ -95,7 +105,7 @@ class Memory:
     """A recurrent cell of :mod:`brainbench.models.cells`, channels unchanged.
 
     Raises:
-        UsageError: there is no such cell.
+        UsageError: there is no such cell, or a number is out of its range.
     """
 
     kind: str = "time-decay"
@@ -111,6 +121,8 @@ class Memory:
 
     def __post_init__(self) -> None:
         check_name("memory", self.kind, MEMORIES)
+        _check_pair("kernel size of a memory", self.kernel_size)
+        check_fields(self, "tau")
 
 
 @dataclass(frozen=True)
@@ -118,7 +130,7 @@ class Pool:
     """Pooling at the end of a node: ``max``, or ``average`` to a fixed output size.
 
     Raises:
-        UsageError: a size is out of its range.
+        UsageError: there is no such kind, or a size is out of its range.
     """
 
     kind: Literal["max", "average"]
@@ -134,6 +146,7 @@ class Pool:
     """Give one vector in place of a grid."""
 
     def __post_init__(self) -> None:
+        check_name("kind of pool", self.kind, ("max", "average"))
         _check_pair("size of a pool", self.size)
         if self.stride is not None:
             _check_pair("stride of a pool", self.stride)

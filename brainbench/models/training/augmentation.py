@@ -23,6 +23,7 @@ from torch.nn import functional
 
 from brainbench.core.contracts import CHANNELS, GRID_SHAPE
 from brainbench.core.errors import UsageError, check_name
+from brainbench.core.reading.ranges import check_number
 from brainbench.models.normaliser import Normaliser
 
 LAST_COLUMNS = (4, 4, 6, 6, 5)
@@ -46,10 +47,7 @@ class Augmentation:
 
     def __post_init__(self) -> None:
         check_name("augmentation", self.kind, KINDS)
-        if not 0.0 <= self.masking < 1.0:
-            raise UsageError(
-                f"The share of masked time steps lies between 0 and 1, 1 excluded; received {self.masking!r}."
-            )
+        check_number("The share of masked time steps", self.masking, least=0, below=1)
 
     def __call__(self, x: torch.Tensor, generator: torch.Generator, *, part: tuple[int, int] = (0, 1)) -> torch.Tensor:
         """Return an augmented copy of sweeps [B, T, S·C, 5, 7] in SI.

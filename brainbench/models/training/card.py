@@ -19,7 +19,7 @@ def checkpoint_info(
     epochs_done: float | None,
     best_epoch: float | None,
     evaluation: Evaluation | None,
-    twin: Mapping[str, Any] | None = None,
+    twin: Mapping[str, Any],
     controls: Mapping[str, Evaluation] | None = None,
     data: Mapping[str, Any] | None = None,
 ) -> dict[str, Any]:
@@ -40,7 +40,7 @@ def checkpoint_info(
         "best_epoch": best_epoch,
         "training": dataclasses.asdict(config),
         "evaluation": to_plain(evaluation),
-        "twin": dict(twin or {"name": config.model, "seed": config.seed}),
+        "twin": dict(twin),
         "licence": "MIT",
         "provenance": provenance(),
         **({"data": dict(data)} if data else {}),

@@ -9,7 +9,7 @@ from typing import Any
 from brainbench.core.errors import UsageError, check_name, shown, unknown_name
 from brainbench.core.reading.ranges import check_fields, check_number
 from brainbench.models.architecture import OBJECTIVES, Architecture, is_path
-from brainbench.models.recipes import BATCH_SIZE, EPOCHS, recipe_for
+from brainbench.models.recipes import BATCH_SIZE, EPOCHS, OPTIMIZERS, SCHEDULES, recipe_for
 from brainbench.models.training.checkpoints import DTYPES
 
 PRECISIONS = ("auto", "float32", "bf16")
@@ -68,6 +68,8 @@ class TrainingConfig:
     def __post_init__(self) -> None:
         for kind, value, allowed in (
             ("objective", self.objective, OBJECTIVES),
+            ("optimizer", self.optimizer, OPTIMIZERS),
+            ("schedule", self.schedule, SCHEDULES),
             ("precision", self.precision, PRECISIONS),
             ("way to compile", self.compile, COMPILE),
             ("precision of weights", self.weights_dtype, ("auto", *DTYPES)),

@@ -75,16 +75,40 @@ def topk(answers: torch.Tensor, labels: torch.Tensor, k: int) -> int:
     return int(((ahead < k) & torch.isfinite(own[:, 0])).sum())
 
 
+class SweepsHash:
+    """Hash of labelled sweeps, whatever the batches in which they come: after each block, its labels."""
+
+    _BLOCK = 1024
+    """Batch of the published recipes, in which the networks that come with the package were evaluated."""
+
+    def __init__(self) -> None:
+        self._digest = hashlib.sha256()
+        self._labels: list[bytes] = []
+
+    def add(self, x: torch.Tensor, labels: torch.Tensor) -> None:
+        """Take sweeps [B, ...] and their labels [B]."""
+        for sweep, label in zip(x.contiguous().cpu().numpy(), labels.cpu().long().numpy(), strict=True):
+            self._digest.update(sweep)
+            self._labels.append(label.tobytes())
+            if len(self._labels) == self._BLOCK:
+                self._end_block()
+
+    def _end_block(self) -> None:
+        self._digest.update(b"".join(self._labels))
+        self._labels.clear()
+
+    def value(self) -> str:
+        """Return the hash of all that came; nothing can be added after it."""
+        self._end_block()
+        return self._digest.hexdigest()[:16]
+
+
 def sweeps_hash(batches: Iterable[tuple[torch.Tensor, torch.Tensor]]) -> str:
     """Return the hash of labelled sweeps that :attr:`Evaluation.data` of them would have."""
-    digest = hashlib.sha256()
+    found = SweepsHash()
     for x, labels in batches:
-        _add(digest, x, labels)
-    return digest.hexdigest()[:16]
-
-
-def _add(digest: Any, x: torch.Tensor, labels: torch.Tensor) -> None:
-    digest.update(x.contiguous().cpu().numpy().tobytes() + labels.cpu().long().numpy().tobytes())
+        found.add(x, labels)
+    return found.value()
 
 
 def collapse(predicted: int, classes: int, spread: float) -> str:
@@ -104,12 +128,12 @@ def evaluate(model: nn.Module, batches: Iterable[tuple[Any, Any]], *, device: An
     """
     encode: Any = getattr(model, "encode", None)
     decoder: Any = getattr(model, "decoder", None)
-    digest, seen, first, five = hashlib.sha256(), 0, 0, 0
+    digest, seen, first, five = SweepsHash(), 0, 0, 0
     predictions, labelled = set(), set()
     moments: torch.Tensor | None = None
     with evaluating(model), torch.no_grad():
         for x, labels in batches:
-            _add(digest, x, labels)
+            digest.add(x, labels)
             x, labels = x.to(device), labels.to(device).long()
             if encode is not None and decoder is not None:
                 # Encoded once for both, the accuracy and the spread of the features.
@@ -150,7 +174,7 @@ def evaluate(model: nn.Module, batches: Iterable[tuple[Any, Any]], *, device: An
         spread=spread,
         collapsed=bool(reason),
         reason=reason,
-        data=digest.hexdigest()[:16],
+        data=digest.value(),
     )
 
 

@@ -12,6 +12,7 @@ from torch.optim import Optimizer
 
 from brainbench.core.errors import check_name
 from brainbench.core.reading.ranges import check_number
+from brainbench.models.recipes import OPTIMIZERS, SCHEDULES
 
 MOMENTUM = 0.9
 WEIGHT_DECAY = 1e-4
@@ -54,16 +55,13 @@ class LARS(Optimizer):
                 weight.sub_(group["lr"] * state["velocity"])
 
 
-OPTIMIZERS: Mapping[str, Callable[..., Optimizer]] = {
+_MAKERS: Mapping[str, Callable[..., Optimizer]] = {
     "sgd": lambda p, lr: torch.optim.SGD(p, lr=lr, momentum=MOMENTUM, weight_decay=WEIGHT_DECAY),
     "adam": lambda p, lr: torch.optim.Adam(p, lr=lr, weight_decay=WEIGHT_DECAY),
     "adamw": lambda p, lr: torch.optim.AdamW(p, lr=lr, weight_decay=WEIGHT_DECAY),
     "lars": LARS,
 }
 """Optimisers by name; each takes parameters and a learning rate."""
-
-SCHEDULES = ("step", "constant", "cosine")
-"""``step``: a tenth every 30 epochs; ``constant``; ``cosine``: to zero, after a linear rise if there is a warm-up."""
 
 
 def make_optimizer(name: str, parameters: Iterable[nn.Parameter], learning_rate: float) -> Optimizer:
@@ -74,7 +72,7 @@ def make_optimizer(name: str, parameters: Iterable[nn.Parameter], learning_rate:
     """
     check_name("optimizer", name, OPTIMIZERS)
     check_number("learning_rate", learning_rate, above=0)
-    return OPTIMIZERS[name]([p for p in parameters if p.requires_grad], learning_rate)
+    return _MAKERS[name]([p for p in parameters if p.requires_grad], learning_rate)
 
 
 def rate_factor(schedule: str, epoch: float, *, epochs: int, warmup_epochs: int = 0) -> float:

@@ -158,10 +158,10 @@ class _Run:
         self.progress = progress if progress is not None and where.first else (lambda done, total, what: None)
         self.started = self.saved = time.monotonic()
         self.options: dict[str, Any] = {"classes": len(data.classes), "decoder": config.decoder}
-        claim(out, {**config.identity, "classes": list(data.classes)}, write=where.first)
-        where.wait()
+        identity = {**config.identity, "classes": list(data.classes)}
+        claim(out, identity, write=False)
         model = load_model(config.model, seed=config.seed, **self.options).train()
-        self.twin = self._twin(describe_twin(config.model, config.seed, model))
+        start = describe_twin(config.model, config.seed, model)
         learner = make_learner(config.objective, model)
         if where.count > 1 and config.batch_size % where.count:
             raise UsageError(f"A batch of {config.batch_size} cannot be shared evenly by {where.count} processes.")
@@ -181,6 +181,10 @@ class _Run:
         if batches is None:
             raise DataError("The data set has no split 'train', so there is nothing to train on.")
         self.batches: Batches = batches
+        # What cannot be trained has ended by now, and takes no folder.
+        claim(out, identity, write=where.first)
+        where.wait()
+        self.twin = self._twin(start)
         self.at = _Position()
         if (out / STATE).exists():  # what is no file is refused there
             self._restore()
@@ -194,8 +198,6 @@ class _Run:
             return now
         kept = read_mapping(self.out / RUN).get("twin")
         if kept is None:
-            if (self.out / STATE).is_file():  # of an earlier version, which kept no hash
-                del now["state"]
             mark(self.out, twin=now)
         elif told := difference(kept, now):
             _log.warning("The run goes on, but without its untrained twin: %s.", told)
@@ -360,6 +362,8 @@ class _Run:
         # The probes are fitted to the training sweeps; where their data set names no hash, their content is hashed.
         fitted = dict(self.data.summary) or sweeps_hash(self._batches("train", shuffle=False, part=False) or ())
         key = {**probe, "classes": list(self.data.classes), "data": result.data, "train": fitted, "twin": self.twin}
+        # Batches of another size bring the sweeps to the probes in another order.
+        key["batch_size"] = self.config.batch_size
         if self.controls_file.is_file() and (kept := read_mapping(self.controls_file)).get("of") == key:
             return _evaluations(kept["controls"])
         self.progress(self._steps, self._steps, "probing raw input, random features and the untrained twin")

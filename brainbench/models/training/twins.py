@@ -28,8 +28,6 @@ def describe_twin(name: str, seed: int, model: nn.Module) -> dict[str, Any]:
 
 def difference(twin: Mapping[str, Any], found: Mapping[str, Any]) -> str:
     """Return why a network that was drawn again is not the twin, as :func:`describe_twin` tells of both; else ''."""
-    if "state" not in twin:
-        return f"nothing is known of the weights that training of {twin['name']} with seed {twin['seed']} started from"
     if twin["state"] == found["state"]:
         return ""
     return (

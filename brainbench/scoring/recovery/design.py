@@ -38,10 +38,8 @@ class RecoveryDesign:
     """Seed of the animals."""
 
     def __post_init__(self) -> None:
-        for name, fewest in (("splits", 1), ("orders", 40)):
-            if getattr(self, name) < fewest:
-                raise UsageError(f"A recovery needs at least {fewest} {name}; received {getattr(self, name)}.")
-        check_fields(self, "stimuli", least=FEWEST_STIMULI, whole=True)
+        for name, fewest in (("splits", 1), ("orders", 40), ("seed", 0), ("stimuli", FEWEST_STIMULI)):
+            check_fields(self, name, of="{} of a recovery", least=fewest, whole=True)
 
 
 def parse_trials(text: str) -> int | tuple[int, int]:

@@ -16,6 +16,7 @@ import numpy as np
 
 from brainbench.core.errors import UsageError
 from brainbench.core.progress import Progress
+from brainbench.core.reading.ranges import check_number
 from brainbench.metrics.layers import held_out
 from brainbench.metrics.measures.metric import Metric
 from brainbench.metrics.measures.registry import get_metric
@@ -65,8 +66,8 @@ def select_stimuli(
     design = replace(design or RecoveryDesign(), stimuli=None)
     check_candidates(candidates, design, boards)
     pool = len(candidates[0].stimuli)
-    if not FEWEST_STIMULI <= keep <= pool:
-        raise UsageError(f"The pool has {pool} stimuli; {keep} cannot be kept, only {FEWEST_STIMULI} to {pool}.")
+    check_number(f"Stimuli to keep of the {pool} of the pool", keep, least=FEWEST_STIMULI, most=pool, whole=True)
+    check_number("The number of exchanges", exchanges, least=0, whole=True)
     metric = get_metric(design.metric)
     if not metric.of_rdms:
         raise UsageError(f"Stimuli are chosen by RDMs; the metric {metric.name!r} does not compare any, 'rsa' does.")

@@ -65,6 +65,7 @@ def recover(
     """
     design = design or RecoveryDesign()
     check_candidates(candidates, design, boards)
+    check_number("The number of the first board", first, least=0, whole=True)
     jobs = [
         _Job(true, tuple(range(start, min(start + _TOGETHER, first + boards))))
         for start in range(first, first + boards, _TOGETHER)

@@ -96,3 +96,9 @@ def test_features_that_cannot_be_mixed_are_refused(features, error, culprit):
 def test_impossible_numbers_of_trials_are_refused(trials):
     with pytest.raises(UsageError, match="trials"):
         PopulationDesign(trials=trials)
+
+
+@pytest.mark.parametrize("seed", [-1, 0.5, "a", (0, -1)])
+def test_a_seed_is_one_or_several_whole_numbers(seed):
+    with pytest.raises(UsageError, match="A seed"):
+        draw_animals(make_features(), PopulationDesign(animals=1, units=2, trials=2), seed=seed)

@@ -70,15 +70,16 @@ def test_without_a_whole_manifest_nothing_counts_as_built(make_record, site, tex
     _refused(make_record, site, "no build")
 
 
-def test_temporary_files_of_a_killed_build_are_swept(make_record, site):
-    for name in (
-        ".index-0123456789abcdef.html",
-        "data/.records-0123456789abcdef.zip",
-        "models/.x-0123456789abcdef.html",
-    ):
-        (site / name).write_text("half")
+def test_temporary_files_of_a_build_killed_elsewhere_do_not_stop_the_build(make_record, site, tmp_path):
+    (site / "models" / ".x-0123456789abcdef.html").write_text("half")
     build_leaderboard([make_record("a")], site)
-    assert not [name for name in files_of(site) if "0123456789abcdef" in str(name)]
+    (tmp_path / "new").mkdir()
+    (tmp_path / "new" / ".build-manifest-0123456789abcdef.json").write_text("half")
+    build_leaderboard([make_record("a")], tmp_path / "new")
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / ".mine-0123456789abcdef.json").write_text("half")
+    with pytest.raises(UsageError, match="mine"):
+        build_leaderboard([make_record("a")], tmp_path / "other")
 
 
 def test_an_error_leaves_the_earlier_site(make_record, site, monkeypatch):

@@ -73,3 +73,6 @@ def test_misuse_is_told_in_a_sentence():
         decode(rng.normal(size=(5, 3)), range(5), SHAPES)
     with pytest.raises(UsageError, match="must be finite"):
         decode(np.full((6, 3), np.nan), range(6), SHAPES)
+    for penalty in (0.0, -1.0, np.nan):
+        with pytest.raises(UsageError, match=f"penalty .*{penalty}"):
+            decode(rng.normal(size=(6, 3)), range(6), SHAPES, penalty=penalty)

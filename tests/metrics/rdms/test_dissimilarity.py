@@ -236,6 +236,8 @@ def test_responses_must_be_a_matrix_of_numbers():
         rdm(np.ones((3, 4, 5)))
     with pytest.raises(UsageError, match="real numbers"):
         rdm([["a", "b"], ["c", "d"]])
+    with pytest.raises(UsageError, match="unequal length"):
+        rdm([[1, 2], [3]])
 
 
 def test_negative_rates_are_refused_by_poisson():

@@ -157,3 +157,9 @@ def test_bias_is_small_above_the_gate_and_errors_are_gross_below_it():
     assert abs(errors[above].mean()) < 0.05
     assert np.sqrt((errors[above] ** 2).mean()) < 0.25
     assert np.sqrt((errors[below] ** 2).mean()) > 0.4
+
+
+@pytest.mark.parametrize(("r", "halves"), [(2.0, [0.9, 0.8]), (0.5, [1.9, 1.8])])
+def test_what_is_no_correlation_is_refused(r, halves):
+    with pytest.raises(UsageError, match="from -1 to 1"):
+        noise_corrected(r, halves)

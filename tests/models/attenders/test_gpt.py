@@ -101,3 +101,7 @@ def test_dropout_acts_in_training_alone():
 def test_a_width_that_heads_cannot_share_is_refused():
     with pytest.raises(UsageError, match="4 heads; received 10"):
         GPTAttender(12, 10)
+    with pytest.raises(UsageError, match="4 heads; received 0"):
+        GPTAttender(12, 0)
+    with pytest.raises(UsageError, match=r"received -0\.5"):
+        GPTAttender(12, 8, dropout=-0.5)

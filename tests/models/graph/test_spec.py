@@ -52,6 +52,14 @@ def test_a_wrong_graph_is_answered_in_one_sentence(edges, changes, message):
         (lambda: Convolution(3, stride=(1, 1.5)), "stride of a convolution .*whole number.*received 1.5"),
         (lambda: Pool("max", (2, 2), padding=(0, -1)), "padding of a pool .*received -1"),
         (lambda: Pool("average", 6), "size of a pool .*rows, columns.*received 6"),
+        (lambda: Pool("mean", (2, 2)), "kind of pool 'mean'.*'max', 'average'"),
+        (lambda: Convolution(3, dropout=-1), "dropout .*at least 0 .*received -1"),
+        (lambda: Convolution(3, bias=float("nan")), "bias must be a finite number; received nan"),
+        (lambda: Convolution(0), "channels .*at least 1; received 0"),
+        (lambda: Dense(4, dropout=1.5), "dropout .*at most 1; received 1.5"),
+        (lambda: Dense(2.5), "features must be a whole number.*received 2.5"),
+        (lambda: Memory("gru", (0, 2)), "kernel size of a memory .*received 0"),
+        (lambda: Memory(tau=float("inf")), "tau must be a finite number; received inf"),
     ],
 )
 def test_impossible_sizes_are_refused(make, message):

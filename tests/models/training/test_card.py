@@ -14,7 +14,9 @@ def _found(correct, count=400):
 
 def _card(correct, twin=None, **changes):
     config = TrainingConfig.published("zhuang-small", "simclr", epochs=3)
-    info = checkpoint_info(config, ("a", "b"), epochs_done=3, best_epoch=2, evaluation=_found(correct), **changes)
+    start = {"name": "zhuang-small", "seed": 0}
+    known = {"epochs_done": 3, "best_epoch": 2, "evaluation": _found(correct), "twin": start}
+    info = checkpoint_info(config, ("a", "b"), **known, **changes)
     if twin is not None:
         info["twin_evaluation"] = {
             "top1": twin / 400,

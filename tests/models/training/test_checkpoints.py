@@ -108,16 +108,21 @@ def test_the_hub_is_asked_only_by_its_prefix(folder, monkeypatch):
         load_model("hf-hub:someone/touch")
 
 
-@pytest.mark.parametrize("twin", [NAME, {"name": NAME, "seed": 4}])
-def test_a_score_carries_what_the_checkpoint_says(folder, twin):
+def test_a_score_carries_what_the_checkpoint_says(folder):
     from brainbench.scoring.model_responses import resolve_model
 
     config = json.loads((folder / "config.json").read_text())
     found = {"top1": 0.5, "top5": 0.9, "interval": {"low": 0.4, "high": 0.6}, "data": "abc", "collapsed": False}
-    (folder / "config.json").write_text(json.dumps(config | {"evaluation": found, "twin": twin, "seed": 4}))
+    (folder / "config.json").write_text(
+        json.dumps(config | {"evaluation": found, "twin": {"name": NAME, "seed": 4}, "seed": 4})
+    )
     card = resolve_model(f"local-dir:{folder}").card
     assert (card.objective, card.top1, card.accuracy_interval.high, card.twin, card.seed) == ("ae", 0.5, 0.6, NAME, 4)
     assert resolve_model(NAME).card.objective == "untrained"
+    for name in ("evaluation", "twin", "baselines"):
+        (folder / "config.json").write_text(json.dumps(config | {name: "damaged"}))
+        with pytest.raises(DataError, match=r"config\.json' is not a readable configuration"):
+            resolve_model(f"local-dir:{folder}")
 
 
 def test_weights_of_another_version_are_refused(folder, tmp_path):

@@ -34,6 +34,8 @@ def test_changes_win():
         ({"epochs": 0}, "epochs .*at least 1 .*received 0"),
         ({"epochs": 1.5}, r"'epochs' is a int; received 1\.5"),
         ({"learning_rate": -1.0}, "learning_rate .*-1"),
+        ({"optimizer": "sgdd"}, "Unknown optimizer 'sgdd'; did you mean 'sgd'"),
+        ({"schedule": "stepp"}, "Unknown schedule 'stepp'; did you mean 'step'"),
         ({"precision": "fp16"}, "Unknown precision 'fp16'"),
         ({"augmentation": "tactile"}, "Unknown augmentation 'tactile'"),
         ({"objective": "simclr"}, ""),

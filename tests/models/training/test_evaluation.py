@@ -1,3 +1,4 @@
+import hashlib
 import math
 
 import pytest
@@ -7,7 +8,7 @@ from torch import nn
 from brainbench.core.errors import DataError, UsageError
 from brainbench.models.registry import load_model
 from brainbench.models.training.batches import BatchOptions
-from brainbench.models.training.evaluation import RawInput, baselines, collapse, evaluate, fit_probe, topk
+from brainbench.models.training.evaluation import RawInput, baselines, collapse, evaluate, fit_probe, sweeps_hash, topk
 from tests.factories.array_data import ArrayBatches
 from tests.factories.training_sweeps import sweeps
 
@@ -38,6 +39,16 @@ def test_accuracy_is_counted_over_batches():
     assert math.isnan(result.spread)
     again = evaluate(Fixed(6), [(x[:4], labels[:4]), (x[4:], labels[4:])])
     assert again.data == result.data != evaluate(Fixed(6), [(x, labels.flip(0))]).data
+
+
+def test_the_hash_of_sweeps_does_not_depend_on_their_batches():
+    x, labels = torch.rand(1030, 4), torch.arange(1030) % 4
+    parts = [(x[:1024], labels[:1024]), (x[1024:], labels[1024:])]
+    # Records that exist were made of batches of 1,024.
+    known = hashlib.sha256(b"".join(item.numpy().tobytes() for part in parts for item in part)).hexdigest()[:16]
+    for size in (1024, 1030, 7, 500):
+        batches = list(zip(x.split(size), labels.split(size), strict=True))
+        assert evaluate(Fixed(4), batches).data == sweeps_hash(batches) == known
 
 
 def test_a_network_that_always_gives_one_class_has_collapsed():

@@ -5,7 +5,8 @@ import torch
 from torch import nn
 
 from brainbench.core.errors import UsageError
-from brainbench.models.training.optimizers import LARS, OPTIMIZERS, make_optimizer, rate_factor
+from brainbench.models.recipes import OPTIMIZERS
+from brainbench.models.training.optimizers import LARS, make_optimizer, rate_factor
 
 
 def _stepped(weight, gradient, steps=1, **options):

@@ -4,6 +4,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -175,6 +176,8 @@ def test_a_run_is_compared_with_raw_input_random_features_and_its_twin_once(tmp_
     again = train(_config(epochs=1), tiny(), out=shared / "a", controls=shared, device="cpu")
     assert first.controls == other.controls == again.controls
     assert not computed
+    train(_config(epochs=1, batch_size=6), tiny(), out=shared / "h", controls=shared, device="cpu")
+    assert computed.pop()  # the probes see the sweeps in another order
     train(_config(epochs=1), tiny(test=6), out=shared / "c", controls=shared, device="cpu")
     assert computed.pop()  # other sweeps
     train(_config(epochs=1), tiny(train=21, test=6), out=shared / "d", controls=shared, device="cpu")
@@ -188,6 +191,14 @@ def test_a_run_is_compared_with_raw_input_random_features_and_its_twin_once(tmp_
     told.summary = told.summary | {"hash": "b"}
     train(_config(epochs=1), told, out=shared / "g", controls=shared, device="cpu")
     assert computed
+
+
+@pytest.mark.parametrize("changes", [{"decoder": "lineer"}, {"model": "zhuangg-small"}])
+def test_a_run_that_cannot_begin_takes_no_folder(tmp_path, changes):
+    wrong = replace(_config(epochs=1), **changes)
+    with pytest.raises(UsageError, match=next(iter(changes.values()))):
+        train(wrong, tiny(), out=tmp_path, device="cpu")
+    assert train(_config(epochs=1), tiny(), out=tmp_path, device="cpu").status == "finished"
 
 
 def test_the_random_state_of_others_is_left_alone(tmp_path):

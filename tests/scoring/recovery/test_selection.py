@@ -48,8 +48,9 @@ def test_kept_stimuli_keep_their_features():
 
 
 def test_more_stimuli_than_the_pool_has_are_refused():
-    with pytest.raises(UsageError, match="8 stimuli; 9"):
-        select_stimuli(make_candidates(8), 9, DESIGN)
+    for keep in (3, 9, 4.5):
+        with pytest.raises(UsageError, match=f"the 8 of the pool .*received {keep}"):
+            select_stimuli(make_candidates(8), keep, DESIGN)
     with pytest.raises(UsageError, match="at least two"):
         select_stimuli(make_candidates(8, names=("a",)), 4, DESIGN)
     with pytest.raises(UsageError, match="'procrustes'"):

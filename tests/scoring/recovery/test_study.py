@@ -61,6 +61,8 @@ def test_a_folder_of_another_recovery_is_refused(tmp_path):
         (make_candidates(8), {"layer": "layr1"}, 1, "'layer1'"),
         (make_candidates(8), {"metric": "decoding"}, 1, "'decoding'"),
         (make_candidates(8), {}, 0, "received 0"),
+        (make_candidates(8), {"splits": 1.5}, 1, "splits .* received 1.5"),
+        (make_candidates(8), {"seed": -1}, 1, "seed .* received -1"),
         ((*make_candidates(8), *make_candidates(9, names=("d",))), {}, 1, "different stimuli"),
     ],
 )

@@ -129,7 +129,7 @@ def test_a_setting_means_the_same_on_a_gpu_as_on_a_processor():
 @pytest.mark.skipif(warp().is_cuda_available(), reason="there is a GPU")
 def test_a_gpu_that_is_not_there_is_told(tmp_path):
     plan = small_plan(("brick:1",), backend="rod", device="cuda")
-    with pytest.raises(UsageError, match="No CUDA device"):
+    with pytest.raises(UsageError, match="0 CUDA devices"):
         generate(plan, tmp_path, workers=1)
 
 

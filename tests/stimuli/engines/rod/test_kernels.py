@@ -60,6 +60,14 @@ def test_a_warp_without_a_compiler_for_processors_says_what_to_do(monkeypatch):
             _device.pick_device(name)
 
 
+@pytest.mark.parametrize("name", ["cuda:9", "cuda:1", "cuda:x", "cuda:", "cudax", "gpu"])
+def test_a_device_that_is_not_there_is_told_in_one_sentence(monkeypatch, name):
+    monkeypatch.setattr(_device.warp(), "is_cuda_available", lambda: True)
+    monkeypatch.setattr(_device.warp(), "get_cuda_device_count", lambda: 1)
+    with pytest.raises(UsageError, match=f"'{name}'"):
+        _device.pick_device(name)
+
+
 def test_the_automatic_device_is_the_processor_wherever_that_works():
     assert _device.pick_device("auto").is_cpu
 
