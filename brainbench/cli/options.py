@@ -44,9 +44,9 @@ class OptionField:
     """One field of a dataclass as an option."""
 
     kind: Any
-    """Type of one value on the command line."""
+    """Type of one value."""
     several: bool
-    """True for a tuple, which is written with commas."""
+    """True for a tuple, which is written with commas on the command line."""
     default: Any
     help: str
 
@@ -54,12 +54,15 @@ class OptionField:
         """Return the parameter of a typer command."""
         # A switch that is off by default has no opposite.
         flags = flags or ((f"--{name.replace('_', '-')}",) if self.kind is bool and not default else ())
-        hint = Annotated[self.kind if default is not None else self.kind | None, typer.Option(*flags, help=self.help)]
+        kind = str if self.several else self.kind
+        hint = Annotated[kind if default is not None else kind | None, typer.Option(*flags, help=self.help)]
         return inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=hint)
 
-    def value(self, given: Any) -> Any:
-        """Return what a field holds for a value of the command line."""
-        return tuple(items(given)) if self.several and given is not None else given
+    def value(self, name: str, given: Any) -> Any:
+        """Return what the field of a name holds for a value of the command line."""
+        if not self.several or given is None:
+            return given
+        return tuple(items(given)) if self.kind is str else numbers(given, f"--{name}", self.kind)
 
 
 @cache
@@ -115,10 +118,9 @@ def with_options(
         parameters.append(field.parameter(name, (flags or {}).get(name, ()), default))
 
     def make(values: dict[str, Any]) -> Any:
-        options = {name: known[name].value(value) for name, value in values.items()}
-        if build:
-            # Defaults that are tuples are not read from the source; the dataclass has them.
-            options = {n: value for n, value in options.items() if not (known[n].several and value is None)}
+        options = {name: known[name].value(name, value) for name, value in values.items()}
+        # Defaults that are tuples are not read from the source; the dataclass has them.
+        options = {n: value for n, value in options.items() if not (known[n].several and value is None)}
         if given:
             options = {name: value for name, value in options.items() if value is not None}
         return getattr(import_module(module), wanted)(**options) if build and not given else options
@@ -168,7 +170,7 @@ def as_flags(kind: str, options: Any, flags: Mapping[str, tuple[str, ...]]) -> l
         if told.kind is bool:
             words.append(flag if value else f"--no-{flag.removeprefix('--')}")
         else:
-            words += [flag, ",".join(value) if told.several else str(value)]
+            words += [flag, ",".join(map(str, value)) if told.several else str(value)]
     return words
 
 

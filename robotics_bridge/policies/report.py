@@ -411,18 +411,19 @@ def remarks(results: Sequence[StudentResult]) -> list[str]:
 
 def command(config: DistillConfig, *, stop_at: int | None = None) -> str:
     """Return the command line that distils a student up to ``stop_at``, but for what only a file of students sets."""
+    usual = DistillConfig(task=config.task)
     words: dict[str, Any] = {"teacher": config.teacher, "config": config.variant, "observe": config.observe}
     if config.tactile is not None:
         words |= {"placement": config.placement, "resolution": config.resolution, "encoder": config.encoder}
         words |= {"noisy": "" if config.noisy else None}
-        words |= {name: config.encoder_settings.get(name) for name in ("learning", "time", "pretrained")}
+        words |= {name: config.encoder_settings.get(name) for name in ("learning", "time", "pretrained", "units")}
         words |= {"draw": config.encoder_settings.get("seed")}
         words |= {"unroll": config.encoder_settings.get("options", {}).get("unroll")}
     words |= {"contacts": config.contacts, "embedder": config.embedder, "hand": config.hand, "envs": config.num_envs}
     words |= {"seed": config.seed, "precision": config.precision, "iterations": config.iterations}
     words |= {"learning-rate": config.learning_rate, "epochs": config.epochs, "start": config.start}
+    words |= {"hidden": ",".join(map(str, config.hidden)) if config.hidden != usual.hidden else None}
     words |= {"stop-at": stop_at if stop_at != config.iterations else None}
-    usual = DistillConfig(task=config.task)
     given = {
         name: value
         for name, value in words.items()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -13,6 +14,14 @@ SCHEDULES = ("adaptive", "fixed")
 BOUNDED = "robotics_bridge.policies.training.bounded_ppo:BoundedPPO"
 """The algorithm of runs whose learning rate has other bounds than rsl_rl's."""
 _WIDEST = (1e-5, 1e-2)
+
+
+def check_widths(hidden: Sequence[int]) -> None:
+    """Raise UsageError unless these are widths of one hidden layer or more."""
+    if not hidden:
+        raise UsageError("A network has at least one hidden layer; received no width.")
+    for width in hidden:
+        check_number("A width of the hidden layers", width, least=1, most=65_536, whole=True)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -77,8 +86,7 @@ class TeacherSettings:
             )
         check_fields(self, "num_envs", "steps_per_env", "epochs", "minibatches", "rnd_outputs", least=1, whole=True)
         check_fields(self, "iterations", least=0, whole=True)
-        for width in self.hidden:
-            check_number("A width of the hidden layers", width, least=1, most=65_536, whole=True)
+        check_widths(self.hidden)
         check_fields(self, "discount", "gae_lambda", least=0, most=1)
         check_fields(self, "clip", "desired_kl", "max_grad_norm", "initial_std", above=0)
         check_fields(self, "entropy", "value_loss", "rnd_weight", "rnd_learning_rate", least=0)
@@ -157,3 +165,4 @@ class AuxiliaryDecoder:
     def __post_init__(self) -> None:
         check_fields(self, "weight", least=0)
         check_fields(self, "scale")
+        check_widths(self.hidden)

@@ -159,6 +159,25 @@ def test_a_task_of_ones_own_is_trained_and_evaluated(tmp_path: Path, quick: Path
     assert all(row["episodes"] == 2 for row in found)
 
 
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (("--hidden", "12,x"), "--hidden takes whole numbers joined by commas; received '12,x'"),
+        (("--hidden", "12,-4"), "width of the hidden layers .*received -4"),
+        (("--encoder", "rnn", "--unroll", "full"), "--unroll and --pretrained are of models; 'rnn' is none"),
+        (("--encoder", "reservoir", "--units", "3"), "'reservoir' has none"),
+    ],
+)
+def test_settings_that_reach_nothing_are_refused(tmp_path: Path, words: tuple[str, ...], told: str) -> None:
+    with pytest.raises(UsageError, match=told):
+        CliRunner().invoke(
+            app, ["policy", "distill", "in_palm_rotate", "--teacher", "in_palm_rotate.teacher", *words,
+                  "--envs", "2", "--out", str(tmp_path / "student")],
+            catch_exceptions=False,
+        )  # fmt: skip
+    assert not (tmp_path / "student").exists()
+
+
 def test_wrong_requests_are_refused(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="did you mean 'random'"):
         _run("play", "in_palm_rotate", "--agent", "randm", "--seconds", "0.1")

@@ -28,7 +28,12 @@ def test_records_are_intact_and_make_one_board_on_which_touch_leads(stored) -> N
     (board,) = rank(item.record for item in stored if item.record)
     names = [entry.name for entry in board.entries]
     assert names[0].startswith("in_palm_rotate_xhand1_force_torque_hand")
-    assert names[-2:] == ["in_palm_rotate_xhand1_none_lstm", "in_palm_rotate_xhand1_none"]
+    assert names[-1] == "in_palm_rotate_xhand1_none"
+    forgets, remembers = (names.index(f"in_palm_rotate_xhand1_none{more}") for more in ("", "_lstm_head-1024-256-128"))
+    assert remembers < forgets
+    frozen = [names.index(name) for name in names if "frozen" in name]
+    assert max(names.index(f"in_palm_rotate_xhand1_force_torque_hand_med_clean_{arm}") for arm in
+               ("tactile_convrnn", "reservoir", "rnn")) < min(frozen)  # fmt: skip
 
 
 def test_every_training_seed_has_a_command_that_exists_and_students_stopped_early_are_unreliable(

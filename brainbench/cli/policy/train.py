@@ -68,8 +68,8 @@ DISTILL = "robotics_bridge.policies.training.distill_config:DistillConfig"
 DISTILL_FLAGS = {"variant": ("--config",), "num_envs": ("--envs",)}
 OFFERED = (
     "observe", "placement", "resolution", "noisy", "contacts", "embedder", "hand", "variant", "num_envs", "iterations",
-    "learning_rate", "epochs", "teacher_share", "teacher_iterations", "aggregate", "precision", "save_interval", "seed",
-    "start",
+    "learning_rate", "epochs", "hidden", "teacher_share", "teacher_iterations", "aggregate", "precision",
+    "save_interval", "seed", "start",
 )  # fmt: skip
 """Fields of a student's configuration that have a flag of their name."""
 
@@ -94,6 +94,7 @@ def distill(
         int | None, typer.Option(help="Seed of an untrained model or reservoir; by default that of the student.")
     ] = None,
     pretrained: Annotated[Path | None, typer.Option(help="Weights of a tagged model.")] = None,
+    units: Annotated[int | None, typer.Option(help="Units of the encoder rnn. [default: 64]")] = None,
     episodes: Annotated[int, typer.Option(help="Of the evaluation, per seed; 0 for none.")] = 100,
     device: DeviceOption = "cpu",
     stop_after: Annotated[float | None, typer.Option(help="Save, stop and evaluate after so many seconds.")] = None,
@@ -101,16 +102,18 @@ def distill(
     as_json: JsonOption = False,
 ) -> None:
     """Distil a teacher into a student that feels; a run that was interrupted goes on when it is started again."""
+    from brainbench.core.errors import UsageError
     from robotics_bridge.policies.encoders.arms import ARMS, AUTO
     from robotics_bridge.policies.training.distill_config import DistillConfig
     from robotics_bridge.policies.training.students import train_student
 
-    settings: dict[str, Any] = {} if draw is None else {"seed": draw}
+    given = {"seed": draw, "units": units, "pretrained": pretrained and str(pretrained)}
+    settings: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
     if encoder not in (AUTO, *ARMS):
         settings |= {"learning": learning, "time": time}
         settings |= {} if unroll is None else {"options": {"unroll": unroll}}
-        if pretrained is not None:
-            settings["pretrained"] = str(pretrained)
+    elif (learning, time, unroll, pretrained) != ("frozen", "native", None, None):
+        raise UsageError(f"--learning, --time, --unroll and --pretrained are of models; {encoder!r} is none of them.")
     config = DistillConfig(task=task, teacher=str(teacher), encoder=encoder, encoder_settings=settings, **options)
     folder = out or Path("students") / config.name
     with progress_bar() as progress:

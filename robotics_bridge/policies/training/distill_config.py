@@ -15,7 +15,7 @@ from robotics_bridge.hands.observations import observation_type
 from robotics_bridge.policies.encoders.arms import ARMS, AUTO, EncoderConfig
 from robotics_bridge.policies.student import EMBEDDERS
 from robotics_bridge.tasks.contact_model import CONTACTS
-from robotics_bridge.tasks.settings import StudentSettings
+from robotics_bridge.tasks.settings import StudentSettings, check_widths
 
 _HIDDEN = (512, 256, 128)
 LOSSES = ("mse", "inv_var_mse")
@@ -89,6 +89,7 @@ class DistillConfig:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "hidden", tuple(self.hidden))
+        check_widths(self.hidden)
         observation_type(self.observe)
         if self.contacts is not None:
             check_name("contacts of a task", self.contacts, CONTACTS)

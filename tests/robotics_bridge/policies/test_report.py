@@ -261,6 +261,8 @@ def test_a_record_says_how_to_make_its_student(tmp_path) -> None:
         "--encoder zhuang-small.simclr --noisy --learning frozen --envs 64 --iterations 6000 --learning-rate 0.0005 "
         "--stop-at 77"
     )
+    small = DistillConfig(task="in_palm_rotate", encoder="rnn", encoder_settings={"units": 9}, hidden=(128, 64))
+    assert command(small) == "brainbench policy distill in_palm_rotate --encoder rnn --units 9 --hidden 128,64"
 
 
 def test_the_picture_shows_every_group(tmp_path) -> None:

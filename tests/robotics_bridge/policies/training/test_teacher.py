@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import signal
 import subprocess
@@ -148,7 +149,14 @@ def test_exploration_may_begin_anew_with_the_networks_of_another(tmp_path: Path)
 
 @pytest.mark.parametrize(
     ("name", "value"),
-    [("minutes", float("nan")), ("minutes", 0), ("iterations", 0), ("iterations", 2.5), ("save_every", 0), ("seed", -1)],
+    [
+        ("minutes", math.nan),
+        ("minutes", 0),
+        ("iterations", 0),
+        ("iterations", 2.5),
+        ("save_every", 0),
+        ("seed", -1),
+    ],
 )
 def test_a_run_of_no_extent_is_refused(name: str, value: float) -> None:
     with pytest.raises(UsageError, match=rf"{name} must be a .*received {value}"):
