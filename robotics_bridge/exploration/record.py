@@ -23,7 +23,6 @@ from brainbench.core.files import content_hash, to_json
 from brainbench.core.progress import Progress
 from brainbench.core.reading.ranges import check_fields
 from brainbench.core.rotations import from_matrices, from_rpy, to_matrices
-from brainbench.geometry import Mesh
 from brainbench.models.network import SUB_STEP_SECONDS, SUB_STEPS
 from robotics_bridge import hands
 from robotics_bridge.exploration.procedures import PROCEDURES, Pose, Procedure, find_procedure
@@ -50,32 +49,24 @@ class Explored:
     """An object to explore.
 
     Raises:
-        UsageError: neither or both of geometry and mesh are given, or the orientation or the retreat is not valid.
+        UsageError: the orientation or the retreat is not valid.
     """
 
     label: str
-    geometry: Geometry | None = None
-    """A primitive (its link and pose do not matter)."""
-    mesh: Mesh | None = None
-    """A surface. It collides as its convex hull; what taxels feel is the surface itself."""
+    geometry: Geometry
+    """Its shape; link and pose do not matter. A mesh collides as its convex hull; taxels feel the surface itself."""
     quaternion: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)
     """Orientation in which it is held (w, x, y, z)."""
     retreat: float = 0.0
     """Held so much further away than the procedure says (m)."""
 
     def __post_init__(self) -> None:
-        if (self.geometry is None) == (self.mesh is None):
-            raise UsageError(f"The object {self.label!r} needs a geometry or a mesh, and not both.")
         if np.shape(self.quaternion) != (4,) or not 1e-6 < float(np.linalg.norm(self.quaternion)) < np.inf:
             raise UsageError(
                 f"The orientation of {self.label!r} is a quaternion (w, x, y, z) that is finite and not zero; received "
                 f"{self.quaternion!r}."
             )
         check_fields(self, "retreat")
-
-    def shape(self) -> Geometry:
-        """Return the geometry that the physics uses."""
-        return self.geometry or Geometry(name=OBJECT, link=OBJECT, kind="mesh", mesh=self.mesh)
 
 
 @dataclass(frozen=True, eq=False)
@@ -205,8 +196,8 @@ def record_exploration(
         "objects": [
             {
                 "label": item.label, "quaternion": item.quaternion, "retreat": item.retreat,
-                "mesh": None if item.mesh is None else content_hash(item.mesh.vertices, item.mesh.faces),
-                "geometry": None if item.geometry is None else [item.geometry.kind, *item.geometry.size],
+                "mesh": None if (mesh := item.geometry.mesh) is None else content_hash(mesh.vertices, mesh.faces),
+                "geometry": [item.geometry.kind, *item.geometry.size] if mesh is None else None,
             }
             for item in objects
         ],
@@ -230,7 +221,7 @@ class _World:
         if not {*self.hand.joints} <= servos:
             replace_drives(spec)
         kinds = list(dict.fromkeys(objects))
-        models = compile_variants(spec, OBJECT, [item.shape() for item in kinds], density=_DENSE)
+        models = compile_variants(spec, OBJECT, [item.geometry for item in kinds], density=_DENSE)
         self.engine = MujocoEngine(
             models, len(objects), assignment=tuple(kinds.index(item) for item in objects), contacts=128
         )
@@ -242,7 +233,7 @@ class _World:
         self._closed = closing(self.hand, 1.0)
         # How far the lowest point of a held object lies below its body's origin (m), by the support function downwards:
         # row 2 of the rotation is the vertical in the object's frame.
-        self._bottoms = {id(item): float(item.shape().reach(-to_matrices(item.quaternion)[2])) for item in kinds}
+        self._bottoms = {id(item): float(item.geometry.reach(-to_matrices(item.quaternion)[2])) for item in kinds}
 
     def move(self, conditions: Sequence[tuple[Explored, Procedure]], time: float) -> None:
         """Put every object where it is at a time (0 to 1 of its procedure), and step the hand once."""
