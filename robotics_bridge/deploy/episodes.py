@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -42,48 +42,23 @@ class TactilePoints:
     normal: NDArray[np.float64]
     """[N, 3] outward, link frame."""
 
-    @classmethod
-    def of(cls, layout: Mapping[str, Any]) -> TactilePoints:
-        """Return the active taxels of a hand's layout."""
-        counts = [int(probes.active.sum()) for probes in layout.values()]
-        position, normal = (
-            np.concatenate([getattr(probes, name)[probes.active] for probes in layout.values()])
-            for name in ("position", "normal")
-        )
-        return cls(tuple(layout), np.repeat(np.arange(len(counts)), counts), position, normal)
 
-
-@dataclass
+@dataclass(frozen=True, eq=False)
 class Episode:
     """Frames of one episode; every array has a row per frame T."""
 
     task: str
     """Task that was done, in words."""
-    state: list[NDArray[np.floating]] = field(default_factory=list)
+    state: NDArray[np.floating]
     """[T, J] joint positions (rad)."""
-    velocity: list[NDArray[np.floating]] = field(default_factory=list)
+    velocity: NDArray[np.floating]
     """[T, J] (rad/s)."""
-    action: list[NDArray[np.floating]] = field(default_factory=list)
+    action: NDArray[np.floating]
     """[T, J] joint targets (rad)."""
-    tactile: list[NDArray[np.floating]] = field(default_factory=list)
+    tactile: NDArray[np.floating]
     """[T, N, 6]."""
-    wrench: list[NDArray[np.floating]] = field(default_factory=list)
+    wrench: NDArray[np.floating]
     """[T, 6]."""
-
-    def add(
-        self,
-        state: NDArray[np.floating],
-        velocity: NDArray[np.floating],
-        action: NDArray[np.floating],
-        tactile: NDArray[np.floating],
-        wrench: NDArray[np.floating],
-    ) -> None:
-        """Append a frame."""
-        values = (state, velocity, action, tactile, wrench)
-        for store, value in zip(
-            (self.state, self.velocity, self.action, self.tactile, self.wrench), values, strict=True
-        ):
-            store.append(np.array(value, dtype=np.float32))
 
 
 def total_wrench(
@@ -110,7 +85,7 @@ class SessionRecorder:
     """
 
     def __init__(self, hand: str, rate: float, task: str) -> None:
-        self.hand, self.rate, self.episode = hands.load(hand), rate, Episode(task)
+        self.hand, self.rate, self.task = hands.load(hand), rate, task
         layout = self.hand.layout("med", "tips")
         self.axes = finger_axes_of(self.hand, self.hand.layout("med", "hand"))
         fingers = tuple(self.hand.fingers)
@@ -121,6 +96,7 @@ class SessionRecorder:
             for name in ("position", "normal")
         )
         self.points = TactilePoints(tuple(layout), np.arange(len(layout)), position, normal)
+        self._frames: list[tuple[NDArray[np.floating], ...]] = []
 
     def __call__(self, reading: HandReading, obs: Any, action: Any, targets: NDArray[np.floating]) -> None:
         """Keep a tick, as a :class:`~robotics_bridge.deploy.controller.Controller` reports it."""
@@ -130,13 +106,12 @@ class SessionRecorder:
         torque = np.cross(self.points.position, force).astype(float)
         points = np.concatenate([force, torque], axis=1)
         wrench = total_wrench(points, self.points.links, self.points.link, self.axes)
-        self.episode.add(reading.position, reading.velocity, targets, points, wrench)
+        self._frames.append((reading.position, reading.velocity, targets, points, wrench))
 
     def write(self, folder: Path, joints: tuple[str, ...]) -> Path:
         """Write the session as a data set; see :func:`write_lerobot`."""
-        return write_lerobot(
-            folder, [self.episode], fps=self.rate, joints=joints, points=self.points, robot=self.hand.name
-        )
+        episode = Episode(self.task, *(np.array([frame[part] for frame in self._frames]) for part in range(5)))
+        return write_lerobot(folder, [episode], fps=self.rate, joints=joints, points=self.points, robot=self.hand.name)
 
 
 def check_folder(folder: Path, fps: float) -> None:
