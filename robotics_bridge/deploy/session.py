@@ -13,7 +13,7 @@ import numpy as np
 from brainbench.core.errors import DataError, DataFileNotFoundError, UsageError, listing
 from brainbench.core.files import file_hash
 from robotics_bridge import hands
-from robotics_bridge.deploy.controller import Actuation, Controller, Source
+from robotics_bridge.deploy.controller import Controller, Source
 from robotics_bridge.deploy.driver import Driver
 from robotics_bridge.deploy.safety import SafetyLimits
 from robotics_bridge.deploy.touch import REAL_TYPES, Fallback, PressureCalibration, RealTouch
@@ -116,10 +116,7 @@ class DeployedPolicy:
             )  # fmt: skip
         safe = SafetyLimits.of_hand(body, driver.joints, **dict(limits or {}))
         run = read_policy(self.path, self.groups, threads=threads, actions=len(contract.moved))
-        return Controller(
-            run, driver, Actuation.of(contract), safe, groups=tuple(self.groups), rate=contract.rate, sources=sources,
-            **settings,
-        )  # fmt: skip
+        return Controller(run, driver, contract, safe, sources=sources, **settings)
 
 
 def read_deployed(path: str | Path) -> DeployedPolicy:
