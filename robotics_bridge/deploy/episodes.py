@@ -96,7 +96,8 @@ class SessionRecorder:
             for name in ("position", "normal")
         )
         self.points = TactilePoints(tuple(layout), np.arange(len(layout)), position, normal)
-        self._frames: list[tuple[NDArray[np.floating], ...]] = []
+        self.frames: list[tuple[NDArray[np.floating], ...]] = []
+        """State, velocity, action, tactile and wrench of each tick."""
 
     def __call__(self, reading: HandReading, obs: Any, action: Any, targets: NDArray[np.floating]) -> None:
         """Keep a tick, as a :class:`~robotics_bridge.deploy.controller.Controller` reports it."""
@@ -106,11 +107,11 @@ class SessionRecorder:
         torque = np.cross(self.points.position, force).astype(float)
         points = np.concatenate([force, torque], axis=1)
         wrench = total_wrench(points, self.points.links, self.points.link, self.axes)
-        self._frames.append((reading.position, reading.velocity, targets, points, wrench))
+        self.frames.append((reading.position, reading.velocity, targets, points, wrench))
 
     def write(self, folder: Path, joints: tuple[str, ...]) -> Path:
         """Write the session as a data set; see :func:`write_lerobot`."""
-        episode = Episode(self.task, *(np.array([frame[part] for frame in self._frames]) for part in range(5)))
+        episode = Episode(self.task, *(np.array([frame[part] for frame in self.frames]) for part in range(5)))
         return write_lerobot(folder, [episode], fps=self.rate, joints=joints, points=self.points, robot=self.hand.name)
 
 
