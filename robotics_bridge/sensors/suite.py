@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, cast
@@ -14,6 +13,7 @@ from brainbench.core.cuda_graphs import record_launches
 from brainbench.core.devices import pick_device, warp
 from brainbench.core.errors import UsageError, unknown_name
 from brainbench.core.plugins import load_object
+from brainbench.core.reading.ranges import check_number
 from robotics_bridge.physics.scene import TouchScene
 from robotics_bridge.physics.state import DIVERGED, MOST_ENVS, UNFELT, HandState
 from robotics_bridge.sensors.context import ReadoutSlice, SuiteContext, UpdateClock
@@ -79,10 +79,9 @@ class SensorSuite:
         if fidelity is not None:
             sensors, resolution = fidelity.apply(sensors), resolution or fidelity.resolution
         resolution = resolution or 64
-        if listed is not None and listed < 1:
-            raise UsageError(f"listed is the positive number of geometries looked at on a link; received {listed}.")
-        if not 1 <= num_envs <= MOST_ENVS:
-            raise UsageError(f"A suite serves 1 to {MOST_ENVS:,} environments; received {num_envs}.")
+        if listed is not None:
+            check_number("listed", listed, least=1, whole=True)
+        check_number("environments of a suite", num_envs, least=1, most=MOST_ENVS, whole=True)
         self.scene, self.sensors = scene, dict(sensors)
         self.num_envs, self.device = num_envs, pick_device(device)
         groups: dict[Any, dict[str, Sensor]] = {}
@@ -133,8 +132,7 @@ class SensorSuite:
         """
         if self._status is None or state.status is not self._status:
             self._check(state)
-        if not (math.isfinite(dt) and dt > 0):
-            raise UsageError(f"dt is the positive time since the last update (s); received {dt!r}.")
+        check_number("dt (time since the last update, s)", dt, above=0)
         if not self.device.is_cuda:
             self._launch(state, dt)
             self._warn_crowded()
@@ -219,17 +217,18 @@ class SensorSuite:
     @property
     def diverged(self) -> torch.Tensor:
         """Mask [B] of environments that held numbers that are not finite since their reset; their readings are NaN."""
-        if self._status is None:
-            raise UsageError("Nothing was read yet; call update(state) first.")
-        return (wp.to_torch(self._status) & DIVERGED) != 0
+        return self._flagged(DIVERGED)
 
     @property
     def unfelt(self) -> torch.Tensor:
         """Mask [B] of environments in which, at the last update, a contact on a link with taxels of ``total="engine"``
         lay near none of them that feels it: their sum lacks its force."""
+        return self._flagged(UNFELT)
+
+    def _flagged(self, bit: int) -> torch.Tensor:
         if self._status is None:
             raise UsageError("Nothing was read yet; call update(state) first.")
-        return (wp.to_torch(self._status) & UNFELT) != 0
+        return (wp.to_torch(self._status) & bit) != 0
 
     @property
     def crowded(self) -> torch.Tensor:
