@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from brainbench.core.devices import mujoco_module
 from brainbench.core.errors import UsageError, check_name, repeats
+from brainbench.core.reading.ranges import check_number
 from brainbench.geometry import Mesh
 
 mujoco = mujoco_module()
@@ -209,10 +210,7 @@ class TouchScene:
         Raises:
             UsageError: the variants have different links or geometries, or the time step is no sensible time.
         """
-        if not 0 < (timestep := float(model.opt.timestep)) <= LONGEST_STEP:
-            raise UsageError(
-                f"A step of the engine lasts more than 0 s, at most {LONGEST_STEP:g} s; received {timestep}."
-            )
+        check_number("time step of the engine (s)", float(model.opt.timestep), above=0, most=LONGEST_STEP)
         links = tuple(_name(model, 1, index) for index in range(model.nbody))
         for other in others:
             if other.nbody != model.nbody or other.ngeom != model.ngeom:

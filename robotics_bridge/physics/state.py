@@ -170,11 +170,8 @@ class HandState:
             )
         if len(pairs) != count:
             raise UsageError(f"Every contact needs one pair of geometries; received {count} and {len(pairs)}.")
-        if count and not (environments.min() >= 0 and environments.max() < self.num_envs):
-            raise UsageError(
-                f"Environments of contacts are 0 to {self.num_envs - 1}; received {environments.min()} to "
-                f"{environments.max()}."
-            )
+        for environment in (environments.min(initial=0), environments.max(initial=0)):
+            check_number("environment of a contact", environment, least=0, below=self.num_envs)
         for name in optional:
             check_name("quantity of a contact", name, _CONTACT)
         for name, values in {"env": environments, "geom": pairs, **_CONTACT, **optional}.items():

@@ -118,10 +118,8 @@ def preset_modes(material: str | ElasticMaterial, lowest: float, count: int = 16
         UsageError: the lowest frequency lies outside the audible range, or the count is not positive.
     """
     chosen = elastic_material(material)
-    if not 20 <= lowest < 20_000 or count < 1:
-        raise UsageError(
-            f"A body rings between 20 and 20000 Hz in at least one mode; received {lowest!r} Hz, {count!r} modes."
-        )
+    check_number("lowest frequency of a body that is heard (Hz)", lowest, least=20, below=20_000)
+    check_number("number of modes", count, least=1, whole=True)
     # Free bar: wave numbers near (2n + 1) π / 2L, and frequencies with their square.
     every = (lowest * (2 * n + 1) ** 2 / 9 for n in range(1, count + 1))
     frequency = tuple(value for value in every if value <= 20_000)

@@ -267,7 +267,7 @@ def test_a_noisy_taxel_keeps_at_most_130_bytes(name: str) -> None:
             "release .*most 0.0001",
         ),
         (lambda: KinematicTaxel(link="hand", probes=GRID, convention="thesys"), "thesis"),  # type: ignore[arg-type]
-        (lambda: ContactDepthProbe(link="hand", probes=GRID, query="ray"), "'sdf' or 'raycast'"),  # type: ignore[arg-type]
+        (lambda: ContactDepthProbe(link="hand", probes=GRID, query="ray"), "'sdf', 'raycast'"),  # type: ignore[arg-type]
         (lambda: SurfaceDistanceProbe(link="hand", probes=GRID, noise=Noise(gain=(0.5, 2.0))), "no noise knob 'gain'"),
     ],
 )
