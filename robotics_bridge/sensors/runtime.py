@@ -82,40 +82,35 @@ class Runtime(abc.ABC):
 
         arrays = NoiseArrays(list(self.slices.values()), channels, context)
         self.part, self.probe = arrays.part, arrays.probe
-        self._truth = planes(True)
-        self._measured = planes(True) if self.noisy else self._truth
         self._stage = NoiseStage(arrays) if staged else None
         self._delay = DelayLine(arrays) if any(noise.read_delay for noise in noises) else None
         io = ReadoutArrays()
-        io.truth, io.measured = self._truth, self._measured
+        io.truth = planes(True)
+        io.measured = planes(True) if self.noisy else io.truth
         io.hysteresis, io.walk = (planes(wanted) for wanted in self.stores)
         io.age, io.episode = context.clock.age, context.clock.episode
         io.knobs, io.env_offset = arrays.params, context.clock.env_offset
         self.io = io
+        """Warp structure of the readings: ``truth`` and ``measured``, planar."""
         self._channels = channels
 
-    @abc.abstractmethod
     def update(self, state: HandState, dt: float) -> None:
         """Read the state; ``dt`` seconds have passed since the last update."""
+        self.io.status, self.io.dt = state.status, dt
+        self.run_kernels(state, dt)
+        # What noise is left after the sensor's own kernel.
+        if self._stage:
+            self._stage.launch(self.io.measured, self.io.measured, dt)
+        if self._delay:
+            self._delay.launch(self.io.measured, dt)
+
+    @abc.abstractmethod
+    def run_kernels(self, state: HandState, dt: float) -> None:
+        """Run the sensor's own kernels; ``io`` knows of this update."""
 
     def measured(self) -> Any:
         """Return the planar Warp array of measured readings."""
-        return self._delay.out if self._delay else self._measured
-
-    def truth(self) -> Any:
-        """Return the planar Warp array of readings without noise."""
-        return self._truth
-
-    def begin(self, state: HandState, dt: float) -> None:
-        """Point the structure that kernels take at this update."""
-        self.io.status, self.io.dt = state.status, dt
-
-    def finish(self, dt: float) -> None:
-        """Run what noise is left after the sensor's own kernel."""
-        if self._stage:
-            self._stage.launch(self._measured, self._measured, dt)
-        if self._delay:
-            self._delay.launch(self._measured, dt)
+        return self._delay.out if self._delay else self.io.measured
 
     @property
     def state_bytes(self) -> int:

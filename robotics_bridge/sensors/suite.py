@@ -160,7 +160,7 @@ class SensorSuite:
 
     def read_ground_truth(self, name: str) -> torch.Tensor:
         """Return the reading without noise, in the shape of :meth:`read`; a view."""
-        return self._view(name, self.runtime_of(name).truth())
+        return self._view(name, self.runtime_of(name).io.truth)
 
     def read_history(self, name: str) -> torch.Tensor:
         """Return the last measured readings [B, T, N(, C)], oldest first; zeros before the reset. A view.
