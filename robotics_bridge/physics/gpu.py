@@ -33,7 +33,6 @@ class MujocoWarpEngine:
         model: as of ``MujocoEngine``; so are ``num_envs``, ``assignment`` and ``fields``, which MuJoCo Warp must batch.
         device: ``cuda``, ``cuda:1`` or ``cpu`` (slow; for tests).
         contacts: room for contacts per environment, on average; by default sixteen, and nine per moving link.
-        constraints: room for constraint rows in each environment; by default enough for that many contacts.
 
     Raises:
         MissingDependencyError: mujoco-warp is not installed.
@@ -49,7 +48,6 @@ class MujocoWarpEngine:
         fields: Mapping[str, ArrayLike] | None = None,
         assignment: Sequence[int] = (),
         contacts: int | None = None,
-        constraints: int | None = None,
     ) -> None:
         self._engine = _mujoco_warp()
         check_number("environments of an engine", num_envs, least=1, most=MOST_ENVS, whole=True)
@@ -69,7 +67,7 @@ class MujocoWarpEngine:
             # Room for constraint rows: four per contact (two tangents in a pyramid), limits, equalities, tendons,
             # friction of joints.
             rows = 4 * contacts + 2 * self.model.njnt + 6 * self.model.neq + 2 * self.model.ntendon + self.model.nv
-            room = {"nconmax": contacts, "njmax": constraints or rows}
+            room = {"nconmax": contacts, "njmax": rows}
             self._d = self._engine.make_data(self.model, nworld=num_envs, **room)
             if set(varied) & set(_MASSES):
                 self._engine.set_const(self._m, self._d)
