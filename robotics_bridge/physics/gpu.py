@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from brainbench.core.cuda_graphs import record_launches
 from brainbench.core.devices import pick_device, warp
-from brainbench.core.errors import MissingDependencyError, UsageError, install_command, unknown_name
+from brainbench.core.errors import UsageError, missing_dependency, unknown_name
 from brainbench.core.reading.ranges import check_number
 from robotics_bridge.physics.kernels.state import fill_contacts, fill_links
 from robotics_bridge.physics.scene import TouchScene
@@ -193,9 +193,7 @@ def _mujoco_warp() -> Any:
     try:
         import mujoco_warp
     except ImportError as error:
-        raise MissingDependencyError(
-            f"Simulation on a GPU needs mujoco-warp; install it with: {install_command('gpu')}"
-        ) from error
+        raise missing_dependency("mujoco-warp", extra="gpu", purpose="Simulation on a GPU") from error
     return mujoco_warp
 
 

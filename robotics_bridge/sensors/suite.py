@@ -16,7 +16,7 @@ from brainbench.core.plugins import load_object
 from brainbench.core.reading.ranges import check_number
 from robotics_bridge.physics.scene import TouchScene
 from robotics_bridge.physics.state import DIVERGED, MOST_ENVS, UNFELT, HandState
-from robotics_bridge.sensors.context import ReadoutSlice, SuiteContext, UpdateClock
+from robotics_bridge.sensors.context import SuiteContext, UpdateClock
 from robotics_bridge.sensors.fidelity import SensorFidelity
 from robotics_bridge.sensors.plausibility import warn_of
 from robotics_bridge.sensors.probes.runtime import DistanceRuntime
@@ -111,7 +111,7 @@ class SensorSuite:
             self._updates = 0
             self._counter = context.zeros(1, int)
             self._histories = {
-                name: History(self._slice(name), max(sensor.channels, 1), sensor.history, context)
+                name: History(self._owner[name].slices[name], max(sensor.channels, 1), sensor.history, context)
                 for name, sensor in self.sensors.items()
                 if sensor.history
             }
@@ -291,10 +291,7 @@ class SensorSuite:
             raise unknown_name(what, name, choices)
         return self._owner[name]
 
-    def _slice(self, name: str) -> ReadoutSlice:
-        return self._owner[name].slices[name]
-
     def _view(self, name: str, planes: Any) -> torch.Tensor:
-        part = self._slice(name)
+        part = self._owner[name].slices[name]
         tensor = wp.to_torch(planes)[:, :, part.span].permute(1, 2, 0).unflatten(1, part.layout)
         return tensor.squeeze(-1) if part.scalar else tensor
