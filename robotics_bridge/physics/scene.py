@@ -90,11 +90,6 @@ class Geometry:
             return np.linalg.norm(d * np.array(size), axis=-1)
         return np.abs(d) @ np.array(size) if self.kind == "box" else np.full(d.shape[:-1], np.inf)
 
-    @property
-    def collides(self) -> bool:
-        """True if it can touch anything at all."""
-        return bool(self.contype or self.affinity)
-
 
 @dataclass(frozen=True)
 class Variants:
@@ -198,7 +193,8 @@ class TouchScene:
         kept: list[int] = []
         for other in {*range(len(self.links))} - self._barred(link):
             mine = [g for g in np.flatnonzero(self.link_of == other).tolist() if self.geometries[g].kind != "other"]
-            kept += [g for g in mine if self.geometries[g].collides] or mine
+            # Bits of zero collide with nothing at all.
+            kept += [g for g in mine if self._bits[g].any()] or mine
         return tuple(sorted(kept))
 
     @classmethod

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 from brainbench.core.errors import UsageError, unknown_name
 from brainbench.core.reading.ranges import check_fields, check_number
@@ -94,18 +94,6 @@ class Modes:
     def rows(self) -> Sequence[tuple[float, float, float]]:
         """Return (frequency, decay, gain) of each mode."""
         return list(zip(self.frequency, self.decay, self.gain, strict=True))
-
-    def strongest(self, count: int) -> Modes:
-        """Return the modes with the largest gains, by frequency."""
-        rows = sorted(sorted(self.rows(), key=lambda row: -abs(row[2]))[:count])
-        return Modes(*(tuple(column) for column in zip(*rows, strict=True)))
-
-    def scaled(self, size: float) -> Modes:
-        """Return the modes of a body ``size`` times as large of the same material (decays unchanged)."""
-        check_number("The scale of a body", size, above=0)
-        # Frequencies go with 1 / size, gains with 1 / mass, hence with 1 / size³.
-        gain = tuple(value / size**3 for value in self.gain)
-        return replace(self, frequency=tuple(value / size for value in self.frequency), gain=gain)
 
 
 def preset_modes(material: str | ElasticMaterial, lowest: float, count: int = 16) -> Modes:
