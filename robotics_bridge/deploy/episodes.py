@@ -8,7 +8,6 @@ Per frame: ``observation.state`` (joint positions, rad), ``observation.velocity`
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib.util import find_spec
@@ -155,7 +154,7 @@ def write_lerobot(
     """
     folder = Path(folder)
     check_folder(folder, fps)
-    import pyarrow
+    import pandas
 
     if not episodes:
         raise UsageError("A data set needs episodes; received none.")
@@ -172,8 +171,14 @@ def write_lerobot(
         tables.append(table)
         first += length
     _write_frames(folder / _DATA.format(chunk_index=0, file_index=0), tables, shapes)
-    _write_table(folder / "meta" / "episodes" / "chunk-000" / "file-000.parquet", pyarrow.Table.from_pylist(rows))
-    _write_tasks(folder / "meta" / "tasks.parquet", tasks)
+    # LeRobot reads the tasks as the index of a table.
+    described = {
+        "episodes/chunk-000/file-000": pandas.DataFrame(rows),
+        "tasks": pandas.DataFrame({"task_index": range(len(tasks))}, index=pandas.Index(tasks, name="task")),
+    }
+    for file, frame in described.items():
+        with atomic_path(folder / "meta" / f"{file}.parquet") as temporary:
+            frame.to_parquet(temporary)
     whole = {name: np.concatenate([table[name] for table in tables]) for name in tables[0]}
     write_json(folder / "meta" / "stats.json", {name: _stats(value) for name, value in whole.items()})
     names = {"observation.tactile": ["point", "channel"], "observation.wrench": ["Fx", "Fy", "Fz", "Mx", "My", "Mz"]}
@@ -256,26 +261,3 @@ def _write_frames(path: Path, tables: list[dict[str, NDArray]], shapes: Mapping[
         for table in tables:  # a row group per episode, so that one can be read alone
             columns = [pa.array(values.tolist(), type=schema.field(name).type) for name, values in table.items()]
             writer.write_table(pa.Table.from_arrays(columns, schema=schema))
-
-
-def _write_table(path: Path, table: Any) -> None:
-    from pyarrow import parquet
-
-    with atomic_path(path) as temporary:
-        parquet.write_table(table, temporary)
-
-
-def _write_tasks(path: Path, tasks: list[str]) -> None:
-    """Write the tasks as pandas does that has them as its index, for that is how LeRobot reads them."""
-    import pyarrow as pa
-
-    column = {"field_name": "task_index", "name": "task_index", "pandas_type": "int64", "numpy_type": "int64"}
-    index = {"field_name": "task", "name": "task", "pandas_type": "unicode", "numpy_type": "object"}
-    described = {
-        "index_columns": ["task"],
-        "column_indexes": [],
-        "columns": [{**part, "metadata": None} for part in (column, index)],
-        "pandas_version": "2.0.0",
-    }
-    table = pa.table({"task_index": pa.array(range(len(tasks)), pa.int64()), "task": pa.array(tasks, pa.string())})
-    _write_table(path, table.replace_schema_metadata({"pandas": json.dumps(described)}))
