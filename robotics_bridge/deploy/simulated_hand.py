@@ -67,6 +67,7 @@ class Faults:
     def __post_init__(self) -> None:
         check_fields(self, "drop", "damage", "absurd", "nan", least=0, most=1)
         check_fields(self, "delay", "delay_after", "jitter", "silent_after", "frozen_after", least=0, below=3600)
+        check_fields(self, "seed", least=0, whole=True)
 
     @classmethod
     def parse(cls, texts: list[str]) -> Faults:

@@ -21,7 +21,7 @@ from brainbench.core.contracts import CHANNELS, GRID_SHAPE, check_stimulus_set
 from brainbench.core.errors import UsageError
 from brainbench.core.files import content_hash, to_json
 from brainbench.core.progress import Progress
-from brainbench.core.reading.ranges import check_fields
+from brainbench.core.reading.ranges import check_fields, check_number
 from brainbench.core.rotations import from_matrices, from_rpy, to_matrices
 from brainbench.models.network import SUB_STEP_SECONDS, SUB_STEPS
 from robotics_bridge import hands
@@ -171,8 +171,9 @@ def record_exploration(
     """
     chosen = [find_procedure(name) for name in procedures]
     labels = [item.label for item in objects]
-    if not labels or not chosen or len(set(labels)) < len(labels) or frames < 1:
-        raise UsageError("Exploration needs objects with different labels, procedures and frames.")
+    check_number("frames", frames, least=1, whole=True)
+    if not labels or not chosen or len(set(labels)) < len(labels):
+        raise UsageError("Exploration needs objects with different labels, and procedures.")
     conditions = [(item, procedure) for item in objects for procedure in chosen]
     world = _World(hand, [item for item, _ in conditions], SUB_STEP_SECONDS * frames)
     grid = TaxelGrid(world.hand, resolution=resolution, placement=placement)

@@ -44,6 +44,7 @@ def holding_spec(hand: Hand, *, radius: float = 0.03, timestep: float = 0.002, r
         UsageError: the palm's side is unknown, or the radius is not positive.
     """
     check_number("radius of the ball (m)", radius, above=0)
+    check_number("reach", reach)
     up, surface, step = palm_surface(hand)
     # Between the middle of the palm and the roots of the fingers, where these reach it when they close.
     surface = surface + reach * step

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from brainbench.core.devices import mujoco_module
 from brainbench.core.errors import UsageError, check_name, repeats
-from brainbench.core.reading.ranges import check_number
+from brainbench.core.reading.ranges import check_fields, check_number
 from brainbench.geometry import Mesh
 
 mujoco = mujoco_module()
@@ -57,18 +57,20 @@ class Geometry:
 
     def __post_init__(self) -> None:
         check_name("kind of geometry", self.kind, KINDS)
-        needed = _SIZES[self.kind]
-        if len(self.size) < needed or not all(np.isfinite(s) and s > 0 for s in self.size[:needed]):
+        needed, of = _SIZES[self.kind], f"{{}} of {self.name!r}"
+        if len(self.size) < needed:
             raise UsageError(
                 f"The {self.kind} {self.name!r} needs {needed} positive size(s) in metres; received {self.size}."
             )
+        for size in self.size[:needed]:
+            check_number(of.format("size"), size, above=0)
+        check_fields(self, "contype", "affinity", of=of, whole=True)
+        check_fields(self, "position", of=of, items=3)
+        check_fields(self, "quaternion", of=of, items=4)
         if self.kind == "mesh" and self.mesh is None:
             raise UsageError(f"The geometry {self.name!r} is of kind 'mesh' and names no mesh; pass mesh=Mesh(...).")
         norm = float(np.linalg.norm(self.quaternion))
-        if not (np.isfinite([*self.position]).all() and np.isfinite(norm) and norm > 1e-6):
-            raise UsageError(
-                f"The geometry {self.name!r} has the pose {self.position}, {self.quaternion}, which is not valid."
-            )
+        check_number(f"length of the quaternion of {self.name!r}", norm, above=1e-6)
         object.__setattr__(self, "quaternion", tuple(float(q) / norm for q in self.quaternion))
         object.__setattr__(self, "size", tuple(float(s) for s in self.size[:needed]))
 
@@ -207,6 +209,8 @@ class TouchScene:
             UsageError: the variants have different links or geometries, or the time step is no sensible time.
         """
         check_number("time step of the engine (s)", float(model.opt.timestep), above=0, most=LONGEST_STEP)
+        for number in assignment:
+            check_number("variant of the assignment", number, least=0, below=1 + len(others), whole=True)
         links = tuple(_name(model, 1, index) for index in range(model.nbody))
         for other in others:
             if other.nbody != model.nbody or other.ngeom != model.ngeom:

@@ -147,6 +147,8 @@ def test_calibrations_of_pressure_have_ranges(value) -> None:
 def test_faults_have_ranges(name, value) -> None:
     with pytest.raises(UsageError, match=name):
         Faults(**{name: value})
+    with pytest.raises(UsageError, match="seed"):
+        Faults(seed=-1)
 
 
 @pytest.mark.parametrize(("joints", "fingers"), [(0, 0), (256, 0), (1, 256), (100_000, 1)])

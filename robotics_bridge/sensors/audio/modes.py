@@ -15,6 +15,7 @@ from scipy.sparse.linalg import eigsh
 
 from brainbench.core.errors import UsageError
 from brainbench.core.files import cache_dir, content_hash, to_plain
+from brainbench.core.reading.ranges import check_number
 from brainbench.core.reading.sealed import read_sealed, write_sealed
 from robotics_bridge.physics.scene import Geometry
 from robotics_bridge.sensors.audio import tetrahedra
@@ -47,6 +48,8 @@ def find_modes(
     Raises:
         UsageError: the solid is of another kind, or the mesh is too coarse for so many modes.
     """
+    for name, value in {"count": count, "cells": cells}.items():
+        check_number(name, value, least=1, whole=True)
     chosen = elastic_material(material)
     shape = (solid.kind, list(solid.size), None if solid.mesh is None else solid.mesh.content_hash)
     points = [None if point is None else np.asarray(point, float).tolist() for point in (strike, hear)]

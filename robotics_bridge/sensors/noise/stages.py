@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from brainbench.core.devices import pick_device, warp
 from brainbench.core.errors import UsageError
+from brainbench.core.reading.ranges import check_number
 from robotics_bridge.sensors.context import LaunchContext, ReadoutSlice, UpdateClock
 from robotics_bridge.sensors.noise.kernels.noise import NoiseParams, crosstalk, delay_line, measure
 from robotics_bridge.sensors.noise.model import Noise, stream_seed
@@ -197,15 +198,19 @@ def simulate(
         env_offset: Number of the first environment in the whole experiment.
 
     Raises:
-        UsageError: the signal has not four axes.
+        UsageError: the signal has not four axes, or the layout is none of its probes.
     """
     frames = np.asarray(clean, dtype=np.float32)
     if frames.ndim != 4:
         raise UsageError(f"A recorded signal has axes [time, environment, probe, channel]; received {frames.shape}.")
+    check_number("dt (s)", dt, above=0)
     _steps, envs, probes, channels = frames.shape
+    layout = layout or (probes,)
+    if any(not isinstance(side, int) or side < 1 for side in layout) or math.prod(layout) != probes:
+        raise UsageError(f"The layout of {probes} probes is (ny, nx) with ny nx = {probes}; received {layout}.")
     where = pick_device(device)
     clock = UpdateClock(*(wp.zeros(envs, dtype=int, device=where) for _ in range(2)), env_offset=env_offset)
-    slices = [ReadoutSlice(name, replace(noise, radius=0.0), 0, layout or (probes,))]
+    slices = [ReadoutSlice(name, replace(noise, radius=0.0), 0, layout)]
     arrays = NoiseArrays(slices, channels, LaunchContext(envs, where, seed, clock))
     stage, line = NoiseStage(arrays, gained=False), DelayLine(arrays) if noise.read_delay else None
     measured, out = arrays.zeros(True), np.empty_like(frames)

@@ -78,6 +78,9 @@ def test_requests_that_make_no_sense_are_refused() -> None:
         find_procedure("enclosur")
     with pytest.raises(UsageError, match="different labels"):
         record_exploration([_box(), _box()], ["enclosure"])
+    for frames in (0, 1.5, True, np.nan):
+        with pytest.raises(UsageError, match=rf"frames .*{frames}"):
+            record_exploration([_box()], ["enclosure"], frames=frames)
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf])

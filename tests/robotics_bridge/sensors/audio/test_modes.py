@@ -121,6 +121,9 @@ def test_modes_and_solids_outside_their_range_are_refused():
         find_modes(_solid("capsule", 0.01, 0.02), "wood")
     with pytest.raises(UsageError, match=r"60 modes .*6 tetrahedra; .*cells"):
         find_modes(_solid("box", 1, 1, 1), "wood", count=60, cells=1)
+    for wrong in ({"cells": 0}, {"cells": -3}, {"cells": 2.5}, {"count": 0}, {"count": 1.5}):
+        with pytest.raises(UsageError, match=rf"{next(iter(wrong))} must be a whole number, at least 1"):
+            find_modes(_solid("box", 1, 1, 1), "wood", **wrong)
     with pytest.raises(UsageError, match="did you mean 'glass'"):
         elastic_material("glas")
     with pytest.raises(UsageError, match="poisson_ratio"):

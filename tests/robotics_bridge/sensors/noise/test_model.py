@@ -195,6 +195,21 @@ def test_crosstalk_without_a_grid_is_refused():
         simulate(Noise(crosstalk=0.5), _constant(probes=4), dt=0.01)
 
 
+@pytest.mark.parametrize("layout", [(2, 3), (4,), (-2, -2), (2, 2.0)])
+def test_a_layout_is_that_of_the_probes(layout):
+    if layout == (4,):
+        simulate(Noise(), _constant(probes=4), dt=0.01, layout=layout)
+        return
+    with pytest.raises(UsageError, match="layout"):
+        simulate(Noise(), _constant(probes=4), dt=0.01, layout=layout)
+
+
+@pytest.mark.parametrize("dt", [0.0, -0.01, math.nan, math.inf, True, "0.1"])
+def test_time_goes_on(dt):
+    with pytest.raises(UsageError, match=rf"dt .*{dt}"):
+        simulate(Noise(hysteresis=0.5), _constant(), dt=dt)
+
+
 def test_late_readings_hold_the_last_value_and_carry_the_noise_of_their_time():
     ramp = np.arange(20, dtype=np.float32).reshape(-1, 1, 1, 1)
     assert simulate(Noise(read_delay=0.03), ramp, dt=0.01).ravel() == pytest.approx(np.maximum(np.arange(20) - 3, 0))
