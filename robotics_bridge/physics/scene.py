@@ -93,36 +93,12 @@ class Geometry:
         return np.abs(d) @ np.array(size) if self.kind == "box" else np.full(d.shape[:-1], np.inf)
 
 
-@dataclass(frozen=True)
-class Variants:
-    """Shapes that one geometry takes in different environments.
-
-    Raises:
-        UsageError: there is no choice, or the assignment names one that does not exist.
-    """
-
-    choices: tuple[Geometry, ...]
-    assignment: tuple[int, ...] = ()
-    """Choice of environment e is ``assignment[e % len(assignment)]``; empty means each in turn."""
-
-    def __post_init__(self) -> None:
-        if not self.choices:
-            raise UsageError("Variants of a geometry need at least one choice.")
-        if wrong := [index for index in self.assignment if not 0 <= index < len(self.choices)]:
-            raise UsageError(f"There are {len(self.choices)} variants; the assignment names variant {wrong[0]}.")
-
-    def of(self, env: int) -> Geometry:
-        """Return the shape in one environment."""
-        order = self.assignment or range(len(self.choices))
-        return self.choices[order[env % len(order)]]
-
-
 @dataclass(frozen=True, eq=False)
 class TouchScene:
     """Links, their geometries and the pairs that may touch; says nothing about motion.
 
     Raises:
-        UsageError: a name occurs twice or a geometry names an unknown link.
+        UsageError: a name occurs twice, a geometry names an unknown link, or variants are empty.
     """
 
     links: tuple[str, ...]
@@ -131,13 +107,15 @@ class TouchScene:
     """Pairs of link numbers (low, high) that never collide, such as parent and child."""
     included: frozenset[tuple[int, int]] = frozenset()
     """Pairs of geometry numbers (low, high) that collide whatever their bits say."""
-    variants: Mapping[int, Variants] = field(default_factory=dict)
-    """By geometry number: its shapes where environments differ."""
+    variants: Mapping[int, tuple[Geometry, ...]] = field(default_factory=dict)
+    """By geometry number, where environments differ: its shapes in environments 0, 1, …, then from the first again."""
 
     def __post_init__(self) -> None:
         for what, names in (("link", self.links), ("geometry", [g.name for g in self.geometries])):
             if twice := repeats(filter(None, names)):
                 raise UsageError(f"The scene has two of the {what} {twice[0]!r}; names must differ.")
+        if not all(self.variants.values()):
+            raise UsageError("Variants of a geometry need at least one shape.")
         for geometry in self.geometries:
             check_name("link", geometry.link, self.links, hint=f"Geometry {geometry.name!r} is fixed to it.")
 
@@ -161,7 +139,8 @@ class TouchScene:
 
     def geometry_in(self, env: int, geometry: int) -> Geometry:
         """Return a geometry as one environment has it."""
-        return self.variants[geometry].of(env) if geometry in self.variants else self.geometries[geometry]
+        shapes = self.variants.get(geometry) or (self.geometries[geometry],)
+        return shapes[env % len(shapes)]
 
     @cached_property
     def _bits(self) -> NDArray[np.int64]:
@@ -203,7 +182,8 @@ class TouchScene:
     def from_mujoco(cls, model: Any, others: Sequence[Any] = (), assignment: Sequence[int] = ()) -> TouchScene:
         """Read the scene out of a compiled ``mujoco.MjModel``; link 0 is the world.
 
-        ``others`` are further variants that differ in numbers only, assigned to environments as in :class:`Variants`.
+        ``others`` are further variants that differ in numbers only. That of environment e is number
+        ``assignment[e % len(assignment)]``; empty means each in turn.
 
         Raises:
             UsageError: the variants have different links or geometries, or the time step is no sensible time.
@@ -219,10 +199,11 @@ class TouchScene:
                     f"{other.ngeom} geometries, the first {model.nbody} and {model.ngeom}."
                 )
         geometries, *rows = (_geometries(each, links) for each in (model, *others))
+        order = list(assignment) or range(1 + len(others))
         variants = {
-            index: Variants((first, *rest), tuple(int(a) for a in assignment))
-            for index, (first, *rest) in enumerate(zip(geometries, *rows, strict=True))
-            if any(_differs(first, shape) for shape in rest)
+            index: tuple(shapes[number] for number in order)
+            for index, shapes in enumerate(zip(geometries, *rows, strict=True))
+            if any(_differs(shapes[0], shape) for shape in shapes[1:])
         }
         pairs = zip(model.pair_geom1.tolist(), model.pair_geom2.tolist(), strict=True)
         always = frozenset((min(pair), max(pair)) for pair in pairs)

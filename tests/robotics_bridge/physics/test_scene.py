@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from brainbench.core.errors import UsageError
-from robotics_bridge.physics import Geometry, MujocoEngine, TouchScene, Variants, compile_variants
+from robotics_bridge.physics import Geometry, MujocoEngine, TouchScene, compile_variants
 
 CHAIN = """<mujoco><worldbody>
 <geom name="floor" type="plane" size="0 0 1"/>
@@ -48,7 +48,7 @@ def test_every_pair_that_mujoco_finds_is_a_candidate() -> None:
 def test_variants_give_each_environment_its_shape() -> None:
     ball = Geometry(name="o", link="o", kind="sphere", size=(0.1,))
     box = Geometry(name="o", link="o", kind="box", size=(0.1, 0.1, 0.1))
-    scene = TouchScene(("world", "o"), (ball,), variants={0: Variants((ball, box), (1, 1, 0))})
+    scene = TouchScene(("world", "o"), (ball,), variants={0: (box, box, ball)})
     assert [scene.geometry_in(env, 0).kind for env in range(4)] == ["box", "box", "sphere", "box"]
 
 
@@ -89,7 +89,7 @@ def test_compiled_variants_differ_where_they_should() -> None:
         (lambda: Geometry(name="a", link="b", kind="mesh"), "names no mesh"),
         (lambda: TouchScene(("w", "w")), "two of the link 'w'"),
         (lambda: TouchScene(("w",), (Geometry(name="a", link="v", kind="plane"),)), "Geometry 'a' is fixed"),
-        (lambda: Variants(()), "at least one choice"),
+        (lambda: TouchScene(("w",), variants={0: ()}), "at least one shape"),
     ],
 )
 def test_mistakes_are_named(make: object, message: str) -> None:
