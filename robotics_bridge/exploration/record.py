@@ -18,14 +18,14 @@ from numpy.typing import NDArray
 
 from brainbench import __version__
 from brainbench.core.contracts import CHANNELS, GRID_SHAPE, check_stimulus_set
-from brainbench.core.errors import UsageError
+from brainbench.core.errors import UsageError, check_name
 from brainbench.core.files import content_hash, to_json
 from brainbench.core.progress import Progress
 from brainbench.core.reading.ranges import check_fields, check_number
 from brainbench.core.rotations import from_matrices, from_rpy, to_matrices
 from brainbench.models.network import SUB_STEP_SECONDS, SUB_STEPS
 from robotics_bridge import hands
-from robotics_bridge.exploration.procedures import PROCEDURES, Pose, Procedure, find_procedure
+from robotics_bridge.exploration.procedures import PROCEDURES, Pose
 from robotics_bridge.hands.observations import observe, sensors_for
 from robotics_bridge.hands.scenes import OBJECT, closing, holding_spec, replace_drives
 from robotics_bridge.physics import Geometry, MujocoEngine
@@ -169,12 +169,13 @@ def record_exploration(
     Raises:
         UsageError: a name is unknown or occurs twice, or nothing is to be explored.
     """
-    chosen = [find_procedure(name) for name in procedures]
+    for name in procedures:
+        check_name("exploratory procedure", name, PROCEDURES)
     labels = [item.label for item in objects]
     check_number("frames", frames, least=1, whole=True)
-    if not labels or not chosen or len(set(labels)) < len(labels):
+    if not labels or not procedures or len(set(labels)) < len(labels):
         raise UsageError("Exploration needs objects with different labels, and procedures.")
-    conditions = [(item, procedure) for item in objects for procedure in chosen]
+    conditions = [(item, procedure) for item in objects for procedure in procedures]
     world = _World(hand, [item for item, _ in conditions], SUB_STEP_SECONDS * frames)
     grid = TaxelGrid(world.hand, resolution=resolution, placement=placement)
     sensors = sensors_for("force_torque", grid.layout, noisy=noisy, track=(OBJECT,), twist=TWIST)
@@ -189,11 +190,10 @@ def record_exploration(
         felt.append(grid(taxels).flatten(2).transpose(1, 2).numpy())
         if progress is not None:
             progress(frame + 1, frames, "exploring")
-    several = len(chosen) > 1
     config = {
         "hand": hand, "resolution": resolution, "placement": placement, "noisy": noisy, "twist": TWIST,
         "frames": frames, "seed": seed,
-        "procedures": [procedure.name for procedure in chosen],
+        "procedures": list(procedures),
         "objects": [
             {
                 "label": item.label, "quaternion": item.quaternion, "retreat": item.retreat,
@@ -205,8 +205,8 @@ def record_exploration(
     }  # fmt: skip
     return HandRecording(
         world.hand.name, resolution, placement,
-        tuple(f"{item.label}/{procedure.name}" if several else item.label for item, procedure in conditions),
-        tuple(item.label for item, _ in conditions), tuple(procedure.name for _, procedure in conditions),
+        tuple(f"{item.label}/{name}" if len(procedures) > 1 else item.label for item, name in conditions),
+        tuple(item.label for item, _ in conditions), tuple(name for _, name in conditions),
         np.linspace(SUB_STEP_SECONDS, SUB_STEP_SECONDS * frames, frames), np.stack(felt, axis=1), config,
     )  # fmt: skip
 
@@ -236,11 +236,11 @@ class _World:
         # row 2 of the rotation is the vertical in the object's frame.
         self._bottoms = {id(item): float(item.geometry.reach(-to_matrices(item.quaternion)[2])) for item in kinds}
 
-    def move(self, conditions: Sequence[tuple[Explored, Procedure]], time: float) -> None:
+    def move(self, conditions: Sequence[tuple[Explored, str]], time: float) -> None:
         """Put every object where it is at a time (0 to 1 of its procedure), and step the hand once."""
         step = 1e-3
         for data, (item, procedure) in zip(self.engine.data, conditions, strict=True):
-            pose, after = procedure.pose(time), procedure.pose(time + step)
+            pose, after = PROCEDURES[procedure](time), PROCEDURES[procedure](time + step)
             data.qpos[self._at : self._at + 7] = self._held(pose, item)
             # Velocity by a forward difference over 1 ‰ of the procedure: friction needs the speed of an object that is
             # put in place.
