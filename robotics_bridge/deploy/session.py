@@ -108,12 +108,7 @@ class DeployedPolicy:
         if "command" in self.groups and "command" in contract.more:
             sources.setdefault("command", constant("command", contract.more["command"], self.groups["command"]))
         if "tactile" in self.groups:
-            slots, items, channels = self.groups["tactile"]
-            tips = {chain[-1]: finger for finger, chain in body.fingers.items()}
-            sources["tactile"] = RealTouch(
-                contract.observe, contract.links, (slots, items, channels), tips=tips, fingers=driver.fingers,
-                calibration=calibration, fallback=fallback,
-            )  # fmt: skip
+            sources["tactile"] = RealTouch(contract, driver.fingers, calibration=calibration, fallback=fallback)
         safe = SafetyLimits.of_hand(body, driver.joints, **dict(limits or {}))
         run = read_policy(self.path, self.groups, threads=threads, actions=len(contract.moved))
         return Controller(run, driver, contract, safe, sources=sources, **settings)
