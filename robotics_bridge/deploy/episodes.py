@@ -21,6 +21,7 @@ from brainbench.core.errors import DataError, UsageError, missing_dependency
 from brainbench.core.files import atomic_path, write_json
 from robotics_bridge import hands
 from robotics_bridge.deploy.driver import HandReading
+from robotics_bridge.policies.contract import PolicyContract
 from robotics_bridge.policies.encoders.finger_axes import FingerAxes, finger_axes_of
 
 VERSION = "v3.0"
@@ -78,13 +79,11 @@ class SessionRecorder:
     """Keeps a session of a deployed policy; touch is one point per finger tip, where the hand senses it.
 
     Args:
-        hand: Name of the hand.
-        rate: Control steps per second.
-        task: Task that is done, in words.
+        contract: Of the policy.
     """
 
-    def __init__(self, hand: str, rate: float, task: str) -> None:
-        self.hand, self.rate, self.task = hands.load(hand), rate, task
+    def __init__(self, contract: PolicyContract) -> None:
+        self.hand, self.contract = hands.load(contract.hand), contract
         layout = self.hand.layout("med", "tips")
         self.axes = finger_axes_of(self.hand, self.hand.layout("med", "hand"))
         fingers = tuple(self.hand.fingers)
@@ -110,8 +109,11 @@ class SessionRecorder:
 
     def write(self, folder: Path, joints: tuple[str, ...]) -> Path:
         """Write the session as a data set; see :func:`write_lerobot`."""
-        episode = Episode(self.task, *(np.array([frame[part] for frame in self.frames]) for part in range(5)))
-        return write_lerobot(folder, [episode], fps=self.rate, joints=joints, points=self.points, robot=self.hand.name)
+        task = self.contract.more.get("task", "deployed policy")
+        episode = Episode(task, *(np.array([frame[part] for frame in self.frames]) for part in range(5)))
+        return write_lerobot(
+            folder, [episode], fps=self.contract.rate, joints=joints, points=self.points, robot=self.hand.name
+        )
 
 
 def check_folder(folder: Path, fps: float) -> None:

@@ -102,8 +102,7 @@ def deploy(
         )
         address, joints, fingers, secret = ends
         link = stack.enter_context(UdpDriver(address, joints, fingers, secret))
-        task = str(contract.more.get("task", "deployed policy"))
-        recorder = SessionRecorder(contract.hand, contract.rate, task) if record is not None else None
+        recorder = SessionRecorder(contract) if record is not None else None
         fallback = ShadowTouch(contract, joints) if shadow else given.pop("tactile", None)
         controller = deployed.controller(
             link, limits={"timeout": timeout, "pressure": pressure}, sources=given, fallback=fallback,

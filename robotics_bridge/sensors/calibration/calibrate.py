@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -30,6 +30,11 @@ from robotics_bridge.sensors.noise.model import Noise
 NOT_FITTED = ("radius", "crosstalk")
 """Knobs that a log of one signal cannot tell: they need known places."""
 _ROUNDS = 12
+ORDER = (
+    "gain_low", "gain_high", "hysteresis", "hysteresis_tau", "walk", "white", "bias", "quantum", "dead_probability",
+    "dead_low", "dead_high", "read_delay", "jitter",
+)  # fmt: skip
+"""Knobs in the order of the model."""
 
 
 @dataclass(frozen=True)
@@ -38,7 +43,7 @@ class Calibration:
 
     noise: Noise
     estimates: Mapping[str, Estimate]
-    """By knob; ``gain_low`` and so on for the ends of ranges."""
+    """By knob, in the order of the model; ``gain_low`` and so on for the ends of ranges."""
     notes: tuple[str, ...] = ()
     """Knobs that could not be told, and why."""
     about: Mapping[str, Any] = field(default_factory=dict)
@@ -99,6 +104,7 @@ def calibrate(log: Log, *, max_delay: float = 0.5) -> Calibration:
     estimates |= fit.estimates
     if quantum > 2.5 * max(estimates["white"].value, 1e-300):
         notes.append("The white noise is far below a quantisation step; its value is an upper bound at best.")
+    estimates = {name: estimates[name] for name in ORDER if name in estimates}
     about = {"readings": int(log.readings.size), "probes": list(log.probes), "episodes": len(parts), "step": log.step}
     return Calibration(_noise(estimates), estimates, tuple(notes), about)
 
@@ -164,10 +170,3 @@ def _gain(fit: Fit) -> dict[str, Estimate]:
         "gain_low": Estimate(low, float(gains[0]) - reach, float(gains[0]) + Z95 * noise, how),
         "gain_high": Estimate(high, float(gains[-1]) - Z95 * noise, float(gains[-1]) + reach, how),
     }
-
-
-def describe(calibration: Calibration) -> Sequence[tuple[str, Estimate]]:
-    """Return the estimates in the order of the model."""
-    order = ["gain_low", "gain_high", "hysteresis", "hysteresis_tau", "walk", "white", "bias", "quantum"]
-    order += ["dead_probability", "dead_low", "dead_high", "read_delay", "jitter"]
-    return [(name, calibration.estimates[name]) for name in order if name in calibration.estimates]
