@@ -16,7 +16,7 @@ from benchmarks.report import table, write_section
 from robotics_bridge.physics import Geometry, HandState, MujocoEngine, TouchScene
 from robotics_bridge.sensors import ContactAudio, Noise, SensorSuite, TemperatureGrid
 from robotics_bridge.sensors.audio.materials import ElasticMaterial
-from robotics_bridge.sensors.audio.modes import ElasticSolid, find_modes
+from robotics_bridge.sensors.audio.modes import find_modes
 from robotics_bridge.sensors.calibration.calibrate import calibrate
 from robotics_bridge.sensors.calibration.log import Log
 from robotics_bridge.sensors.noise.stages import simulate
@@ -26,6 +26,10 @@ STEEL = ElasticMaterial(2e11, 0.3, 7850.0, 5.0, 3e-8)
 PLAIN = ThermalMaterial(2.0, 1000.0, 1000.0, 0.8)
 
 
+def _solid(kind: str, *size: float) -> Geometry:
+    return Geometry(name="solid", link="solid", kind=kind, size=size)
+
+
 def modes() -> list[list[str]]:
     rows = []
 
@@ -33,20 +37,18 @@ def modes() -> list[list[str]]:
         rows.append([what, f"{cells}", f"{truth:.4g}", f"{found:.4g}", f"{abs(found / truth - 1):.2%}"])
 
     for cells in (8, 16, 32):
-        found = find_modes(
-            ElasticSolid("box", (0.1, 0.005, 0.005)), STEEL, count=2, cells=cells, cache=False
-        ).frequency[0]
+        found = find_modes(_solid("box", 0.1, 0.005, 0.005), STEEL, count=2, cells=cells, cache=False).frequency[0]
         exact = 4.730041**2 / (2 * math.pi * 0.04) * math.sqrt(2e11 * 1e-4 / 12 / 7850)
         add("free beam 20:1, first bending (Hz; Euler-Bernoulli)", cells, exact, found)
     rigid = 2e11 * 0.002**3 / 12 / 0.91
     for cells in (6, 10, 14):
-        found = find_modes(ElasticSolid("box", (0.1, 0.1, 0.001)), STEEL, count=4, cells=cells, cache=False).frequency
+        found = find_modes(_solid("box", 0.1, 0.1, 0.001), STEEL, count=4, cells=cells, cache=False).frequency
         for mode, exact in enumerate((13.49, 19.79, 24.43)):
             number = found[mode] * 2 * math.pi * 0.04 * math.sqrt(7850 * 0.002 / rigid)
             add(f"free square plate 100:1, mode {mode + 1} (Leissa)", cells, exact, number)
     shear = math.sqrt(2e11 / 2.6 / 7850)
     for cells in (4, 6):
-        found = find_modes(ElasticSolid("sphere", (0.05,)), STEEL, count=6, cells=cells, cache=False).frequency
+        found = find_modes(_solid("sphere", 0.05), STEEL, count=6, cells=cells, cache=False).frequency
         for mode, exact, name in ((0, 2.501, "torsional"), (5, 2.640, "spheroidal")):
             add(f"free ball, {name} (Lamb)", cells, exact, found[mode] * 2 * math.pi * 0.05 / shear)
     return rows
@@ -142,7 +144,7 @@ def classifier() -> list[list[str]]:
     </worldbody></mujoco>""")
     envs, rng = 96, np.random.default_rng(1)
     names = ("wood", "metal", "glass")
-    solid = ElasticSolid("box", (0.15, 0.1, 0.015))
+    solid = _solid("box", 0.15, 0.1, 0.015)
     sensors = {name: ContactAudio(link="slab", modes=find_modes(solid, name, cells=8)) for name in names}
     engine = MujocoEngine(model, envs, threads=1)
     suite = SensorSuite(engine.scene, sensors, num_envs=envs)

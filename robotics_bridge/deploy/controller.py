@@ -9,13 +9,14 @@ import logging
 import math
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from brainbench.core.errors import UsageError
+from brainbench.core.reading.ranges import check_number
 from robotics_bridge.deploy.driver import Driver, HandReading
 from robotics_bridge.deploy.safety import ClockOffset, SafetyLimits
 from robotics_bridge.deploy.timing import LatencyHistogram, RateMonitor
@@ -42,32 +43,6 @@ class Clock:
     def sleep(self, seconds: float) -> None:
         """Wait."""
         time.sleep(seconds)
-
-
-@dataclass(frozen=True, eq=False)
-class Actuation:
-    """The way from actions to targets, as the policy was trained; of an exported policy's contract."""
-
-    joints: tuple[str, ...]
-    """All driven joints J, in the order of ``proprio``."""
-    actions: ActionMap
-    """From actions to targets of the joints A that they move."""
-    frozen: Mapping[str, float] = field(default_factory=dict)
-    """Joint → position (rad) of those that actions do not move."""
-    action_limit: float | None = None
-    """Largest action that counts and is observed as the last one, as in training (``Task.action_limit``)."""
-
-    @classmethod
-    def of(cls, contract: PolicyContract) -> Actuation:
-        """Return the actuation of a contract."""
-        arrays = {name: np.array(values) for name, values in contract.action_map.items()}
-        limit = contract.more.get("action_limit")
-        return cls(contract.joints, ActionMap(contract.moved, **arrays), contract.frozen, limit)
-
-    def targets(self, action: NDArray[np.floating]) -> dict[str, float]:
-        """Return joint → target (rad) of an action [A]."""
-        moved = self.actions.targets(action).tolist()
-        return {**self.frozen, **dict(zip(self.actions.names, moved, strict=True))}
 
 
 @dataclass
@@ -98,8 +73,7 @@ class Report:
 
 def check_duration(seconds: float) -> None:
     """Raise :class:`UsageError` unless a session can last so long (s)."""
-    if not 0 < seconds <= LONGEST:
-        raise UsageError(f"A session lasts more than 0 s, at most {LONGEST:g} s; received {seconds!r}.")
+    check_number("length of a session (s)", seconds, above=0, most=LONGEST)
 
 
 class Controller:
@@ -108,10 +82,8 @@ class Controller:
     Args:
         run: The policy: groups → action [A] (:func:`~robotics_bridge.policies.export.read_policy`).
         driver: The hand.
-        actuation: From actions to targets.
+        contract: What the policy reads and moves, and how often.
         limits: In the order of the driver's joints.
-        groups: Names of the groups that the policy reads.
-        rate: Control steps per second.
         sources: Group → what gives it, for groups other than ``proprio``: for ``tactile`` a
             :class:`~robotics_bridge.deploy.touch.RealTouch`.
         clock: Tells the time and waits.
@@ -125,30 +97,26 @@ class Controller:
         self,
         run: Runner,
         driver: Driver,
-        actuation: Actuation,
+        contract: PolicyContract,
         limits: SafetyLimits,
         *,
-        groups: tuple[str, ...],
-        rate: float = 40.0,
         sources: Mapping[str, Source] | None = None,
         clock: Clock | None = None,
         record: Callable[..., None] | None = None,
     ) -> None:
-        self.run_policy, self.driver, self.actuation, self.limits = run, driver, actuation, limits
-        if not RATE[0] <= rate <= RATE[1]:
-            raise UsageError(
-                f"A policy runs at {RATE[0]:g} to {RATE[1]:g} control steps per second; received {rate!r}."
-            )
-        self.rate, self.sources, self.clock, self.record = rate, dict(sources or {}), clock or Clock(), record
-        if missing := [name for name in groups if name not in {"proprio", *self.sources}]:
+        self.run_policy, self.driver, self.contract, self.limits = run, driver, contract, limits
+        check_number("control steps per second", contract.rate, least=RATE[0], most=RATE[1])
+        self.rate, self.sources, self.clock, self.record = contract.rate, dict(sources or {}), clock or Clock(), record
+        if missing := [name for name in contract.inputs if name not in {"proprio", *self.sources}]:
             raise UsageError(f"The policy reads the group {missing[0]!r}, and nothing here gives it.")
-        if missing := [name for name in actuation.joints if name not in driver.joints]:
+        if missing := [name for name in contract.joints if name not in driver.joints]:
             raise UsageError(f"The policy moves the joint {missing[0]!r}, which the hand does not have.")
-        self.groups = groups
-        self._order = [driver.joints.index(name) for name in actuation.joints]
-        self._action = np.zeros(len(actuation.actions.names), np.float32)
+        self.actions = ActionMap(contract.moved, **{name: np.array(row) for name, row in contract.action_map.items()})
+        """From actions to targets, as the policy was trained."""
+        self._order = [driver.joints.index(name) for name in contract.joints]
+        self._action = np.zeros(len(contract.moved), np.float32)
         self._targets: NDArray[np.float64] | None = None
-        self._offset, self._monitor = ClockOffset(), RateMonitor(rate, limits.rate_window)
+        self._offset, self._monitor = ClockOffset(), RateMonitor(self.rate, limits.rate_window)
         self.latency, self.processor = LatencyHistogram(), LatencyHistogram()
         self.limited = self.overruns = self.ticks = 0
 
@@ -213,10 +181,12 @@ class Controller:
             return f"the policy gave actions of shape {action.shape} instead of {self._action.shape}"
         if not np.isfinite(action).all():
             return "the policy gave values that are no numbers"
-        if (limit := self.actuation.action_limit) is not None:
+        if (limit := self.contract.more.get("action_limit")) is not None:
+            # What counts and is observed as the last action, as in training (``Task.action_limit``).
             action = np.clip(action, -limit, limit)
         self._action = action.astype(np.float32)
-        targets = self._limit(self.actuation.targets(action), reading)
+        moved = zip(self.contract.moved, self.actions.targets(action).tolist(), strict=True)
+        targets = self._limit({**self.contract.frozen, **dict(moved)}, reading)
         # The last look before anything moves, whatever the parts before it did.
         if not self.limits.allows(targets):
             return "a command would be no numbers or beyond the joints' limits"
@@ -231,9 +201,9 @@ class Controller:
     def _observe(self, reading: HandReading) -> dict[str, NDArray[np.float32]]:
         position, velocity = reading.position[self._order], reading.velocity[self._order]
         proprio = np.concatenate([position, VELOCITY * velocity, self._action]).astype(np.float32)
-        sources = {name: source for name, source in self.sources.items() if name in self.groups}
+        sources = {name: source for name, source in self.sources.items() if name in self.contract.inputs}
         found = {name: np.asarray(source(reading), np.float32) for name, source in sources.items()}
-        return {name: found.get(name, proprio) for name in self.groups}
+        return {name: found.get(name, proprio) for name in self.contract.inputs}
 
     def _limit(self, targets: Mapping[str, float], reading: HandReading) -> NDArray[np.float64]:
         wanted = np.array([targets.get(name, reading.position[i]) for i, name in enumerate(self.driver.joints)])

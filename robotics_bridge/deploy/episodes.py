@@ -8,9 +8,8 @@ Per frame: ``observation.state`` (joint positions, rad), ``observation.velocity`
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -22,6 +21,7 @@ from brainbench.core.errors import DataError, UsageError, missing_dependency
 from brainbench.core.files import atomic_path, write_json
 from robotics_bridge import hands
 from robotics_bridge.deploy.driver import HandReading
+from robotics_bridge.policies.contract import PolicyContract
 from robotics_bridge.policies.encoders.finger_axes import FingerAxes, finger_axes_of
 
 VERSION = "v3.0"
@@ -42,48 +42,23 @@ class TactilePoints:
     normal: NDArray[np.float64]
     """[N, 3] outward, link frame."""
 
-    @classmethod
-    def of(cls, layout: Mapping[str, Any]) -> TactilePoints:
-        """Return the active taxels of a hand's layout."""
-        counts = [int(probes.active.sum()) for probes in layout.values()]
-        position, normal = (
-            np.concatenate([getattr(probes, name)[probes.active] for probes in layout.values()])
-            for name in ("position", "normal")
-        )
-        return cls(tuple(layout), np.repeat(np.arange(len(counts)), counts), position, normal)
 
-
-@dataclass
+@dataclass(frozen=True, eq=False)
 class Episode:
     """Frames of one episode; every array has a row per frame T."""
 
     task: str
     """Task that was done, in words."""
-    state: list[NDArray[np.floating]] = field(default_factory=list)
+    state: NDArray[np.floating]
     """[T, J] joint positions (rad)."""
-    velocity: list[NDArray[np.floating]] = field(default_factory=list)
+    velocity: NDArray[np.floating]
     """[T, J] (rad/s)."""
-    action: list[NDArray[np.floating]] = field(default_factory=list)
+    action: NDArray[np.floating]
     """[T, J] joint targets (rad)."""
-    tactile: list[NDArray[np.floating]] = field(default_factory=list)
+    tactile: NDArray[np.floating]
     """[T, N, 6]."""
-    wrench: list[NDArray[np.floating]] = field(default_factory=list)
+    wrench: NDArray[np.floating]
     """[T, 6]."""
-
-    def add(
-        self,
-        state: NDArray[np.floating],
-        velocity: NDArray[np.floating],
-        action: NDArray[np.floating],
-        tactile: NDArray[np.floating],
-        wrench: NDArray[np.floating],
-    ) -> None:
-        """Append a frame."""
-        values = (state, velocity, action, tactile, wrench)
-        for store, value in zip(
-            (self.state, self.velocity, self.action, self.tactile, self.wrench), values, strict=True
-        ):
-            store.append(np.array(value, dtype=np.float32))
 
 
 def total_wrench(
@@ -104,13 +79,11 @@ class SessionRecorder:
     """Keeps a session of a deployed policy; touch is one point per finger tip, where the hand senses it.
 
     Args:
-        hand: Name of the hand.
-        rate: Control steps per second.
-        task: Task that is done, in words.
+        contract: Of the policy.
     """
 
-    def __init__(self, hand: str, rate: float, task: str) -> None:
-        self.hand, self.rate, self.episode = hands.load(hand), rate, Episode(task)
+    def __init__(self, contract: PolicyContract) -> None:
+        self.hand, self.contract = hands.load(contract.hand), contract
         layout = self.hand.layout("med", "tips")
         self.axes = finger_axes_of(self.hand, self.hand.layout("med", "hand"))
         fingers = tuple(self.hand.fingers)
@@ -121,6 +94,8 @@ class SessionRecorder:
             for name in ("position", "normal")
         )
         self.points = TactilePoints(tuple(layout), np.arange(len(layout)), position, normal)
+        self.frames: list[tuple[NDArray[np.floating], ...]] = []
+        """State, velocity, action, tactile and wrench of each tick."""
 
     def __call__(self, reading: HandReading, obs: Any, action: Any, targets: NDArray[np.floating]) -> None:
         """Keep a tick, as a :class:`~robotics_bridge.deploy.controller.Controller` reports it."""
@@ -130,12 +105,14 @@ class SessionRecorder:
         torque = np.cross(self.points.position, force).astype(float)
         points = np.concatenate([force, torque], axis=1)
         wrench = total_wrench(points, self.points.links, self.points.link, self.axes)
-        self.episode.add(reading.position, reading.velocity, targets, points, wrench)
+        self.frames.append((reading.position, reading.velocity, targets, points, wrench))
 
     def write(self, folder: Path, joints: tuple[str, ...]) -> Path:
         """Write the session as a data set; see :func:`write_lerobot`."""
+        task = self.contract.more.get("task", "deployed policy")
+        episode = Episode(task, *(np.array([frame[part] for frame in self.frames]) for part in range(5)))
         return write_lerobot(
-            folder, [self.episode], fps=self.rate, joints=joints, points=self.points, robot=self.hand.name
+            folder, [episode], fps=self.contract.rate, joints=joints, points=self.points, robot=self.hand.name
         )
 
 
@@ -179,7 +156,7 @@ def write_lerobot(
     """
     folder = Path(folder)
     check_folder(folder, fps)
-    import pyarrow
+    import pandas
 
     if not episodes:
         raise UsageError("A data set needs episodes; received none.")
@@ -196,8 +173,14 @@ def write_lerobot(
         tables.append(table)
         first += length
     _write_frames(folder / _DATA.format(chunk_index=0, file_index=0), tables, shapes)
-    _write_table(folder / "meta" / "episodes" / "chunk-000" / "file-000.parquet", pyarrow.Table.from_pylist(rows))
-    _write_tasks(folder / "meta" / "tasks.parquet", tasks)
+    # LeRobot reads the tasks as the index of a table.
+    described = {
+        "episodes/chunk-000/file-000": pandas.DataFrame(rows),
+        "tasks": pandas.DataFrame({"task_index": range(len(tasks))}, index=pandas.Index(tasks, name="task")),
+    }
+    for file, frame in described.items():
+        with atomic_path(folder / "meta" / f"{file}.parquet") as temporary:
+            frame.to_parquet(temporary)
     whole = {name: np.concatenate([table[name] for table in tables]) for name in tables[0]}
     write_json(folder / "meta" / "stats.json", {name: _stats(value) for name, value in whole.items()})
     names = {"observation.tactile": ["point", "channel"], "observation.wrench": ["Fx", "Fy", "Fz", "Mx", "My", "Mz"]}
@@ -280,26 +263,3 @@ def _write_frames(path: Path, tables: list[dict[str, NDArray]], shapes: Mapping[
         for table in tables:  # a row group per episode, so that one can be read alone
             columns = [pa.array(values.tolist(), type=schema.field(name).type) for name, values in table.items()]
             writer.write_table(pa.Table.from_arrays(columns, schema=schema))
-
-
-def _write_table(path: Path, table: Any) -> None:
-    from pyarrow import parquet
-
-    with atomic_path(path) as temporary:
-        parquet.write_table(table, temporary)
-
-
-def _write_tasks(path: Path, tasks: list[str]) -> None:
-    """Write the tasks as pandas does that has them as its index, for that is how LeRobot reads them."""
-    import pyarrow as pa
-
-    column = {"field_name": "task_index", "name": "task_index", "pandas_type": "int64", "numpy_type": "int64"}
-    index = {"field_name": "task", "name": "task", "pandas_type": "unicode", "numpy_type": "object"}
-    described = {
-        "index_columns": ["task"],
-        "column_indexes": [],
-        "columns": [{**part, "metadata": None} for part in (column, index)],
-        "pandas_version": "2.0.0",
-    }
-    table = pa.table({"task_index": pa.array(range(len(tasks)), pa.int64()), "task": pa.array(tasks, pa.string())})
-    _write_table(path, table.replace_schema_metadata({"pandas": json.dumps(described)}))

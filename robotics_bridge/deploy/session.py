@@ -13,7 +13,7 @@ import numpy as np
 from brainbench.core.errors import DataError, DataFileNotFoundError, UsageError, listing
 from brainbench.core.files import file_hash
 from robotics_bridge import hands
-from robotics_bridge.deploy.controller import Actuation, Controller, Source
+from robotics_bridge.deploy.controller import Controller, Source
 from robotics_bridge.deploy.driver import Driver
 from robotics_bridge.deploy.safety import SafetyLimits
 from robotics_bridge.deploy.touch import REAL_TYPES, Fallback, PressureCalibration, RealTouch
@@ -108,18 +108,10 @@ class DeployedPolicy:
         if "command" in self.groups and "command" in contract.more:
             sources.setdefault("command", constant("command", contract.more["command"], self.groups["command"]))
         if "tactile" in self.groups:
-            slots, items, channels = self.groups["tactile"]
-            tips = {chain[-1]: finger for finger, chain in body.fingers.items()}
-            sources["tactile"] = RealTouch(
-                contract.observe, contract.links, (slots, items, channels), tips=tips, fingers=driver.fingers,
-                calibration=calibration, fallback=fallback,
-            )  # fmt: skip
+            sources["tactile"] = RealTouch(contract, driver.fingers, calibration=calibration, fallback=fallback)
         safe = SafetyLimits.of_hand(body, driver.joints, **dict(limits or {}))
         run = read_policy(self.path, self.groups, threads=threads, actions=len(contract.moved))
-        return Controller(
-            run, driver, Actuation.of(contract), safe, groups=tuple(self.groups), rate=contract.rate, sources=sources,
-            **settings,
-        )  # fmt: skip
+        return Controller(run, driver, contract, safe, sources=sources, **settings)
 
 
 def read_deployed(path: str | Path) -> DeployedPolicy:

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from brainbench.core.errors import DataError, check_once
+from brainbench.core.errors import DataError, UsageError, check_once
 from brainbench.core.reading.ranges import check_fields
 from robotics_bridge import hands
 from robotics_bridge.deploy.driver import HandReading
@@ -27,6 +27,7 @@ from robotics_bridge.deploy.udp import LOOPBACK
 from robotics_bridge.hands.observations import observation_type, observe, sensors_for
 from robotics_bridge.hands.scenes import OBJECT, holding
 from robotics_bridge.physics import MujocoEngine
+from robotics_bridge.policies.contract import PolicyContract
 from robotics_bridge.sensors import SensorSuite
 from robotics_bridge.tasks.contact_model import CONTACTS, ContactModel, set_contacts
 from robotics_bridge.tasks.overrides import set_field
@@ -66,6 +67,7 @@ class Faults:
     def __post_init__(self) -> None:
         check_fields(self, "drop", "damage", "absurd", "nan", least=0, most=1)
         check_fields(self, "delay", "delay_after", "jitter", "silent_after", "frozen_after", least=0, below=3600)
+        check_fields(self, "seed", least=0, whole=True)
 
     @classmethod
     def parse(cls, texts: list[str]) -> Faults:
@@ -170,31 +172,20 @@ class ShadowTouch:
     guess.
 
     Args:
-        hand: Name of the hand.
-        observe: Observation type of the policy.
-        placement: Of its taxels.
-        resolution: Of its taxels.
+        contract: Of the policy; hand, skin and contacts are those in which it was trained.
         joints: Names of the joints in the order of the reports.
-        rate: Control steps per second.
-        sub_steps: S.
-        **settings: ``twist`` and ``contacts`` of :class:`SimulatedHand`, as in training.
+
+    Raises:
+        UsageError: the contract does not say what the skin is.
     """
 
-    def __init__(
-        self,
-        hand: str,
-        observe: str,
-        placement: str,
-        resolution: str,
-        *,
-        joints: tuple[str, ...],
-        rate: float = 40.0,
-        sub_steps: int = 5,
-        **settings: Any,
-    ) -> None:
-        self.sub_steps = sub_steps
-        senses = {"observe": observe, "placement": placement, "resolution": resolution}
-        self.hand = SimulatedHand(hand, rate * sub_steps, **senses, **settings)
+    def __init__(self, contract: PolicyContract, joints: tuple[str, ...]) -> None:
+        more = contract.more
+        if missing := [name for name in ("placement", "resolution", "sub_steps") if name not in more]:
+            raise UsageError(f"The contract does not say {missing[0]!r}, so no touch can be simulated beside the hand.")
+        self.sub_steps: int = more["sub_steps"]
+        senses = {name: more[name] for name in ("placement", "resolution", "twist", "contacts")}
+        self.hand = SimulatedHand(contract.hand, contract.rate * self.sub_steps, observe=contract.observe, **senses)
         self._order = [joints.index(name) for name in self.hand.joints]
 
     def __call__(self, reading: HandReading) -> NDArray[np.float32]:

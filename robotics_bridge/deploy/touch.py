@@ -15,7 +15,9 @@ from numpy.typing import NDArray
 
 from brainbench.core.errors import UsageError, check_name
 from brainbench.core.reading.ranges import check_fields, check_number
+from robotics_bridge import hands
 from robotics_bridge.deploy.driver import HandReading
+from robotics_bridge.policies.contract import PolicyContract
 
 REAL_TYPES = ("agg_bool", "agg_force")
 """Observation types that a real hand can measure."""
@@ -43,13 +45,14 @@ class PressureCalibration:
     """Contact pressure, in the maker's unit, above which a finger touches (η_real of 4.31)."""
 
     def __post_init__(self) -> None:
-        check_fields(self, "threshold", above=0, most=LARGEST_SCALE)
-        check_fields(self, "axes", items=3)
+        of = "{!r} of a pressure calibration"
+        check_fields(self, "threshold", of=of, above=0, most=LARGEST_SCALE)
+        check_fields(self, "axes", of=of, items=3)
         factors = [("scale", self.scale), *self.per_finger.items(), *(("axes", factor) for factor in self.axes)]
         for name, factor in factors:
-            check_number(name, factor, least=-LARGEST_SCALE, most=LARGEST_SCALE)
+            check_number(of.format(name), factor, least=-LARGEST_SCALE, most=LARGEST_SCALE)
             if factor == 0:
-                raise UsageError(f"{name} of a pressure calibration must not be 0; received {factor}.")
+                raise UsageError(f"{of.format(name)} must not be 0; received {factor}.")
 
     def force(self, fingers: tuple[str, ...], pressure: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the simulator's ``agg_force`` [F, 3] of pressures [F, 3]."""
@@ -67,11 +70,8 @@ class RealTouch:
     """Makes the tactile group of a policy from reports.
 
     Args:
-        observe: Observation type of the policy.
-        links: Its links, in order; one item each for the aggregated types.
-        shape: (S, N, C) of the group.
-        tips: Link → finger, for the links whose tip the hand senses.
-        fingers: Fingers in the order of the reports.
+        contract: Of the policy: what it observes on which links of its hand.
+        fingers: Fingers whose tips the hand senses, in the order of the reports.
         calibration: From the maker's unit to the simulator's.
         fallback: Where the hand senses nothing; None leaves those items zero.
 
@@ -82,31 +82,25 @@ class RealTouch:
 
     def __init__(
         self,
-        observe: str,
-        links: tuple[str, ...],
-        shape: tuple[int, int, int],
-        *,
-        tips: Mapping[str, str],
+        contract: PolicyContract,
         fingers: tuple[str, ...],
+        *,
         calibration: PressureCalibration | None = None,
         fallback: Fallback | None = None,
     ) -> None:
-        self.observe, self.shape, self.fallback = observe, shape, fallback
+        self.observe, self.shape, self.fallback = contract.observe, contract.inputs["tactile"], fallback
         self.calibration, self.fingers = calibration or PressureCalibration(), fingers
         for finger in self.calibration.per_finger:
             check_name("finger of a pressure calibration", finger, fingers)
-        sensed = [(item, tips.get(link, "")) for item, link in enumerate(links)]
-        self.measured = [(item, fingers.index(finger)) for item, finger in sensed if finger in fingers]
-        real = observe in REAL_TYPES
+        real = contract.observe in REAL_TYPES
         if not real and fallback is None:
             raise UsageError(
-                f"A real hand cannot measure {observe!r}, one value per taxel; deploy a policy that was trained on "
-                "'agg_force' or 'agg_bool', or simulate its touch beside the hand."
+                f"A real hand cannot measure {contract.observe!r}, one value per taxel; deploy a policy that was "
+                "trained on 'agg_force' or 'agg_bool', or simulate its touch beside the hand."
             )
-        if not real:
-            self.measured = []
-        elif shape[1] != len(links):
-            raise UsageError(f"{observe!r} has one item per link ({len(links)}); the policy reads {shape[1]}.")
+        tips = {chain[-1]: finger for finger, chain in hands.load(contract.hand).fingers.items()}
+        sensed = [(item, tips.get(link, "")) for item, link in enumerate(contract.links if real else ())]
+        self.measured = [(item, fingers.index(finger)) for item, finger in sensed if finger in fingers]
 
     def __call__(self, reading: HandReading) -> NDArray[np.float32]:
         """Return the tactile group [S, N, C]."""

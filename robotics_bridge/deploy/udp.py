@@ -54,11 +54,8 @@ class UdpDriver:
         *,
         max_age: float = MAX_AGE,
     ) -> None:
-        if not 0 < len(joints) <= frames.MOST or len(fingers) > frames.MOST:
-            raise UsageError(
-                f"A hand has 1 to {frames.MOST} joints and at most {frames.MOST} fingers; received {len(joints)} and "
-                f"{len(fingers)}."
-            )
+        check_number("joints of a hand", len(joints), least=1, most=frames.MOST)
+        check_number("fingers of a hand", len(fingers), most=frames.MOST)
         check_number("max_age (s)", max_age, above=0, most=MOST_AGE)
         self.address, self.joints, self.fingers = (address[0] or LOOPBACK, address[1]), joints, fingers
         self.counters = LinkCounters()

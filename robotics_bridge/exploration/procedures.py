@@ -10,8 +10,6 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
-from brainbench.core.errors import check_name
-
 
 @dataclass(frozen=True)
 class Pose:
@@ -27,17 +25,6 @@ class Pose:
     """Share of their range to which the fingers are flexed."""
 
 
-@dataclass(frozen=True)
-class Procedure:
-    """A movement over one second."""
-
-    name: str
-    text: str
-    """Purpose, in words."""
-    pose: Callable[[float], Pose]
-    """Time from 0 to 1 s → pose."""
-
-
 _ABOVE, _PRESSED, _LIGHT = 0.008, -0.002, -0.001
 
 
@@ -48,39 +35,34 @@ def _ramp(time: float, start: float, end: float) -> float:
 
 
 def _lateral(time: float) -> Pose:
+    """Rub to and fro across the fingers, pressed: texture."""
     z = _ABOVE + (_PRESSED - _ABOVE) * _ramp(time, 0.0, 0.25)
     return Pose(y=0.012 * math.sin(4 * math.pi * max(time - 0.25, 0.0)), z=z)
 
 
 def _static(time: float) -> Pose:
+    """Press and hold: hardness."""
     return Pose(z=_ABOVE + (1.5 * _PRESSED - _ABOVE) * _ramp(time, 0.0, 0.5))
 
 
 def _enclosure(time: float) -> Pose:
+    """Close the fingers around it: global shape."""
     z = _ABOVE + (_LIGHT - _ABOVE) * _ramp(time, 0.0, 0.2)
     return Pose(z=z, closing=0.15 + 0.55 * _ramp(time, 0.2, 0.85))
 
 
 def _contour(time: float) -> Pose:
+    """Turn its outline along the fingers: exact shape."""
     z = _ABOVE + (_LIGHT - _ABOVE) * _ramp(time, 0.0, 0.2)
     # The object turns about itself while its middle goes once around a circle: the outline passes along the fingers.
     turn = 2 * math.pi * _ramp(time, 0.2, 1.0)
     return Pose(x=0.008 * math.sin(turn), y=0.008 * (1 - math.cos(turn)), z=z, yaw=turn, closing=0.45)
 
 
-PROCEDURES: Mapping[str, Procedure] = {
-    item.name: item
-    for item in (
-        Procedure("lateral_motion", "texture: pressed and rubbed to and fro across the fingers", _lateral),
-        Procedure("static_pressure", "hardness: pressed and held", _static),
-        Procedure("enclosure", "global shape: the fingers close around it", _enclosure),
-        Procedure("contour_following", "exact shape: its outline turns along the fingers", _contour),
-    )
+PROCEDURES: Mapping[str, Callable[[float], Pose]] = {
+    "lateral_motion": _lateral,
+    "static_pressure": _static,
+    "enclosure": _enclosure,
+    "contour_following": _contour,
 }
-"""Procedures by name."""
-
-
-def find_procedure(name: str) -> Procedure:
-    """Return a procedure by name; raise UsageError if there is none of this name."""
-    check_name("exploratory procedure", name, PROCEDURES)
-    return PROCEDURES[name]
+"""Name → movement over one second: time from 0 to 1 s → pose."""

@@ -18,15 +18,14 @@ from numpy.typing import NDArray
 
 from brainbench import __version__
 from brainbench.core.contracts import CHANNELS, GRID_SHAPE, check_stimulus_set
-from brainbench.core.errors import UsageError
+from brainbench.core.errors import UsageError, check_name
 from brainbench.core.files import content_hash, to_json
 from brainbench.core.progress import Progress
-from brainbench.core.reading.ranges import check_fields
+from brainbench.core.reading.ranges import check_fields, check_number
 from brainbench.core.rotations import from_matrices, from_rpy, to_matrices
-from brainbench.geometry import Mesh
 from brainbench.models.network import SUB_STEP_SECONDS, SUB_STEPS
 from robotics_bridge import hands
-from robotics_bridge.exploration.procedures import PROCEDURES, Pose, Procedure, find_procedure
+from robotics_bridge.exploration.procedures import PROCEDURES, Pose
 from robotics_bridge.hands.observations import observe, sensors_for
 from robotics_bridge.hands.scenes import OBJECT, closing, holding_spec, replace_drives
 from robotics_bridge.physics import Geometry, MujocoEngine
@@ -50,32 +49,24 @@ class Explored:
     """An object to explore.
 
     Raises:
-        UsageError: neither or both of geometry and mesh are given, or the orientation or the retreat is not valid.
+        UsageError: the orientation or the retreat is not valid.
     """
 
     label: str
-    geometry: Geometry | None = None
-    """A primitive (its link and pose do not matter)."""
-    mesh: Mesh | None = None
-    """A surface. It collides as its convex hull; what taxels feel is the surface itself."""
+    geometry: Geometry
+    """Its shape; link and pose do not matter. A mesh collides as its convex hull; taxels feel the surface itself."""
     quaternion: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)
     """Orientation in which it is held (w, x, y, z)."""
     retreat: float = 0.0
     """Held so much further away than the procedure says (m)."""
 
     def __post_init__(self) -> None:
-        if (self.geometry is None) == (self.mesh is None):
-            raise UsageError(f"The object {self.label!r} needs a geometry or a mesh, and not both.")
         if np.shape(self.quaternion) != (4,) or not 1e-6 < float(np.linalg.norm(self.quaternion)) < np.inf:
             raise UsageError(
                 f"The orientation of {self.label!r} is a quaternion (w, x, y, z) that is finite and not zero; received "
                 f"{self.quaternion!r}."
             )
         check_fields(self, "retreat")
-
-    def shape(self) -> Geometry:
-        """Return the geometry that the physics uses."""
-        return self.geometry or Geometry(name=OBJECT, link=OBJECT, kind="mesh", mesh=self.mesh)
 
 
 @dataclass(frozen=True, eq=False)
@@ -178,11 +169,13 @@ def record_exploration(
     Raises:
         UsageError: a name is unknown or occurs twice, or nothing is to be explored.
     """
-    chosen = [find_procedure(name) for name in procedures]
+    for name in procedures:
+        check_name("exploratory procedure", name, PROCEDURES)
     labels = [item.label for item in objects]
-    if not labels or not chosen or len(set(labels)) < len(labels) or frames < 1:
-        raise UsageError("Exploration needs objects with different labels, procedures and frames.")
-    conditions = [(item, procedure) for item in objects for procedure in chosen]
+    check_number("frames", frames, least=1, whole=True)
+    if not labels or not procedures or len(set(labels)) < len(labels):
+        raise UsageError("Exploration needs objects with different labels, and procedures.")
+    conditions = [(item, procedure) for item in objects for procedure in procedures]
     world = _World(hand, [item for item, _ in conditions], SUB_STEP_SECONDS * frames)
     grid = TaxelGrid(world.hand, resolution=resolution, placement=placement)
     sensors = sensors_for("force_torque", grid.layout, noisy=noisy, track=(OBJECT,), twist=TWIST)
@@ -197,24 +190,23 @@ def record_exploration(
         felt.append(grid(taxels).flatten(2).transpose(1, 2).numpy())
         if progress is not None:
             progress(frame + 1, frames, "exploring")
-    several = len(chosen) > 1
     config = {
         "hand": hand, "resolution": resolution, "placement": placement, "noisy": noisy, "twist": TWIST,
         "frames": frames, "seed": seed,
-        "procedures": [procedure.name for procedure in chosen],
+        "procedures": list(procedures),
         "objects": [
             {
                 "label": item.label, "quaternion": item.quaternion, "retreat": item.retreat,
-                "mesh": None if item.mesh is None else content_hash(item.mesh.vertices, item.mesh.faces),
-                "geometry": None if item.geometry is None else [item.geometry.kind, *item.geometry.size],
+                "mesh": None if (mesh := item.geometry.mesh) is None else content_hash(mesh.vertices, mesh.faces),
+                "geometry": [item.geometry.kind, *item.geometry.size] if mesh is None else None,
             }
             for item in objects
         ],
     }  # fmt: skip
     return HandRecording(
         world.hand.name, resolution, placement,
-        tuple(f"{item.label}/{procedure.name}" if several else item.label for item, procedure in conditions),
-        tuple(item.label for item, _ in conditions), tuple(procedure.name for _, procedure in conditions),
+        tuple(f"{item.label}/{name}" if len(procedures) > 1 else item.label for item, name in conditions),
+        tuple(item.label for item, _ in conditions), tuple(name for _, name in conditions),
         np.linspace(SUB_STEP_SECONDS, SUB_STEP_SECONDS * frames, frames), np.stack(felt, axis=1), config,
     )  # fmt: skip
 
@@ -230,7 +222,7 @@ class _World:
         if not {*self.hand.joints} <= servos:
             replace_drives(spec)
         kinds = list(dict.fromkeys(objects))
-        models = compile_variants(spec, OBJECT, [item.shape() for item in kinds], density=_DENSE)
+        models = compile_variants(spec, OBJECT, [item.geometry for item in kinds], density=_DENSE)
         self.engine = MujocoEngine(
             models, len(objects), assignment=tuple(kinds.index(item) for item in objects), contacts=128
         )
@@ -242,13 +234,13 @@ class _World:
         self._closed = closing(self.hand, 1.0)
         # How far the lowest point of a held object lies below its body's origin (m), by the support function downwards:
         # row 2 of the rotation is the vertical in the object's frame.
-        self._bottoms = {id(item): float(item.shape().reach(-to_matrices(item.quaternion)[2])) for item in kinds}
+        self._bottoms = {id(item): float(item.geometry.reach(-to_matrices(item.quaternion)[2])) for item in kinds}
 
-    def move(self, conditions: Sequence[tuple[Explored, Procedure]], time: float) -> None:
+    def move(self, conditions: Sequence[tuple[Explored, str]], time: float) -> None:
         """Put every object where it is at a time (0 to 1 of its procedure), and step the hand once."""
         step = 1e-3
         for data, (item, procedure) in zip(self.engine.data, conditions, strict=True):
-            pose, after = procedure.pose(time), procedure.pose(time + step)
+            pose, after = PROCEDURES[procedure](time), PROCEDURES[procedure](time + step)
             data.qpos[self._at : self._at + 7] = self._held(pose, item)
             # Velocity by a forward difference over 1 ‰ of the procedure: friction needs the speed of an object that is
             # put in place.

@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brainbench.core.devices import mujoco_module
-from robotics_bridge.hands.layouts import palm_side
 from robotics_bridge.hands.surface import link_points
 
 mujoco = mujoco_module()
@@ -117,8 +116,11 @@ def _flexed(
     if end is None or start != body or np.linalg.norm(end - data.xpos[body]) < 1e-6:
         end = data.xpos[body] + data.xmat[body].reshape(3, 3) @ own.mean(axis=0)
     axis = data.xmat[model.jnt_bodyid[joint]].reshape(3, 3) @ model.jnt_axis[joint]
-    world = palm_side(axis, end - data.xpos[start], (low, high))
-    return world if np.any(world) else None
+    reach = end - data.xpos[start]
+    # Velocity of the far end under a turn about the joint, ω × r; the longer side of its range is flexion.
+    way = (1.0 if abs(high) >= abs(low) else -1.0) * np.cross(axis, reach)
+    length = float(np.linalg.norm(way))
+    return way / length if length > 1e-9 * max(float(np.linalg.norm(reach)), 1e-9) else None
 
 
 def _flexion(model: Any, body: int) -> int:

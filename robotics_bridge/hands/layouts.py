@@ -6,7 +6,6 @@ import math
 import os
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -150,15 +149,3 @@ def write_probes(path: str | os.PathLike[str], layout: Mapping[str, Probes]) -> 
         grid = [cells[row * columns : (row + 1) * columns] for row in range(rows)]
         document.append({"link_name": link, "kind": "grid", "probes": grid})
     write_json(path, document)
-
-
-def palm_side(axis: Any, reach: Any, limits: tuple[float, float]) -> NDArray[np.float64]:
-    """Return the direction [3] in which a link moves when its joint flexes: its palmar side.
-
-    ``reach`` [3] leads from the joint to the far end of the link; the longer side of its limits [rad] is flexion.
-    """
-    sign = 1.0 if abs(limits[1]) >= abs(limits[0]) else -1.0
-    # Velocity of the far end under a turn about the joint, ω × r; its sign follows the longer side of the range.
-    direction = sign * np.cross(axis, reach)
-    length = float(np.linalg.norm(direction))
-    return direction / length if length > 1e-9 * max(math.dist(reach, (0, 0, 0)), 1e-9) else np.zeros(3)

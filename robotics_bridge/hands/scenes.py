@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from brainbench.core.devices import mujoco_module
 from brainbench.core.errors import UsageError
 from brainbench.core.reading.ranges import check_number
-from brainbench.core.rotations import to_matrices
+from brainbench.core.rotations import from_z_axis, to_matrices
 from robotics_bridge.hands.facing import half_open, link_middle, palmar_directions, slide_of
 from robotics_bridge.hands.hand import Hand
 
@@ -44,6 +44,7 @@ def holding_spec(hand: Hand, *, radius: float = 0.03, timestep: float = 0.002, r
         UsageError: the palm's side is unknown, or the radius is not positive.
     """
     check_number("radius of the ball (m)", radius, above=0)
+    check_number("reach", reach)
     up, surface, step = palm_surface(hand)
     # Between the middle of the palm and the roots of the fingers, where these reach it when they close.
     surface = surface + reach * step
@@ -54,7 +55,8 @@ def holding_spec(hand: Hand, *, radius: float = 0.03, timestep: float = 0.002, r
     if not hand.model.nu:
         replace_drives(spec)
     palm = spec.body(hand.palm)
-    turn = _onto_z(up)
+    # The shortest turn onto z is that of z onto the direction mirrored at z.
+    turn = from_z_axis(up * (-1.0, -1.0, 1.0))
     palm.quat, palm.pos = turn, -to_matrices(turn) @ surface
     ball = spec.worldbody.add_body(name=OBJECT, pos=(0.0, 0.0, radius + 1e-3))
     ball.add_freejoint()
@@ -175,15 +177,3 @@ def palm_surface(hand: Hand) -> tuple[NDArray[np.float64], NDArray[np.float64], 
     middle = np.median((roots - data.xpos[palm]) @ data.xmat[palm].reshape(3, 3), axis=0)
     step = middle - surface
     return up, surface, step - up * (step @ up)
-
-
-def _onto_z(direction: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the quaternion (w, x, y, z) of the shortest turn of a unit vector onto z."""
-    z = np.array([0.0, 0.0, 1.0])
-    # Shortest turn between unit vectors: (1 + a · b, a × b), normalised. It vanishes for opposite ones, which are
-    # turned about x.
-    axis, cosine = np.cross(direction, z), float(direction @ z)
-    if cosine < -0.999999:
-        return np.array([0.0, 1.0, 0.0, 0.0])
-    quaternion = np.array([1.0 + cosine, *axis])
-    return quaternion / np.linalg.norm(quaternion)

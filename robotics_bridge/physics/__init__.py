@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from robotics_bridge.physics.cpu import MujocoEngine
 from robotics_bridge.physics.gpu import MujocoWarpEngine
-from robotics_bridge.physics.scene import KINDS, Geometry, TouchScene, Variants
+from robotics_bridge.physics.scene import KINDS, Geometry, TouchScene
 from robotics_bridge.physics.state import CROWDED, DIVERGED, HandState
 from robotics_bridge.physics.variants import compile_variants
 
@@ -21,6 +21,5 @@ __all__ = [
     "MujocoEngine",
     "MujocoWarpEngine",
     "TouchScene",
-    "Variants",
     "compile_variants",
 ]

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from brainbench.core.cuda_graphs import record_launches
 from brainbench.core.devices import pick_device, warp
-from brainbench.core.errors import MissingDependencyError, UsageError, install_command, unknown_name
+from brainbench.core.errors import UsageError, missing_dependency, unknown_name
 from brainbench.core.reading.ranges import check_number
 from robotics_bridge.physics.kernels.state import fill_contacts, fill_links
 from robotics_bridge.physics.scene import TouchScene
@@ -33,7 +33,6 @@ class MujocoWarpEngine:
         model: as of ``MujocoEngine``; so are ``num_envs``, ``assignment`` and ``fields``, which MuJoCo Warp must batch.
         device: ``cuda``, ``cuda:1`` or ``cpu`` (slow; for tests).
         contacts: room for contacts per environment, on average; by default sixteen, and nine per moving link.
-        constraints: room for constraint rows in each environment; by default enough for that many contacts.
 
     Raises:
         MissingDependencyError: mujoco-warp is not installed.
@@ -49,7 +48,6 @@ class MujocoWarpEngine:
         fields: Mapping[str, ArrayLike] | None = None,
         assignment: Sequence[int] = (),
         contacts: int | None = None,
-        constraints: int | None = None,
     ) -> None:
         self._engine = _mujoco_warp()
         check_number("environments of an engine", num_envs, least=1, most=MOST_ENVS, whole=True)
@@ -69,7 +67,7 @@ class MujocoWarpEngine:
             # Room for constraint rows: four per contact (two tangents in a pyramid), limits, equalities, tendons,
             # friction of joints.
             rows = 4 * contacts + 2 * self.model.njnt + 6 * self.model.neq + 2 * self.model.ntendon + self.model.nv
-            room = {"nconmax": contacts, "njmax": constraints or rows}
+            room = {"nconmax": contacts, "njmax": rows}
             self._d = self._engine.make_data(self.model, nworld=num_envs, **room)
             if set(varied) & set(_MASSES):
                 self._engine.set_const(self._m, self._d)
@@ -195,9 +193,7 @@ def _mujoco_warp() -> Any:
     try:
         import mujoco_warp
     except ImportError as error:
-        raise MissingDependencyError(
-            f"Simulation on a GPU needs mujoco-warp; install it with: {install_command('gpu')}"
-        ) from error
+        raise missing_dependency("mujoco-warp", extra="gpu", purpose="Simulation on a GPU") from error
     return mujoco_warp
 
 

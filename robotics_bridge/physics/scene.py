@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from brainbench.core.devices import mujoco_module
 from brainbench.core.errors import UsageError, check_name, repeats
+from brainbench.core.reading.ranges import check_fields, check_number
 from brainbench.geometry import Mesh
 
 mujoco = mujoco_module()
@@ -56,18 +57,20 @@ class Geometry:
 
     def __post_init__(self) -> None:
         check_name("kind of geometry", self.kind, KINDS)
-        needed = _SIZES[self.kind]
-        if len(self.size) < needed or not all(np.isfinite(s) and s > 0 for s in self.size[:needed]):
+        needed, of = _SIZES[self.kind], f"{{}} of {self.name!r}"
+        if len(self.size) < needed:
             raise UsageError(
                 f"The {self.kind} {self.name!r} needs {needed} positive size(s) in metres; received {self.size}."
             )
+        for size in self.size[:needed]:
+            check_number(of.format("size"), size, above=0)
+        check_fields(self, "contype", "affinity", of=of, whole=True)
+        check_fields(self, "position", of=of, items=3)
+        check_fields(self, "quaternion", of=of, items=4)
         if self.kind == "mesh" and self.mesh is None:
             raise UsageError(f"The geometry {self.name!r} is of kind 'mesh' and names no mesh; pass mesh=Mesh(...).")
         norm = float(np.linalg.norm(self.quaternion))
-        if not (np.isfinite([*self.position]).all() and np.isfinite(norm) and norm > 1e-6):
-            raise UsageError(
-                f"The geometry {self.name!r} has the pose {self.position}, {self.quaternion}, which is not valid."
-            )
+        check_number(f"length of the quaternion of {self.name!r}", norm, above=1e-6)
         object.__setattr__(self, "quaternion", tuple(float(q) / norm for q in self.quaternion))
         object.__setattr__(self, "size", tuple(float(s) for s in self.size[:needed]))
 
@@ -89,42 +92,13 @@ class Geometry:
             return np.linalg.norm(d * np.array(size), axis=-1)
         return np.abs(d) @ np.array(size) if self.kind == "box" else np.full(d.shape[:-1], np.inf)
 
-    @property
-    def collides(self) -> bool:
-        """True if it can touch anything at all."""
-        return bool(self.contype or self.affinity)
-
-
-@dataclass(frozen=True)
-class Variants:
-    """Shapes that one geometry takes in different environments.
-
-    Raises:
-        UsageError: there is no choice, or the assignment names one that does not exist.
-    """
-
-    choices: tuple[Geometry, ...]
-    assignment: tuple[int, ...] = ()
-    """Choice of environment e is ``assignment[e % len(assignment)]``; empty means each in turn."""
-
-    def __post_init__(self) -> None:
-        if not self.choices:
-            raise UsageError("Variants of a geometry need at least one choice.")
-        if wrong := [index for index in self.assignment if not 0 <= index < len(self.choices)]:
-            raise UsageError(f"There are {len(self.choices)} variants; the assignment names variant {wrong[0]}.")
-
-    def of(self, env: int) -> Geometry:
-        """Return the shape in one environment."""
-        order = self.assignment or range(len(self.choices))
-        return self.choices[order[env % len(order)]]
-
 
 @dataclass(frozen=True, eq=False)
 class TouchScene:
     """Links, their geometries and the pairs that may touch; says nothing about motion.
 
     Raises:
-        UsageError: a name occurs twice or a geometry names an unknown link.
+        UsageError: a name occurs twice, a geometry names an unknown link, or variants are empty.
     """
 
     links: tuple[str, ...]
@@ -133,13 +107,15 @@ class TouchScene:
     """Pairs of link numbers (low, high) that never collide, such as parent and child."""
     included: frozenset[tuple[int, int]] = frozenset()
     """Pairs of geometry numbers (low, high) that collide whatever their bits say."""
-    variants: Mapping[int, Variants] = field(default_factory=dict)
-    """By geometry number: its shapes where environments differ."""
+    variants: Mapping[int, tuple[Geometry, ...]] = field(default_factory=dict)
+    """By geometry number, where environments differ: its shapes in environments 0, 1, …, then from the first again."""
 
     def __post_init__(self) -> None:
         for what, names in (("link", self.links), ("geometry", [g.name for g in self.geometries])):
             if twice := repeats(filter(None, names)):
                 raise UsageError(f"The scene has two of the {what} {twice[0]!r}; names must differ.")
+        if not all(self.variants.values()):
+            raise UsageError("Variants of a geometry need at least one shape.")
         for geometry in self.geometries:
             check_name("link", geometry.link, self.links, hint=f"Geometry {geometry.name!r} is fixed to it.")
 
@@ -163,7 +139,8 @@ class TouchScene:
 
     def geometry_in(self, env: int, geometry: int) -> Geometry:
         """Return a geometry as one environment has it."""
-        return self.variants[geometry].of(env) if geometry in self.variants else self.geometries[geometry]
+        shapes = self.variants.get(geometry) or (self.geometries[geometry],)
+        return shapes[env % len(shapes)]
 
     @cached_property
     def _bits(self) -> NDArray[np.int64]:
@@ -197,22 +174,23 @@ class TouchScene:
         kept: list[int] = []
         for other in {*range(len(self.links))} - self._barred(link):
             mine = [g for g in np.flatnonzero(self.link_of == other).tolist() if self.geometries[g].kind != "other"]
-            kept += [g for g in mine if self.geometries[g].collides] or mine
+            # Bits of zero collide with nothing at all.
+            kept += [g for g in mine if self._bits[g].any()] or mine
         return tuple(sorted(kept))
 
     @classmethod
     def from_mujoco(cls, model: Any, others: Sequence[Any] = (), assignment: Sequence[int] = ()) -> TouchScene:
         """Read the scene out of a compiled ``mujoco.MjModel``; link 0 is the world.
 
-        ``others`` are further variants that differ in numbers only, assigned to environments as in :class:`Variants`.
+        ``others`` are further variants that differ in numbers only. That of environment e is number
+        ``assignment[e % len(assignment)]``; empty means each in turn.
 
         Raises:
             UsageError: the variants have different links or geometries, or the time step is no sensible time.
         """
-        if not 0 < (timestep := float(model.opt.timestep)) <= LONGEST_STEP:
-            raise UsageError(
-                f"A step of the engine lasts more than 0 s, at most {LONGEST_STEP:g} s; received {timestep}."
-            )
+        check_number("time step of the engine (s)", float(model.opt.timestep), above=0, most=LONGEST_STEP)
+        for number in assignment:
+            check_number("variant of the assignment", number, least=0, below=1 + len(others), whole=True)
         links = tuple(_name(model, 1, index) for index in range(model.nbody))
         for other in others:
             if other.nbody != model.nbody or other.ngeom != model.ngeom:
@@ -221,10 +199,11 @@ class TouchScene:
                     f"{other.ngeom} geometries, the first {model.nbody} and {model.ngeom}."
                 )
         geometries, *rows = (_geometries(each, links) for each in (model, *others))
+        order = list(assignment) or range(1 + len(others))
         variants = {
-            index: Variants((first, *rest), tuple(int(a) for a in assignment))
-            for index, (first, *rest) in enumerate(zip(geometries, *rows, strict=True))
-            if any(_differs(first, shape) for shape in rest)
+            index: tuple(shapes[number] for number in order)
+            for index, shapes in enumerate(zip(geometries, *rows, strict=True))
+            if any(_differs(shapes[0], shape) for shape in shapes[1:])
         }
         pairs = zip(model.pair_geom1.tolist(), model.pair_geom2.tolist(), strict=True)
         always = frozenset((min(pair), max(pair)) for pair in pairs)

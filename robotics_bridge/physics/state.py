@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike
 
 from brainbench.core.devices import pick_device, warp
 from brainbench.core.errors import UsageError, check_name
+from brainbench.core.reading.ranges import check_number
 from robotics_bridge.physics.kernels.state import StateArrays
 
 DIVERGED = 1
@@ -67,11 +68,9 @@ class HandState:
         Raises:
             UsageError: no or too many environments, no link, or negative room.
         """
-        if not 1 <= num_envs <= MOST_ENVS or num_links < 1 or contacts < 0:
-            raise UsageError(
-                f"A state needs 1 to {MOST_ENVS:,} environments, one link and no negative room for contacts; received "
-                f"{num_envs}, {num_links} and {contacts}."
-            )
+        check_number("environments of a state", num_envs, least=1, most=MOST_ENVS, whole=True)
+        check_number("links of a state", num_links, least=1, whole=True)
+        check_number("contacts of a state", contacts, least=0, whole=True)
         wp, device = warp(), pick_device(device)
         pose = np.zeros((num_envs, num_links, 7), dtype=np.float32)
         # Unit quaternion in Warp's order (x, y, z, w).
@@ -171,11 +170,8 @@ class HandState:
             )
         if len(pairs) != count:
             raise UsageError(f"Every contact needs one pair of geometries; received {count} and {len(pairs)}.")
-        if count and not (environments.min() >= 0 and environments.max() < self.num_envs):
-            raise UsageError(
-                f"Environments of contacts are 0 to {self.num_envs - 1}; received {environments.min()} to "
-                f"{environments.max()}."
-            )
+        for environment in (environments.min(initial=0), environments.max(initial=0)):
+            check_number("environment of a contact", environment, least=0, below=self.num_envs)
         for name in optional:
             check_name("quantity of a contact", name, _CONTACT)
         for name, values in {"env": environments, "geom": pairs, **_CONTACT, **optional}.items():

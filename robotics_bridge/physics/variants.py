@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from brainbench.core.devices import mujoco_module
 from brainbench.core.errors import UsageError, unknown_name
+from brainbench.core.reading.ranges import check_number
 from robotics_bridge.physics.scene import KINDS, Geometry
 
 mujoco = mujoco_module()
@@ -79,6 +80,7 @@ def compile_variants(spec: Any, geometry: str, shapes: Sequence[Geometry], *, de
     Raises:
         UsageError: the spec has no such geometry, or a kind cannot be an object.
     """
+    check_number("density (kg/m³)", density, above=0)
     models = []
     for shape in shapes:
         if shape.kind not in KINDS[1:-1]:

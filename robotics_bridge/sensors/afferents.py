@@ -7,7 +7,6 @@ update on the device of the signal. Letters: B environment, … anything else.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -38,8 +37,8 @@ class Band:
     """Order of the Butterworth filter at each edge."""
 
     def __post_init__(self) -> None:
-        if not (0 <= self.low < self.high and math.isfinite(self.high)):
-            raise UsageError(f"A band runs from a lower to a higher frequency (Hz); received {self.low}, {self.high}.")
+        check_fields(self, "low", least=0)
+        check_fields(self, "high", above=self.low)
         check_fields(self, "order", least=1, most=8, whole=True)
 
     def sections(self, rate: float) -> np.ndarray:

@@ -25,7 +25,7 @@ from robotics_bridge.sensors import (
     TemperatureGrid,
 )
 from robotics_bridge.sensors.audio.materials import ElasticMaterial, Modes
-from robotics_bridge.sensors.audio.modes import ElasticSolid, find_modes
+from robotics_bridge.sensors.audio.modes import find_modes
 from robotics_bridge.sensors.noise.stages import simulate
 from robotics_bridge.sensors.sensor import Sensor
 from robotics_bridge.sensors.temperature.materials import ThermalMaterial
@@ -105,7 +105,8 @@ def _tone(device: str) -> Result:
 def _beam(device: str) -> Result:
     del device
     steel = ElasticMaterial(2e11, 0.3, 7850.0, 5.0, 3e-8)
-    found = find_modes(ElasticSolid("box", (0.1, 0.005, 0.005)), steel, count=2, cells=16, cache=False).frequency[0]
+    bar = Geometry(name="bar", link="bar", kind="box", size=(0.1, 0.005, 0.005))
+    found = find_modes(bar, steel, count=2, cells=16, cache=False).frequency[0]
     return found, 4.730041**2 / (2 * math.pi * 0.2**2) * math.sqrt(2e11 * 1e-4 / 12 / 7850), 0.02
 
 

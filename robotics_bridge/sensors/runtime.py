@@ -16,7 +16,7 @@ from brainbench.core.devices import warp
 from robotics_bridge.physics.state import HandState
 from robotics_bridge.sensors.context import LaunchContext, ReadoutSlice, SuiteContext
 from robotics_bridge.sensors.kernels.readout import CLEAN, FUSED, STAGED, ProbeArrays, ReadoutArrays, append_history
-from robotics_bridge.sensors.noise.stages import DelayLine, NoiseArrays, NoiseStage
+from robotics_bridge.sensors.noise.stages import ReadingNoise
 from robotics_bridge.sensors.probes.placement import enclosing_sphere
 from robotics_bridge.sensors.sensor import ProbeSensor, Sensor
 
@@ -80,49 +80,37 @@ class Runtime(abc.ABC):
         def planes(wanted: bool) -> Any:
             return context.zeros(shape if wanted else (1, 1, 1))
 
-        arrays = NoiseArrays(list(self.slices.values()), channels, context)
-        self.part, self.probe = arrays.part, arrays.probe
-        self._truth = planes(True)
-        self._measured = planes(True) if self.noisy else self._truth
-        self._stage = NoiseStage(arrays) if staged else None
-        self._delay = DelayLine(arrays) if any(noise.read_delay for noise in noises) else None
+        self._noise = ReadingNoise(list(self.slices.values()), channels, context, staged=staged)
+        self.part, self.probe = self._noise.part, self._noise.probe
         io = ReadoutArrays()
-        io.truth, io.measured = self._truth, self._measured
+        io.truth = planes(True)
+        io.measured = planes(True) if self.noisy else io.truth
         io.hysteresis, io.walk = (planes(wanted) for wanted in self.stores)
         io.age, io.episode = context.clock.age, context.clock.episode
-        io.knobs, io.env_offset = arrays.params, context.clock.env_offset
+        io.knobs, io.env_offset = self._noise.params, context.clock.env_offset
         self.io = io
+        """Warp structure of the readings: ``truth`` and ``measured``, planar."""
         self._channels = channels
 
-    @abc.abstractmethod
     def update(self, state: HandState, dt: float) -> None:
         """Read the state; ``dt`` seconds have passed since the last update."""
+        self.io.status, self.io.dt = state.status, dt
+        self.run_kernels(state, dt)
+        self._noise.launch(self.io.measured, self.io.measured, dt)
+
+    @abc.abstractmethod
+    def run_kernels(self, state: HandState, dt: float) -> None:
+        """Run the sensor's own kernels; ``io`` knows of this update."""
 
     def measured(self) -> Any:
         """Return the planar Warp array of measured readings."""
-        return self._delay.out if self._delay else self._measured
-
-    def truth(self) -> Any:
-        """Return the planar Warp array of readings without noise."""
-        return self._truth
-
-    def begin(self, state: HandState, dt: float) -> None:
-        """Point the structure that kernels take at this update."""
-        self.io.status, self.io.dt = state.status, dt
-
-    def finish(self, dt: float) -> None:
-        """Run what noise is left after the sensor's own kernel."""
-        if self._stage:
-            self._stage.launch(self._measured, self._measured, dt)
-        if self._delay:
-            self._delay.launch(self._measured, dt)
+        return self._noise.read(self.io.measured)
 
     @property
     def state_bytes(self) -> int:
         """Lasting memory per environment [bytes], readings included, without history and delay."""
         planes = 1 + int(self.noisy) + sum(self.stores)
-        own = 4 * self._channels * self.count * planes + (self._stage.state_bytes if self._stage else 0)
-        return own + self._bytes(self.lasting)
+        return 4 * self._channels * self.count * planes + self._noise.state_bytes + self._bytes(self.lasting)
 
     @property
     def scratch_bytes(self) -> int:
@@ -132,7 +120,7 @@ class Runtime(abc.ABC):
     @property
     def ring_bytes(self) -> int:
         """Memory per environment [bytes] of delays that the user asked for."""
-        return self._delay.ring_bytes if self._delay else 0
+        return self._noise.ring_bytes
 
     def _bytes(self, arrays: list[Any]) -> int:
         return sum(array.size * wp.types.type_size_in_bytes(array.dtype) for array in arrays) // self.context.num_envs

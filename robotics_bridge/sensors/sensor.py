@@ -7,7 +7,7 @@ from collections.abc import Hashable
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, ClassVar, Literal
 
-from brainbench.core.errors import UsageError
+from brainbench.core.errors import check_name
 from brainbench.core.reading.ranges import check_fields
 from robotics_bridge.sensors.noise.model import BASE_KNOBS, PROBE_KNOBS, Noise
 from robotics_bridge.sensors.probes.placement import Probes
@@ -111,9 +111,8 @@ class QuerySensor(ProbeSensor):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        for name, allowed in (("query", ("sdf", "raycast")), ("pairs", ("contact", "all"))):
-            if getattr(self, name) not in allowed:
-                raise UsageError(f"{name} is {' or '.join(map(repr, allowed))}; received {getattr(self, name)!r}.")
+        check_name("query", self.query, ("sdf", "raycast"))
+        check_name("choice of pairs", self.pairs, ("contact", "all"))
 
     @property
     def contact_only(self) -> bool:  # type: ignore[override]

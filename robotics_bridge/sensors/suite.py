@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, cast
@@ -14,9 +13,10 @@ from brainbench.core.cuda_graphs import record_launches
 from brainbench.core.devices import pick_device, warp
 from brainbench.core.errors import UsageError, unknown_name
 from brainbench.core.plugins import load_object
+from brainbench.core.reading.ranges import check_number
 from robotics_bridge.physics.scene import TouchScene
 from robotics_bridge.physics.state import DIVERGED, MOST_ENVS, UNFELT, HandState
-from robotics_bridge.sensors.context import ReadoutSlice, SuiteContext, UpdateClock
+from robotics_bridge.sensors.context import SuiteContext, UpdateClock
 from robotics_bridge.sensors.fidelity import SensorFidelity
 from robotics_bridge.sensors.plausibility import warn_of
 from robotics_bridge.sensors.probes.runtime import DistanceRuntime
@@ -79,10 +79,9 @@ class SensorSuite:
         if fidelity is not None:
             sensors, resolution = fidelity.apply(sensors), resolution or fidelity.resolution
         resolution = resolution or 64
-        if listed is not None and listed < 1:
-            raise UsageError(f"listed is the positive number of geometries looked at on a link; received {listed}.")
-        if not 1 <= num_envs <= MOST_ENVS:
-            raise UsageError(f"A suite serves 1 to {MOST_ENVS:,} environments; received {num_envs}.")
+        if listed is not None:
+            check_number("listed", listed, least=1, whole=True)
+        check_number("environments of a suite", num_envs, least=1, most=MOST_ENVS, whole=True)
         self.scene, self.sensors = scene, dict(sensors)
         self.num_envs, self.device = num_envs, pick_device(device)
         groups: dict[Any, dict[str, Sensor]] = {}
@@ -112,7 +111,7 @@ class SensorSuite:
             self._updates = 0
             self._counter = context.zeros(1, int)
             self._histories = {
-                name: History(self._slice(name), max(sensor.channels, 1), sensor.history, context)
+                name: History(self._owner[name].slices[name], max(sensor.channels, 1), sensor.history, context)
                 for name, sensor in self.sensors.items()
                 if sensor.history
             }
@@ -133,8 +132,7 @@ class SensorSuite:
         """
         if self._status is None or state.status is not self._status:
             self._check(state)
-        if not (math.isfinite(dt) and dt > 0):
-            raise UsageError(f"dt is the positive time since the last update (s); received {dt!r}.")
+        check_number("dt (time since the last update, s)", dt, above=0)
         if not self.device.is_cuda:
             self._launch(state, dt)
             self._warn_crowded()
@@ -162,7 +160,7 @@ class SensorSuite:
 
     def read_ground_truth(self, name: str) -> torch.Tensor:
         """Return the reading without noise, in the shape of :meth:`read`; a view."""
-        return self._view(name, self.runtime_of(name).truth())
+        return self._view(name, self.runtime_of(name).io.truth)
 
     def read_history(self, name: str) -> torch.Tensor:
         """Return the last measured readings [B, T, N(, C)], oldest first; zeros before the reset. A view.
@@ -219,17 +217,18 @@ class SensorSuite:
     @property
     def diverged(self) -> torch.Tensor:
         """Mask [B] of environments that held numbers that are not finite since their reset; their readings are NaN."""
-        if self._status is None:
-            raise UsageError("Nothing was read yet; call update(state) first.")
-        return (wp.to_torch(self._status) & DIVERGED) != 0
+        return self._flagged(DIVERGED)
 
     @property
     def unfelt(self) -> torch.Tensor:
         """Mask [B] of environments in which, at the last update, a contact on a link with taxels of ``total="engine"``
         lay near none of them that feels it: their sum lacks its force."""
+        return self._flagged(UNFELT)
+
+    def _flagged(self, bit: int) -> torch.Tensor:
         if self._status is None:
             raise UsageError("Nothing was read yet; call update(state) first.")
-        return (wp.to_torch(self._status) & UNFELT) != 0
+        return (wp.to_torch(self._status) & bit) != 0
 
     @property
     def crowded(self) -> torch.Tensor:
@@ -292,10 +291,7 @@ class SensorSuite:
             raise unknown_name(what, name, choices)
         return self._owner[name]
 
-    def _slice(self, name: str) -> ReadoutSlice:
-        return self._owner[name].slices[name]
-
     def _view(self, name: str, planes: Any) -> torch.Tensor:
-        part = self._slice(name)
+        part = self._owner[name].slices[name]
         tensor = wp.to_torch(planes)[:, :, part.span].permute(1, 2, 0).unflatten(1, part.layout)
         return tensor.squeeze(-1) if part.scalar else tensor

@@ -8,7 +8,7 @@ import torch
 
 from brainbench.core.errors import UsageError
 from robotics_bridge import hands, tasks
-from robotics_bridge.deploy.controller import Actuation, Clock, Controller
+from robotics_bridge.deploy.controller import Clock, Controller
 from robotics_bridge.deploy.driver import HandReading, LinkCounters
 from robotics_bridge.deploy.frames import new_key
 from robotics_bridge.deploy.safety import LIMITS, SafetyLimits
@@ -16,9 +16,9 @@ from robotics_bridge.deploy.session import constant
 from robotics_bridge.deploy.simulated_hand import Faults
 from robotics_bridge.deploy.touch import PressureCalibration
 from robotics_bridge.deploy.udp import UdpDriver
-from robotics_bridge.envs import ActionMap
 from robotics_bridge.hands.scenes import holding
 from robotics_bridge.physics import Geometry, HandState, MujocoEngine
+from robotics_bridge.policies.contract import PolicyContract
 from robotics_bridge.sensors import ContactDepthProbe, KinematicTaxel, Probes, SensorSuite
 from tests.factories.touch_scenes import pad_scene, poses_at, state_of
 
@@ -64,8 +64,8 @@ class _Ticks(Clock):
 def _controller(hand, policy, *, rate=40.0, **mapping):
     parts = {"default": np.zeros(2), "scale": np.ones(2), "low": -np.ones(2), "high": np.ones(2), **mapping}
     limits = SafetyLimits(-np.ones(2), np.ones(2), np.full(2, 8.0), timeout=2.0)
-    actuation = Actuation(hand.joints, ActionMap(hand.joints, **parts))
-    return Controller(policy, hand, actuation, limits, groups=("proprio",), rate=rate, clock=_Ticks())
+    contract = PolicyContract({"proprio": (6,)}, rate, "paper", hand.joints, hand.joints, parts, {})
+    return Controller(policy, hand, contract, limits, clock=_Ticks())
 
 
 @pytest.mark.parametrize("name", ["default", "scale", "low", "high"])
@@ -134,11 +134,11 @@ def test_constants_have_a_size_and_a_range(values) -> None:
     assert _one_sentence(error)
 
 
-@pytest.mark.parametrize("value", [*NOT_FINITE, 0.0, 1e9])
+@pytest.mark.parametrize("value", [*NOT_FINITE, 0.0, 1e9, True, "1000", None])
 def test_calibrations_of_pressure_have_ranges(value) -> None:
     changes = ({"scale": value}, {"per_finger": {"thumb": value}}, {"axes": (1.0, value, 1.0)}, {"threshold": value})
     for change in changes:
-        with pytest.raises(UsageError, match="calibration"):
+        with pytest.raises(UsageError, match=f"calibration .*{value}"):
             PressureCalibration(**change)
 
 
@@ -147,11 +147,13 @@ def test_calibrations_of_pressure_have_ranges(value) -> None:
 def test_faults_have_ranges(name, value) -> None:
     with pytest.raises(UsageError, match=name):
         Faults(**{name: value})
+    with pytest.raises(UsageError, match="seed"):
+        Faults(seed=-1)
 
 
 @pytest.mark.parametrize(("joints", "fingers"), [(0, 0), (256, 0), (1, 256), (100_000, 1)])
 def test_hands_of_no_or_too_many_joints_are_refused(joints, fingers) -> None:
-    with pytest.raises(UsageError, match=f"{joints} and {fingers}"):
+    with pytest.raises(UsageError, match=rf"(joints|fingers) of a hand .*received ({joints}|{fingers})\."):
         UdpDriver(("", 9), ("j",) * joints, ("f",) * fingers, new_key())
     for age in (*NOT_FINITE, 0.0, 100.0):
         with pytest.raises(UsageError, match="max_age"):

@@ -76,7 +76,7 @@ def deploy(
     from robotics_bridge.deploy import session
     from robotics_bridge.deploy.controller import check_duration
     from robotics_bridge.deploy.episodes import SessionRecorder, check_folder
-    from robotics_bridge.deploy.simulated_hand import Faults, simulated_hand
+    from robotics_bridge.deploy.simulated_hand import Faults, ShadowTouch, simulated_hand
     from robotics_bridge.deploy.timing import realtime
     from robotics_bridge.deploy.udp import UdpDriver
     from robotics_bridge.tasks.contact_model import contacts_name
@@ -102,9 +102,8 @@ def deploy(
         )
         address, joints, fingers, secret = ends
         link = stack.enter_context(UdpDriver(address, joints, fingers, secret))
-        task = str(contract.more.get("task", "deployed policy"))
-        recorder = SessionRecorder(contract.hand, contract.rate, task) if record is not None else None
-        fallback = _shadow(deployed, joints) if shadow else given.pop("tactile", None)
+        recorder = SessionRecorder(contract) if record is not None else None
+        fallback = ShadowTouch(contract, joints) if shadow else given.pop("tactile", None)
         controller = deployed.controller(
             link, limits={"timeout": timeout, "pressure": pressure}, sources=given, fallback=fallback,
             threads=threads, record=recorder,
@@ -112,7 +111,7 @@ def deploy(
         with realtime() if ahead else contextlib.nullcontext():
             report = controller.run(seconds)
     facts: dict[str, Any] = {**vars(report), "unmeasured": told}
-    if record is not None and recorder is not None and recorder.episode.state:
+    if record is not None and recorder is not None and recorder.frames:
         facts["episode"] = str(recorder.write(record, joints))
     reason = f" ({report.reason})" if report.reason else ""
     latency = report.latency
@@ -162,18 +161,3 @@ def _remote(text: str, key: Path | None, deployed: DeployedPolicy) -> tuple[Any,
         raise UsageError("A hand behind a socket needs --key FILE: the key that its computer holds too.")
     hand = hands.load(deployed.contract.hand)
     return (host, int(port)), hand.joints, tuple(hand.fingers), read_key(key)
-
-
-def _shadow(deployed: DeployedPolicy, joints: tuple[str, ...]) -> Any:
-    from brainbench.core.errors import UsageError
-    from robotics_bridge.deploy.simulated_hand import ShadowTouch
-
-    contract = deployed.contract
-    facts = {"observe": contract.observe, **contract.more}
-    if missing := {"placement", "resolution", "sub_steps"} - set(facts):
-        raise UsageError(
-            f"The contract does not say {sorted(missing)[0]!r}, so no touch can be simulated beside the hand."
-        )
-    names = (facts[name] for name in ("observe", "placement", "resolution"))
-    settings = {name: facts[name] for name in ("sub_steps", "twist", "contacts")}
-    return ShadowTouch(contract.hand, *names, joints=joints, rate=contract.rate, **settings)

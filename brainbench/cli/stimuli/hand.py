@@ -115,14 +115,14 @@ def objects_of(text: str, diagonal: float, unit: str | None = None) -> list[Expl
         shapes = {kind: Geometry(name=kind, link=kind, kind=kind, size=size) for kind, size in sizes.items()}
         return [Explored(kind, one, quaternion=lying.get(kind, (1, 0, 0, 0))) for kind, one in shapes.items()]
     if text == RODGERS:
-        mesh, found = _surface(rodgers_solid(diagonal)), []
+        shape, found = _geometry(_surface(rodgers_solid(diagonal))), []
         for scene in get_recipe(RODGERS).scenes:
             side, _, distance = scene.label.partition("-")
             # The concave face looks towards -y, askew by 25 degrees; the side that is named faces the palm.
             half, skew = math.radians(-90.0 if side == "convex" else 90.0) / 2, math.radians(25.0) / 2
             c, s, cz, sz = math.cos(half), math.sin(half), math.cos(skew), math.sin(skew)
             turn = (c * cz, s * cz, -s * sz, c * sz)
-            found.append(Explored(scene.label, mesh=mesh, quaternion=turn, retreat=_DISTANCES[distance]))
+            found.append(Explored(scene.label, shape, quaternion=turn, retreat=_DISTANCES[distance]))
         return found
     found = []
     for name, item in resolve_objects([text], unit=unit, surfaces=True).items():
@@ -130,8 +130,14 @@ def objects_of(text: str, diagonal: float, unit: str | None = None) -> list[Expl
         # Centred, and scaled to the diagonal of its box.
         low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
         scale = diagonal / float(np.linalg.norm(high - low))
-        found.append(Explored(name, mesh=Mesh((mesh.vertices - (low + high) / 2) * scale, mesh.faces)))
+        found.append(Explored(name, _geometry(Mesh((mesh.vertices - (low + high) / 2) * scale, mesh.faces))))
     return found
+
+
+def _geometry(mesh: Any) -> Any:
+    from robotics_bridge.physics import Geometry
+
+    return Geometry(name="object", link="object", kind="mesh", mesh=mesh)
 
 
 def _surface(solid: Any) -> Any:

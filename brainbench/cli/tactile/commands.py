@@ -164,7 +164,6 @@ def calibrate(
     """
     from brainbench.core.errors import UsageError
     from robotics_bridge.sensors.calibration.calibrate import calibrate as fit
-    from robotics_bridge.sensors.calibration.calibrate import describe
     from robotics_bridge.sensors.calibration.log import read_log
 
     if not max_delay >= 0:
@@ -182,7 +181,7 @@ def calibrate(
     }
     about = found.about
     title = f"{log.name}: {len(about['probes'])} probes, {about['episodes']} episodes, {about['readings']} readings"
-    text = table_of(title, describe(found), columns)
+    text = table_of(title, list(found.estimates.items()), columns)
     text += "\n\n" + "\n".join(found.notes) + (f"\nWrote {out}." if out is not None else "")
     data = {"noise": found.noise, "estimates": found.estimates, "notes": found.notes, "about": about}
     emit({**data, "preset": out}, text, as_json=as_json)

@@ -21,7 +21,7 @@ from robotics_bridge.hands.scenes import closing, holding
 from robotics_bridge.physics import Geometry, HandState, MujocoEngine, MujocoWarpEngine, TouchScene
 from robotics_bridge.sensors import ContactAudio, ElastomerTaxel, Noise, Probes, SensorSuite, TemperatureGrid
 from robotics_bridge.sensors.audio.materials import Modes
-from robotics_bridge.sensors.audio.modes import ElasticSolid, find_modes
+from robotics_bridge.sensors.audio.modes import find_modes
 from robotics_bridge.sensors.temperature.materials import ThermalBody
 
 CLASSES = {
@@ -193,12 +193,12 @@ def sound(path: Path) -> dict[str, float]:
       <body name="ball" pos="0.03 0.02 0.12"><freejoint/>
         <geom size="0.02" mass="0.05" solref="0.004 0.3"/></body>
     </worldbody></mujoco>""")
-    solid = ElasticSolid("box", (0.15, 0.1, 0.01))
+    engine = MujocoEngine(model, 1, threads=1)
+    solid = engine.scene.geometries[0]
     sensors = {
         name: ContactAudio(link="slab", samples=160, modes=find_modes(solid, name, count=24, cells=10))
         for name in ("wood", "metal", "glass")
     }
-    engine = MujocoEngine(model, 1, threads=1)
     suite = SensorSuite(engine.scene, sensors, num_envs=1)
     blocks: dict[str, list[Any]] = {name: [] for name in sensors}
     for _ in range(240):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 from brainbench.core.errors import UsageError, unknown_name
 from brainbench.core.reading.ranges import check_fields, check_number
@@ -95,18 +95,6 @@ class Modes:
         """Return (frequency, decay, gain) of each mode."""
         return list(zip(self.frequency, self.decay, self.gain, strict=True))
 
-    def strongest(self, count: int) -> Modes:
-        """Return the modes with the largest gains, by frequency."""
-        rows = sorted(sorted(self.rows(), key=lambda row: -abs(row[2]))[:count])
-        return Modes(*(tuple(column) for column in zip(*rows, strict=True)))
-
-    def scaled(self, size: float) -> Modes:
-        """Return the modes of a body ``size`` times as large of the same material (decays unchanged)."""
-        check_number("The scale of a body", size, above=0)
-        # Frequencies go with 1 / size, gains with 1 / mass, hence with 1 / size³.
-        gain = tuple(value / size**3 for value in self.gain)
-        return replace(self, frequency=tuple(value / size for value in self.frequency), gain=gain)
-
 
 def preset_modes(material: str | ElasticMaterial, lowest: float, count: int = 16) -> Modes:
     """Return hand-made modes for a body of a material that is known by ear only.
@@ -118,10 +106,8 @@ def preset_modes(material: str | ElasticMaterial, lowest: float, count: int = 16
         UsageError: the lowest frequency lies outside the audible range, or the count is not positive.
     """
     chosen = elastic_material(material)
-    if not 20 <= lowest < 20_000 or count < 1:
-        raise UsageError(
-            f"A body rings between 20 and 20000 Hz in at least one mode; received {lowest!r} Hz, {count!r} modes."
-        )
+    check_number("lowest frequency of a body that is heard (Hz)", lowest, least=20, below=20_000)
+    check_number("number of modes", count, least=1, whole=True)
     # Free bar: wave numbers near (2n + 1) π / 2L, and frequencies with their square.
     every = (lowest * (2 * n + 1) ** 2 / 9 for n in range(1, count + 1))
     frequency = tuple(value for value in every if value <= 20_000)

@@ -103,8 +103,8 @@ class Listener:
         for index, (name, runtime) in enumerate(self._sources.items()):
             part = runtime.slices[name]
             # The ring takes silence in place of what is not finite, and later blocks hear it late.
-            self.diverged |= ~warp().to_torch(runtime.truth())[:, :, part.span].sum(dim=2).isfinite().all(dim=0)
-            c.launch(k.record_source, block, runtime.truth(), part.start, part.count, self._slot, index, self._ring)
+            self.diverged |= ~warp().to_torch(runtime.io.truth)[:, :, part.span].sum(dim=2).isfinite().all(dim=0)
+            c.launch(k.record_source, block, runtime.io.truth, part.start, part.count, self._slot, index, self._ring)
         # Lengths at the start and the end of the block: the kernel lets them change evenly in between.
         place, paths = warp().vec3f(*m.position), [self._now, self._before]
         c.launch(k.measure_paths, self._now.shape, state.pose, self._links, self._link, place, age, *paths)

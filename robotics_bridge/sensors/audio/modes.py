@@ -6,64 +6,26 @@ the closed forms of beams and plates to a percent with a few hundred elements.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from importlib import import_module
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.sparse.linalg import eigsh
 
-from brainbench.core.errors import UsageError, unknown_name
+from brainbench.core.errors import UsageError
 from brainbench.core.files import cache_dir, content_hash, to_plain
+from brainbench.core.reading.ranges import check_number
 from brainbench.core.reading.sealed import read_sealed, write_sealed
-from brainbench.geometry import Mesh
+from robotics_bridge.physics.scene import Geometry
 from robotics_bridge.sensors.audio import tetrahedra
 from robotics_bridge.sensors.audio.materials import ElasticMaterial, Modes, elastic_material
 
 _VERSION = 1
-SHAPES = ("box", "sphere", "ellipsoid", "cylinder", "mesh")
-
-
-@dataclass(frozen=True)
-class ElasticSolid:
-    """A body to be struck, in its own frame.
-
-    Raises:
-        UsageError: the shape is unknown or a size is not positive.
-    """
-
-    shape: str
-    """``box``, ``sphere``, ``ellipsoid``, ``cylinder`` (along z) or ``mesh`` (any closed surface)."""
-    size: tuple[float, ...] = ()
-    """Half edges; radius; half axes; radius and half length [m]."""
-    mesh: Mesh | None = None
-
-    def __post_init__(self) -> None:
-        needed = {"box": 3, "sphere": 1, "ellipsoid": 3, "cylinder": 2, "mesh": 0}
-        if self.shape not in needed:
-            raise unknown_name("solid", self.shape, SHAPES)
-        sizes = self.size[: needed[self.shape]]
-        if len(sizes) < needed[self.shape] or not all(0 < value < np.inf for value in sizes):
-            raise UsageError(f"A {self.shape} needs {needed[self.shape]} positive sizes (m); received {self.size}.")
-        if self.shape == "mesh" and self.mesh is None:
-            raise UsageError("A solid of shape 'mesh' needs its mesh.")
-
-    def tetrahedra(self, cells: int) -> Any:
-        """Return the ``skfem.MeshTet`` with ``cells`` elements along its longest edge."""
-        if self.shape == "box":
-            return tetrahedra.box((self.size[0], self.size[1], self.size[2]), cells)
-        if self.shape == "sphere":
-            return tetrahedra.ball((self.size[0], self.size[0], self.size[0]), cells)
-        if self.shape == "ellipsoid":
-            return tetrahedra.ball((self.size[0], self.size[1], self.size[2]), cells)
-        if self.shape == "cylinder":
-            return tetrahedra.cylinder(self.size[0], self.size[1], cells)
-        return tetrahedra.voxels(cast("Mesh", self.mesh), cells)
 
 
 def find_modes(
-    solid: ElasticSolid,
+    solid: Geometry,
     material: str | ElasticMaterial,
     *,
     count: int = 16,
@@ -75,7 +37,7 @@ def find_modes(
     """Return the lowest elastic modes of a free solid.
 
     Args:
-        solid: Its shape.
+        solid: A box, sphere, ellipsoid, cylinder or closed mesh; link and pose do not matter.
         material: What it is made of; decays follow from its Rayleigh damping.
         count: Number of modes.
         cells: Elements along the longest edge.
@@ -84,15 +46,17 @@ def find_modes(
         cache: Whether the result is kept in the cache folder.
 
     Raises:
-        UsageError: the mesh is too coarse for so many modes.
+        UsageError: the solid is of another kind, or the mesh is too coarse for so many modes.
     """
+    for name, value in {"count": count, "cells": cells}.items():
+        check_number(name, value, least=1, whole=True)
     chosen = elastic_material(material)
-    shape = (solid.shape, list(solid.size), None if solid.mesh is None else solid.mesh.content_hash)
+    shape = (solid.kind, list(solid.size), None if solid.mesh is None else solid.mesh.content_hash)
     points = [None if point is None else np.asarray(point, float).tolist() for point in (strike, hear)]
     path = cache_dir("modes") / f"{content_hash(_VERSION, shape, to_plain(chosen), count, cells, points)}.npz"
     if cache and (kept := read_sealed(path, "modes of a solid")) is not None:
         return Modes(*(tuple(kept[name].tolist()) for name in ("frequency", "decay", "gain")))
-    frequency, normal, place = solve(solid.tetrahedra(cells), chosen, count)
+    frequency, normal, place = solve(tetrahedra.fill(solid, cells), chosen, count)
     weights = []
     for point in (strike, hear):
         if point is None:

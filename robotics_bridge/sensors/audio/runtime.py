@@ -81,15 +81,13 @@ class ContactAudioRuntime(Runtime):
             array.assign(np.ascontiguousarray(quads, dtype=np.float32))
         self._own.sources.assign(self.context.array(sources, SourceParams))
 
-    def update(self, state: HandState, dt: float) -> None:
-        """Read the contacts and make the next block."""
+    def run_kernels(self, state: HandState, dt: float) -> None:
+        """Make the next block from the contacts."""
         self._set_step(dt)
-        self.begin(state, dt)
         c, own, many = self.context, self._own, (self.context.num_envs, len(self._sensors))
         c.launch(gather_contacts, state.contact_env.shape[0], state.arrays, own)
         c.launch(excite_modes, (self.samples, *many), own, self.io, self.samples)
         c.launch(ring_modes, many, own, self.io, self.samples)
-        self.finish(dt)
 
 
 class DriveAudioRuntime(Runtime):
@@ -107,9 +105,7 @@ class DriveAudioRuntime(Runtime):
             self.lasting.append(getattr(own, name))
         self._own, self.effort, self.speed = own, own.effort, own.speed
 
-    def update(self, state: HandState, dt: float) -> None:
+    def run_kernels(self, state: HandState, dt: float) -> None:
         """Make the next block from the torques and speeds that were written."""
-        self.begin(state, dt)
         c = self.context
         c.launch(sound_drives, (c.num_envs, self.count), self._own, self.io, self.samples)
-        self.finish(dt)

@@ -6,11 +6,12 @@ from importlib import import_module
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import KDTree
 
 from brainbench.core.errors import UsageError, missing_dependency
 from brainbench.geometry import Mesh, winding_number
+from robotics_bridge.physics.scene import Geometry
 from robotics_bridge.sensors.probes.placement import face_areas, spread_over
 
 SMALLEST = 0.05
@@ -25,18 +26,38 @@ def skfem() -> Any:
         raise missing_dependency("scikit-fem", extra="tactile", purpose="Modal analysis") from error
 
 
-def box(half: tuple[float, float, float], cells: int) -> Any:
+def fill(solid: Geometry, cells: int) -> Any:
+    """Return the ``skfem.MeshTet`` of a solid with ``cells`` elements along its longest edge.
+
+    Raises:
+        UsageError: the solid is of a kind that is not filled, or too thin for so few cells.
+    """
+    if solid.kind == "box":
+        return box(solid.size, cells)
+    if solid.kind in ("sphere", "ellipsoid"):
+        return ball(np.broadcast_to(solid.size, 3), cells)
+    if solid.kind == "cylinder":
+        return cylinder(solid.size[0], solid.size[1], cells)
+    if solid.mesh is None:
+        raise UsageError(
+            f"Modes are those of a box, sphere, ellipsoid, cylinder or mesh; {solid.name!r} is a {solid.kind}. Make it "
+            "a mesh."
+        )
+    return voxels(solid.mesh, cells)
+
+
+def box(half: ArrayLike, cells: int) -> Any:
     """Return a box of half edges (m) with ``cells`` along its longest edge and at least one along each."""
-    size = 2 * np.array(half, dtype=float)
+    size = 2 * np.asarray(half, dtype=float)
     counts = np.maximum(np.round(cells * size / size.max()), 1).astype(int)
     axes = [np.linspace(-s / 2, s / 2, n + 1) for s, n in zip(size, counts, strict=True)]
     return skfem().MeshTet.init_tensor(*axes)
 
 
-def ball(half: tuple[float, float, float], cells: int) -> Any:
+def ball(half: ArrayLike, cells: int) -> Any:
     """Return an ellipsoid of half axes (m), from a cube whose shells are pushed out to spheres."""
     mesh = box((1.0, 1.0, 1.0), cells)
-    return type(mesh)(_rounded(mesh.p, 0.8) * np.array(half)[:, None], mesh.t)
+    return type(mesh)(_rounded(mesh.p, 0.8) * np.asarray(half)[:, None], mesh.t)
 
 
 def cylinder(radius: float, half_length: float, cells: int) -> Any:

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -30,6 +30,11 @@ from robotics_bridge.sensors.noise.model import Noise
 NOT_FITTED = ("radius", "crosstalk")
 """Knobs that a log of one signal cannot tell: they need known places."""
 _ROUNDS = 12
+ORDER = (
+    "gain_low", "gain_high", "hysteresis", "hysteresis_tau", "walk", "white", "bias", "quantum", "dead_probability",
+    "dead_low", "dead_high", "read_delay", "jitter",
+)  # fmt: skip
+"""Knobs in the order of the model."""
 
 
 @dataclass(frozen=True)
@@ -38,9 +43,7 @@ class Calibration:
 
     noise: Noise
     estimates: Mapping[str, Estimate]
-    """By knob; ``gain_low`` and so on for the ends of ranges."""
-    gains: tuple[float, ...] = ()
-    """Gain of each living probe and episode."""
+    """By knob, in the order of the model; ``gain_low`` and so on for the ends of ranges."""
     notes: tuple[str, ...] = ()
     """Knobs that could not be told, and why."""
     about: Mapping[str, Any] = field(default_factory=dict)
@@ -62,7 +65,6 @@ def calibrate(log: Log, *, max_delay: float = 0.5) -> Calibration:
     """
     estimates: dict[str, Estimate] = {}
     notes = [f"Not fitted: {', '.join(NOT_FITTED)}."]
-    knobs: dict[str, Any] = {}
     parts = segments(log)
     stuck, values = find_dead(parts)
     living = [(x, y[:, ~dead]) for (x, y), dead in zip(parts, stuck, strict=True) if (~dead).any()]
@@ -74,12 +76,10 @@ def calibrate(log: Log, *, max_delay: float = 0.5) -> Calibration:
         if not moved:
             raise DataError("The reference never changes; leave the column out for a device at rest.")
         held, at = (np.concatenate([items[index] for index in moved]) for items in (stuck, values))
-        _dead(held, at, knobs, estimates)
+        estimates |= _dead(held, at)
     quantum = find_quantum(np.concatenate([y.ravel() for _x, y in living]))
-    knobs["quantum"] = quantum
-    estimates["quantum"] = Estimate(
-        quantum, quantum, quantum, "all readings are its multiples" if quantum else "none found"
-    )
+    how = "all readings are its multiples" if quantum else "none found"
+    estimates["quantum"] = Estimate(quantum, quantum, quantum, how)
     moving = log.reference is not None
     guess = find_delays(living, round(max_delay / log.step)) if moving else (0, 0)
     fit = fit_dynamics(align(living, *guess), log.step, quantum, moving=moving)
@@ -96,51 +96,58 @@ def calibrate(log: Log, *, max_delay: float = 0.5) -> Calibration:
         notes.append("Without a column 'reference' the true signal counts as 0: gain, delay, hysteresis and dead "
                      "probes were not fitted.")  # fmt: skip
     else:
-        _delay(extent(lags, guess), len(lags), log.step, knobs, estimates)
-        _gain(fit, knobs, estimates, notes)
-    for name, item in fit.estimates.items():
-        knobs[name] = item.value
-        estimates[name] = item
-    if not knobs.get("hysteresis"):
-        knobs.pop("hysteresis_tau", None)
-    if quantum > 2.5 * max(knobs["white"], 1e-300):
+        estimates |= _delay(extent(lags, guess), len(lags), log.step) | _gain(fit)
+        if len(fit.gains) < 20 and estimates["gain_high"].value > estimates["gain_low"].value:
+            notes.append(
+                f"The range of gains rests on {len(fit.gains)} probes; log more probes or resets to narrow it."
+            )
+    estimates |= fit.estimates
+    if quantum > 2.5 * max(estimates["white"].value, 1e-300):
         notes.append("The white noise is far below a quantisation step; its value is an upper bound at best.")
+    estimates = {name: estimates[name] for name in ORDER if name in estimates}
     about = {"readings": int(log.readings.size), "probes": list(log.probes), "episodes": len(parts), "step": log.step}
-    return Calibration(Noise(**knobs), estimates, tuple(fit.gains.tolist()), tuple(notes), about)
+    return Calibration(_noise(estimates), estimates, tuple(notes), about)
 
 
-def _delay(
-    lags: tuple[int, int], certain: int, step: float, knobs: dict[str, Any], estimates: dict[str, Estimate]
-) -> None:
-    """Enter delay and jitter: lags are rounded up to whole readings and spread evenly over twice the jitter."""
+def _noise(estimates: Mapping[str, Estimate]) -> Noise:
+    knobs: dict[str, Any] = {name: item.value for name, item in estimates.items()}
+    for name, ends in {"gain": ("gain_low", "gain_high"), "dead_range": ("dead_low", "dead_high")}.items():
+        if ends[0] in knobs:
+            knobs[name] = tuple(knobs.pop(end) for end in ends)
+    if not knobs["hysteresis"]:
+        knobs.pop("hysteresis_tau", None)
+    return Noise(**knobs)
+
+
+def _delay(lags: tuple[int, int], certain: int, step: float) -> dict[str, Estimate]:
+    """Return delay and jitter: lags are rounded up to whole readings and spread evenly over twice the jitter."""
     first, last = lags
     middle, half = (first + last - 1) / 2 * step, (last - first + 1) / 2 * step
     if first == last:
         middle, half = last * step, 0.0
-    knobs["read_delay"], knobs["jitter"] = middle, min(half, middle)
     low = max(middle - (step if first == last else step / 2), 0.0)
     high = middle if first == last else middle + step / 2
-    estimates["read_delay"] = Estimate(middle, low, high, "best agreement, to one reading")
     how = f"{certain} readings whose lag is certain" if certain else "no lag is certain"
-    estimates["jitter"] = Estimate(knobs["jitter"], max(half - step / 2, 0.0), half + step / 2, how)
+    return {
+        "read_delay": Estimate(middle, low, high, "best agreement, to one reading"),
+        "jitter": Estimate(min(half, middle), max(half - step / 2, 0.0), half + step / 2, how),
+    }
 
 
-def _dead(stuck: NDArray, values: NDArray, knobs: dict[str, Any], estimates: dict[str, Estimate]) -> None:
-    """Enter the share of dead probes with its exact binomial interval (Clopper & Pearson), and their values."""
+def _dead(stuck: NDArray, values: NDArray) -> dict[str, Estimate]:
+    """Return the share of dead probes with its exact binomial interval (Clopper & Pearson), and their values."""
     count, dead = len(stuck), int(stuck.sum())
     low = float(beta.ppf(0.025, dead, count - dead + 1)) if dead else 0.0
     high = float(beta.ppf(0.975, dead + 1, count - dead)) if dead < count else 1.0
-    knobs["dead_probability"] = dead / count
-    estimates["dead_probability"] = Estimate(dead / count, low, high, f"{dead} of {count} probes are stuck")
+    found = {"dead_probability": Estimate(dead / count, low, high, f"{dead} of {count} probes are stuck")}
     if dead:
-        held = values[stuck]
-        knobs["dead_range"] = (float(held.min()), float(held.max()))
-        for name, value in zip(("dead_low", "dead_high"), knobs["dead_range"], strict=True):
-            estimates[name] = Estimate(value, math.nan, math.nan, "extreme of the stuck values")
+        for name, value in {"dead_low": values[stuck].min(), "dead_high": values[stuck].max()}.items():
+            found[name] = Estimate(float(value), math.nan, math.nan, "extreme of the stuck values")
+    return found
 
 
-def _gain(fit: Fit, knobs: dict[str, Any], estimates: dict[str, Estimate], notes: list[str]) -> None:
-    """Enter the range of the gains: the extremes, moved out by their mean distance from the ends."""
+def _gain(fit: Fit) -> dict[str, Estimate]:
+    """Return the range of the gains: the extremes, moved out by their mean distance from the ends."""
     gains, count = np.sort(fit.gains), len(fit.gains)
     mean = float(np.average(fit.gains, weights=1 / fit.gain_errors**2))
     if mean <= 0:
@@ -152,23 +159,14 @@ def _gain(fit: Fit, knobs: dict[str, Any], estimates: dict[str, Estimate], notes
         if count > 1:
             middle, how = mean, "gains are equal within their errors"
         error = Z95 * noise / math.sqrt(count)
-        knobs["gain"] = (middle, middle)
-        estimates["gain_low"] = estimates["gain_high"] = Estimate(middle, middle - error, middle + error, how)
-        return
+        return dict.fromkeys(("gain_low", "gain_high"), Estimate(middle, middle - error, middle + error, how))
     # For uniform gains the extremes lie inside the range by its width / (n + 1) on average, which is span / (n − 1).
     out = span / (count - 1)
-    knobs["gain"] = (max(float(gains[0] - out), 0.0), float(gains[-1] + out))
+    low, high = max(float(gains[0] - out), 0.0), float(gains[-1] + out)
     # The end lies beyond the extreme by at most the span times a^(-1/(n-1)) - 1, at confidence 1 - a per end.
     reach = span * (0.025 ** (-1 / (count - 1)) - 1)
     how = f"extremes of {count} gains"
-    estimates["gain_low"] = Estimate(knobs["gain"][0], float(gains[0]) - reach, float(gains[0]) + Z95 * noise, how)
-    estimates["gain_high"] = Estimate(knobs["gain"][1], float(gains[-1]) - Z95 * noise, float(gains[-1]) + reach, how)
-    if count < 20:
-        notes.append(f"The range of gains rests on {count} probes; log more probes or resets to narrow it.")
-
-
-def describe(calibration: Calibration) -> Sequence[tuple[str, Estimate]]:
-    """Return the estimates in the order of the model."""
-    order = ["gain_low", "gain_high", "hysteresis", "hysteresis_tau", "walk", "white", "bias", "quantum"]
-    order += ["dead_probability", "dead_low", "dead_high", "read_delay", "jitter"]
-    return [(name, calibration.estimates[name]) for name in order if name in calibration.estimates]
+    return {
+        "gain_low": Estimate(low, float(gains[0]) - reach, float(gains[0]) + Z95 * noise, how),
+        "gain_high": Estimate(high, float(gains[-1]) - Z95 * noise, float(gains[-1]) + reach, how),
+    }

@@ -13,6 +13,7 @@ import torch
 
 from brainbench.core.devices import warp
 from brainbench.core.errors import UsageError
+from brainbench.core.reading.ranges import check_number
 from robotics_bridge.physics.state import HandState
 from robotics_bridge.sensors.elastomer.runtime import ElastomerRuntime
 from robotics_bridge.sensors.elastomer.taxel import ElastomerTaxel
@@ -44,10 +45,8 @@ def contact_pressure(
     """
     runtime = cast(ElastomerRuntime, suite.runtime_of(name, ElastomerTaxel, "elastomer"))
     sensor = cast(ElastomerTaxel, suite.sensors[name])
-    if not (0 < modulus < math.inf and 0 <= poisson <= 0.5):
-        raise UsageError(
-            f"modulus is positive (Pa), and poisson lies between 0 and 0.5; received {modulus} and {poisson}."
-        )
+    check_number("modulus (Pa)", modulus, above=0)
+    check_number("poisson", poisson, least=0, most=0.5)
     pitch = sensor.probes.pitch
     if not sensor.planar or pitch is None or min(sensor.probes.shape) < 2:
         raise UsageError(f"The pressure on {name!r} needs a regular planar grid of markers (Probes.grid).")

@@ -93,10 +93,9 @@ class ElastomerRuntime(ProbeRuntime):
         order = (*range(1, len(shape)), 0)
         return self.context.zeros((shape[-1], *shape[:-1]), dtype).transpose(order)
 
-    def update(self, state: HandState, dt: float) -> None:
-        """Read the state."""
+    def run_kernels(self, state: HandState, dt: float) -> None:
+        """Run the kernels."""
         c, pads, in_turn = self.context, self.pads, not self.side_by_side
-        self.begin(state, dt)
         solids, pairs = c.solids.struct, c.pairs.struct
         indent = indent_kernel(self.kinds, self._raycast, self._planes, in_turn)
         self.launch(indent, self.probes, solids, pairs, self.io, pads)
@@ -113,7 +112,6 @@ class ElastomerRuntime(ProbeRuntime):
         way = ("direct", "separable", "fft").index(self._way)
         kernel = marker_kernel(way, self._layered, self._planes, self.mode, *self.stores, in_turn, self.apart)
         self.launch(kernel, self.probes, self.io, pads, pairs, self.points)
-        self.finish(dt)
 
     def launch(self, kernel: Any, *inputs: Any) -> None:
         """Run a kernel over all environments and markers."""

@@ -1,4 +1,4 @@
-"""The noise of whole readings: a stage that measures, and a line that delays. Arrays are planar [C, B, N].
+"""The noise of whole readings: crosstalk, all that follows it, and the delay. Arrays are planar [C, B, N].
 
 Sensors that fuse the noise into their own kernels need the delay alone. Letters: B environment, N probe, C channel.
 """
@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from brainbench.core.devices import pick_device, warp
 from brainbench.core.errors import UsageError
+from brainbench.core.reading.ranges import check_number
 from robotics_bridge.sensors.context import LaunchContext, ReadoutSlice, UpdateClock
 from robotics_bridge.sensors.noise.kernels.noise import NoiseParams, crosstalk, delay_line, measure
 from robotics_bridge.sensors.noise.model import Noise, stream_seed
@@ -22,65 +23,61 @@ from robotics_bridge.sensors.noise.model import Noise, stream_seed
 wp = warp()
 
 
-class NoiseArrays:
-    """Noise and probe indices of the sensors that share planar arrays, on the device.
+class ReadingNoise:
+    """Noise of the sensors that share planar arrays: what their own kernel leaves to stages, and the delay.
+
+    It needs no reset: what belongs to an environment whose ``clock.age`` is 0 counts as zero. A late reading (held until
+    the next) carries the noise it was recorded with; before the first one after a reset has arrived, the first is read.
 
     Args:
-        slices: the sensors, one after another on N.
+        slices: The sensors, one after another on N.
         channels: C.
-        context: device, clock and seed.
-    """
-
-    def __init__(self, slices: Sequence[ReadoutSlice], channels: int, context: LaunchContext) -> None:
-        self.slices, self.channels, self.context = slices, channels, context
-        self.total = sum(part.count for part in slices)
-        """N."""
-        index, probe, active = (np.zeros(self.total, np.int32) for _ in range(3))
-        for number, part in enumerate(slices):
-            index[part.span], probe[part.span] = number, np.arange(part.count)
-            active[part.span] = 1 if part.active is None else part.active
-        self.part, self.probe, self.active = (context.array(item, int) for item in (index, probe, active))
-        """Warp arrays [N]: number of the sensor, number of the probe within it, 0 for fillers."""
-        structures = [part.noise.params(stream_seed(context.seed, part.name)) for part in slices]
-        self.params = context.array(structures, NoiseParams)
-
-    def zeros(self, wanted: bool, leading: tuple[int, ...] = ()) -> Any:
-        """Return [..., C, B, N] zeros, or an empty array when they are not wanted."""
-        shape = (*leading, self.channels, self.context.num_envs, self.total)
-        return self.context.zeros(shape if wanted else (0,) * len(shape))
-
-    def clock_inputs(self, dt: float) -> list[Any]:
-        """Return age, episode, first environment and time step (s) as kernels take them."""
-        clock = self.context.clock
-        return [clock.age, clock.episode, int(clock.env_offset), float(dt)]
-
-
-class NoiseStage:
-    """The measured branch after the sensor's own kernel: crosstalk, then everything up to dead probes.
-
-    For sensors that do not fuse the noise into their kernel. It needs no reset: what belongs to an environment
-    whose ``clock.age`` is 0 counts as zero.
-
-    Args:
-        arrays: The sensors that share the arrays.
-        gained: The sensor applies the gain itself; otherwise it multiplies the signal here.
+        context: Device, clock and seed.
+        staged: Crosstalk and everything up to dead probes are applied here; otherwise the sensors' kernel does it.
+        gained: The sensors apply the gain themselves; otherwise it multiplies the signal here.
 
     Raises:
         UsageError: crosstalk is asked for on probes that form no grid.
     """
 
-    def __init__(self, arrays: NoiseArrays, *, gained: bool = True) -> None:
-        self._arrays, self._gained = arrays, gained
-        noises = [part.noise for part in arrays.slices]
-        self._hysteresis = arrays.zeros(any(noise.hysteresis for noise in noises))
-        self._walk = arrays.zeros(any(noise.walk for noise in noises))
-        self._mixes = any(noise.crosstalk for noise in noises)
-        self._buffers = [arrays.zeros(self._mixes) for _ in range(2)]
+    def __init__(
+        self,
+        slices: Sequence[ReadoutSlice],
+        channels: int,
+        context: LaunchContext,
+        *,
+        staged: bool,
+        gained: bool = True,
+    ) -> None:
+        self._slices, self._context, self._staged, self._gained = slices, context, staged, gained
+        total, noises = sum(part.count for part in slices), [part.noise for part in slices]
+        self._shape = (channels, context.num_envs, total)
+        index, probe, active = (np.zeros(total, np.int32) for _ in range(3))
+        for number, part in enumerate(slices):
+            index[part.span], probe[part.span] = number, np.arange(part.count)
+            active[part.span] = 1 if part.active is None else part.active
+        self.part, self.probe, self._active = (context.array(item, int) for item in (index, probe, active))
+        """Warp arrays [N]: number of the sensor, number of the probe within it, 0 for fillers."""
+        structures = [part.noise.params(stream_seed(context.seed, part.name)) for part in slices]
+        self.params = context.array(structures, NoiseParams)
+        """Warp array [S] of the knobs."""
+        self._hysteresis = self._zeros(staged and any(noise.hysteresis for noise in noises))
+        self._walk = self._zeros(staged and any(noise.walk for noise in noises))
+        self._mixes = staged and any(noise.crosstalk for noise in noises)
+        self._buffers = [self._zeros(self._mixes) for _ in range(2)]
         if self._mixes:
             self._crosstalk = self._prepare_crosstalk()
+        self._delay = context.array([noise.read_delay for noise in noises], float)
+        self._jitter = context.array([noise.jitter for noise in noises], float)
+        self._longest = max(noise.read_delay + noise.jitter for noise in noises)
+        self._late, self._ring = self._zeros(self._longest > 0), None
+
+    def _zeros(self, wanted: bool, leading: tuple[int, ...] = ()) -> Any:
+        """Return [..., C, B, N] zeros, or an empty array when they are not wanted."""
+        return self._context.zeros((*leading, *self._shape) if wanted else (0, 0, 0))
 
     def _prepare_crosstalk(self) -> tuple[Any, Any, Any]:
-        slices, context = self._arrays.slices, self._arrays.context
+        slices, context = self._slices, self._context
         mixed = {number: part for number, part in enumerate(slices) if part.noise.crosstalk}
         for part in mixed.values():
             if len(part.layout) != 2:
@@ -99,68 +96,51 @@ class NoiseStage:
 
     @property
     def state_bytes(self) -> int:
-        """Memory per environment [bytes]."""
+        """Memory per environment [bytes], without the delay."""
         arrays = (self._hysteresis, self._walk, *self._buffers)
-        return sum(array.size for array in arrays) * 4 // max(self._arrays.context.num_envs, 1)
+        return sum(array.size for array in arrays) * 4 // self._context.num_envs
+
+    @property
+    def ring_bytes(self) -> int:
+        """Memory per environment [bytes] of the delay; its ring exists from the first launch on."""
+        ring = 0 if self._ring is None else self._ring.size
+        return (ring + self._late.size) * 4 // self._context.num_envs
 
     def launch(self, x: Any, out: Any, dt: float) -> None:
-        """Measure the signal ``x`` [C, B, N] (after radius noise) into ``out``; ``dt`` is the time step [s]."""
-        own, context = self._arrays, self._arrays.context
-        signal = x
+        """Measure the signal ``x`` [C, B, N] (after radius noise) into ``out``, if that is staged, and record ``out``.
+
+        Raises:
+            UsageError: the time step ``dt`` (s) became so short that recorded readings do not reach back far enough.
+        """
+        context, clock = self._context, self._context.clock
+        known, now = [self.params, self.part], [clock.age, clock.episode, int(clock.env_offset), float(dt)]
         if self._mixes:
             first, second = self._buffers
             # Rows into one buffer, columns into the other: threads read neighbours, so no pass writes what it reads.
             for along, source, target in ((1, x, first), (0, first, second)):
-                context.launch(crosstalk, target.shape, along, x, source, own.part, own.probe, *self._crosstalk, target)
-            signal = second
-        inputs = [own.params, own.part, own.probe, own.active, *own.clock_inputs(dt), int(self._gained)]
-        dim = (context.num_envs, own.total)
-        context.launch(measure, dim, *inputs, signal, self._hysteresis, self._walk, out)
+                context.launch(
+                    crosstalk, self._shape, along, x, source, self.part, self.probe, *self._crosstalk, target
+                )
+            x = second
+        if self._staged:
+            inputs = [*known, self.probe, self._active, *now, int(self._gained), x, self._hysteresis, self._walk, out]
+            context.launch(measure, self._shape[1:], *inputs)
+        if self._longest > 0:
+            # The small amount less than a slot keeps a delay of exactly n steps at n despite rounding of the quotient.
+            slots = math.ceil(self._longest / dt - 1e-4) + 1
+            if self._ring is None:
+                self._ring = self._zeros(True, (slots,))
+            if slots > self._ring.shape[0]:
+                raise UsageError(
+                    f"A delay of {self._longest:g} s needs {slots} readings at a time step of {dt:g} s, but the first "
+                    f"update made room for {self._ring.shape[0]}; build the sensors anew for the shorter step."
+                )
+            inputs = [*known, self._delay, self._jitter, *now, out, self._ring, self._late]
+            context.launch(delay_line, self._shape[1:], *inputs)
 
-
-class DelayLine:
-    """Late readings: a ring of what was measured, read with a zero-order hold.
-
-    A late reading carries the noise it was recorded with. Before the first reading after a reset has arrived,
-    the first is read.
-
-    Args:
-        arrays: The sensors that share the arrays.
-    """
-
-    def __init__(self, arrays: NoiseArrays) -> None:
-        self._arrays, noises = arrays, [part.noise for part in arrays.slices]
-        self._delay = arrays.context.array([noise.read_delay for noise in noises], float)
-        self._jitter = arrays.context.array([noise.jitter for noise in noises], float)
-        self._longest = max((noise.read_delay + noise.jitter for noise in noises), default=0.0)
-        self._ring: Any = None
-        self.out = arrays.zeros(True)
-        """[C, B, N] what is read."""
-
-    @property
-    def ring_bytes(self) -> int:
-        """Memory per environment [bytes]; the ring exists from the first launch on."""
-        ring = 0 if self._ring is None else self._ring.size
-        return (ring + self.out.size) * 4 // max(self._arrays.context.num_envs, 1)
-
-    def launch(self, measured: Any, dt: float) -> None:
-        """Record ``measured`` [C, B, N] of this update; ``dt`` is the time step [s].
-
-        Raises:
-            UsageError: the time step became so short that the ring does not reach back far enough.
-        """
-        own, context = self._arrays, self._arrays.context
-        # The small amount less than a slot keeps a delay of exactly n steps at n despite rounding of the quotient.
-        slots = math.ceil(self._longest / dt - 1e-4) + 1
-        if self._ring is None:
-            self._ring = own.zeros(True, (slots,))
-        if slots > self._ring.shape[0]:
-            raise UsageError(
-                f"A delay of {self._longest:g} s needs {slots} readings at a time step of {dt:g} s, but the first "
-                f"update made room for {self._ring.shape[0]}; build the sensors anew for the shorter step."
-            )
-        inputs = [own.params, own.part, self._delay, self._jitter, *own.clock_inputs(dt)]
-        context.launch(delay_line, (context.num_envs, own.total), *inputs, measured, self._ring, self.out)
+    def read(self, measured: Any) -> Any:
+        """Return what is read where ``measured`` [C, B, N] is newest: an earlier reading if there is a delay."""
+        return self._late if self._longest > 0 else measured
 
 
 def gaussian_weights(sigma: float, half: int) -> NDArray[np.float64]:
@@ -197,22 +177,24 @@ def simulate(
         env_offset: Number of the first environment in the whole experiment.
 
     Raises:
-        UsageError: the signal has not four axes.
+        UsageError: the signal has not four axes, or the layout is none of its probes.
     """
     frames = np.asarray(clean, dtype=np.float32)
     if frames.ndim != 4:
         raise UsageError(f"A recorded signal has axes [time, environment, probe, channel]; received {frames.shape}.")
+    check_number("dt (s)", dt, above=0)
     _steps, envs, probes, channels = frames.shape
+    layout = layout or (probes,)
+    if any(not isinstance(side, int) or side < 1 for side in layout) or math.prod(layout) != probes:
+        raise UsageError(f"The layout of {probes} probes is (ny, nx) with ny nx = {probes}; received {layout}.")
     where = pick_device(device)
     clock = UpdateClock(*(wp.zeros(envs, dtype=int, device=where) for _ in range(2)), env_offset=env_offset)
-    slices = [ReadoutSlice(name, replace(noise, radius=0.0), 0, layout or (probes,))]
-    arrays = NoiseArrays(slices, channels, LaunchContext(envs, where, seed, clock))
-    stage, line = NoiseStage(arrays, gained=False), DelayLine(arrays) if noise.read_delay else None
-    measured, out = arrays.zeros(True), np.empty_like(frames)
+    slices = [ReadoutSlice(name, replace(noise, radius=0.0), 0, layout)]
+    context = LaunchContext(envs, where, seed, clock)
+    stages = ReadingNoise(slices, channels, context, staged=True, gained=False)
+    measured, out = context.zeros((channels, envs, probes)), np.empty_like(frames)
     for step, frame in enumerate(frames):
         clock.age.fill_(step)
-        stage.launch(wp.array(np.ascontiguousarray(frame.transpose(2, 0, 1)), device=where), measured, dt)
-        if line:
-            line.launch(measured, dt)
-        out[step] = (line.out if line else measured).numpy().transpose(1, 2, 0)
+        stages.launch(wp.array(np.ascontiguousarray(frame.transpose(2, 0, 1)), device=where), measured, dt)
+        out[step] = stages.read(measured).numpy().transpose(1, 2, 0)
     return out

@@ -92,8 +92,8 @@ class Probes:
             along: direction in which the column number grows; its part along the normal is removed.
             radius: sensing radius (m).
         """
-        if rows < 1 or columns < 1:
-            raise UsageError(f"A grid needs at least one row and one column; received {rows} × {columns}.")
+        for name, number in {"rows": rows, "columns": columns}.items():
+            check_number(name, number, least=1, whole=True)
         n = _direction("normal", normal)
         u = _direction("along", along)
         u = u - n * (u @ n)

@@ -27,13 +27,11 @@ class DistanceRuntime(ProbeRuntime):
         """Nearest points [3, B, N] in the link frame (m)."""
         self.lasting = [self.points] if first.nearest else []
 
-    def update(self, state: HandState, dt: float) -> None:
-        """Read the state."""
-        self.begin(state, dt)
+    def run_kernels(self, state: HandState, dt: float) -> None:
+        """Run the kernels."""
         c = self.context
         inputs = [self.probes, c.solids.struct, c.pairs.struct, self.io]
         self.launch(self._kernel, *inputs, self._limits, self.points)
-        self.finish(dt)
 
 
 class DepthRuntime(ProbeRuntime):
@@ -52,9 +50,7 @@ class DepthRuntime(ProbeRuntime):
                 row[:] = sensor.threshold, sensor.threshold if sensor.release is None else sensor.release
         self._limits = context.array(limits, warp().vec2f)
 
-    def update(self, state: HandState, dt: float) -> None:
-        """Read the state."""
-        self.begin(state, dt)
+    def run_kernels(self, state: HandState, dt: float) -> None:
+        """Run the kernels."""
         c = self.context
         self.launch(self._kernel, self.probes, c.solids.struct, c.pairs.struct, self.io, self._limits)
-        self.finish(dt)

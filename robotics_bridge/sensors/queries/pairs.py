@@ -76,16 +76,6 @@ class PairTable:
         return len(self._slots) - 1
 
     @property
-    def contacts_needed(self) -> bool:
-        """True if any slot looks at the contact list."""
-        return any(slot["contact"] for slot in self._slots)
-
-    @property
-    def _apart(self) -> bool:
-        # A processor gains nothing from more threads.
-        return self.contacts_needed and bool(self._device.is_cuda)
-
-    @property
     def state_bytes(self) -> int:
         """Memory per environment [bytes]."""
         return _PLACE_BYTES * sum(self._rooms) + 4 * len(self._slots) * (1 + self._words) + 4
@@ -93,6 +83,9 @@ class PairTable:
     def freeze(self) -> None:
         """Make the arrays."""
         wp, device, slots, envs = warp(), self._device, self._slots, self._num_envs
+        self._contacts = any(slot["contact"] for slot in slots)
+        # A processor gains nothing from more threads.
+        self._apart = self._contacts and bool(device.is_cuda)
         most = self._listed
         if most is None and envs * _PLACE_BYTES * sum(len(s["members"]) for s in slots) > _LIST_BYTES:
             most = _LISTED
@@ -132,10 +125,10 @@ class PairTable:
 
     def start(self, state: HandState, age: Any) -> None:
         """Count an update, refresh the state's status and mark contacts."""
-        contacts, room = self.contacts_needed, state.contact_env.shape[0]
+        room = state.contact_env.shape[0]
         inputs = [self.plan, state.arrays, self._words, self._bits, age, self.diverged]
-        dim = max(self._num_envs, -(-room // CONTACTS)) if contacts else self._num_envs
-        self._launch(start_kernel(contacts, self._apart), dim, *inputs)
+        dim = max(self._num_envs, -(-room // CONTACTS)) if self._contacts else self._num_envs
+        self._launch(start_kernel(self._contacts, self._apart), dim, *inputs)
 
     def update(self, state: HandState) -> None:
         """List what every slot meets now; contacts were marked by :meth:`start`."""

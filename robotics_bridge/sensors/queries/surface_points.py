@@ -77,7 +77,7 @@ def sample_cloud(scene: TouchScene, geometries: Sequence[int], points: int, rows
 
 def list_by_cells(cloud: Cloud, reach: float, device: Any) -> Any:
     """Return the Warp structure ``CellArrays`` that lists the points within ``reach`` (m) of every cell of a grid."""
-    starts, entries, origins, inverses, sizes, firsts = [], [], [], [], [], []
+    grids: list[dict[str, Any]] = []
     first = point = entry = 0
     for placed in cloud.shapes:
         points = placed[np.isfinite(placed[:, 0])].astype(np.float64)
@@ -89,23 +89,15 @@ def list_by_cells(cloud: Cloud, reach: float, device: Any) -> Any:
         edge = max(far, float((np.prod(high - low) / (8 * max(len(points), 1))) ** (1 / 3)))
         counts = np.maximum(np.ceil((high - low) / edge).astype(int), 1)
         cells, numbers = _within(points, far, low, edge, counts)
-        starts.append(entry + np.searchsorted(cells, np.arange(int(np.prod(counts)) + 1)))
-        entries.append(point + numbers)
-        origins.append(low)
-        inverses.append(1 / edge)
-        sizes.append(counts)
-        firsts.append(first)
-        first, point, entry = first + len(starts[-1]), point + len(placed), entry + len(numbers)
-    arrays = {
-        "shape": cloud.shape,
-        "origin": np.array(origins),
-        "inverse": np.array(inverses),
-        "counts": np.array(sizes),
-        "first": np.array(firsts),
-        "start": np.concatenate(starts),
-        "entry": np.concatenate(entries),
-    }
-    return to_struct(CellArrays, arrays, device)
+        start = entry + np.searchsorted(cells, np.arange(int(np.prod(counts)) + 1))
+        grids.append({
+            "origin": low, "inverse": 1 / edge, "counts": counts, "first": first, "start": start,
+            "entry": point + numbers,
+        })  # fmt: skip
+        first, point, entry = first + len(start), point + len(placed), entry + len(numbers)
+    arrays = {name: np.array([grid[name] for grid in grids]) for name in ("origin", "inverse", "counts", "first")}
+    arrays |= {name: np.concatenate([grid[name] for grid in grids]) for name in ("start", "entry")}
+    return to_struct(CellArrays, {**arrays, "shape": cloud.shape}, device)
 
 
 def _within(

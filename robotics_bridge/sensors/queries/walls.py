@@ -12,6 +12,7 @@ from brainbench.core.errors import UsageError
 from brainbench.geometry import Mesh
 from brainbench.geometry.distance import sample_surface
 from brainbench.geometry.mesh_repair import repair
+from robotics_bridge.sensors.probes.placement import face_areas
 from robotics_bridge.sensors.queries.distance_fields import mesh_tree
 from robotics_bridge.sensors.queries.kernels.distance import measure_walls
 
@@ -58,9 +59,7 @@ def wall_thickness(mesh: Mesh, cell: float, device: Any) -> float:
     """
     wp, tree = warp(), mesh_tree(mesh, device)
     points, faces = sample_surface(mesh, _SAMPLES, np.random.default_rng(0))
-    corners = mesh.vertices[mesh.faces[faces]]
-    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-300)
+    normal = face_areas(mesh.vertices[mesh.faces[faces]])[1]
     arrays = [wp.array(a.astype(np.float32), dtype=wp.vec3f, device=device) for a in (points, normal)]
     out = wp.zeros(len(points), dtype=float, device=device)
     inputs = [tree.id, *arrays, 1e-6 * mesh.diagonal, out]

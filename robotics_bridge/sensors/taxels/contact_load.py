@@ -51,9 +51,8 @@ class ContactLoadRuntime(KinematicRuntime):
         self._written = context.array(np.full((context.num_envs, self.rows.shape[0]), self.noisy), wp.uint8)
         self.nodes = self._make_nodes(0)
 
-    def update(self, state: HandState, dt: float) -> None:
-        """Read the state."""
-        self.begin(state, dt)
+    def run_kernels(self, state: HandState, dt: float) -> None:
+        """Run the kernels."""
         c, room = self.context, state.contact_env.shape[0]
         if self.nodes.felt.shape[0] != 2 * room:
             self.nodes = self._make_nodes(room)
@@ -65,11 +64,10 @@ class ContactLoadRuntime(KinematicRuntime):
         c.launch(kernels.list_contacts, 2 * found, *known, state.contact_friction, nodes)
         if c.device.is_cuda:
             c.launch(kernels.sort_contacts, nodes.head.shape, nodes)
-        self.ask()
+        super().run_kernels(state, dt)
         c.launch(kernels.share_contacts, (2 * found, self._most), *known, press, nodes)
         inputs = [plan, self.probes, self.rows, press, nodes, int(self.noisy), self._written, self.io]
         c.launch(kernels.spread_contacts, (c.num_envs, self.rows.shape[0]), *inputs)
-        self.finish(dt)
 
     def _make_nodes(self, room: int) -> Any:
         c, nodes = self.context, kernels.ContactNodes()

@@ -49,13 +49,7 @@ class KinematicRuntime(ProbeRuntime):
         self._sticks = sticks
         self.lasting = [sticks.anchor, sticks.body, sticks.stamp] if first.sticky else []
 
-    def update(self, state: HandState, dt: float) -> None:
-        """Read the state."""
-        self.begin(state, dt)
-        self.ask()
-        self.finish(dt)
-
-    def ask(self) -> None:
+    def run_kernels(self, state: HandState, dt: float) -> None:
         """Run the kernel."""
         c = self.context
         inputs = [self.probes, self.rows, c.solids.struct, c.pairs.struct, self.io, self._laws, self._sticks]
@@ -83,10 +77,8 @@ class ProximityRuntime(ProbeRuntime):
         reach = max(float(s.probes.radius.max(initial=0.0)) + s.noise.radius for s in sensors.values())
         self._cells = list_by_cells(self.cloud, reach, context.device)
 
-    def update(self, state: HandState, dt: float) -> None:
-        """Read the state."""
-        self.begin(state, dt)
+    def run_kernels(self, state: HandState, dt: float) -> None:
+        """Run the kernels."""
         c = self.context
         inputs = [self.probes, c.pairs.struct, self.cloud.struct, self._cells, self.io, self._own, state.arrays]
         self.launch(self._kernel, *inputs)
-        self.finish(dt)

@@ -87,7 +87,7 @@ class TemperatureGrid(Sensor):
         check_fields(self, "low", "high", items=3)
         if (self.low is None) != (self.high is None):
             raise UsageError("Give both corners of the grid, low and high, or neither.")
-        if any(low >= high for low, high in zip(self.low or (), self.high or (), strict=True)):
+        if self.low is not None and self.high is not None and not np.less(self.low, self.high).all():
             raise UsageError(f"The corners of the grid differ along every axis; received {self.low}, {self.high}.")
         limits = ("contact_conductance", "warm_range", "cold_range")
         check_fields(self, *(name for name in limits if getattr(self, name) != math.inf), least=0)

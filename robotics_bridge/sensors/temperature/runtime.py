@@ -67,7 +67,7 @@ class TemperatureRuntime(Runtime):
         # What the element shows differs from the cell where it lags, or where its range ends.
         limits = [value for sensor in self._sensors for value in (sensor.warm_range, sensor.cold_range)]
         if not self.noisy and (min(limits) < math.inf or any(sensor.tau > 0 for sensor in self._sensors)):
-            self._measured = self.io.measured = wp.zeros_like(self._truth)
+            self.io.measured = wp.zeros_like(self.io.truth)
         self._dt = math.nan
         self._set_step(1e-2)
 
@@ -109,10 +109,9 @@ class TemperatureRuntime(Runtime):
             self.heat.matrix.assign(values)
         self._dt = dt
 
-    def update(self, state: HandState, dt: float) -> None:
-        """Read the state; a new time step re-computes the diffusion matrices first."""
+    def run_kernels(self, state: HandState, dt: float) -> None:
+        """Run the kernels; a new time step re-computes the diffusion matrices first."""
         self._set_step(dt)
-        self.begin(state, dt)
         c, heat, cells = self.context, self.heat, (self.context.num_envs, self.count)
         heat.number.zero_()
         c.launch(collect_contacts, state.contact_env.shape[0], state.arrays, heat)
@@ -126,7 +125,6 @@ class TemperatureRuntime(Runtime):
             c.launch(diffuse_heat, cells, axis, heat, now, spare)
             now, spare = spare, now
         c.launch(sense_temperature, cells, heat, self.io, now)
-        self.finish(dt)
 
 
 def diffusion(cells: int, edge: float, spread: float) -> NDArray[np.float64]:

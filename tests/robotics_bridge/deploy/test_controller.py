@@ -9,12 +9,12 @@ import pytest
 
 from brainbench.core.errors import UsageError
 from robotics_bridge import hands
-from robotics_bridge.deploy.controller import Actuation, Clock, Controller
+from robotics_bridge.deploy.controller import Clock, Controller
 from robotics_bridge.deploy.driver import HandReading, LinkCounters
 from robotics_bridge.deploy.safety import ClockOffset, SafetyLimits
 from robotics_bridge.deploy.timing import LatencyHistogram, RateMonitor
 from robotics_bridge.deploy.touch import PressureCalibration, RealTouch
-from robotics_bridge.envs import ActionMap
+from robotics_bridge.policies.contract import PolicyContract
 
 JOINTS = ("a", "b", "c")
 
@@ -65,11 +65,11 @@ class PaperHand:
         pass
 
 
-ACTUATION = Actuation(
-    JOINTS,
-    ActionMap(("a", "c"), np.array([0.1, 0.2]), np.array([0.5, 0.5]), np.array([-1.0, 0.0]), np.array([1.0, 0.4])),
-    frozen={"b": 0.3},
-)  # fmt: skip
+ACTIONS = {"default": (0.1, 0.2), "scale": (0.5, 0.5), "low": (-1.0, 0.0), "high": (1.0, 0.4)}
+
+
+def _contract(groups=("proprio",), rate=40.0) -> PolicyContract:
+    return PolicyContract(dict.fromkeys(groups, (1,)), rate, "paper", JOINTS, ("a", "c"), ACTIONS, {"b": 0.3})
 
 
 def _limits(**changes) -> SafetyLimits:
@@ -80,8 +80,8 @@ def _control(spoil=None, *, policy=None, seconds=2.0, clock=None, **changes):
     clock = clock or OwnClock()
     hand = PaperHand(clock, spoil)
     controller = Controller(
-        policy or (lambda obs, forget: np.array([0.2, 0.1], np.float32)), hand, ACTUATION, _limits(),
-        groups=changes.pop("groups", ("proprio",)), clock=clock, **changes,
+        policy or (lambda obs, forget: np.array([0.2, 0.1], np.float32)), hand,
+        _contract(changes.pop("groups", ("proprio",))), _limits(), clock=clock, **changes,
     )  # fmt: skip
     return controller.run(seconds), hand, controller
 
@@ -167,7 +167,7 @@ def test_a_policy_that_gives_no_numbers_or_fails_leaves_the_hand_holding() -> No
     def broken(obs, forget):
         raise RuntimeError("boom")
 
-    controller = Controller(broken, hand, ACTUATION, _limits(), groups=("proprio",), clock=clock)
+    controller = Controller(broken, hand, _contract(), _limits(), clock=clock)
     with pytest.raises(RuntimeError, match="boom"):
         controller.run(1.0)
     assert hand.stops == 1
@@ -200,41 +200,34 @@ def test_ages_are_told_without_a_common_clock() -> None:
     assert offset.age(5.2, 105.31, 105.35) == pytest.approx(0.14)
 
 
+def _touching(observe: str, shape: tuple[int, ...]) -> PolicyContract:
+    body = hands.load("xhand1")
+    links = (body.palm, body.fingers["index"][-1], body.fingers["thumb"][-1])
+    return PolicyContract({"tactile": shape}, 40.0, "xhand1", JOINTS, JOINTS, {}, {}, links, observe)
+
+
 def test_real_values_fill_all_slots_and_simulated_ones_the_rest() -> None:
     pressure = np.array([[0.0, 0.0, 0.03], [0.02, 0.0, 0.1]])
     reading = HandReading(0, 0.0, 0.0, np.zeros(3), np.zeros(3), pressure)
-    links, tips = ("palm", "index_tip", "thumb_tip"), {"index_tip": "index", "thumb_tip": "thumb"}
     fallback = lambda r: np.full((5, 3, 1), 7.0)  # noqa: E731
-    touch = RealTouch("agg_bool", links, (5, 3, 1), tips=tips, fingers=("thumb", "index"), fallback=fallback)
+    touch = RealTouch(_touching("agg_bool", (5, 3, 1)), ("thumb", "index"), fallback=fallback)
     assert touch(reading)[:, :, 0].tolist() == [[7.0, 1.0, 0.0]] * 5  # 4.31: |f| > 0.05
-    force = RealTouch("agg_force", links, (5, 3, 3), tips=tips, fingers=("thumb", "index"))
+    force = RealTouch(_touching("agg_force", (5, 3, 3)), ("thumb", "index"))
     assert force(reading)[2].tolist() == [[0, 0, 0], [-20.0, 0.0, 100.0], [0.0, 0.0, 30.0]]
     calibration = PressureCalibration(per_finger={"index": 500.0})
     again = calibration.pressure(("thumb", "index"), calibration.force(("thumb", "index"), pressure))
     np.testing.assert_allclose(again, pressure)
-    simulated = RealTouch("force", links, (5, 9, 3), tips=tips, fingers=(), fallback=lambda r: np.ones((5, 9, 3)))
+    simulated = RealTouch(_touching("force", (5, 9, 3)), (), fallback=lambda r: np.ones((5, 9, 3)))
     assert simulated(reading).all()
     with pytest.raises(UsageError, match=r"'force', .*'agg_force'"):
-        RealTouch("force", links, (5, 9, 3), tips=tips, fingers=())
-    with pytest.raises(UsageError, match=r"link \(3\).* reads 4"):
-        RealTouch("agg_bool", links, (5, 4, 1), tips=tips, fingers=("thumb", "index"))
-
-
-@pytest.mark.parametrize("value", [True, "1000", 0.0, float("nan"), 1e7, None])
-@pytest.mark.parametrize("name", ["scale", "per_finger", "axes"])
-def test_a_calibration_is_made_of_numbers_that_are_not_zero(name, value) -> None:
-    given = {"scale": value, "per_finger": {"index": value}, "axes": (-1.0, value, 1.0)}
-    with pytest.raises(UsageError, match=rf"{'index' if name == 'per_finger' else name} .*{value}"):
-        PressureCalibration(**{name: given[name]})
-    with pytest.raises(UsageError, match=rf"threshold .*{value}"):
-        PressureCalibration(threshold=value)
+        RealTouch(_touching("force", (5, 9, 3)), ())
 
 
 @pytest.mark.parametrize("observe", ["agg_force", "agg_bool"])
 def test_a_calibration_of_a_finger_that_the_hand_lacks_is_refused(observe) -> None:
     calibration = PressureCalibration(per_finger={"indx": 5.0})
     with pytest.raises(UsageError, match="'indx'; did you mean 'index'"):
-        RealTouch(observe, ("palm",), (5, 1, 3), tips={}, fingers=("thumb", "index"), calibration=calibration)
+        RealTouch(_touching(observe, (5, 3, 3)), ("thumb", "index"), calibration=calibration)
 
 
 def test_what_does_not_fit_is_refused_before_anything_moves() -> None:

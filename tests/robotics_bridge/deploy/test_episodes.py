@@ -16,15 +16,18 @@ from robotics_bridge.policies.encoders.finger_axes import finger_axes_of
 from robotics_bridge.policies.encoders.taxel_grid import TaxelGrid
 
 HAND = hands.load("xhand1")
-POINTS = TactilePoints.of(HAND.layout("low", "tips"))
+PROBES = HAND.layout("low", "tips")
+PLACES = [[getattr(probes, name)[probes.active] for probes in PROBES.values()] for name in ("position", "normal")]
+POINTS = TactilePoints(
+    tuple(PROBES), np.repeat(range(5), list(map(len, PLACES[0]))), np.concatenate(PLACES[0]), np.concatenate(PLACES[1])
+)
 
 
 def _episode(length: int, task: str = "turn the ball", seed: int = 0) -> Episode:
     rng = np.random.default_rng(seed)
-    episode = Episode(task)
-    for _ in range(length):
-        episode.add(*(rng.normal(size=shape) for shape in ((12,), (12,), (12,), (45, 6), (6,))))
-    return episode
+    shapes = ((12,), (12,), (12,), (45, 6), (6,))
+    frames = [[rng.normal(size=shape) for shape in shapes] for _ in range(length)]
+    return Episode(task, *(np.array([frame[part] for frame in frames]) for part in range(5)))
 
 
 @pytest.fixture
@@ -40,10 +43,10 @@ def test_frames_are_those_that_were_recorded(folder) -> None:
     frames = pd.read_parquet(path)
     assert set(frames.columns) == set(info["features"])
     second = _episode(3, seed=1)
-    np.testing.assert_allclose(np.stack(frames["action"])[4:], np.array(second.action))
+    np.testing.assert_allclose(np.stack(frames["action"])[4:], second.action, rtol=1e-6)
     tactile = np.array([np.stack(row) for row in frames["observation.tactile"]])
     assert tactile.shape == (7, 45, 6)
-    np.testing.assert_allclose(tactile[4:], np.array(second.tactile))
+    np.testing.assert_allclose(tactile[4:], second.tactile, rtol=1e-6)
     assert frames["frame_index"].tolist() == [0, 1, 2, 3, 0, 1, 2]
     assert frames["index"].tolist() == list(range(7))
     np.testing.assert_allclose(frames["timestamp"], np.array([0, 1, 2, 3, 0, 1, 2]) / 40)
@@ -66,7 +69,7 @@ def test_episodes_and_tasks_are_found_as_lerobot_looks_for_them(folder) -> None:
     stats = json.loads((folder / "meta" / "stats.json").read_text())
     both = np.concatenate([_episode(4).wrench, _episode(3, seed=1).wrench])
     np.testing.assert_allclose(stats["observation.wrench"]["mean"], both.mean(axis=0), rtol=1e-5)
-    np.testing.assert_allclose(episodes["stats/action/max"][1], np.max(_episode(3, seed=1).action, axis=0))
+    np.testing.assert_allclose(episodes["stats/action/max"][1], np.max(_episode(3, seed=1).action, axis=0), rtol=1e-6)
     points = json.loads((folder / "meta" / "tactile.json").read_text())
     assert len(points["position"]) == len(points["link"]) == 45
     assert set(points["links"]) == set(HAND.tips)
@@ -95,7 +98,7 @@ def test_episodes_that_do_not_fit_are_refused(tmp_path) -> None:
     with pytest.raises(UsageError, match=r"whole number.* 33\.3"):
         write_lerobot(tmp_path / "a", [_episode(2)], fps=33.3, **settings)
     with pytest.raises(UsageError, match=r"observation.state .*\(0,\)"):
-        write_lerobot(tmp_path / "b", [Episode("nothing")], fps=40, **settings)
+        write_lerobot(tmp_path / "b", [_episode(0)], fps=40, **settings)
     spoiled = _episode(2)
     spoiled.wrench[1][0] = np.nan
     with pytest.raises(DataError, match=r"observation.wrench .* no numbers"):

@@ -9,6 +9,7 @@ from robotics_bridge.deploy.driver import HandReading
 from robotics_bridge.deploy.simulated_hand import ShadowTouch, SimulatedHand
 from robotics_bridge.deploy.touch import RealTouch
 from robotics_bridge.hands.scenes import closing
+from robotics_bridge.policies.contract import PolicyContract
 from robotics_bridge.tasks.contact_model import CONTACTS
 
 HAND = hands.load("xhand1")
@@ -19,9 +20,16 @@ def _reading(position, pressure=None) -> HandReading:
     return HandReading(0, 0.0, 0.0, np.asarray(position), np.zeros(12), pressure)
 
 
+def _contract(observe: str, joints: tuple[str, ...] = HAND.joints) -> PolicyContract:
+    links = tuple(HAND.layout("low", "hand"))
+    more = {"placement": "hand", "resolution": "low", "sub_steps": 5, "twist": None, "contacts": CONTACTS["firm"]}
+    inputs = {"tactile": (5, len(links), 3)}
+    return PolicyContract(inputs, 40.0, "xhand1", joints, joints, {}, {}, links, observe, "", more)
+
+
 def test_it_follows_the_reported_joints_whatever_their_order_and_feels_the_ball() -> None:
     joints = HAND.joints[::-1]
-    shadow = ShadowTouch("xhand1", "force_torque", "hand", "low", joints=joints)
+    shadow = ShadowTouch(_contract("force_torque", joints), joints)
     closed = closing(HAND, 0.5)
     order = [joints.index(name) for name in HAND.joints]
     reported = np.empty(12)
@@ -53,12 +61,11 @@ def test_its_contacts_are_those_of_the_policy() -> None:
 
 
 def test_measured_links_replace_simulated_ones() -> None:
-    shadow = ShadowTouch("xhand1", "agg_force", "hand", "low", joints=HAND.joints)
+    contract = _contract("agg_force")
+    shadow = ShadowTouch(contract, HAND.joints)
     layout = HAND.layout("low", "hand")
     tips = {chain[-1]: finger for finger, chain in HAND.fingers.items()}
-    touch = RealTouch(
-        "agg_force", tuple(layout), (5, len(layout), 3), tips=tips, fingers=tuple(HAND.fingers), fallback=shadow
-    )
+    touch = RealTouch(contract, tuple(HAND.fingers), fallback=shadow)
     pressure = np.full((5, 3), 0.01)
     for _ in range(20):
         felt = touch(_reading(np.zeros(12), pressure))

@@ -11,13 +11,13 @@ import numpy as np
 import pytest
 
 from brainbench.core.errors import UsageError
-from robotics_bridge.deploy.controller import Actuation, Controller
+from robotics_bridge.deploy.controller import Controller
 from robotics_bridge.deploy.frames import new_key
 from robotics_bridge.deploy.hand_link import HandLink
 from robotics_bridge.deploy.safety import SafetyLimits
 from robotics_bridge.deploy.simulated_hand import Faults, SimulatedHand, serve, simulated_hand
 from robotics_bridge.deploy.udp import UdpDriver
-from robotics_bridge.envs import ActionMap
+from robotics_bridge.policies.contract import PolicyContract
 
 JOINTS, FINGERS, KEY = ("a", "b"), ("thumb",), new_key()
 
@@ -67,11 +67,16 @@ def _until(condition, seconds: float = 1.2) -> None:
         time.sleep(0.01)
 
 
+def _contract(joints, default, low) -> PolicyContract:
+    values = {"default": default, "scale": 1.0, "low": low, "high": 1.0}
+    actions = {name: (value,) * len(joints) for name, value in values.items()}
+    return PolicyContract({"proprio": (3 * len(joints),)}, 40.0, "hand", joints, joints, actions, {})
+
+
 def _control(driver, seconds=0.6, **limits):
-    actuation = Actuation(JOINTS, ActionMap(JOINTS, np.zeros(2), np.ones(2), -np.ones(2), np.ones(2)))
     safe = SafetyLimits(-np.ones(2), np.ones(2), np.full(2, 8.0), rate_share=0.2, **limits)
     policy = lambda obs, forget: np.full(2, 0.4)  # noqa: E731
-    return Controller(policy, driver, actuation, safe, groups=("proprio",)).run(seconds)
+    return Controller(policy, driver, _contract(JOINTS, 0.0, -1.0), safe).run(seconds)
 
 
 @pytest.mark.parametrize(
@@ -177,9 +182,8 @@ def test_a_process_of_its_own_serves_the_simulated_xhand1() -> None:
     with simulated_hand(seconds=60) as (*ends, key), UdpDriver(*ends, key) as driver:
         joints = driver.joints
         limits = SafetyLimits(np.full(12, -1.0), np.full(12, 2.2), np.full(12, 8.0), timeout=1.0, rate_share=0.2)
-        actuation = Actuation(joints, ActionMap(joints, np.full(12, 0.3), np.ones(12), np.zeros(12), np.ones(12)))
         policy = lambda obs, forget: np.zeros(12)  # noqa: E731
-        report = Controller(policy, driver, actuation, limits, groups=("proprio",)).run(1.5)
+        report = Controller(policy, driver, _contract(joints, 0.3, 0.0), limits).run(1.5)
         assert report.status == "finished", report.reason
         reading = driver.read()
         assert reading is not None

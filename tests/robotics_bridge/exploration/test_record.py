@@ -10,7 +10,7 @@ from brainbench import load_model
 from brainbench.core.errors import UsageError
 from brainbench.stimuli import load_stimuli
 from brainbench.stimuli.stimulus_set import hash_stimulus_set
-from robotics_bridge.exploration.procedures import PROCEDURES, find_procedure
+from robotics_bridge.exploration.procedures import PROCEDURES
 from robotics_bridge.exploration.record import Explored, record_exploration
 from robotics_bridge.physics import Geometry
 from robotics_bridge.policies.encoders.taxel_grid import TaxelGrid
@@ -34,7 +34,7 @@ def test_nothing_is_felt_before_the_touch_and_the_object_pushes_into_the_palm(ru
 def test_rubbing_drags_the_skin_along(rubbed) -> None:
     times = np.arange(40) / 40
     there = times > 0.45
-    sideways = np.array([PROCEDURES["lateral_motion"].pose(t).y for t in times])
+    sideways = np.array([PROCEDURES["lateral_motion"](t).y for t in times])
     velocity = np.gradient(sideways, times)
     force = rubbed.wrench[0, :, :, :3].sum(axis=1)
     # Across the fingers is the palm's y, up to its sign in the world.
@@ -75,11 +75,12 @@ def test_every_procedure_touches_on_both_hands(hand, name) -> None:
 
 def test_requests_that_make_no_sense_are_refused() -> None:
     with pytest.raises(UsageError, match="'enclosure'"):
-        find_procedure("enclosur")
+        record_exploration([_box()], ["enclosur"])
     with pytest.raises(UsageError, match="different labels"):
         record_exploration([_box(), _box()], ["enclosure"])
-    with pytest.raises(UsageError, match=r"'nothing' .*mesh"):
-        Explored("nothing")
+    for frames in (0, 1.5, True, np.nan):
+        with pytest.raises(UsageError, match=rf"frames .*{frames}"):
+            record_exploration([_box()], ["enclosure"], frames=frames)
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf])

@@ -44,6 +44,8 @@ def test_spreading_joints_stay_in_their_middle():
 def test_an_impossible_ball_is_refused():
     with pytest.raises(UsageError, match=r"radius .*received 0"):
         holding(hands.load("xhand1"), radius=0.0)
+    with pytest.raises(UsageError, match=r"reach .*received nan"):
+        holding(hands.load("xhand1"), reach=float("nan"))
 
 
 @pytest.mark.shared

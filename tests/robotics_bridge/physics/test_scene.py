@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from brainbench.core.errors import UsageError
-from robotics_bridge.physics import Geometry, MujocoEngine, TouchScene, Variants, compile_variants
+from robotics_bridge.physics import Geometry, MujocoEngine, TouchScene, compile_variants
 
 CHAIN = """<mujoco><worldbody>
 <geom name="floor" type="plane" size="0 0 1"/>
@@ -48,7 +48,7 @@ def test_every_pair_that_mujoco_finds_is_a_candidate() -> None:
 def test_variants_give_each_environment_its_shape() -> None:
     ball = Geometry(name="o", link="o", kind="sphere", size=(0.1,))
     box = Geometry(name="o", link="o", kind="box", size=(0.1, 0.1, 0.1))
-    scene = TouchScene(("world", "o"), (ball,), variants={0: Variants((ball, box), (1, 1, 0))})
+    scene = TouchScene(("world", "o"), (ball,), variants={0: (box, box, ball)})
     assert [scene.geometry_in(env, 0).kind for env in range(4)] == ["box", "box", "sphere", "box"]
 
 
@@ -65,6 +65,13 @@ def test_compiled_variants_differ_where_they_should() -> None:
     assert np.isfinite(engine.state.pose.numpy()).all()
     with pytest.raises(UsageError, match="did you mean 'g3'"):
         compile_variants(spec, "g33", shapes)
+    for density in (np.nan, -1.0, 0.0, True, "wood"):
+        with pytest.raises(UsageError, match=rf"density .*{density}"):
+            compile_variants(spec, "g3", shapes, density=density)
+    heavy = [*compile_variants(spec, "g3", shapes[:1], density=100), *compile_variants(spec, "g3", shapes[:1])]
+    for assignment in ((-1,), (2,), (0.0,), (True,)):
+        with pytest.raises(UsageError, match=rf"assignment .*{assignment[0]}"):
+            MujocoEngine(heavy, 2, assignment=assignment)
 
 
 @pytest.mark.parametrize(
@@ -72,10 +79,17 @@ def test_compiled_variants_differ_where_they_should() -> None:
     [
         (lambda: Geometry(name="a", link="b", kind="bx"), "did you mean 'box'"),
         (lambda: Geometry(name="a", link="b", kind="box", size=(1.0,)), "needs 3 positive"),
+        (lambda: Geometry(name="a", link="b", kind="box", size=(1.0, 1.0, 0.0)), r"size of 'a' .*received 0\.0"),
+        (lambda: Geometry(name="a", link="b", kind="box", size=(1.0, "1", 1.0)), "size of 'a' .*received '1'"),
+        (lambda: Geometry(name="a", link="b", kind="plane", position=(0, 0, True)), "position of 'a' .*received True"),
+        (lambda: Geometry(name="a", link="b", kind="plane", position=(0, 0)), "position of 'a' holds 3 numbers"),
+        (lambda: Geometry(name="a", link="b", kind="plane", quaternion=(0, 0, 0, 0)), "quaternion of 'a'"),
+        (lambda: Geometry(name="a", link="b", kind="plane", quaternion=(1, 0, 0, np.nan)), "quaternion of 'a' .*nan"),
+        (lambda: Geometry(name="a", link="b", kind="plane", contype=1.5), r"contype of 'a' .*received 1\.5"),
         (lambda: Geometry(name="a", link="b", kind="mesh"), "names no mesh"),
         (lambda: TouchScene(("w", "w")), "two of the link 'w'"),
         (lambda: TouchScene(("w",), (Geometry(name="a", link="v", kind="plane"),)), "Geometry 'a' is fixed"),
-        (lambda: Variants(()), "at least one choice"),
+        (lambda: TouchScene(("w",), variants={0: ()}), "at least one shape"),
     ],
 )
 def test_mistakes_are_named(make: object, message: str) -> None:

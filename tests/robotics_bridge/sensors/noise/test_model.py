@@ -12,7 +12,7 @@ from scipy import stats
 from brainbench.core.errors import DataError, UsageError
 from robotics_bridge.sensors.context import LaunchContext, ReadoutSlice, UpdateClock
 from robotics_bridge.sensors.noise.model import PRESETS, TAXEL_KNOBS, Noise, stream_seed
-from robotics_bridge.sensors.noise.stages import DelayLine, NoiseArrays, NoiseStage, gaussian_weights, simulate
+from robotics_bridge.sensors.noise.stages import ReadingNoise, gaussian_weights, simulate
 from tests.factories.sensor_episode import require_processor
 
 
@@ -195,6 +195,21 @@ def test_crosstalk_without_a_grid_is_refused():
         simulate(Noise(crosstalk=0.5), _constant(probes=4), dt=0.01)
 
 
+@pytest.mark.parametrize("layout", [(2, 3), (4,), (-2, -2), (2, 2.0)])
+def test_a_layout_is_that_of_the_probes(layout):
+    if layout == (4,):
+        simulate(Noise(), _constant(probes=4), dt=0.01, layout=layout)
+        return
+    with pytest.raises(UsageError, match="layout"):
+        simulate(Noise(), _constant(probes=4), dt=0.01, layout=layout)
+
+
+@pytest.mark.parametrize("dt", [0.0, -0.01, math.nan, math.inf, True, "0.1"])
+def test_time_goes_on(dt):
+    with pytest.raises(UsageError, match=rf"dt .*{dt}"):
+        simulate(Noise(hysteresis=0.5), _constant(), dt=dt)
+
+
 def test_late_readings_hold_the_last_value_and_carry_the_noise_of_their_time():
     ramp = np.arange(20, dtype=np.float32).reshape(-1, 1, 1, 1)
     assert simulate(Noise(read_delay=0.03), ramp, dt=0.01).ravel() == pytest.approx(np.maximum(np.arange(20) - 3, 0))
@@ -221,14 +236,14 @@ def _stage(noise: Noise, envs: int = 3, probes: int = 4, active: np.ndarray | No
     wp = warp()
     clock = UpdateClock(*(wp.zeros(envs, dtype=wp.int32, device="cpu") for _ in range(2)), env_offset=0)
     context = LaunchContext(envs, pick_device("cpu"), 0, clock)
-    arrays = NoiseArrays([ReadoutSlice("sensor", noise, 0, (probes,), active=active)], 1, context)
+    slices = [ReadoutSlice("sensor", noise, 0, (probes,), active=active)]
     x, out = (wp.zeros((1, envs, probes), dtype=wp.float32, device="cpu") for _ in range(2))
-    return clock, NoiseStage(arrays, gained=gained), DelayLine(arrays), x, out
+    return clock, ReadingNoise(slices, 1, context, staged=True, gained=gained), x, out
 
 
 def test_a_reset_redraws_and_forgets_in_its_environment_alone():
     noise = Noise(walk=1.0, gain=(0.5, 2.0), hysteresis=1.0)
-    clock, stage, _line, x, out = _stage(noise, gained=False)
+    clock, stage, x, out = _stage(noise, gained=False)
     x.fill_(1.0)
     for step in range(10):
         clock.age.fill_(step)
@@ -250,7 +265,7 @@ def test_a_reset_redraws_and_forgets_in_its_environment_alone():
 
 def test_fillers_read_zero_and_a_broken_environment_harms_no_other():
     noise = Noise(bias=1.0, walk=0.1, hysteresis=0.5)
-    clock, stage, line, x, out = _stage(noise, active=np.array([True, True, False, True]))
+    clock, stage, x, out = _stage(noise, active=np.array([True, True, False, True]))
     for step in range(3):
         clock.age.fill_(step)
         values = np.ones((1, 3, 4), np.float32)
@@ -258,26 +273,25 @@ def test_fillers_read_zero_and_a_broken_environment_harms_no_other():
             values[0, 1] = np.nan
         x.assign(values)
         stage.launch(x, out, 0.01)
-        line.launch(out, 0.01)
-        read = line.out.numpy()[0]
+        read = stage.read(out).numpy()[0]
         assert np.all(read[:, 2] == 0)
         assert np.isnan(read[1, [0, 1, 3]]).all() == (step == 1)
         assert np.isfinite(read[[0, 2]]).all()
 
 
 def test_the_state_counts_two_numbers_per_channel():
-    _clock, stage, line, x, _out = _stage(Noise(walk=1.0, hysteresis=0.5), probes=10)
+    _clock, stage, x, out = _stage(Noise(walk=1.0, hysteresis=0.5, read_delay=0.01), probes=10)
     assert stage.state_bytes == 10 * 2 * 4
     assert _stage(Noise(white=1.0, gain=(0.5, 2), dead_probability=0.5))[1].state_bytes == 0
-    line.launch(x, 0.01)
-    assert line.ring_bytes == 2 * 10 * 4
+    stage.launch(x, out, 0.01)
+    assert stage.ring_bytes == 3 * 10 * 4
 
 
 def test_a_shorter_step_than_the_ring_has_room_for_is_refused():
-    _clock, _, line, x, _out = _stage(Noise(read_delay=0.1))
-    line.launch(x, 0.05)
+    _clock, stage, x, out = _stage(Noise(read_delay=0.1))
+    stage.launch(x, out, 0.05)
     with pytest.raises(UsageError, match=r"21 readings.*room for 3"):
-        line.launch(x, 0.005)
+        stage.launch(x, out, 0.005)
 
 
 @pytest.mark.parametrize(

@@ -60,7 +60,8 @@ def test_fillers_keep_their_places_and_need_no_normal() -> None:
         (lambda: Probes([[0, 0, 0]] * 4, [[0, 0, 1]] * 4, [0.1, 0.1]), "one radius or 4"),
         (lambda: Probes([[0, 0, np.nan]], [[0, 0, 1]], 0.1), "finite"),
         (lambda: Probes.grid(2, 2, size=(1, 1), along=(0, 0, 1)), "parallel to the normal"),
-        (lambda: Probes.grid(0, 2, size=(1, 1)), "0 × 2"),
+        (lambda: Probes.grid(0, 2, size=(1, 1)), "rows .*at least 1; received 0"),
+        (lambda: Probes.grid(2, 1.5, size=(1, 1)), r"columns .*received 1\.5"),  # type: ignore[arg-type]
         (lambda: Probes.grid(2, 2, size=(1, 1), normal=(0, 0, 0)), "'normal' is a direction"),
         (lambda: Probes.on_mesh(_ball(), -1), "count must be a whole number"),
         (lambda: Probes.on_mesh(_ball(), 5, facing=(0, 0, 0)), "'facing' is a direction"),

@@ -393,6 +393,10 @@ def test_touched_bodies_and_materials_have_ranges(value):
             ThermalMaterial(**{"conductivity": 1.0, "density": 1.0, "specific_heat": 1.0, name: value})
 
 
+def test_corners_may_be_arrays():
+    assert TemperatureGrid(link="pad", low=np.zeros(3), high=np.ones(3)).low is not None  # type: ignore[arg-type]
+
+
 def test_limits_of_a_grid_may_be_infinite():
     grid = TemperatureGrid(link="pad", **dict.fromkeys(LIMITS, math.inf), source=-1.0)
     assert all(getattr(grid, name) == math.inf for name in LIMITS)
