@@ -71,8 +71,10 @@ def read_limits(
     Raises:
         UsageError: a variable is unknown, is not one of the scene, or starts outside its bounds.
     """
-    for name in (*variables, *bounds):
+    for name in variables:
         check_name("variable of a design", name, VARIABLES)
+    for name in bounds:
+        check_name("chosen variable with bounds", name, variables)
     limits = np.array([bounds.get(name, (VARIABLES[name].low, VARIABLES[name].high)) for name in variables])
     begin = np.array([VARIABLES[name].read(scene) for name in variables])
     if (begin < limits[:, 0]).any() or (begin > limits[:, 1]).any():

@@ -67,6 +67,8 @@ def test_wrong_requests_are_refused():
         design(_scenes(3e-4), ["protraction"])
     with pytest.raises(UsageError, match="protraction"):
         design(_scenes(3e-4, 6e-4), ["protracton"])
+    with pytest.raises(UsageError, match="with bounds 'protraction'"):
+        design(_scenes(3e-4, 6e-4), ["frequency"], bounds={"protraction": (0.1, 0.2)})
     with pytest.raises(UsageError, match="outside the bounds"):
         design(_scenes(3e-4, 6e-4), ["frequency"], bounds={"frequency": (4.0, 8.0)})
 

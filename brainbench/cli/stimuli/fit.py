@@ -78,6 +78,10 @@ def fit(
     from brainbench.stimuli.fitting.tracks.readers import holds_shapes, read_shapes
     from brainbench.stimuli.fitting.tracks.wrenches import read_wrenches
 
+    unused = {"--picture": picture, "--bounds": bounds} if contacts else {"--frames": frames != 1}
+    if given := [flag for flag, value in unused.items() if value]:
+        how = "with" if contacts else "without"
+        raise UsageError(f"{' and '.join(given)} cannot be used {how} --contacts; leave it out.")
     chosen = None if scene is None else scenes.choose_scene(scenes.open_recipe(scene, "all"), stimulus)
     start = _whisker(whisker, chosen, _pairs(known, "--known"))
     if holds_shapes(file):
@@ -89,6 +93,8 @@ def fit(
             measured["noise"] = 1e-6 * noise
     elif contacts:
         raise UsageError(f"--contacts takes a track; {shown(str(file))} holds wrenches.")
+    elif noise is not None:
+        raise UsageError(f"--noise is that of traced points; {shown(str(file))} holds wrenches. Leave it out.")
     else:
         measured = read_wrenches(file, whisker=None if scene is None else whisker, stimulus=stimulus)
     if contacts:

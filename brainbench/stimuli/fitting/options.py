@@ -47,3 +47,4 @@ class FitOptions:
         check_level(self.level)
         check_number("most_iterations of a fit", self.most_iterations, least=1, whole=True)
         check_number("steps_per_period of a fit", self.steps_per_period, least=4)
+        check_number("time_step of a fit (s)", self.time_step, above=0)

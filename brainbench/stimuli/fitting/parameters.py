@@ -116,7 +116,7 @@ class FreeParameters:
     """The parameters of one fit, with their start values and bounds.
 
     Raises:
-        UsageError: a name is unknown or stands twice, or a start value is not possible.
+        UsageError: a name is unknown or stands twice, bounds are of none of them, or a start value is not possible.
     """
 
     names: tuple[str, ...]
@@ -126,8 +126,10 @@ class FreeParameters:
     """Bounds of single parameters, in their units; others as in :data:`PARAMETERS`."""
 
     def __post_init__(self) -> None:
-        for name in (*self.names, *self.bounds):
+        for name in self.names:
             check_name("parameter of a fit", name, PARAMETERS)
+        for name in self.bounds:
+            check_name("fitted parameter with bounds", name, self.names)
         if not self.names or len(set(self.names)) < len(self.names):
             raise UsageError(f"A fit needs at least one parameter, each once; received {list(self.names)}.")
         for name in self.names:

@@ -72,7 +72,8 @@ class Trial:
     """One recording of one whisker, with the motion and the objects that belong to it.
 
     Raises:
-        DataError: the measurement holds fewer than three instants, or a shape is longer than the whisker.
+        DataError: the measurement holds fewer than three instants, its noise is not positive, or a shape is longer than
+            the whisker.
     """
 
     job: Job
@@ -85,6 +86,10 @@ class Trial:
         count = self.measured.sizes["time"]
         if count < 3:
             raise DataError(f"The measurement has {count} frames; a fit over time needs at least 3.")
+        if "noise" in self.measured and not (self.measured["noise"].values > 0).all():
+            raise DataError(
+                f"The noise of a measurement is above 0; received {self.measured['noise'].values.tolist()}."
+            )
         if self.of_shapes:
             check_length(self.measured, self.job.whisker.arc_length)
 

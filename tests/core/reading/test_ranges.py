@@ -4,7 +4,7 @@ from dataclasses import dataclass
 import pytest
 
 from brainbench.core.errors import UsageError
-from brainbench.core.reading.ranges import check_fields, check_number
+from brainbench.core.reading.ranges import check_fields, check_number, check_vector
 
 
 def test_numbers_within_their_bounds_pass():
@@ -36,3 +36,10 @@ def test_none_passes_where_the_type_of_a_field_allows_it():
 def test_the_culprit_is_named_with_its_bound(wrong: object):
     with pytest.raises(UsageError, match="epochs must be a whole number, at least 0; received"):
         check_fields(Options(epochs=wrong), "seed", "epochs", least=0, whole=True)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("wrong", [(1.0, 2.0), (1.0, 2.0, math.nan), ("a", "b", "c"), 3.0])
+def test_a_vector_is_three_finite_numbers(wrong: object):
+    check_vector("place", [0, 1.5, -2])
+    with pytest.raises(UsageError, match="place must be three finite numbers"):
+        check_vector("place", wrong)

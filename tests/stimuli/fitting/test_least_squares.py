@@ -11,7 +11,7 @@ from brainbench.core.errors import DataError, UsageError
 from brainbench.stimuli import WhiskerArray, references
 from brainbench.stimuli.fitting import FitOptions, Trial, fit, new_shapes, new_wrenches
 from brainbench.stimuli.fitting.model import FitModel
-from brainbench.stimuli.fitting.parameters import PARAMETERS, FreeParameters
+from brainbench.stimuli.fitting.parameters import PARAMETERS, PUBLISHED, FreeParameters
 from brainbench.stimuli.fitting.synthetic import blank_wrenches, measure_shapes, measure_wrenches, simulate_trial
 
 KNOWN = replace(WhiskerArray.of("mouse")["C2"].whisker, damping_ratio=0.15)
@@ -187,6 +187,14 @@ def test_unknown_names_and_bad_starts_are_refused():
         FreeParameters(("young_modulus",), trial.condition, {"young_modulus": (6e9, 9e9)}).limits()
     with pytest.raises(UsageError, match="laplace"):
         FitOptions(intervals="laplac")
+    with pytest.raises(UsageError, match="with bounds 'density'"):
+        fit(trial, ["young_modulus"], bounds={"density": (1000.0, 2000.0)})
+    with pytest.raises(UsageError, match="with a prior 'density'"):
+        fit(trial, ["young_modulus"], priors={"density": PUBLISHED["density"]})
+    with pytest.raises(UsageError, match="time_step"):
+        FitOptions(time_step=-1e-4)
+    with pytest.raises(DataError, match="noise"):
+        Trial.ringdown(KNOWN, trial.measured.assign(noise=-1e-6), 1e-3)
     still = Trial(replace(trial.job, loads=()), trial.measured)
     with pytest.raises(UsageError, match="ring-down"):
         FreeParameters(("deflection",), still.condition)
