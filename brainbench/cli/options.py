@@ -172,6 +172,12 @@ def as_flags(kind: str, options: Any, flags: Mapping[str, tuple[str, ...]]) -> l
     return words
 
 
+def refuse(options: Mapping[str, object], where: str) -> None:
+    """Raise a :class:`UsageError` for options, by flag, that were given and would mean nothing ``where`` they are."""
+    if given := [flag for flag, value in options.items() if not (value is None or value is False or value == "")]:
+        raise UsageError(f"{' and '.join(given)} cannot be used {where}; leave it out.")
+
+
 def items(text: str) -> list[str]:
     """Return the texts between commas."""
     return [item.strip() for item in text.split(",") if item.strip()]

@@ -60,10 +60,10 @@ def test_contacts_of_a_track_are_printed(run, tmp_path):
         (["--bounds", "young_modulus=5"], "LOW:HIGH"),
         (["--known", "density=1200,density=1300"], "'density' more than once"),
         (["--bounds", "density=1:2,density=1:3"], "'density' more than once"),
-        (["--contacts"], "takes a track"),
+        (["--contacts"], "--contacts cannot be used with wrenches"),
         (["--contacts", "--picture", "fit.png"], "--picture cannot be used with --contacts"),
         (["--frames", "3"], "--frames cannot be used without --contacts"),
-        (["--noise", "20"], "--noise is that of traced points"),
+        (["--noise", "20"], "--noise cannot be used with wrenches"),
         (["--intervals", "laplac"], "laplace"),
     ],
 )

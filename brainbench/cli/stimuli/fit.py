@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from brainbench.cli.destinations import out_file, picture_file
-from brainbench.cli.options import items, option, with_options
+from brainbench.cli.options import items, option, refuse, with_options
 from brainbench.cli.output import JsonOption, emit, progress_bar, table_of
 from brainbench.cli.stimuli import scenes
 from brainbench.cli.stimuli.scenes import StimulusOption
@@ -78,10 +78,8 @@ def fit(
     from brainbench.stimuli.fitting.tracks.readers import holds_shapes, read_shapes
     from brainbench.stimuli.fitting.tracks.wrenches import read_wrenches
 
-    unused = {"--picture": picture, "--bounds": bounds} if contacts else {"--frames": frames != 1}
-    if given := [flag for flag, value in unused.items() if value]:
-        how = "with" if contacts else "without"
-        raise UsageError(f"{' and '.join(given)} cannot be used {how} --contacts; leave it out.")
+    refuse({"--picture": picture, "--bounds": bounds} if contacts else {}, "with --contacts")
+    refuse({} if contacts else {"--frames": frames != 1}, "without --contacts")
     chosen = None if scene is None else scenes.choose_scene(scenes.open_recipe(scene, "all"), stimulus)
     start = _whisker(whisker, chosen, _pairs(known, "--known"))
     if holds_shapes(file):
@@ -91,11 +89,8 @@ def fit(
         measured = read_shapes(file, told)
         if noise is not None:
             measured["noise"] = 1e-6 * noise
-    elif contacts:
-        raise UsageError(f"--contacts takes a track; {shown(str(file))} holds wrenches.")
-    elif noise is not None:
-        raise UsageError(f"--noise is that of traced points; {shown(str(file))} holds wrenches. Leave it out.")
     else:
+        refuse({"--contacts": contacts, "--noise": noise}, f"with wrenches, which {shown(str(file))} holds")
         measured = read_wrenches(file, whisker=None if scene is None else whisker, stimulus=stimulus)
     if contacts:
         data, text = _contacts(measured, start, noise, frames)
