@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +18,7 @@ from brainbench.stimuli.engines.protocol import Job, Load, StillFollicle, Trace
 from brainbench.stimuli.fitting.curves import normal_offsets
 from brainbench.stimuli.fitting.parameters import Condition
 from brainbench.stimuli.fitting.plausibility import check_clock
+from brainbench.stimuli.fitting.tracks.contract import AXES
 from brainbench.stimuli.fitting.tracks.quality import check_length
 from brainbench.stimuli.validation import references
 from brainbench.stimuli.whiskers.chain import build_chain
@@ -187,15 +188,17 @@ def to_frame(measured: xr.Dataset, axes: NDArray[np.float64], origin: NDArray[np
     """Return a measurement in the frame of a job, whose axes [3, 3] (columns, world) and origin [3] (m) are given."""
     if np.allclose(axes, np.eye(3)) and not origin.any():
         return measured
-    name = "shape" if "shape" in measured else "wrench"
-    values = measured[name].values
-    if values.shape[-1] not in (3, 6):
+    name, along, needed = ("shape", "axis", AXES) if "shape" in measured else ("wrench", "channel", CHANNELS)
+    if missing := sorted(set(needed) - set(measured[along].values.tolist())):
         raise UsageError(
-            f"The head of this scene is turned or displaced, which needs all three axes of what was measured; "
-            f"received {values.shape[-1]} columns."
+            f"The head of this scene is turned or displaced, which needs all axes of what was measured; {missing[0]} "
+            "is missing."
         )
     if name == "shape":
-        turned: Any = (values - origin) @ axes
-    else:
-        turned = np.concatenate([values[..., :3] @ axes, values[..., 3:] @ axes], axis=-1)
-    return measured.assign({name: (measured[name].dims, turned)})
+        return measured.assign(shape=(measured["shape"].dims, (measured["shape"].values - origin) @ axes))
+    # Columns come in any order; three are turned together.
+    measured = measured.sel(channel=list(CHANNELS))
+    turned = {"wrench": (measured["wrench"].values.reshape(-1, 2, 3) @ axes).reshape(-1, 6)}
+    if "noise" in measured:
+        turned["noise"] = np.sqrt((measured["noise"].values ** 2).reshape(2, 3) @ axes**2).reshape(6)
+    return measured.assign({name: (measured[name].dims, values) for name, values in turned.items()})
