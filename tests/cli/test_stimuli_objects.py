@@ -70,6 +70,7 @@ def test_a_shapenet_folder_is_counted(run, tmp_path):
         (("torsu",), "did you mean 'torus'"),
         (("torus", "--collision", "hul"), "did you mean 'hull'"),
         (("torus", "--detail", "10"), "at least 2,000 and at most 20,000"),
+        (("torus", "--diagonal-mm", "0"), "above 0"),
         (("torus", "--export", "x.dae"), "Unknown mesh format '.dae'"),
         (("--export", "x.obj"), "--export cannot be used without a family or a mesh file"),
         (("torus", "--unit", "mm"), "--unit cannot be used for a family"),

@@ -96,7 +96,9 @@ def _member(
         hint = "Or the path of a mesh file or of a ShapeNet folder."
         raise unknown_name("object", name, procedural.list_families(), hint=hint)
     shape = procedural.make(family, seed, detail=detail)
-    solid = shape_solid(shape, diagonal=diagonal or 0.04, collision=collision, decomposition=settings)
+    solid = shape_solid(
+        shape, diagonal=0.04 if diagonal is None else diagonal, collision=collision, decomposition=settings
+    )
     about = {"family": family, "description": procedural.describe_family(family), "seed": seed}
     mesh = solid.mesh or shape.mesh
     return {**about, "parameters": dict(shape.parameters), **_measures(mesh, solid)}, solid

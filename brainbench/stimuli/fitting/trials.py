@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from brainbench.core.contracts import CHANNELS
 from brainbench.core.errors import DataError, UsageError, check_name
+from brainbench.core.reading.ranges import check_fields, check_number, check_vector
 from brainbench.stimuli.engines.protocol import Job, Load, StillFollicle, Trace
 from brainbench.stimuli.fitting.curves import normal_offsets
 from brainbench.stimuli.fitting.parameters import Condition
@@ -37,14 +38,23 @@ swings."""
 
 @dataclass(frozen=True)
 class Pluck:
-    """A whisker held aside and let go at t = 0."""
+    """A whisker held aside and let go at t = 0.
+
+    Raises:
+        UsageError: the deflection or the arc length is not above 0, or the direction is none.
+    """
 
     deflection: float
     """Deflection of the held point before the release [m]."""
     arc: float
     """Arc length of the held point [m]."""
     direction: Vector = (0.0, 1.0, 0.0)
-    """Direction of the deflection, in the frame of the job."""
+    """Direction of the deflection, in the frame of the job; its length does not matter."""
+
+    def __post_init__(self) -> None:
+        check_fields(self, "deflection", "arc", above=0, of="The {} (m) of a held whisker")
+        check_vector("The direction of a held whisker", self.direction)
+        check_number("The length of the direction of a held whisker", math.hypot(*self.direction), above=0)
 
     def loads(self, condition: Condition, start: float) -> tuple[Load, Load]:
         """Return the loads that hold the whisker aside from ``start`` (s) to the release.
@@ -58,7 +68,7 @@ class Pluck:
         # The small-bending closed form is that of the straight whisker; curvature changes it by second order.
         straight = replace(whisker, curvature=0.0)
         force = condition["deflection"] / references.point_load_deflection(straight, 1.0, arc)
-        whole = force * np.asarray(self.direction, dtype=float)
+        whole = force * np.asarray(self.direction, dtype=float) / math.hypot(*self.direction)
         ratio, omega = min(whisker.damping_ratio, 0.9), float(build_chain(whisker, 16).frequencies()[0])
         damped = math.sqrt(1 - ratio**2)
         decay = math.exp(-math.pi * ratio / damped)
@@ -133,7 +143,10 @@ class Trial:
 
         Raises:
             DataError: the readings are too rare or too late to follow the swing.
+            UsageError: the held point is beyond the tip, or the readings begin before the release.
         """
+        arc = 0.95 * whisker.arc_length if arc is None else arc
+        check_number("The arc length (m) of the held point", arc, above=0, most=whisker.arc_length)
         times = measured["time"].values.astype(float)
         if times[0] < 0:
             raise UsageError(
@@ -147,7 +160,7 @@ class Trial:
         omega = 2 * math.pi * frequency
         settling = SETTLING / (max(whisker.damping_ratio, 0.05) * omega) + math.pi / omega
         job = Job(whisker, StillFollicle(), (), times, start=-settling)
-        return cls(job, measured, Pluck(deflection, arc or 0.95 * whisker.arc_length, direction))
+        return cls(job, measured, Pluck(deflection, arc, direction))
 
     @property
     def of_shapes(self) -> bool:

@@ -14,9 +14,9 @@ from brainbench.core.rotations import euler_matrix
 from brainbench.stimuli import WhiskerArray, references
 from brainbench.stimuli.fitting import FitOptions, Trial, fit, new_shapes, new_wrenches
 from brainbench.stimuli.fitting.model import FitModel, Readings
-from brainbench.stimuli.fitting.parameters import PARAMETERS, PUBLISHED, FreeParameters
+from brainbench.stimuli.fitting.parameters import PARAMETERS, PUBLISHED, Condition, FreeParameters
 from brainbench.stimuli.fitting.synthetic import blank_wrenches, measure_shapes, measure_wrenches, simulate_trial
-from brainbench.stimuli.fitting.trials import to_frame
+from brainbench.stimuli.fitting.trials import Pluck, to_frame
 
 KNOWN = replace(WhiskerArray.of("mouse")["C2"].whisker, damping_ratio=0.15)
 TRUTH = replace(KNOWN, young_modulus=3.5e9, damping_ratio=0.2)
@@ -204,6 +204,31 @@ def test_unknown_names_and_bad_starts_are_refused():
     still = Trial(replace(trial.job, loads=()), trial.measured)
     with pytest.raises(UsageError, match="ring-down"):
         FreeParameters(("deflection",), still.condition)
+
+
+def test_the_direction_of_a_pluck_has_no_length():
+    whisker = WhiskerArray.mouse()["C2"].whisker
+    condition = Condition(whisker, {"deflection": 1e-3})
+    unit, long = (
+        Pluck(1e-3, 0.01, direction).loads(condition, -0.1) for direction in ((0.0, 0.6, 0.8), (0.0, 3.0, 4.0))
+    )
+    assert [load.force for load in long] == [pytest.approx(load.force) for load in unit]
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"arc": 0.0}, "arc length"),
+        ({"arc": 30.0}, "arc length"),
+        ({"deflection": 0.0}, "deflection"),
+        ({"deflection": np.nan}, "deflection"),
+        ({"direction": (0.0, 0.0, 0.0)}, "direction"),
+    ],
+)
+def test_a_pluck_that_holds_nothing_is_refused(changes, said):
+    given = {"deflection": 1e-3, **changes}
+    with pytest.raises(UsageError, match=said):
+        Trial.ringdown(KNOWN, blank_wrenches(np.arange(1, 50) * 2e-4), **given)
 
 
 def test_columns_of_wrenches_come_in_any_order():
