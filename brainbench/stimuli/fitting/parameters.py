@@ -15,6 +15,7 @@ from typing import Any, Literal
 import numpy as np
 
 from brainbench.core.errors import UsageError, check_name
+from brainbench.core.reading.ranges import check_number
 from brainbench.stimuli.engines.protocol import Job
 from brainbench.stimuli.gradients.parameters import WHISKER, JobParameters, whisker_value, with_values
 from brainbench.stimuli.whiskers.whisker import Whisker
@@ -192,9 +193,15 @@ class Prior:
     """Standard deviation; relative for positive parameters."""
     source: str
 
+    def __post_init__(self) -> None:
+        check_number("The mean of a prior", self.mean)
+        check_number("The spread of a prior", self.spread, above=0)
+
     def row(self, name: str, start: float, whisker: Whisker) -> tuple[float, float]:
         """Return the mean and the standard deviation of the coordinate u of a fit that began at ``start``."""
         parameter = PARAMETERS[name]
+        if parameter.kind == "log":
+            check_number(f"The mean of the prior of {name!r}", self.mean, above=0)
         spread = self.spread if parameter.kind == "log" else self.spread / parameter.unit_of(whisker)
         return parameter.coordinate(start, self.mean, whisker), spread
 

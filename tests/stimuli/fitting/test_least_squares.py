@@ -14,7 +14,7 @@ from brainbench.core.rotations import euler_matrix
 from brainbench.stimuli import WhiskerArray, references
 from brainbench.stimuli.fitting import FitOptions, Trial, fit, new_shapes, new_wrenches
 from brainbench.stimuli.fitting.model import FitModel, Readings
-from brainbench.stimuli.fitting.parameters import PARAMETERS, PUBLISHED, Condition, FreeParameters
+from brainbench.stimuli.fitting.parameters import PARAMETERS, PUBLISHED, Condition, FreeParameters, Prior
 from brainbench.stimuli.fitting.synthetic import blank_wrenches, measure_shapes, measure_wrenches, simulate_trial
 from brainbench.stimuli.fitting.trials import Pluck, to_frame
 
@@ -204,6 +204,12 @@ def test_unknown_names_and_bad_starts_are_refused():
     still = Trial(replace(trial.job, loads=()), trial.measured)
     with pytest.raises(UsageError, match="ring-down"):
         FreeParameters(("deflection",), still.condition)
+
+
+@pytest.mark.parametrize(("mean", "spread"), [(np.nan, 0.1), (-3e9, 0.1), (3e9, 0.0), (3e9, -0.1), (3e9, np.nan)])
+def test_priors_are_normal_laws(mean, spread):
+    with pytest.raises(UsageError, match=r"of (a|the) prior"):
+        Prior(mean, spread, "the test").row("young_modulus", 3e9, KNOWN)
 
 
 def test_the_direction_of_a_pluck_has_no_length():
