@@ -211,7 +211,9 @@ def to_frame(measured: xr.Dataset, axes: NDArray[np.float64], origin: NDArray[np
         return measured.assign(shape=(measured["shape"].dims, (measured["shape"].values - origin) @ axes))
     # Columns come in any order; three are turned together.
     measured = measured.sel(channel=list(CHANNELS))
-    turned = {"wrench": (measured["wrench"].values.reshape(-1, 2, 3) @ axes).reshape(-1, 6)}
-    if "noise" in measured:
-        turned["noise"] = np.sqrt((measured["noise"].values ** 2).reshape(2, 3) @ axes**2).reshape(6)
-    return measured.assign({name: (measured[name].dims, values) for name, values in turned.items()})
+    wrench = (measured["wrench"].values.reshape(-1, 2, 3) @ axes).reshape(-1, 6)
+    turned = measured.assign(wrench=(measured["wrench"].dims, wrench))
+    if "noise" not in measured:
+        return turned
+    noise = np.sqrt((measured["noise"].values ** 2).reshape(2, 3) @ axes**2).reshape(6)
+    return turned.assign(noise=(measured["noise"].dims, noise))
