@@ -54,8 +54,10 @@ class JobParameters:
         """
         self.jobs, self.names = tuple(jobs), tuple(names)
         self.knots = None if knots is None else np.array(knots, dtype=float)
-        if self.knots is not None and (len(self.knots) < 2 or (np.diff(self.knots) <= 0).any()):
-            raise UsageError("knots are at least two increasing times in seconds.")
+        if self.knots is not None:
+            whole = len(self.knots) >= 2 and np.isfinite(self.knots).all()
+            if not whole or (np.diff(self.knots) <= 0).any():
+                raise UsageError("knots are at least two increasing times in seconds.")
         if not self.jobs or not self.names or len(set(self.names)) < len(self.names):
             raise UsageError("Give at least one job and one parameter, and every parameter once.")
         length = min(job.whisker.arc_length for job in self.jobs)

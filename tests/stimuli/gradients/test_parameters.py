@@ -114,6 +114,12 @@ def test_unknown_parameters_are_refused(names, said):
         JobParameters([BALL], names)
 
 
+@pytest.mark.parametrize("knots", [[0.0], [0.0, 0.0], [0.0, np.nan, 0.1], [0.0, np.inf]])
+def test_knots_increase(knots):
+    with pytest.raises(UsageError, match="increasing times"):
+        JobParameters([BALL], ["base.x[0]"], knots=knots)
+
+
 def test_whiskers_that_differ_in_a_parameter_are_refused():
     other = replace(BALL, whisker=replace(WHISKER, curvature=20.0))
     with pytest.raises(UsageError, match="curvature"):
