@@ -15,7 +15,7 @@ PRODUCT = [path for room in ("brainbench", "robotics_bridge", "leaderboards") fo
 TESTS = list((ROOT / "tests").rglob("*.py"))
 MOST_MODULES = 16
 """Modules of a folder, its ``__init__`` aside; about twelve are wanted."""
-MOST_LINES = 520
+MOST_LINES = 500
 """Lines of a module; about 120 are wanted."""
 
 

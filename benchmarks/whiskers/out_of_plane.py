@@ -57,7 +57,7 @@ def report(pool: Executor, backend: str) -> tuple[str, list[str]]:
         "Curved whiskers, Poisson's ratio .4. First the error in % of the deflection under a force across the plane "
         "that would bend the straight whisker by d; then, of a frictionless peg (radius .25 mm) that moves by d "
         f"across the plane, the error of force / moment at the base. Gates: {gates}. "
-        "Reference: `brainbench.stimuli.validation.kirchhoff`.\n\n"
+        "Reference: `tests.factories.kirchhoff`.\n\n"
     )
     text += table(["whisker", "a/L", "d/L", *SETTINGS], rows)
     text += "\n\nBroken gates: " + ("none." if not broken else "\n\n" + "\n".join(f"- {line}" for line in broken))

@@ -17,8 +17,8 @@ from brainbench.stimuli.figures.raster import Triangles, draw
 from brainbench.stimuli.figures.shading import floor, lamp, paint, shade
 from brainbench.stimuli.figures.surfaces import tube
 from brainbench.stimuli.validation import references
-from brainbench.stimuli.validation.kirchhoff import KirchhoffRod, load_rod, trace_rod
 from brainbench.stimuli.whiskers.array import WhiskerArray
+from tests.factories.kirchhoff import KirchhoffRod, load_rod, trace_rod
 
 SIZE, SAMPLES = (1100, 620), 2
 AT, SHARE, EXAGGERATED = 0.7, 0.15, 12.0

@@ -93,16 +93,18 @@ def with_options(
     kind: str,
     names: Iterable[str] | None = None,
     *,
+    parameter: str = "options",
     flags: Mapping[str, tuple[str, ...]] | None = None,
     build: bool = True,
     given: bool = False,
     help: str | None = None,
 ) -> Callable[[Callable[..., None]], Callable[..., None]]:
-    """Decorate a command so that its parameter ``options`` is filled from flags.
+    """Decorate a command so that one parameter of it is filled from flags.
 
     Args:
         kind: The dataclass, ``package.module:Class``.
         names: Fields that have a flag; all of them by default.
+        parameter: The parameter of the command.
         flags: Flags of a field, where they are not its name with hyphens.
         build: Hand over the dataclass; else a mapping of its fields.
         given: Hand over a mapping of the values that were given; no flag has a default then.
@@ -126,7 +128,7 @@ def with_options(
         return getattr(import_module(module), wanted)(**options) if build and not given else options
 
     # The dataclass is named in the signature of a command and not imported.
-    return lambda command: filled_from(command, "options", parameters, make, **{wanted: Any})
+    return lambda command: filled_from(command, parameter, parameters, make, **{wanted: Any})
 
 
 def filled_from(
@@ -172,6 +174,18 @@ def as_flags(kind: str, options: Any, flags: Mapping[str, tuple[str, ...]]) -> l
         else:
             words += [flag, ",".join(map(str, value)) if told.several else str(value)]
     return words
+
+
+def changed(kind: str, values: Mapping[str, Any]) -> dict[str, bool]:
+    """Return by flag which values differ from the defaults of their fields, for :func:`refuse`."""
+    known = option_fields(kind)
+    return {f"--{name.replace('_', '-')}": value != known[name].default for name, value in values.items()}
+
+
+def refuse(options: Mapping[str, object], where: str) -> None:
+    """Raise a :class:`UsageError` for options, by flag, that were given and would mean nothing ``where`` they are."""
+    if given := [flag for flag, value in options.items() if not (value is None or value is False or value == "")]:
+        raise UsageError(f"{' and '.join(given)} cannot be used {where}; leave it out.")
 
 
 def items(text: str) -> list[str]:

@@ -107,13 +107,14 @@ def design(
         backend: physics engine.
 
     Raises:
-        UsageError: there is one scene only, or a variable is unknown or starts outside its bounds.
+        UsageError: there is one scene only, their whiskers or whisking differ, or a variable is unknown or starts
+            outside its bounds.
         DataError: whiskers are unstable with the given motion.
     """
     options = options or DesignOptions()
     if len(scenes) < 2:
         raise UsageError("A design needs at least two scenes, each with an object to tell from the others.")
-    begin, limits = read_limits(scenes[0], variables, bounds or {})
+    begin, limits = read_limits(scenes, variables, bounds or {})
     evaluator = _Evaluator(scenes, tuple(variables), options, backend)
     finalists = find_motions(evaluator.worths, evaluator.slope, begin, limits, options)
     # What is best at the coarse setting need not be at the finer one, which has the last word.

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from brainbench.core.errors import UsageError, check_name
+from brainbench.core.errors import UsageError, check_name, check_once
 from brainbench.stimuli.motion.trajectories import Whisking
 from brainbench.stimuli.scenes.scene import Scene
 
@@ -64,17 +64,26 @@ VARIABLES: Mapping[str, DesignVariable] = {
 
 
 def read_limits(
-    scene: Scene, variables: Sequence[str], bounds: Mapping[str, tuple[float, float]]
+    scenes: Sequence[Scene], variables: Sequence[str], bounds: Mapping[str, tuple[float, float]]
 ) -> tuple[Array, Array]:
-    """Return the values [p] of variables in a scene, and their bounds [p, 2].
+    """Return the values [p] of variables in some scenes, and their bounds [p, 2].
 
     Raises:
-        UsageError: a variable is unknown, is not one of the scene, or starts outside its bounds.
+        UsageError: whiskers or whisking differ between the scenes, or a variable is unknown, stands twice, is not one
+            of the scenes, or starts outside its bounds.
     """
-    for name in (*variables, *bounds):
+    check_once("--variables", variables)
+    for name in variables:
         check_name("variable of a design", name, VARIABLES)
+    for name in bounds:
+        check_name("chosen variable with bounds", name, variables)
     limits = np.array([bounds.get(name, (VARIABLES[name].low, VARIABLES[name].high)) for name in variables])
-    begin = np.array([VARIABLES[name].read(scene) for name in variables])
+    first = scenes[0]
+    if any(one.names != first.names or one.whisking.config() != first.whisking.config() for one in scenes):
+        raise UsageError("The scenes of a design have the same whiskers and the same whisking; these differ.")
+    begin = np.array([VARIABLES[name].read(first) for name in variables])
+    if not (limits[:, 0] < limits[:, 1]).all():
+        raise UsageError(f"The bounds of {', '.join(variables)} are a lower and a higher number each.")
     if (begin < limits[:, 0]).any() or (begin > limits[:, 1]).any():
         raise UsageError(f"The given motion lies outside the bounds of {', '.join(variables)}; widen them.")
     return begin, limits

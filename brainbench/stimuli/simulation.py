@@ -36,8 +36,6 @@ if TYPE_CHECKING:
     import xarray as xr
 
 _LOG = logging.getLogger(__name__)
-ENTRY = "entry"
-"""Key of a data set's encoding: the file of the cache that holds it."""
 
 
 def simulate(
@@ -84,7 +82,6 @@ def simulate(
         with keeping("stimuli"):
             write_stimulus_set(dataset, path)
             seal_file(path)
-            dataset.encoding[ENTRY] = path
     return dataset
 
 
@@ -108,7 +105,7 @@ def _read_entry(path: Path, *state: int) -> xr.Dataset:
     started = time.perf_counter()
     trust_sealed(path)
     dataset = read_stimulus_set(path)
-    dataset.encoding |= {SECONDS: {"read": time.perf_counter() - started}, ENTRY: path}
+    dataset.encoding[SECONDS] = {"read": time.perf_counter() - started}
     return dataset
 
 

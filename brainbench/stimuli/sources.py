@@ -22,7 +22,7 @@ from brainbench.core.reading.regular import readable
 from brainbench.core.reading.texts import read_toml
 from brainbench.stimuli.engines import DEFAULT_ENGINE
 from brainbench.stimuli.engines.fidelity import Fidelity
-from brainbench.stimuli.kept_sets import find_kept, index_path, write_index
+from brainbench.stimuli.kept_sets import find_kept
 from brainbench.stimuli.readout import to_grid
 from brainbench.stimuli.scenes.recipes import get_recipe, is_packaged, is_recipe, list_recipes, recipe_file
 from brainbench.stimuli.stimulus_set import hash_stimulus_set, read_stimulus_set
@@ -88,19 +88,15 @@ def load_stimuli(
         return source if whiskers == "all" else load_stimuli(source.dataset, whiskers=whiskers)  # type: ignore[arg-type]
     if not isinstance(source, (str, os.PathLike)):
         return _from_dataset(check_stimulus_set(source), whiskers, "stimulus set")
-    asked = None
     if cache and isinstance(backend, str) and is_packaged(source):
-        asked = (source, whiskers, Fidelity.of(fidelity), backend)
-        if (found := _kept(*asked)) is not None:
+        found = _kept(source, whiskers, Fidelity.of(fidelity), backend)
+        if found is not None:
             return found
     if (recipe := _recipe(source, whiskers)) is not None:
-        from brainbench.stimuli.simulation import ENTRY, simulate
+        from brainbench.stimuli.simulation import simulate
 
         dataset = simulate(recipe.scenes, fidelity=fidelity, backend=backend, progress=progress, cache=cache)
-        description = recipe.description.strip() or recipe.name
-        if asked is not None and ENTRY in dataset.encoding:
-            write_index(index_path(*asked), dataset.encoding[ENTRY], description)
-        return _from_dataset(dataset, "all", description)
+        return _from_dataset(dataset, "all", recipe.description.strip() or recipe.name)
     path = Path(source)
     if path.suffix in _HDF5 or path.is_file():
         return _from_hdf5(path, whiskers)
@@ -144,7 +140,7 @@ def prepare_stimuli(
 
 
 def _kept(source: str, whiskers: str, fidelity: Fidelity, backend: str) -> Stimuli | None:
-    """Return stimuli that the package or the cache keeps; None without them."""
+    """Return stimuli that the package holds; None without them."""
     from brainbench.stimuli.simulation import read_entry
 
     found = find_kept(source, whiskers, fidelity, backend)

@@ -109,6 +109,7 @@ def test_plot_writes_one_file_per_stimulus(run, scene, tmp_path):
         (["render", "{scene}", "-o", "a.png", "-s", "stil"], "did you mean 'still'"),
         (["render", "{scene}", "-o", "a.png", "-s", "still", "--view", "1,2"], "--view takes 3 numbers"),
         (["render", "{scene}", "-o", "a.gif", "-s", "still", "--at", "5"], "--start, --stop and --step"),
+        (["render", "{scene}", "-o", "a.png", "-s", "still", "--stop", "5"], "--stop cannot be used for a picture"),
         (["render", "set.h5", "-o", "a.png"], "file of forces"),
         (["render", "rogers", "-o", "a.png"], "did you mean 'rodgers'"),
         (["plot", "{scene}", "-o", "a.bmp"], "Allowed: '.png', '.svg', '.pdf'"),

@@ -60,7 +60,14 @@ def test_contacts_of_a_track_are_printed(run, tmp_path):
         (["--bounds", "young_modulus=5"], "LOW:HIGH"),
         (["--known", "density=1200,density=1300"], "'density' more than once"),
         (["--bounds", "density=1:2,density=1:3"], "'density' more than once"),
-        (["--contacts"], "takes a track"),
+        (["--contacts"], "--contacts cannot be used with wrenches"),
+        (["--contacts", "--picture", "fit.png"], "--picture cannot be used with --contacts"),
+        (["--contacts", "--parameters", "density"], "--parameters cannot be used with --contacts"),
+        (["--contacts", "--level", "0.9"], "--level cannot be used with --contacts"),
+        (["--scene", "x.toml", "--deflection", "2"], "--deflection cannot be used with --scene"),
+        (["--frame-rate", "500", "--parts", "a,b"], "--frame-rate and --parts cannot be used with wrenches"),
+        (["--frames", "3"], "--frames cannot be used without --contacts"),
+        (["--noise", "20"], "--noise cannot be used with wrenches"),
         (["--intervals", "laplac"], "laplace"),
     ],
 )
@@ -75,6 +82,7 @@ def test_a_track_without_scale_is_refused(run, tmp_path):
     result = run("stimuli", "fit", str(path))
     assert result.status == 2
     assert "metres_per_pixel" in result.err
+    assert "--stimulus cannot be used with a track" in run("stimuli", "fit", str(path), "--stimulus", "near").err
 
 
 def test_a_design_is_printed(run, tmp_path):

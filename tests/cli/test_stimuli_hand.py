@@ -29,4 +29,5 @@ def test_objects_and_frames_that_do_not_exist_are_explained(run):
     found = run("stimuli", "hand", "--objects", "toruss")
     assert found.status == 2
     assert "torus" in found.err
+    assert "must be a finite number, above 0" in run("stimuli", "hand", "--objects", "torus", "--diagonal", "-50").err
     assert "multiple of 5" in run("stimuli", "hand", "--frames", "7").err

@@ -70,8 +70,11 @@ def test_a_shapenet_folder_is_counted(run, tmp_path):
         (("torsu",), "did you mean 'torus'"),
         (("torus", "--collision", "hul"), "did you mean 'hull'"),
         (("torus", "--detail", "10"), "at least 2,000 and at most 20,000"),
+        (("torus", "--diagonal-mm", "0"), "above 0"),
         (("torus", "--export", "x.dae"), "Unknown mesh format '.dae'"),
-        (("--export", "x.obj"), "name a family or a mesh file"),
+        (("--export", "x.obj"), "--export cannot be used without a family or a mesh file"),
+        (("torus", "--unit", "mm"), "--unit cannot be used for a family"),
+        (("torus", "--ids", "ids.txt"), "--ids cannot be used for one object"),
         (("torus", "--method", "cocad"), "did you mean 'coacd'"),
     ],
 )
@@ -82,7 +85,8 @@ def test_mistakes_are_one_sentence_and_status_two(run, arguments, message):
     assert len(result.err.strip().splitlines()) == 1
 
 
-def test_a_file_without_a_unit_is_refused(run, cup):
+def test_a_file_has_a_unit_and_no_seed(run, cup):
+    assert "--seed cannot be used for a file" in run("stimuli", "objects", cup, "--unit", "mm", "--seed", "1").err
     result = run("stimuli", "objects", cup)
     assert result.status == 2
     assert "--unit m|cm|mm|um|in" in result.err

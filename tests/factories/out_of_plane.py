@@ -17,8 +17,8 @@ from brainbench.stimuli.engines.protocol import Load
 from brainbench.stimuli.motion.trajectories import smooth_step
 from brainbench.stimuli.objects.obstacle import Capsule, Obstacle
 from brainbench.stimuli.validation.bench_tests import BenchTest, PointLoad, job_at_rest, run_one, settling_time
-from brainbench.stimuli.validation.kirchhoff import KirchhoffRod, RodEquilibrium, load_rod, press_rod
 from brainbench.stimuli.whiskers.whisker import Whisker
+from tests.factories.kirchhoff import KirchhoffRod, RodEquilibrium, load_rod, press_rod
 
 
 def load_aside(
@@ -51,7 +51,7 @@ def push_aside(
     backend: str = DEFAULT_ENGINE,
     fidelity: Fidelity | str = "balanced",
 ) -> BenchTest:
-    """Push a whisker out of its plane and compare with the Kirchhoff rod (``stimuli.validation.kirchhoff``).
+    """Push a whisker out of its plane and compare with the Kirchhoff rod (:mod:`tests.factories.kirchhoff`).
 
     The base stands still. A long frictionless round peg lies in parallel to the whisker's plane and normal to the
     whisker at arc length ``at`` (m). It moves along the plane's normal by ``offset`` (m, positive) from touching the

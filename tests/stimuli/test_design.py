@@ -67,6 +67,17 @@ def test_wrong_requests_are_refused():
         design(_scenes(3e-4), ["protraction"])
     with pytest.raises(UsageError, match="protraction"):
         design(_scenes(3e-4, 6e-4), ["protracton"])
+    with pytest.raises(UsageError, match="more than once"):
+        design(_scenes(3e-4, 6e-4), ["protraction", "protraction"])
+    with pytest.raises(UsageError, match="same whisking"):
+        design([*_scenes(3e-4), *_scenes(6e-4, frequency=10.0)], ["protraction"])
+    one, other = _scenes(3e-4, 6e-4)
+    with pytest.raises(UsageError, match="same whiskers"):
+        design([one, replace(other, array=WhiskerArray.of("mouse", whiskers="C1"))], ["protraction"])
+    with pytest.raises(UsageError, match="a lower and a higher"):
+        design(_scenes(3e-4, 6e-4), ["frequency"], bounds={"frequency": (20.0, 20.0)})
+    with pytest.raises(UsageError, match="with bounds 'protraction'"):
+        design(_scenes(3e-4, 6e-4), ["frequency"], bounds={"protraction": (0.1, 0.2)})
     with pytest.raises(UsageError, match="outside the bounds"):
         design(_scenes(3e-4, 6e-4), ["frequency"], bounds={"frequency": (4.0, 8.0)})
 

@@ -5,8 +5,8 @@ import pytest
 
 from brainbench.core.files import read_json
 from brainbench.core.reading.sealed import is_sealed
-from brainbench.stimuli import Fidelity, get_recipe, kept_sets, load_stimuli, simulate, simulation, sources
-from brainbench.stimuli.kept_sets import SHIPPED, SHIPPED_INDEX, find_kept, index_path, write_index
+from brainbench.stimuli import Fidelity, get_recipe, kept_sets, load_stimuli, simulate, simulation
+from brainbench.stimuli.kept_sets import SHIPPED, SHIPPED_INDEX, find_kept
 from brainbench.stimuli.stimulus_set import read_stimulus_set
 from tests.factories.shipped_stimuli import RECIPES, entry_name, simulate_again
 
@@ -25,28 +25,6 @@ def no_simulation(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def _asked(recipe: str, whiskers: str = "all", fidelity: str | None = None) -> tuple[Path, str] | None:
     return find_kept(recipe, whiskers, Fidelity.of(fidelity), "rod")
-
-
-def test_a_simulated_recipe_is_found_again_without_its_scenes(monkeypatch: pytest.MonkeyPatch):
-    asked = {"whiskers": "C1", "fidelity": "fast"}
-    first = load_stimuli("rodgers", **asked)
-    monkeypatch.setattr(sources, "_recipe", lambda *given: pytest.fail("the scenes were built again"))
-    again = load_stimuli("rodgers", **asked)
-    assert (again.content_hash, again.config_hash, again.description) == (
-        first.content_hash, first.config_hash, first.description,
-    )  # fmt: skip
-    np.testing.assert_array_equal(again.input, first.input)
-
-
-def test_an_index_without_its_entry_or_damaged_leads_nowhere(tmp_path: Path):
-    index, entry = index_path("rodgers", "C1", Fidelity.of(None), "rod"), tmp_path / "stimuli" / "a.h5"
-    assert _asked("rodgers", "C1") is None
-    write_index(index, entry, "words")
-    assert _asked("rodgers", "C1") is None
-    entry.touch()
-    assert _asked("rodgers", "C1") == (entry, "words")
-    index.write_text("{")
-    assert _asked("rodgers", "C1") is None
 
 
 @pytest.mark.parametrize("recipe", RECIPES)
@@ -87,7 +65,7 @@ def test_a_damaged_set_of_the_package_gives_way_to_the_cache(
         (folder / name).write_bytes((SHIPPED / name).read_bytes())
     (damaged / name).write_bytes(b"\x89HDF" + bytes(1000))
     monkeypatch.setattr(kept_sets, "SHIPPED", damaged)
-    assert simulate(get_recipe("rodgers").scenes).encoding[simulation.ENTRY] == entry
+    assert simulate(get_recipe("rodgers").scenes).encoding["source"] == str(entry)
     assert "damaged" in caplog.text
 
 

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from brainbench.cli.destinations import beside
+from brainbench.cli.options import refuse
 from brainbench.cli.output import JsonOption, emit, facts, progress_bar
 from brainbench.core.errors import DataError, DataFileNotFoundError, UsageError, listing
 from brainbench.core.writing.temporaries import temporary_path
@@ -61,8 +62,8 @@ def convert(
 
     if not source.exists():
         raise DataFileNotFoundError(f"There is no file or folder {str(source)!r}.")
-    of_runs: dict[str, Any] = {"cleaning": cleaning, "rate": rate}
-    of_sets = {"stimulus": stimulus, "dialect": dialect}
+    of_runs: dict[str, Any] = {"--cleaning": cleaning, "--rate": rate}
+    of_sets = {"--stimulus": stimulus, "--dialect": dialect}
     if source.is_dir() and is_sweep_tree(source):
         _check("a folder of sweeps", of_runs | of_sets, out, "a data set, which is a folder", not _is_set(out))
         made = _data_set(source, out)
@@ -98,8 +99,7 @@ def _is_set(out: Path) -> bool:
 
 def _check(what: str, refused: Mapping[str, Any], out: Path, becomes: str, fits: bool) -> None:
     """Refuse options that belong to another conversion, and an ``out`` that cannot be what the source becomes."""
-    if given := [f"--{name}" for name, value in refused.items() if value is not None]:
-        raise UsageError(f"{' and '.join(given)} cannot be used when {what} is converted; leave it out.")
+    refuse(refused, f"when {what} is converted")
     if not fits:
         raise UsageError(f"The source is {what} and becomes {becomes}; received {str(out)!r}.")
 

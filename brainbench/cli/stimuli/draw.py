@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from brainbench.cli.destinations import out_file_option
-from brainbench.cli.options import numbers
+from brainbench.cli.options import numbers, refuse
 from brainbench.cli.output import JsonOption, emit, progress_bar
 from brainbench.cli.stimuli import scenes
 from brainbench.cli.stimuli.scenes import BackendOption, FidelityOption, StimulusOption, WhiskersOption
@@ -53,10 +53,10 @@ def render(
     suffix = check_format(out, drawing.FORMATS)
     scene = scenes.choose_scene(scenes.open_recipe(source, whiskers), stimulus)
     if suffix == ".png":
+        refuse({"--start": start != 0, "--stop": stop, "--step": step != 2.0, "--fps": fps != 25.0}, "for a picture")
         times = [drawing.still_time(scene) if at is None else at * 1e-3]
-    elif at is not None:
-        raise UsageError("--at chooses the instant of a .png; a film takes --start, --stop and --step.")
     else:
+        refuse({"--at": at}, "for a film, which takes --start, --stop and --step")
         times = list(drawing.film_times(scene, start * 1e-3, None if stop is None else stop * 1e-3, step * 1e-3))
     target = None if look_at is None else numbers(look_at, "--look-at", float, count=3)
     camera = Camera(

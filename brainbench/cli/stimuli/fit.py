@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from brainbench.cli.destinations import out_file, picture_file
-from brainbench.cli.options import items, option, with_options
+from brainbench.cli.options import changed, items, option, refuse, with_options
 from brainbench.cli.output import JsonOption, emit, progress_bar, table_of
 from brainbench.cli.stimuli import scenes
 from brainbench.cli.stimuli.scenes import StimulusOption
@@ -23,8 +23,13 @@ if TYPE_CHECKING:
 _FIT = "brainbench.stimuli.fitting.options:FitOptions"
 _CONTACTS = "brainbench.stimuli.fitting.contacts:ContactOptions"
 _TRACK = "brainbench.stimuli.fitting.tracks.options:TrackOptions"
+_OFFERED = (
+    "metres_per_pixel", "frame_rate", "track", "layout", "zero_frame", "identities", "parts", "least_likelihood",
+)  # fmt: skip
+_PARAMETERS = "young_modulus,damping_ratio"
 
 
+@with_options(_TRACK, _OFFERED, parameter="scale", build=False)
 @with_options(_FIT)
 def fit(
     file: Annotated[
@@ -34,15 +39,16 @@ def fit(
         ),
     ],
     options: FitOptions,
+    scale: dict[str, Any],
     whisker: Annotated[str, typer.Option(help="Whisker: mouse:C2, or C2 of the scene.")] = "mouse:C2",
-    parameters: Annotated[
-        str, typer.Option(help="Parameters to estimate, with commas between them.")
-    ] = "young_modulus,damping_ratio",
+    parameters: Annotated[str, typer.Option(help="Parameters to estimate, with commas between them.")] = _PARAMETERS,
     scene: Annotated[
         str | None, typer.Option(help="Scene file (.toml) with the motion and the objects. [default: a ring-down]")
     ] = None,
     stimulus: StimulusOption = None,
-    deflection: Annotated[float, typer.Option(help="Deflection of a ring-down before the release, mm, roughly.")] = 1.0,
+    deflection: Annotated[
+        float | None, typer.Option(help="Deflection of a ring-down before the release, mm, roughly. [default: 1]")
+    ] = None,
     contacts: Annotated[
         bool, typer.Option("--contacts", help="Estimate contact point and force in each frame of a track instead.")
     ] = False,
@@ -57,14 +63,6 @@ def fit(
         float | None, typer.Option(help="Standard deviation of a traced coordinate, µm, when repeats tell it.")
     ] = None,
     frames: Annotated[int, option(_CONTACTS, "frames")] = 1,
-    metres_per_pixel: Annotated[float | None, option(_TRACK, "metres_per_pixel")] = None,
-    frame_rate: Annotated[float | None, option(_TRACK, "frame_rate")] = None,
-    track: Annotated[str | None, option(_TRACK, "track")] = None,
-    layout: Annotated[str, option(_TRACK, "layout")] = "auto",
-    zero_frame: Annotated[int, option(_TRACK, "zero_frame")] = 0,
-    identities: Annotated[str | None, option(_TRACK, "identities")] = None,
-    parts: Annotated[str, option(_TRACK, "parts")] = "",
-    least_likelihood: Annotated[float, option(_TRACK, "least_likelihood")] = 0.6,
     out: Annotated[
         Path | None, typer.Option("--out", "-o", callback=out_file, help="Write the result as JSON.")
     ] = None,
@@ -78,18 +76,22 @@ def fit(
     from brainbench.stimuli.fitting.tracks.readers import holds_shapes, read_shapes
     from brainbench.stimuli.fitting.tracks.wrenches import read_wrenches
 
+    if contacts:
+        of_fits = {"--parameters": parameters != _PARAMETERS, "--bounds": bounds, "--picture": picture}
+        refuse({**of_fits, "--deflection": deflection, **changed(_FIT, vars(options))}, "with --contacts")
+    else:
+        refuse({"--frames": frames != 1}, "without --contacts")
+    refuse({"--deflection": deflection} if scene else {}, "with --scene")
     chosen = None if scene is None else scenes.choose_scene(scenes.open_recipe(scene, "all"), stimulus)
     start = _whisker(whisker, chosen, _pairs(known, "--known"))
     if holds_shapes(file):
-        told = TrackOptions(
-            metres_per_pixel, frame_rate, track, layout, zero_frame, identities, tuple(items(parts)), least_likelihood
-        )
-        measured = read_shapes(file, told)
+        refuse({} if scene else {"--stimulus": stimulus}, "with a track that has no --scene")
+        measured = read_shapes(file, TrackOptions(**{name: one for name, one in scale.items() if one is not None}))
         if noise is not None:
             measured["noise"] = 1e-6 * noise
-    elif contacts:
-        raise UsageError(f"--contacts takes a track; {shown(str(file))} holds wrenches.")
     else:
+        of_tracks = {"--contacts": contacts, "--noise": noise, **changed(_TRACK, scale)}
+        refuse(of_tracks, f"with wrenches, which {shown(str(file))} holds")
         measured = read_wrenches(file, whisker=None if scene is None else whisker, stimulus=stimulus)
     if contacts:
         data, text = _contacts(measured, start, noise, frames)
@@ -99,7 +101,7 @@ def fit(
         from brainbench.stimuli.fitting.figure import draw_fit
 
         trial = (
-            Trial.ringdown(start, measured, 1e-3 * deflection)
+            Trial.ringdown(start, measured, 1e-3 * (1.0 if deflection is None else deflection))
             if chosen is None
             else Trial.of_scene(chosen, measured, whisker, start=start)
         )

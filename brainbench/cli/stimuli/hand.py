@@ -97,8 +97,6 @@ def objects_of(text: str, diagonal: float, unit: str | None = None) -> list[Expl
     """
     import math
 
-    import numpy as np
-
     from brainbench.geometry import Mesh
     from brainbench.stimuli.objects.collections import resolve_objects
     from brainbench.stimuli.objects.primitives import rodgers_solid
@@ -128,9 +126,8 @@ def objects_of(text: str, diagonal: float, unit: str | None = None) -> list[Expl
     for name, item in resolve_objects([text], unit=unit, surfaces=True).items():
         mesh = _surface(item.load())
         # Centred, and scaled to the diagonal of its box.
-        low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
-        scale = diagonal / float(np.linalg.norm(high - low))
-        found.append(Explored(name, _geometry(Mesh((mesh.vertices - (low + high) / 2) * scale, mesh.faces))))
+        centred = Mesh(mesh.vertices - mesh.bounds.mean(axis=0), mesh.faces)
+        found.append(Explored(name, _geometry(centred.scaled(diagonal / mesh.diagonal))))
     return found
 
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from brainbench.cli.destinations import out_file
+from brainbench.cli.options import refuse
 from brainbench.cli.output import JsonOption, emit, facts, progress_bar, table
 
 if TYPE_CHECKING:
@@ -41,21 +42,23 @@ def objects(
     as_json: JsonOption = False,
 ) -> None:
     """List the shape families, or describe one object: its size, its faults, and what whiskers touch of it."""
-    from brainbench.core.errors import UsageError
     from brainbench.geometry import DecompositionSettings, save_mesh
 
     settings = DecompositionSettings(method=method, threshold=threshold)  # type: ignore[arg-type]
     diagonal = None if diagonal_mm is None else diagonal_mm / _MILLI
     if source is None or Path(source).is_dir():
-        if export is not None:
-            raise UsageError("--export writes one object: name a family or a mesh file.")
+        one = {"--unit": unit, "--diagonal-mm": diagonal_mm, "--collision": collision, "--export": export}
+        refuse(one, "without a family or a mesh file")
         data, text = _families() if source is None else _folder(source, ids, categories)
         emit(data, text, as_json=as_json)
         return
+    refuse({"--ids": ids, "--categories": categories}, "for one object")
     with progress_bar("preparing the object"):
         if Path(source).is_file():
+            refuse({"--seed": seed or None, "--detail": detail != 4_000}, "for a file")
             data, solid = _file(source, unit, diagonal, collision or "hull", settings)
         else:
+            refuse({"--unit": unit}, "for a family")
             data, solid = _member(source, seed, detail, diagonal, collision, settings)
     if export is not None and solid.mesh is not None:
         data["export"] = save_mesh(export, solid.mesh, unit="mm")
@@ -93,7 +96,9 @@ def _member(
         hint = "Or the path of a mesh file or of a ShapeNet folder."
         raise unknown_name("object", name, procedural.list_families(), hint=hint)
     shape = procedural.make(family, seed, detail=detail)
-    solid = shape_solid(shape, diagonal=diagonal or 0.04, collision=collision, decomposition=settings)
+    solid = shape_solid(
+        shape, diagonal=0.04 if diagonal is None else diagonal, collision=collision, decomposition=settings
+    )
     about = {"family": family, "description": procedural.describe_family(family), "seed": seed}
     mesh = solid.mesh or shape.mesh
     return {**about, "parameters": dict(shape.parameters), **_measures(mesh, solid)}, solid

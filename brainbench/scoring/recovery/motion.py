@@ -111,7 +111,7 @@ def design_for_networks(
         )
     if len(networks) != 2:
         raise UsageError(f"A design tells two networks apart; received {len(networks)}.")
-    begin, limits = read_limits(scenes[0], variables, bounds or {})
+    begin, limits = read_limits(scenes, variables, bounds or {})
     models = [_Network.of(model, study.layer) for model in networks]
     if models[0].name == models[1].name:
         raise UsageError(f"The network {models[0].name!r} is given twice; give two different ones.")

@@ -53,10 +53,9 @@ def move_obstacle(
         shift: displacement [3] (m).
         turn: rotation vector [3] (rad).
     """
-    vector, way = np.asarray(turn, dtype=float), np.asarray(shift, dtype=float)
-    angle = float(np.linalg.norm(vector))
-    half = np.append(np.cos(angle / 2), np.sinc(angle / (2 * np.pi)) / 2 * vector)
-    rotation = rotations.to_matrices(half)
+    from scipy.spatial.transform import Rotation
+
+    rotation, way = Rotation.from_rotvec(turn).as_matrix(), np.asarray(shift, dtype=float)
     middle = obstacle.bounds.mean(axis=0)
     if obstacle.motion is not None:
         return replace(obstacle, motion=_MovedMotion(obstacle.motion, rotation, way, middle, start))

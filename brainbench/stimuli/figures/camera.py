@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from brainbench.core.errors import UsageError, check_name, unknown_name
-from brainbench.core.reading.ranges import check_fields
+from brainbench.core.reading.ranges import check_fields, check_vector
 
 Vector = tuple[float, float, float]
 
@@ -53,9 +53,8 @@ class Camera:
             raise unknown_name("view", self.view, VIEWS)
         check_name("projection", self.projection, PROJECTIONS)
         for name, value in {"view": self.view, "target": self.target}.items():
-            given = None if isinstance(value, str) else value
-            if given is not None and (len(given) != 3 or not all(map(math.isfinite, given))):
-                raise UsageError(f"The {name} of a camera is a name or three finite numbers; received {value!r}.")
+            if value is not None and not isinstance(value, str):
+                check_vector(f"{name} of a camera", value)
         if not any(self.view):
             raise UsageError("The view of a camera is a direction; (0, 0, 0) is none.")
         check_fields(self, "width", above=0, of="{} (m)")

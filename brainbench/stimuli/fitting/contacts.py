@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from brainbench.core.errors import DataError, UsageError
-from brainbench.core.reading.ranges import check_fields
+from brainbench.core.reading.ranges import check_fields, check_number
 from brainbench.stimuli.fitting.curves import offsets_of_samples
 from brainbench.stimuli.fitting.elastica import STEPS, LoadedShapes, LoadedWhisker
 from brainbench.stimuli.fitting.tracks.quality import check_length, check_track
@@ -51,9 +51,9 @@ class ContactOptions:
     noise: float | None = None
     """Standard deviation of a traced coordinate [m]; estimated from each shape when None."""
     first_arc: float | None = 0.0
-    """Arc length of the first traced point [m]; None when the trace begins anywhere."""
+    """Arc length of the first traced point [m]; None when the trace begins anywhere. Frames that lack it go without."""
     tip_traced: bool = False
-    """True when the last traced point is the tip of the whisker."""
+    """True when the last traced point is the tip of the whisker. Frames that lack it go without."""
     contact_noise: float = 5e-5
     """Standard deviation of the contact points that are given [m]."""
     frames: int = 1
@@ -82,6 +82,8 @@ class ShapeFit:
     """Root mean square distance of them [m]."""
     reason: str = ""
     """Why there is no fit, if so."""
+    lacks: str = ""
+    """What the frame lacks of what is known along the whisker, in a sentence."""
 
 
 def find_contacts(
@@ -111,6 +113,8 @@ def find_contacts(
     import xarray as xr
 
     options = options or ContactOptions()
+    if options.first_arc is not None:
+        check_number("first_arc (m) on this whisker", options.first_arc, least=0, most=whisker.arc_length)
     check_track(shapes)
     check_length(shapes, whisker.arc_length)
     points = _in_plane(shapes["shape"].values)
@@ -162,18 +166,19 @@ class ContactSolver:
         base = unknowns[:, :3] * np.array([length, length, 1.0])
         return self.rod.shapes(base, arc, self.force(arc, unknowns[:, 4] * length))
 
-    def residuals(self, unknowns: Array, points: Array, place: Array, noise: float) -> Array:
+    def residuals(self, unknowns: Array, frame: Array, place: Array, noise: float) -> Array:
         """Return residuals [b, m] over the noise: distances across the shape, and what is known along it."""
+        points = frame[np.isfinite(frame).all(axis=-1)]
         shapes, options, length = self.shapes(unknowns), self.options, self.whisker.arc_length
         traced = np.broadcast_to(points, (len(unknowns), *points.shape))
         rows = [offsets_of_samples(shapes.place, shapes.along, shapes.bend, traced)[..., 0] / noise]
-        if options.first_arc is not None:
+        if options.first_arc is not None and np.isfinite(frame[0]).all():
             where = np.clip(options.first_arc / (unknowns[:, 3] * length), 0, 1) * STEPS
             low = np.minimum(where.astype(int), STEPS - 1)
             share, pick = (where - low)[:, None], np.arange(len(unknowns))
             start = (1 - share) * shapes.place[pick, low] + share * shapes.place[pick, low + 1]
             rows.append(np.sum((start - points[0]) * shapes.along[pick, low], axis=-1)[:, None] / noise)
-        if options.tip_traced:
+        if options.tip_traced and np.isfinite(frame[-1]).all():
             gap = shapes.place[:, -1] - points[-1]
             rows.append(np.sum(gap * shapes.along[:, -1], axis=-1)[:, None] / noise)
         if np.isfinite(place).all():
@@ -193,15 +198,15 @@ class ContactSolver:
         high = np.array([np.inf, np.inf, np.inf, FARTHEST, 3.0])
 
         def residual(unknowns: Array) -> Array:
-            return self.residuals(unknowns[None], points, place, noise)[0]
+            return self.residuals(unknowns[None], frame, place, noise)[0]
 
         def jacobian(unknowns: Array) -> Array:
             moves = np.concatenate([np.eye(5), -np.eye(5)]) * _STEP
-            values = self.residuals(unknowns + moves, points, place, noise)
+            values = self.residuals(unknowns + moves, frame, place, noise)
             return (values[:5] - values[5:]).T / (2 * _STEP)
 
         best = None
-        for start in self._starts(points, place, noise, before):
+        for start in self._starts(frame, place, noise, before):
             began = np.clip(start, low + 1e-3, high - 1e-3)
             limits = (low, high)
             found = least_squares(residual, began, jac=jacobian, bounds=limits, max_nfev=60)  # type: ignore[arg-type]
@@ -213,10 +218,15 @@ class ContactSolver:
         matrix = jacobian(best.x) * (1.0 if self.options.noise else noise / spread)
         covariance: Any = np.linalg.pinv(matrix.T @ matrix, rcond=1e-14)
         reason = "" if best.status > 0 else "The fit of the shape did not converge."
-        return ShapeFit(best.x, covariance, spread, math.sqrt(float(np.mean(across**2))), reason)
+        known = (self.options.first_arc is not None, self.options.tip_traced)
+        lost = [end for end, use, point in zip(("first", "last"), known, frame[[0, -1]], strict=True)
+                if use and not np.isfinite(point).all()]  # fmt: skip
+        lacks = f" The {' and the '.join(lost)} point was not traced in this frame." if lost else ""
+        return ShapeFit(best.x, covariance, spread, math.sqrt(float(np.mean(across**2))), reason, lacks)
 
-    def _starts(self, points: Array, place: Array, noise: float, before: Array | None) -> Sequence[Array]:
+    def _starts(self, frame: Array, place: Array, noise: float, before: Array | None) -> Sequence[Array]:
         """Return unknowns [5] to start from: the three best of a grid of arcs and forces, turned onto the points."""
+        points = frame[np.isfinite(frame).all(axis=-1)]
         length = self.whisker.arc_length
         arcs, pushes = np.meshgrid(_ARCS, [0.0, *(s * d for d in _DEFLECTIONS for s in (1, -1))])
         chord = points[-1] - points[0]
@@ -229,7 +239,7 @@ class ContactSolver:
         reach = np.argmin(np.abs(size - np.linalg.norm(chord)), axis=1)
         tip = sample[np.arange(len(grid)), reach]
         grid[:, 2] = math.atan2(chord[1], chord[0]) - np.arctan2(tip[:, 1], tip[:, 0])
-        cost = np.sum(self.residuals(grid, points, place, noise) ** 2, axis=1)
+        cost = np.sum(self.residuals(grid, frame, place, noise) ** 2, axis=1)
         order = np.argsort(np.nan_to_num(cost, nan=np.inf))[:3]
         return [*grid[order], *([] if before is None else [before])]
 
@@ -285,6 +295,7 @@ class ContactSolver:
         force, deviation, _ = self._force(one)
         shape = self.shapes(one.unknowns[None])
         status, reason = self._judge(one, force, deviation)
+        reason += one.lacks if reason else ""
         return {
             "force": force,
             "arc": length * float(one.unknowns[3]),

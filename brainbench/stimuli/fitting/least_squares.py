@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from brainbench.core.errors import DataError, UsageError
+from brainbench.core.errors import DataError, UsageError, check_name
 from brainbench.core.files import provenance
 from brainbench.core.records import Status
 from brainbench.stimuli.fitting.identifiability import directions, unknown_parameters
@@ -55,7 +55,8 @@ def fit(
         Estimates with intervals, noise, tests of the residuals, and a status with reasons.
 
     Raises:
-        UsageError: a parameter is unknown, or a start value lies outside its bounds.
+        UsageError: a parameter is unknown, one with bounds or a prior is not fitted, or a start value lies outside its
+            bounds.
         DataError: there are fewer readings than parameters, wrenches have the wrong unit or sign, or the whisker is
             unstable at the start values.
     """
@@ -73,6 +74,8 @@ def fit(
             for trial in trials
         ]
     free = FreeParameters(tuple(parameters), condition, bounds or {})
+    for name in priors or {}:
+        check_name("fitted parameter with a prior", name, free.names)
     model = FitModel(trials, free, options)
     chosen = {**(PUBLISHED if options.priors == "published" else {}), **(priors or {})}
     problem = _Problem(model, {index: chosen[name] for index, name in enumerate(free.names) if name in chosen})

@@ -47,7 +47,11 @@ class Readings:
 
     @classmethod
     def of(cls, trials: Sequence[Trial]) -> Readings:
-        """Return the readings of some trials: every finite number that was measured."""
+        """Return the readings of some trials: every finite number that was measured.
+
+        Raises:
+            DataError: trials disagree on the noise of a channel.
+        """
         names = tuple(dict.fromkeys(name for trial in trials for name in trial.channels))
         rows: list[NDArray[np.int_]] = []
         owners, groups = [], []
@@ -71,7 +75,10 @@ class Readings:
             np.add.at(counts, group[known], 1)
             if "noise" in trial.measured:
                 stated = np.broadcast_to(trial.measured["noise"].values, len(trial.channels))
-                noise[[names.index(name) for name in trial.channels]] = stated
+                mine = [names.index(name) for name in trial.channels]
+                if (np.isfinite(noise[mine]) & (noise[mine] != stated)).any():
+                    raise DataError("Two trials state a different noise of one channel; a fit takes one of each.")
+                noise[mine] = stated
         size = np.sqrt(squares / np.maximum(counts, 1))
         # Small components are no more reliable than large ones of the same kind.
         for kind in ("F", "M", "s"):

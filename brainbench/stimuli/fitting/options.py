@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-from brainbench.core.errors import check_name
+from brainbench.core.errors import UsageError, check_name
 from brainbench.core.reading.ranges import check_number
 from brainbench.core.statistics import check_level
 
@@ -44,6 +44,12 @@ class FitOptions:
         check_name("priors of a fit", self.priors, PRIORS)
         check_name("intervals of a fit", self.intervals, INTERVALS)
         check_name("loss of a fit", self.loss, LOSSES)
+        if self.intervals == "profile" and self.loss != "linear":
+            raise UsageError(
+                f"Profile intervals follow the squares of the residuals, and the loss {self.loss!r} is another; "
+                "use intervals = 'laplace', or the loss 'linear'."
+            )
         check_level(self.level)
         check_number("most_iterations of a fit", self.most_iterations, least=1, whole=True)
         check_number("steps_per_period of a fit", self.steps_per_period, least=4)
+        check_number("time_step of a fit (s)", self.time_step, above=0)

@@ -15,6 +15,7 @@ from typing import Any, Literal
 import numpy as np
 
 from brainbench.core.errors import UsageError, check_name
+from brainbench.core.reading.ranges import check_number
 from brainbench.stimuli.engines.protocol import Job
 from brainbench.stimuli.gradients.parameters import WHISKER, JobParameters, whisker_value, with_values
 from brainbench.stimuli.whiskers.whisker import Whisker
@@ -116,7 +117,7 @@ class FreeParameters:
     """The parameters of one fit, with their start values and bounds.
 
     Raises:
-        UsageError: a name is unknown or stands twice, or a start value is not possible.
+        UsageError: a name is unknown or stands twice, bounds are of none of them, or a start value is not possible.
     """
 
     names: tuple[str, ...]
@@ -126,8 +127,10 @@ class FreeParameters:
     """Bounds of single parameters, in their units; others as in :data:`PARAMETERS`."""
 
     def __post_init__(self) -> None:
-        for name in (*self.names, *self.bounds):
+        for name in self.names:
             check_name("parameter of a fit", name, PARAMETERS)
+        for name in self.bounds:
+            check_name("fitted parameter with bounds", name, self.names)
         if not self.names or len(set(self.names)) < len(self.names):
             raise UsageError(f"A fit needs at least one parameter, each once; received {list(self.names)}.")
         for name in self.names:
@@ -190,9 +193,15 @@ class Prior:
     """Standard deviation; relative for positive parameters."""
     source: str
 
+    def __post_init__(self) -> None:
+        check_number("The mean of a prior", self.mean)
+        check_number("The spread of a prior", self.spread, above=0)
+
     def row(self, name: str, start: float, whisker: Whisker) -> tuple[float, float]:
         """Return the mean and the standard deviation of the coordinate u of a fit that began at ``start``."""
         parameter = PARAMETERS[name]
+        if parameter.kind == "log":
+            check_number(f"The mean of the prior of {name!r}", self.mean, above=0)
         spread = self.spread if parameter.kind == "log" else self.spread / parameter.unit_of(whisker)
         return parameter.coordinate(start, self.mean, whisker), spread
 

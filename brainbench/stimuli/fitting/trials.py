@@ -7,17 +7,19 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from brainbench.core.contracts import CHANNELS
 from brainbench.core.errors import DataError, UsageError, check_name
+from brainbench.core.reading.ranges import check_fields, check_number, check_vector
 from brainbench.stimuli.engines.protocol import Job, Load, StillFollicle, Trace
 from brainbench.stimuli.fitting.curves import normal_offsets
 from brainbench.stimuli.fitting.parameters import Condition
 from brainbench.stimuli.fitting.plausibility import check_clock
+from brainbench.stimuli.fitting.tracks.contract import AXES
 from brainbench.stimuli.fitting.tracks.quality import check_length
 from brainbench.stimuli.validation import references
 from brainbench.stimuli.whiskers.chain import build_chain
@@ -36,14 +38,23 @@ swings."""
 
 @dataclass(frozen=True)
 class Pluck:
-    """A whisker held aside and let go at t = 0."""
+    """A whisker held aside and let go at t = 0.
+
+    Raises:
+        UsageError: the deflection or the arc length is not above 0, or the direction is none.
+    """
 
     deflection: float
     """Deflection of the held point before the release [m]."""
     arc: float
     """Arc length of the held point [m]."""
     direction: Vector = (0.0, 1.0, 0.0)
-    """Direction of the deflection, in the frame of the job."""
+    """Direction of the deflection, in the frame of the job; its length does not matter."""
+
+    def __post_init__(self) -> None:
+        check_fields(self, "deflection", "arc", above=0, of="The {} (m) of a held whisker")
+        check_vector("The direction of a held whisker", self.direction)
+        check_number("The length of the direction of a held whisker", math.hypot(*self.direction), above=0)
 
     def loads(self, condition: Condition, start: float) -> tuple[Load, Load]:
         """Return the loads that hold the whisker aside from ``start`` (s) to the release.
@@ -57,7 +68,7 @@ class Pluck:
         # The small-bending closed form is that of the straight whisker; curvature changes it by second order.
         straight = replace(whisker, curvature=0.0)
         force = condition["deflection"] / references.point_load_deflection(straight, 1.0, arc)
-        whole = force * np.asarray(self.direction, dtype=float)
+        whole = force * np.asarray(self.direction, dtype=float) / math.hypot(*self.direction)
         ratio, omega = min(whisker.damping_ratio, 0.9), float(build_chain(whisker, 16).frequencies()[0])
         damped = math.sqrt(1 - ratio**2)
         decay = math.exp(-math.pi * ratio / damped)
@@ -72,7 +83,8 @@ class Trial:
     """One recording of one whisker, with the motion and the objects that belong to it.
 
     Raises:
-        DataError: the measurement holds fewer than three instants, or a shape is longer than the whisker.
+        DataError: the measurement holds fewer than three instants, its noise is not positive, or a shape is longer than
+            the whisker.
     """
 
     job: Job
@@ -85,6 +97,10 @@ class Trial:
         count = self.measured.sizes["time"]
         if count < 3:
             raise DataError(f"The measurement has {count} frames; a fit over time needs at least 3.")
+        if "noise" in self.measured and not (self.measured["noise"].values > 0).all():
+            raise DataError(
+                f"The noise of a measurement is above 0; received {self.measured['noise'].values.tolist()}."
+            )
         if self.of_shapes:
             check_length(self.measured, self.job.whisker.arc_length)
 
@@ -127,7 +143,10 @@ class Trial:
 
         Raises:
             DataError: the readings are too rare or too late to follow the swing.
+            UsageError: the held point is beyond the tip, or the readings begin before the release.
         """
+        arc = 0.95 * whisker.arc_length if arc is None else arc
+        check_number("The arc length (m) of the held point", arc, above=0, most=whisker.arc_length)
         times = measured["time"].values.astype(float)
         if times[0] < 0:
             raise UsageError(
@@ -141,7 +160,7 @@ class Trial:
         omega = 2 * math.pi * frequency
         settling = SETTLING / (max(whisker.damping_ratio, 0.05) * omega) + math.pi / omega
         job = Job(whisker, StillFollicle(), (), times, start=-settling)
-        return cls(job, measured, Pluck(deflection, arc or 0.95 * whisker.arc_length, direction))
+        return cls(job, measured, Pluck(deflection, arc, direction))
 
     @property
     def of_shapes(self) -> bool:
@@ -182,15 +201,19 @@ def to_frame(measured: xr.Dataset, axes: NDArray[np.float64], origin: NDArray[np
     """Return a measurement in the frame of a job, whose axes [3, 3] (columns, world) and origin [3] (m) are given."""
     if np.allclose(axes, np.eye(3)) and not origin.any():
         return measured
-    name = "shape" if "shape" in measured else "wrench"
-    values = measured[name].values
-    if values.shape[-1] not in (3, 6):
+    name, along, needed = ("shape", "axis", AXES) if "shape" in measured else ("wrench", "channel", CHANNELS)
+    if missing := sorted(set(needed) - set(measured[along].values.tolist())):
         raise UsageError(
-            f"The head of this scene is turned or displaced, which needs all three axes of what was measured; "
-            f"received {values.shape[-1]} columns."
+            f"The head of this scene is turned or displaced, which needs all axes of what was measured; {missing[0]} "
+            "is missing."
         )
     if name == "shape":
-        turned: Any = (values - origin) @ axes
-    else:
-        turned = np.concatenate([values[..., :3] @ axes, values[..., 3:] @ axes], axis=-1)
-    return measured.assign({name: (measured[name].dims, turned)})
+        return measured.assign(shape=(measured["shape"].dims, (measured["shape"].values - origin) @ axes))
+    # Columns come in any order; three are turned together.
+    measured = measured.sel(channel=list(CHANNELS))
+    wrench = (measured["wrench"].values.reshape(-1, 2, 3) @ axes).reshape(-1, 6)
+    turned = measured.assign(wrench=(measured["wrench"].dims, wrench))
+    if "noise" not in measured:
+        return turned
+    noise = np.sqrt((measured["noise"].values ** 2).reshape(2, 3) @ axes**2).reshape(6)
+    return turned.assign(noise=(measured["noise"].dims, noise))

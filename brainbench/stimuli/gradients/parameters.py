@@ -49,13 +49,15 @@ class JobParameters:
             knots: times (s) of the knots of parameters such as ``base.theta[2]``.
 
         Raises:
-            UsageError: a name is unknown or given twice, there is no such knot or object, or whiskers of the jobs
-                differ in a parameter of theirs.
+            UsageError: a name is unknown or given twice, there is no such knot or object, or whiskers or objects
+                of the jobs differ in a parameter of theirs.
         """
         self.jobs, self.names = tuple(jobs), tuple(names)
         self.knots = None if knots is None else np.array(knots, dtype=float)
-        if self.knots is not None and (len(self.knots) < 2 or (np.diff(self.knots) <= 0).any()):
-            raise UsageError("knots are at least two increasing times in seconds.")
+        if self.knots is not None:
+            whole = len(self.knots) >= 2 and np.isfinite(self.knots).all()
+            if not whole or (np.diff(self.knots) <= 0).any():
+                raise UsageError("knots are at least two increasing times in seconds.")
         if not self.jobs or not self.names or len(set(self.names)) < len(self.names):
             raise UsageError("Give at least one job and one parameter, and every parameter once.")
         length = min(job.whisker.arc_length for job in self.jobs)
@@ -79,9 +81,17 @@ class JobParameters:
                 raise UsageError(f"The whiskers of the jobs differ in {name!r}; fit them one by one.")
             return found.pop()
         kind, index, what = self._parse(name)
-        if kind == "object" and what == "friction":
-            return float(self.jobs[0].obstacles[max(index, 0)].friction or 0.0)
-        return 0.0
+        if kind != "object" or what != "friction":
+            return 0.0
+        chosen = slice(None) if index < 0 else slice(index, index + 1)
+        found = {
+            job.whisker.friction if one.friction is None else one.friction
+            for job in self.jobs
+            for one in job.obstacles[chosen]
+        }
+        if len(found) != 1:
+            raise UsageError(f"{name!r} names no object, or several whose frictions differ; name one.")
+        return found.pop()
 
     def _scale(self, name: str, value: float, length: float) -> float:
         if name in ("curvature", "friction") or name.endswith(".friction"):

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brainbench.core.errors import UsageError
-from brainbench.core.reading.ranges import check_fields, check_number
+from brainbench.core.reading.ranges import check_fields, check_number, check_vector
 from brainbench.stimuli.engines.protocol import base_rotation
 from brainbench.stimuli.motion.hinge_angles import follow_angles
 from brainbench.stimuli.whiskers.array import MountedWhisker
@@ -141,10 +141,7 @@ class _SteadyMotion(_Motion):
 
     def __post_init__(self) -> None:
         name = type(self).__name__.lower()
-        if len(self.velocity) != 3 or not all(math.isfinite(value) for value in self.velocity):
-            raise UsageError(
-                f"The velocity of a {name} is three finite numbers in {self._unit}; received {self.velocity!r}."
-            )
+        check_vector(f"velocity of a {name} ({self._unit})", self.velocity)
         check_number(f"{name} onset (s)", self.onset, least=0)
 
     @property

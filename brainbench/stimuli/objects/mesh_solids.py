@@ -104,7 +104,7 @@ def touchable(mesh: Mesh, collision: str, settings: DecompositionSettings | None
 
 def _exact(mesh: Mesh) -> Solid:
     """Make a solid that is touched at its surface, and at its hull by other engines if it is convex."""
-    if not mesh.diagnosis.watertight:
+    if not mesh.diagnosis.watertight or mesh.diagnosis.inconsistent:
         raise UsageError(
             f"The mesh {mesh.name!r} is not closed ({mesh.diagnosis}), so it has no inside to keep whiskers out of; use"
             " collision = 'hull' (its concavities filled), or close it."

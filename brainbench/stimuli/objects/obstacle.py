@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brainbench.core.errors import UsageError, check_name
-from brainbench.core.reading.ranges import check_number
+from brainbench.core.reading.ranges import check_number, check_vector
 from brainbench.core.rotations import from_matrices, to_matrices
 
 RigidMotion = Callable[[NDArray[np.float64]], tuple[NDArray[np.float64], NDArray[np.float64]]]
@@ -110,8 +110,8 @@ class _Primitive:
         name = type(self).__name__.lower()
         for field in (*self._points, *self._sizes):
             value = getattr(self, field)
-            if isinstance(value, Sequence) and (len(value) != 3 or not all(map(math.isfinite, value))):
-                raise UsageError(f"{field} of a {name} must be three finite numbers (m); received {value!r}.")
+            if isinstance(value, Sequence):
+                check_vector(f"{field} of a {name} (m)", value)
         for field in self._sizes:
             for size in np.atleast_1d(getattr(self, field)).tolist():
                 check_number(f"{field} of a {name} (m)", size, above=0)

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from brainbench.core.reading.ranges import check_number
+from brainbench.core.reading.ranges import check_number, check_vector
 from brainbench.core.rotations import euler_matrix, from_matrices
 from brainbench.stimuli.motion.trajectories import Path, Spin, Still, Translation
 from brainbench.stimuli.objects.obstacle import Obstacle, Vector
@@ -39,7 +39,7 @@ class _PlacedMotion:
 
 @dataclass(frozen=True, eq=False)
 class PlacedObject:
-    """A solid in a scene (world frame); a friction below 0 is a :class:`UsageError`."""
+    """A solid in a scene (world frame); a friction below 0 or a pose that is not finite is a :class:`UsageError`."""
 
     solid: Solid
     position: Vector = (0.0, 0.0, 0.0)
@@ -52,6 +52,8 @@ class PlacedObject:
     """Coulomb coefficient of its contacts; None takes each whisker's own."""
 
     def __post_init__(self) -> None:
+        check_vector("position of an object (m)", self.position)
+        check_vector("rotation of an object (rad)", self.rotation)
         if self.friction is not None:
             check_number("The friction of an object", self.friction, least=0)
 

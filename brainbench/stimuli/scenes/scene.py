@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brainbench.core.errors import UsageError
+from brainbench.core.reading.ranges import check_vector
 from brainbench.core.rotations import euler_matrix
 from brainbench.stimuli.engines.protocol import Job, base_rotation
 from brainbench.stimuli.motion.recorded import Recorded
@@ -25,13 +26,17 @@ from brainbench.stimuli.whiskers.selection import match_whiskers
 
 @dataclass(frozen=True)
 class Head:
-    """Pose of an array in the world, and its motion."""
+    """Pose of an array in the world, and its motion; one that is not finite is a :class:`UsageError`."""
 
     position: Vector = (0.0, 0.0, 0.0)
     """World position of the array's origin at t = 0 [m]."""
     rotation: Vector = (0.0, 0.0, 0.0)
     """Angles [rad] about the world's x, then y, then z axis that turn the array frame."""
     motion: Still | Translation | Path = field(default_factory=Still)
+
+    def __post_init__(self) -> None:
+        check_vector("position of a head (m)", self.position)
+        check_vector("rotation of a head (rad)", self.rotation)
 
     @property
     def matrix(self) -> NDArray[np.float64]:

@@ -43,7 +43,7 @@ class Span:
     step: float
 
     def __post_init__(self) -> None:
-        if not (math.isfinite(self.low) and self.step > 0 and self.low <= self.high < math.inf):
+        if not (math.isfinite(self.low) and 0 < self.step < math.inf and self.low <= self.high < math.inf):
             raise UsageError(f"A span ascends from low to high in positive steps; received {self!r}.")
 
     @property
@@ -128,7 +128,7 @@ class SweepGrid:
     """Published numbers of this grid, printed beside our counts."""
 
     def __post_init__(self) -> None:
-        for name in ("speed", "height", "rotation", "distance", "size"):
+        for name in ("speed", "height", "rotation", "distance", "size", "turns"):
             values = getattr(self, name)
             if not isinstance(values, Span):
                 object.__setattr__(self, name, tuple(map(float, values)))
@@ -139,8 +139,7 @@ class SweepGrid:
             if (values.low if isinstance(values, Span) else min(values)) <= 0:
                 raise UsageError(f"{name} of a sweep grid must be positive (SI units); received {values!r}.")
         check_fields(self, "draws", least=1, whole=True, of="{} of a sweep grid")
-        if not self.turns:
-            raise UsageError("A sweep grid needs at least one turn; received none.")
+        check_fields(self, "start", of="{} of a sweep grid (m)")
         if self.heights_per_draw is not None and (
             isinstance(self.height, Span) or not 1 <= self.heights_per_draw <= len(self.height)
         ):

@@ -15,7 +15,6 @@ from functools import cache
 from importlib import resources
 from typing import Any, Literal
 
-from brainbench.core.contracts import GRID_SHAPE
 from brainbench.core.errors import UsageError, check_name, unknown_name
 from brainbench.stimuli.whiskers.selection import match_whiskers
 from brainbench.stimuli.whiskers.whisker import Whisker
@@ -49,11 +48,6 @@ class MountedWhisker:
     def full_name(self) -> str:
         """Side and name, such as ``RC2``."""
         return self.side[0].upper() + self.name
-
-    @property
-    def cell(self) -> int:
-        """Flat index row·7 + col in the 5 × 7 grid."""
-        return self.row * GRID_SHAPE[1] + self.col
 
     def mirrored(self) -> MountedWhisker:
         """Return the whisker of the other side: x, θ and ζ change sign, the curvature does not."""

@@ -142,3 +142,25 @@ def test_few_points_are_refused_in_words():
     found = find_contacts(new_shapes(np.arange(3.0), points), MOUSE)
     assert (found["status"] == "undefined").all()
     assert "4 points" in str(found["reason"].values[0])
+
+
+@pytest.mark.parametrize(("end", "options"), [(0, ContactOptions(noise=2e-5)), (-1, ContactOptions(2e-5, None, True))])
+def test_a_frame_without_its_first_or_last_point_takes_no_other_for_it(end, options):
+    contact, force = _truth(MOUSE, 0.5, 0.15)
+    points, place = _shape(MOUSE, contact, force, points=12, traced=1.0)
+    frames = np.tile(points, (3, 1, 1))
+    frames[1, end] = np.nan
+    shapes = new_shapes(np.arange(3.0), frames)
+    found = find_contacts(shapes, MOUSE, options=options)
+    assert list(found["status"].values) == ["ok", "undefined", "ok"]
+    assert ("first" if end == 0 else "last") in str(found["reason"].values[1])
+    # The contact point makes up for it.
+    held = find_contacts(shapes, MOUSE, contact_points=np.tile(place, (3, 1)), options=options)
+    np.testing.assert_allclose(held["force"], force, rtol=0.03)
+
+
+@pytest.mark.parametrize("first_arc", [np.nan, -1e-3, 0.02])
+def test_a_trace_begins_on_the_whisker(first_arc):
+    shapes = new_shapes(np.arange(3.0), np.tile(MOUSE.centre_line(np.linspace(0, 0.01, 8)), (3, 1, 1)))
+    with pytest.raises(UsageError, match="first_arc"):
+        find_contacts(shapes, MOUSE, options=ContactOptions(first_arc=first_arc))

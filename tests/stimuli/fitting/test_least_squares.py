@@ -6,13 +6,17 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import xarray as xr
 
+from brainbench.core.contracts import CHANNELS
 from brainbench.core.errors import DataError, UsageError
+from brainbench.core.rotations import euler_matrix
 from brainbench.stimuli import WhiskerArray, references
 from brainbench.stimuli.fitting import FitOptions, Trial, fit, new_shapes, new_wrenches
-from brainbench.stimuli.fitting.model import FitModel
-from brainbench.stimuli.fitting.parameters import PARAMETERS, FreeParameters
+from brainbench.stimuli.fitting.model import FitModel, Readings
+from brainbench.stimuli.fitting.parameters import PARAMETERS, PUBLISHED, Condition, FreeParameters, Prior
 from brainbench.stimuli.fitting.synthetic import blank_wrenches, measure_shapes, measure_wrenches, simulate_trial
+from brainbench.stimuli.fitting.trials import Pluck, to_frame
 
 KNOWN = replace(WhiskerArray.of("mouse")["C2"].whisker, damping_ratio=0.15)
 TRUTH = replace(KNOWN, young_modulus=3.5e9, damping_ratio=0.2)
@@ -187,9 +191,72 @@ def test_unknown_names_and_bad_starts_are_refused():
         FreeParameters(("young_modulus",), trial.condition, {"young_modulus": (6e9, 9e9)}).limits()
     with pytest.raises(UsageError, match="laplace"):
         FitOptions(intervals="laplac")
+    with pytest.raises(UsageError, match="with bounds 'density'"):
+        fit(trial, ["young_modulus"], bounds={"density": (1000.0, 2000.0)})
+    with pytest.raises(UsageError, match="with a prior 'density'"):
+        fit(trial, ["young_modulus"], priors={"density": PUBLISHED["density"]})
+    with pytest.raises(UsageError, match="time_step"):
+        FitOptions(time_step=-1e-4)
+    with pytest.raises(UsageError, match="the loss 'huber'"):
+        FitOptions(loss="huber", intervals="profile")
+    with pytest.raises(DataError, match="noise"):
+        Trial.ringdown(KNOWN, trial.measured.assign(noise=-1e-6), 1e-3)
     still = Trial(replace(trial.job, loads=()), trial.measured)
     with pytest.raises(UsageError, match="ring-down"):
         FreeParameters(("deflection",), still.condition)
+
+
+@pytest.mark.parametrize(("mean", "spread"), [(np.nan, 0.1), (-3e9, 0.1), (3e9, 0.0), (3e9, -0.1), (3e9, np.nan)])
+def test_priors_are_normal_laws(mean, spread):
+    with pytest.raises(UsageError, match=r"of (a|the) prior"):
+        Prior(mean, spread, "the test").row("young_modulus", 3e9, KNOWN)
+
+
+def test_the_direction_of_a_pluck_has_no_length():
+    whisker = WhiskerArray.mouse()["C2"].whisker
+    condition = Condition(whisker, {"deflection": 1e-3})
+    unit, long = (
+        Pluck(1e-3, 0.01, direction).loads(condition, -0.1) for direction in ((0.0, 0.6, 0.8), (0.0, 3.0, 4.0))
+    )
+    assert [load.force for load in long] == [pytest.approx(load.force) for load in unit]
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"arc": 0.0}, "arc length"),
+        ({"arc": 30.0}, "arc length"),
+        ({"deflection": 0.0}, "deflection"),
+        ({"deflection": np.nan}, "deflection"),
+        ({"direction": (0.0, 0.0, 0.0)}, "direction"),
+    ],
+)
+def test_a_pluck_that_holds_nothing_is_refused(changes, said):
+    given = {"deflection": 1e-3, **changes}
+    with pytest.raises(UsageError, match=said):
+        Trial.ringdown(KNOWN, blank_wrenches(np.arange(1, 50) * 2e-4), **given)
+
+
+def test_columns_of_wrenches_come_in_any_order():
+    axes, values = euler_matrix((0.3, -0.2, 0.5)), np.arange(18.0).reshape(3, 6)
+    levels, order = np.array([1.0, 2.0, 3.0, 4.0, 5.0, 6.0]), [0, 3, 1, 4, 2, 5]
+    whole = new_wrenches(np.arange(3.0), values, noise=levels)
+    mixed = new_wrenches(np.arange(3.0), values[:, order], [CHANNELS[i] for i in order], noise=levels[order])
+    expected, found = (to_frame(one, axes, np.zeros(3)) for one in (whole, mixed))
+    np.testing.assert_allclose(expected["wrench"].values, (values.reshape(3, 2, 3) @ axes).reshape(3, 6))
+    # Turned noise of variances that differ: those of the turned components.
+    np.testing.assert_allclose(expected["noise"].values[:3], np.sqrt(np.diag(axes.T @ np.diag([1, 4, 9]) @ axes)))
+    xr.testing.assert_allclose(found, expected)
+    with pytest.raises(UsageError, match="My is missing"):
+        to_frame(new_wrenches(np.arange(3.0), values[:, :4], CHANNELS[:4]), axes, np.zeros(3))
+
+
+def test_trials_agree_on_the_noise_of_a_channel(rung):
+    trial = Trial.ringdown(KNOWN, _wrenches(rung).assign(noise=("channel", [1e-6, 1e-6, 1e-8])), 1e-3)
+    other = replace(trial, measured=trial.measured.assign(noise=("channel", [2e-6, 1e-6, 1e-8])))
+    Readings.of([trial, trial])
+    with pytest.raises(DataError, match="different noise"):
+        Readings.of([trial, other])
 
 
 def test_too_few_frames_readings_and_long_shapes_are_refused():

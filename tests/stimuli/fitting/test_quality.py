@@ -72,7 +72,9 @@ def test_noise_does_not_make_a_shape_too_long():
     check_length(_with(shapes + rng.normal(size=shapes.shape) * 5e-5), 0.0155)
 
 
-@pytest.mark.parametrize("times", [np.zeros(40), TIMES[:-1], np.where(TIMES > 0.05, np.nan, TIMES)])
+@pytest.mark.parametrize(
+    "times", [np.zeros(40), TIMES[:-1], np.where(TIMES > 0.05, np.nan, TIMES), np.append(TIMES[:-1], np.inf)]
+)
 def test_times_must_increase(times):
     with pytest.raises(DataError, match="times"):
         new_shapes(times, SHAPES)

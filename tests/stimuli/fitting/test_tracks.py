@@ -159,3 +159,25 @@ def test_files_that_are_no_tracks_are_refused(tmp_path):
         read_shapes(tmp_path / "a.measurements", _options())
     with pytest.raises(DataError, match="There is no track"):
         read_shapes(tmp_path / "b.csv", _options())
+
+
+def test_times_in_place_of_frame_numbers_are_refused_at_once(tmp_path):
+    path = tracks.write_points(tmp_path / "a.csv", SHAPES, frames=range(0, 12_000_000_000, 1_000_000_000))
+    with pytest.raises(DataError, match="numbers of frames"):
+        read_shapes(path, _options())
+
+
+def test_points_of_a_frame_may_stand_apart(tmp_path):
+    path = tracks.write_points(tmp_path / "a.csv", SHAPES)
+    head, *rows = path.read_text().splitlines()
+    # First every frame's first point, then every second one.
+    mixed = [row for point in range(10) for row in rows[point::10]]
+    path.write_text("\n".join([head, *mixed]) + "\n")
+    _same(read_shapes(path, _options()))
+
+
+def test_names_of_columns_that_differ_in_number_are_refused(tmp_path):
+    path = tracks.write_deeplabcut_csv(tmp_path / "a.csv", PIXELS, np.ones(PIXELS.shape[:2]))
+    path.write_text(path.read_text().replace(",p0,p0,p0,", ",p0,p0,", 1))
+    with pytest.raises(DataError, match="differ in length"):
+        read_shapes(path, _options())

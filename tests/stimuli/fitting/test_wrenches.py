@@ -66,6 +66,20 @@ def test_one_whisker_of_a_stimulus_set_is_read(tmp_path):
         read_wrenches(path)
 
 
+def test_a_stimulus_set_is_read_in_world_axes_and_as_readings_alone(tmp_path):
+    from brainbench.stimuli import Frames, Scene, WhiskerArray, simulate, write_stimulus_set
+
+    array, found = WhiskerArray.of("mouse", whiskers="C1"), {}
+    for axes in ("world", "follicle"):
+        dataset = simulate(Scene("air", array, frames=Frames(0.04, 0.004, 4, axes=axes)), cache=False, fidelity="fast")
+        found[axes] = read_wrenches(write_stimulus_set(dataset, tmp_path / f"{axes}.h5"))["wrench"].values
+    assert np.abs(found["world"]).max() > 0
+    np.testing.assert_allclose(found["follicle"], found["world"], atol=1e-6 * np.abs(found["world"]).max())
+    means = simulate(Scene("air", array, frames=Frames(count=2, average=3)), cache=False, fidelity="fast")
+    with pytest.raises(DataError, match="mean of 3 readings"):
+        read_wrenches(write_stimulus_set(means, tmp_path / "means.h5"))
+
+
 def test_unknown_channels_and_noise_are_refused():
     with pytest.raises(UsageError, match="Fx"):
         new_wrenches(TIMES, VALUES[:, :1], ["Fq"])

@@ -28,6 +28,21 @@ def test_values_are_those_of_the_jobs_and_shifts_begin_at_zero():
     assert same.obstacles[0].parts == BALL.obstacles[0].parts
 
 
+def test_the_friction_of_an_object_is_that_of_the_whisker_where_it_states_none():
+    rough = replace(BALL, whisker=replace(WHISKER, friction=0.3))
+    assert rough.obstacles[0].friction is None
+    assert JobParameters([rough], ["object.friction"]).values.tolist() == [0.3]
+    stated = replace(rough, obstacles=(replace(BALL.obstacles[0], friction=0.1),))
+    assert JobParameters([stated], ["objects.friction"]).values.tolist() == [0.1]
+
+
+@pytest.mark.parametrize("name", ["object.friction", "objects.friction"])
+def test_objects_that_differ_in_friction_are_refused(name):
+    stated = replace(BALL, obstacles=(replace(BALL.obstacles[0], friction=0.1),))
+    with pytest.raises(UsageError, match="frictions differ"):
+        JobParameters([BALL, stated], [name])
+
+
 def test_density_keeps_the_proportion_of_the_tip():
     job = replace(BALL, whisker=replace(WHISKER, density=(1000.0, 1500.0)))
     assert _build(job, density=1100.0).whisker.density == pytest.approx((1100.0, 1650.0))
@@ -97,6 +112,12 @@ def test_what_two_parameters_share_is_not_built_twice():
 def test_unknown_parameters_are_refused(names, said):
     with pytest.raises(UsageError, match=said):
         JobParameters([BALL], names)
+
+
+@pytest.mark.parametrize("knots", [[0.0], [0.0, 0.0], [0.0, np.nan, 0.1], [0.0, np.inf]])
+def test_knots_increase(knots):
+    with pytest.raises(UsageError, match="increasing times"):
+        JobParameters([BALL], ["base.x[0]"], knots=knots)
 
 
 def test_whiskers_that_differ_in_a_parameter_are_refused():

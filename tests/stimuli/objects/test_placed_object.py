@@ -16,7 +16,7 @@ from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.engines.protocol import Job, StillFollicle
 from brainbench.stimuli.motion.trajectories import Path, Spin, Translation
 from brainbench.stimuli.objects import procedural
-from brainbench.stimuli.objects.mesh_solids import mesh_solid, shape_solid
+from brainbench.stimuli.objects.mesh_solids import mesh_solid, shape_solid, touchable
 from brainbench.stimuli.objects.obstacle import TriangleMesh
 from brainbench.stimuli.objects.placed_object import PlacedObject
 from brainbench.stimuli.objects.primitives import RODGERS_CONTROL, box, capsule, cylinder, rodgers_solid, sphere
@@ -188,6 +188,23 @@ def test_an_open_mesh_says_so(tmp_path):
     cube = trimesh.creation.box()
     trimesh.Trimesh(cube.vertices, cube.faces[:-2]).export(path)
     assert any("not watertight" in note for note in mesh_solid(path, unit="mm").notes)
+
+
+def test_a_surface_without_an_inside_is_not_touched_as_it_is():
+    # A bottle of Klein: every edge joins two triangles, and none of its sides is out.
+    u, v = np.divmod(np.arange(64), 8)
+    right, up = (u + 1) % 8, (v + 1) % 8
+    here, beside = np.where(u < 7, v, -v % 8), np.where(u < 7, up, -up % 8)
+    quads = np.stack([8 * u + v, 8 * right + here, 8 * right + beside, 8 * u + up], axis=1)
+    angle, swing = 2 * np.pi * u / 8, 2 * np.pi * v / 8
+    away = 3 + np.cos(angle / 2) * np.sin(swing) - np.sin(angle / 2) * np.sin(2 * swing)
+    height = np.sin(angle / 2) * np.sin(swing) + np.cos(angle / 2) * np.sin(2 * swing)
+    vertices = np.column_stack([away * np.cos(angle), away * np.sin(angle), height])
+    mesh = Mesh(vertices, np.vstack([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]]))
+    assert mesh.diagnosis.watertight
+    assert mesh.diagnosis.inconsistent
+    with pytest.raises(UsageError, match="disagree on inside and outside"):
+        touchable(mesh, "exact", None)
 
 
 def test_repairs_of_a_file_are_noted_and_reach_the_configuration(tmp_path):

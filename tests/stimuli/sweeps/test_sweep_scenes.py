@@ -207,6 +207,8 @@ def test_one_sweep_is_simulated_end_to_end():
         ({"placing": "cleer"}, "did you mean 'clear'"),
         ({"heights_per_draw": 2}, r"heights_per_draw .*got 2"),
         ({"draws": 0}, "draws .*received 0"),
+        ({"turns": (math.nan,)}, "turns .*nan"),
+        ({"start": math.nan}, "start .*nan"),
         ({"head": Head(motion=Translation((0.0, 0.1, 0.0)))}, "choose mover='head'"),
     ],
 )
@@ -215,9 +217,10 @@ def test_impossible_grids_are_refused(changes, message):
         SweepGrid(**changes)
 
 
-def test_spans_ascend():
-    with pytest.raises(UsageError, match=r"received Span\(low=2\.0"):
-        Span(2.0, 1.0, 1.0)
+@pytest.mark.parametrize("values", [(2.0, 1.0, 1.0), (0.0, 1.0, math.inf)])
+def test_spans_ascend(values):
+    with pytest.raises(UsageError, match=r"received Span\(low="):
+        Span(*values)
 
 
 def test_recipes_say_which_of_them_take_objects():

@@ -8,8 +8,8 @@ import pytest
 
 from brainbench.core.errors import DataError
 from brainbench.stimuli.validation import references
-from brainbench.stimuli.validation.kirchhoff import KirchhoffRod, load_rod, press_rod
 from brainbench.stimuli.whiskers.array import WhiskerArray
+from tests.factories.kirchhoff import KirchhoffRod, load_rod, press_rod
 from tests.factories.whiskers import H
 
 

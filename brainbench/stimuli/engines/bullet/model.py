@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from brainbench.core.errors import MissingDependencyError, UsageError, install_command, missing_dependency
+from brainbench.core.rotations import from_z_axis
 from brainbench.stimuli.engines.tapered_links import LEAST_TAPER, cone_vertices
 from brainbench.stimuli.engines.units import MICRO, MILLI
 from brainbench.stimuli.objects.obstacle import Box, Capsule, ConvexPart, Cylinder, Obstacle, Part, Sphere
@@ -218,20 +219,10 @@ class BulletWorld:
     def _segment(self, kind: str, start: NDArray, end: NDArray, radius: float) -> int:
         """Add a capsule or a cylinder from ``start`` to ``end`` (mm)."""
         length = float(np.linalg.norm(end - start))
-        turn = {"collisionFrameOrientation": _turn_from_z((end - start) / length)}
+        turn = {"collisionFrameOrientation": np.roll(from_z_axis((end - start) / length), -1)}
         return self._collision(kind, (start + end) / 2, radius=radius, height=length, **turn)
 
     def _collision(self, kind: str, centre: ArrayLike = (0.0, 0.0, 0.0), **options: Any) -> int:
         """Add a collision shape around ``centre`` (mm)."""
         kind = getattr(self.bullet, f"GEOM_{kind}")
         return self.bullet.createCollisionShape(kind, collisionFramePosition=centre, **options)
-
-
-def _turn_from_z(axis: NDArray[np.float64]) -> tuple[float, float, float, float]:
-    """Return the quaternion (x, y, z, w) of the shortest turn of the z axis to the unit vector ``axis``."""
-    x, y, z = axis
-    if z < -1 + 1e-12:
-        return 1.0, 0.0, 0.0, 0.0
-    # (cos ½θ, sin ½θ · z × axis / |z × axis|) by half-angle formulas; the opposite direction has no unique turn.
-    half = np.sqrt((1 + z) / 2)
-    return -y / (2 * half), x / (2 * half), 0.0, half

@@ -21,7 +21,7 @@ from brainbench.core.errors import UsageError
 from brainbench.stimuli.engines.motion_pieces import carried_pose
 from brainbench.stimuli.engines.protocol import Job, base_rotation
 from brainbench.stimuli.engines.rod.limits import LIGHT
-from brainbench.stimuli.engines.rod.packing import knots_alike, pack_chains
+from brainbench.stimuli.engines.rod.packing import knots_alike, pack_chains, rotation_vectors
 from brainbench.stimuli.engines.rod.shapes import PackedShapes
 from brainbench.stimuli.engines.rod.tasks import JobTask, PackedTasks
 from brainbench.stimuli.engines.units import MILLI
@@ -87,8 +87,10 @@ def packed_change(task: JobTask, low: Job, high: Job, width: float, quasistatic:
     def add(of: Callable[[Job], Numbers]) -> None:
         ends = of(low), of(high)
         for name in ends[0]:
-            changes[name] = _rotation(*ends) if name == "shape_turn" else ends[1][name] - ends[0][name]
-            changes[name] = changes[name] / width
+            low_value, high_value = (end[name] for end in ends)
+            turns = name == "shape_turn"
+            change = rotation_vectors(low_value, high_value) if turns else high_value - low_value
+            changes[name] = change / width
 
     if low.whisker is not high.whisker:
         add(lambda job: _whisker(task, job, quasistatic))
@@ -213,13 +215,6 @@ def _rigid(nominal: TriangleMesh, moved: TriangleMesh) -> tuple[NDArray[np.float
 def _require(what: str, found: int, wanted: int) -> None:
     if found != wanted:
         raise UsageError(f"Jobs built from other values must have the same {what}: received {found} and {wanted}.")
-
-
-def _rotation(low: Numbers, high: Numbers) -> NDArray[np.float64]:
-    """Return the rotation vectors [shape, 3] between turns, which are small: the antisymmetric parts."""
-    turn = high["shape_turn"] @ np.swapaxes(low["shape_turn"], -1, -2)
-    vectors = turn[:, [2, 0, 1], [1, 2, 0]] - turn[:, [1, 2, 0], [2, 0, 1]]
-    return vectors / 2
 
 
 def packed_part(arrays: Mapping[str, NDArray[Any]], name: str, places: PackedPlaces, job: int) -> NDArray[Any]:

@@ -188,13 +188,13 @@ def _knots(
         around.append((np.asarray(place, dtype=float), to_matrices(np.asarray(turn, dtype=float))))
     (place0, turn0), (place, turn), (place1, turn1) = around
     span = sides[:, None]
-    spin0, spin1 = _spin(turn0, turn) / span, _spin(turn, turn1) / span
+    spin0, spin1 = rotation_vectors(turn0, turn) / span, rotation_vectors(turn, turn1) / span
     # Central differences, whose error is of second order; m per s are mm per ms.
     velocity = (place1 - place0) / (2 * span)
     if early:
         place2, turn2 = pose(times[:1] + 2 * sides[:1])
         there = (np.asarray(place2, dtype=float) - place1[:1]) / sides[0]
-        beyond = _spin(turn1[:1], to_matrices(np.asarray(turn2, dtype=float))) / sides[0]
+        beyond = rotation_vectors(turn1[:1], to_matrices(np.asarray(turn2, dtype=float))) / sides[0]
         velocity[0] = (3 * (place1[0] - place[0]) / sides[0] - there[0]) / 2
         spin0[0] = 2 * spin1[0] - beyond[0]
     knots = np.empty((len(times), 16))
@@ -206,7 +206,7 @@ def _knots(
     return knots
 
 
-def _spin(before: NDArray, after: NDArray) -> NDArray[np.float64]:
+def rotation_vectors(before: NDArray, after: NDArray) -> NDArray[np.float64]:
     """Return the rotation vectors [n, 3] (rad, world) between rotations [n, 3, 3]; small angles."""
     turn = after @ np.swapaxes(before, -1, -2)
     # Antisymmetric part of the relative rotation, sin(angle) times the axis; angles between neighbours are tiny.

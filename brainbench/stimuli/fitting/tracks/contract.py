@@ -116,7 +116,8 @@ def check_times(times: ArrayLike, count: int) -> NDArray[np.float64]:
     values = np.asarray(times, dtype=float)
     if values.shape != (count,):
         raise DataError(f"{count} rows of measurements need {count} times; received an array of shape {values.shape}.")
-    if not np.isfinite(values).all() or (np.diff(values) <= 0).any():
-        wrong = int(np.flatnonzero(~(np.diff(values, prepend=-np.inf) > 0))[0])
+    good = np.isfinite(values) & (np.diff(values, prepend=-np.inf) > 0)
+    if not good.all():
+        wrong = int(np.argmin(good))
         raise DataError(f"The times of a measurement increase, in seconds; row {wrong + 1} has {values[wrong]:g}.")
     return values

@@ -58,6 +58,8 @@ def _read_csv(path: str | os.PathLike[str]) -> tuple[NDArray[np.int_], Columns]:
     heads = {row[0]: row[1:] for row in rows[:4] if row[0] in ("scorer", "individuals", "bodyparts", "coords")}
     if not {"bodyparts", "coords"} <= set(heads):
         raise DataError(f"{shown(os.fspath(path))} is no {kind}: its first lines are not scorer, bodyparts and coords.")
+    if len({len(row) for row in heads.values()} | {len(rows[0]) - 1}) > 1:
+        raise DataError(f"{shown(os.fspath(path))} is no {kind}: its lines of names differ in length.")
     body = rows[len(heads) :]
     if not body:
         raise DataError(f"{shown(os.fspath(path))} holds no frame.")
@@ -86,6 +88,8 @@ def _read_hdf5(path: str | os.PathLike[str]) -> tuple[NDArray[np.int_], Columns]
                 for level in range(levels)
             ]
             names = list(zip(*words, strict=True))
+    if len(names) != values.shape[1]:
+        raise DataError(f"{shown(os.fspath(path))} has {len(names)} names of columns and {values.shape[1]} columns.")
     # The first level is the scorer; before the last two there may be individuals.
     keys = [(name[1] if len(name) == 4 else "", name[-2], name[-1]) for name in names]
     return frame_numbers(index, path), {key: values[:, column] for column, key in enumerate(keys)}

@@ -6,13 +6,14 @@ What can be used stays and is counted; what cannot be true is refused in one sen
 from __future__ import annotations
 
 import math
+import os
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from brainbench.core.errors import DataError
+from brainbench.core.errors import DataError, shown
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -59,6 +60,22 @@ class TrackQuality:
         if len(self.jumps):
             told.append(_swap_words(self.jumps))
         return tuple(told)
+
+
+def every_frame(frames: NDArray[np.int_], path: str | os.PathLike[str]) -> NDArray[np.int_]:
+    """Return all frame numbers from the first to the last of some, before room is made for their shapes.
+
+    Raises:
+        DataError: more of them are missing than a track may lack, as where times stand for frame numbers.
+    """
+    first, last, seen = int(frames.min()), int(frames.max()), len(np.unique(frames))
+    if (count := last - first + 1) - seen > MOST_GAPS * count:
+        raise DataError(
+            f"{shown(os.fspath(path))} has shapes in {seen:,} of the {count:,} frames from {first} to {last}; a track "
+            f"is used from {100 * (1 - MOST_GAPS):g} % on: give numbers of frames, not times, or cut it to frames in "
+            "which it was seen."
+        )
+    return np.arange(first, last + 1)
 
 
 def inspect_track(shapes: xr.Dataset) -> TrackQuality:

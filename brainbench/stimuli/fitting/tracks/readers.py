@@ -16,7 +16,7 @@ from brainbench.core.reading.tables import read_columns, read_rows
 from brainbench.stimuli.fitting.tracks.contract import new_shapes
 from brainbench.stimuli.fitting.tracks.deeplabcut import frame_numbers, pandas_groups, read_deeplabcut
 from brainbench.stimuli.fitting.tracks.options import TrackOptions
-from brainbench.stimuli.fitting.tracks.quality import check_track
+from brainbench.stimuli.fitting.tracks.quality import check_track, every_frame
 from brainbench.stimuli.fitting.tracks.whisk import read_whisk
 from brainbench.stimuli.fitting.tracks.whiskerman import read_whiskerman
 
@@ -113,12 +113,12 @@ def _read_points(path: str | os.PathLike[str], options: TrackOptions) -> tuple[N
         columns = {name: values[chosen] for name, values in columns.items()}
     frames = frame_numbers(columns["frame"], path)
     axes = [axis for axis in ("x", "y", "z") if axis in columns]
-    every = np.arange(frames.min(), frames.max() + 1)
-    counts = np.array([np.sum(frames == frame) for frame in every])
-    points = np.full((len(every), counts.max(), len(axes)), np.nan)
-    for index, frame in enumerate(every):
-        rows = np.flatnonzero(frames == frame)
-        points[index, : len(rows)] = np.stack([columns[axis][rows] for axis in axes], axis=1)
+    every, order = every_frame(frames, path), np.argsort(frames, kind="stable")
+    ordered = frames[order]
+    # Which of its frame each point is: they stand in order from the base.
+    place = np.arange(len(order)) - np.searchsorted(ordered, ordered)
+    points = np.full((len(every), place.max() + 1, len(axes)), np.nan)
+    points[ordered - every[0], place] = np.stack([columns[axis][order] for axis in axes], axis=1)
     return every, points
 
 

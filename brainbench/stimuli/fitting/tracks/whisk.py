@@ -21,6 +21,7 @@ from brainbench.core.reading.hdf5 import open_hdf5
 from brainbench.core.reading.regular import MOST_TEXT, check_file, readable
 from brainbench.core.reading.tables import read_columns, read_rows
 from brainbench.stimuli.fitting.tracks.options import TrackOptions
+from brainbench.stimuli.fitting.tracks.quality import every_frame
 
 Array = NDArray[np.float64]
 Segments = dict[tuple[int, int], Array]
@@ -59,7 +60,10 @@ def read_whisk(path: str | os.PathLike[str], options: TrackOptions) -> tuple[NDA
     traces = {key[0]: segments[key] for key in chosen}
     if not traces:
         raise DataError(f"{name} holds no trace of the whisker {shown(wanted)}.")
-    return _stack(traces, {key[0]: follicles[key] for key in chosen if key in follicles}, options.points)
+    frames = every_frame(np.array(sorted(traces)), path)
+    return frames, _stack(
+        traces, frames, {key[0]: follicles[key] for key in chosen if key in follicles}, options.points
+    )
 
 
 def _read_segments(path: str | os.PathLike[str]) -> Segments:
@@ -146,20 +150,18 @@ def _read_whiskiwrap(
     return dict(zip(keys, points, strict=True)), *_identities(columns)
 
 
-def _stack(traces: Mapping[int, Array], follicles: Mapping[int, Array], most: int) -> tuple[NDArray[np.int_], Array]:
-    """Return frame numbers [n] and points [n, k, 2] of traces by frame, base first, NaN behind the last.
+def _stack(traces: Mapping[int, Array], frames: NDArray[np.int_], follicles: Mapping[int, Array], most: int) -> Array:
+    """Return points [n, k, 2] of traces in frames [n], base first, NaN behind the last.
 
-    Frames between the first and the last that have no trace are NaN. Traces with more than ``most`` points lose some of
+    Frames that have no trace are NaN. Traces with more than ``most`` points lose some of
     them evenly: neighbours of a trace share the noise of their pixels, and more points would tell no more.
     """
-    frames = np.arange(min(traces), max(traces) + 1)
-    known = sorted(traces)
-    oriented = _orient({frame: traces[frame] for frame in known}, follicles)
+    oriented = _orient({frame: traces[frame] for frame in sorted(traces)}, follicles)
     points = np.full((len(frames), min(most, max(len(one) for one in traces.values())), 2), np.nan)
     for frame, trace in oriented.items():
         picked = np.unique(np.linspace(0, len(trace) - 1, min(len(trace), most)).round().astype(int))
         points[frame - frames[0], : len(picked)] = trace[picked]
-    return frames, points
+    return points
 
 
 def _orient(traces: Mapping[int, Array], follicles: Mapping[int, Array]) -> dict[int, Array]:

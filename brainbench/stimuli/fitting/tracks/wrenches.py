@@ -126,14 +126,20 @@ def _find_series(file: Any) -> tuple[Any, Any] | None:
 
 
 def _read_stimulus_set(path: str | os.PathLike[str], whisker: str | None, stimulus: str | None) -> xr.Dataset:
+    from brainbench.stimuli.readout import to_axes
     from brainbench.stimuli.stimulus_set import read_stimulus_set
 
-    dataset, chosen = read_stimulus_set(path), {}
+    dataset, chosen = to_axes(read_stimulus_set(path), "world"), {}
+    if (made := dataset.attrs.get("readout", "instantaneous")) != "instantaneous":
+        raise DataError(
+            f"A frame of {shown(os.fspath(path))} is no reading ({made}), and a fit compares readings; simulate the "
+            "scenes with instantaneous frames (average = 1, no low-pass)."
+        )
     for kind, name in (("whisker", whisker), ("stimulus", stimulus)):
         present = [str(one) for one in dataset[kind].values]
         chosen[kind] = present.index(choose_name(f"{kind} of {shown(os.fspath(path))}", name, present))
     one = dataset["wrench"].isel(chosen)
-    return new_wrenches(dataset["time"].values, one.values, source=os.fspath(path), axes=dataset.attrs.get("axes", ""))
+    return new_wrenches(dataset["time"].values, one.values, source=os.fspath(path))
 
 
 def _no_times(path: str | os.PathLike[str], names: list[str]) -> DataError:

@@ -110,6 +110,22 @@ def test_an_overdamping_step_is_told_in_the_log(caplog):
     assert re.search(r"time step .*0\.001 s .*ratio", caplog.text)
 
 
+@pytest.mark.parametrize(
+    ("make", "said"),
+    [
+        (lambda: StillFollicle(position=(np.nan, 0.0, 0.0)), "position"),
+        (lambda: StillFollicle(euler=(0.0, np.inf, 0.0)), "angles"),
+        (lambda: Job(C2, StillFollicle(), (), np.array([0.1]), start=np.nan), "start"),
+        (lambda: Job(C2, StillFollicle(), (), np.array([0.1]), gravity=(0.0, 0.0, np.nan)), "gravity"),
+        (lambda: Job(C2, StillFollicle(), (), np.array([0.1]), loads=(Load(0.01, (0.0, np.nan, 0.0)),)), "force"),
+        (lambda: Job(C2, StillFollicle(), (), np.array([0.1]), loads=(Load(0.01, (0, 0, 0), stop=np.nan),)), "stop"),
+    ],
+)
+def test_jobs_of_numbers_that_are_not_finite_are_refused(make, said):
+    with pytest.raises(UsageError, match=f"{said} .*nan|{said} .*inf"):
+        make()
+
+
 def test_unknown_backends_and_bad_jobs_are_refused():
     assert "mujoco" in list_engines()
     with pytest.raises(UsageError, match="did you mean 'mujoco'"):

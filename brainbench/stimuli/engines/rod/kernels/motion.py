@@ -2,7 +2,8 @@
 
 A track with one knot stands still, or moves straight at the knot's velocity. Times count from the start of the launch
 as whole milliseconds and a rest, places as a coarse grid and a rest, so that both keep their digits in single precision
-however long a simulation lasts and wherever it stands. Units: mm, ms, rad.
+however long a simulation lasts and wherever it stands. The jobs that these motions drive, and the times at which they
+are read, stand here too. Units: mm, ms, mN, rad.
 """
 
 import warp as wp
@@ -53,6 +54,38 @@ class MotionArrays:
     """[knot] angular velocity, world axes."""
     surge: wp.array(dtype=vec3)
     """[knot] angular acceleration, world axes."""
+
+
+@wp.struct
+class JobArrays:
+    """Jobs, and the forces that act on them besides contact."""
+
+    whisker: wp.array(dtype=wp.int32)
+    """[job]"""
+    scene: wp.array(dtype=wp.int32)
+    """[job]"""
+    base: wp.array(dtype=wp.int32)
+    """[job] motion of the base."""
+    step: wp.array(dtype=real)
+    """[job] longest time step."""
+    limit_first: wp.array(dtype=wp.int32)
+    """[job + 1] first limit of each job."""
+    limit: wp.array(dtype=real)
+    """[limit] longest step from each cell of the motions on; a job without is limited by ``step`` alone."""
+    row: wp.array(dtype=wp.int32)
+    """[job] first index of its results."""
+    column: wp.array(dtype=wp.int32)
+    """[job] third index of its results."""
+    load_first: wp.array(dtype=wp.int32)
+    """[job + 1] first load of each job."""
+    load_link: wp.array(dtype=wp.int32)
+    """[load]"""
+    load_share: wp.array(dtype=real)
+    """[load] place along its link, 0 to 1."""
+    load_force: wp.array(dtype=vec3)
+    """[load]"""
+    load_stop: wp.array(dtype=real)
+    """[load] time at which it ends."""
 
 
 @wp.struct

@@ -15,7 +15,7 @@ from brainbench.stimuli.engines.rod.limits import LISTED, SPARE, contacts_for
 from brainbench.stimuli.engines.rod.mesh_bvh import WIDE
 
 from .algebra import JointInverse, JointVector, mat33, reader, vec3, vec4
-from .motion import Instant, MotionArrays, ReadingArrays  # noqa: F401 — launches take all arrays from here
+from .motion import Instant, JobArrays, MotionArrays, ReadingArrays  # noqa: F401 — launches take all arrays from here
 from .parameters import capacity, hinges, real, recorded
 
 if recorded:
@@ -137,38 +137,6 @@ class ShapeArrays:
     """[leaf] of its triangles; each surface begins with a leaf of its own."""
     outward: wp.array2d(dtype=vec3)
     """[triangle, 7] angle-weighted normals: face, three corners, edges opposite to them."""
-
-
-@wp.struct
-class JobArrays:
-    """Jobs, and the forces that act on them besides contact."""
-
-    whisker: wp.array(dtype=wp.int32)
-    """[job]"""
-    scene: wp.array(dtype=wp.int32)
-    """[job]"""
-    base: wp.array(dtype=wp.int32)
-    """[job] motion of the base."""
-    step: wp.array(dtype=real)
-    """[job] longest time step."""
-    limit_first: wp.array(dtype=wp.int32)
-    """[job + 1] first limit of each job."""
-    limit: wp.array(dtype=real)
-    """[limit] longest step from each cell of the motions on; a job without is limited by ``step`` alone."""
-    row: wp.array(dtype=wp.int32)
-    """[job] first index of its results."""
-    column: wp.array(dtype=wp.int32)
-    """[job] third index of its results."""
-    load_first: wp.array(dtype=wp.int32)
-    """[job + 1] first load of each job."""
-    load_link: wp.array(dtype=wp.int32)
-    """[load]"""
-    load_share: wp.array(dtype=real)
-    """[load] place along its link, 0 to 1."""
-    load_force: wp.array(dtype=vec3)
-    """[load]"""
-    load_stop: wp.array(dtype=real)
-    """[load] time at which it ends."""
 
 
 @wp.struct
