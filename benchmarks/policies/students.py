@@ -265,7 +265,7 @@ def lay_out(options: argparse.Namespace) -> None:
     parts = [f"{title}.", table(columns, rows)]
     parts += [f"Notes: {'; '.join(notes)}."] if notes else []
     logs = found_logs(options.lay_out, named)
-    parts += [every_student(named, logs), differences(named)]
+    parts += [every_student(named, logs), differences(named, logs)]
     if options.notes:
         parts.append(options.notes.read_text(encoding="utf-8").strip())
     body = "\n\n".join(parts)
@@ -316,7 +316,7 @@ def found_logs(folders: list[Path], named: dict[str, StudentResult]) -> dict[tup
         rows = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
         if len(rows) > len(logs.get((arm, config.seed), [])):
             logs[arm, config.seed] = rows
-    return dict(sorted(logs.items(), key=lambda item: (list(ARMS).index(item[0][0]), item[0][1])))
+    return dict(sorted(logs.items(), key=lambda item: (list(named).index(item[0][0]), item[0][1])))
 
 
 def every_student(named: dict[str, StudentResult], logs: dict[tuple[str, int], list[dict[str, Any]]]) -> str:
@@ -342,32 +342,46 @@ def every_student(named: dict[str, StudentResult], logs: dict[tuple[str, int], l
     return table([*columns, f"success in training, iterations {span}", "success in evaluation"], rows)
 
 
-def differences(named: dict[str, StudentResult]) -> str:
-    """Return the table of :data:`CONTRASTS`, what spread they were held against, and whether trained networks help."""
+def differences(named: dict[str, StudentResult], logs: dict[tuple[str, int], list[dict[str, Any]]]) -> str:
+    """Return the table of :data:`CONTRASTS`, what spread they were held against, and whether trained networks help.
+
+    Success in training is that of several moments of a policy, so that it scatters less than that of the last one.
+    """
+    from dataclasses import replace
+
     from benchmarks.report import table
     from brainbench.metrics.inference.multiple import adjust
     from robotics_bridge.policies.report import mixed_model
 
+    least = min(learned or 0 for result in named.values() for learned in result.learned)
     model = mixed_model(list(named.values()))
+    trained = mixed_model(
+        [
+            replace(result, success=tuple(seen(logs[arm, seed], least) for seed in result.seeds))
+            for arm, result in named.items()
+        ]
+    )
     pairs = [(one, other) for one, other in CONTRASTS if one in named and other in named]
     found = [model.contrast(named[one].name, named[other].name) for one, other in pairs]
     held = adjust([item.p for item in found], "holm")
-    rows = [
-        [
-            f"{one} – {other}", f"{len(named[one].seeds)}, {len(named[other].seeds)}", f"{item.difference:+.3f}",
-            _span(item.interval), f"{p:.2g}",
-        ]
-        for (one, other), item, p in zip(pairs, found, held, strict=True)
-    ]  # fmt: skip
-    parts = ", ".join(f"{name} {value:.3f}" for name, value in model.spread.items())
-    said = f"Mixed model of all {len(named)} arms; standard deviations of success: {parts}. Differences of arms:"
-    lines = [said, table(["arms", "students", "success", "95 % interval", "p (Holm)"], rows)]
+    rows = []
+    for (one, other), item, p in zip(pairs, found, held, strict=True):
+        moments = trained.contrast(named[one].name, named[other].name)
+        count = f"{len(named[one].seeds)}, {len(named[other].seeds)}"
+        told = [f"{each.difference:+.3f} {_span(each.interval)}" for each in (item, moments)]
+        rows.append([f"{one} – {other}", count, told[0], f"{p:.2g}", told[1]])
+    spreads = [", ".join(f"{name} {value:.3f}" for name, value in one.spread.items()) for one in (model, trained)]
+    said = (
+        f"Mixed model of all {len(named)} arms; standard deviations of success in evaluation: {spreads[0]}; in "
+        f"training, iterations {least - _SMOOTH + 1} to {least}: {spreads[1]}. Differences of arms with 95 % intervals:"
+    )
+    lines = [said, table(["arms", "students", "success in evaluation", "p (Holm)", "success in training"], rows)]
     random = {named[arm].name: arm for arm in RANDOM if arm in named}
     for arm in (arm for arm in TRAINED if arm in named and random):
-        held = model.judge(named[arm].name, random)
-        gain = f"{held.contrast.difference:+.3f} {_span(held.contrast.interval)}"
-        word = "helps" if held.helps else "is not shown to help"
-        lines.append(f"`{arm}` {word}: {gain} over `{random[held.best]}`, the best random arm.")
+        judged = model.judge(named[arm].name, random)
+        gain = f"{judged.contrast.difference:+.3f} {_span(judged.contrast.interval)}"
+        word = "helps" if judged.helps else "is not shown to help"
+        lines.append(f"`{arm}` {word}: {gain} over `{random[judged.best]}`, the best random arm.")
     return "\n\n".join(lines)
 
 

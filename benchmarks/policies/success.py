@@ -20,7 +20,7 @@ import numpy as np
 from scipy.stats import norm
 
 from benchmarks.policies.alignment import RECORD, board, partial_spearman
-from benchmarks.policies.students import NETWORKS, arm_of
+from benchmarks.policies.students import NETWORKS, arm_of, found_logs, seen
 from benchmarks.report import table, write_section
 from brainbench.core.figures.style import COLORS, PALE, panels, save_figure
 from brainbench.core.files import read_json
@@ -33,28 +33,30 @@ FROZEN = (*NETWORKS, "ead_simclr", "ead_supervised", "ead_untrained")
 """Arms whose encoder is a network of the board."""
 FEWEST = 6
 """Networks below which a correlation says nothing."""
-_APART = 0.006
-"""Difference of success above which two names of the picture stand clear of one another."""
-OUTCOMES = {"success": "success", "goals": "quarter turns in 10 s"}
+OUTCOMES = {"success": "success", "learning": "success in training", "goals": "quarter turns in 10 s"}
 GIVEN = ("accuracy", "position", "contact")
 """What else may go with success: the whisker accuracy, and two read-outs of the object in the hand."""
 
 
-def networks(results: Sequence[StudentResult]) -> list[dict[str, Any]]:
+def networks(results: Sequence[StudentResult], folders: list[Path]) -> list[dict[str, Any]]:
     """Return one row per network with students, highest score first; KeyError for one that is not on the board."""
     known = board()
     measured = {row["model"]: row for row in read_json(RECORD)}
+    named = {arm: result for result in results if (arm := arm_of(result.config)) in FROZEN}
+    logs = found_logs(folders, named)
     found = []
-    for result in results:
-        if arm_of(result.config) not in FROZEN:
-            continue
+    for arm, result in named.items():
+        least = min(learned or 0 for learned in result.learned)
         name = result.config.encoder
+        moments = [seen(logs[arm, seed], least) for seed in result.seeds]
         rows = [known[f"{name} seed {weights_seed(config)}"] for config in result.configs]
         found.append(
             {
                 "model": name, "students": len(result.seeds), "training": rows[0]["training"],
                 "score": float(np.mean([row["score"] for row in rows])),
                 "success": result.value, "goals": result.graded["goals"][0],
+                "learning": float(np.mean(moments)),
+                "spread": [float(np.std(of, ddof=1)) if len(of) > 1 else None for of in (result.success, moments)],
                 **{key: measured[name][key] for key in GIVEN},
             }
         )  # fmt: skip
@@ -91,22 +93,15 @@ def correlations(found: Sequence[Mapping[str, Any]]) -> list[list[str]]:
 
 
 def draw(found: Sequence[Mapping[str, Any]]) -> None:
-    """Draw success over the board's score, and over the position that can be read out, a network a point."""
-    figure, axes = panels(1, 2, (11.0, 4.4), sharey=True, width_ratios=(1.5, 1))
-    rows = sorted(found, key=lambda row: row["success"])
-    for panel, key in zip(axes[0], ("score", "position"), strict=True):
-        for row in rows:
+    """Draw success in training over the board's score and over two read-outs, a network a point."""
+    figure, axes = panels(1, 3, (12.0, 3.8), sharey=True)
+    labels = {"score": "score on the board", "position": "position, read out (R²)", "contact": "contact, read out (R²)"}
+    for panel, (key, label) in zip(axes[0], labels.items(), strict=True):
+        for row in found:
             color = COLORS[0] if row["training"] != "untrained" else COLORS[1] if "+" in row["model"] else PALE
-            panel.plot(row[key], row["success"], "o", color=color, ms=5 + 2 * (row["students"] > 1))
-            # A name among other points would be read as theirs; the table has them all.
-            alone = all(other is row or abs(other["success"] - row["success"]) > _APART for other in rows)
-            if key == "score" and alone:
-                panel.annotate(
-                    row["model"], (row[key], row["success"]), textcoords="offset points", xytext=(6, -2), fontsize=7,
-                    color=PALE,
-                )  # fmt: skip
-    axes[0, 0].set(xlabel="score on the board", ylabel="success of students")
-    axes[0, 1].set(xlabel="position that can be read out (R²)")
+            panel.plot(row[key], row["learning"], "o", color=color, ms=5 + 2 * (row["students"] > 1))
+        panel.set(xlabel=label)
+    axes[0, 0].set(ylabel="success of students in training")
     save_figure(figure, PICTURE, dpi=120)
 
 
@@ -119,19 +114,21 @@ def main() -> None:
     parser.add_argument("--write", action="store_true")
     options = parser.parse_args()
     results = read_results(options.students, at_least=options.at_least)
-    found = networks(results)
-    several = [result for result in results if arm_of(result.config) in FROZEN and len(result.success) > 1]
-    spread = [np.std(result.success, ddof=1) for result in several]
+    found = networks(results, options.students)
     keys = ("score", *GIVEN, *OUTCOMES)
     heads = ["score", "whisker accuracy", "position (R²)", "contact (R²)", *OUTCOMES.values()]
     rows = [[row["model"], str(row["students"]), *(f"{row[key]:.3f}" for key in keys)] for row in found]
-    between = np.std([row["success"] for row in found], ddof=1)
+    spreads = [
+        f"{np.std([row[key] for row in found], ddof=1):.3f} and "
+        f"{np.mean([row['spread'][of] for row in found if row['students'] > 1] or [np.nan]):.3f}"
+        for of, key in enumerate(("success", "learning"))
+    ]
     if len(found) < FEWEST:
         parser.error(f"there are students of {len(found)} networks of the board; a correlation takes {FEWEST}")
     parts = [
-        f"{len(found)} frozen networks of the default board as encoders of students. Success differs between networks "
-        f"by {between:.3f} (standard deviation)"
-        + (f", between students of one network by {np.mean(spread):.3f}." if spread else "."),
+        f"{len(found)} frozen networks of the default board as encoders of students. Standard deviations of success "
+        f"between networks, and between students of one: {spreads[0]} in evaluation, {spreads[1]} in the last episodes "
+        "of training.",
         table(["network", "students", *heads], rows),
         "Spearman's correlations over networks with 95 % intervals (Bonett & Wright 2000), two-sided p of permuted "
         "networks; `given` is partialled out of the ranks:",
