@@ -138,13 +138,14 @@ def depth_kernel(kinds: frozenset[int], raycast: bool, binary: bool, mode: int, 
             # neither.
             fixed = episode_draw(io.knobs[part], env + io.env_offset, probe, episode)
             signal = wp.max(noisy - best, 0.0) * fixed[0]
-        true_bit = io.truth[0, env, n]
-        bit = io.measured[0, env, n]
-        emit(io, io.knobs[part], env, n, probe, truth, signal)
         if wp.static(binary):
             # Each branch latches on its own last bit (4.3): noise must not switch the true contact.
-            if wp.static(mode != CLEAN):
-                io.measured[0, env, n] = latch(bit, age, io.measured[0, env, n], limits[part])
-            io.truth[0, env, n] = latch(true_bit, age, truth, limits[part])
+            truth = latch(io.truth[0, env, n], age, truth, limits[part])
+        if wp.static(binary and mode != CLEAN):
+            bit = io.measured[0, env, n]
+            emit(io, io.knobs[part], env, n, probe, truth, signal)
+            io.measured[0, env, n] = latch(bit, age, io.measured[0, env, n], limits[part])
+        else:
+            emit(io, io.knobs[part], env, n, probe, truth, signal)
 
     return contact_depth
