@@ -13,10 +13,11 @@
 #   device, 4…: bash /w/gpu.sh run PART …                             each at most as long as it says; all below 600 s
 #   or, on a machine of several GPUs, parts in the background, one after the other on each GPU, and a look at them:
 #               PLAN="0:ft_hand,reservoir_50 3:ft_hand" bash /w/gpu.sh lane 0 students-for; bash /w/gpu.sh look SECOND
-#               (PLAN: seed:arms …, TEACHER a run's folder; JOB=NAME-0 … lane 1 teachers; TASK=screwdriver NAME=-a
-#               WITH="--seed 1" … lane 2a teacher-of, and another as 2b beside it: two teachers of 4,096 environments
-#               share a GPU well; SECOND of the machine's life; policies/jobs.toml says what to compare; on a fresh
-#               machine two minutes go into compiling; kill what fails by `pkill -f "run/NAME-[b]"`, not by its own name)
+#               (PLAN: seed:arms …, TEACHER a run's folder, one lane of two students, or two lanes a GPU with TOGETHER=1
+#               and LANE=-0a, which never wait for each other; JOB=NAME-0 … lane 1 teachers; TASK=screwdriver NAME=-a
+#               CONFIG=careful WITH="--seed 1" … lane 2a teacher-of, and another as 2b beside it: two teachers of 4,096
+#               environments share a GPU well; SECOND of the machine's life; policies/jobs.toml says what to compare; on a
+#               fresh machine 140 s go into compiling; kill what fails by `pkill -f "run/NAME-[b]"`, not by its own name)
 #   here:       git checkout -f main && git branch -D device; python -m benchmarks.report after copying results/*.json
 #
 # Calls follow one another within 30 s, or the machine goes back with all that is on it: on 2026-11-26 that happened twice,
