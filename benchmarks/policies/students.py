@@ -252,7 +252,8 @@ def lay_out(options: argparse.Namespace) -> None:
 
     from benchmarks.report import table, write_section
     from leaderboards import write_record
-    from robotics_bridge.policies import report, student_figure
+    from robotics_bridge.policies import report
+    from robotics_bridge.policies.report import figure
 
     every = report.read_results(options.lay_out, at_least=options.at_least)
     results = [result for result in every if arm_of(result.config) not in NETWORKS]
@@ -271,7 +272,7 @@ def lay_out(options: argparse.Namespace) -> None:
     body = "\n\n".join(parts)
     print(body)
     if options.write:
-        student_figure.draw(results, _PICTURES / "policy-students.png", agents=agents)
+        figure.draw(results, _PICTURES / "policy-students.png", agents=agents)
         command = f"python -m benchmarks.policies.students --teacher {options.teacher} --config careful"
         write_section(f"Students of {options.task}", command, body, where=options.device, subject="policies")
     if options.records is not None:

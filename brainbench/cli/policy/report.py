@@ -49,7 +49,7 @@ def report(
     first = columns.index("success")
     text = table(title, columns, rows, right=tuple(range(first, len(columns))))
     if picture is not None:
-        from robotics_bridge.policies.student_figure import draw
+        from robotics_bridge.policies.report.figure import draw
 
         draw(results, picture, agents=agents)
     written = []

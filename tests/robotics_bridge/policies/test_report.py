@@ -25,7 +25,7 @@ from robotics_bridge.policies.report import (
     remarks,
     rows,
 )
-from robotics_bridge.policies.student_figure import draw
+from robotics_bridge.policies.report.figure import draw
 from robotics_bridge.policies.training.distill_config import DistillConfig
 from robotics_bridge.tasks.task import TASK_VERSION
 

@@ -20,10 +20,9 @@ import msgspec
 import numpy as np
 
 from brainbench.core.errors import DataError, DataFileNotFoundError, shown
-from brainbench.core.files import content_hash, provenance, read_json
-from brainbench.core.provenance import Provenance
+from brainbench.core.files import read_json
 from brainbench.core.reading.regular import reason
-from brainbench.core.records import Interval, ModelCard, ResultRecord, Score, SubjectScore
+from brainbench.core.records import Interval
 from brainbench.core.statistics import newcombe_interval, t_interval, wilson_interval
 from robotics_bridge.policies.contrasts import MixedModel, TrainedPolicy
 from robotics_bridge.policies.evaluate import mean_of_episodes
@@ -36,7 +35,7 @@ EVALUATION, AGENTS = "evaluation.json", "agents.json"
 """Of a student; of the teacher and the agents that do nothing and anything, as ``policy evaluate --out`` writes it."""
 GRADED = ("metric", "goals", "turn_rate", "seconds", "returns", "dropped")
 """Quantities of an episode beside its success."""
-_STOPPED = "stopped after"
+STOPPED = "stopped after"
 _DRAWN = ("seed", "pretrained", "calibration")
 """Settings of an encoder that differ between its draws, or were measured in each run."""
 _FREE = {"seed", "teacher", "iterations", "save_interval"}
@@ -252,7 +251,7 @@ def _result(members: Sequence[_Member], left_out: tuple[LeftOut, ...]) -> Studen
     learned = tuple(member.learned for member in members)
     fewest = min((number for number in learned if number is not None), default=None)
     if fewest is not None and first.iterations is not None and fewest < first.iterations:
-        note = "; ".join(filter(None, (note, f"{_STOPPED} {_learned(learned)} of {first.iterations} iterations")))
+        note = "; ".join(filter(None, (note, f"{STOPPED} {learned_of(learned)} of {first.iterations} iterations")))
     return StudentResult(
         first, seeds, tuple(shares), episodes, metric, _share(interval), note, graded=graded, iterations=fewest,
         learned=learned, left_out=left_out, configs=tuple(member.config for member in members),
@@ -264,7 +263,7 @@ def _share(interval: Interval | None) -> Interval | None:
     return interval and replace(interval, low=max(interval.low, 0.0), high=min(interval.high, 1.0))
 
 
-def _learned(learned: Iterable[int | None]) -> str:
+def learned_of(learned: Iterable[int | None]) -> str:
     """Return the fewest and the most iterations that some students learned; empty where none is said."""
     numbers = sorted({number for number in learned if number is not None})
     return " to ".join(str(number) for number in numbers[:: max(len(numbers) - 1, 1)])
@@ -305,54 +304,6 @@ def _by_seed(result: StudentResult) -> dict[int, float]:
     return {seed: float(np.mean([share for other, share in pairs if other == seed])) for seed in result.seeds}
 
 
-COLUMNS = (
-    "task", "hand", "contacts", "touch", "placement", "resolution", "noise", "encoder", "iterations", "seeds",
-    "success", "over none", "goals", "rad/s", "s", "return",
-)  # fmt: skip
-
-
-_SHARED = COLUMNS[: COLUMNS.index("success")]
-"""What students have in common stands above a table rather than in each of its rows."""
-
-
-def _pm(value: tuple[float, float] | None) -> str:
-    return "–" if value is None else f"{value[0]:.3g} ± {value[1]:.2g}"
-
-
-def _span(interval: Interval | None) -> str:
-    return "" if interval is None else f" [{interval.low:.3f}, {interval.high:.3f}]"
-
-
-def sense(config: DistillConfig) -> tuple[str, str, str, str]:
-    """Return placement, resolution, noise and encoder of a student's touch in words; dashes without touch."""
-    tactile = config.tactile
-    if tactile is None:
-        return "–", "–", "–", "–"
-    own = config.encoder_settings
-    told = ([tactile.learning] if "learning" in own else []) + ([f"{own['units']} units"] if "units" in own else [])
-    # A layout of one's own is a file; its name tells it apart.
-    resolution = Path(config.resolution).stem if config.resolution.endswith(".json") else config.resolution
-    encoder = f"{tactile.arm} ({', '.join(told)})" if told else tactile.arm
-    return config.placement, resolution, "noisy" if config.noisy else "clean", encoder
-
-
-def rows(results: Sequence[StudentResult]) -> list[list[str]]:
-    """Return the table of the results as text, in the order of :data:`COLUMNS`."""
-    found = []
-    for result in results:
-        config = result.config
-        found.append(
-            [
-                *result.world, config.felt, *sense(config),
-                _learned(result.learned) or "–", str(len(result.seeds)),
-                f"{result.value:.3f}{_span(result.interval)}",
-                "–" if result.gain is None else f"{result.gain:+.3f}{_span(result.difference)}",
-                *(_pm(result.graded.get(name)) for name in ("goals", "turn_rate", "seconds", "returns")),
-            ]
-        )  # fmt: skip
-    return found
-
-
 def read_agents(folders: Iterable[str | Path]) -> list[dict[str, Any]]:
     """Return what stands in the files :data:`AGENTS` below some folders: one summary per agent and task.
 
@@ -362,128 +313,3 @@ def read_agents(folders: Iterable[str | Path]) -> list[dict[str, Any]]:
     files = [path for root in folders for path in sorted(Path(root).rglob(AGENTS))]
     what = "evaluated agents; brainbench policy evaluate --out writes one"
     return [summary for path in files for summary in _listed(path, _Agent, what)]
-
-
-def agent_rows(agents: Sequence[Mapping[str, Any]]) -> list[list[str]]:
-    """Return the table of agents that are no students as text, in the order of :data:`COLUMNS`."""
-    names = ("goals", "turn_rate", "seconds", "returns")
-    return [
-        [
-            item["task"], "–", item.get("contacts", "–"), Path(item["agent"]).name, *["–"] * 6,
-            "{:.3f} [{:.3f}, {:.3f}]".format(item["success_rate"], *item["success_interval"]), "–",
-            *(_mean_of(item, name) for name in names),
-        ]
-        for item in agents
-    ]  # fmt: skip
-
-
-def _mean_of(item: Mapping[str, Any], name: str) -> str:
-    mean, half_width = item.get(name), item.get(f"{name}_half_width")
-    return _pm(None if mean is None else (mean, math.nan if half_width is None else half_width))
-
-
-def concise(table: Sequence[Sequence[str]]) -> tuple[str, list[str], list[list[str]]]:
-    """Return what all rows share, as words, and the columns and rows that are left; a dash in a row says nothing."""
-    columns = {name: [row[index] for row in table] for index, name in enumerate(COLUMNS)}
-    words = []
-    for name in _SHARED:
-        if len(said := {*columns[name]} - {"–"}) <= 1:
-            words += [f"{name}: {one}" for one in said]
-            del columns[name]
-    return ", ".join(words), list(columns), [list(row) for row in zip(*columns.values(), strict=True)]
-
-
-def remarks(results: Sequence[StudentResult]) -> list[str]:
-    """Return every note once; how far students were trained in one line; at the end the students left out."""
-    parts = dict.fromkeys(part for result in results for part in result.note.split("; ") if part)
-    early = [result for result in results if _STOPPED in result.note]
-    found = [part for part in parts if not part.startswith(_STOPPED)]
-    if early:
-        wanted = ", ".join(str(number) for number in sorted({result.config.iterations or 0 for result in early}))
-        found.append(f"{_STOPPED} {_learned(n for result in early for n in result.learned)} of {wanted} iterations")
-    return found + [
-        f"left out: {result.name}, seed {item.seed}, after "
-        f"{'unknown' if item.iterations is None else item.iterations} iterations ({item.reason})"
-        for result in results
-        for item in result.left_out
-    ]
-
-
-def command(config: DistillConfig, *, stop_at: int | None = None) -> str:
-    """Return the command line that distils a student up to ``stop_at``, but for what only a file of students sets."""
-    usual = DistillConfig(task=config.task)
-    words: dict[str, Any] = {"teacher": config.teacher, "config": config.variant, "observe": config.observe}
-    if config.tactile is not None:
-        words |= {"placement": config.placement, "resolution": config.resolution, "encoder": config.encoder}
-        words |= {"noisy": "" if config.noisy else None}
-        words |= {name: config.encoder_settings.get(name) for name in ("learning", "time", "pretrained", "units")}
-        words |= {"draw": config.encoder_settings.get("seed")}
-        words |= {"unroll": config.encoder_settings.get("options", {}).get("unroll")}
-    words |= {"contacts": config.contacts, "embedder": config.embedder, "hand": config.hand, "envs": config.num_envs}
-    words |= {"seed": config.seed, "precision": config.precision, "iterations": config.iterations}
-    words |= {"learning-rate": config.learning_rate, "epochs": config.epochs, "start": config.start}
-    words |= {"hidden": ",".join(map(str, config.hidden)) if config.hidden != usual.hidden else None}
-    words |= {"stop-at": stop_at if stop_at != config.iterations else None}
-    given = {
-        name: value
-        for name, value in words.items()
-        if value is not None
-        and value != getattr(usual, {"config": "variant", "envs": "num_envs"}.get(name, name), None)
-    }
-    text = " ".join(f"--{name} {value}".rstrip() for name, value in given.items())
-    return f"brainbench policy distill {config.task} {text}".rstrip()
-
-
-def records(results: Sequence[StudentResult]) -> list[ResultRecord]:
-    """Return one result record per group of students, for a leaderboard.
-
-    A board is a task on a hand under a contact model: its recordings are the evaluation protocol, its animals the
-    training seeds. A record is ``unreliable`` where fewer than :data:`FEWEST_SEEDS` students were trained.
-    """
-    found = []
-    for result in results:
-        config, tactile = result.config, result.config.tactile
-        protocol = {"task": config.task, "hand": config.hand, "variant": config.variant}
-        source = "{task} on {hand} ({variant})".format(**protocol)
-        if config.contacts not in (None, "published"):  # records of versions before know no other contacts
-            protocol["contacts"] = config.contacts
-            source = f"{source}, {config.contacts} contacts"
-        # Records of version 1 do not state it.
-        protocol["task_version"] = str(TASK_VERSION)
-        source = f"{source}, version {TASK_VERSION} of the tasks"
-        name = result.name
-        commands = [
-            command(replace(one, teacher=config.teacher), stop_at=learned)
-            for one, learned in zip(result.configs, result.learned, strict=True)
-        ]
-        crossed = len(set(result.seeds)) < len(result.seeds)
-        settings = {
-            "episodes": result.episodes, "metric": result.metric, "iterations_learned": result.iterations,
-            "seeds": list(result.seeds), **{f"mean_{name}": mean for name, (mean, _) in result.graded.items()},
-            **config.plain(),
-        }  # fmt: skip
-        facts = {
-            "recordings": {"source": source, "content_hash": content_hash(protocol)},
-            "settings": settings,
-            "command": "; ".join(commands),
-        }
-        score = Score(
-            name=name,
-            value=result.value,
-            status="unreliable" if result.note else "ok",
-            reasons=(result.note,) if result.note else (),
-            interval=result.interval,
-            subjects=tuple(
-                SubjectScore(f"seed {one.seed}{f', {one.draw}' * crossed}", share, math.nan, math.nan)
-                for one, share in zip(result.configs, result.success, strict=True)
-            ),
-            estimator="policy-success",
-            metric="share of successful episodes",
-            provenance=Provenance.of(provenance(**facts)),
-        )
-        card = ModelCard(
-            name=name, family="policy", objective="distillation", seed=config.seed,
-            encoder=tactile.arm if tactile is not None else None, attender="none",
-        )  # fmt: skip
-        found.append(ResultRecord(score, card=card))
-    return found
