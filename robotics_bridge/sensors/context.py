@@ -10,10 +10,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from brainbench.core.devices import warp
 
 if TYPE_CHECKING:
-    import numpy as np
     from numpy.typing import NDArray
 
     from robotics_bridge.physics.scene import TouchScene
@@ -28,18 +29,6 @@ def fill(kind: Any, source: Any, **own: Any) -> Any:
     for name in kind.vars:
         setattr(struct, name, own[name] if name in own else getattr(source, name))
     return struct
-
-
-@dataclass(eq=False)
-class UpdateClock:
-    """Counters of updates and episodes on the device."""
-
-    age: Any
-    """Warp array [B] int32: updates since the environment's reset, 0 at the first."""
-    episode: Any
-    """Warp array [B] int32: resets so far."""
-    env_offset: int = 0
-    """Number, in the whole experiment, of environment 0."""
 
 
 class Launcher:
@@ -76,17 +65,22 @@ class Launcher:
 
 @dataclass(eq=False)
 class LaunchContext:
-    """Device of kernels, and what their random numbers depend on."""
+    """Device of kernels, counters of updates and episodes, and what random numbers depend on."""
 
     num_envs: int
     """B."""
     device: Any
     """Warp device."""
     seed: int
-    clock: UpdateClock
+    env_offset: int
+    """Number, in the whole experiment, of environment 0."""
 
     def __post_init__(self) -> None:
         self.launch = Launcher(self.device)
+        self.age: Any = self.array(np.full(self.num_envs, -1), int)
+        """Warp array [B]: updates since the environment's reset, 0 at the first."""
+        self.episode: Any = self.zeros(self.num_envs, int)
+        """Warp array [B]: resets so far."""
 
     def array(self, values: Any, dtype: Any) -> Any:
         """Copy values to the device as a Warp array."""

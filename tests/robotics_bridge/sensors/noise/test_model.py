@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from scipy import stats
 
 from brainbench.core.errors import DataError, UsageError
-from robotics_bridge.sensors.context import LaunchContext, ReadoutSlice, UpdateClock
+from robotics_bridge.sensors.context import LaunchContext, ReadoutSlice
 from robotics_bridge.sensors.noise.model import PRESETS, TAXEL_KNOBS, Noise, stream_seed
 from robotics_bridge.sensors.noise.stages import ReadingNoise, gaussian_weights, simulate
 from tests.factories.sensor_episode import require_processor
@@ -234,11 +234,11 @@ def _stage(noise: Noise, envs: int = 3, probes: int = 4, active: np.ndarray | No
     from brainbench.core.devices import pick_device, warp
 
     wp = warp()
-    clock = UpdateClock(*(wp.zeros(envs, dtype=wp.int32, device="cpu") for _ in range(2)), env_offset=0)
-    context = LaunchContext(envs, pick_device("cpu"), 0, clock)
+    context = LaunchContext(envs, pick_device("cpu"), 0, 0)
+    context.age.fill_(0)
     slices = [ReadoutSlice("sensor", noise, 0, (probes,), active=active)]
     x, out = (wp.zeros((1, envs, probes), dtype=wp.float32, device="cpu") for _ in range(2))
-    return clock, ReadingNoise(slices, 1, context, staged=True, gained=gained), x, out
+    return context, ReadingNoise(slices, 1, context, staged=True, gained=gained), x, out
 
 
 def test_a_reset_redraws_and_forgets_in_its_environment_alone():
