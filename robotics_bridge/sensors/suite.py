@@ -96,10 +96,8 @@ class SensorSuite:
         queries = frozenset().union(*(sensor.queries(scene) for sensor in self.sensors.values()))
         with wp.ScopedDevice(self.device):
             self.solids = Solids(scene, num_envs, self.device, queries, resolution=resolution)
-            self.pairs = PairTable(self.solids, num_envs, self.device, listed)
-            self.context = context = SuiteContext(
-                num_envs, self.device, seed, env_offset, scene, self.solids, self.pairs
-            )
+            self.context = context = SuiteContext(num_envs, self.device, seed, env_offset, scene, self.solids)
+            context.pairs = self.pairs = PairTable(context, listed)
             self.runtimes: list[Runtime] = [
                 load_object(next(iter(members.values())).runtime, "runtime")(members, context)
                 for members in groups.values()
@@ -254,7 +252,6 @@ class SensorSuite:
         return {"sensors": sensors, "shared": 8 + self.pairs.state_bytes, "rings": rings, "scratch": scratch}
 
     def _launch(self, state: HandState, dt: float) -> None:
-        self.pairs.start(state, self.context.age)
         self.pairs.update(state)
         for runtime in self.runtimes:
             runtime.update(state, dt)
