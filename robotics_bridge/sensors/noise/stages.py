@@ -18,7 +18,7 @@ from brainbench.core.errors import UsageError
 from brainbench.core.reading.ranges import check_number
 from robotics_bridge.sensors.context import LaunchContext, ReadoutSlice
 from robotics_bridge.sensors.noise.kernels.noise import NoiseParams, crosstalk, delay_line, measure
-from robotics_bridge.sensors.noise.model import Noise, stream_seed
+from robotics_bridge.sensors.noise.model import Noise
 
 wp = warp()
 
@@ -58,7 +58,7 @@ class ReadingNoise:
             active[part.span] = 1 if part.active is None else part.active
         self.part, self.probe, self._active = (context.array(item, int) for item in (index, probe, active))
         """Warp arrays [N]: number of the sensor, number of the probe within it, 0 for fillers."""
-        structures = [part.noise.params(stream_seed(context.seed, part.name)) for part in slices]
+        structures = [part.noise.params(context.seed, part.name) for part in slices]
         self.params = context.array(structures, NoiseParams)
         """Warp array [S] of the knobs."""
         self._hysteresis = self._zeros(staged and any(noise.hysteresis for noise in noises))
