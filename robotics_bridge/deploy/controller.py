@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from brainbench.core.errors import UsageError
 from brainbench.core.reading.ranges import check_number
-from robotics_bridge.deploy.driver import Driver, HandReading
+from robotics_bridge.deploy.driver import Driver, HandReading, Source
 from robotics_bridge.deploy.safety import ClockOffset, SafetyLimits
 from robotics_bridge.deploy.timing import LatencyHistogram, RateMonitor
 from robotics_bridge.envs import ActionMap
@@ -29,8 +29,6 @@ _log = logging.getLogger(__name__)
 
 LONGEST = 86400.0
 """Seconds of the longest session."""
-Source = Callable[["HandReading"], "NDArray[np.floating]"]
-"""A group of observations for a report: touch, or the goal."""
 
 
 class Clock:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Protocol
 
@@ -25,6 +26,10 @@ class HandReading:
     """Joint velocities [J] (rad/s)."""
     pressure: NDArray[np.float64]
     """Summed contact force of each finger tip [F, 3], as the maker's ``calc_pressure`` gives it."""
+
+
+Source = Callable[["HandReading"], "NDArray[np.floating]"]
+"""A group of observations for a report: touch, or the goal."""
 
 
 @dataclass

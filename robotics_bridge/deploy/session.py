@@ -13,10 +13,10 @@ import numpy as np
 from brainbench.core.errors import DataError, DataFileNotFoundError, UsageError, listing
 from brainbench.core.files import file_hash
 from robotics_bridge import hands
-from robotics_bridge.deploy.controller import Controller, Source
-from robotics_bridge.deploy.driver import Driver
+from robotics_bridge.deploy.controller import Controller
+from robotics_bridge.deploy.driver import Driver, Source
 from robotics_bridge.deploy.safety import SafetyLimits
-from robotics_bridge.deploy.touch import REAL_TYPES, Fallback, PressureCalibration, RealTouch
+from robotics_bridge.deploy.touch import REAL_TYPES, PressureCalibration, RealTouch
 from robotics_bridge.policies.contract import PolicyContract
 from robotics_bridge.policies.runners import read_policy
 from robotics_bridge.tasks.task import check_measured
@@ -85,7 +85,7 @@ class DeployedPolicy:
         limits: Mapping[str, float] | None = None,
         sources: Mapping[str, Source] | None = None,
         calibration: PressureCalibration | None = None,
-        fallback: Fallback | None = None,
+        fallback: Source | None = None,
         threads: int | None = 1,
         **settings: Any,
     ) -> Controller:

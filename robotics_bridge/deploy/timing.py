@@ -11,7 +11,6 @@ from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from brainbench.core.errors import UsageError
 
@@ -54,23 +53,15 @@ class LatencyHistogram(list[float]):
     EDGES = np.logspace(-5, 1, 61)
     """[61] (s)."""
 
-    @property
-    def counts(self) -> NDArray[np.int64]:
-        """Durations [62] below each edge, and beyond the last."""
-        return np.bincount(np.searchsorted(self.EDGES, self, side="right"), minlength=len(self.EDGES) + 1)
-
-    def percentile(self, share: float) -> float:
-        """Return the duration (s) that a share (0 to 100) of ticks stays below; NaN without any."""
-        return float(np.percentile(self, share)) if self else math.nan
-
     def summary(self) -> dict[str, Any]:
-        """Return counts and percentiles in milliseconds."""
-        parts = {f"p{share:g}": 1e3 * self.percentile(share) for share in (50, 90, 99, 99.9)}
+        """Return the number of ticks, percentiles and the longest in milliseconds; NaN without any."""
+        parts = {f"p{share:g}": 1e3 * float(np.percentile(self or [math.nan], share)) for share in (50, 90, 99, 99.9)}
         return {"ticks": len(self), **parts, "max": 1e3 * max(self, default=math.nan)}
 
     def text(self, width: int = 40) -> str:
         """Return the histogram as lines of text, without empty ends."""
-        counts = self.counts
+        # Durations below each edge, and beyond the last.
+        counts = np.bincount(np.searchsorted(self.EDGES, self, side="right"), minlength=len(self.EDGES) + 1)
         used = np.flatnonzero(counts)
         if not len(used):
             return "no ticks"

@@ -7,7 +7,7 @@ Types with one value per taxel have no faithful counterpart on the XHand1.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -16,15 +16,13 @@ from numpy.typing import NDArray
 from brainbench.core.errors import UsageError, check_name
 from brainbench.core.reading.ranges import check_fields, check_number
 from robotics_bridge import hands
-from robotics_bridge.deploy.driver import HandReading
+from robotics_bridge.deploy.driver import HandReading, Source
 from robotics_bridge.policies.contract import PolicyContract
 
 REAL_TYPES = ("agg_bool", "agg_force")
 """Observation types that a real hand can measure."""
 LARGEST_SCALE = 1e6
 """Largest scale or threshold of a pressure calibration."""
-Fallback = Callable[["HandReading"], "NDArray[np.floating]"]
-"""A simulated tactile group [S, N, C] for a report."""
 
 
 @dataclass(frozen=True)
@@ -73,7 +71,7 @@ class RealTouch:
         contract: Of the policy: what it observes on which links of its hand.
         fingers: Fingers whose tips the hand senses, in the order of the reports.
         calibration: From the maker's unit to the simulator's.
-        fallback: Where the hand senses nothing; None leaves those items zero.
+        fallback: Simulated group [S, N, C], used where the hand senses nothing; None leaves those items zero.
 
     Raises:
         UsageError: the type cannot be measured and nothing is simulated in its place, or the calibration names a finger
@@ -86,7 +84,7 @@ class RealTouch:
         fingers: tuple[str, ...],
         *,
         calibration: PressureCalibration | None = None,
-        fallback: Fallback | None = None,
+        fallback: Source | None = None,
     ) -> None:
         self.observe, self.shape, self.fallback = contract.observe, contract.inputs["tactile"], fallback
         self.calibration, self.fingers = calibration or PressureCalibration(), fingers

@@ -178,7 +178,7 @@ class EnvState:
         found = self.episode.tensors()
         found |= {f"{part}.{name}": value for part, owner in parts.items() for name, value in owner.memory().items()}
         if self.touch is not None:
-            clock, wp = self.touch.suite.clock, warp()
+            clock, wp = self.touch.suite.context, warp()
             found |= {"touch.age": wp.to_torch(clock.age), "touch.episode": wp.to_torch(clock.episode)}
             found["touch.reading"] = self.touch.reading
         return found

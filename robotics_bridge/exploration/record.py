@@ -74,8 +74,6 @@ class HandRecording:
     """Touch of a hand, by condition."""
 
     hand: str
-    resolution: str
-    placement: str
     labels: tuple[str, ...]
     """One per condition: object, or object/procedure where there are several procedures."""
     objects: tuple[str, ...]
@@ -130,7 +128,7 @@ class HandRecording:
             attrs={
                 "array": f"hand:{self.hand}",
                 "scene": to_json(self.config, indent=None),
-                "fidelity": json.dumps({"resolution": self.resolution, "placement": self.placement}),
+                "fidelity": json.dumps({name: self.config[name] for name in ("resolution", "placement")}),
                 "seed": int(self.config["seed"]),
                 "backend": "mujoco",
                 "version": __version__,
@@ -204,7 +202,7 @@ def record_exploration(
         ],
     }  # fmt: skip
     return HandRecording(
-        world.hand.name, resolution, placement,
+        world.hand.name,
         tuple(f"{item.label}/{name}" if len(procedures) > 1 else item.label for item, name in conditions),
         tuple(item.label for item, _ in conditions), tuple(name for _, name in conditions),
         np.linspace(SUB_STEP_SECONDS, SUB_STEP_SECONDS * frames, frames), np.stack(felt, axis=1), config,

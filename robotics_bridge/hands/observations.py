@@ -30,30 +30,30 @@ _LAW = ("convention", "total", "friction", "twist")
 class ObservationType:
     """One row of table 4.3."""
 
-    name: str
     sensor: str | None
-    """Name of the sensor class, None for ``none``."""
+    """Name of the sensor class, None for no touch."""
     per_link: bool
     """One value or vector per link instead of per taxel."""
     channels: int
     """Per taxel or link."""
-    text: str
 
 
 OBSERVATIONS: dict[str, ObservationType] = {
-    item.name: item
-    for item in (
-        ObservationType("none", None, True, 0, "no touch: joints alone"),
-        ObservationType("bool", "ContactProbe", False, 1, "contact of each taxel"),
-        ObservationType("agg_bool", "ContactProbe", True, 1, "contact of each link: more than two taxels touch"),
-        ObservationType("depth", "ContactDepthProbe", False, 1, "contact depth of each taxel (m)"),
-        ObservationType("agg_force", "ContactDepthProbe", True, 3, "force of each link from summed depths"),
-        ObservationType("force", "KinematicTaxel", False, 3, "force of each taxel (N)"),
-        ObservationType("force_torque", "KinematicTaxel", False, 6, "force and torque of each taxel (N, N·m)"),
-        ObservationType("elastomer", "ElastomerTaxel", False, 3, "displacement of each marker (m)"),
-        ObservationType("proximity", "ProximityTaxel", False, 6, "force and torque from nearby surface"),
-    )
+    "none": ObservationType(None, True, 0),
+    # Contact of each taxel, and of each link: more than two of its taxels touch.
+    "bool": ObservationType("ContactProbe", False, 1),
+    "agg_bool": ObservationType("ContactProbe", True, 1),
+    # Depth of each taxel (m), and the force of each link from summed depths.
+    "depth": ObservationType("ContactDepthProbe", False, 1),
+    "agg_force": ObservationType("ContactDepthProbe", True, 3),
+    # Force, and force and torque, of each taxel (N, N·m).
+    "force": ObservationType("KinematicTaxel", False, 3),
+    "force_torque": ObservationType("KinematicTaxel", False, 6),
+    # Displacement of each marker (m); force and torque from nearby surface.
+    "elastomer": ObservationType("ElastomerTaxel", False, 3),
+    "proximity": ObservationType("ProximityTaxel", False, 6),
 }
+"""Name → type."""
 
 
 def observation_type(name: str) -> ObservationType:

@@ -144,8 +144,6 @@ class HandSpec:
     """Finger → its links from palm to tip."""
     apart: tuple[tuple[str, str], ...] = ()
     """Pairs of links that overlap at rest and must not collide, besides neighbours."""
-    source: str = ""
-    """Source of the numbers."""
 
     def __post_init__(self) -> None:
         names = [link.name for link in self.links]

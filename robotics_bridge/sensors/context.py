@@ -7,19 +7,24 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from brainbench.core.devices import warp
 
 if TYPE_CHECKING:
-    import numpy as np
     from numpy.typing import NDArray
 
     from robotics_bridge.physics.scene import TouchScene
     from robotics_bridge.sensors.noise.model import Noise
     from robotics_bridge.sensors.queries.pairs import PairTable
     from robotics_bridge.sensors.queries.solids import Solids
+
+
+_MOST = 512
+"""Packed launches that are kept."""
 
 
 def fill(kind: Any, source: Any, **own: Any) -> Any:
@@ -31,62 +36,44 @@ def fill(kind: Any, source: Any, **own: Any) -> Any:
 
 
 @dataclass(eq=False)
-class UpdateClock:
-    """Counters of updates and episodes on the device."""
-
-    age: Any
-    """Warp array [B] int32: updates since the environment's reset, 0 at the first."""
-    episode: Any
-    """Warp array [B] int32: resets so far."""
-    env_offset: int = 0
-    """Number, in the whole experiment, of environment 0."""
-
-
-class Launcher:
-    """Launches kernels on a device; on a processor, what is launched again is packed once.
-
-    Packing the arguments takes Warp 12 µs, which is most of a small update there. Structures may change between
-    launches, arrays must not move.
-    """
-
-    _MOST = 256
-    """Launches that are kept."""
-
-    def __init__(self, device: Any) -> None:
-        self._device = device
-        self._kept: dict[tuple[Any, ...], tuple[Any, tuple[Any, ...]]] = {}
-
-    def __call__(self, kernel: Any, dim: int | Sequence[int], *inputs: Any) -> None:
-        """Run a kernel."""
-        if self._device.is_cuda:
-            warp().launch(kernel, dim=dim, inputs=inputs, device=self._device)
-            return
-        dim = dim if isinstance(dim, int) else tuple(dim)
-        key = (kernel, dim, *(value if isinstance(value, int | float) else id(value) for value in inputs))
-        if key not in self._kept:
-            if len(self._kept) >= self._MOST:
-                self._kept.clear()
-            packed = warp().launch(kernel, dim=dim, inputs=inputs, device=self._device, record_cmd=True)
-            # What an address stands for must live as long as the address is remembered.
-            self._kept[key] = packed, inputs
-        # Warp packs nothing where there is no thread to run.
-        if packed := self._kept[key][0]:
-            packed.launch()
-
-
-@dataclass(eq=False)
 class LaunchContext:
-    """Device of kernels, and what their random numbers depend on."""
+    """Device of kernels, counters of updates and episodes, and what random numbers depend on."""
 
     num_envs: int
     """B."""
     device: Any
     """Warp device."""
     seed: int
-    clock: UpdateClock
+    env_offset: int
+    """Number, in the whole experiment, of environment 0."""
 
     def __post_init__(self) -> None:
-        self.launch = Launcher(self.device)
+        self._packed: dict[tuple[Any, ...], tuple[Any, tuple[Any, ...]]] = {}
+        self.age: Any = self.array(np.full(self.num_envs, -1), int)
+        """Warp array [B]: updates since the environment's reset, 0 at the first."""
+        self.episode: Any = self.zeros(self.num_envs, int)
+        """Warp array [B]: resets so far."""
+
+    def launch(self, kernel: Any, dim: int | Sequence[int], *inputs: Any) -> None:
+        """Run a kernel; on a processor, what is launched again is packed once.
+
+        Packing the arguments takes Warp 12 µs, which is most of a small update there. Structures may change between
+        launches, arrays must not move.
+        """
+        if self.device.is_cuda:
+            warp().launch(kernel, dim=dim, inputs=inputs, device=self.device)
+            return
+        dim = dim if isinstance(dim, int) else tuple(dim)
+        key = (kernel, dim, *(value if isinstance(value, int | float) else id(value) for value in inputs))
+        if key not in self._packed:
+            if len(self._packed) >= _MOST:
+                self._packed.clear()
+            packed = warp().launch(kernel, dim=dim, inputs=inputs, device=self.device, record_cmd=True)
+            # What an address stands for must live as long as the address is remembered.
+            self._packed[key] = packed, inputs
+        # Warp packs nothing where there is no thread to run.
+        if packed := self._packed[key][0]:
+            packed.launch()
 
     def array(self, values: Any, dtype: Any) -> Any:
         """Copy values to the device as a Warp array."""
@@ -103,7 +90,7 @@ class SuiteContext(LaunchContext):
 
     scene: TouchScene
     solids: Solids
-    pairs: PairTable
+    pairs: PairTable = field(init=False)
 
 
 @dataclass(frozen=True)

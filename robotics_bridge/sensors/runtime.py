@@ -86,8 +86,8 @@ class Runtime(abc.ABC):
         io.truth = planes(True)
         io.measured = planes(True) if self.noisy else io.truth
         io.hysteresis, io.walk = (planes(wanted) for wanted in self.stores)
-        io.age, io.episode = context.clock.age, context.clock.episode
-        io.knobs, io.env_offset = self._noise.params, context.clock.env_offset
+        io.age, io.episode = context.age, context.episode
+        io.knobs, io.env_offset = self._noise.params, context.env_offset
         self.io = io
         """Warp structure of the readings: ``truth`` and ``measured``, planar."""
         self._channels = channels
@@ -228,4 +228,4 @@ class History:
         """Append the reading of this update; ``counter`` [1] counts updates on the device."""
         c = self._context
         dim = (c.num_envs, self.part.count)
-        c.launch(append_history, dim, value, self.part.start, counter, c.clock.age, self.ring)
+        c.launch(append_history, dim, value, self.part.start, counter, c.age, self.ring)

@@ -16,7 +16,7 @@ from brainbench.core.plugins import load_object
 from brainbench.core.reading.ranges import check_number
 from robotics_bridge.physics.scene import TouchScene
 from robotics_bridge.physics.state import DIVERGED, MOST_ENVS, UNFELT, HandState
-from robotics_bridge.sensors.context import SuiteContext, UpdateClock
+from robotics_bridge.sensors.context import SuiteContext
 from robotics_bridge.sensors.fidelity import SensorFidelity
 from robotics_bridge.sensors.plausibility import warn_of
 from robotics_bridge.sensors.probes.runtime import DistanceRuntime
@@ -95,13 +95,9 @@ class SensorSuite:
         warn_of(scene, self.sensors)
         queries = frozenset().union(*(sensor.queries(scene) for sensor in self.sensors.values()))
         with wp.ScopedDevice(self.device):
-            age = wp.full(num_envs, -1, dtype=wp.int32, device=self.device)
-            self.clock = UpdateClock(age, wp.zeros(num_envs, dtype=wp.int32, device=self.device), env_offset)
             self.solids = Solids(scene, num_envs, self.device, queries, resolution=resolution)
-            self.pairs = PairTable(self.solids, num_envs, self.device, listed)
-            self.context = context = SuiteContext(
-                num_envs, self.device, seed, self.clock, scene, self.solids, self.pairs
-            )
+            self.context = context = SuiteContext(num_envs, self.device, seed, env_offset, scene, self.solids)
+            context.pairs = self.pairs = PairTable(context, listed)
             self.runtimes: list[Runtime] = [
                 load_object(next(iter(members.values())).runtime, "runtime")(members, context)
                 for members in groups.values()
@@ -212,7 +208,7 @@ class SensorSuite:
                     raise UsageError(f"Environments are 0 to {self.num_envs - 1}; received {numbers.tolist()}.")
                 chosen[numbers] = True
         mask = wp.from_torch(chosen)
-        self.context.launch(reset_clock, self.num_envs, mask, self.clock.age, self.clock.episode)
+        self.context.launch(reset_clock, self.num_envs, mask, self.context.age, self.context.episode)
 
     @property
     def diverged(self) -> torch.Tensor:
@@ -256,7 +252,6 @@ class SensorSuite:
         return {"sensors": sensors, "shared": 8 + self.pairs.state_bytes, "rings": rings, "scratch": scratch}
 
     def _launch(self, state: HandState, dt: float) -> None:
-        self.pairs.start(state, self.clock.age)
         self.pairs.update(state)
         for runtime in self.runtimes:
             runtime.update(state, dt)

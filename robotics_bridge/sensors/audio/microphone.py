@@ -92,7 +92,7 @@ class Listener:
             UsageError: the time step changed.
         """
         c, m, envs = self._suite.context, self.microphone, self._suite.num_envs
-        rate, age, block = self.samples / dt, c.clock.age, (self.samples, envs)
+        rate, age, block = self.samples / dt, c.age, (self.samples, envs)
         # The ring holds the longest delay, reach / c, a few samples for the interpolation, and the block being written.
         blocks = math.ceil((m.reach / m.speed_of_sound * rate + 3) / self.samples) + 1
         if self._ring is None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import Any
 
 import numpy as np
 
@@ -22,16 +21,10 @@ from robotics_bridge.sensors.audio.kernels.sound import (
 )
 from robotics_bridge.sensors.audio.sensors import ActuationAudio, ContactAudio
 from robotics_bridge.sensors.context import SuiteContext, fill
-from robotics_bridge.sensors.noise.model import stream_seed
+from robotics_bridge.sensors.noise.model import stream_key
 from robotics_bridge.sensors.runtime import Runtime
 
 wp = warp()
-
-
-def _key(seed: int, name: str) -> dict[str, Any]:
-    """Return both halves of the key of a source's random numbers."""
-    key = stream_seed(seed, f"{name}/sound")
-    return {"key_low": wp.uint32(key & 0xFFFFFFFF), "key_high": wp.uint32(key >> 32)}
 
 
 class ContactAudioRuntime(Runtime):
@@ -73,7 +66,7 @@ class ContactAudioRuntime(Runtime):
             poles[2, rows, column] = np.where(heard, gain * np.sin(theta), 0.0)
             poles[:2, rows, column] *= heard
             pulse = int(np.clip(round(sensor.contact_time / step), 1, self.samples))
-            link, key = self.context.scene.link_index(sensor.link), _key(self.context.seed, name)
+            link, key = self.context.scene.link_index(sensor.link), stream_key(self.context.seed, f"{name}/sound")
             sources.append(fill(SourceParams, sensor, link=link, pulse=pulse, **key))
         for array, values in zip((self._own.first, self._own.second, self._own.gain), poles, strict=True):
             # Four modes side by side in one vector: a thread loads them at once.
@@ -97,7 +90,8 @@ class DriveAudioRuntime(Runtime):
         first = next(iter(sensors.values()))
         self.samples = first.samples
         super().__init__(sensors, self.samples, context, fusable=False)
-        settings = [fill(DriveSoundParams, sensor, **_key(context.seed, name)) for name, sensor in sensors.items()]
+        keys = [stream_key(context.seed, f"{name}/sound") for name in sensors]
+        settings = [fill(DriveSoundParams, each, **key) for each, key in zip(sensors.values(), keys, strict=True)]
         own, shape = DriveSoundArrays(), (context.num_envs, self.count)
         own.settings, own.part, own.number = context.array(settings, DriveSoundParams), self.part, self.probe
         for name in ("effort", "speed", "last_loud", "last_speed", "phase", "hum_phase"):

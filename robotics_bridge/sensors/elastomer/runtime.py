@@ -46,9 +46,7 @@ class ElastomerRuntime(ProbeRuntime):
         self._planes = 2 if any(sensor.noise.radius for sensor in self._sensors) else 1
         count, tracked = len(self._sensors), first.tracked(scene)
         self._followed = first.points > 0 and bool(tracked)
-        cloud = (
-            sample_cloud(scene, tracked, first.points, context.solids.rows, context.device) if self._followed else None
-        )
+        cloud = sample_cloud(context, tracked, first.points) if self._followed else None
         self.points = cloud.struct if cloud else CloudArrays()
         """Warp structure of the surface points that are followed."""
         total_points = cloud.total if cloud else 0

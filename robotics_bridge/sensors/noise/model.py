@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import hashlib
 import os
+import struct
 from dataclasses import dataclass, fields
 from typing import Any
 
@@ -116,16 +117,14 @@ class Noise:
                 f"{sensor} has no noise knob {', '.join(map(repr, extra))}; it has: {', '.join(sorted(knobs))}."
             )
 
-    def params(self, seed: int) -> Any:
-        """Return the Warp structure ``NoiseParams`` for a 64-bit ``seed`` (see :func:`stream_seed`)."""
+    def params(self, seed: int, name: str) -> Any:
+        """Return the Warp structure ``NoiseParams`` of the sensor ``name`` in an experiment."""
         from robotics_bridge.sensors.context import fill
         from robotics_bridge.sensors.noise.kernels.noise import NoiseParams
 
-        wp = warp()
-        key = {"key_low": wp.uint32(seed & 0xFFFFFFFF), "key_high": wp.uint32((seed >> 32) & 0xFFFFFFFF)}
         ranges = dict(zip(("gain_low", "gain_high", "dead_low", "dead_high"), self.gain + self.dead_range, strict=True))
         levels = 1.0 / self.quantum if self.quantum else 0.0
-        return fill(NoiseParams, self, tau=self.hysteresis_tau, levels=levels, **key, **ranges)
+        return fill(NoiseParams, self, tau=self.hysteresis_tau, levels=levels, **stream_key(seed, name), **ranges)
 
     def save(self, path: str | os.PathLike[str], **about: Any) -> None:
         """Write the knobs as a preset (JSON), with what else is worth telling about it."""
@@ -179,7 +178,8 @@ for _alias, _name in {"agg_bool": "bool", "agg_force": "depth", "force_torque": 
     PRESETS[f"published-{_alias}"] = PRESETS[f"published-{_name}"]
 
 
-def stream_seed(seed: int, name: str) -> int:
-    """Return the 64-bit seed of one sensor: a stable hash of the experiment's seed and the sensor's name."""
+def stream_key(seed: int, name: str) -> dict[str, Any]:
+    """Return both halves of the key of a sensor's random numbers, a stable hash of seed and name."""
     # A hash and not the sensor's number: adding a sensor leaves the noise of the others as it was.
-    return int.from_bytes(hashlib.sha256(f"{seed}:{name}".encode()).digest()[:8], "little")
+    low, high = struct.unpack("<II", hashlib.sha256(f"{seed}:{name}".encode()).digest()[:8])
+    return {"key_low": warp().uint32(low), "key_high": warp().uint32(high)}

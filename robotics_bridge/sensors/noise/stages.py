@@ -16,9 +16,9 @@ from numpy.typing import ArrayLike, NDArray
 from brainbench.core.devices import pick_device, warp
 from brainbench.core.errors import UsageError
 from brainbench.core.reading.ranges import check_number
-from robotics_bridge.sensors.context import LaunchContext, ReadoutSlice, UpdateClock
+from robotics_bridge.sensors.context import LaunchContext, ReadoutSlice
 from robotics_bridge.sensors.noise.kernels.noise import NoiseParams, crosstalk, delay_line, measure
-from robotics_bridge.sensors.noise.model import Noise, stream_seed
+from robotics_bridge.sensors.noise.model import Noise
 
 wp = warp()
 
@@ -26,8 +26,8 @@ wp = warp()
 class ReadingNoise:
     """Noise of the sensors that share planar arrays: what their own kernel leaves to stages, and the delay.
 
-    It needs no reset: what belongs to an environment whose ``clock.age`` is 0 counts as zero. A late reading (held until
-    the next) carries the noise it was recorded with; before the first one after a reset has arrived, the first is read.
+    It needs no reset: what belongs to an environment whose ``age`` is 0 counts as zero. A late reading (held until the
+    next) carries the noise it was recorded with; before the first one after a reset has arrived, the first is read.
 
     Args:
         slices: The sensors, one after another on N.
@@ -58,7 +58,7 @@ class ReadingNoise:
             active[part.span] = 1 if part.active is None else part.active
         self.part, self.probe, self._active = (context.array(item, int) for item in (index, probe, active))
         """Warp arrays [N]: number of the sensor, number of the probe within it, 0 for fillers."""
-        structures = [part.noise.params(stream_seed(context.seed, part.name)) for part in slices]
+        structures = [part.noise.params(context.seed, part.name) for part in slices]
         self.params = context.array(structures, NoiseParams)
         """Warp array [S] of the knobs."""
         self._hysteresis = self._zeros(staged and any(noise.hysteresis for noise in noises))
@@ -112,8 +112,8 @@ class ReadingNoise:
         Raises:
             UsageError: the time step ``dt`` (s) became so short that recorded readings do not reach back far enough.
         """
-        context, clock = self._context, self._context.clock
-        known, now = [self.params, self.part], [clock.age, clock.episode, int(clock.env_offset), float(dt)]
+        context = self._context
+        known, now = [self.params, self.part], [context.age, context.episode, context.env_offset, float(dt)]
         if self._mixes:
             first, second = self._buffers
             # Rows into one buffer, columns into the other: threads read neighbours, so no pass writes what it reads.
@@ -188,13 +188,12 @@ def simulate(
     if any(not isinstance(side, int) or side < 1 for side in layout) or math.prod(layout) != probes:
         raise UsageError(f"The layout of {probes} probes is (ny, nx) with ny nx = {probes}; received {layout}.")
     where = pick_device(device)
-    clock = UpdateClock(*(wp.zeros(envs, dtype=int, device=where) for _ in range(2)), env_offset=env_offset)
     slices = [ReadoutSlice(name, replace(noise, radius=0.0), 0, layout)]
-    context = LaunchContext(envs, where, seed, clock)
+    context = LaunchContext(envs, where, seed, env_offset)
     stages = ReadingNoise(slices, channels, context, staged=True, gained=False)
     measured, out = context.zeros((channels, envs, probes)), np.empty_like(frames)
     for step, frame in enumerate(frames):
-        clock.age.fill_(step)
+        context.age.fill_(step)
         stages.launch(wp.array(np.ascontiguousarray(frame.transpose(2, 0, 1)), device=where), measured, dt)
         out[step] = stages.read(measured).numpy().transpose(1, 2, 0)
     return out

@@ -10,9 +10,8 @@ from numpy.typing import ArrayLike
 
 from brainbench.core.devices import to_struct, warp
 from robotics_bridge.physics.state import HandState
-from robotics_bridge.sensors.context import Launcher
+from robotics_bridge.sensors.context import SuiteContext
 from robotics_bridge.sensors.queries.kernels.pairs import CONTACTS, PairArrays, SlotArrays, pair_kernel, start_kernel
-from robotics_bridge.sensors.queries.solids import Solids
 
 _LISTED = 16
 """Geometries in contact with one link that are listed where lists of all would be too long."""
@@ -29,16 +28,13 @@ class PairTable:
     :meth:`freeze`, when all sensors have asked.
 
     Args:
-        solids: the geometries.
-        num_envs: B.
-        device: where.
+        context: of the suite.
         listed: geometries in contact with one link that are listed at once; None lists all, where that takes at most
             256 MiB, and 16 otherwise.
     """
 
-    def __init__(self, solids: Solids, num_envs: int, device: Any, listed: int | None = None) -> None:
-        self._solids, self._num_envs, self._device, self._listed = solids, num_envs, device, listed
-        self._launch, self._slots = Launcher(device), list[dict[str, Any]]()
+    def __init__(self, context: SuiteContext, listed: int | None = None) -> None:
+        self._context, self._listed, self._slots = context, listed, list[dict[str, Any]]()
         self.struct: Any = None
         """The Warp structure ``PairArrays``; None before :meth:`freeze`."""
         self.plan: Any = None
@@ -82,21 +78,21 @@ class PairTable:
 
     def freeze(self) -> None:
         """Make the arrays."""
-        wp, device, slots, envs = warp(), self._device, self._slots, self._num_envs
+        c, slots, envs = self._context, self._slots, self._context.num_envs
         self._contacts = any(slot["contact"] for slot in slots)
         # A processor gains nothing from more threads.
-        self._apart = self._contacts and bool(device.is_cuda)
+        self._apart = self._contacts and bool(c.device.is_cuda)
         most = self._listed
         if most is None and envs * _PLACE_BYTES * sum(len(s["members"]) for s in slots) > _LIST_BYTES:
             most = _LISTED
         self._rooms = [max(1, len(s["members"][: most if s["contact"] else None])) for s in slots]
         self._words = max([1, *(-(-len(s["members"]) // 32) for s in slots)])
         count = max(len(slots), 1)
-        place = np.full((count, self._solids.kinds.shape[1]), -1)
+        place = np.full((count, c.solids.kinds.shape[1]), -1)
         for number, slot in enumerate(slots):
             place[number, list(slot["members"])] = np.arange(len(slot["members"]))
         # The link of every geometry whose contacts matter, to turn the others away at once.
-        links = self._solids.scene.link_of if self._solids.scene.geometries else np.full(1, -1)
+        links = c.scene.link_of if c.scene.geometries else np.full(1, -1)
         first = np.cumsum([0, *self._rooms])
         plan = {
             "link": [s["link"] for s in slots],
@@ -111,30 +107,24 @@ class PairTable:
             "center": np.reshape([s["center"] for s in slots], (-1, 3)),
             "reach": [s["reach"] for s in slots],
         }
-        self.plan = to_struct(SlotArrays, {name: np.asarray(values) for name, values in plan.items()}, device)
+        self.plan = to_struct(SlotArrays, {name: np.asarray(values) for name, values in plan.items()}, c.device)
         listed = (envs, max(int(first[-1]), 1))
         found = PairArrays()
-        found.first, found.count = self.plan.first, wp.zeros((envs, count), dtype=int, device=device)
-        found.geometry = wp.zeros(listed, dtype=int, device=device)
-        found.rotation = wp.zeros(listed, dtype=wp.mat33f, device=device)
+        found.first, found.count = self.plan.first, c.zeros((envs, count), int)
+        found.geometry, found.rotation = c.zeros(listed, int), c.zeros(listed, warp().mat33f)
         for name in ("offset", "velocity", "spin"):
-            setattr(found, name, wp.zeros(listed, dtype=wp.vec3f, device=device))
+            setattr(found, name, c.zeros(listed, warp().vec3f))
         self.struct = found
-        self._bits = wp.zeros((envs, count * self._words), dtype=int, device=device)
-        self.crowded, self.diverged = (wp.zeros(envs, dtype=int, device=device) for _ in range(2))
-
-    def start(self, state: HandState, age: Any) -> None:
-        """Count an update, refresh the state's status and mark contacts."""
-        room = state.contact_env.shape[0]
-        inputs = [self.plan, state.arrays, self._words, self._bits, age, self.diverged]
-        dim = max(self._num_envs, -(-room // CONTACTS)) if self._contacts else self._num_envs
-        self._launch(start_kernel(self._contacts, self._apart), dim, *inputs)
+        self._bits = c.zeros((envs, count * self._words), int)
+        self.crowded, self.diverged = (c.zeros(envs, int) for _ in range(2))
 
     def update(self, state: HandState) -> None:
-        """List what every slot meets now; contacts were marked by :meth:`start`."""
-        if not self._slots:
-            return
-        inputs = [self.plan, self._solids.struct, state.arrays, self._words, self._bits, self.struct]
-        inputs += [self.crowded, self.diverged]
-        dim = self._num_envs * (len(self._slots) + self._apart * state.num_links)
-        self._launch(pair_kernel(self._apart), dim, *inputs)
+        """Count an update, refresh the state's status, mark contacts, and list what every slot meets now."""
+        c, envs, room = self._context, self._context.num_envs, state.contact_env.shape[0]
+        inputs = [self.plan, state.arrays, self._words, self._bits, c.age, self.diverged]
+        dim = max(envs, -(-room // CONTACTS)) if self._contacts else envs
+        c.launch(start_kernel(self._contacts, self._apart), dim, *inputs)
+        if self._slots:
+            inputs = [self.plan, c.solids.struct, state.arrays, self._words, self._bits, self.struct]
+            dim = envs * (len(self._slots) + self._apart * state.num_links)
+            c.launch(pair_kernel(self._apart), dim, *inputs, self.crowded, self.diverged)

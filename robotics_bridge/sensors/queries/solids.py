@@ -110,8 +110,6 @@ class Solids:
                 described = seen[id(geometry)]
                 self.kinds[rows, index], size[rows, index], bound[rows, index] = described[:3]
                 frame[rows, index], field[rows, index], mesh[rows, index] = described[3:]
-        self.field_count, self.tree_count = len(self._fields), len(self._trees)
-        """Distance fields and triangle trees on the device."""
         volumes = list(self._fields.values()) or [Field(np.zeros((2, 2, 2), np.float32), np.zeros(3, np.float32), 1.0)]
         starts = np.cumsum([0, *(v.values.size for v in volumes)])
         if starts[-1] >= 2**31:

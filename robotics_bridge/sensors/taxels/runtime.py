@@ -63,7 +63,7 @@ class ProximityRuntime(ProbeRuntime):
         super().__init__(sensors, 6, context, reach=max(sensor.noise.radius for sensor in sensors.values()))
         first = next(iter(sensors.values()))
         tracked, rows = first.tracked(context.scene), context.solids.rows
-        self.cloud = sample_cloud(context.scene, tracked, first.points, rows, context.device)
+        self.cloud = sample_cloud(context, tracked, first.points)
         laws = [fill(ProximityParams, sensor) for sensor in sensors.values()]
         densities = np.zeros((len(sensors), rows))
         for row, sensor in zip(densities, sensors.values(), strict=True):

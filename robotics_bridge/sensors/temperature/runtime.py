@@ -58,6 +58,9 @@ class TemperatureRuntime(Runtime):
         heat.number, heat.kept = context.zeros(many, int), context.zeros((*many, CAPACITY), int)
         heat.touched, heat.covered, heat.conductance, heat.inflow = (context.zeros(shape) for _ in range(4))
         heat.temperature, heat.element = (context.zeros(shape, wp.float64) for _ in range(2))
+        sizes = np.square([sensor.cells for sensor in self._sensors])
+        heat.matrix = context.zeros(int(sizes.sum()))
+        heat.offset = context.array((np.cumsum(sizes) - sizes.ravel()).reshape(-1, 3), int)
         self.heat = heat
         """Warp structure of contacts, bodies and fields."""
         self._buffers = [context.zeros(shape, wp.float64) for _ in range(2)]
@@ -93,20 +96,12 @@ class TemperatureRuntime(Runtime):
         # Exponentials are taken on the host and only when the step changes.
         if dt == self._dt:
             return
-        matrices, offsets, start = [], [], 0
-        for sensor, edges in zip(self._sensors, self._edges, strict=True):
-            row = []
-            for axis in range(3):
-                block = diffusion(sensor.cells[axis], edges[axis], material(sensor.material).diffusivity * dt)
-                row.append(start)
-                start += block.size
-                matrices.append(block.ravel())
-            offsets.append(row)
-        values = np.concatenate(matrices).astype(np.float32)
-        if math.isnan(self._dt):
-            self.heat.matrix, self.heat.offset = self.context.array(values, float), self.context.array(offsets, int)
-        else:
-            self.heat.matrix.assign(values)
+        matrices = [
+            diffusion(cells, edge, material(sensor.material).diffusivity * dt).ravel()
+            for sensor, edges in zip(self._sensors, self._edges, strict=True)
+            for cells, edge in zip(sensor.cells, edges, strict=True)
+        ]
+        self.heat.matrix.assign(np.concatenate(matrices).astype(np.float32))
         self._dt = dt
 
     def run_kernels(self, state: HandState, dt: float) -> None:

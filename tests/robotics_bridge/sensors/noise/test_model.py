@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 from scipy import stats
 
 from brainbench.core.errors import DataError, UsageError
-from robotics_bridge.sensors.context import LaunchContext, ReadoutSlice, UpdateClock
-from robotics_bridge.sensors.noise.model import PRESETS, TAXEL_KNOBS, Noise, stream_seed
+from robotics_bridge.sensors.context import LaunchContext, ReadoutSlice
+from robotics_bridge.sensors.noise.model import PRESETS, TAXEL_KNOBS, Noise, stream_key
 from robotics_bridge.sensors.noise.stages import ReadingNoise, gaussian_weights, simulate
 from tests.factories.sensor_episode import require_processor
 
@@ -139,7 +139,7 @@ def test_the_radius_error_is_uniform_and_new_in_every_update():
 
     wp = warp()
     out = wp.zeros((200, 50), dtype=wp.float32, device="cpu")
-    wp.launch(_radius_kernel(), dim=(200, 50), inputs=[Noise(radius=3e-4).params(7), out], device="cpu")
+    wp.launch(_radius_kernel(), dim=(200, 50), inputs=[Noise(radius=3e-4).params(7, "a"), out], device="cpu")
     assert stats.kstest(out.numpy().ravel(), "uniform", args=(-3e-4, 6e-4)).pvalue > 0.01
     assert abs(np.corrcoef(out.numpy()[1:].ravel(), out.numpy()[:-1].ravel())[0, 1]) < 0.03
 
@@ -163,7 +163,7 @@ def test_other_seeds_and_other_names_read_differently_and_the_same_ones_alike():
     assert np.array_equal(first, simulate(Noise(white=1.0), x, dt=0.01, seed=1))
     for other in ({"seed": 2}, {"seed": 1, "name": "other"}):
         assert not np.any(first == simulate(Noise(white=1.0), x, dt=0.01, **other))
-    assert stream_seed(1, "23") != stream_seed(12, "3")
+    assert stream_key(1, "23") != stream_key(12, "3")
 
 
 def test_a_normalised_crosstalk_keeps_the_total_away_from_the_edge_and_strength_zero_changes_nothing():
@@ -234,11 +234,11 @@ def _stage(noise: Noise, envs: int = 3, probes: int = 4, active: np.ndarray | No
     from brainbench.core.devices import pick_device, warp
 
     wp = warp()
-    clock = UpdateClock(*(wp.zeros(envs, dtype=wp.int32, device="cpu") for _ in range(2)), env_offset=0)
-    context = LaunchContext(envs, pick_device("cpu"), 0, clock)
+    context = LaunchContext(envs, pick_device("cpu"), 0, 0)
+    context.age.fill_(0)
     slices = [ReadoutSlice("sensor", noise, 0, (probes,), active=active)]
     x, out = (wp.zeros((1, envs, probes), dtype=wp.float32, device="cpu") for _ in range(2))
-    return clock, ReadingNoise(slices, 1, context, staged=True, gained=gained), x, out
+    return context, ReadingNoise(slices, 1, context, staged=True, gained=gained), x, out
 
 
 def test_a_reset_redraws_and_forgets_in_its_environment_alone():
