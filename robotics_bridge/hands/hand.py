@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -49,8 +49,8 @@ class Hand:
     """The data of one of our own hands."""
     path: Path | None = None
     """The file of any other."""
-    probes: Mapping[str, Layout] = field(default_factory=dict)
-    """Resolution → layout read from a probe file; ``custom`` of :meth:`with_probes`."""
+    custom: Layout | None = None
+    """Probes of :meth:`with_probes`, the resolution ``custom``."""
 
     def mjspec(self) -> Any:
         """Return a new ``mujoco.MjSpec`` of the hand, for scenes to attach; the palm is fixed to the world.
@@ -106,8 +106,8 @@ class Hand:
         links = self.links(placement)
         if resolution.endswith(".json"):
             return self.with_probes(resolution).layout("custom", placement)
-        if resolution in self.probes:
-            return select(self.probes[resolution], links)
+        if resolution == "custom" and self.custom is not None:
+            return select(self.custom, links)
         check_names(resolution, placement)
         if self.spec is not None:
             return {
@@ -117,7 +117,7 @@ class Hand:
             }
         return self._cast(resolution, links)
 
-    def with_probes(self, source: str | os.PathLike[str] | Layout, resolution: str = "custom") -> Hand:
+    def with_probes(self, source: str | os.PathLike[str] | Layout) -> Hand:
         """Return the hand with a layout from a probe file (:func:`read_probes`) or a mapping of link to probes.
 
         Raises:
@@ -127,7 +127,7 @@ class Hand:
         known = [self.model.body(index).name for index in range(1, self.model.nbody)]
         for link in layout:
             check_name("link", link, known)
-        return Hand(self.name, self.palm, self.fingers, self.spec, self.path, {**self.probes, resolution: layout})
+        return replace(self, custom=layout)
 
     def _cast(self, resolution: str, links: tuple[str, ...]) -> Layout:
         from robotics_bridge.hands.surface import cast_grid, geoms_of

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Mapping
 from typing import Any
 
@@ -71,6 +72,7 @@ class TemperatureRuntime(Runtime):
         limits = [value for sensor in self._sensors for value in (sensor.warm_range, sensor.cold_range)]
         if not self.noisy and (min(limits) < math.inf or any(sensor.tau > 0 for sensor in self._sensors)):
             self.io.measured = wp.zeros_like(self.io.truth)
+        self._warned = False
         self._dt = math.nan
         self._set_step(1e-2)
 
@@ -110,6 +112,15 @@ class TemperatureRuntime(Runtime):
         c, heat, cells = self.context, self.heat, (self.context.num_envs, self.count)
         heat.number.zero_()
         c.launch(collect_contacts, state.contact_env.shape[0], state.arrays, heat)
+        # On a GPU, where looking would wait for the device, ``lost_contacts`` tells.
+        if not (self._warned or c.device.is_cuda) and (most := int(heat.number.numpy().max(initial=0))) > CAPACITY:
+            self._warned = True
+            warnings.warn(
+                f"{most} contacts touched one temperature grid at once; heat flows through {CAPACITY} alone. Give its "
+                "link fewer or simpler geometries.",
+                RuntimeWarning,
+                stacklevel=5,
+            )
         for measure in (1, 0):
             c.launch(conduct_contacts, heat.kept.shape, measure, state.arrays, heat, self.io)
         # Sources, contacts and surfaces first, then diffusion axis by axis: the exponentials of the axes commute, so

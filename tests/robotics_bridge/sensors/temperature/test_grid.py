@@ -414,12 +414,14 @@ def test_a_grid_needs_finite_geometry_or_corners():
         link_temperature(suite, "gird")
 
 
-def test_contacts_without_room_are_counted():
+def test_contacts_without_room_are_counted_and_warned_of_once():
     suite, state = _make(contacts=60, bodies={"object": ThermalBody("steel", 60.0)})
     state.set_contacts(
         np.zeros(60), np.tile([[0, 1]], (60, 1)), distance=np.full(60, -1e-4),
         position=np.random.default_rng(0).normal(size=(60, 3)) * 0.01, normal=np.tile([0.0, 0, 1], (60, 1)),
     )  # fmt: skip
+    with pytest.warns(RuntimeWarning, match="60 contacts touched one temperature grid"):
+        suite.update(state, 0.01)
     suite.update(state, 0.01)
     assert lost_contacts(suite, "grid").tolist() == [12]
     assert float(suite.read("grid").max()) > 22
