@@ -43,14 +43,15 @@ class PressureCalibration:
     """Contact pressure, in the maker's unit, above which a finger touches (η_real of 4.31)."""
 
     def __post_init__(self) -> None:
-        of = "{!r} of a pressure calibration"
+        of = "'{}' of a pressure calibration"
         check_fields(self, "threshold", of=of, above=0, most=LARGEST_SCALE)
         check_fields(self, "axes", of=of, items=3)
         factors = [("scale", self.scale), *self.per_finger.items(), *(("axes", factor) for factor in self.axes)]
         for name, factor in factors:
-            check_number(of.format(name), factor, least=-LARGEST_SCALE, most=LARGEST_SCALE)
+            told = of.replace("{}", name)
+            check_number(told, factor, least=-LARGEST_SCALE, most=LARGEST_SCALE)
             if factor == 0:
-                raise UsageError(f"{of.format(name)} must not be 0; received {factor}.")
+                raise UsageError(f"{told} must not be 0; received {factor}.")
 
     def force(self, fingers: tuple[str, ...], pressure: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the simulator's ``agg_force`` [F, 3] of pressures [F, 3]."""

@@ -63,7 +63,7 @@ class Geometry:
                 f"The {self.kind} {self.name!r} needs {needed} positive size(s) in metres; received {self.size}."
             )
         for size in self.size[:needed]:
-            check_number(of.format("size"), size, above=0)
+            check_number(f"size of {self.name!r}", size, above=0)
         check_fields(self, "contype", "affinity", of=of, whole=True)
         check_fields(self, "position", of=of, items=3)
         check_fields(self, "quaternion", of=of, items=4)

@@ -49,7 +49,8 @@ def check_fields(options: Any, *names: str, of: str = "{}", items: int = 0, **bo
     """
     kinds = {field.name: str(field.type) for field in fields(options)}
     for name in names:
-        value, told = getattr(options, name), of.format(name)
+        # No format: what a user named may hold braces of its own.
+        value, told = getattr(options, name), of.replace("{}", name)
         if value is None and "None" in kinds[name]:
             continue
         values = [value] if not items else list(value) if isinstance(value, Iterable) else []

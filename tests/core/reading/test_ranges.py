@@ -1,4 +1,5 @@
 import math
+import re
 from dataclasses import dataclass
 
 import pytest
@@ -55,3 +56,9 @@ def test_a_vector_is_three_finite_numbers(wrong: object):
     check_vector("place", [0, 1.5, -2])
     with pytest.raises(UsageError, match="place must be three finite numbers"):
         check_vector("place", wrong)
+
+
+@pytest.mark.parametrize("own", ["a}b", "{0}", "{name!x}"])
+def test_braces_in_what_a_user_named_are_told_as_they_are(own: str):
+    with pytest.raises(UsageError, match=re.escape(f"rate of {own!r} must be")):
+        check_fields(Options(rate=-1.0), "rate", of=f"{{}} of {own!r}", least=0)
