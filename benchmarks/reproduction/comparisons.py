@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Any
 
+from benchmarks.reproduction.campaign import NetworkKey
+from benchmarks.reproduction.contrasts import Matched
+from benchmarks.reproduction.measures import ANIMALS, RANDOM_FEATURES, Measured
 from brainbench.core.statistics import LEVEL
 from leaderboards.boards import RAW_INPUT
-from leaderboards.reproduction.campaign import NetworkKey
-from leaderboards.reproduction.contrasts import Matched
-from leaderboards.reproduction.measures import ANIMALS, RANDOM_FEATURES, Measured
 
 _Chosen = tuple[list[Matched], str, float]
 _Choice = Callable[[Measured], _Chosen]
