@@ -10,7 +10,7 @@ from xml.etree import ElementTree
 import pytest
 
 from tests.factories.benchmark_programs import benchmark_program
-from tests.factories.campaigns import draw_campaign, draw_records
+from tests.factories.campaigns import draw_campaign, draw_records, draw_trainings, write_campaign
 
 CAMPAIGN, PAGE = benchmark_program("reproduction.campaign"), benchmark_program("reproduction.page")
 
@@ -72,6 +72,16 @@ def test_the_page_of_the_documentation_is_that_of_the_campaign_in_the_repository
     files, _ = PAGE.write_page(CAMPAIGN.read_campaign(ROOT / "leaderboards" / "reproduction"), tmp_path)
     for file in files:
         assert file.read_bytes() == (ROOT / "docs" / file.relative_to(tmp_path)).read_bytes()
+
+
+def test_the_program_writes_the_page_and_prints_verdicts(tmp_path, monkeypatch, capsys):
+    folder, out = write_campaign(tmp_path / "campaign", draw_trainings(1), draw_records(1)[:3]), tmp_path / "out"
+    monkeypatch.setattr("sys.argv", ["reproduction", str(folder), "--out", str(out)])
+    benchmark_program("reproduction.__main__").main()
+    lines = capsys.readouterr().out.splitlines()
+    assert next(line for line in lines if line.startswith("gpt-accuracy ")).endswith("holds")
+    assert lines[-1] == str(out / PAGE.PAGE)
+    assert (out / PAGE.PAGE).is_file()
 
 
 def test_networks_of_another_size_and_what_is_missing_are_named(tmp_path):
