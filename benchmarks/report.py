@@ -10,7 +10,7 @@ import datetime
 import os
 import platform
 import re
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Container, Iterable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -132,9 +132,10 @@ def write_page() -> None:
     write_text(PAGE, page(read_sections()))
 
 
-def table(columns: list[str], rows: list[list[str]]) -> str:
-    """Lay out a Markdown table."""
-    lines = ["| " + " | ".join(columns) + " |", "|" + "---|" * len(columns)]
+def table(columns: list[str], rows: list[list[str]], *, right: Container[str] = ()) -> str:
+    """Lay out a Markdown table; columns named in ``right`` are aligned to that side."""
+    rule = "".join("---:|" if name in right else "---|" for name in columns)
+    lines = ["| " + " | ".join(columns) + " |", "|" + rule]
     return "\n".join(lines + ["| " + " | ".join(row) + " |" for row in rows])
 
 

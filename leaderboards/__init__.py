@@ -4,8 +4,7 @@ A record is one JSON file per score, named by its content (:mod:`leaderboards.st
 ``record.schema.json``. :mod:`leaderboards.boards` decides what may be compared with what, :mod:`leaderboards.entries`
 folds seeds together, :mod:`leaderboards.ranking` tests which models differ, :mod:`leaderboards.standing` says what a
 score is worth and :mod:`leaderboards.conclusions` says it all in sentences. :mod:`leaderboards.figures` draws,
-:mod:`leaderboards.site` writes pages and :mod:`leaderboards.report` papers, :mod:`leaderboards.reproduction` holds
-trainings and records against the published study; :mod:`leaderboards.audit` finds stale and
+:mod:`leaderboards.site` writes pages and :mod:`leaderboards.report` papers; :mod:`leaderboards.audit` finds stale and
 contradicting records, :mod:`leaderboards.changes` compares builds, :mod:`leaderboards.held_out` keeps recordings back.
 This package reads records, never models.
 """

@@ -28,9 +28,6 @@ svg.figure{font:12px system-ui,-apple-system,"Segoe UI",Roboto,"Helvetica Neue",
 """
 """Colours of a drawing that stands alone; the pages bring their own for light and dark."""
 
-_DARK = "@media (prefers-color-scheme:dark){svg.figure{filter:invert(1) hue-rotate(180deg)}}"
-"""The same on a dark ground: light and dark change places, hues stay."""
-
 COLOURS = 8
 """Classes ``c1`` to ``c8``; ``c0`` is grey."""
 
@@ -91,14 +88,11 @@ class Drawing:
         return self.render()
 
 
-def standalone(drawing: Drawing, *, follow: bool = False) -> str:
-    """Return a drawing as a file of its own, with its colours and a white ground.
-
-    With ``follow`` it turns dark where the page around it, or the reader's system, is dark.
-    """
+def standalone(drawing: Drawing) -> str:
+    """Return a drawing as a file of its own, with its colours and a white ground."""
     ground = f'<rect width="{_n(drawing.width)}" height="{_n(drawing.height)}" fill="#fff"/>'
     copy = Drawing(drawing.width, drawing.height, drawing.title, [ground, *drawing.parts])
-    return copy.render(style=STYLE + _DARK * follow)
+    return copy.render(style=STYLE)
 
 
 @dataclass(frozen=True)

@@ -38,14 +38,15 @@ def render(template: str, **values: Any) -> str:
 
 def render_markdown(template: str, **values: Any) -> str:
     """Fill ``template`` with every value escaped for Markdown, and for the HTML that Markdown may hold."""
-    environment = _environment().overlay(autoescape=False, finalize=_escape_markdown)
+    environment = _environment().overlay(autoescape=False, finalize=escape_markdown)
     return environment.get_template(template).render(**values)
 
 
 _MARKDOWN = str.maketrans({mark: f"\\{mark}" for mark in "\\`*_{}[]|#!"} | {"<": "&lt;", ">": "&gt;"})
 
 
-def _escape_markdown(value: Any) -> Any:
+def escape_markdown(value: Any) -> Any:
+    """Return a value as text of one line that Markdown, and the HTML in it, take literally; markup stays as it is."""
     return value if isinstance(value, Markup) else " ".join(str(value).translate(_MARKDOWN).split())
 
 

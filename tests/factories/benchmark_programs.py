@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-from pathlib import Path
+from importlib import import_module
 from types import ModuleType
-
-from brainbench.core.plugins import load_module
-
-BENCHMARKS = Path(__file__).parents[2] / "benchmarks"
 
 
 def benchmark_program(name: str) -> ModuleType:
-    """The program of a path relative to ``benchmarks``."""
-    return load_module(str(BENCHMARKS / name))
+    """The module of a name inside ``benchmarks``, as ``policies.jobs``."""
+    return import_module(f"benchmarks.{name}")

@@ -12,14 +12,15 @@ import msgspec
 import numpy as np
 
 from brainbench.core.records import LayerScore, ModelCard, ResultRecord
-from leaderboards.reproduction.campaign import Campaign, join_campaign
-from leaderboards.reproduction.trainings import Training
 from leaderboards.store import write_record
+from tests.factories.benchmark_programs import benchmark_program
 from tests.factories.records import draw_board
 
+CAMPAIGN = benchmark_program("reproduction.campaign")
 TEST_SWEEPS = 10_000
 _ENCODERS = ("zhuang", "zhuang-gru", "zhuang-intersection-ln", "resnet18", "s4")
-_OBJECTIVES = ("simclr", "simsiam", "ae", "untrained")
+_OBJECTIVES = {"simclr": "physical", "simsiam": "physical", "ae": "physical", "untrained": "none"}
+"""Objective → usual augmentation."""
 
 
 def networks(seeds: int = 2) -> list[dict[str, Any]]:
@@ -27,13 +28,13 @@ def networks(seeds: int = 2) -> list[dict[str, Any]]:
     found = []
     for encoder in _ENCODERS:
         for attender in ("", "+gpt", "+mamba"):
-            found += [(f"{encoder}-small{attender}", "supervised", "physical", 0.0, seed) for seed in range(seeds)]
+            found += [(f"{encoder}-small{attender}", "supervised", "none", 0.0, seed) for seed in range(seeds)]
     for encoder in ("zhuang-gru", "zhuang-intersection-ln", "resnet18"):
         for attender in ("", "+gpt"):
-            found += [(f"{encoder}-small{attender}", objective, "physical", 0.0, 0) for objective in _OBJECTIVES]
+            found += [(f"{encoder}-small{attender}", *trained, 0.0, 0) for trained in _OBJECTIVES.items()]
         found.append((f"{encoder}-small", "simclr", "image", 0.0, 0))
         found.append((f"{encoder}-small", "simclr", "physical", 0.75, 0))
-    found += [("zhuang-gru-ln-small", "supervised", "physical", 0.0, seed) for seed in range(seeds)]
+    found += [("zhuang-gru-ln-small", "supervised", "none", 0.0, seed) for seed in range(seeds)]
     names = ("model", "objective", "augmentation", "masking", "seed")
     return [dict(zip(names, values, strict=True)) for values in found]
 
@@ -57,7 +58,7 @@ def draw_trainings(sign: float, *, noise: float = 0.004, seed: int = 0) -> list[
     lines = []
     for place, run in enumerate(networks()):
         top5 = float(np.clip(truth(run, sign) + rng.normal(0, noise), 0.01, 0.99))
-        variant = "" if run["augmentation"] == "physical" else f".{run['augmentation']}"
+        variant = f".{run['augmentation']}" if run["augmentation"] == "image" else ""
         variant += ".masked75" if run["masking"] else ""
         lines.append(
             {
@@ -103,10 +104,10 @@ def write_campaign(folder: Path, lines: Iterable[dict[str, Any]] = (), records: 
     return folder
 
 
-def draw_campaign(sign: float, **changes: Any) -> Campaign:
+def draw_campaign(sign: float, **changes: Any) -> Any:
     """Return a campaign in which every published effect has this sign; ``changes`` go to its records."""
-    trainings = [msgspec.convert(line, Training) for line in draw_trainings(sign)]
-    return join_campaign(trainings, draw_records(sign, **changes))
+    trainings = [msgspec.convert(line, CAMPAIGN.Training) for line in draw_trainings(sign)]
+    return CAMPAIGN.join_campaign(trainings, draw_records(sign, **changes))
 
 
 def _evaluation(top5: float) -> dict[str, Any]:

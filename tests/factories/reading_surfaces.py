@@ -46,9 +46,7 @@ from brainbench.stimuli.sweeps.generation import generate
 from brainbench.stimuli.whiskit_runs import read_runs
 from leaderboards import build_leaderboard, read_records
 from leaderboards.held_out import Commitment
-from leaderboards.reproduction.trainings import read_trainings
 from leaderboards.site.folder import MANIFEST, check_site
-from tests.factories.campaigns import draw_trainings
 from tests.factories.published_surfaces import PUBLISHED
 from tests.factories.published_sweeps import write_run
 from tests.factories.reading_trials import Surface, bad_counts, not_finite, numbers, typed, written, written_json
@@ -315,11 +313,6 @@ def _commitment(folder: Path) -> Path:
     return write_json(folder / "held-out.json", Commitment("animals", 3, 8, "9f3c2a7be1d04455", "0f" * 32))
 
 
-def _bad_trainings(trainings: Any) -> bool:
-    shares = [one for item in trainings for one in (item.evaluation, item.twin_evaluation) if one]
-    return not_finite(trainings) or any(not 0 <= one.top1 <= one.top5 <= 1 or one.count < 1 for one in shares)
-
-
 def _whiskers(text: str) -> Any:
     return WhiskerArray.mouse(whiskers=text)
 
@@ -391,12 +384,6 @@ SURFACES = (
     ),
     Surface("site manifest", _site, lambda path: check_site(path.parent), lambda found: not found[1]),
     Surface("commitment", _commitment, Commitment.read, lambda found: min(found.held, found.kept) < 1),
-    Surface(
-        "trainings",
-        written("trainings.json", "".join(json.dumps(line) + "\n" for line in draw_trainings(1.0)[:4])),
-        read_trainings,
-        _bad_trainings,
-    ),
     Surface(
         "fidelity text",
         written("fidelity.txt", "fast,links=12,links_per_mm=0.3,time_step=1e-4,solver=quasistatic"),

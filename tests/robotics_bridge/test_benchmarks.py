@@ -63,7 +63,7 @@ def test_a_state_that_is_kept_and_repeated_is_the_same() -> None:
     state.set_pose(rng.normal(size=(2, 3, 7)))
     state.set_velocity(rng.normal(size=(2, 3, 6)))
     state.set_contacts([1, 0, 1], [(0, 1), (0, 2), (2, 1)], distance=[-1.0, -2.0, -3.0], force=[1.0, 2.0, 3.0])
-    scene = benchmark_program("tactile/scene.py")
+    scene = benchmark_program("tactile.scene")
     found = scene.snapshot(state)
     assert found["env"].tolist() == [0, 1, 1]
     again = scene.snapshot(scene.restore(found, 5, "cpu"))
@@ -77,6 +77,6 @@ def test_a_state_that_is_kept_and_repeated_is_the_same() -> None:
 def test_the_last_record_of_a_case_is_laid_out() -> None:
     base = {"device": "gpu", "part": "step", "case": "none", "share": 1.0}
     rows = [{**base, "envs": n, "env_steps_per_s": rate} for n, rate in ((8, 1.0), (16, 2.0), (8, 3.0))]
-    (heading, body) = benchmark_program("tactile/tables.py").tables(rows)["step"]
+    (heading, body) = benchmark_program("tactile.tables").tables(rows)["step"]
     assert heading == "Tactile whole step on the pyramid (gpu)"
     assert [line.split(" | ")[2] for line in body.splitlines()[2:]] == ["3", "2"]

@@ -11,7 +11,7 @@ import pytest
 from brainbench.core.errors import UsageError
 from tests.factories.benchmark_programs import benchmark_program
 
-JOBS = benchmark_program("policies/jobs.py")
+JOBS = benchmark_program("policies.jobs")
 read_jobs = JOBS.read_jobs
 
 

@@ -1,4 +1,4 @@
-"""``brainbench leaderboard build | report | diff | reproduce``: what people read of a folder of records."""
+"""``brainbench leaderboard build | report | diff``: what people read of a folder of records."""
 
 from __future__ import annotations
 
@@ -88,26 +88,6 @@ def diff(
     if restated := len(changes) - len(told):
         text += f"\n{restated} restated: other records with the same inputs and numbers."
     emit({"changes": changes, "problems": problems}, text + _left_out(problems), as_json=as_json)
-
-
-def reproduce(
-    folder: Annotated[Path, typer.Argument(help="Folder with trainings.jsonl and records/.")],
-    out: Annotated[Path, out_folder_option("Folder of the page.")] = Path("reproduction"),
-    as_json: JsonOption = False,
-) -> None:
-    """Judge every claim of the published study on a campaign, and write the page with figures 3.3 to 3.8."""
-    from leaderboards.reproduction.campaign import read_campaign
-    from leaderboards.reproduction.page import write_page
-    from leaderboards.text import number, span
-
-    files, found = write_page(read_campaign(folder), out)
-    columns = {
-        "claim": "{0.claim.key}",
-        "ours": lambda item: f"{number(item.effect.value)} {span(item.effect.interval)}" if item.effect else "–",
-        "verdict": "{0.verdict}",
-        "rule": "{0.rule}",
-    }
-    emit({"files": files, "judgements": found}, f"{table_of('', found, columns)}\n{files[0]}", as_json=as_json)
 
 
 def _problems(stored: list[StoredRecord]) -> list[dict[str, Any]]:

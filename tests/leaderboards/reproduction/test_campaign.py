@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 
+import msgspec
 import pytest
 
-from brainbench.core.errors import DataError, DataFileNotFoundError, UsageError
-from leaderboards.reproduction.campaign import NetworkKey, board_name, join_campaign, read_campaign
-from leaderboards.reproduction.measures import accuracies, fits
+from brainbench.core.errors import DataError, DataFileNotFoundError
+from tests.factories.benchmark_programs import benchmark_program
 from tests.factories.campaigns import draw_campaign, draw_records, draw_trainings, write_campaign
+
+CAMPAIGN, MEASURES = benchmark_program("reproduction.campaign"), benchmark_program("reproduction.measures")
+NetworkKey, join_campaign, read_campaign = CAMPAIGN.NetworkKey, CAMPAIGN.join_campaign, CAMPAIGN.read_campaign
+accuracies, fits = MEASURES.accuracies, MEASURES.fits
 
 
 def test_trainings_and_records_of_a_folder_meet(tmp_path):
@@ -25,47 +28,28 @@ def test_trainings_and_records_of_a_folder_meet(tmp_path):
         }
     assert NetworkKey("zhuang-gru", "none", "simclr", "masked") in campaign.networks
     assert NetworkKey("zhuang-gru", "none", "simclr", "image") in campaign.networks
-    assert board_name(campaign.boards[0]).startswith("demo")
+    assert CAMPAIGN.board_name(campaign.boards[0]).startswith("demo")
 
 
-@pytest.mark.parametrize(
-    "name", ["zhuang-gru-small+gpt.supervised.seed1", "local-dir:/runs/zhuang-gru-small+gpt.supervised.seed1"]
-)
-def test_a_record_without_card_is_known_by_its_name(name):
-    record = next(one for one in draw_records(1) if one.score.name == "zhuang-gru-small+gpt.supervised")
-    bare = replace(record, card=None, score=replace(record.score, name=name))
-    campaign = join_campaign([], [bare])
-    network = campaign.networks[NetworkKey("zhuang-gru", "gpt", "supervised")]
-    assert list(network.records[0]) == [1]
-    odd = join_campaign([], [replace(bare, score=replace(bare.score, name="features.npz"))])
-    assert not odd.networks
-    assert odd.unmatched == ("features.npz",)
-
-
-def test_of_one_network_and_seed_the_newest_record_counts():
+def test_a_record_that_does_not_say_what_was_trained_is_refused():
     record = draw_records(1)[0]
-    told = {**record.score.provenance, "time": "2027-01-01T00:00:00+00:00"}
-    newer = replace(record, score=replace(record.score, value=0.9, provenance=told))
-    for order in ([record, newer], [newer, record]):
-        campaign = join_campaign([], order)
-        (network,) = campaign.networks.values()
-        assert network.records[0][0].score.value == 0.9
+    for card in (None, replace(record.card, objective=None), replace(record.card, twin=None)):
+        with pytest.raises(DataError, match=record.score.name):
+            join_campaign([], [replace(record, card=card)])
+
+
+def test_two_records_of_one_network_and_seed_are_refused():
+    record = draw_records(1)[0]
+    with pytest.raises(DataError, match="same network and seed"):
+        join_campaign([], [record, replace(record, score=replace(record.score, value=0.9))])
 
 
 def test_networks_of_published_size_enter_no_comparison():
     lines = draw_campaign(1).trainings
     full = replace(lines[0], name="full", model="zhuang+gpt", evaluation=lines[0].evaluation)
     campaign = join_campaign([*lines, full], [])
-    assert campaign.other_sizes == ("zhuang+gpt",)
+    assert [key.name for key in campaign.full] == ["zhuang+gpt.ae"]
     assert "full" not in {line.name for line in campaign.trainings}
-
-
-def test_twins_stand_in_for_untrained_networks():
-    lines = draw_campaign(1).trainings
-    alone = [line for line in lines if line.objective == "simclr"][:1]
-    twin = replace(alone[0], twin_evaluation=replace(alone[0].evaluation, top5=0.11, top1=0.05))
-    found = accuracies(join_campaign([twin], [])).find(objective="untrained")
-    assert [item.value for item in found.values()] == [0.11]
 
 
 def test_unreliable_scores_are_left_out():
@@ -78,39 +62,32 @@ def test_unreliable_scores_are_left_out():
 @pytest.mark.parametrize(
     ("change", "told"),
     [
-        ({"objective": "supervized"}, "supervised"),
-        ({"evaluation": {"top1": 0.5, "top5": 0.4, "count": 10}}, "top-5 0.4"),
+        ({"objective": "supervized"}, "supervized"),
+        ({"evaluation": {"top1": 0.5, "top5": 1.4, "count": 10}}, "top5"),
         ({"evaluation": {"top1": "high", "top5": 0.4, "count": 10}}, "top1"),
-        ({"model": ""}, "model"),
-        ({"data": {"hash": "abcd", "classes": 7}}, "'7'"),
+        ({"data": {"hash": "efgh"}}, "efgh"),
         ({"seed": "first"}, "seed"),
     ],
 )
 def test_a_bad_line_is_named(tmp_path, change, told):
     lines = draw_trainings(1)[:3]
     folder = write_campaign(tmp_path / "campaign", [*lines[:2], {**lines[2], **change}])
-    with pytest.raises((DataError, UsageError)) as caught:
+    with pytest.raises((DataError, msgspec.ValidationError), match=told):
         read_campaign(folder)
-    assert told in str(caught.value)
-    assert "\n" not in str(caught.value)
 
 
 def test_repeated_lines_broken_json_and_empty_folders_are_refused(tmp_path):
     lines = draw_trainings(1)[:2]
-    with pytest.raises(DataError, match="repeats"):
-        read_campaign(write_campaign(tmp_path / "twice", [lines[0], lines[0]]))
     with pytest.raises(DataError, match="same network and seed"):
-        read_campaign(write_campaign(tmp_path / "same", [lines[0], {**lines[0], "name": "again"}]))
+        read_campaign(write_campaign(tmp_path / "same", [lines[0], {**lines[0], "name": "again"}], draw_records(1)[:1]))
     folder = write_campaign(tmp_path / "cut", lines)
     text = (folder / "trainings.jsonl").read_text()
     (folder / "trainings.jsonl").write_text(text[:-40])
-    with pytest.raises(DataError, match="Line 2"):
+    with pytest.raises(msgspec.DecodeError):
         read_campaign(folder)
-    (folder / "trainings.jsonl").write_text(json.dumps([1]) + "\n")
-    with pytest.raises(DataError, match="Line 1"):
+    (folder / "trainings.jsonl").write_text("")
+    with pytest.raises(DataFileNotFoundError, match="records"):
         read_campaign(folder)
-    with pytest.raises(DataFileNotFoundError, match="nowhere"):
-        read_campaign(tmp_path / "nowhere")
 
 
 def test_a_damaged_record_is_refused(tmp_path):
@@ -123,13 +100,14 @@ def test_a_damaged_record_is_refused(tmp_path):
 
 def test_a_folder_of_weights_is_known_by_its_card_and_gets_the_accuracies_of_its_training():
     record = next(one for one in draw_records(1) if one.score.name == "zhuang-gru-small+gpt.supervised")
-    card = replace(record.card, top1=None, top5=None, augmentation="physical + 75% masking", training={"masking": 0.75})
+    card = replace(record.card, top1=None, top5=None, augmentation="none + 75% masking", training={"masking": 0.75})
     moved = replace(record, card=card, score=replace(record.score, name="local-dir:/runs/17/best"))
     key = NetworkKey("zhuang-gru", "gpt", "supervised")
     line = draw_campaign(1).networks[key].trainings[card.seed]
     twin = replace(line.evaluation, top1=0.05, top5=0.1)
-    campaign = join_campaign([replace(line, masking=0.75, twin_evaluation=twin)], [moved])
-    assert list(campaign.networks) == [key._replace(variant="masked")]
+    drawn = replace(line, objective="untrained", evaluation=twin)
+    campaign = join_campaign([replace(line, masking=0.75), drawn], [moved])
+    assert list(campaign.networks) == [key._replace(variant="masked"), key.untrained]
     (entry,) = campaign.boards[0].entries
     assert (entry.card.top5, entry.card.twin_top1) == (line.evaluation.top5, 0.05)
     lost = join_campaign([replace(line, masking=0.75, status="diverged")], [moved])

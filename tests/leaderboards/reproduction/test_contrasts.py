@@ -9,8 +9,11 @@ import numpy as np
 import pytest
 
 from brainbench.core.records import Interval
-from leaderboards.reproduction import contrasts
-from leaderboards.reproduction.contrasts import Effect, Matched, Observed, contrast, judge
+from tests.factories.benchmark_programs import benchmark_program
+
+CONTRASTS = benchmark_program("reproduction.contrasts")
+Effect, Matched, Observed = CONTRASTS.Effect, CONTRASTS.Matched, CONTRASTS.Observed
+contrast, judge = CONTRASTS.contrast, CONTRASTS.judge
 
 SWEEPS = 10_000
 
@@ -86,4 +89,4 @@ def test_paired_seeds_take_away_what_both_share():
 
 
 def test_the_examples_of_the_module():
-    assert doctest.testmod(contrasts).failed == 0
+    assert doctest.testmod(CONTRASTS).failed == 0

@@ -9,9 +9,10 @@ from xml.etree import ElementTree
 
 import pytest
 
-from leaderboards.reproduction.campaign import join_campaign, read_campaign
-from leaderboards.reproduction.page import PAGE, write_page
-from tests.factories.campaigns import draw_campaign
+from tests.factories.benchmark_programs import benchmark_program
+from tests.factories.campaigns import draw_campaign, draw_records, draw_trainings, write_campaign
+
+CAMPAIGN, PAGE = benchmark_program("reproduction.campaign"), benchmark_program("reproduction.page")
 
 ROOT = Path(__file__).parents[3]
 
@@ -19,7 +20,7 @@ ROOT = Path(__file__).parents[3]
 @pytest.fixture(scope="module")
 def written(tmp_path_factory):
     out = tmp_path_factory.mktemp("page")
-    files, judged = write_page(draw_campaign(1, synthetic=True), out)
+    files, judged = PAGE.write_page(draw_campaign(1, synthetic=True), out)
     return files, judged, files[0].read_text(encoding="utf-8")
 
 
@@ -40,13 +41,13 @@ def test_tables_are_whole_and_say_the_verdicts(written):
     row = next(line for line in text.splitlines() if line.startswith("| A GPT attender makes"))
     assert "0.027" in row  # the published effect
     assert row.rstrip(" |").endswith("holds")
-    assert "not trained yet" in next(line for line in text.splitlines() if "zhuang-lstm.simsiam" in line)
 
 
 def test_a_board_on_which_the_rule_decides_nothing_says_so(written, tmp_path):
     campaign = draw_campaign(1, synthetic=True)
-    few = replace(campaign, boards=tuple(replace(board, conditions=board.conditions[:6]) for board in campaign.boards))
-    files, _ = write_page(few, tmp_path)
+    (board,) = campaign.boards
+    few = replace(campaign, boards=(replace(board, lacks="at least 10 stimuli (here 6)"),))
+    files, _ = PAGE.write_page(few, tmp_path)
     told = "the rule leaves all undecided: it needs at least 10 stimuli (here 6)."
     assert told in files[0].read_text(encoding="utf-8")
     assert told not in written[2]
@@ -67,22 +68,31 @@ def test_figures_of_the_study_are_drawn_for_light_and_dark(written):
 
 
 @pytest.mark.slow
-def test_the_page_of_the_documentation_is_that_of_the_campaign_beside_the_code(tmp_path):
-    folder = ROOT / "leaderboards" / "reproduction"
-    begun = (folder / "trainings.jsonl").exists() or (folder / "records").exists()
-    files, _ = write_page(read_campaign(folder) if begun else join_campaign([], []), tmp_path)
-    assert files[0].read_text(encoding="utf-8") == (ROOT / "docs" / PAGE).read_text(encoding="utf-8")
+def test_the_page_of_the_documentation_is_that_of_the_campaign_in_the_repository(tmp_path):
+    files, _ = PAGE.write_page(CAMPAIGN.read_campaign(ROOT / "leaderboards" / "reproduction"), tmp_path)
+    for file in files:
+        assert file.read_bytes() == (ROOT / "docs" / file.relative_to(tmp_path)).read_bytes()
 
 
-def test_a_campaign_without_records_or_of_nothing_gives_a_page(tmp_path):
+def test_the_program_writes_the_page_and_prints_verdicts(tmp_path, monkeypatch, capsys):
+    folder, out = write_campaign(tmp_path / "campaign", draw_trainings(1), draw_records(1)[:3]), tmp_path / "out"
+    monkeypatch.setattr("sys.argv", ["reproduction", str(folder), "--out", str(out)])
+    benchmark_program("reproduction.__main__").main()
+    lines = capsys.readouterr().out.splitlines()
+    assert next(line for line in lines if line.startswith("gpt-accuracy ")).endswith("holds")
+    assert lines[-1] == str(out / PAGE.PAGE)
+    assert (out / PAGE.PAGE).is_file()
+
+
+def test_networks_of_another_size_and_what_is_missing_are_named(tmp_path):
     lines = draw_campaign(1).trainings
-    lines.append(replace(lines[0], name="full", model="zhuang+gpt"))
-    text = write_page(join_campaign(lines, []), tmp_path)[0][0].read_text(encoding="utf-8")
-    assert "No network has been scored yet" in text
-    assert "| Trained networks fit better than the raw input |" in text
-    assert "not scored yet" in text
-    assert "| zhuang+gpt." in next(line for line in text.splitlines() if "another size" in line)
+    full = replace(lines[0], name="full", model="zhuang+gpt", objective="simclr", augmentation="physical")
+    lost = replace(full, name="lost", model="zhuang", status="diverged")
+    campaign = CAMPAIGN.join_campaign([*lines, full, lost], draw_records(1)[:1])
+    text = PAGE.write_page(campaign, tmp_path)[0][0].read_text(encoding="utf-8")
+    rows = [line for line in text.splitlines() if "another size" in line]
+    assert [row.split(" | ")[0] for row in rows] == ["| zhuang+gpt.simclr", "| zhuang.simclr"]
+    assert [row.count("diverged") for row in rows] == [0, 2]
+    assert sum("not scored yet" in line for line in text.splitlines()) > 10
     assert all(len({len(row) for row in table}) == 1 for table in _tables(text))
-    text = write_page(join_campaign([], []), tmp_path)[0][0].read_text(encoding="utf-8")
-    assert "not trained yet" in text
-    assert "Figures 3.3 to 3.8" in text
+    assert "not trained yet" in next(line for line in text.splitlines() if "GPT attender fits better" in line)

@@ -7,7 +7,7 @@ import pytest
 from robotics_bridge.policies.training.distill_config import DistillConfig
 from tests.factories.benchmark_programs import benchmark_program
 
-STUDENTS = benchmark_program("policies/students.py")
+STUDENTS = benchmark_program("policies.students")
 
 
 @pytest.mark.parametrize("arm", STUDENTS.ARMS | STUDENTS.NETWORKS)

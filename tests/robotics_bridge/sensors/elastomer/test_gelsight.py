@@ -17,7 +17,7 @@ PUBLISHED = {"dilate": 0.329, "shear": 0.174}
 @pytest.fixture(scope="module")
 def gel() -> ModuleType:
     """The benchmark that fits the elastomer."""
-    return benchmark_program("tactile/gelsight_fit.py")
+    return benchmark_program("tactile.gelsight_fit")
 
 
 def test_fields_tracked_in_the_pictures_are_met_with_eight_numbers(reference: Path, gel: ModuleType) -> None:

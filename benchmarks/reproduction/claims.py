@@ -15,20 +15,15 @@ from itertools import combinations
 import msgspec
 import numpy as np
 
+from benchmarks.reproduction import measures
+from benchmarks.reproduction.campaign import Campaign, NetworkKey
+from benchmarks.reproduction.comparisons import COMPARISONS, each
+from benchmarks.reproduction.contrasts import Effect, Verdict, contrast, judge
+from benchmarks.reproduction.measures import Measured
 from brainbench.core.statistics import wilson_interval
-from leaderboards.boards import Board
 from leaderboards.figures.scatter import regression
-from leaderboards.ranking import lacking
-from leaderboards.reproduction import measures
-from leaderboards.reproduction.campaign import Campaign, NetworkKey
-from leaderboards.reproduction.comparisons import COMPARISONS, each
-from leaderboards.reproduction.contrasts import Effect, Verdict, contrast, judge
-from leaderboards.reproduction.measures import Measured
 
-SYNTHETIC_REASON = "the animals are synthetic"
-FIT_MEASURES = ("fit", "accuracy-fit", "parameters-fit", "layers", "blocks")
-GOAL = 0.8
-"""Kendall's τ that the rankings of two seeds should reach."""
+_UNTESTABLE: Verdict = "cannot be tested here"
 
 
 @dataclass(frozen=True)
@@ -49,6 +44,15 @@ class PublishedClaim:
     """Differences are taken seed by seed: both networks begin from the same initial state."""
     reason: str = ""
     """Why records cannot test it; empty where they can."""
+
+    def compare(self, measured: Measured) -> Effect | None:
+        """Return the effect of a claim that compares networks, or is about each of them."""
+        comparisons, detail, level = COMPARISONS.get(self.key, each(None, None))(measured)
+        return contrast(comparisons, measured.networks.values(), paired=self.paired, level=level, detail=detail)
+
+    def judge(self, effect: Effect | None) -> Verdict:
+        """Return what the rule says of the claim."""
+        return judge(effect, self.direction, margin=self.margin, neutral=self.neutral)
 
 
 @dataclass(frozen=True)
@@ -76,7 +80,7 @@ def judge_accuracy(campaign: Campaign) -> list[Judgement]:
     for claim in published_claims():
         effect = other = None
         if claim.measure == "accuracy":
-            effect, other = _compare(claim, ours), _compare(claim, theirs)
+            effect, other = claim.compare(ours), claim.compare(theirs)
         elif claim.measure == "parameters-accuracy":
             effect = _correlate(measures.parameters(campaign), ours, "supervised")
             other = _correlate(measures.published_parameters(), theirs, "supervised")
@@ -84,74 +88,49 @@ def judge_accuracy(campaign: Campaign) -> list[Judgement]:
             effect = _divergence(campaign)
         elif claim.measure != "none":
             continue
-        verdict = _untestable if claim.measure == "none" else _judged(claim, effect)
-        found.append(Judgement(claim, effect, verdict, verdict, claim.reason or _unknown(effect), other))
+        verdict = _UNTESTABLE if claim.measure == "none" else claim.judge(effect)
+        found.append(Judgement(claim, effect, verdict, verdict, claim.reason, other))
     return found
 
 
 def judge_fit(campaign: Campaign, place: int) -> list[Judgement]:
-    """Judge the claims on neural fit on one board; without any board all are of networks not trained yet."""
-    claims = [claim for claim in published_claims() if claim.measure in FIT_MEASURES]
-    if not campaign.boards:
-        return [Judgement(claim, None, "not trained yet", "not trained yet") for claim in claims]
+    """Judge the claims on neural fit on one board."""
     board, fit = campaign.boards[place], measures.fits(campaign, place)
-    lacks = lacks_of(board)
     accuracy = {key: item.value for key, item in measures.accuracies(campaign).networks.items()}
     measured: dict[str, Callable[[PublishedClaim], Effect | None]] = {
-        "fit": lambda claim: _compare(claim, fit),
-        "accuracy-fit": lambda claim: _correlate(accuracy, fit, "supervised"),
-        "parameters-fit": lambda claim: _correlate(measures.parameters(campaign, place), fit, None),
-        "layers": lambda claim: _compare(claim, measures.layer_orders(campaign, place)),
-        "blocks": lambda claim: _compare(claim, measures.layer_orders(campaign, place, "attender.block")),
+        "fit": lambda claim: claim.compare(fit),
+        "accuracy-fit": lambda _: _correlate(accuracy, fit, "supervised"),
+        "parameters-fit": lambda _: _correlate(measures.parameters(campaign), fit, None),
+        "layers": lambda claim: claim.compare(measures.layer_orders(campaign, place)),
+        "blocks": lambda claim: claim.compare(measures.layer_orders(campaign, place, "attender.block")),
     }
     found = []
-    for claim in claims:
+    for claim in (claim for claim in published_claims() if claim.measure in measured):
         effect = measured[claim.measure](claim)
-        rule, reason = _judged(claim, effect), _unknown(effect)
-        if lacks and effect is not None:
-            rule, reason = "undecided", f"the rule needs {lacks}"
+        rule, reason = claim.judge(effect), ""
+        if board.lacks and effect is not None:
+            rule, reason = "undecided", f"the rule needs {board.lacks}"
         verdict = rule
         if board.synthetic and effect is not None:
-            verdict, reason = _untestable, "; ".join(filter(None, (SYNTHETIC_REASON, reason)))
+            verdict, reason = _UNTESTABLE, "; ".join(filter(None, ("the animals are synthetic", reason)))
         found.append(Judgement(claim, effect, verdict, rule, reason))
     return found
 
 
-def lacks_of(board: Board) -> str:
-    """Return what a board lacks for the rule to decide anything, in words; empty when nothing."""
-    return lacking(max((len(entry.score.subjects) for entry in board.entries), default=0), len(board.conditions))
+def seed_agreement(measured: Measured) -> list[tuple[int, int, int, float]]:
+    """Return (seed, seed, networks, Kendall's τ) of the rankings of supervised networks by every two seeds.
 
-
-_untestable: Verdict = "cannot be tested here"
-
-
-def _judged(claim: PublishedClaim, effect: Effect | None) -> Verdict:
-    return judge(effect, claim.direction, margin=claim.margin, neutral=claim.neutral)
-
-
-def seed_agreement(measured: Measured, objective: str | None = None) -> list[tuple[int, int, int, float]]:
-    """Return (seed, seed, networks, Kendall's τ) of the rankings by every two seeds that share three networks."""
+    Seeds that share fewer than three networks are left out.
+    """
     from scipy.stats import kendalltau
 
-    items = [item.seeds for item in measured.find(objective=objective).values() if len(item.seeds) > 1]
+    items = [item.seeds for item in measured.find(objective="supervised").values() if len(item.seeds) > 1]
     found = []
     for one, other in combinations(sorted({seed for seeds in items for seed in seeds}), 2):
         pairs = [(seeds[one], seeds[other]) for seeds in items if one in seeds and other in seeds]
         if len(pairs) > 2:
             found.append((one, other, len(pairs), float(np.array(kendalltau(*zip(*pairs, strict=True)))[0])))
     return found
-
-
-def _unknown(effect: Effect | None) -> str:
-    if effect is None or effect.interval is not None:
-        return ""
-    return "no interval, with fewer than three comparisons and one seed of each network"
-
-
-def _compare(claim: PublishedClaim, measured: Measured) -> Effect | None:
-    """Return the effect of a claim that compares networks, or is about each of them."""
-    comparisons, detail, level = COMPARISONS.get(claim.key, each(None, None))(measured)
-    return contrast(comparisons, measured.networks.values(), paired=claim.paired, level=level, detail=detail)
 
 
 def _correlate(x: Mapping[NetworkKey, float], measured: Measured, objective: str | None) -> Effect | None:

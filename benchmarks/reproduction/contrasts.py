@@ -109,7 +109,8 @@ def contrast(
             for member in side:
                 weights[member.name] += sign / (len(side) * len(comparisons))
                 members[member.name] = member
-    parts = [_training(comparisons, values, weights, members, pool, paired), _test(weights, members)]
+    weighed = [(weights[name], member) for name, member in members.items()]
+    parts = [_training(comparisons, values, weighed, pool, paired), _test(weighed)]
     mean, interval = float(np.mean(values)), None
     total = sum(variance for variance, _ in parts)
     if math.isfinite(total):
@@ -148,8 +149,7 @@ def judge(effect: Effect | None, direction: int, *, margin: float = 0.0, neutral
 def _training(
     comparisons: Sequence[Matched],
     values: Sequence[float],
-    weights: Mapping[str, float],
-    members: Mapping[str, Observed],
+    weighed: Sequence[tuple[float, Observed]],
     pool: Iterable[Observed],
     paired: bool,
 ) -> tuple[float, float]:
@@ -161,14 +161,14 @@ def _training(
         groups = [item.paired_seeds for item in comparisons]
         variance, freedom = _pooled(groups)
         return variance * sum(1 / len(group) for group in groups) / count**2, freedom
-    trained = {name: item for name, item in members.items() if item.objective}
+    trained = [(weight, item) for weight, item in weighed if item.objective]
     if not trained:
         return 0.0, 1.0
-    objectives = {item.objective for item in trained.values()}
+    objectives = {item.objective for _, item in trained}
     repeated = [item for item in pool if item.objective and len(item.seeds) > 1]
     same = [item for item in repeated if item.objective in objectives]
     variance, freedom = _pooled([list(item.seeds.values()) for item in same or repeated])
-    return variance * sum(weights[name] ** 2 / len(item.seeds) for name, item in trained.items()), freedom
+    return variance * sum(weight**2 / len(item.seeds) for weight, item in trained), freedom
 
 
 def _pooled(groups: Sequence[Sequence[float]]) -> tuple[float, float]:
@@ -178,16 +178,15 @@ def _pooled(groups: Sequence[Sequence[float]]) -> tuple[float, float]:
     return (within / freedom, float(freedom)) if freedom else (math.nan, 1.0)
 
 
-def _test(weights: Mapping[str, float], members: Mapping[str, Observed]) -> tuple[float, float]:
+def _test(weighed: Sequence[tuple[float, Observed]]) -> tuple[float, float]:
     """Return the variance that test sweeps, or animals and stimuli, add to the mean, and its degrees of freedom."""
-    if samples := {name: item.sample for name, item in members.items() if item.sample is not None}:
-        shared = sorted(set.intersection(*({*sample.animals} for sample in samples.values())))
-        animals = [sum(weights[name] * one.animals[animal] for name, one in samples.items()) for animal in shared]
-        if len({len(sample.without_stimulus) for sample in samples.values()}) > 1:
+    if samples := [(weight, item.sample) for weight, item in weighed if item.sample is not None]:
+        shared = sorted(set.intersection(*({*sample.animals} for _, sample in samples)))
+        animals = [sum(weight * sample.animals[animal] for weight, sample in samples) for animal in shared]
+        if len({len(sample.without_stimulus) for _, sample in samples}) > 1:
             return math.nan, 1.0
-        stimuli = sum(weights[name] * sample.without_stimulus for name, sample in samples.items())
+        stimuli = sum(weight * sample.without_stimulus for weight, sample in samples)
         error, freedom = two_factor_error(animals, np.asarray(stimuli))
         return float(error) ** 2, float(freedom)
-    counted = {name: item for name, item in members.items() if item.sweeps}
-    parts = [weights[name] ** 2 * item.value * (1 - item.value) / item.sweeps for name, item in counted.items()]
+    parts = [weight**2 * item.value * (1 - item.value) / item.sweeps for weight, item in weighed if item.sweeps]
     return sum(parts), math.inf

@@ -3,27 +3,34 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
+from benchmarks.reproduction.campaign import NetworkKey
+from benchmarks.reproduction.contrasts import Matched
+from benchmarks.reproduction.measures import ANIMALS, RANDOM_FEATURES, Measured
 from brainbench.core.statistics import LEVEL
 from leaderboards.boards import RAW_INPUT
-from leaderboards.reproduction.campaign import NetworkKey
-from leaderboards.reproduction.contrasts import Matched
-from leaderboards.reproduction.measures import ANIMALS, RANDOM_FEATURES, Measured
 
-_Chosen = tuple[list[Matched], str, float]
-_Choice = Callable[[Measured], _Chosen]
+
+class Chosen(NamedTuple):
+    """Comparisons of a claim."""
+
+    comparisons: list[Matched]
+    detail: str = ""
+    """Words beside the effect."""
+    level: float = LEVEL
+    """Level of its interval."""
+
+
+_Choice = Callable[[Measured], Chosen]
 
 
 def _encoders(
-    one: Callable[[NetworkKey], bool],
-    other: Callable[[NetworkKey], bool],
-    objective: str | None,
-    variant: str = "",
+    one: Callable[[NetworkKey], bool], other: Callable[[NetworkKey], bool], objective: str | None, variant: str = ""
 ) -> _Choice:
     """Return the choice of comparisons of two kinds of encoders, one comparison for each attender and objective."""
 
-    def chosen(measured: Measured) -> _Chosen:
+    def chosen(measured: Measured) -> Chosen:
         found = measured.find(objective=objective, variant=variant)
         comparisons = []
         for group in sorted({(key.attender, key.objective) for key in found}):
@@ -31,21 +38,21 @@ def _encoders(
             sides = [tuple(item for key, item in inside.items() if test(key)) for test in (one, other)]
             if all(sides):
                 comparisons.append(Matched(*sides))
-        return comparisons, "", LEVEL
+        return Chosen(comparisons)
 
     return chosen
 
 
-def _swap(change: Mapping[str, str] | Callable[[NetworkKey], NetworkKey], sign: int = 1, **chosen: Any) -> _Choice:
-    """Return the choice that holds every chosen network against the one with something changed; −1: the reverse."""
+def _swap(change: Mapping[str, str] | Callable[[NetworkKey], NetworkKey], **chosen: Any) -> _Choice:
+    """Return the choice that holds every chosen network against the one with something changed."""
 
-    def matched(measured: Measured) -> _Chosen:
+    def matched(measured: Measured) -> Chosen:
         comparisons = []
         for key, item in measured.find(**chosen).items():
             changed = change(key) if callable(change) else key._replace(**change)
             if changed != key and (other := measured.networks.get(changed)):
-                comparisons.append(Matched((item,), (other,)) if sign > 0 else Matched((other,), (item,)))
-        return comparisons, "", LEVEL
+                comparisons.append(Matched((item,), (other,)))
+        return Chosen(comparisons)
 
     return matched
 
@@ -53,11 +60,11 @@ def _swap(change: Mapping[str, str] | Callable[[NetworkKey], NetworkKey], sign: 
 def each(baseline: str | None, objective: str | None) -> _Choice:
     """Return the choice that holds every network against a baseline, or by itself."""
 
-    def matched(measured: Measured) -> _Chosen:
+    def matched(measured: Measured) -> Chosen:
         base = measured.baselines.get(baseline or "")
         other = (base,) if base else ()
         items = measured.find(objective=objective).values() if base or baseline is None else ()
-        return [Matched((item,), other) for item in items], "", LEVEL
+        return Chosen([Matched((item,), other) for item in items])
 
     return matched
 
@@ -68,24 +75,24 @@ def _best(hero: NetworkKey, objective: str | None) -> _Choice:
     The level of the interval is corrected for the choice of that one (Bonferroni).
     """
 
-    def chosen(measured: Measured) -> _Chosen:
+    def chosen(measured: Measured) -> Chosen:
         found = measured.find(objective=objective)
         own = found.pop(hero, None)
         if own is None or not found:
-            return [], "", LEVEL
+            return Chosen([])
         rival = max(found.values(), key=lambda item: item.value)
-        return [Matched((own,), (rival,))], f"against {rival.name}", 1 - (1 - LEVEL) / len(found)
+        return Chosen([Matched((own,), (rival,))], f"against {rival.name}", 1 - (1 - LEVEL) / len(found))
 
     return chosen
 
 
-def _saturation(measured: Measured) -> _Chosen:
+def _saturation(measured: Measured) -> Chosen:
     """Hold the best network, corrected for being the best of many, against animals."""
     found, animals = measured.find(), measured.baselines.get(ANIMALS)
     if not found or animals is None:
-        return [], "", LEVEL
+        return Chosen([])
     best = max(found.values(), key=lambda item: item.value)
-    return [Matched((best,), (animals,))], f"{best.name}", 1 - (1 - LEVEL) / len(found)
+    return Chosen([Matched((best,), (animals,))], best.name, 1 - (1 - LEVEL) / len(found))
 
 
 _INTERSECTION = "zhuang-intersection-ln"
@@ -112,7 +119,7 @@ def _without_norm(key: NetworkKey) -> NetworkKey:
 _to_untrained = _swap({"objective": "untrained"})
 _without_attender = _swap({"attender": "none"}, attender="gpt", objective="supervised")
 _with_mamba = _swap({"attender": "mamba"}, attender="gpt", objective="supervised")
-_image = _swap({"variant": ""}, -1, objective="simclr", variant="image")
+_image = _swap({"variant": "image"}, objective="simclr")
 _masked = _swap({"variant": ""}, objective="simclr", variant="masked")
 _HIGHER_RATE = "rate 0.01"
 
@@ -147,4 +154,4 @@ COMPARISONS: dict[str, _Choice] = {
     "tactile-image-fit": _image,
     "masking-fit": _masked,
 }
-"""The choice of comparisons of each claim: networks, words beside the effect, and the level of its interval."""
+"""The choice of comparisons of each claim."""

@@ -1,4 +1,4 @@
-"""Quantities of a campaign's networks: accuracy on the test sweeps, fit on a board, order of the layers."""
+"""Quantities of networks, ours and the study's: accuracy on the test sweeps, fit on a board, order of the layers."""
 
 from __future__ import annotations
 
@@ -13,11 +13,10 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks.reproduction.campaign import Accuracy, Campaign, NetworkKey
+from benchmarks.reproduction.contrasts import Observed
 from brainbench.core.records import ResultRecord, Score
 from leaderboards.ranking import Sample
-from leaderboards.reproduction.campaign import Campaign, NetworkKey
-from leaderboards.reproduction.contrasts import Observed
-from leaderboards.reproduction.trainings import Accuracy
 
 ANIMALS = "animal-to-animal"
 RANDOM_FEATURES = "random features"
@@ -45,31 +44,35 @@ class Measured:
 
 @cache
 def published() -> dict[str, Any]:
-    """Return the content of ``published.json``."""
-    return json.loads(Path(__file__).with_name("published.json").read_text(encoding="utf-8"))
+    """Return the content of ``published.json``, and as ``networks`` its runs by network."""
+
+    def key(run: dict[str, Any]) -> NetworkKey:
+        return NetworkKey.of(run["model"], run["objective"])._replace(full=False)
+
+    found = json.loads(Path(__file__).with_name("published.json").read_text(encoding="utf-8"))
+    return {**found, "networks": {key(run): run for run in found["runs"]}}
 
 
 def published_accuracy() -> Measured:
     """Return the published top-5 accuracies, one run of each network."""
-    runs = [(NetworkKey.of(run["model"], run["objective"]), run["top5"]) for run in published()["runs"]]
-    sweeps = published()["test_sweeps"]
-    return Measured({key: Observed(key.name, {0: top5}, key.objective, sweeps) for key, top5 in runs if top5})
+    runs, sweeps = published()["networks"].items(), published()["test_sweeps"]
+    return Measured(
+        {key: Observed(key.name, {0: run["top5"]}, key.objective, sweeps) for key, run in runs if run["top5"]}
+    )
+
+
+def published_parameters() -> dict[NetworkKey, float]:
+    """Return log10 of the published numbers of parameters."""
+    return {key: math.log10(run["parameters"]) for key, run in published()["networks"].items() if run["parameters"]}
 
 
 def accuracies(campaign: Campaign, name: str = "top5") -> Measured:
-    """Return the top-5 (or ``top1``) accuracies, those of untrained twins and of the baselines among them."""
-    values: dict[NetworkKey, dict[int, Accuracy]] = {}
+    """Return the top-5 (or ``top1``) accuracies of networks and baselines."""
+    networks = {}
     for key, network in campaign.networks.items():
-        for seed, training in network.trainings.items():
-            twin = NetworkKey(key.encoder, key.attender, "untrained")
-            own = training.evaluation if training.finished else None
-            for owner, result in ((key, own), (twin, training.twin_evaluation)):
-                # An untrained network's own line comes before what trainings say of their twin.
-                first = owner == key and key.objective == "untrained"
-                if result is not None and (first or seed not in values.get(owner, {})):
-                    values.setdefault(owner, {})[seed] = result
-    networks = {key: observed(key.name, told, name, key.objective) for key, told in values.items()}
-    lines = {re.sub("[-_]", " ", title): line.evaluation for title, line in campaign.baselines.items()}
+        if values := {seed: line.result for seed, line in network.trainings.items() if line.result}:
+            networks[key] = observed(key.name, values, name, key.objective)
+    lines = {re.sub("[-_]", " ", title): line.result for title, line in campaign.baselines.items()}
     return Measured(networks, {title: observed(title, {0: told}, name) for title, told in lines.items() if told})
 
 
@@ -79,11 +82,17 @@ def observed(name: str, results: Mapping[int, Accuracy], which: str, objective: 
     return Observed(name, values, objective, min(found.count for found in results.values()))
 
 
+def parameters(campaign: Campaign) -> dict[NetworkKey, float]:
+    """Return log10 of the parameters of the networks."""
+    counts = {key: [line.parameters for line in one.trainings.values()] for key, one in campaign.networks.items()}
+    return {key: math.log10(found[0]) for key, found in counts.items() if found and found[0]}
+
+
 def fits(campaign: Campaign, place: int) -> Measured:
     """Return the fits on one board, scaled between chance (0) and all that is reliable (1); reliable ones only."""
     networks = {}
     for key, network in campaign.networks.items():
-        lost = {seed for seed, line in network.trainings.items() if not line.finished}
+        lost = {seed for seed, line in network.trainings.items() if not line.result}
         scores = {seed: one.score for seed, one in network.records.get(place, {}).items() if seed not in lost}
         networks[key] = _fit(key.name, scores, key.objective)
     baselines = {item.name: _fit(item.name, {0: item.score}) for item in campaign.boards[place].baselines}
@@ -100,24 +109,6 @@ def layer_orders(campaign: Campaign, place: int, part: str = "") -> Measured:
         if taus := {seed: tau for seed, tau in taus.items() if math.isfinite(tau)}:
             found[key] = Observed(key.name, taus, key.objective)
     return Measured(found)
-
-
-def parameters(campaign: Campaign, place: int | None = None) -> dict[NetworkKey, float]:
-    """Return log10 of the parameters of the networks, from trainings or else from the cards of a board's records."""
-    found = {}
-    for key, network in campaign.networks.items():
-        records = network.records.get(place, {}) if place is not None else {}
-        counts = [line.parameters for line in network.trainings.values()]
-        counts += [record.card.parameters for record in records.values() if record.card]
-        if count := next(filter(None, counts), None):
-            found[key] = math.log10(count)
-    return found
-
-
-def published_parameters() -> dict[NetworkKey, float]:
-    """Return log10 of the published numbers of parameters."""
-    runs = [(NetworkKey.of(run["model"], run["objective"]), run["parameters"]) for run in published()["runs"]]
-    return {key: math.log10(count) for key, count in runs if count}
 
 
 def _fit(name: str, scores: Mapping[int, Score], objective: str = "") -> Observed | None:
