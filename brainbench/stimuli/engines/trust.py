@@ -163,12 +163,12 @@ def judge(facts: RunFacts) -> Verdict:
     crowded = (until == np.inf) & ~unsolved & (facts.crowded > LARGEST_CROWDED_SHARE * facts.steps)
     moved = (
         "an object moves by {:.3g} mm against the whisker in a step at {:.6g} s, further than the {:.3g} mm up to "
-        "which contact is followed; choose a time step {:.2g} times shorter"
+        "which contact is followed; choose a smaller time step (at most 1/{:.0f} of it)"
     )
     missed = "contact forces missed by {:.0%} (root mean square); choose a smaller time step"
     many = "more contacts than can be solved together in {} of {} steps"
     way, most = facts.travel * MILLI, facts.farthest * MILLI
-    blame(fast, lambda i: moved.format(way[i], facts.fast_at[i], most[i], way[i] / most[i]))
+    blame(fast, lambda i: moved.format(way[i], facts.fast_at[i], most[i], np.ceil(way[i] / most[i])))
     blame(unsolved, lambda i: missed.format(min(facts.residual[i], 10.0)))
     blame(crowded, lambda i: many.format(facts.crowded[i], facts.steps[i]))
     bad = unsolved | crowded

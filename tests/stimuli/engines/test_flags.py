@@ -101,7 +101,7 @@ FLAGGED = {
         lambda: _reason(_moving((0.008, -0.1, 0), (0, 3.0, 0), _peg(1e-3)), step=5e-3),
     ),
     "is struck too hard": (
-        "further than the 0.0121 mm up to which contact is followed; choose a time step 41 times shorter",
+        "further than the 0.0121 mm up to which contact is followed; choose a smaller time step (at most 1/42 of it)",
         lambda: _struck(5.0, engine="rod"),
     ),
     "changes at half the step": (

@@ -101,7 +101,7 @@ def make_task(
     steps = np.full(len(seen) - 1, step)
     if limit is not None:
         steps = limit[np.clip(((seen[:-1] - start) / KNOT).astype(int), 0, len(limit) - 1)]
-    fast = _too_fast(job, reach, (position, euler), seen, steps)
+    fast = _too_fast(job, reach, (position, euler), seen, steps, step)
     twists = fidelity.twist is not False and not stays_in_plane(job, reach, position, euler, seen)
     return JobTask(job, chain, base, near, reach.indices, names, limit, fast, twists)
 
@@ -170,15 +170,19 @@ def followed(
 
 
 def _too_fast(
-    job: Job, reach: Reach, pose: tuple[NDArray, NDArray], times: NDArray, steps: NDArray
+    job: Job, reach: Reach, pose: tuple[NDArray, NDArray], times: NDArray, steps: NDArray, step: float
 ) -> tuple[float, float, float]:
-    """Return :attr:`JobTask.fast` from the base's ``pose`` at ``times`` [n] (s) and the longest steps [n − 1] (s)."""
+    """Return :attr:`JobTask.fast` from the base's ``pose`` at ``times`` [n] (s).
+
+    ``steps`` [n − 1] (s) are the longest there, ``step`` is the longest of the whisker.
+    """
     for obstacle in reach.obstacles:
         speed = step_travel(job.whisker, *pose, obstacle, times) / np.diff(times)
         blow = np.zeros_like(speed)
         if speed.max(initial=0.0) > HARD_BLOW:
-            # Without the turns of the base, which are those of whisking.
+            # Without the turns of the base, which are those of whisking. Steps that a brief motion shortens follow it.
             blow = near_travel(job.whisker, pose[0], np.zeros_like(pose[1]), obstacle, times) / np.diff(times)
+            blow[steps < step] = 0.0
         way, farthest = followed(speed, blow, steps, job.whisker.base_radius)
         if (way > farthest).any():
             first = int(np.argmax(way > farthest))
