@@ -102,8 +102,9 @@ def turn(wrench: NDArray[np.floating], rotation: NDArray[np.float64]) -> NDArray
 def _describe_gaps(dataset: xr.Dataset) -> str:
     bad = ~np.isfinite(dataset["wrench"].values).all(axis=(1, 3))
     names = [f"{dataset['whisker'].values[j]} in {dataset['stimulus'].values[i]}" for i, j in np.argwhere(bad)]
+    reasons = dataset["reason"].values[bad].tolist() if "reason" in dataset else []
+    why = f", the first because {reasons[0]}" if reasons else ": convert runs of WHISKiT with --cleaning published"
     return (
-        f"The simulation of {len(names)} whiskers became unstable ({listing(names, limit=4)}): simulate with a finer "
-        "fidelity, convert runs of WHISKiT with --cleaning published, or read them as zero with to_grid(…, "
-        "unstable='zero')."
+        f"The simulation of {len(names)} whiskers became unstable ({listing(names, limit=4)}){why}, or leave whiskers "
+        "out (--whiskers), or read them as zero with to_grid(…, unstable='zero')."
     )

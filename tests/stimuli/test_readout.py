@@ -61,7 +61,7 @@ def test_both_sides_do_not_fit_one_grid():
 
 def test_an_unstable_whisker_is_refused_unless_zero_is_asked_for():
     dataset = _dataset("C1,C2", unstable={0: "blew up"})
-    with pytest.raises(DataError, match=r"'C1 in a'.*unstable='zero'"):
+    with pytest.raises(DataError, match=r"'C1 in a'.*blew up.*--whiskers.*unstable='zero'"):
         to_grid(dataset)
     grid = to_grid(dataset, unstable="zero")
     assert np.isfinite(grid).all()

@@ -16,7 +16,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from brainbench.core.errors import UsageError
 from brainbench.core.rotations import to_matrices
@@ -123,14 +123,34 @@ def cut(
     return MotionPieces(count, needed, moves)
 
 
+def _poses(
+    found: tuple[ArrayLike, ArrayLike], times: NDArray[np.float64], width: int, what: str
+) -> tuple[NDArray, NDArray]:
+    """Return positions [n, 3] and rotations [n, width] that a motion gave; other shapes are a :class:`UsageError`."""
+    place, turn = (np.asarray(values, dtype=float) for values in found)
+    if place.shape != (len(times), 3) or turn.shape != (len(times), width):
+        kind = "quaternions" if width == 4 else "angles"
+        raise UsageError(
+            f"The motion of {what} must give positions [n, 3] and {kind} [n, {width}], one for each of the n = "
+            f"{len(times)} times; received the shapes {place.shape} and {turn.shape}."
+        )
+    return place, turn
+
+
 def carried_pose(motion: RigidMotion | None, anchor: NDArray[np.float64]) -> Pose:
     """Return the pose, with rotation matrices [n, 3, 3], of the point ``anchor`` [3] (m) of a body that moves."""
     assert motion is not None
 
     def pose(times: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        place, turn = motion(times)
-        turn = to_matrices(np.asarray(turn, dtype=float))
-        return np.asarray(place) + turn @ anchor, turn
+        place, quaternions = _poses(motion(times), times, 4, "an object")
+        zero = ~quaternions.any(axis=1)
+        if zero.any():
+            raise UsageError(
+                f"The motion of an object gives a quaternion of zero length at {times[zero].min():.6g} s; give unit "
+                "quaternions (w, x, y, z), (1, 0, 0, 0) for no rotation."
+            )
+        turn = to_matrices(quaternions)
+        return place + turn @ anchor, turn
 
     return pose
 
@@ -149,8 +169,8 @@ class Cutting:
         """Cut the motion of a base whose whisker has the arc length ``size`` (m); errors as :func:`cut`."""
 
         def path(times: NDArray[np.float64]) -> NDArray[np.float64]:
-            position, euler = follicle.pose(times)
-            return np.concatenate([np.asarray(position), np.asarray(euler) * size], axis=1) * MILLI
+            position, euler = _poses(follicle.pose(times), times, 3, "the base of a whisker")
+            return np.concatenate([position, euler * size], axis=1) * MILLI
 
         return self._cut(path, follicle, "the base of a whisker")
 

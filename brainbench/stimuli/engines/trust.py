@@ -45,11 +45,18 @@ SUSPICIOUS_ROUGHNESS = 0.05
 follow what they touch stay below .01; those that are thrown off and caught again have .1 to 2."""
 LARGEST_CHANGE = 0.2
 """Share by which the base force (root mean square over the readings) may change when the step is halved."""
-LARGEST_ROUGH_CHANGE = 0.7
+LARGEST_ROUGH_CHANGE = 0.65
 """The same in soft contacts of a whisker that is suspicious for its roughness or overlap and meets no :data:`BLOW`:
-with friction, soft contacts hop at ordinary speeds too, and change by some .3 to .6 in long steps."""
+with friction, soft contacts hop at ordinary speeds too, and change by some .3 to .6 in long steps. All measured beyond
+.65 are off by more than two thirds of the force that fine steps of ``rod`` give."""
 BLOW = 1.0
 """Speed (m/s) of an object against the base from which it counts as a blow."""
+HARD_BLOW = 3.0
+"""The same in rigid contacts. Beyond it the presets err by 20 to 90 %, and half the step does not tell: contacts cut
+both to the same steps."""
+BLOW_STRIDE = 0.25
+"""Way of an object in a step of such a blow up to which it is followed, in radii of the whisker's base. The median
+whisker is then within 20 % of the force in far shorter steps, up to 25 m/s."""
 
 OK, BENT, LOST, STARTED_INSIDE, GOT_INSIDE, AT_BASE = range(6)
 """Ends of an integration: in order; with a joint bent beyond :data:`LARGEST_BEND`; with a value that is no number; in
@@ -82,9 +89,11 @@ class RunFacts:
     strongest: NDArray[np.floating]
     """Base force (N) that the whisker bears (:func:`strongest_force`)."""
     travel: NDArray[np.floating]
-    """Way (m) of an object against the whisker in the shortest step, at ``fast_at``; anything without."""
+    """Way (m) of an object against the whisker in a step, at ``fast_at``; anything without."""
+    farthest: NDArray[np.floating]
+    """Way (m) up to which its contact is followed."""
     fast_at: NDArray[np.floating]
-    """First time at which an object moves further in the shortest step than contacts are looked for; inf if never."""
+    """First time at which it moves further; inf if never."""
     residual: NDArray[np.floating]
     """As :func:`residual` gives it."""
     crowded: NDArray[np.int32]
@@ -153,12 +162,13 @@ def judge(facts: RunFacts) -> Verdict:
     unsolved = (until == np.inf) & ~(facts.residual <= LARGEST_RESIDUAL)
     crowded = (until == np.inf) & ~unsolved & (facts.crowded > LARGEST_CROWDED_SHARE * facts.steps)
     moved = (
-        "an object moves by {:.3g} mm against the whisker in the shortest step at {:.6g} s, further than contacts are "
-        "looked for; choose a smaller time step"
+        "an object moves by {:.3g} mm against the whisker in a step at {:.6g} s, further than the {:.3g} mm up to "
+        "which contact is followed; choose a smaller time step (at most 1/{:.0f} of it)"
     )
     missed = "contact forces missed by {:.0%} (root mean square); choose a smaller time step"
     many = "more contacts than can be solved together in {} of {} steps"
-    blame(fast, lambda i: moved.format(facts.travel[i] * MILLI, facts.fast_at[i]))
+    way, most = facts.travel * MILLI, facts.farthest * MILLI
+    blame(fast, lambda i: moved.format(way[i], facts.fast_at[i], most[i], np.ceil(way[i] / most[i])))
     blame(unsolved, lambda i: missed.format(min(facts.residual[i], 10.0)))
     blame(crowded, lambda i: many.format(facts.crowded[i], facts.steps[i]))
     bad = unsolved | crowded

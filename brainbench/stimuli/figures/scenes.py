@@ -21,6 +21,7 @@ from brainbench.core.reading.ranges import check_fields
 from brainbench.stimuli.engines import DEFAULT_ENGINE
 from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.engines.protocol import WhiskerEngine
+from brainbench.stimuli.engines.units import MILLI
 from brainbench.stimuli.figures.annotation import Annotation
 from brainbench.stimuli.figures.camera import Camera, Lens
 from brainbench.stimuli.figures.canvas import MOMENT_MAP, ROW_COLORS, UNSTABLE_COLOR, round_up
@@ -212,7 +213,7 @@ def render(
         fidelity, backend, progress, cache: as for :func:`brainbench.stimuli.whisker_shapes.record`.
 
     Raises:
-        UsageError: the format is unknown, or a picture was asked for several instants.
+        UsageError: the format is unknown, a picture was asked for several instants, or one lies behind the scene's end.
         MissingDependencyError: a package of the extra ``report`` is missing.
     """
     path = Path(out)
@@ -224,6 +225,12 @@ def render(
     if suffix == ".png" and len(times) != 1:
         raise UsageError(f"A .png shows one instant; received {len(times)}: write a film ({listing(FORMATS[1:])}).")
     require_writer(suffix)
+    asked, last = times.max(initial=0.0) * MILLI, float(scene.frames.times[-1]) * MILLI
+    if asked > last + 1e-6:
+        raise UsageError(
+            f"The scene {scene.label!r} ends at {last:g} ms; received the instant {asked:g} ms: choose an earlier one, "
+            "or give the scene more frames."
+        )
     recording = record(scene, times, fidelity=fidelity, backend=backend, progress=progress, cache=cache)
     if recording.unstable:
         _LOG.warning("unstable whiskers are drawn black and unbent from then on: %s", listing(recording.unstable))

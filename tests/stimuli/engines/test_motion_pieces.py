@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from brainbench.core.errors import UsageError
+from brainbench.stimuli.engines import get_engine
 from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.engines.motion_pieces import KNOT, MOST_PIECES, SPEED_ERROR, cut
 from brainbench.stimuli.engines.mujoco.engine import MujocoWhiskerEngine
@@ -123,3 +124,30 @@ def test_equal_steps_follow_a_shake_too(amplitude):
         assert stepped.step < given
     else:
         assert stepped.step == given
+
+
+@pytest.mark.parametrize("engine", ["rod", "mujoco"])
+@pytest.mark.parametrize(
+    ("poses", "culprit"),
+    [
+        (lambda n: (np.zeros((n, 3)), np.zeros((n, 4))), "quaternion of zero length at"),
+        (lambda n: (np.zeros((n, 3)), np.zeros((n - 1, 4))), r"one for each of the n = .* received the shapes"),
+        (lambda n: (np.zeros((1, 3)), np.array([[1.0, 0.0, 0.0, 0.0]])), r"positions \[n, 3\] and quaternions"),
+        (lambda n: (np.zeros((n, 2)), np.tile([1.0, 0.0, 0.0, 0.0], (n, 1))), r"positions \[n, 3\] and quaternions"),
+    ],
+    ids=["zero quaternions", "too few quaternions", "one pose", "positions in a plane"],
+)
+def test_poses_of_objects_that_are_none_are_refused(engine, poses, culprit):
+    ball = Obstacle((Sphere((0.008, 0.01, 0.0), 1e-3),), lambda times: poses(len(times)))
+    job = Job(C2, StillFollicle(), (ball,), np.array([0.01]))
+    with pytest.raises(UsageError, match=culprit):
+        get_engine(engine).run([job], Fidelity(links=8))
+
+
+def test_a_base_with_too_few_angles_is_refused():
+    class Short:
+        def pose(self, times):
+            return np.zeros((len(times), 3)), np.zeros((len(times) - 1, 3))
+
+    with pytest.raises(UsageError, match="base of a whisker must give positions"):
+        RodEngine().run([Job(C2, Short(), (), np.array([0.01]))], Fidelity(links=8))

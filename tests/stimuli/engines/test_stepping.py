@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 
-from brainbench.stimuli import get_recipe, simulate
+from brainbench.stimuli import WhiskerArray, get_recipe, simulate
 from brainbench.stimuli.engines import get_engine
 from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.engines.protocol import Job, StillFollicle
 from brainbench.stimuli.engines.stepping import SteppedJob
 from brainbench.stimuli.engines.trust import changes_words, roughness
-from brainbench.stimuli.objects.obstacle import Box, Capsule, Obstacle
+from brainbench.stimuli.objects.obstacle import Box, Capsule, Cylinder, Obstacle
 from brainbench.stimuli.validation.contact_scenes import contact_jobs
 from tests.factories.whiskers import C2
 
@@ -59,6 +59,23 @@ def test_blows_of_a_flat_face_that_soft_contacts_throw_back_are_flagged(speed, h
     assert not trace.contact.any()
     # Both runs were computed.
     assert trace.steps > 2 * SteppedJob(_swept(box, speed), fidelity, False).where[-1]
+
+
+def test_a_thin_rod_that_soft_contacts_throw_back_is_flagged_and_rod_follows_it():
+    whisker = WhiskerArray.of("mouse")["C2"].whisker
+    post = Cylinder((0.5 * whisker.arc_length, 3e-3, -5e-3), (0.5 * whisker.arc_length, 3e-3, 5e-3), 5e-5)
+
+    def motion(times):
+        return np.outer(times, [0, -0.1, 0]), np.tile([1.0, 0, 0, 0], (len(times), 1))
+
+    job = Job(whisker, StillFollicle(), (Obstacle((post,), motion),), np.arange(1, 400) * 2e-4)
+    (soft,) = get_engine("mujoco").run([job], Fidelity.preset("balanced"))
+    (rigid,) = get_engine("rod").run([job], Fidelity.preset("balanced"))
+    (fine,) = get_engine("rod").run([job], Fidelity.parse("accurate,contact_tolerance=1e-6"))
+    assert soft.status == "unstable"
+    assert "changes by 69% (root mean square) with half the step" in soft.reason
+    assert rigid.status == "ok"
+    assert np.linalg.norm(rigid.wrench - fine.wrench) < 0.1 * np.linalg.norm(fine.wrench)
 
 
 def test_what_stays_at_half_the_step_keeps_its_numbers(halves):

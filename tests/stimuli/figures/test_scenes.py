@@ -212,7 +212,13 @@ def test_impossible_styles_are_refused(options, message):
 
 
 @pytest.mark.parametrize(
-    ("name", "times", "message"), [("a.jpg", None, "did you mean '.png'"), ("a.png", [0.0, 0.1], "shows one instant")]
+    ("name", "times", "message"),
+    [
+        ("a.jpg", None, "did you mean '.png'"),
+        ("a.png", [0.0, 0.1], "shows one instant"),
+        ("a.png", [1e6], r"ends at .* ms; received the instant 1e\+09 ms"),
+        ("a.gif", [0.0, 1e6], r"ends at .* ms; received the instant 1e\+09 ms"),
+    ],
 )
 def test_impossible_files_are_refused(tmp_path, name, times, message):
     with pytest.raises(UsageError, match=message):

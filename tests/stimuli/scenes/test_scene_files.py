@@ -1,10 +1,12 @@
 import math
+import pathlib
 
 import numpy as np
 import pytest
 import trimesh
 
 from brainbench.core.errors import DataError, DataFileNotFoundError, UsageError
+from brainbench.stimuli import simulate
 from brainbench.stimuli.motion.trajectories import ROTATIONS, Path, Spin, Still, Translation
 from brainbench.stimuli.objects.obstacle import Cylinder
 from brainbench.stimuli.scenes.frames import Frames
@@ -255,3 +257,9 @@ def test_an_object_turns_or_follows_keyframes(tmp_path):
 def test_motions_of_objects_that_cannot_be_meant_are_refused(tmp_path, keys, message):
     with pytest.raises(UsageError, match=message):
         _object_motion(tmp_path, keys)
+
+
+def test_the_shipped_pole_stands_where_no_whisker_starts_in_it():
+    pytest.importorskip("warp")
+    scene = load_scene(pathlib.Path(__file__).parents[3] / "docs" / "scenes" / "pole.toml")
+    assert (simulate(scene.scenes, fidelity="fast", cache=False)["status"] == "ok").all()

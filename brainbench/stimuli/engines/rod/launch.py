@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from brainbench.core.devices import to_struct, warp
 from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.engines.rod.compilation import load_kernels
-from brainbench.stimuli.engines.rod.limits import FINEST, LIGHT, LONGEST_SPAN, TO_ROUNDING, contact_iterations
+from brainbench.stimuli.engines.rod.limits import LIGHT, LONGEST_SPAN, TO_ROUNDING, contact_iterations
 from brainbench.stimuli.engines.rod.packing import PackedJobs, PackedMotions, capacity_for, pack_chains
 from brainbench.stimuli.engines.rod.scheduling import Slices, allocate, make_problems
 from brainbench.stimuli.engines.rod.shapes import PackedShapes
@@ -138,8 +138,6 @@ class WhiskerSolver:
         self.block = {} if block is None else {"block_dim": block}
         self.steps = np.array([fidelity.step_of(chain) * MILLI for chain in self.chains])
         """[whisker] longest time step (ms)."""
-        self.shortest = self.steps / FINEST / MILLI
-        """[whisker] shortest time step (s)."""
         self.strongest = np.array([strongest_force(chain.whisker) for chain in self.chains])
         self.tuning: dict[str, Any] = {}
         """Arguments of :class:`Slices`."""
@@ -162,8 +160,7 @@ class WhiskerSolver:
         start: float = 0.0,
         gravity: Sequence[float] = (0.0, 0.0, 0.0),
         axes: NDArray[np.float64] | None = None,
-        travel: NDArray[np.float64] | None = None,
-        fast_at: NDArray[np.float64] | None = None,
+        fast: NDArray[np.float64] | None = None,
         record_shape: bool = False,
     ) -> LaunchResult:
         """Simulate jobs.
@@ -174,7 +171,8 @@ class WhiskerSolver:
             size: rows and columns of the results; jobs that stand in none of them are as if at rest.
             start, gravity: beginning of the simulation (s), acceleration [3] (m/s²).
             axes: rotation [3, 3] of the results; none when None.
-            travel, fast_at: [row, column] as in :class:`brainbench.stimuli.engines.trust.RunFacts`; never when None.
+            fast: [3, row, column] ``travel``, ``farthest`` and ``fast_at`` of
+                :class:`brainbench.stimuli.engines.trust.RunFacts`; never when None.
             record_shape: also return shapes and contact wrenches; jobs then stand in their rows in order.
         """
         device = self.device
@@ -204,8 +202,7 @@ class WhiskerSolver:
             # Single precision rounds a late time; the reading at it must not pass for one before it.
             start + table(found["failed"].astype(float)) * (1 - 2e-7) / MILLI,
             *_strong(force, table(self.strongest[jobs.whisker]), readings),
-            travel=np.zeros(size) if travel is None else travel,
-            fast_at=np.full(size, np.inf) if fast_at is None else fast_at,
+            *(np.full((3, *size), np.inf) if fast is None else fast),
             residual=missed,
             crowded=counts["crowded"],
             steps=counts["steps"],

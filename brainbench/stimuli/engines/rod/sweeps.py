@@ -22,9 +22,10 @@ from brainbench.core.rotations import euler_matrix, from_matrices
 from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.engines.protocol import base_rotation
 from brainbench.stimuli.engines.rod.launch import LaunchResult, WhiskerSolver
-from brainbench.stimuli.engines.rod.limits import MESHES, WIDEST
+from brainbench.stimuli.engines.rod.limits import MESHES
 from brainbench.stimuli.engines.rod.packing import PackedJobs, PackedMotions, still_knots
 from brainbench.stimuli.engines.rod.shapes import PackedShapes, PackedSurface
+from brainbench.stimuli.engines.rod.tasks import followed
 from brainbench.stimuli.engines.rod.tries import Ahead, Try, first_simulation, run_with_retries, tries_ahead
 from brainbench.stimuli.engines.sweep_batch import SweepBatch, describe_unstable, join_batches
 from brainbench.stimuli.engines.units import MILLI
@@ -109,8 +110,11 @@ class SweepLauncher:
             # Neighbouring threads take the same whisker past the same object.
             whisker, sweep = np.indices((whiskers, count), dtype=np.int32).reshape(2, -1)
             row, column, finer, size = sweep, whisker, np.ones_like(sweep), (count, whiskers)
-        travel = np.empty(size)
-        travel[row, column] = speed[sweep] * self.solver.shortest[whisker]
+        radii = np.array([chain.whisker.base_radius for chain in self.solver.chains])
+        speeds = speed[sweep]
+        way, farthest = followed(speeds, speeds, self.solver.steps[whisker] / MILLI, radii[whisker])
+        fast = np.empty((3, *size))
+        fast[:, row, column] = way, farthest, np.where(way > farthest, 0.0, np.inf)
         placed = time.perf_counter() - started
         result = self.solver.launch(
             PackedJobs(whisker, sweep, bases[whisker], row, column, finer),
@@ -119,8 +123,7 @@ class SweepLauncher:
             self.grid.frames.readings,
             size,
             axes=self._head,
-            travel=travel,
-            fast_at=np.where(travel > WIDEST / MILLI, 0.0, np.inf),
+            fast=fast,
         )
         self.seconds = {"objects": placed, **result.seconds}
         return result

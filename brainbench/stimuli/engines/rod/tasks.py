@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.engines.motion_pieces import KNOT, Cutting
@@ -28,7 +28,7 @@ from brainbench.stimuli.engines.rod.packing import (
 )
 from brainbench.stimuli.engines.rod.shapes import PackedShapes, TrackedObstacle
 from brainbench.stimuli.engines.stepping import is_silent
-from brainbench.stimuli.engines.trust import step_travel
+from brainbench.stimuli.engines.trust import BLOW_STRIDE, HARD_BLOW, near_travel, step_travel
 from brainbench.stimuli.engines.units import MILLI
 from brainbench.stimuli.whiskers.chain import Chain
 
@@ -48,9 +48,8 @@ class JobTask:
     """What tells them from other bodies."""
     limit: NDArray[np.float64] | None
     """[cell] longest step from each cell of the motions on (s); None for any."""
-    fast: tuple[float, float]
-    """When (s) an object first moves further against the whisker in the shortest step than contacts are looked for, inf
-    if never, and how far (m)."""
+    fast: tuple[float, float, float]
+    """``travel``, ``farthest`` and ``fast_at`` of :class:`brainbench.stimuli.engines.trust.RunFacts`."""
     twists: bool
     """Whether it may leave its plane, and may twist at this fidelity."""
 
@@ -99,10 +98,10 @@ def make_task(
     pieces = [track.pieces for track in (base, *(body.track for body in near)) if track.pieces is not None]
     limits = [some.longest_steps(step, per_period) for some in pieces if some.needed.max() > 1]
     limit = np.min(limits, axis=0) if limits else None
-    shortest = np.full(len(seen) - 1, step)
+    steps = np.full(len(seen) - 1, step)
     if limit is not None:
-        shortest = limit[np.clip(((seen[:-1] - start) / KNOT).astype(int), 0, len(limit) - 1)]
-    fast = _too_fast(job, reach, (position, euler), seen, shortest / FINEST)
+        steps = limit[np.clip(((seen[:-1] - start) / KNOT).astype(int), 0, len(limit) - 1)]
+    fast = _too_fast(job, reach, (position, euler), seen, steps, step)
     twists = fidelity.twist is not False and not stays_in_plane(job, reach, position, euler, seen)
     return JobTask(job, chain, base, near, reach.indices, names, limit, fast, twists)
 
@@ -144,7 +143,6 @@ class PackedTasks:
     def launch(self, solver: WhiskerSolver, *, record_shape: bool) -> LaunchResult:
         """Simulate the tasks in a solver of :attr:`chains`; a row of results each."""
         first = self.tasks[0].job
-        fast = np.array([task.fast for task in self.tasks])
         return solver.launch(
             self.jobs,
             self.motions,
@@ -153,23 +151,40 @@ class PackedTasks:
             (len(self.tasks), 1),
             start=first.start,
             gravity=first.gravity,
-            fast_at=fast[:, :1],
-            travel=fast[:, 1:],
+            fast=np.array([task.fast for task in self.tasks]).T[..., None],
             record_shape=record_shape,
         )
 
 
+def followed(
+    speed: NDArray[np.float64], blow: NDArray[np.float64], step: NDArray[np.float64], radius: ArrayLike
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return ways (m) of objects in a step (s), and up to which way contact is followed.
+
+    ``speed`` (m/s) is that against any point of the whisker, ``blow`` that against its base while the object is near.
+    """
+    # The shortest step that contacts may ask for finds them; blows are cut to one way by it, whose force is not right.
+    stride = np.multiply(BLOW_STRIDE, radius)
+    hard = (blow > HARD_BLOW) & (blow * step > stride)
+    return np.where(hard, blow * step, speed * step / FINEST), np.where(hard, stride, WIDEST / MILLI)
+
+
 def _too_fast(
-    job: Job, reach: Reach, pose: tuple[NDArray, NDArray], times: NDArray, shortest: NDArray
-) -> tuple[float, float]:
-    """Return :attr:`JobTask.fast` from the base's ``pose`` at ``times`` [n] (s) and the shortest steps [n − 1] (s)."""
-    share = shortest / np.diff(times)
-    still = [obstacle for obstacle in reach.obstacles if obstacle.motion is None]
-    # Against all that stands still the whisker moves alike.
-    for obstacle in [*still[:1], *(obstacle for obstacle in reach.obstacles if obstacle.motion is not None)]:
-        # Ways between knots, scaled to the shortest step that a retry may take.
-        travel = step_travel(job.whisker, *pose, obstacle, times) * share
-        if (travel > WIDEST / MILLI).any():
-            first = int(np.argmax(travel > WIDEST / MILLI))
-            return float(times[first]), float(travel[first])
-    return math.inf, 0.0
+    job: Job, reach: Reach, pose: tuple[NDArray, NDArray], times: NDArray, steps: NDArray, step: float
+) -> tuple[float, float, float]:
+    """Return :attr:`JobTask.fast` from the base's ``pose`` at ``times`` [n] (s).
+
+    ``steps`` [n − 1] (s) are the longest there, ``step`` is the longest of the whisker.
+    """
+    for obstacle in reach.obstacles:
+        speed = step_travel(job.whisker, *pose, obstacle, times) / np.diff(times)
+        blow = np.zeros_like(speed)
+        if speed.max(initial=0.0) > HARD_BLOW:
+            # Without the turns of the base, which are those of whisking. Steps that a brief motion shortens follow it.
+            blow = near_travel(job.whisker, pose[0], np.zeros_like(pose[1]), obstacle, times) / np.diff(times)
+            blow[steps < step] = 0.0
+        way, farthest = followed(speed, blow, steps, job.whisker.base_radius)
+        if (way > farthest).any():
+            first = int(np.argmax(way > farthest))
+            return float(way[first]), float(farthest[first]), float(times[first])
+    return 0.0, math.inf, math.inf
