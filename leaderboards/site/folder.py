@@ -17,7 +17,7 @@ import msgspec
 from brainbench.core.errors import DataError, UsageError
 from brainbench.core.files import atomic_path, file_hash, read_json, writable, write_json
 from brainbench.core.writing.locks import lock_folder
-from brainbench.core.writing.temporaries import is_temporary
+from brainbench.core.writing.temporaries import is_temporary, sweep
 
 MANIFEST = "build-manifest.json"
 _Hashes = dict[str, list[str]]
@@ -38,6 +38,8 @@ def rebuilt(root: Path) -> Iterator[Callable[[str, str | bytes], Path]]:
     check_site(root)
     with writable(root), lock_folder(root):
         known, present = check_site(root)
+        for folder, _, _ in os.walk(root):
+            sweep(Path(folder))
         _write(root, known)
         new: _Hashes = {}
         with ExitStack() as stack:

@@ -20,7 +20,7 @@ _TEMPORARY = re.compile(r"\..+-(?P<machine>[0-9a-f]{4})(?P<process>[0-9a-f]{6})[
 
 def temporary_path(target: Path) -> Path:
     """Return a new name beside ``target``, with its suffix; what dead processes left in the folder is removed."""
-    sweep(target.parent, os.getpid())
+    _sweep_once(target.parent, os.getpid())
     token = f"{_machine()}{os.getpid() % 0x1000000:06x}{secrets.token_hex(3)}"
     return target.with_name(f".{target.stem[:200]}-{token}{target.suffix}")
 
@@ -31,8 +31,14 @@ def is_temporary(name: str) -> bool:
 
 
 @lru_cache(maxsize=1024)
-def sweep(folder: Path, process: int) -> None:
-    """Remove from a folder what processes of this machine left that run no more; once for a folder and process."""
+def _sweep_once(folder: Path, process: int) -> None:
+    # To list a folder of thousands of records for each of them would take minutes.
+    del process
+    sweep(folder)
+
+
+def sweep(folder: Path) -> None:
+    """Remove from a folder what processes of this machine left that run no more."""
     if os.name != "posix":
         return
     with contextlib.suppress(OSError):
