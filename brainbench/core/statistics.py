@@ -13,30 +13,25 @@ from brainbench.core.errors import DataError, UsageError
 from brainbench.core.records import Interval, Score
 
 LEVEL = 0.95
-"""Confidence level where none is asked for."""
+"""Confidence level of all intervals but those of an equivalence test."""
 
 
-def t_interval(values: ArrayLike, level: float = LEVEL, *, over: str = "values") -> Interval | None:
+def t_interval(values: ArrayLike, *, over: str = "values") -> Interval | None:
     """Return Student's t interval of the mean of independent values [n]; None below two values or with missing ones.
 
     Args:
         values: [n], any unit.
-        level: Coverage asked for, in (0, 1).
         over: What the values are, for the method's name: ``animals``, ``seeds``.
-
-    Raises:
-        UsageError: a level outside (0, 1).
     """
     # scipy.stats has the same quantile, but takes most of a second to import.
     from scipy.special import stdtrit
 
-    check_level(level)
     array = np.asarray(values, dtype=np.float64)
     if len(array) < 2 or not np.isfinite(array).all():
         return None
-    half = float(stdtrit(len(array) - 1, (1 + level) / 2) * array.std(ddof=1) / math.sqrt(len(array)))
+    half = float(stdtrit(len(array) - 1, (1 + LEVEL) / 2) * array.std(ddof=1) / math.sqrt(len(array)))
     mean = float(array.mean())
-    return Interval(mean - half, mean + half, level, f"t over {len(array)} {over}")
+    return Interval(mean - half, mean + half, LEVEL, f"t over {len(array)} {over}")
 
 
 FEWEST_ANIMALS = 4
@@ -111,48 +106,40 @@ def _spread(values: NDArray[np.float64]) -> NDArray[np.float64]:
     return (np.where(finite, values - mean, 0.0) ** 2).sum(axis=-1)
 
 
-def wilson_interval(successes: float, count: int, level: float = LEVEL, *, over: str = "trials") -> Interval:
+def wilson_interval(successes: float, count: int, *, over: str = "trials") -> Interval:
     """Return Wilson's score interval of a proportion of independent trials (Wilson 1927).
 
     Raises:
         DataError: there is nothing to count.
-        UsageError: a level outside (0, 1), or not 0 to ``count`` successes.
+        UsageError: not 0 to ``count`` successes.
     """
     from scipy.special import ndtri
 
-    check_level(level)
     if count < 1:
         raise DataError("A proportion needs at least one observation.")
     # A share times a count may lie beyond by its last digit.
     if not -1e-9 <= successes <= count + 1e-9:
         raise UsageError(f"Of {count:,} observations {successes} cannot be successes.")
-    z = float(ndtri(0.5 + level / 2))
+    z = float(ndtri(0.5 + LEVEL / 2))
     share = min(max(successes / count, 0.0), 1.0)
     middle = (share + z * z / (2 * count)) / (1 + z * z / count)
     half = z / (1 + z * z / count) * math.sqrt(share * (1 - share) / count + z * z / (4 * count * count))
-    return Interval(max(0.0, middle - half), min(1.0, middle + half), level, f"Wilson score over {count} {over}")
+    return Interval(max(0.0, middle - half), min(1.0, middle + half), LEVEL, f"Wilson score over {count} {over}")
 
 
 def newcombe_interval(
-    successes: float,
-    count: int,
-    other_successes: float,
-    other_count: int,
-    level: float = LEVEL,
-    *,
-    over: str = "trials",
+    successes: float, count: int, other_successes: float, other_count: int, *, over: str = "trials"
 ) -> Interval:
     """Return the interval of the difference of two independent proportions (Newcombe 1998, method 10).
 
     Raises:
         DataError: one of them has nothing to count.
-        UsageError: a level outside (0, 1).
     """
     share, other = successes / max(count, 1), other_successes / max(other_count, 1)
-    one, two = wilson_interval(successes, count, level), wilson_interval(other_successes, other_count, level)
+    one, two = wilson_interval(successes, count), wilson_interval(other_successes, other_count)
     low = math.hypot(share - one.low, two.high - other)
     high = math.hypot(one.high - share, other - two.low)
-    return Interval(share - other - low, share - other + high, level, f"Newcombe over {over}")
+    return Interval(share - other - low, share - other + high, LEVEL, f"Newcombe over {over}")
 
 
 def is_finite(interval: Interval | None) -> TypeGuard[Interval]:

@@ -96,10 +96,10 @@ class Decomposition:
     """True when the pieces were found in the cache."""
 
 
-def decompose(mesh: Mesh, settings: DecompositionSettings | None = None, *, cache: bool = True) -> Decomposition:
+def decompose(mesh: Mesh, settings: DecompositionSettings | None = None) -> Decomposition:
     """Cut a mesh into convex pieces; holes of the surface are closed by CoACD's remeshing.
 
-    The pieces are computed for the mesh at a diagonal of 1 and kept (with ``cache``) under
+    The pieces are computed for the mesh at a diagonal of 1 and kept under
     ``brainbench.core.files.cache_dir("collision")`` by the hash of that mesh, the settings and the versions
     of the packages, so that one decomposition serves every size.
 
@@ -112,7 +112,7 @@ def decompose(mesh: Mesh, settings: DecompositionSettings | None = None, *, cach
     # Rounded, so that one shape at two sizes has one name in the cache.
     unit = Mesh(np.round((mesh.vertices - centre) / diagonal, 9), mesh.faces, mesh.name)
     key = _key(unit, settings)
-    path = cache_dir("collision") / f"{key}.npz" if cache else None
+    path = cache_dir("collision") / f"{key}.npz"
     found = _read(path, mesh.name)
     pieces, numbers = found or _compute(unit, settings, path)
     outward, inward, samples, decimated = (float(value) for value in numbers)
@@ -128,7 +128,7 @@ def decompose(mesh: Mesh, settings: DecompositionSettings | None = None, *, cach
     )
 
 
-def _compute(unit: Mesh, settings: DecompositionSettings, path: Path | None) -> tuple[tuple[Mesh, ...], Any]:
+def _compute(unit: Mesh, settings: DecompositionSettings, path: Path) -> tuple[tuple[Mesh, ...], Any]:
     module, distribution, extra, purpose = METHODS[settings.method]
     if find_spec(module) is None:
         raise missing_dependency(distribution, extra=extra, purpose=purpose)
@@ -138,8 +138,7 @@ def _compute(unit: Mesh, settings: DecompositionSettings, path: Path | None) -> 
     found = deviation(unit, pieces, inside=reduced)
     # Relative to a diagonal of 1, so that the cached numbers serve every size.
     numbers = np.array([found.outward, found.inward, found.samples, decimated])
-    if path is not None:
-        _write(path, pieces, numbers)
+    _write(path, pieces, numbers)
     return pieces, numbers
 
 

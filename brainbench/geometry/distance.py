@@ -14,6 +14,8 @@ from numpy.typing import ArrayLike, NDArray
 from brainbench.core.reading.ranges import check_number
 from brainbench.geometry.mesh import Mesh
 
+SAMPLES = 4000
+"""Points that are looked at in each direction."""
 _NEIGHBOURS = 24
 _BLOCK = 4_000_000
 
@@ -35,9 +37,7 @@ class Deviation:
         return max(self.outward, self.inward)
 
 
-def deviation(
-    solid: Mesh, pieces: Sequence[Mesh], *, samples: int = 4000, seed: int = 0, inside: Mesh | None = None
-) -> Deviation:
+def deviation(solid: Mesh, pieces: Sequence[Mesh], *, samples: int = SAMPLES, inside: Mesh | None = None) -> Deviation:
     """Measure how far the union of convex ``pieces`` departs from the solid inside a mesh.
 
     Sampled Hausdorff distance between the two as filled bodies, so faces that pieces share inside the
@@ -46,7 +46,7 @@ def deviation(
 
     Args:
         solid, pieces: the mesh, inside where its winding number exceeds one half; convex meshes.
-        samples, seed: points in each direction, on top of the vertices of the pieces; equal seeds give equal numbers.
+        samples: points in each direction, on top of the vertices of the pieces; equal calls give equal numbers.
         inside: a coarser mesh of the same solid that decides what is inside, to save time.
 
     Raises:
@@ -54,7 +54,7 @@ def deviation(
     """
     check_number("The number of samples", samples, least=1, whole=True)
     check_number("The number of pieces", len(pieces), least=1, whole=True)
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     areas = np.array([piece.to_trimesh().area for piece in pieces])
     shares = np.maximum(8, np.ceil(samples * areas / areas.sum())).astype(int)
     points = []
@@ -68,16 +68,11 @@ def deviation(
     return Deviation(outward, _farthest_from(pieces, sample_surface(solid, samples, rng)[0]), samples)
 
 
-def hausdorff(first: Mesh, second: Mesh, *, samples: int = 4000, seed: int = 0) -> float:
-    """Return the sampled two-sided distance [m] between two surfaces (not the bodies inside them).
-
-    Raises:
-        UsageError: there are no samples.
-    """
-    check_number("The number of samples", samples, least=1, whole=True)
-    rng = np.random.default_rng(seed)
-    there = _Surface(second, rng).distance(sample_surface(first, samples, rng)[0])
-    back = _Surface(first, rng).distance(sample_surface(second, samples, rng)[0])
+def hausdorff(first: Mesh, second: Mesh) -> float:
+    """Return the sampled two-sided distance [m] between two surfaces (not the bodies inside them)."""
+    rng = np.random.default_rng(0)
+    there = _Surface(second, rng).distance(sample_surface(first, SAMPLES, rng)[0])
+    back = _Surface(first, rng).distance(sample_surface(second, SAMPLES, rng)[0])
     return float(max(there.max(), back.max()))
 
 

@@ -19,7 +19,7 @@ PRIORITY = 20
 
 
 @contextlib.contextmanager
-def realtime(priority: int = PRIORITY) -> Iterator[None]:
+def realtime() -> Iterator[None]:
     """Run the calling thread ahead of all ordinary ones (SCHED_FIFO) and without garbage collection, until it leaves.
 
     Processes that it starts meanwhile are ordinary. A loop that never sleeps would keep a processor to itself.
@@ -31,11 +31,11 @@ def realtime(priority: int = PRIORITY) -> Iterator[None]:
         raise UsageError("Real-time scheduling is Linux's; leave realtime out on this system.")
     before, parameters, collecting = os.sched_getscheduler(0), os.sched_getparam(0), gc.isenabled()
     try:
-        os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(priority))
+        os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(PRIORITY))
     except PermissionError as error:
         raise UsageError(
-            f"This user may not run threads at real-time priority {priority}; allow it with the line "
-            f"'{os.environ.get('USER', 'USER')} - rtprio {priority}' in /etc/security/limits.conf, or leave realtime "
+            f"This user may not run threads at real-time priority {PRIORITY}; allow it with the line "
+            f"'{os.environ.get('USER', 'USER')} - rtprio {PRIORITY}' in /etc/security/limits.conf, or leave realtime "
             "out."
         ) from error
     gc.disable()

@@ -138,14 +138,14 @@ def step_context(state: EnvState) -> StepContext:
     goals.update(pose[:, 3:], force > 0)
     return StepContext(
         dt=state.step_dt, joint_names=state.model.joints, joint_position=simulation.qpos[:, actuators.qpos_columns],
-        joint_velocity=simulation.qvel[:, actuators.qvel_columns], joint_low=state.low, joint_high=state.high,
-        start_joints=episode.start_joints, power=actuators.power.sum(dim=1), action=episode.action,
-        last_action=episode.last_action, object_position=pose[:, :3], object_quat=pose[:, 3:],
-        object_velocity=velocity, object_spin=spin, start_position=episode.start_position, object_force=force,
-        tip_force=contacts.tip_force, surface_distance=contacts.surface_distance, step_count=episode.steps,
-        goal_angle=goals.angle, previous_goal_angle=goals.angle_before, reached=goals.reached, missed=goals.missed,
-        goals_reached=goals.count, axis_rate=goals.rate, off_axis=goals.off_axis,
-        allowed_off_axis=goals.allowed_off_axis, turned=goals.turned, turned_before=goals.turned_before,
+        joint_low=state.low, joint_high=state.high, start_joints=episode.start_joints,
+        power=actuators.power.sum(dim=1), action=episode.action, last_action=episode.last_action,
+        object_position=pose[:, :3], object_quat=pose[:, 3:], object_velocity=velocity, object_spin=spin,
+        start_position=episode.start_position, object_force=force, tip_force=contacts.tip_force,
+        surface_distance=contacts.surface_distance, goal_angle=goals.angle,
+        previous_goal_angle=goals.angle_before, reached=goals.reached, missed=goals.missed, goals_reached=goals.count,
+        axis_rate=goals.rate, off_axis=goals.off_axis, allowed_off_axis=goals.allowed_off_axis,
+        turned=goals.turned, turned_before=goals.turned_before,
     )  # fmt: skip
 
 

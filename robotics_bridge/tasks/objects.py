@@ -113,8 +113,8 @@ def screwdriver(length: float, handle_length: float, handle_radius: float, shaft
     return ObjectShape(f"screwdriver {handle_radius:g}", (handle, shaft), (wide, length, wide), 0.0)
 
 
-def with_sizes(shapes: Sequence[ObjectShape], span: tuple[float, float], steps: int = 8) -> tuple[ObjectShape, ...]:
-    """Return every shape at several sizes, evenly from the smallest to the largest factor of a span.
+def with_sizes(shapes: Sequence[ObjectShape], span: tuple[float, float]) -> tuple[ObjectShape, ...]:
+    """Return every shape at eight sizes, evenly from the smallest to the largest factor of a span.
 
     Raises:
         UsageError: the range is not positive or falls.
@@ -123,7 +123,7 @@ def with_sizes(shapes: Sequence[ObjectShape], span: tuple[float, float], steps: 
         return tuple(shapes)
     if not 0 < span[0] <= span[1]:
         raise UsageError(f"Factors of size are a positive range (low, high); received {span}.")
-    factors = [span[0] + (span[1] - span[0]) * index / (steps - 1) for index in range(steps)]
+    factors = [span[0] + (span[1] - span[0]) * index / 7 for index in range(8)]
     return tuple(shape.scaled(factor) for factor in factors for shape in shapes)
 
 

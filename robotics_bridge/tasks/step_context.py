@@ -19,8 +19,6 @@ class StepContext:
     joint_names: tuple[str, ...]
     joint_position: torch.Tensor
     """[B, J] (rad)."""
-    joint_velocity: torch.Tensor
-    """[B, J] (rad/s)."""
     joint_low: torch.Tensor
     """[J] limits (rad)."""
     joint_high: torch.Tensor
@@ -49,8 +47,6 @@ class StepContext:
     """[B, F, 3] net normal contact force on finger tips, link frame (N)."""
     surface_distance: torch.Tensor
     """[B, F] from finger tips to the object (m)."""
-    step_count: torch.Tensor
-    """[B] control steps since the start of the episode."""
     goal_angle: torch.Tensor
     """[B] angle to the goal (rad)."""
     previous_goal_angle: torch.Tensor

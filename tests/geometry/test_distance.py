@@ -154,6 +154,5 @@ def test_filling_the_hole_of_a_ring_counts_by_its_depth():
 @pytest.mark.parametrize("samples", [0, -5, 1.5])
 def test_no_distance_is_told_without_a_sample(samples):
     box = _box(1, 1, 1)
-    for measure in (lambda: deviation(box, [box], samples=samples), lambda: hausdorff(box, box, samples=samples)):
-        with pytest.raises(UsageError, match=f"samples .*at least 1; received {samples}"):
-            measure()
+    with pytest.raises(UsageError, match=f"samples .*at least 1; received {samples}"):
+        deviation(box, [box], samples=samples)

@@ -28,6 +28,8 @@ from brainbench.core.statistics import (
 
 MARGIN = 0.1
 """Difference on the common scale below which model and animals count as alike."""
+ALPHA = 0.05
+"""Level of each one-sided test; the interval has level 1 − 2α."""
 
 
 @dataclass(frozen=True)
@@ -58,26 +60,22 @@ class EquivalenceTest:
         return text if self.status == "ok" else f"{text} ({self.status}: {self.reason})"
 
 
-def equivalence_test(
-    differences: ArrayLike, without_stimulus: ArrayLike, *, margin: float = MARGIN, alpha: float = 0.05
-) -> EquivalenceTest:
+def equivalence_test(differences: ArrayLike, without_stimulus: ArrayLike, *, margin: float = MARGIN) -> EquivalenceTest:
     """Test whether a model equals the animals' consistency with one another up to ``margin``.
 
     Args:
         differences: [A] score of the model on each animal less that of the animal against the others.
         without_stimulus: [K] the mean difference without each stimulus in turn.
         margin: Largest difference that still counts as alike, > 0.
-        alpha: Level of each one-sided test; the interval has level 1 − 2α.
 
     Raises:
-        UsageError: a margin or an alpha out of range.
+        UsageError: a margin that is not positive.
 
     >>> test = equivalence_test([-0.01, 0.03, -0.02, -0.01, 0.02], [0.0, 0.004] * 6)
     >>> test.verdict, round(test.difference, 3)
     ('equivalent', 0.002)
     """
     check_number("An equivalence margin", margin, above=0)
-    check_number("alpha", alpha, above=0, below=0.5)
     difference, without = (np.asarray(part, dtype=np.float64).ravel() for part in (differences, without_stimulus))
     difference, without = difference[np.isfinite(difference)], without[np.isfinite(without)]
     count = len(difference)
@@ -89,7 +87,7 @@ def equivalence_test(
     # Two one-sided t tests (Schuirmann 1987), t = (margin ± mean)/error. Both reject at level α exactly when the
     # interval at level 1 − 2α lies within ±margin.
     mean = float(difference.mean())
-    interval = two_factor_interval(mean, difference, without, 1 - 2 * alpha)
+    interval = two_factor_interval(mean, difference, without, 1 - 2 * ALPHA)
     error, freedom = (float(found) for found in two_factor_error(difference, without))
     lower, upper = (student_tail(distance, error, freedom) for distance in (mean + margin, margin - mean))
     low, high = (interval.low, interval.high) if interval else (math.nan, math.nan)
@@ -105,20 +103,18 @@ def equivalence_test(
     )
 
 
-def turing_test(
-    score: Score, animal_to_animal: Score, *, margin: float = MARGIN, alpha: float = 0.05
-) -> EquivalenceTest:
+def turing_test(score: Score, animal_to_animal: Score, *, margin: float = MARGIN) -> EquivalenceTest:
     """Test a model's score against the animals' consistency with one another, paired by animal and stimulus.
 
     Raises:
-        UsageError: a margin or an alpha out of range, or scores by different estimators.
+        UsageError: a margin that is not positive, or scores by different estimators.
     """
     if score.estimator != animal_to_animal.estimator:
         raise UsageError(
             f"Model and animals must be scored by one estimator; received {score.estimator!r} and "
             f"{animal_to_animal.estimator!r}."
         )
-    found = equivalence_test(*paired_differences(score, animal_to_animal), margin=margin, alpha=alpha)
+    found = equivalence_test(*paired_differences(score, animal_to_animal), margin=margin)
     doubtful = [one.name for one in (score, animal_to_animal) if one.status != "ok"]
     if found.status == "undefined" or not doubtful:
         return found

@@ -30,19 +30,17 @@ _SPLITS = 100
 _CHUNK = 20
 
 
-def unit_reliability(
-    blocks: Sequence[Trials], n_stimuli: int, *, splits: int = _SPLITS, seed: int = 0
-) -> tuple[Floats, ...]:
+def unit_reliability(blocks: Sequence[Trials], n_stimuli: int, *, seed: int = 0) -> tuple[Floats, ...]:
     """Return the reliability of every unit's tuning [F], for each session; NaN where it has none.
 
     Responses are [R, F] or [R, T, F], whose time is averaged. A unit without variation over stimuli, or with fewer than
     two trials of some stimulus in every split, has no reliability. Values can be negative.
 
     Raises:
-        UsageError: fewer than 3 stimuli or 1 split, bad shapes or labels.
+        UsageError: fewer than 3 stimuli, bad shapes or labels.
     """
-    if n_stimuli < 3 or splits < 1:
-        raise UsageError(f"A unit's tuning needs at least 3 stimuli and 1 split; received {n_stimuli} and {splits}.")
+    if n_stimuli < 3:
+        raise UsageError(f"A unit's tuning needs at least 3 stimuli; received {n_stimuli}.")
     found = []
     for block in blocks:
         values = np.asarray(block.responses)
@@ -50,8 +48,8 @@ def unit_reliability(
         responses, codes, _ = labelled_trials(values.astype(np.float64), block.labels, n_stimuli)
         session = SortedTrials.sort(responses, codes, trial_hashes(block, responses, codes))
         total, number = np.zeros(responses.shape[1]), np.zeros(responses.shape[1])
-        for start in range(0, splits, _CHUNK):
-            member = split_members(session, n_stimuli, np.arange(start, min(start + _CHUNK, splits)), seed)
+        for start in range(0, _SPLITS, _CHUNK):
+            member = split_members(session, n_stimuli, np.arange(start, start + _CHUNK), seed)
             # Split by split, so that memory holds a chunk of splits of one session.
             halves = [mean_patterns(session, w, n_stimuli, variances=False)[0] for w in (member, 1.0 - member)]
             # Pearson's r over stimuli between the halves' mean responses, of all units and splits at once.

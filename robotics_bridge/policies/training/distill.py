@@ -70,7 +70,6 @@ def distill(
     teacher: Policy,
     stop_after: float | None = None,
     stop_at: int | None = None,
-    graphs: bool = True,
     progress: Progress | None = None,
 ) -> DistillResult:
     """Teach a student, or go on with a run that was interrupted.
@@ -84,7 +83,6 @@ def distill(
         env: Environment of :func:`robotics_bridge.tasks.make` with the configuration's observation type.
         teacher: Of :func:`robotics_bridge.policies.training.teacher.load_teacher`.
         stop_after, stop_at: When to stop, where that is before the end.
-        graphs: On CUDA, record a step of learning and replay it.
         progress: Called with (iterations done, iterations in all, what).
 
     Raises:
@@ -101,7 +99,7 @@ def distill(
     devices = [env.device] if torch.device(env.device).type == "cuda" else []
     with lock_folder(Path(out), wait=False), torch.random.fork_rng(devices=devices):
         torch.manual_seed(config.seed)
-        run = _Run(config.resolved(env.task.student), Path(out), env, teacher, graphs=graphs)
+        run = _Run(config.resolved(env.task.student), Path(out), env, teacher)
         # Products as exact as PyTorch's convolutions are by default.
         before = torch.get_float32_matmul_precision()
         if devices:
@@ -137,7 +135,7 @@ class _Learner(nn.Module):
 
 
 class _Run:
-    def __init__(self, config: DistillConfig, out: Path, env: Any, teacher: Policy, *, graphs: bool = True) -> None:
+    def __init__(self, config: DistillConfig, out: Path, env: Any, teacher: Policy) -> None:
         self.config, self.out, self.env, self.teacher = config, out, env, teacher
         self.device = torch.device(env.device)
         read = [name for name in env.task.groups["student"] if name != TACTILE]
@@ -158,7 +156,7 @@ class _Run:
         self.front = tactile.frozen_part if tactile is not None else None
         self.precision = torch.bfloat16 if config.precision == "bf16" else None
         self.student.core.precision = self.precision
-        self.step = ChunkStep(self._loss, weights, self.optimizer, clip=config.max_grad_norm, record=cuda and graphs)
+        self.step = ChunkStep(self._loss, weights, self.optimizer, clip=config.max_grad_norm, record=cuda)
         self.observations: dict[str, torch.Tensor] = env.reset()
         # First episodes end at different times, so that no rollout holds only beginnings.
         env.episode_length_buf.copy_(torch.randint_like(env.episode_length_buf, int(env.max_episode_length)))

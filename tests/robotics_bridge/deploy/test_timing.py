@@ -35,7 +35,7 @@ def test_a_user_who_may_not_is_told_how_to_be_allowed(monkeypatch: pytest.Monkey
         raise PermissionError
 
     monkeypatch.setattr(os, "sched_setscheduler", refuse)
-    with pytest.raises(UsageError, match=r"rtprio 7' in .*limits\.conf"), realtime(7):
+    with pytest.raises(UsageError, match=r"rtprio 20' in .*limits\.conf"), realtime():
         pass
     assert gc.isenabled()
 

@@ -131,8 +131,8 @@ def test_timed_goals_stay_within_their_tilt() -> None:
 def test_shapes_share_their_slots_and_scale_in_all_lengths() -> None:
     shapes = (box(0.04, 0.05, 0.06), screwdriver(0.2, 0.1, 0.02, 0.004))
     assert slots(shapes) == ("box", "capsule", "cylinder")
-    sizes = with_sizes(shapes, (0.5, 2.0), steps=4)
-    assert len(sizes) == 8
+    sizes = with_sizes(shapes, (0.5, 2.0))
+    assert len(sizes) == 16
     assert sizes[0].extent == pytest.approx((0.02, 0.025, 0.03))
     assert sizes[-1].solids[0].position == pytest.approx((0.0, 0.3, 0.0))
     assert with_sizes(shapes, (1.0, 1.0)) == shapes
