@@ -22,6 +22,7 @@ from collections.abc import Callable, Iterator
 from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import numpy as np
 import torch
@@ -31,13 +32,18 @@ from benchmarks.report import table, write_section
 from brainbench.core.cuda_graphs import record_step
 from brainbench.models.activations import evaluating
 from brainbench.models.export import export_model, read_onnx
-from brainbench.models.ops.dispatch import plain
+from brainbench.models.ops import dispatch
 from brainbench.models.ops.packing import packed
 from brainbench.models.registry import describe_model, load_model
 from brainbench.models.streaming import StreamingStep
 from brainbench.models.training.gradients import compiled, fuse
 
 STEPS = 22
+
+
+def plain() -> Any:
+    """A context that leaves everything to PyTorch's own operations, to compare with."""
+    return mock.patch.object(dispatch, "TRITON", False)
 
 
 class Loop(torch.nn.Module):

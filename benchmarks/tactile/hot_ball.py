@@ -21,10 +21,17 @@ from benchmarks.report import table, write_section
 from robotics_bridge import tasks
 from robotics_bridge.envs import Env
 from robotics_bridge.policies.training.teacher import load_teacher
-from robotics_bridge.tasks.hot_ball import CELLS, DIAMETER
+from robotics_bridge.tasks.hot_ball import DIAMETER
 from robotics_bridge.tasks.task import Success
 from robotics_bridge.tasks.thermometers import ThermalSettings, Thermometers
 
+CELLS = tuple(
+    (conductivity, emissivity, heat)
+    for conductivity in (1.0, 10.0, 100.0, 150.0)
+    for emissivity in (0.5, 0.85)
+    for heat in (500.0, 5000.0)
+)
+"""Conductivity, emissivity and heat generation of the sixteen cells of figure 4.8."""
 PUBLISHED = {(150.0, 0.5, 500.0), (150.0, 0.5, 5000.0)}
 """Cells with a check mark in figure 4.8."""
 NAMES = {1.0: "glass", 10.0: "steel", 100.0: "aluminium alloy", 150.0: "aluminium"}

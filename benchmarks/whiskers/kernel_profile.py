@@ -12,12 +12,11 @@ from collections.abc import Callable
 from typing import Any
 
 import torch
-from policy_encoder import cast, copy_into
-from training_step import clock, sweeps, training_step
 
+from benchmarks.models.training_step import clock, plain, sweeps, training_step
+from benchmarks.policies.encoder_step import cast, copy_into
 from brainbench.core.cuda_graphs import record_step
 from brainbench.models.activations import evaluating
-from brainbench.models.ops.dispatch import plain
 from brainbench.models.registry import load_model
 
 DEVICE = torch.device("cuda")

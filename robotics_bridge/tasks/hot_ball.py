@@ -28,13 +28,6 @@ if TYPE_CHECKING:
 SIDE, WALL, HEIGHT, TILT = 0.5, 0.0125, 0.25, math.radians(10)
 """Outer edge of the bin, thickness of its walls and floor, its height [m], and how far it leans about y [rad]."""
 BALLS, DIAMETER = 8, 0.08
-CELLS = tuple(
-    (conductivity, emissivity, heat)
-    for conductivity in (1.0, 10.0, 100.0, 150.0)
-    for emissivity in (0.5, 0.85)
-    for heat in (500.0, 5000.0)
-)
-"""Conductivity, emissivity and heat generation of the sixteen cells of figure 4.8."""
 _SPANS = {"x": (-0.22, 0.22), "y": (-0.22, 0.22), "z": (-0.2, 0.05)}
 """Distance that the hand can be carried from above the middle of the bin [m]."""
 LOWER = 0.08

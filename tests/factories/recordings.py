@@ -8,7 +8,7 @@ from brainbench.core.contracts import CHANNELS
 from brainbench.datasets.sessions import Session, make_session
 from brainbench.datasets.synthetic import PopulationDesign
 from brainbench.datasets.synthetic.populations import draw_sessions
-from brainbench.datasets.synthetic.sessions import trial_times
+from brainbench.datasets.synthetic.sessions import spike_session, trial_times
 from brainbench.datasets.trials.conditions import Conditions
 from brainbench.datasets.trials.counting import UNIT_COLUMNS, ReadingOptions, SessionCounts, missing_column
 from brainbench.datasets.trials.joining import join_sessions
@@ -74,6 +74,11 @@ def quiet_design(**changes):
     """A design without any noise but Poisson's and without individual differences, apart from ``changes``."""
     quiet = {"animals": 11, "units": 40, "trials": 20, "rate": 8.0, "window": 1.0, "modulation": 0.3}
     return PopulationDesign(**{**quiet, "emphasis": 0.0, "dispersion": 0.0, "shared_gain": 0.0, **changes})
+
+
+def make_sessions(geometry, design=None, *, seed=0):
+    """Synthetic animals as sessions of spike times."""
+    return [spike_session(geometry, drawn) for drawn in draw_sessions(geometry, design, seed)]
 
 
 def as_recordings(geometry, design=None, *, seed=0):

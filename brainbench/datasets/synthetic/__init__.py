@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from brainbench.datasets.synthetic.geometry import ResponseGeometry
     from brainbench.datasets.synthetic.populations import draw_animals, stimulus_means
     from brainbench.datasets.synthetic.rodgers_demo import ensure_rodgers_demo, make_rodgers_demo
-    from brainbench.datasets.synthetic.sessions import make_sessions, write_files
+    from brainbench.datasets.synthetic.sessions import write_files
     from brainbench.datasets.synthetic.truth import read_truth
 
 __all__ = [
@@ -30,7 +30,6 @@ __all__ = [
     "draw_animals",
     "ensure_rodgers_demo",
     "make_rodgers_demo",
-    "make_sessions",
     "measure_ceiling",
     "read_truth",
     "simulate",

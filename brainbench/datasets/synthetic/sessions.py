@@ -31,18 +31,6 @@ _TOUCH = 0.05
 """Duration of a contact, s."""
 
 
-def make_sessions(
-    geometry: ResponseGeometry, design: PopulationDesign | None = None, *, seed: int | Sequence[int] = 0
-) -> list[Session]:
-    """Draw synthetic animals as sessions of spike times.
-
-    A trial begins 0.5 s before a whisker touches (table ``contacts_by_whisker_C1``); 15 % of the spikes that are
-    counted come about 12 ms after that touch, the others anywhere in the window; between windows units fire at half
-    their mean rate, and never twice within 2 ms (less at rates above 250 Hz). The window is ``first-contact..choice``.
-    """
-    return [_session(geometry, drawn) for drawn in draw_sessions(geometry, design, seed)]
-
-
 def write_files(
     folder: str | os.PathLike[str],
     geometry: ResponseGeometry,
@@ -71,7 +59,7 @@ def write_files(
 
     def draw() -> Iterator[SyntheticSession]:
         for done, drawn in enumerate(draw_sessions(geometry, design, seed), start=1):
-            yield SyntheticSession(replace(_session(geometry, drawn), stimuli=stimuli), drawn.expected)
+            yield SyntheticSession(replace(spike_session(geometry, drawn), stimuli=stimuli), drawn.expected)
             if progress is not None:
                 progress(done, design.animals * design.sessions, f"synthetic recordings {drawn.subject}")
 
@@ -99,7 +87,13 @@ def trial_times(drawn: DrawnSession) -> tuple[NDArray[np.float64], NDArray[np.fl
     return stop - pause - drawn.window, stop
 
 
-def _session(geometry: ResponseGeometry, drawn: DrawnSession) -> Session:
+def spike_session(geometry: ResponseGeometry, drawn: DrawnSession) -> Session:
+    """Return the spike times of a session whose counts were drawn.
+
+    A trial begins 0.5 s before a whisker touches (table ``contacts_by_whisker_C1``); 15 % of the spikes that are
+    counted come about 12 ms after that touch, the others anywhere in the window; between windows units fire at half
+    their mean rate, and never twice within 2 ms (less at rates above 250 Hz). The window is ``first-contact..choice``.
+    """
     random = np.random.default_rng([*drawn.stream, 1])
     begin, stop = trial_times(drawn)
     choice, end = begin + drawn.window, float(stop[-1])

@@ -21,7 +21,6 @@ import functools
 import importlib.util
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from contextvars import ContextVar
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -32,17 +31,17 @@ from brainbench.models.ops.layers import Conv2d
 if TYPE_CHECKING:
     from brainbench.models.cells import IntersectionRNN
 
-_TRITON = importlib.util.find_spec("triton") is not None
-_wanted: ContextVar[bool] = ContextVar("brainbench_kernels", default=True)
+TRITON = importlib.util.find_spec("triton") is not None
+"""True where the kernels can be compiled."""
 
 
 def usable(x: torch.Tensor) -> bool:
     """Return whether the kernels apply to what is computed from ``x`` here: in bfloat16, on CUDA, not being traced."""
-    if not _eager_on_cuda(x) or not _wanted.get():
+    if not _eager_on_cuda(x):
         return False
     # Under autocast inputs may still be single: what counts is the precision that convolutions compute in.
     half = torch.get_autocast_dtype("cuda") if torch.is_autocast_enabled("cuda") else x.dtype
-    return half == torch.bfloat16 and _TRITON
+    return half == torch.bfloat16 and TRITON
 
 
 def selective_scan(x: torch.Tensor) -> Any:
@@ -95,16 +94,6 @@ def deferring(given: Iterable[tuple[Any, Any]]) -> Iterator[None]:
     finally:
         for module in changed:
             module.deferred = None
-
-
-@contextmanager
-def plain() -> Iterator[None]:
-    """Leave everything to PyTorch's own operations, to compare with."""
-    token = _wanted.set(False)
-    try:
-        yield
-    finally:
-        _wanted.reset(token)
 
 
 def _eager_on_cuda(x: torch.Tensor) -> bool:

@@ -13,9 +13,9 @@ from brainbench.datasets.checks.spikes import coincidences
 from brainbench.datasets.exports import subset
 from brainbench.datasets.reading import each_session, open_file
 from brainbench.datasets.sessions import SPIKES, Session, SessionTable, make_session, ragged
-from brainbench.datasets.synthetic import ResponseGeometry, make_sessions, write_files
+from brainbench.datasets.synthetic import ResponseGeometry, write_files
 from tests.factories.recording_files import HUMAN, detection, write_nwb, write_rodgers
-from tests.factories.recordings import as_recordings, make_simple_session, quiet_design
+from tests.factories.recordings import as_recordings, make_sessions, make_simple_session, quiet_design
 
 GEOMETRY = ResponseGeometry.from_features(np.random.default_rng(0).normal(size=(6, 4)))
 

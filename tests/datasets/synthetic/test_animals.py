@@ -14,7 +14,6 @@ from brainbench.datasets.synthetic import (
     PopulationDesign,
     ResponseGeometry,
     calibrate,
-    make_sessions,
     measure_ceiling,
     read_truth,
     simulate,
@@ -24,7 +23,7 @@ from brainbench.datasets.synthetic import (
 from brainbench.datasets.trials.session_trials import trials_by_subject
 from brainbench.metrics import noise_ceiling, rdm
 from brainbench.metrics.reliability.subject_rdm import subject_rdm
-from tests.factories.recordings import as_recordings, quiet_design
+from tests.factories.recordings import as_recordings, make_sessions, quiet_design
 
 SMALL = quiet_design(animals=3, sessions=2, units=12, trials=5)
 
