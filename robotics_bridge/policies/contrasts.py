@@ -160,7 +160,7 @@ class MixedModel:
             check_name("arm", name, self.arms)
         return self._estimate(np.array([float(one == arm) - float(other == arm) for arm in self.arms]))
 
-    def judge(self, arm: str, random: Collection[str], *, margin: float = MARGIN) -> Help:
+    def judge(self, arm: str, random: Collection[str]) -> Help:
         """Return whether an arm helps beyond the best of some random arms.
 
         Raises:
@@ -173,7 +173,7 @@ class MixedModel:
         best = max(random, key=lambda name: self.mean(name).difference)
         found = self.contrast(arm, best)
         above = found.interval is not None and found.interval.low > 0
-        return Help(above and found.difference >= margin, best, found)
+        return Help(above and found.difference >= MARGIN, best, found)
 
     def _estimate(self, weights: NDArray[np.float64]) -> Contrast:
         x, y = self._design, self._success

@@ -80,7 +80,6 @@ def design_for_networks(
     networks: Sequence[Any],
     variables: Sequence[str],
     *,
-    bounds: Mapping[str, tuple[float, float]] | None = None,
     options: DesignOptions | None = None,
     study: RecoveryDesign | None = None,
     boards: int = BOARDS,
@@ -92,7 +91,6 @@ def design_for_networks(
         scenes: the same whiskers and motion, each with another object; at least eight, every other one is held out.
         networks: two models as :func:`brainbench.score` takes them; no files of activations.
         variables: names of :data:`brainbench.stimuli.design_variables.VARIABLES`.
-        bounds: bounds of single variables, in their units.
         options: search and simulation; noise and rate of its sensor do not count, the noise is that of animals.
         study: animals that are drawn to compare motions; its layer is that of networks that commit to none: ``any``
             and ``last`` stand for the last.
@@ -111,7 +109,7 @@ def design_for_networks(
         )
     if len(networks) != 2:
         raise UsageError(f"A design tells two networks apart; received {len(networks)}.")
-    begin, limits = read_limits(scenes, variables, bounds or {})
+    begin, limits = read_limits(scenes, variables, {})
     models = [_Network.of(model, study.layer) for model in networks]
     if models[0].name == models[1].name:
         raise UsageError(f"The network {models[0].name!r} is given twice; give two different ones.")

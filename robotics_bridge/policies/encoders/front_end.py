@@ -90,11 +90,6 @@ class FrontEnd(nn.Module):
             self.step.requires_grad_(False)
             self.train(False)
 
-    @property
-    def network(self) -> EncoderAttenderDecoder:
-        """The network."""
-        return self.step.model
-
     def train(self, mode: bool = True) -> FrontEnd:
         """Set training mode; a frozen network stays in evaluation mode."""
         super().train(mode and self.learning != "frozen")

@@ -135,7 +135,7 @@ class _Learner(nn.Module):
 
 
 class _Run:
-    def __init__(self, config: DistillConfig, out: Path, env: Any, teacher: Policy) -> None:
+    def __init__(self, config: DistillConfig, out: Path, env: Any, teacher: Policy, *, graphs: bool = True) -> None:
         self.config, self.out, self.env, self.teacher = config, out, env, teacher
         self.device = torch.device(env.device)
         read = [name for name in env.task.groups["student"] if name != TACTILE]
@@ -156,7 +156,7 @@ class _Run:
         self.front = tactile.frozen_part if tactile is not None else None
         self.precision = torch.bfloat16 if config.precision == "bf16" else None
         self.student.core.precision = self.precision
-        self.step = ChunkStep(self._loss, weights, self.optimizer, clip=config.max_grad_norm, record=cuda)
+        self.step = ChunkStep(self._loss, weights, self.optimizer, clip=config.max_grad_norm, record=cuda and graphs)
         self.observations: dict[str, torch.Tensor] = env.reset()
         # First episodes end at different times, so that no rollout holds only beginnings.
         env.episode_length_buf.copy_(torch.randint_like(env.episode_length_buf, int(env.max_episode_length)))

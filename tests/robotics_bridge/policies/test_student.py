@@ -225,7 +225,7 @@ def test_a_network_keeps_the_weights_that_were_scored() -> None:
     own = dict(load_model(NETWORK).named_parameters())
     front = policy.core.tactile.front  # type: ignore[union-attr]
     with warnings.catch_warnings():
-        for name, weight in front.network.named_parameters():
+        for name, weight in front.step.model.named_parameters():
             torch.testing.assert_close(weight, own[name], rtol=0, atol=0)
 
 

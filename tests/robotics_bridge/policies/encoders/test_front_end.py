@@ -80,7 +80,7 @@ def test_forces_of_the_calibration_reach_the_network_as_ones() -> None:
     seen = front.stimulus(torch.zeros(1, 5, GRID.items, 6))
     assert not seen.any()
     image = GRID(_touch(1, 1)[0])
-    normalised = front.network.normaliser(front.stimulus(_touch(1, 1)[0])).view(5, 6, 5, 7)
+    normalised = front.step.model.normaliser(front.stimulus(_touch(1, 1)[0])).view(5, 6, 5, 7)
     torch.testing.assert_close(normalised[:, :3], image.view(5, 6, 5, 7)[:, :3] / 0.3)
     torch.testing.assert_close(normalised[:, 3:], image.view(5, 6, 5, 7)[:, 3:] / 4e-3)
 
@@ -92,7 +92,7 @@ def test_the_networks_own_normaliser_acts_per_channel() -> None:
     front = FrontEnd(network, GRID)
     plain = FrontEnd("zhuang-small", GRID)
     touch = _touch(1, 1)[0]
-    ours, theirs = (f.network.normaliser(f.stimulus(touch)) for f in (front, plain))
+    ours, theirs = (f.step.model.normaliser(f.stimulus(touch)) for f in (front, plain))
     ratio = torch.tensor(Normaliser.physical().scale.flatten().tolist()) / torch.tensor(scale)
     torch.testing.assert_close(ours, theirs * ratio.view(-1, 1, 1))
 

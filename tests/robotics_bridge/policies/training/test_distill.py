@@ -129,7 +129,7 @@ def test_a_frozen_network_sees_each_step_once_and_is_left_as_it_was(tmp_path) ->
     _run(tmp_path, iterations=2, encoder="zhuang-small")
     student, _ = load_student(tmp_path)
     own = load_model("zhuang-small").state_dict()
-    for name, value in student.core.tactile.front.network.state_dict().items():  # type: ignore[union-attr]
+    for name, value in student.core.tactile.front.step.model.state_dict().items():  # type: ignore[union-attr]
         torch.testing.assert_close(value, own[name], rtol=0, atol=0)
 
 
