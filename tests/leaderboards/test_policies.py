@@ -39,6 +39,7 @@ def test_records_are_intact_and_make_one_board_on_which_touch_leads(stored) -> N
 def test_every_training_seed_has_a_command_that_exists_and_students_stopped_early_are_unreliable(
     stored,
 ) -> None:
+    tried: set[tuple[str, ...]] = set()
     for item in stored:
         assert item.record is not None
         score = item.record.score
@@ -48,6 +49,9 @@ def test_every_training_seed_has_a_command_that_exists_and_students_stopped_earl
         for command in commands:
             program, *words = shlex.split(command)
             assert program == "brainbench"
-            # All words are parsed before help is shown: an unknown option would be refused.
+            # All words are parsed before help is shown: an unknown option would be refused. Seeds have the same.
+            if (options := tuple(word for word in words if word.startswith("--"))) in tried:
+                continue
+            tried.add(options)
             assert CliRunner().invoke(app, [*words, "--help"]).exit_code == 0
     assert CliRunner().invoke(app, [*words, "--no-such-option", "--help"]).exit_code != 0

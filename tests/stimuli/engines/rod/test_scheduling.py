@@ -130,7 +130,7 @@ def test_whiskers_that_are_simulated_again_do_not_depend_on_what_comes_with_them
     assert together.steps == sum(one.steps for one in alone)
 
 
-@pytest.mark.parametrize("sliced", [False, True])
+@pytest.mark.parametrize("sliced", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_tries_at_the_same_time_give_the_bytes_of_tries_one_after_the_other(sliced):
     picked = {"brick-0": 72, "chair-0": 24, "gear-0": 24, "gear-1": 36, "brick-1": 24}
     objects = resolve_objects(list(picked), surfaces=True)
