@@ -86,6 +86,11 @@ def measure_once(
     return found
 
 
+def with_notes(text: str, notes: Path | None) -> str:
+    """Return the body of a section and, below it, the text of a file that was written by hand."""
+    return text if notes is None else f"{text}\n\n{notes.read_text(encoding='utf-8').strip()}"
+
+
 def write_section(title: str, command: str, body: str, *, subject: str, where: str = "") -> None:
     """Replace or add a section, and write the page anew.
 

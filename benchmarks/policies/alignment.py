@@ -23,7 +23,7 @@ import torch
 from numpy.typing import NDArray
 from scipy.stats import rankdata
 
-from benchmarks.report import measure_once, table, write_section
+from benchmarks.report import measure_once, table, with_notes, write_section
 from brainbench.cli.policy.options import World, agent_of
 from brainbench.core.figures.style import COLORS, PALE, panels, save_figure
 from brainbench.core.files import read_json, write_json
@@ -278,9 +278,7 @@ def main() -> None:
         "Trained networks less their untrained twins:",
         table(["network", *heads], gains(found)),
     ]
-    if options.notes:
-        parts.append(options.notes.read_text(encoding="utf-8").strip())
-    body = "\n\n".join(parts)
+    body = with_notes("\n\n".join(parts), options.notes)
     print(body)
     if options.write:
         draw(found)

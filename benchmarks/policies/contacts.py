@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from benchmarks.report import measure_once, table, write_section
+from benchmarks.report import measure_once, table, with_notes, write_section
 from brainbench.core.devices import mujoco_module
 from brainbench.core.figures.style import COLORS, panels, save_figure
 from robotics_bridge import tasks
@@ -169,8 +169,7 @@ def main() -> None:
     if options.write:
         draw(rows)
         body = f"Block of in_palm_rotate (13 g and more) under `{options.policy}`.\n\n{body}"
-        if options.notes:
-            body += "\n\n" + options.notes.read_text(encoding="utf-8").strip()
+        body = with_notes(body, options.notes)
         words = f"--policy {options.policy} --envs {options.envs}"
         command = f"python -m benchmarks.policies.contacts {words} --out FOLDER --write"
         write_section("Contacts of a block in the hand", command, body, subject="policies")

@@ -23,7 +23,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from benchmarks.report import table, write_section
+from benchmarks.report import table, with_notes, write_section
 from brainbench.core.statistics import wilson_interval
 from robotics_bridge import tasks
 from robotics_bridge.deploy.controller import Clock, Report
@@ -165,8 +165,7 @@ def main() -> None:
             ways[name] = {key: torch.cat([found[key] for found, _ in runs]).tolist() for key in runs[0][0]}
             reports += [report for _, own in runs for report in own] if limited else []
     text = body(options.student, task, ways, reports) + f" What the policy reads: {', '.join(deployed.groups)}."
-    if options.notes:
-        text += "\n\n" + options.notes.read_text(encoding="utf-8").strip()
+    text = with_notes(text, options.notes)
     print(text)
     if options.write:
         command = "python -m benchmarks.policies.deployment --write"

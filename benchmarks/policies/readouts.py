@@ -15,7 +15,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from benchmarks.report import table, write_section
+from benchmarks.report import table, with_notes, write_section
 from brainbench.core.figures.style import COLORS, PALE, panels, save_figure
 from brainbench.core.files import read_json, write_json
 from robotics_bridge.policies.readouts.rollout import TARGETS
@@ -83,8 +83,7 @@ def main() -> None:
     options = parser.parse_args()
     records = [read_json(path) for path in options.record]
     text = "\n\n".join(body(record) for record in records)
-    if options.notes:
-        text += "\n\n" + options.notes.read_text(encoding="utf-8").strip()
+    text = with_notes(text, options.notes)
     print(text)
     if options.write:
         draw(records[0])

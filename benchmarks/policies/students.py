@@ -250,7 +250,7 @@ def lay_out(options: argparse.Namespace) -> None:
     """Print the comparison; with ``--write`` keep it as a section and draw it, and how students learned."""
     from dataclasses import replace
 
-    from benchmarks.report import table, write_section
+    from benchmarks.report import table, with_notes, write_section
     from leaderboards import write_record
     from robotics_bridge.policies import report
     from robotics_bridge.policies.report import figure
@@ -267,9 +267,7 @@ def lay_out(options: argparse.Namespace) -> None:
     parts += [f"Notes: {'; '.join(notes)}."] if notes else []
     logs = found_logs(options.lay_out, named)
     parts += [every_student(named, logs), differences(named, logs)]
-    if options.notes:
-        parts.append(options.notes.read_text(encoding="utf-8").strip())
-    body = "\n\n".join(parts)
+    body = with_notes("\n\n".join(parts), options.notes)
     print(body)
     if options.write:
         figure.draw(results, _PICTURES / "policy-students.png", agents=agents)

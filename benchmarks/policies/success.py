@@ -21,7 +21,7 @@ from scipy.stats import norm
 
 from benchmarks.policies.alignment import RECORD, board, partial_spearman
 from benchmarks.policies.students import NETWORKS, arm_of, found_logs, seen
-from benchmarks.report import table, write_section
+from benchmarks.report import table, with_notes, write_section
 from brainbench.core.figures.style import COLORS, PALE, panels, save_figure
 from brainbench.core.files import read_json
 from brainbench.models.architecture import Architecture
@@ -134,9 +134,7 @@ def main() -> None:
         "networks; `given` is partialled out of the ranks:",
         table(["networks", "count", "quantity", "given", *OUTCOMES.values()], correlations(found)),
     ]
-    if options.notes:
-        parts.append(options.notes.read_text(encoding="utf-8").strip())
-    body = "\n\n".join(parts)
+    body = with_notes("\n\n".join(parts), options.notes)
     print(body)
     if options.write:
         draw(found)

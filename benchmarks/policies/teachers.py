@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.report import table, write_section
+from benchmarks.report import table, with_notes, write_section
 from brainbench.core.figures.style import COLORS, panels, save_figure
 
 PICTURE = Path(__file__).resolve().parents[2] / "docs" / "images" / "policy-teachers.png"
@@ -125,8 +125,7 @@ def main() -> None:
     files, curves = ({name: Path(path) for name, path in pairs(words).items()} for words in
                      (options.evaluated, options.curves))  # fmt: skip
     text = others(files, curves) if options.others else evaluated(files)
-    if options.notes:
-        text += "\n\n" + options.notes.read_text(encoding="utf-8").strip()
+    text = with_notes(text, options.notes)
     print(text)
     if not options.write:
         return
