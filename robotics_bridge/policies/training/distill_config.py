@@ -143,12 +143,12 @@ class DistillConfig:
     @property
     def felt(self) -> str:
         """Observation type, with the embedder of joints and the widths of the head where those are not the usual."""
-        told = ", ".join([self.embedder] * (self.embedder != "mlp") + [self._head] * bool(self._head))
-        return f"{self.observe} ({told})" if told else self.observe
+        return f"{self.observe} ({', '.join(self._unusual)})" if self._unusual else self.observe
 
     @property
-    def _head(self) -> str:
-        return "" if self.hidden == _HIDDEN else f"head-{'-'.join(map(str, self.hidden))}"
+    def _unusual(self) -> list[str]:
+        found = [] if self.embedder == "mlp" else [self.embedder]
+        return found if self.hidden == _HIDDEN else [*found, f"head-{'-'.join(map(str, self.hidden))}"]
 
     @property
     def name(self) -> str:
@@ -164,8 +164,7 @@ class DistillConfig:
                 "noisy" if self.noisy else "clean",
                 f"{arm}{learning}",
             ]
-        parts += [] if self.embedder == "mlp" else [self.embedder]
-        parts += [self._head] if self._head else []
+        parts += self._unusual
         parts += [] if self.contacts in (None, "firm") else [self.contacts]
         parts.append(f"seed{self.seed}")
         drawn = self.encoder_settings.get("pretrained") or self.encoder_settings.get("seed", self.seed)
