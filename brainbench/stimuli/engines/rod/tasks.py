@@ -176,8 +176,13 @@ def _too_fast(
 
     ``steps`` [n − 1] (s) are the longest there, ``step`` is the longest of the whisker.
     """
+    still = next((obstacle for obstacle in reach.obstacles if obstacle.motion is None), None)
+    # Against all that stands still, such as the parts of one object, the whisker moves alike.
+    resting = None if still is None else step_travel(job.whisker, *pose, still, times)
     for obstacle in reach.obstacles:
-        speed = step_travel(job.whisker, *pose, obstacle, times) / np.diff(times)
+        moves = resting is None or obstacle.motion is not None
+        travel = step_travel(job.whisker, *pose, obstacle, times) if moves else resting
+        speed = travel / np.diff(times)
         blow = np.zeros_like(speed)
         if speed.max(initial=0.0) > HARD_BLOW:
             # Without the turns of the base, which are those of whisking. Steps that a brief motion shortens follow it.
