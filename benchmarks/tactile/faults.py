@@ -247,7 +247,7 @@ def recovered() -> str:
 
 def twist() -> str:
     """Default torsional friction of taxels of 4 mm."""
-    return f"{KinematicTaxel(link='hand', probes=Probes.grid(2, 2, size=(0.01, 0.01), radius=0.004)).twist:.2g} N m s"
+    return f"{KinematicTaxel(link='hand', probes=Probes.grid(2, 2, size=(0.01, 0.01), radius=0.004)).torsion:.2g} N m s"
 
 
 FAULTS: dict[str, tuple[str, Callable[[], str]]] = {

@@ -14,11 +14,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.signal import butter, sosfilt_zi
 
-from brainbench.core.errors import UsageError, check_name
+from brainbench.core.errors import UsageError, check_name, shown
 from brainbench.core.reading.ranges import check_fields, check_number
 
 if TYPE_CHECKING:
     import torch
+
+    from robotics_bridge.sensors.selection import EnvIds
 
 
 @dataclass(frozen=True)
@@ -70,7 +72,7 @@ class AfferentFilter:
         rectify: Whether fast bands give magnitudes, as firing rates do.
 
     Raises:
-        UsageError: a band is unknown or does not fit below half the rate.
+        UsageError: there is no band, or one is unknown or does not fit below half the rate.
 
     Example::
 
@@ -87,9 +89,11 @@ class AfferentFilter:
     ) -> None:
         check_number("rate (Hz)", rate, above=0)
         if not isinstance(bands, Mapping):
-            for name in bands:
+            for name in (bands,) if isinstance(bands, str) else bands:
                 check_name("afferent", name, AFFERENTS)
-            bands = {name: AFFERENTS[name] for name in bands}
+            bands = {name: AFFERENTS[name] for name in ((bands,) if isinstance(bands, str) else bands)}
+        if not bands:
+            raise UsageError(f"A filter needs a band, such as {next(iter(AFFERENTS))!r}; received none.")
         self.rate, self.bands, self.rectify = rate, dict(bands), rectify
         self._sections = {name: band.sections(rate) for name, band in self.bands.items()}
         self._state: dict[str, list[list[torch.Tensor]]] = {}
@@ -97,8 +101,13 @@ class AfferentFilter:
     def step(self, x: torch.Tensor) -> dict[str, torch.Tensor]:
         """Return name → filtered signal, in the shape of ``x`` [B, …].
 
-        The first signal counts as having lasted for ever, so that contact before it rings in no band.
+        The first signal counts as having lasted for ever, so that contact before it rings in no band. A value that is
+        not finite stays in its memory until :meth:`reset`.
+
+        Raises:
+            UsageError: the signal holds no real numbers with a fraction, or has another shape than before.
         """
+        self._check(x)
         if not self._state:
             self._state = {name: self._rest(name, x) for name in self.bands}
         filtered = {}
@@ -115,22 +124,42 @@ class AfferentFilter:
             filtered[name] = y.abs() if self.rectify and self.bands[name].low > 0 else y
         return filtered
 
-    def reset(self, env_ids: torch.Tensor | Sequence[int] | None = None, x: torch.Tensor | None = None) -> None:
+    def reset(self, env_ids: EnvIds | None = None, x: torch.Tensor | None = None) -> None:
         """Forget the past of some environments (all by default).
 
         Args:
-            env_ids: Environments.
+            env_ids: Numbers of environments, or a mask [B] bool.
             x: [B, …] signal that counts as having lasted for ever there; zero if not given.
+
+        Raises:
+            UsageError: an environment does not exist, or the signal has another shape than before.
         """
+        from robotics_bridge.sensors.selection import select_envs
+
         if env_ids is None and x is None:
             self._state = {}
             return
+        if x is not None:
+            self._check(x)
+        if self._shape is None:
+            return
+        device = next(iter(self._state.values()))[0][0].device
+        chosen = select_envs(env_ids, self._shape[0], device)
         for name, state in self._state.items():
-            rest = self._rest(name, x if x is not None else state[0][0] * 0)
+            rest = self._rest(name, x if x is not None else state[0][0].new_zeros(self._shape))
             for pair, fresh in zip(state, rest, strict=True):
                 for kept, value in zip(pair, fresh, strict=True):
-                    where = slice(None) if env_ids is None else env_ids
-                    kept[where] = value[where]
+                    kept[chosen] = value[chosen]
+
+    def _check(self, x: torch.Tensor) -> None:
+        if not (hasattr(x, "is_floating_point") and x.is_floating_point()):
+            raise UsageError(f"A signal is a torch tensor [B, …] of floating-point numbers; received {shown(x)}.")
+        if self._shape is not None and x.shape != self._shape:
+            raise UsageError(f"A signal keeps its shape, {tuple(self._shape)}; received {tuple(x.shape)}.")
+
+    @property
+    def _shape(self) -> torch.Size | None:
+        return next(iter(self._state.values()))[0][0].shape if self._state else None
 
     def _rest(self, name: str, x: torch.Tensor) -> list[list[torch.Tensor]]:
         """Return the memories at which a constant signal stays as it is: those of a unit step, times the signal."""

@@ -10,13 +10,16 @@ import numpy as np
 from brainbench.core.rotations import to_matrices
 from robotics_bridge.physics.scene import TouchScene
 from robotics_bridge.sensors.probes.placement import Probes, enclosing_sphere
-from robotics_bridge.sensors.probes.sensors import SurfaceDistanceProbe
+from robotics_bridge.sensors.probes.sensors import ContactProbe, SurfaceDistanceProbe
 from robotics_bridge.sensors.sensor import ProbeSensor, Sensor
+from robotics_bridge.sensors.temperature.grid import TemperatureGrid
 
 LARGEST = 3.0
 """Radius (m) around the probes of one sensor, or around a touched mesh, above which numbers look like millimetres."""
 WIDEST = 0.3
 """Sensing radius (m) of a taxel above which it does, if it also exceeds the patch of its sensor."""
+DEEPEST = 0.05
+"""Depth (m) at which a contact begins above which it does."""
 _CONVEX = ("sphere", "capsule", "ellipsoid", "cylinder", "box")
 
 
@@ -26,12 +29,17 @@ def warn_of(scene: TouchScene, sensors: Mapping[str, Sensor]) -> None:
     sizes = [(f"the probes of {name!r}", enclosing_sphere(sensor.probes)[1]) for name, sensor in probing.items()]
     tracked = {g for sensor in probing.values() for g in sensor.tracked(scene)}
     sizes += [(f"the mesh {mesh.name!r}", mesh.diagonal / 2) for g in tracked if (mesh := scene.geometries[g].mesh)]
+    for name, sensor in sensors.items():
+        if isinstance(sensor, TemperatureGrid) and sensor.low is not None and sensor.high is not None:
+            sizes.append((f"the grid of {name!r}", float(np.linalg.norm(np.subtract(sensor.high, sensor.low))) / 2))
     found = [(what, f"{2 * size:g} m across") for what, size in sizes if size > LARGEST]
     for name, sensor in probing.items():
         widest = float(sensor.probes.radius.max(initial=0.0))
         patch = float(np.ptp(np.reshape(sensor.probes.position, (-1, 3)), axis=0).max())
         if widest > max(WIDEST, patch) and not isinstance(sensor, SurfaceDistanceProbe):
             found.append((f"the sensing radius of {name!r}", f"{widest:g} m"))
+        if isinstance(sensor, ContactProbe) and sensor.threshold > DEEPEST:
+            found.append((f"the threshold of {name!r}", f"{sensor.threshold:g} m"))
     if found:
         what, size = found[0]
         _warn(f"{what[:1].upper()}{what[1:]}: {size}. Lengths are in metres; scale millimetres by 1e-3.")

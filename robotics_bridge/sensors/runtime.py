@@ -98,6 +98,10 @@ class Runtime(abc.ABC):
         self.run_kernels(state, dt)
         self._noise.launch(self.io.measured, self.io.measured, dt)
 
+    def seed(self) -> None:
+        """Draw from the context's present seed from now on."""
+        self._noise.seed()
+
     @abc.abstractmethod
     def run_kernels(self, state: HandState, dt: float) -> None:
         """Run the sensor's own kernels; ``io`` knows of this update."""

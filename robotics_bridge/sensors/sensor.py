@@ -7,7 +7,7 @@ from collections.abc import Hashable
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, ClassVar, Literal
 
-from brainbench.core.errors import check_name
+from brainbench.core.errors import UsageError, check_name, shown
 from brainbench.core.reading.ranges import check_fields
 from robotics_bridge.sensors.noise.model import BASE_KNOBS, PROBE_KNOBS, Noise
 from robotics_bridge.sensors.probes.placement import Probes
@@ -18,12 +18,18 @@ if TYPE_CHECKING:
 Convention = Literal["physical", "thesis"]
 
 
+def check_kind(name: str, value: object, kind: type | tuple[type, ...], wanted: str) -> None:
+    """Raise UsageError unless a value is of a kind, of which ``wanted`` is an example."""
+    if not isinstance(value, kind):
+        raise UsageError(f"The {name} must be {wanted}; received {shown(value)} ({type(value).__name__}).")
+
+
 @dataclass(frozen=True, kw_only=True)
 class Sensor(abc.ABC):
     """Configuration of a sensor on one link.
 
     Raises:
-        UsageError: a noise knob is set that the sensor does not have, or the history is negative.
+        UsageError: the link has no name, a noise knob is set that the sensor does not have, or the history is negative.
     """
 
     link: str
@@ -44,6 +50,8 @@ class Sensor(abc.ABC):
     """``package.module:Class`` of the runtime that serves those of one group, imported when a suite is built."""
 
     def __post_init__(self) -> None:
+        check_kind("link of a sensor", self.link, str, "a name")
+        check_kind("noise of a sensor", self.noise, Noise, "Noise(...)")
         self.noise.check(self.knobs, type(self).__name__)
         check_fields(self, "history", least=0, whole=True)
 
@@ -74,6 +82,13 @@ class ProbeSensor(Sensor):
     knobs: ClassVar[frozenset[str]] = PROBE_KNOBS
     contact_only: ClassVar[bool] = False
     """True if it meets only geometries that the engine reports in contact with its link."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_kind("probes of a sensor", self.probes, Probes, "Probes(...)")
+        check_kind("track", self.track, (tuple, list), "the names of links, such as ('object',)")
+        # Sensors are told apart by what they track, so that it must be hashable.
+        object.__setattr__(self, "track", tuple(self.track))
 
     def layout(self) -> tuple[int, ...]:
         """Return the shape (N,) or (rows, columns) of the reading of one environment, without channels."""

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from typing import Any, cast
 
-import numpy as np
 import torch
 
 from brainbench.core.cuda_graphs import record_launches
@@ -25,7 +24,8 @@ from robotics_bridge.sensors.queries.kernels.pairs import count_update, reset_cl
 from robotics_bridge.sensors.queries.pairs import PairTable
 from robotics_bridge.sensors.queries.solids import Solids
 from robotics_bridge.sensors.runtime import History, Runtime
-from robotics_bridge.sensors.sensor import Sensor
+from robotics_bridge.sensors.selection import EnvIds, select_envs
+from robotics_bridge.sensors.sensor import Sensor, check_kind
 
 wp = warp()
 
@@ -77,11 +77,16 @@ class SensorSuite:
         listed: int | None = None,
     ) -> None:
         if fidelity is not None:
-            sensors, resolution = fidelity.apply(sensors), resolution or fidelity.resolution
-        resolution = resolution or 64
+            sensors = fidelity.apply(sensors)
+        if resolution is None:
+            resolution = fidelity.resolution if fidelity is not None else 64
+        check_number("resolution", resolution, least=4, most=512, whole=True)
+        check_number("seed", seed, whole=True)
+        check_number("env_offset", env_offset, least=0, whole=True)
         if listed is not None:
             check_number("listed", listed, least=1, whole=True)
         check_number("environments of a suite", num_envs, least=1, most=MOST_ENVS, whole=True)
+        check_kind("sensors of a suite", sensors, Mapping, "a dictionary of name to sensor")
         self.scene, self.sensors = scene, dict(sensors)
         self.num_envs, self.device = num_envs, pick_device(device)
         groups: dict[Any, dict[str, Sensor]] = {}
@@ -151,7 +156,11 @@ class SensorSuite:
         self._updates += 1
 
     def read(self, name: str) -> torch.Tensor:
-        """Return the measured reading of a sensor, [B, N] or [B, rows, columns], and channels last; a view."""
+        """Return the measured reading of a sensor, [B, N] or [B, rows, columns], and channels last; a view.
+
+        It is that of the last update: zero before the first, and until the next one after a reset that of the episode
+        before.
+        """
         return self._view(name, self.runtime_of(name).measured())
 
     def read_ground_truth(self, name: str) -> torch.Tensor:
@@ -187,28 +196,25 @@ class SensorSuite:
         points = wp.to_torch(cast(DistanceRuntime, runtime).points)[:, :, part.span]
         return points.permute(1, 2, 0).unflatten(1, part.layout)
 
-    def reset(self, env_ids: Sequence[int] | np.ndarray | torch.Tensor | None = None) -> None:
+    def reset(self, env_ids: EnvIds | None = None) -> None:
         """Start a new episode in some environments (all by default): memories are cleared, new errors drawn.
 
+        Args:
+            env_ids: numbers of environments, or a mask [B] bool.
+
         Raises:
-            UsageError: an environment does not exist.
+            UsageError: an environment does not exist, or these are neither numbers nor a mask.
         """
-        where = wp.device_to_torch(self.device)
-        chosen = torch.zeros(self.num_envs, dtype=torch.bool, device=where)
-        if env_ids is None:
-            chosen[:] = True
-        else:
-            numbers = torch.as_tensor(env_ids, device=where)
-            if numbers.dtype == torch.bool:
-                chosen |= numbers
-            elif numbers.numel():
-                numbers = numbers.long()
-                # On a GPU the range is not looked at, which would wait for the device.
-                if not self.device.is_cuda and bool(((numbers < 0) | (numbers >= self.num_envs)).any()):
-                    raise UsageError(f"Environments are 0 to {self.num_envs - 1}; received {numbers.tolist()}.")
-                chosen[numbers] = True
-        mask = wp.from_torch(chosen)
+        mask = wp.from_torch(select_envs(env_ids, self.num_envs, wp.device_to_torch(self.device)))
         self.context.launch(reset_clock, self.num_envs, mask, self.context.age, self.context.episode)
+
+    def seed(self, seed: int) -> None:
+        """Begin the random numbers of noise and sound anew, from the next reset of each environment on."""
+        check_number("seed", seed, whole=True)
+        self.context.seed = seed
+        self.context.episode.zero_()
+        for runtime in self.runtimes:
+            runtime.seed()
 
     @property
     def diverged(self) -> torch.Tensor:

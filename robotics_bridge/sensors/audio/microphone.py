@@ -10,10 +10,11 @@ import torch
 
 from brainbench.core.devices import warp
 from brainbench.core.errors import UsageError
-from brainbench.core.reading.ranges import check_fields
+from brainbench.core.reading.ranges import check_fields, check_number
 from robotics_bridge.physics.state import HandState
 from robotics_bridge.sensors.audio.kernels import sound as k
 from robotics_bridge.sensors.audio.sensors import AudioSensor
+from robotics_bridge.sensors.sensor import check_kind
 from robotics_bridge.sensors.suite import SensorSuite
 
 
@@ -44,6 +45,7 @@ class Microphone:
         check_fields(self, "position", items=3)
         check_fields(self, "speed_of_sound", "nearest", "reach", above=0)
         check_fields(self, "power", least=0)
+        check_kind("sources", self.sources, (tuple, list), "the names of sensors, such as ('tip',)")
 
     def build(self, suite: SensorSuite) -> Listener:
         """Return the listener of a suite; call its ``update`` after the suite's."""
@@ -89,8 +91,9 @@ class Listener:
         """Take the suite's latest block, of ``dt`` seconds.
 
         Raises:
-            UsageError: the time step changed.
+            UsageError: the time step changed, or is not a positive time.
         """
+        check_number("dt (time of a block, s)", dt, above=0)
         c, m, envs = self._suite.context, self.microphone, self._suite.num_envs
         rate, age, block = self.samples / dt, c.age, (self.samples, envs)
         # The ring holds the longest delay, reach / c, a few samples for the interpolation, and the block being written.

@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.sparse.linalg import eigsh
 
-from brainbench.core.errors import UsageError
+from brainbench.core.errors import UsageError, shown
 from brainbench.core.files import cache_dir, content_hash, to_plain
-from brainbench.core.reading.ranges import check_number
+from brainbench.core.reading.ranges import check_number, check_vector
 from brainbench.core.reading.sealed import read_sealed, write_sealed
 from robotics_bridge.physics.scene import Geometry
 from robotics_bridge.sensors.audio import tetrahedra
@@ -46,11 +46,15 @@ def find_modes(
         cache: Whether the result is kept in the cache folder.
 
     Raises:
-        UsageError: the solid is of another kind, or the mesh is too coarse for so many modes.
+        UsageError: the solid is of another kind, a point does not lie on it, or the mesh is too coarse for so many
+            modes.
     """
     for name, value in {"count": count, "cells": cells}.items():
         check_number(name, value, least=1, whole=True)
     chosen = elastic_material(material)
+    for name, point in {"strike": strike, "hear": hear}.items():
+        if point is not None:
+            check_vector(f"{name} (m)", point)
     shape = (solid.kind, list(solid.size), None if solid.mesh is None else solid.mesh.content_hash)
     points = [None if point is None else np.asarray(point, float).tolist() for point in (strike, hear)]
     path = cache_dir("modes") / f"{content_hash(_VERSION, shape, to_plain(chosen), count, cells, points)}.npz"
@@ -61,8 +65,14 @@ def find_modes(
     for point in (strike, hear):
         if point is None:
             weights.append(np.sqrt(np.mean(normal**2, axis=0)))
-        else:
-            weights.append(normal[np.argmin(np.linalg.norm(place - np.asarray(point, float), axis=1))])
+            continue
+        away = np.linalg.norm(place - np.asarray(point, float), axis=1)
+        if away.min() > (most := float(np.ptp(place, axis=0).max()) / 2):
+            raise UsageError(
+                f"The point {shown(point)} lies {away.min():g} m off the surface of {solid.name!r}, which is "
+                f"{2 * most:g} m long; points are in metres, in the frame of the solid."
+            )
+        weights.append(normal[np.argmin(away)])
     decay = tuple(chosen.decay(f) for f in frequency)
     modes = Modes(tuple(frequency.tolist()), decay, tuple((weights[0] * weights[1]).tolist()))
     if cache:

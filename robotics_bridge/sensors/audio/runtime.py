@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 
 from brainbench.core.devices import warp
+from brainbench.core.reading.ranges import check_number
 from robotics_bridge.physics.state import HandState
 from robotics_bridge.sensors.audio.kernels.sound import (
     ContactSoundArrays,
@@ -45,10 +48,20 @@ class ContactAudioRuntime(Runtime):
         own.y1, own.y2 = (context.zeros((quads, envs, count), wp.vec4) for _ in range(2))
         self._own, self.lasting = own, [own.force, own.before, own.rubbing, own.drive, own.y1, own.y2]
 
+    def seed(self) -> None:
+        """Draw from the context's present seed from now on."""
+        super().seed()
+        self._dt = math.nan
+
     def _set_step(self, dt: float) -> None:
         """Compute the poles for a sample rate of K / dt; modes beyond its half stay silent."""
         if dt == self._dt:
             return
+        for name, sensor in self._sensors.items():
+            check_number(
+                f"contact_time (s) of {name!r}, which ends within the time step,", sensor.contact_time, most=dt
+            )
+        self._warn_silent(self.samples / dt / 2)
         self._dt = dt
         step = dt / self.samples
         poles = np.zeros((3, self._quads * 4, len(self._sensors)))
@@ -74,6 +87,14 @@ class ContactAudioRuntime(Runtime):
             array.assign(np.ascontiguousarray(quads, dtype=np.float32))
         self._own.sources.assign(self.context.array(sources, SourceParams))
 
+    def _warn_silent(self, highest: float) -> None:
+        for name, sensor in self._sensors.items():
+            if all(frequency >= highest for frequency in sensor.modes.frequency):
+                warnings.warn(
+                    f"Impacts of {name!r} are silent: all its modes lie above {highest:g} Hz, half the sample rate. "
+                    "Take more samples.", RuntimeWarning, stacklevel=6,
+                )  # fmt: skip
+
     def run_kernels(self, state: HandState, dt: float) -> None:
         """Make the next block from the contacts."""
         self._set_step(dt)
@@ -90,14 +111,23 @@ class DriveAudioRuntime(Runtime):
         first = next(iter(sensors.values()))
         self.samples = first.samples
         super().__init__(sensors, self.samples, context, fusable=False)
-        keys = [stream_key(context.seed, f"{name}/sound") for name in sensors]
-        settings = [fill(DriveSoundParams, each, **key) for each, key in zip(sensors.values(), keys, strict=True)]
+        self._drives = dict(sensors)
         own, shape = DriveSoundArrays(), (context.num_envs, self.count)
-        own.settings, own.part, own.number = context.array(settings, DriveSoundParams), self.part, self.probe
+        own.settings, own.part, own.number = self._settings(), self.part, self.probe
         for name in ("effort", "speed", "last_loud", "last_speed", "phase", "hum_phase"):
             setattr(own, name, context.zeros(shape))
             self.lasting.append(getattr(own, name))
         self._own, self.effort, self.speed = own, own.effort, own.speed
+
+    def _settings(self) -> Any:
+        keys = [stream_key(self.context.seed, f"{name}/sound") for name in self._drives]
+        settings = [fill(DriveSoundParams, each, **key) for each, key in zip(self._drives.values(), keys, strict=True)]
+        return self.context.array(settings, DriveSoundParams)
+
+    def seed(self) -> None:
+        """Draw from the context's present seed from now on."""
+        super().seed()
+        self._own.settings.assign(self._settings())
 
     def run_kernels(self, state: HandState, dt: float) -> None:
         """Make the next block from the torques and speeds that were written."""

@@ -22,9 +22,10 @@ from numpy.typing import NDArray
 from scipy.stats import beta
 
 from brainbench.core.errors import DataError
+from brainbench.core.reading.ranges import check_number
 from robotics_bridge.sensors.calibration.delays import align, extent, find_delays, find_lags
 from robotics_bridge.sensors.calibration.likelihood import Z95, Estimate, Fit, fit_dynamics
-from robotics_bridge.sensors.calibration.log import Log, find_dead, find_quantum, segments
+from robotics_bridge.sensors.calibration.log import SHORTEST, Log, find_dead, find_quantum, segments
 from robotics_bridge.sensors.noise.model import Noise
 
 NOT_FITTED = ("radius", "crosstalk")
@@ -61,11 +62,16 @@ def calibrate(log: Log, *, max_delay: float = 0.5) -> Calibration:
         max_delay: Longest delay that is tried [s].
 
     Raises:
-        DataError: no probe is alive, the reference never changes, or readings fall where it rises.
+        UsageError: the longest delay is negative or not finite.
+        DataError: no probe is alive, every episode is too short, the reference never changes, or readings fall where
+            it rises.
     """
+    check_number("max_delay (s)", max_delay, least=0)
     estimates: dict[str, Estimate] = {}
     notes = [f"Not fitted: {', '.join(NOT_FITTED)}."]
     parts = segments(log)
+    if skipped := len(np.unique(log.episode)) - len(parts) if log.episode is not None else 0:
+        notes.append(f"{skipped} episodes of fewer than {SHORTEST} readings were left out.")
     stuck, values = find_dead(parts)
     living = [(x, y[:, ~dead]) for (x, y), dead in zip(parts, stuck, strict=True) if (~dead).any()]
     if not living:

@@ -15,6 +15,8 @@ from numpy.typing import NDArray
 from brainbench.core.errors import DataError, UsageError, listing
 from brainbench.core.reading.tables import read_columns
 
+SHORTEST = 10
+"""Readings of the shortest episode that is used."""
 LARGEST = 1e12
 """Magnitude of times and readings beyond which a log is taken to be damaged."""
 Episode = tuple["NDArray[np.float64]", "NDArray[np.float64]"]
@@ -25,7 +27,7 @@ class Log:
     """A recording.
 
     Raises:
-        UsageError: the arrays do not fit each other.
+        UsageError: the arrays do not fit each other, hold what is not finite, or the time stands still or falls.
     """
 
     time: NDArray[np.float64]
@@ -40,12 +42,19 @@ class Log:
     """Names [N]."""
 
     def __post_init__(self) -> None:
-        for name in ("reference", "episode"):
-            values = getattr(self, name)
-            if values is not None and len(values) != len(self.time):
-                raise UsageError(f"{name} has {len(values)} rows, time {len(self.time)}.")
-        if self.readings.ndim != 2 or len(self.readings) != len(self.time):
+        for name in ("time", "readings", "reference", "episode"):
+            if (values := getattr(self, name)) is not None:
+                object.__setattr__(self, name, values := np.asarray(values))
+                if values.shape[:1] != np.shape(self.time)[:1] or (values.ndim != 1 and name != "readings"):
+                    raise UsageError(f"{name} has the shape {values.shape}, time {np.shape(self.time)}.")
+                if not np.isfinite(values).all():
+                    raise UsageError(f"{name} of a log must be finite numbers; leave out the rows of the others.")
+        if self.readings.ndim != 2 or not self.readings.size:
             raise UsageError(f"Readings are [T, N] with T = {len(self.time)}; received {self.readings.shape}.")
+        if self.probes and len(self.probes) != self.readings.shape[1]:
+            raise UsageError(f"{self.readings.shape[1]} probes have as many names; received {len(self.probes)}.")
+        if len(self.time) > 1 and not self.step > 0:
+            raise UsageError(f"Times of a log (s) rise; received steps of {self.step:g} s.")
 
     @property
     def step(self) -> float:
@@ -78,23 +87,30 @@ def read_log(path: str | os.PathLike[str]) -> Log:
         episode = columns["episode"].astype(np.int64)
         if (np.abs(columns["episode"]) > 1e9).any() or (episode != columns["episode"]).any():
             raise DataError(f"{name}: episodes are whole numbers of at most a billion.")
-    log = Log(columns["time"], readings, columns.get("reference"), episode, tuple(probes))
-    gaps = np.diff(log.time)[np.diff(episode) == 0] if episode is not None else np.diff(log.time)
+    time = columns["time"]
+    gaps = np.diff(time)[np.diff(episode) == 0] if episode is not None else np.diff(time)
     if not len(gaps) or gaps.min() <= 0 or gaps.max() > 1.5 * gaps.min():
         raise DataError(
             f"{name}: times must rise in equal steps within an episode; found "
             f"{f'{gaps.min():g}…{gaps.max():g} s' if len(gaps) else 'no two rows of one episode'}."
         )
-    return log
+    return Log(time, readings, columns.get("reference"), episode, tuple(probes))
 
 
 def segments(log: Log) -> list[Episode]:
-    """Split a log into its episodes."""
+    """Split a log into its episodes, without those of fewer than :data:`SHORTEST` readings.
+
+    Raises:
+        DataError: none is longer.
+    """
     x = np.zeros(len(log.time)) if log.reference is None else log.reference
     numbers = np.zeros(len(x), int) if log.episode is None else log.episode
     edges = np.flatnonzero(np.diff(numbers)) + 1
     parts = zip(np.split(x, edges), np.split(log.readings, edges), strict=True)
-    return [(a, b) for a, b in parts if len(a) >= 10]
+    kept = [(a, b) for a, b in parts if len(a) >= SHORTEST]
+    if not kept:
+        raise DataError(f"Every episode of the log has fewer than {SHORTEST} readings; record longer ones.")
+    return kept
 
 
 def find_dead(parts: list[Episode]) -> tuple[list[NDArray[np.bool_]], list[NDArray[np.float64]]]:

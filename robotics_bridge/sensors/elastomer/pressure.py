@@ -29,6 +29,8 @@ def contact_pressure(
 ) -> torch.Tensor:
     """Return the pressure (Pa) [B, R, C] on the cells of an elastomer's grid; it is never negative.
 
+    Environments that diverged, or whose pressure was not found, are NaN.
+
     Under a ball of radius r that is pressed in by δ it is Hertz's, with the total 4/3 E √r δ^1.5 / (1 − ν²), as long as
     the contact is at least five markers across and small beside the thickness of the pad.
 
@@ -41,7 +43,8 @@ def contact_pressure(
             contacts between the pad's link and what the sensor tracks; the modulus then plays no part.
 
     Raises:
-        UsageError: there is no such elastomer, its markers form no grid, or a number lies outside its range.
+        UsageError: there is no such elastomer, nothing was read yet, its markers form no grid, or a number lies outside
+            its range.
     """
     runtime = cast(ElastomerRuntime, suite.runtime_of(name, ElastomerTaxel, "elastomer"))
     sensor = cast(ElastomerTaxel, suite.sensors[name])
@@ -58,7 +61,7 @@ def contact_pressure(
         load = _load(suite, sensor, state).double()
         total = pressure.sum((1, 2)) * pitch[0] * pitch[1]
         pressure = pressure * (load / total.clamp_min(1e-30)).where(total > 0, 0.0)[:, None, None]
-    return pressure.float()
+    return pressure.masked_fill(suite.diverged[:, None, None], math.nan).float()
 
 
 def _love(layout: tuple[int, ...], pitch: tuple[float, float]) -> np.ndarray:
@@ -81,7 +84,8 @@ def _love(layout: tuple[int, ...], pitch: tuple[float, float]) -> np.ndarray:
 def _solve(height: torch.Tensor, kernel: torch.Tensor) -> torch.Tensor:
     """Return p ≥ 0 [B, R, C] under which the surface sinks by ``height`` where p > 0, and by no less elsewhere.
 
-    Conjugate gradients on the set in contact (Polonsky & Keer 1999), convolutions in Fourier space.
+    Conjugate gradients on the set in contact (Polonsky & Keer 1999), convolutions in Fourier space. NaN where they do
+    not converge.
     """
     rows, columns = height.shape[1:]
     size = (3 * rows - 2, 3 * columns - 2)
@@ -109,10 +113,12 @@ def _solve(height: torch.Tensor, kernel: torch.Tensor) -> torch.Tensor:
         overlap = (new == 0) & (gap < 0) & ~inside
         new = torch.where(overlap, -step * gap, new)
         keep = (~overlap.any(dim=1, keepdim=True).any(dim=2, keepdim=True)).to(p.dtype)
-        change, p, before = (new - p).norm(), new, square
-        if change <= _ACCURACY * p.norm():
+        change, p, before = (new - p).norm(dim=(1, 2)), new, square
+        # By environment: beside a large pressure in one, a small one elsewhere would never count.
+        found = change <= _ACCURACY * p.norm(dim=(1, 2))
+        if found.all():
             break
-    return p
+    return p.masked_fill(~found[:, None, None], math.nan)
 
 
 def _load(suite: SensorSuite, sensor: ElastomerTaxel, state: HandState) -> torch.Tensor:

@@ -58,8 +58,7 @@ class ReadingNoise:
             active[part.span] = 1 if part.active is None else part.active
         self.part, self.probe, self._active = (context.array(item, int) for item in (index, probe, active))
         """Warp arrays [N]: number of the sensor, number of the probe within it, 0 for fillers."""
-        structures = [part.noise.params(context.seed, part.name) for part in slices]
-        self.params = context.array(structures, NoiseParams)
+        self.params = self._draw_keys()
         """Warp array [S] of the knobs."""
         self._hysteresis = self._zeros(staged and any(noise.hysteresis for noise in noises))
         self._walk = self._zeros(staged and any(noise.walk for noise in noises))
@@ -71,6 +70,15 @@ class ReadingNoise:
         self._jitter = context.array([noise.jitter for noise in noises], float)
         self._longest = max(noise.read_delay + noise.jitter for noise in noises)
         self._late, self._ring = self._zeros(self._longest > 0), None
+
+    def _draw_keys(self) -> Any:
+        structures = [part.noise.params(self._context.seed, part.name) for part in self._slices]
+        return self._context.array(structures, NoiseParams)
+
+    def seed(self) -> None:
+        """Draw from the context's present seed from now on."""
+        # Into the same memory, which recorded launches keep the address of.
+        self.params.assign(self._draw_keys())
 
     def _zeros(self, wanted: bool, leading: tuple[int, ...] = ()) -> Any:
         """Return [..., C, B, N] zeros, or an empty array when they are not wanted."""

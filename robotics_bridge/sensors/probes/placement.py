@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from brainbench.core.errors import UsageError
-from brainbench.core.reading.ranges import check_fields, check_number
+from brainbench.core.errors import UsageError, shown
+from brainbench.core.reading.ranges import check_fields, check_number, check_vector
 from brainbench.geometry import Mesh
 
 
@@ -18,7 +18,8 @@ class Probes:
     """Positions, outward normals and sensing radii of probes. A radius of 0 marks a filler that always reads 0.
 
     Raises:
-        UsageError: shapes do not match, numbers are not finite, a radius is negative or a normal has no length.
+        UsageError: shapes do not match, numbers are not finite, a radius is negative, a normal has no length, or the
+            probes do not lie a pitch apart.
     """
 
     position: NDArray[np.float64]
@@ -33,14 +34,13 @@ class Probes:
     """Distance of neighbouring rows and columns of a regular planar grid (m); None for any other placement."""
 
     def __post_init__(self) -> None:
-        position = np.array(self.position, dtype=float).reshape(-1, 3)
-        normal = np.array(self.normal, dtype=float).reshape(-1, 3)
+        position, normal = (_vectors(name, getattr(self, name)) for name in ("position", "normal"))
         count = len(position)
         try:
             radius = np.array(np.broadcast_to(np.asarray(self.radius, dtype=float), (count,)))
         except ValueError:
             raise UsageError(f"{count} probes need one radius or {count}; received {np.shape(self.radius)}.") from None
-        shape = tuple(self.shape) or (count,)
+        shape = tuple(np.atleast_1d(np.asarray(self.shape, dtype=object))) or (count,)
         if not count:
             raise UsageError("A sensor needs at least one probe; received none.")
         for side in shape:
@@ -52,6 +52,8 @@ class Probes:
             raise UsageError("Positions, normals and radii of probes must be finite numbers.")
         if (radius < 0).any():
             raise UsageError(f"The radius of a probe is positive, or 0 for a filler; received {radius.min():g} m.")
+        if self.pitch is not None:
+            _check_pitch(position, shape, self.pitch)
         length = np.linalg.norm(normal, axis=1)
         if (length[radius > 0] < 1e-9).any():
             raise UsageError("The normal of a probe needs a length; received a zero vector.")
@@ -94,6 +96,9 @@ class Probes:
         """
         for name, number in {"rows": rows, "columns": columns}.items():
             check_number(name, number, least=1, whole=True)
+        check_vector("center", center)
+        if np.shape(size) != (2,):
+            raise UsageError(f"size is the extent along rows and columns (m); received {size!r}.")
         n = _direction("normal", normal)
         u = _direction("along", along)
         u = u - n * (u @ n)
@@ -132,9 +137,11 @@ class Probes:
             seed: of the sampling.
 
         Raises:
-            UsageError: no triangle is left.
+            UsageError: no triangle is left, or a number lies outside its range.
         """
-        check_number("count", count, least=1, whole=True)
+        for name, number, least in (("count", count, 1), ("seed", seed, 0)):
+            check_number(name, number, least=least, whole=True)
+        check_number("within (degrees)", within, least=0, most=180)
         corners = mesh.vertices[mesh.faces]
         area, normal = face_areas(corners)
         keep = area > 0
@@ -152,8 +159,31 @@ class Probes:
         return cls(points, normal[keep][faces], np.full(count, radius))
 
     def with_radius(self, radius: ArrayLike) -> Probes:
-        """Return the same places with other radii (m); fillers stay fillers."""
+        """Return the same places with another radius for all or each (m); fillers stay fillers."""
+        if np.shape(radius) not in ((), self.radius.shape):
+            raise UsageError(f"{len(self)} probes need one radius or {len(self)}; received {np.shape(radius)}.")
         return Probes(self.position, self.normal, np.where(self.active, radius, 0.0), self.shape, self.pitch)
+
+
+def _vectors(name: str, values: ArrayLike) -> NDArray[np.float64]:
+    """Return vectors [N, 3] of any arrangement [..., 3]; UsageError for anything else."""
+    try:
+        vectors = np.array(values, dtype=float)
+    except (TypeError, ValueError):
+        raise UsageError(f"The {name} of probes is an array [N, 3] of numbers; received {shown(values)}.") from None
+    if not vectors.ndim or (vectors.size and vectors.shape[-1] != 3):
+        raise UsageError(f"The {name} of probes is an array [N, 3]; received the shape {vectors.shape}.")
+    return vectors.reshape(-1, 3)
+
+
+def _check_pitch(position: NDArray[np.float64], shape: tuple[int, ...], pitch: tuple[float, float]) -> None:
+    """Raise UsageError unless the probes [rows, columns] form the regular planar grid that a pitch (m) promises."""
+    grid = position.reshape(*shape, 3) if len(shape) == 2 else position[None]
+    for axis, step in enumerate(pitch):
+        way = np.diff(grid, axis=axis)
+        if way.size and not (np.allclose(way, way[0, 0], atol=1e-9) and math.isclose(np.linalg.norm(way[0, 0]), step)):
+            raise UsageError(f"A pitch {tuple(pitch)} m promises a regular grid, which these {len(position)} probes "
+                             "do not form; use Probes.grid, or leave the pitch out.")  # fmt: skip
 
 
 def _direction(name: str, value: ArrayLike) -> NDArray[np.float64]:

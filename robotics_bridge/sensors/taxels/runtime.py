@@ -37,7 +37,10 @@ class KinematicRuntime(ProbeRuntime):
             self.kinds, first.query == "raycast", first.convention == "physical", first.sticky, self.summed, self.mode,
             *self.stores, context.device.is_cuda, self.mode == FUSED and len(rows) == self.count,
         )  # fmt: skip
-        laws = [fill(KinematicParams, sensor, friction=sensor.friction or 0.0) for sensor in sensors.values()]
+        laws = [
+            fill(KinematicParams, sensor, friction=sensor.friction or 0.0, twist=sensor.torsion)
+            for sensor in sensors.values()
+        ]
         self._laws = context.array(laws, KinematicParams)
         self.rows: Any = context.array(rows, wp.vec4i)
         """Warp array [R]: rows of taxels that one thread takes in turn."""

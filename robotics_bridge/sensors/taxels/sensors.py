@@ -67,10 +67,6 @@ class KinematicTaxel(QuerySensor):
         check_name("total of a force field", self.total, ("law", "engine"))
         check_fields(self, "stiffness", "damping", "shear", "twist", "friction", least=0)
         check_fields(self, "exponent", "grip", above=0)
-        if self.twist is None:
-            radius = float(self.probes.radius.max(initial=0.0))
-            published = self.convention == "thesis"
-            object.__setattr__(self, "twist", PUBLISHED_TWIST if published else self.shear * radius**2 / 2)
         if self.sticky and self.convention == "thesis":
             raise UsageError("The published law has no friction at rest; leave out friction or convention='thesis'.")
 
@@ -79,6 +75,15 @@ class KinematicTaxel(QuerySensor):
         """``package.module:Class`` of the runtime that serves it."""
         own = "contact_load:ContactLoadRuntime" if self.total == "engine" else "runtime:KinematicRuntime"
         return f"robotics_bridge.sensors.taxels.{own}"
+
+    @property
+    def torsion(self) -> float:
+        """k_ω that acts (N·m·s): ``twist``, or what stands for None."""
+        # No field: a copy by dataclasses.replace with another radius or shear would keep the old number.
+        if self.twist is not None:
+            return self.twist
+        radius = float(self.probes.radius.max(initial=0.0))
+        return PUBLISHED_TWIST if self.convention == "thesis" else self.shear * radius**2 / 2
 
     @property
     def sticky(self) -> bool:

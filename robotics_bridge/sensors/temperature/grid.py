@@ -19,7 +19,7 @@ from brainbench.core.devices import warp
 from brainbench.core.errors import UsageError, check_name
 from brainbench.core.reading.ranges import check_fields, check_number
 from brainbench.core.rotations import to_matrices
-from robotics_bridge.sensors.sensor import Sensor
+from robotics_bridge.sensors.sensor import Sensor, check_kind
 from robotics_bridge.sensors.temperature.materials import ABSOLUTE_ZERO, ThermalBody, ThermalMaterial, material
 
 if TYPE_CHECKING:
@@ -40,7 +40,7 @@ class TemperatureGrid(Sensor):
     """
 
     cells: tuple[int, int, int] = (2, 2, 2)
-    """Along the axes of the link."""
+    """Along the axes of the link; at most a million."""
     low: tuple[float, float, float] | None = None
     """Lower corner of the grid [m, link frame]; None takes the box around the link's geometries."""
     high: tuple[float, float, float] | None = None
@@ -84,6 +84,7 @@ class TemperatureGrid(Sensor):
     def __post_init__(self) -> None:
         super().__post_init__()
         check_fields(self, "cells", items=3, least=1, whole=True)
+        check_number("cells of the grid, all together,", math.prod(map(int, self.cells)), most=10**6)
         check_fields(self, "low", "high", items=3)
         if (self.low is None) != (self.high is None):
             raise UsageError("Give both corners of the grid, low and high, or neither.")
@@ -99,7 +100,8 @@ class TemperatureGrid(Sensor):
             raise UsageError(f"source is a number or an array {tuple(self.cells)}; received {np.shape(self.source)}.")
         for value in np.ravel(self.source):
             check_number("source", value)
-        for body in (*self.bodies.values(), self.other):
+        for name, body in {**self.bodies, "other": self.other}.items():
+            check_kind(f"body {name!r}", body, ThermalBody, "ThermalBody(material, temperature)")
             material(body.material)
         material(self.material)
 

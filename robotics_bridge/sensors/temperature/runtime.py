@@ -44,6 +44,8 @@ class TemperatureRuntime(Runtime):
             edges = self._edges[-1]
             exposed.append(_exposed(sensor.cells, edges).ravel())
             source.append((np.broadcast_to(np.asarray(sensor.source, float), sensor.cells) * edges.prod()).ravel())
+        for name in self._sensors[0].bodies:
+            scene.link_index(name)
         links = [_body(self._sensors, name) for name in scene.links]
         materials = [material(body.material) for body in links]
         temperatures = np.tile([body.temperature for body in links], (context.num_envs, 1))

@@ -100,7 +100,7 @@ def test_published_sensors_carry_the_published_parameters():
     noisy = sensors_for("bool", layout, noisy=True)["right_index_DP"]
     assert (noisy.threshold, noisy.release, noisy.noise) == (5e-4, 2e-4, Noise.preset("published-bool"))
     force = sensors_for("force", layout, convention="thesis")["right_thumb_DP"]
-    assert (force.stiffness, force.damping, force.exponent, force.shear, force.twist) == (500, 1, 1.2, 2, 2)
+    assert (force.stiffness, force.damping, force.exponent, force.shear, force.torsion) == (500, 1, 1.2, 2, 2)
     assert force.convention == "thesis"
     holding, law = (sensors_for("force", layout, **knobs)["right_thumb_DP"] for knobs in ({}, {"twist": 2.0}))
     assert (holding.total, holding.friction, law.total, law.friction, law.twist) == ("engine", 1.0, "law", None, 2)

@@ -38,7 +38,7 @@ def _by_the_equations(
     if convention == "physical":
         normal *= (normal * local).sum(1, keepdims=True) > 0
     f = normal + sign * taxel.shear * (relative - vn)
-    tau = np.cross(GRID.position, f) + sign * taxel.twist * (local @ spin)[:, None] * local
+    tau = np.cross(GRID.position, f) + sign * taxel.torsion * (local @ spin)[:, None] * local
     del ball
     return np.where(depth[:, None] > 0, np.concatenate([f, tau], axis=1), 0)
 

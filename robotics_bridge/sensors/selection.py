@@ -1,0 +1,38 @@
+"""Choice of some environments of a batch. Letters: B environment."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+
+from brainbench.core.errors import UsageError
+
+EnvIds = Sequence[int] | np.ndarray | torch.Tensor
+"""Numbers of environments, or a mask [B] bool."""
+
+
+def select_envs(env_ids: EnvIds | None, num_envs: int, device: torch.device | str) -> torch.Tensor:
+    """Return a mask [B] bool of the chosen environments, a new one; None chooses all.
+
+    Raises:
+        UsageError: an environment does not exist (on a GPU, where looking would wait for the device, this goes
+            unnoticed here), or these are neither whole numbers nor a mask.
+    """
+    device = torch.device(device)
+    if env_ids is None:
+        return torch.ones(num_envs, dtype=torch.bool, device=device)
+    chosen = torch.zeros(num_envs, dtype=torch.bool, device=device)
+    numbers = torch.as_tensor(env_ids, device=device)
+    if numbers.dtype == torch.bool:
+        if numbers.shape != chosen.shape:
+            raise UsageError(f"A mask has one bool per environment ({num_envs}); received {tuple(numbers.shape)}.")
+        return chosen | numbers
+    if numbers.numel():
+        if numbers.is_floating_point() or numbers.is_complex():
+            raise UsageError(f"Environments are whole numbers or a mask; received {numbers.tolist()}.")
+        if device.type == "cpu" and bool(((numbers < 0) | (numbers >= num_envs)).any()):
+            raise UsageError(f"Environments are 0 to {num_envs - 1}; received {numbers.tolist()}.")
+        chosen[numbers.long()] = True
+    return chosen
