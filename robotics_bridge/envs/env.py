@@ -13,12 +13,14 @@ import torch
 
 from brainbench.core.cuda_graphs import CudaGraphStep, warp_recorder
 from brainbench.core.errors import UsageError
+from brainbench.core.reading.ranges import check_number
 from robotics_bridge import hands
 from robotics_bridge.envs.observations import observe
 from robotics_bridge.envs.options import EnvOptions
 from robotics_bridge.envs.reset import EpisodeReset
 from robotics_bridge.envs.state import EnvState
 from robotics_bridge.envs.step import STATISTICS, ActionMap, StepResult, apply_action, compute_step, run_physics
+from robotics_bridge.sensors.sensor import check_kind
 from robotics_bridge.tasks.registry import load
 from robotics_bridge.tasks.task import Task
 
@@ -147,6 +149,8 @@ class Env:
 
     @episode_length_buf.setter
     def episode_length_buf(self, value: torch.Tensor) -> None:
+        if value.shape != self.state.episode.age.shape:
+            raise UsageError(f"Steps by environment have the shape ({self.num_envs},); received {tuple(value.shape)}.")
         if value is not self.state.episode.age:
             self.state.episode.age.copy_(value)
 
@@ -155,7 +159,10 @@ class Env:
         if mask is None:
             mask = torch.ones(self.num_envs, dtype=torch.bool, device=self.device)
         elif mask.shape != (self.num_envs,) or mask.dtype != torch.bool:
-            raise UsageError(f"A mask has one bool per environment ({self.num_envs}); received {tuple(mask.shape)}.")
+            raise UsageError(
+                f"A mask is a torch tensor with one bool per environment ({self.num_envs}); received "
+                f"{tuple(mask.shape)} of {mask.dtype}."
+            )
         self.reset_episodes(self.state, mask)
         self.state.observations = observe(self.state)
         return self.observations
@@ -174,8 +181,9 @@ class Env:
             anything touched the object, rad), and ``final_observations`` if asked for.
 
         Raises:
-            UsageError: the action has another shape.
+            UsageError: the action is no tensor of numbers, or has another shape.
         """
+        check_kind("action", action, torch.Tensor, "a torch tensor [environments, joints moved]")
         if tuple(action.shape) != (self.num_envs, self.num_actions):
             raise UsageError(
                 f"Actions have the shape {(self.num_envs, self.num_actions)} (environments, joints moved); "
@@ -191,7 +199,14 @@ class Env:
         return result
 
     def seed(self, seed: int) -> None:
-        """Begin the random numbers anew, from the next reset on."""
+        """Begin the random numbers anew, from the next reset on, those of tactile noise included.
+
+        Raises:
+            UsageError: the seed is no whole number from 0.
+        """
+        check_number("seed", seed, least=0, below=2**63, whole=True)
+        if self.touch is not None:
+            self.touch.suite.seed(seed)
         self.state.generator.manual_seed(seed)
         self.state.actuators.seed(seed)
 
@@ -212,8 +227,19 @@ class Env:
         return own | {f"observations.{name}": value.clone() for name, value in state.observations.items()}
 
     def load_state_dict(self, values: Mapping[str, torch.Tensor]) -> None:
-        """Take up what :meth:`state_dict` returned."""
+        """Take up what :meth:`state_dict` returned.
+
+        Raises:
+            UsageError: it is the state of other environments: a part is missing, or has another shape.
+        """
         state = self.state
+        for name, own in self.state_dict().items():
+            if name not in values or (name != "generator" and values[name].shape != own.shape):
+                other = tuple(values[name].shape) if name in values else "none"
+                raise UsageError(
+                    f"This is the state of other environments: {name!r} has the shape {tuple(own.shape)} here; "
+                    f"received {other}. Make the environments as those were."
+                )
 
         def under(part: str) -> dict[str, torch.Tensor]:
             return {name.removeprefix(part): value for name, value in values.items() if name.startswith(part)}

@@ -67,12 +67,18 @@ class GymVectorEnv(VectorEnv):
     def reset(
         self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-        """Start new episodes, some with ``options={"reset_mask": [B] bool}``; UsageError for a list of seeds."""
+        """Start new episodes, some with ``options={"reset_mask": [B] bool}``.
+
+        Raises:
+            UsageError: there is a list of seeds, another option, or a mask of another length.
+        """
         super().reset(seed=None)
         if isinstance(seed, list):
             raise UsageError("Environments draw their random numbers together: give one seed, not a list.")
         if seed is not None:
             self.native.seed(seed)
+        for name in options or ():
+            check_name("option of a reset", name, ("reset_mask",))
         mask = (options or {}).get("reset_mask")
         chosen = None if mask is None else torch.as_tensor(np.asarray(mask, dtype=bool), device=self.native.device)
         return self._numpy(self.native.reset(chosen)), {}

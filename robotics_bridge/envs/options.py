@@ -9,8 +9,10 @@ from typing import Any
 from brainbench.core.devices import pick_device
 from brainbench.core.errors import UsageError, check_name
 from brainbench.core.reading.ranges import check_fields
+from robotics_bridge.hands.layouts import check_names
 from robotics_bridge.hands.observations import observation_type
 from robotics_bridge.physics.state import MOST_ENVS
+from robotics_bridge.sensors.sensor import check_kind
 
 ENGINES = ("mujoco", "warp")
 
@@ -51,9 +53,15 @@ class EnvOptions:
 
     def __post_init__(self) -> None:
         check_fields(self, "num_envs", least=1, most=MOST_ENVS, whole=True)
+        check_fields(self, "seed", least=0, below=2**63, whole=True)
+        check_fields(self, "threads", least=1, whole=True)
+        check_kind("device", self.device, str, "'cpu', 'cuda' or 'cuda:N'")
         object.__setattr__(self, "engine", self.engine or ("mujoco" if self.device == "cpu" else "warp"))
         check_name("engine", self.engine, ENGINES)
         observation_type(self.observe)
+        check_names("low" if self.resolution.endswith((".json", "custom")) else self.resolution, self.placement)
+        if self.observe == "none" and (self.noisy or self.knobs):
+            raise UsageError("noisy and knobs are settings of tactile sensors; choose an observation type.")
         if self.link_pose and self.observe == "none":
             raise UsageError("Poses of tactile links belong to tactile sensors; choose an observation type.")
         pick_device(self.device)

@@ -43,7 +43,7 @@ class RslRlEnv:
     @episode_length_buf.setter
     def episode_length_buf(self, value: torch.Tensor) -> None:
         # rsl_rl assigns a new tensor to start episodes at random ages.
-        self.unwrapped.episode_length_buf.copy_(value)
+        self.unwrapped.episode_length_buf = value
 
     def get_observations(self) -> TensorDict:
         """Return the present observations, group → [B, ...]."""

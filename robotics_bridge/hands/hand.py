@@ -21,6 +21,8 @@ from brainbench.core.reading.texts import read_text
 from robotics_bridge.hands.facing import palmar_directions
 from robotics_bridge.hands.layouts import Layout, check_names, pad_probes, read_probes, select
 from robotics_bridge.hands.spec import HandSpec, build
+from robotics_bridge.sensors.probes.placement import Probes
+from robotics_bridge.sensors.sensor import check_kind
 
 _AUTO_GRIDS = {
     "low": {"tips": (3, 3, 0.004), "fingers": (2, 3, 0.004), "palm": (4, 3, 0.004)},
@@ -121,12 +123,15 @@ class Hand:
         """Return the hand with a layout from a probe file (:func:`read_probes`) or a mapping of link to probes.
 
         Raises:
-            UsageError: it names a link that the hand does not have.
+            UsageError: it names no link, or one that the hand does not have, or a link has something else than probes.
         """
-        layout = source if isinstance(source, dict) else read_probes(source)
+        layout = dict(source) if isinstance(source, Mapping) else read_probes(source)
+        if not layout:
+            raise UsageError(f"A layout of hand {self.name!r} needs at least one link with probes; received none.")
         known = [self.model.body(index).name for index in range(1, self.model.nbody)]
-        for link in layout:
+        for link, probes in layout.items():
             check_name("link", link, known)
+            check_kind(f"layout of link {link!r}", probes, Probes, "Probes(...)")
         return replace(self, custom=layout)
 
     def _cast(self, resolution: str, links: tuple[str, ...]) -> Layout:

@@ -6,7 +6,7 @@ Readings are those of one sensor per link, in the layout's order. Letters: B env
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 import torch
@@ -81,7 +81,7 @@ def sensors_for(
             friction or a ``twist`` is stated, which means the law; other classes ignore ``twist``.
 
     Raises:
-        UsageError: there is no such type, or a knob has a wrong value.
+        UsageError: there is no such type, or a knob is unknown or has a wrong value.
     """
     kind = observation_type(name)
     if kind.sensor is None:
@@ -99,10 +99,13 @@ def sensors_for(
     if kind.sensor == "ElastomerTaxel" and any(not probes.active.all() for probes in layout.values()):
         # A grid with fillers is no regular one; its sources are summed directly.
         settings.setdefault("dilation", "direct")
-    found = {}
+    make, found = getattr(sensors, kind.sensor), {}
+    own = [field.name for field in fields(make) if field.name not in ("link", "probes")]
+    for knob in settings:
+        check_name(f"setting of {kind.sensor}", knob, own)
     for link, probes in layout.items():
         placed = probes.with_radius(PROXIMITY_RADIUS) if kind.sensor == "ProximityTaxel" else probes
-        found[link] = getattr(sensors, kind.sensor)(link=link, probes=placed, **settings)
+        found[link] = make(link=link, probes=placed, **settings)
     return found
 
 
@@ -117,20 +120,26 @@ def observe(name: str, readings: Mapping[str, torch.Tensor], layout: Layout) -> 
         layout: Link → probes; fixes the order.
 
     Raises:
-        UsageError: the type is unknown, or a link's reading is missing or has another shape.
+        UsageError: the type is unknown, the layout has no link, or a link's reading is missing or has another shape.
     """
     kind = observation_type(name)
     if kind.sensor is None:
         batch = next((reading.shape[0] for reading in readings.values()), 0)
         return torch.zeros(batch, 0)
+    if not layout:
+        raise UsageError("An observation needs at least one link with probes; received none.")
+    make = getattr(sensors, kind.sensor)
     parts = []
     for link, probes in layout.items():
         check_name("link among the readings", link, readings)
-        reading, count = readings[link], len(probes)
-        if reading[0].numel() % count:
-            shape = tuple(reading.shape)
-            raise UsageError(f"The reading of link {link!r} has shape {shape}, but the link has {count} probes.")
-        parts.append(_part(name, reading.reshape(reading.shape[0], count, -1), probes))
+        reading, channels = readings[link], (make.channels,) if make.channels else ()
+        if tuple(reading.shape[1:]) not in {(*probes.shape, *channels), (len(probes), *channels)}:
+            wanted = ", ".join(map(str, ("B", *probes.shape, *channels)))
+            raise UsageError(
+                f"The reading {name!r} of link {link!r} with its {len(probes)} probes has the shape ({wanted}); "
+                f"received {tuple(reading.shape)}."
+            )
+        parts.append(_part(name, reading.reshape(reading.shape[0], len(probes), make.channels or 1), probes))
     return torch.cat(parts, dim=1)
 
 

@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from brainbench.core.devices import mujoco_module
 from brainbench.core.errors import UsageError
+from brainbench.core.reading.ranges import check_number, check_vector
 from brainbench.core.rotations import to_matrices
 from robotics_bridge.sensors.probes.placement import Probes
 
@@ -45,15 +46,22 @@ def cast_grid(
     ``facing``. Rays that miss the link leave fillers.
 
     Raises:
-        UsageError: the model has no such link, or the link has no surface there.
+        UsageError: the model has no such link, the link has no surface there, or a number lies outside its range.
     """
+    for name, number in {"rows": rows, "columns": columns}.items():
+        check_number(name, number, least=1, whole=True)
+    check_number("extent", extent, above=0, most=1)
+    check_vector("facing", facing)
     body = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, link)
     if body < 0:
         raise UsageError(f"The model has no link {link!r}.")
     corners = link_points(model, body)
     if not len(corners):
         raise UsageError(f"Link {link!r} has no geometry, so no probe can lie on it.")
-    up = np.asarray(facing, dtype=float) / np.linalg.norm(facing)
+    length = np.linalg.norm(facing)
+    if not length:
+        raise UsageError("'facing' is a direction of some length; received a zero vector.")
+    up = np.asarray(facing, dtype=float) / length
     u, v = _plane(up, corners)
     # Extent of the link across and along the rays: the grid covers its shadow, and rays start just above its top.
     seen = corners @ np.stack([u, v, up], axis=1)

@@ -11,8 +11,9 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from brainbench.core.errors import UsageError
-from brainbench.core.reading.ranges import check_number
+from brainbench.core.reading.ranges import check_fields, check_number
 from brainbench.core.rotations import about, constant, multiply, tilted, twist_of
+from robotics_bridge.tasks.checks import check_range, unit_vector
 
 if TYPE_CHECKING:
     import torch
@@ -23,7 +24,8 @@ class Goal(abc.ABC):
     """An orientation to reach; a new one is proposed as soon as it is.
 
     Raises:
-        UsageError: the threshold is not positive, it begins narrower than it ends, or a share lies outside 0 and 1.
+        UsageError: the threshold is not positive, it begins narrower than it ends, a number lies outside its range, or
+            an axis has no length.
     """
 
     threshold: float = 0.1
@@ -33,7 +35,7 @@ class Goal(abc.ABC):
     deadline: tuple[float, float] | None = None
     """Range of the time after which another goal is proposed [s]; None waits for ever."""
     axis: tuple[float, float, float] | None = None
-    """World axis of the commanded rotation; None for goals about any axis."""
+    """World axis of the commanded rotation, made unit length; None for goals about any axis."""
     by_looks: bool = False
     """Orientations in which the object looks the same are the same: of a cylinder, all turns about its own axis. False
     (published) tells them apart."""
@@ -51,6 +53,12 @@ class Goal(abc.ABC):
 
     def __post_init__(self) -> None:
         check_number("The threshold of a goal (rad)", self.threshold, above=0)
+        check_fields(self, "limit", least=1, whole=True, of="{} of a goal")
+        if self.deadline is not None:
+            check_range("deadline of a goal (s)", self.deadline, least=0)
+        if self.axis is not None:
+            object.__setattr__(self, "axis", unit_vector("axis of a goal", self.axis, 3))
+        check_fields(self, "start_threshold", of="{} of a goal")
         if self.start_threshold is not None and not self.threshold <= self.start_threshold:
             raise UsageError(
                 f"Learning begins with a wider threshold than {self.threshold:g} rad; received start_threshold = "
@@ -82,6 +90,11 @@ class SteppingRotation(Goal):
     random yaw of the start in all of them: from the first goal on it is a tilt at which the object cannot lie."""
     limit: int | None = 15
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_fields(self, "step", of="{} of a goal (rad)")
+        check_fields(self, "allowed_off_axis", least=0, of="{} of a goal (rad)")
+
     def first(self, quat: torch.Tensor, draw: torch.Tensor) -> torch.Tensor:
         """Return the goals one step from the start."""
         axis = constant(self.axis or (0.0, 0.0, 1.0), quat)
@@ -104,6 +117,10 @@ class TimedRotation(Goal):
     tilt: tuple[float, float] = (-0.7853975, 0.7853975)
     """Range of both angles [rad]."""
     deadline: tuple[float, float] | None = (4.0, 6.0)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_range("tilt of a goal (rad)", self.tilt)
 
     def following(self, quat: torch.Tensor, goal: torch.Tensor, draw: torch.Tensor) -> torch.Tensor:
         """Return tilted orientations of the object."""

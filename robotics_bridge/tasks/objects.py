@@ -9,13 +9,18 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from numbers import Real
 from typing import Any
 
 from brainbench.core.devices import mujoco_module
-from brainbench.core.errors import UsageError
+from brainbench.core.errors import UsageError, shown
+from brainbench.core.reading.ranges import check_fields
+from robotics_bridge.tasks.checks import check_place, unit_vector
 
 GRAIN = 1e-4
 """Half size of the stand-in for a solid that a shape lacks [m]."""
+LARGEST = 3.0
+"""Half size above which numbers of a hand's object look like millimetres [m]."""
 _SIZES = {"box": 3, "cylinder": 2, "capsule": 2, "sphere": 1}
 
 
@@ -24,7 +29,8 @@ class ObjectPrimitive:
     """A primitive in the body's frame.
 
     Raises:
-        UsageError: the kind is unknown, or its sizes are not positive or not as many as the kind has.
+        UsageError: the kind is unknown, its sizes are not positive, not as many as the kind has or no object's in
+            metres, or its place or orientation is none.
     """
 
     kind: str
@@ -33,18 +39,28 @@ class ObjectPrimitive:
     """Half edges; radius and half length; radius [m]."""
     position: tuple[float, float, float] = (0.0, 0.0, 0.0)
     quaternion: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)
-    """Orientation (w, x, y, z)."""
+    """Orientation (w, x, y, z); made unit length."""
 
     def __post_init__(self) -> None:
         if self.kind not in _SIZES:
             raise UsageError(f"A solid is one of {', '.join(_SIZES)}; received {self.kind!r}.")
-        if len(self.size) != _SIZES[self.kind] or not all(math.isfinite(s) and s > 0 for s in self.size):
-            raise UsageError(f"A {self.kind} has {_SIZES[self.kind]} positive size(s) in metres; received {self.size}.")
+        sizes = self.size if isinstance(self.size, Sequence) else ()
+        if len(sizes) != _SIZES[self.kind] or not all(isinstance(s, Real) and 0 < s <= LARGEST for s in sizes):
+            raise UsageError(
+                f"A {self.kind} has {_SIZES[self.kind]} positive size(s) in metres, at most {LARGEST:g}; received "
+                f"{shown(self.size)}."
+            )
+        check_place(f"The position of a {self.kind}", self.position)
+        object.__setattr__(self, "quaternion", unit_vector(f"The quaternion of a {self.kind}", self.quaternion, 4))
 
 
 @dataclass(frozen=True)
 class ObjectShape:
-    """One object: its solids and its outer measures."""
+    """One object: its solids and its outer measures.
+
+    Raises:
+        UsageError: it has no solid, or a measure is no length.
+    """
 
     name: str
     solids: tuple[ObjectPrimitive, ...]
@@ -53,7 +69,16 @@ class ObjectShape:
     bottom: float
     """Depth below the body's origin to which it reaches when upright [m]."""
     round_about: tuple[float, float, float] | None = None
-    """Axis of the body about which the shape looks the same from everywhere; None without one."""
+    """Axis of the body about which the shape looks the same from everywhere, made unit length; None without one."""
+
+    def __post_init__(self) -> None:
+        if not self.solids:
+            raise UsageError(f"The object {self.name!r} needs at least one solid.")
+        check_fields(self, "extent", items=3, above=0, of=f"{{}} of the object {self.name!r} (m)")
+        check_fields(self, "bottom", of=f"{{}} of the object {self.name!r} (m)")
+        if self.round_about is not None:
+            axis = unit_vector(f"round_about of the object {self.name!r}", self.round_about, 3)
+            object.__setattr__(self, "round_about", axis)
 
     def scaled(self, factor: float) -> ObjectShape:
         """Return the shape with all lengths multiplied."""

@@ -25,6 +25,8 @@ _STIFFNESS, _DAMPING, _ARMATURE, _EFFORT = 2.0, 0.2, 0.01, 2.0
 """Drive of a joint for which the hand's file names none: N·m/rad, N·m·s/rad, kg·m², N·m."""
 _PALM_TOP = 0.4975
 """Height of an upturned palm below objects that start at 0.5 m."""
+_ROUNDED = 1e-3
+"""How far beyond a limit a position that a task states may lie (rad or m)."""
 _TIPS = {
     "right_hand_thumb_rota_link2": (0.0, 0.042, 0.007), "right_hand_index_rota_link2": (0.008, 0.0, 0.035),
     "right_hand_mid_link2": (0.008, 0.0, 0.035), "right_hand_ring_link2": (0.008, 0.0, 0.035),
@@ -69,7 +71,8 @@ def build(task: Task, hand: Hand) -> TaskModel:
     """Compile a task for a hand.
 
     Raises:
-        UsageError: a finger that the task moves, or a joint it names, does not exist on this hand.
+        UsageError: a finger that the task moves, or a joint it names, does not exist on this hand, or a joint rests
+            beyond its limits.
     """
     shapes = with_sizes(task.objects, task.object_changes.size)
     names = tuple("object" if task.copies == 1 else f"object{index}" for index in range(task.copies))
@@ -95,6 +98,14 @@ def build(task: Task, hand: Hand) -> TaskModel:
     given = task.joints.get(hand.name, {})
     for name in given:
         check_name(f"joint in task {task.name!r} of hand {hand.name!r}:", name, joints)
+    for name, position in given.items():
+        least, most = low[joints.index(name)], high[joints.index(name)]
+        if not least - _ROUNDED <= position <= most + _ROUNDED:
+            raise UsageError(
+                f"Joint {name!r} of hand {hand.name!r} rests within {least:g} and {most:g} (rad or m) in task "
+                f"{task.name!r}; received {position:g}."
+            )
+    # Of joints that the task does not name, 0 may lie beyond the limits.
     rest = np.array([given.get(name, 0.0) for name in joints])
     stiffness, damping, effort = (np.array([drives[name][column] for name in joints]) for column in range(3))
     return TaskModel(

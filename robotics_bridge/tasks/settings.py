@@ -133,7 +133,7 @@ class TeacherSettings:
 
 @dataclass(frozen=True, kw_only=True)
 class StudentSettings:
-    """DAgger distillation of the tactile student, lower half of table 4.4."""
+    """DAgger distillation of the tactile student, lower half of table 4.4; UsageError for a number out of range."""
 
     iterations: int = 6000
     learning_rate: float = 1e-4
@@ -147,6 +147,12 @@ class StudentSettings:
     """Norm to which longer gradients are cut; None leaves them."""
     loss: str = "mse"
     """``mse`` or ``inv_var_mse`` (each action weighted by the inverse of its variance)."""
+
+    def __post_init__(self) -> None:
+        check_fields(self, "iterations", least=0, whole=True)
+        check_fields(self, "epochs", "gradient_length", least=1, whole=True)
+        check_fields(self, "learning_rate", "clip", "max_grad_norm", above=0)
+        check_name("loss of a student", self.loss, ("mse", "inv_var_mse"))
 
 
 @dataclass(frozen=True)

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from brainbench.core.errors import UsageError, check_name
 from brainbench.core.reading.ranges import check_fields, check_number
+from robotics_bridge.tasks.checks import check_place, check_range, unit_vector
 from robotics_bridge.tasks.contact_model import CONTACTS, ContactModel
 from robotics_bridge.tasks.goals import Goal
 from robotics_bridge.tasks.objects import PRIMITIVES, ObjectShape
@@ -66,6 +67,13 @@ class ActuatorRandomisation:
     torque_noise: float = 0.1
     """Half width of white noise in every physics step, in units of the joint's effort."""
 
+    def __post_init__(self) -> None:
+        for name in ("stiffness", "damping", "strength", "deadband", "backlash", "kick_ratio"):
+            check_range(f"actuators.{name}", getattr(self, name), least=0)
+        check_range("actuators.position_bias", self.position_bias)
+        check_fields(self, "kick", of="actuators.{}")
+        check_fields(self, "torque_noise", least=0, of="actuators.{}")
+
 
 @dataclass(frozen=True, kw_only=True)
 class ObjectRandomisation:
@@ -80,6 +88,12 @@ class ObjectRandomisation:
     each_reset: bool = True
     """Draw friction and mass anew at every reset, or once."""
 
+    def __post_init__(self) -> None:
+        check_range("object_changes.friction", self.friction, least=0)
+        check_range("object_changes.mass_offset", self.mass_offset)
+        check_range("object_changes.size", self.size)
+        check_number("object_changes.size", self.size[0], above=0)
+
 
 @dataclass(frozen=True, kw_only=True)
 class Push:
@@ -92,7 +106,12 @@ class Push:
     z: Range = (0.0, 0.0)
     """[N]."""
     interval: Range = (2.0, 4.0)
-    """Time from one push to the next [s]."""
+    """Time from one push to the next [s]; a control step at least."""
+
+    def __post_init__(self) -> None:
+        for name in ("x", "y", "z"):
+            check_range(f"push.{name}", getattr(self, name))
+        check_range("push.interval", self.interval, least=0)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -107,9 +126,17 @@ class Placement:
     yaw: Range = (0.0, 0.0)
     """About the vertical [rad]."""
     quaternion: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)
-    """Orientation at yaw 0 (w, x, y, z)."""
+    """Orientation at yaw 0 (w, x, y, z); made unit length."""
     sites: tuple[tuple[float, float, float], ...] = ()
     """Places of several objects, taken in random order [m]; x, y and height are added."""
+
+    def __post_init__(self) -> None:
+        check_fields(self, "height", of="placement.{}")
+        for name in ("x", "y", "yaw"):
+            check_range(f"placement.{name}", getattr(self, name))
+        for site in self.sites:
+            check_place("A site of placement.sites", site)
+        object.__setattr__(self, "quaternion", unit_vector("placement.quaternion", self.quaternion, 4))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -143,9 +170,13 @@ class Success:
     """Success of an episode."""
 
     metric: str
-    """``goals`` reached, rotation ``turned`` (rad) or seconds of ``contact`` with the target."""
+    """``goals`` reached (none without a goal), rotation ``turned`` (rad) about the task's ``turn_axis``, or what its
+    ``task_state`` counts: seconds of ``contact`` with the target."""
     threshold: float = 1.0
     """Smallest value of the metric that is a success."""
+
+    def __post_init__(self) -> None:
+        check_fields(self, "threshold", of="success.{}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -214,7 +245,7 @@ class Task:
     # --- what is to be reached ---
     goal: Goal | None = None
     turn_axis: tuple[float, float, float] | None = None
-    """Axis of the object whose rotation is counted (its own frame)."""
+    """Axis of the object whose rotation is counted (its own frame); made unit length."""
     turn_window: int = 60
     """Steps over which stagnation is judged."""
     task_state: Callable[[EnvState], TaskState] | None = None
@@ -249,17 +280,46 @@ class Task:
                 f"contacts.time_constant {of} is at least two physics steps ({least:g} s); received "
                 f"{self.contacts.time_constant:g}: take more contacts.substeps."
             )
-        check_number(f"object_changes.friction {of}", self.object_changes.friction[0], least=0)
-        check_number(f"object_changes.size {of}", self.object_changes.size[0], above=0)
         for name, reward in self.rewards.items():
             check_number(f"weight of {name!r} {of}", reward.weight)
         if not self.objects:
             raise UsageError(f"Task {self.name!r} needs at least one object.")
-        for name, (low, high) in self._ranges().items():
-            if not (math.isfinite(low) and math.isfinite(high) and low <= high):
-                raise UsageError(f"{name} of task {self.name!r} is a range (low, high); received {(low, high)}.")
-        for name in (name for names in self.groups.values() for name in names):
+        self._check_names(of)
+        self._check_places(of)
+        check_fields(self, "taxel_twist", least=0, of=own)
+
+    def _check_names(self, of: str) -> None:
+        if self.task_state is None:
+            check_name(f"success.metric {of} without task_state", self.success.metric, ("goals", "turned"))
+        if self.success.metric == "turned" and self.turn_axis is None:
+            raise UsageError(f"success.metric {of} is 'turned', which counts turns about turn_axis; name that axis.")
+        if self.starts is not None:
+            check_name(f"starts {of}", self.starts, ("grasps",))
+        if self.copies > len(self.placement.sites) > 0:
+            raise UsageError(f"placement.sites {of} has {len(self.placement.sites)} places for {self.copies} objects.")
+        check_name(f"distances_in {of}", self.distances_in, GROUPS)
+        for name in (*self.auxiliary, *(name for names in self.groups.values() for name in names)):
             check_name("observation group", name, GROUPS)
+        for group, known in {"command": COMMANDS, "goal_terms": GOAL_TERMS}.items():
+            for name in getattr(self, group):
+                check_name(f"content of {group} {of}", name, known)
+
+    def _check_places(self, of: str) -> None:
+        poses = {}
+        for hand, (place, quaternion) in self.hand_poses.items():
+            check_place(f"The place of {hand!r} in hand_poses {of}", place)
+            poses[hand] = (tuple(place), unit_vector(f"The quaternion of {hand!r} in hand_poses {of}", quaternion, 4))
+        object.__setattr__(self, "hand_poses", poses)
+        if self.turn_axis is not None:
+            object.__setattr__(self, "turn_axis", unit_vector(f"turn_axis {of}", self.turn_axis, 3))
+        for hand, joints in self.joints.items():
+            for joint, position in joints.items():
+                check_number(f"joint {joint!r} of {hand!r} {of} (rad)", position)
+        for axis, (span, *numbers) in self.carriage.items():
+            check_name(f"axis of the carriage {of}", axis, ("x", "y", "z"))
+            check_range(f"carriage.{axis} {of}", span)
+            for name, number in zip(("stiffness", "damping", "effort"), numbers, strict=True):
+                check_number(f"{name} of carriage.{axis} {of}", number, least=0)
 
     @property
     def step_dt(self) -> float:
@@ -276,13 +336,6 @@ class Task:
         """Control steps after which an episode is cut off."""
         return math.ceil(self.episode / self.step_dt)
 
-    def _ranges(self) -> dict[str, Range]:
-        found: dict[str, Range] = {}
-        for part in (self.actuators, self.object_changes, self.push, self.placement):
-            numbers = vars(part).items() if part is not None else ()
-            found |= {name: value for name, value in numbers if isinstance(value, tuple) and len(value) == 2}
-        return found
-
 
 ACTION_LIMIT = 2.0
 """Bound of actions of the tasks on which we train: an action of 1 is half a joint's range, so 2 reaches every target
@@ -294,6 +347,10 @@ GROUPS = (
     "priv_thermal", "thermal", "aux_obj_size", "aux_goal_dist", "aux_obj_tilt", "aux_rotation_progress",
 )  # fmt: skip
 """Observation groups (table 4.7 and the decoders' targets)."""
+COMMANDS = ("on", "orientation")
+"""Contents of the group ``command``."""
+GOAL_TERMS = ("orientation", "difference", "angle")
+"""Contents of the group ``goal``."""
 MEASURED = ("proprio", "tactile", "link_pose", "command", "thermal")
 """Groups that a hand measures or is told; the others are known to the simulation alone."""
 

@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from brainbench.core.devices import warp
-from brainbench.core.errors import UsageError
-from brainbench.core.reading.ranges import check_number
+from brainbench.core.errors import UsageError, check_name
+from brainbench.core.reading.ranges import check_fields, check_number
 from robotics_bridge.sensors.temperature.grid import TemperatureGrid, link_temperature
-from robotics_bridge.sensors.temperature.materials import ThermalBody, ThermalMaterial
+from robotics_bridge.sensors.temperature.materials import ABSOLUTE_ZERO, ThermalBody, ThermalMaterial, material
 
 if TYPE_CHECKING:
     import torch
@@ -28,7 +28,7 @@ class ThermalSettings:
     """Materials of fingers and balls. The first four numbers are the axes of figure 4.8 and section 4.6.3.
 
     Raises:
-        UsageError: the target is not hotter than the room, or the margin lies outside 0 and 1.
+        UsageError: the target is not hotter than the room, or a number lies outside its range.
     """
 
     conductivity: float = 150.0
@@ -62,6 +62,13 @@ class ThermalSettings:
         if not self.hot > self.ambient:
             raise UsageError(f"The target is hotter than the room; received {self.hot} and {self.ambient} °C.")
         check_number("The latch's margin", self.margin, above=0, below=1)
+        check_fields(self, "ambient", "hot", least=ABSOLUTE_ZERO)
+        check_fields(self, "heat", "convection", least=0)
+        check_fields(self, "contact_radius", above=0)
+        check_fields(self, "cells", items=3, least=1, whole=True)
+        check_name("conduction", self.conduction, ("physical", "thesis"))
+        # What is wrong in the materials is told by them.
+        _ = self.material, material(self.ball)
 
     @property
     def material(self) -> ThermalMaterial:

@@ -60,7 +60,7 @@ def test_wrong_names_and_shapes_are_explained():
         observe("forces", {}, _layout())
     with pytest.raises(UsageError, match=r"'a'.*Allowed: 'b'"):
         observe("depth", {"b": torch.zeros(1, 3)}, _layout())
-    with pytest.raises(UsageError, match=r"\(1, 5\).* 6 probes"):
+    with pytest.raises(UsageError, match=r"6 probes.*\(1, 5\)"):
         observe("depth", {"a": torch.zeros(1, 5), "b": torch.zeros(1, 3)}, _layout())
 
 

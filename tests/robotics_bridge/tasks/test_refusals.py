@@ -1,0 +1,161 @@
+"""Parts of a task that would be ignored, or would change it in silence, are refused by name."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from brainbench.core.errors import UsageError
+from robotics_bridge import hands, tasks
+from robotics_bridge.tasks.goals import SteppingRotation, TimedRotation
+from robotics_bridge.tasks.objects import ObjectPrimitive, ObjectShape, ball
+from robotics_bridge.tasks.scenes import build
+from robotics_bridge.tasks.settings import StudentSettings
+from robotics_bridge.tasks.task import ActuatorRandomisation, ObjectRandomisation, Placement, Push, Success
+from robotics_bridge.tasks.thermometers import ThermalSettings
+
+
+def _changed(**changes: Any) -> tasks.Task:
+    return replace(tasks.load("in_palm_rotate"), **changes)
+
+
+@pytest.mark.parametrize(
+    ("changes", "suggested"),
+    [
+        ({"success": Success(metric="goal")}, "goals"),
+        ({"success": Success(metric="turn")}, "turned"),
+        ({"success": Success(metric="contact")}, "goals"),
+        ({"starts": "grasp"}, "grasps"),
+        ({"command": ("onn",)}, "on"),
+        ({"goal_terms": ("angel",)}, "angle"),
+        ({"distances_in": "priv_obj_prop"}, "priv_obj_props"),
+        ({"auxiliary": ("aux_objsize",)}, "aux_obj_size"),
+        ({"carriage": {"w": ((-0.1, 0.1), 1.0, 1.0, 1.0)}}, "'x'"),
+    ],
+)
+def test_names_within_a_task_are_known(changes, suggested) -> None:
+    with pytest.raises(UsageError, match=f"'in_palm_rotate'.*{suggested}|{suggested}"):
+        _changed(**changes)
+
+
+def test_turns_are_counted_about_an_axis() -> None:
+    with pytest.raises(UsageError, match="turn_axis"):
+        _changed(success=Success(metric="turned"))
+    assert _changed(success=Success(metric="turned"), turn_axis=(0.0, 0.0, 1.0)).turns
+
+
+RANGES = (
+    *((low, high) for low, high in [(2.0, 1.0), (np.nan, 1.0), (0.0, np.inf)]),
+    [2.0, 1.0],
+    (1.0,),
+    (0, 1, 2),
+    3.0,
+    "01",
+)
+
+
+@pytest.mark.parametrize("value", RANGES)
+@pytest.mark.parametrize(
+    ("kind", "name"),
+    [
+        *((ActuatorRandomisation, name) for name in ("stiffness", "damping", "strength", "position_bias", "deadband",
+                                                     "backlash", "kick_ratio")),
+        *((ObjectRandomisation, name) for name in ("friction", "mass_offset", "size")),
+        *((Push, name) for name in ("x", "y", "z", "interval")),
+        *((Placement, name) for name in ("x", "y", "yaw")),
+        (TimedRotation, "tilt"), (SteppingRotation, "deadline"),
+    ],
+)  # fmt: skip
+def test_ranges_are_two_numbers_in_order(kind, name, value) -> None:
+    with pytest.raises(UsageError, match=name):
+        kind(**{name: value})
+
+
+@pytest.mark.parametrize(
+    ("kind", "name", "value"),
+    [
+        *((ActuatorRandomisation, name, (-2.0, -1.0)) for name in ("stiffness", "strength", "deadband")),
+        (ActuatorRandomisation, "kick", np.nan), (ActuatorRandomisation, "torque_noise", -1.0),
+        (Push, "interval", (-4.0, -2.0)), (SteppingRotation, "deadline", (-6.0, -4.0)),
+        (Placement, "height", np.nan), (Placement, "sites", ((np.nan, 0, 0),)), (Placement, "sites", ((0.0, 0.0),)),
+        (SteppingRotation, "step", np.nan), (SteppingRotation, "allowed_off_axis", np.nan),
+        (SteppingRotation, "limit", 0), (SteppingRotation, "limit", 1.5), (SteppingRotation, "start_threshold", np.inf),
+        *((ThermalSettings, name, np.nan) for name in ("hot", "ambient", "heat", "convection", "contact_radius")),
+        (ThermalSettings, "hot", np.inf), (ThermalSettings, "emissivity", 3.0), (ThermalSettings, "cells", (0, 1, 1)),
+        (ThermalSettings, "ball", "aluminum"), (ThermalSettings, "conduction", "thesi"),
+        (StudentSettings, "learning_rate", np.nan), (StudentSettings, "iterations", -1),
+        (StudentSettings, "gradient_length", 0), (StudentSettings, "loss", "mae"),
+    ],
+)  # fmt: skip
+def test_numbers_of_a_tasks_parts_have_ranges(kind, name, value) -> None:
+    told = {"hot": "hotter|hot", "ambient": "hotter|ambient", "ball": "aluminium", "sites": "site"}.get(name, name)
+    with pytest.raises(UsageError, match=told):
+        kind(**{name: value})
+
+
+@pytest.mark.parametrize("value", [(0, 0, 0, 0), (np.nan, 0, 0, 1), (1.0, 0, 0), "wxyz"])
+def test_orientations_have_a_length(value) -> None:
+    makers = (
+        lambda: Placement(quaternion=value),
+        lambda: ObjectPrimitive("sphere", (0.01,), quaternion=value),
+        lambda: _changed(hand_poses={"xhand1": ((0, 0, 0.5), value)}),
+    )
+    for make in makers:
+        with pytest.raises(UsageError, match="quaternion"):
+            make()
+
+
+def test_axes_and_orientations_count_by_their_direction() -> None:
+    assert Placement(quaternion=(2, 0, 0, 0)) == Placement()
+    assert _changed(turn_axis=(0.0, 0.0, 2.0)).turn_axis == (0.0, 0.0, 1.0)
+    start, draw = torch.tensor([[1.0, 0, 0, 0]]), torch.zeros(1, 2)
+    near, far = (SteppingRotation(axis=(0, 0, length), step=0.5).following(start, start, draw) for length in (1.0, 3.0))
+    assert torch.equal(near, far)
+    for make in (lambda axis: SteppingRotation(axis=axis), lambda axis: _changed(turn_axis=axis)):
+        for axis in ((0, 0, 0), (0, np.nan, 1), (0.0, 1.0)):
+            with pytest.raises(UsageError, match="axis"):
+                make(axis)
+
+
+@pytest.mark.parametrize("size", [20.0, 0.0, np.nan, np.inf, "a"])
+def test_objects_have_sizes_in_metres(size) -> None:
+    with pytest.raises(UsageError, match="metres"):
+        ObjectPrimitive("sphere", (size,))
+    with pytest.raises(UsageError, match="sphere"):
+        ObjectPrimitive("sphere", 0.01)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("name", "value"), [("solids", ()), ("extent", (np.nan, 1, 1)), ("extent", (1, 1)), ("bottom", np.nan)]
+)
+def test_outer_measures_of_objects_are_lengths(name, value) -> None:
+    with pytest.raises(UsageError, match="solid" if name == "solids" else name):
+        replace(ball(0.02), **{name: value})
+    assert isinstance(ball(0.02).scaled(2.0), ObjectShape)
+
+
+def test_joints_rest_within_their_limits() -> None:
+    hand = hands.load("xhand1")
+    joint = hand.joints[0]
+    with pytest.raises(UsageError, match=f"{joint}.*received 45"):
+        build(_changed(joints={"xhand1": {joint: 45.0}}), hand)
+    with pytest.raises(UsageError, match=joint):
+        _changed(joints={"xhand1": {joint: np.nan}})
+
+
+def test_a_carriage_has_a_range_and_positive_numbers() -> None:
+    for slide in (((0.1, -0.1), 1.0, 1.0, 1.0), ((-0.1, 0.1), -1.0, 1.0, 1.0), ((-0.1, 0.1), 1.0, np.nan, 1.0)):
+        with pytest.raises(UsageError, match=r"carriage\.x"):
+            _changed(carriage={"x": slide})
+
+
+@pytest.mark.parametrize("name", tasks.list_tasks())
+@pytest.mark.parametrize("config", ["default", "published"])
+def test_tasks_of_the_package_keep_their_numbers(name, config) -> None:
+    task = tasks.load(name, config)
+    assert all(abs(float(np.linalg.norm(pose[1])) - 1) < 1e-6 for pose in task.hand_poses.values())
+    assert replace(task) == task
