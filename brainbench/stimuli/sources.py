@@ -86,8 +86,38 @@ def load_stimuli(
         if whiskers != "all" and source.dataset is None:
             raise UsageError("These stimuli are arrays, in which whiskers have no names; leave the selection at 'all'.")
         return source if whiskers == "all" else load_stimuli(source.dataset, whiskers=whiskers)  # type: ignore[arg-type]
+    if _is_array_file(source):
+        return _from_arrays(Path(source), whiskers)  # type: ignore[arg-type]
+    dataset, description = load_stimulus_set(
+        source, whiskers=whiskers, fidelity=fidelity, backend=backend, progress=progress, cache=cache
+    )
+    labels = tuple(str(label) for label in dataset["stimulus"].values)
+    numbers = dataset.attrs["content_hash"]
+    with readable(source, "stimulus set") if _is_file(source) else contextlib.nullcontext():
+        return Stimuli(
+            labels, to_grid(dataset), dataset, numbers, description, dataset.attrs.get("config_hash", numbers)
+        )
+
+
+def load_stimulus_set(
+    source: str | os.PathLike[str] | xr.Dataset,
+    *,
+    whiskers: str = "all",
+    fidelity: Fidelity | str | None = None,
+    backend: WhiskerEngine | str = DEFAULT_ENGINE,
+    progress: Progress | None = None,
+    cache: bool = True,
+) -> tuple[xr.Dataset, str]:
+    """Return the stimulus set that a source names, and its description; arguments are those of :func:`load_stimuli`.
+
+    Whiskers that became unstable are NaN in it, with ``status`` and ``reason``; :func:`load_stimuli` refuses them.
+
+    Raises:
+        UsageError: nothing has this name, an option does not fit the source, or the file holds arrays.
+        DataError: a file cannot be used; the message says what it holds and what is needed.
+    """
     if not isinstance(source, (str, os.PathLike)):
-        return _from_dataset(check_stimulus_set(source), whiskers, "stimulus set")
+        return _select(check_stimulus_set(source), whiskers), "stimulus set"
     if cache and isinstance(backend, str) and is_packaged(source):
         found = _kept(source, whiskers, Fidelity.of(fidelity), backend)
         if found is not None:
@@ -96,12 +126,34 @@ def load_stimuli(
         from brainbench.stimuli.simulation import simulate
 
         dataset = simulate(recipe.scenes, fidelity=fidelity, backend=backend, progress=progress, cache=cache)
-        return _from_dataset(dataset, "all", recipe.description.strip() or recipe.name)
+        return dataset, recipe.description.strip() or recipe.name
+    if _is_array_file(source):
+        raise UsageError(
+            f"{os.fspath(source)!r} holds arrays, not forces of whiskers with names."
+        )
     path = Path(source)
-    if path.suffix in _HDF5 or path.is_file():
-        return _from_hdf5(path, whiskers)
+    if _is_file(source):
+        dataset = read_stimulus_set(path)
+        with readable(path, "stimulus set"):
+            return _select(dataset, whiskers), f"stimulus set {path.name}"
     hint = f"Or a path: a scene file (.toml), or a stimulus-set or array file ({', '.join(_HDF5)})."
     raise unknown_name("stimuli", os.fspath(source), list_recipes(), hint=hint)
+
+
+def _is_file(source: object) -> bool:
+    """Return whether a source is the path of a file of finished stimuli, there or not."""
+    if not isinstance(source, (str, os.PathLike)) or is_packaged(source):
+        return False
+    path = Path(source)
+    return path.suffix in _HDF5 or (path.suffix != ".toml" and path.is_file())
+
+
+def _is_array_file(source: object) -> bool:
+    """Return whether a source is an HDF5 file without forces of whiskers."""
+    if not _is_file(source):
+        return False
+    with open_hdf5(Path(source), "stimulus file") as file:  # type: ignore[arg-type]
+        return "wrench" not in file
 
 
 def is_finished(source: object) -> bool:
@@ -139,13 +191,13 @@ def prepare_stimuli(
             prepare(recipe.scenes, fidelity=fidelity, progress=progress)
 
 
-def _kept(source: str, whiskers: str, fidelity: Fidelity, backend: str) -> Stimuli | None:
-    """Return stimuli that the package holds; None without them."""
+def _kept(source: str, whiskers: str, fidelity: Fidelity, backend: str) -> tuple[xr.Dataset, str] | None:
+    """Return a stimulus set that the package holds and its description; None without it."""
     from brainbench.stimuli.simulation import read_entry
 
     found = find_kept(source, whiskers, fidelity, backend)
     dataset = None if found is None else read_entry(found[0])
-    return None if found is None or dataset is None else _from_dataset(dataset, "all", found[1])
+    return None if found is None or dataset is None else (dataset, found[1])
 
 
 def _recipe(source: str | os.PathLike[str], whiskers: str) -> Recipe | None:
@@ -167,31 +219,24 @@ def _packaged(name: str, whiskers: str) -> Recipe:
     return get_recipe(name, whiskers=whiskers)
 
 
-def _from_dataset(dataset: xr.Dataset, whiskers: str, description: str) -> Stimuli:
-    if whiskers != "all":
-        names = [str(name) for name in dataset["whisker"].values]
-        rows, cols = dataset["row"].values.tolist(), dataset["col"].values.tolist()
-        chosen = dataset.isel(whisker=match_whiskers(whiskers, names, rows, cols))
-        config = content_hash(dataset.attrs.get("config_hash", ""), chosen["whisker"].values.astype(str).tolist())
-        dataset = chosen.assign_attrs(content_hash=hash_stimulus_set(chosen), config_hash=config)
-    labels = tuple(str(label) for label in dataset["stimulus"].values)
-    numbers = dataset.attrs["content_hash"]
-    config = dataset.attrs.get("config_hash", numbers)
-    return Stimuli(labels, to_grid(dataset), dataset, numbers, description, config)
+def _select(dataset: xr.Dataset, whiskers: str) -> xr.Dataset:
+    """Return a stimulus set with some whiskers only, hashed anew."""
+    if whiskers == "all":
+        return dataset
+    names = [str(name) for name in dataset["whisker"].values]
+    rows, cols = dataset["row"].values.tolist(), dataset["col"].values.tolist()
+    chosen = dataset.isel(whisker=match_whiskers(whiskers, names, rows, cols))
+    config = content_hash(dataset.attrs.get("config_hash", ""), chosen["whisker"].values.astype(str).tolist())
+    return chosen.assign_attrs(content_hash=hash_stimulus_set(chosen), config_hash=config)
 
 
-def _from_hdf5(path: Path, whiskers: str) -> Stimuli:
-    name = os.fspath(path)
-    with open_hdf5(path, "stimulus file") as file:
-        if "wrench" not in file:
-            return _from_arrays(file, name, whiskers)
-    dataset = read_stimulus_set(path)
-    with readable(path, "stimulus set"):
-        return _from_dataset(dataset, whiskers, f"stimulus set {path.name}")
-
-
-def _from_arrays(file: Any, name: str, whiskers: str) -> Stimuli:
+def _from_arrays(path: Path, whiskers: str) -> Stimuli:
     """Read ``stimuli`` [K, T, …] and ``labels`` [K]."""
+    with open_hdf5(path, "stimulus file") as file:
+        return _read_arrays(file, os.fspath(path), whiskers)
+
+
+def _read_arrays(file: Any, name: str, whiskers: str) -> Stimuli:
     import h5py
 
     if whiskers != "all":

@@ -1,4 +1,5 @@
 import json
+from pathlib import Path
 
 import pytest
 
@@ -142,3 +143,19 @@ def test_show_tells_where_recorded_whisking_starts(run, tmp_path):
     text = run("stimuli", "show", f"rodgers-recorded {path}", "--stimulus", "convex-far").out
     assert "azimuth" in text
     assert "-10°" in text
+
+
+def test_simulate_writes_whiskers_that_cannot_be_trusted_and_names_them(run, tmp_path):
+    import xarray as xr
+
+    scene = str(Path(__file__).parents[2] / "docs" / "scenes" / "inside.toml")
+    arguments = ("stimuli", "simulate", scene, "--whiskers", "C1,C4", "--out", str(tmp_path / "a.h5"))
+    shown = json.loads(run(*arguments, "--json").out)
+    assert [(row["stimulus"], row["whisker"]) for row in shown["unstable"]] == [("inside", "C4")]
+    assert "deep in an object" in shown["unstable"][0]["reason"]
+    assert "C4" in run(*arguments).out
+    with xr.open_dataset(tmp_path / "a.h5", engine="h5netcdf") as dataset:
+        assert dataset["status"].values.tolist() == [["ok", "unstable"]]
+        assert dataset["wrench"].isnull().any(("time", "channel")).values.tolist() == [[False, True]]
+    score = ("score", "zhuang-small", "--stimuli", str(tmp_path / "a.h5"), "--recordings", "demo-rodgers")
+    assert run(*score).status != 0

@@ -12,7 +12,6 @@ from brainbench.cli.options import numbers, refuse
 from brainbench.cli.output import JsonOption, emit, progress_bar
 from brainbench.cli.stimuli import scenes
 from brainbench.cli.stimuli.scenes import BackendOption, FidelityOption, StimulusOption, WhiskersOption
-from brainbench.core.errors import UsageError
 from brainbench.stimuli.engines import DEFAULT_ENGINE
 
 
@@ -102,19 +101,17 @@ def plot(
     import math
 
     from brainbench.core.figures.style import check_format
-    from brainbench.stimuli import load_stimuli
     from brainbench.stimuli.figures.traces import FORMATS, check_channel
     from brainbench.stimuli.figures.traces import plot as draw
+    from brainbench.stimuli.sources import load_stimulus_set
 
     check_format(out, FORMATS)
     check_channel(channel)
     with progress_bar() as progress:
-        stimuli = load_stimuli(source, whiskers=whiskers, fidelity=fidelity, backend=backend, progress=progress)
-    if stimuli.dataset is None:
-        raise UsageError(f"{source!r} holds arrays, not forces of whiskers; there is nothing to plot.")
+        dataset, _ = load_stimulus_set(source, whiskers=whiskers, fidelity=fidelity, backend=backend, progress=progress)
     low = -math.inf if start is None else start * 1e-3
     high = math.inf if stop is None else stop * 1e-3
     width, height = numbers(size, "--size", count=2)
     chosen = {"channel": channel, "stimulus": stimulus, "window": (low, high)}
-    paths = draw(stimuli.dataset, out, **chosen, size=(width, height))
+    paths = draw(dataset, out, **chosen, size=(width, height))
     emit({"paths": paths, "channel": channel}, "\n".join(map(str, paths)), as_json=as_json)

@@ -11,7 +11,6 @@ from brainbench.cli.destinations import out_file_option
 from brainbench.cli.options import items, numbers
 from brainbench.cli.output import JsonOption, emit, progress_bar, table_of
 from brainbench.cli.stimuli.scenes import BackendOption, FidelityOption, WhiskersOption
-from brainbench.core.errors import UsageError
 from brainbench.stimuli.engines import DEFAULT_ENGINE
 
 
@@ -28,20 +27,21 @@ def simulate(
     as_json: JsonOption = False,
 ) -> None:
     """Simulate a recipe or a scene file and report which whiskers touched what, and how hard."""
-    from brainbench.stimuli import load_stimuli, write_stimulus_set
+    from brainbench.stimuli import write_stimulus_set
     from brainbench.stimuli.explain import Explanation
+    from brainbench.stimuli.sources import load_stimulus_set
 
     with progress_bar() as progress:
-        stimuli = load_stimuli(
+        dataset, description = load_stimulus_set(
             source, whiskers=whiskers, fidelity=fidelity, backend=backend, progress=progress, cache=cache
         )
-    dataset = stimuli.dataset
-    if dataset is None:
-        raise UsageError(f"{source!r} holds arrays, not scenes; nothing is simulated.")
     told = Explanation.of(dataset) if explain else None
     if out is not None:
         write_stimulus_set(dataset, out)
-    data: dict[str, Any] = {"content_hash": stimuli.content_hash, "stimuli": _summary(dataset), "path": out}
+    unstable = _unstable(dataset)
+    data: dict[str, Any] = {
+        "content_hash": dataset.attrs["content_hash"], "stimuli": _summary(dataset), "unstable": unstable, "path": out,
+    }  # fmt: skip
     whiskers_in_all = dataset.sizes["whisker"]
     columns = {
         "stimulus": "{0[stimulus]}",
@@ -49,11 +49,31 @@ def simulate(
         "peak force mN": "{0[peak_force_mN]:.3g}",
         "peak moment µN·m": "{0[peak_moment_uNm]:.3g}",
     }
-    text = table_of(stimuli.description, data["stimuli"], columns)
+    text = table_of(description, data["stimuli"], columns)
+    if unstable:
+        text += "\n\n" + table_of(
+            f"{len(unstable)} whiskers cannot be trusted; their numbers are missing, and networks refuse the set",
+            unstable, {"stimulus": "{0[stimulus]}", "whisker": "{0[whisker]}", "reason": "{0[reason]}"},
+        )  # fmt: skip
     if told is not None:
         data["explanation"] = told
         text += f"\n\n{told}"
     emit(data, text + ("" if out is None else f"\n\nstimuli  {out}"), as_json=as_json)
+
+
+def _unstable(dataset: Any) -> list[dict[str, str]]:
+    """Return the whiskers whose numbers cannot be trusted, and why."""
+    import numpy as np
+
+    bad = dataset["status"].values != "ok" if "status" in dataset else np.zeros((0, 0), bool)
+    return [
+        {
+            "stimulus": str(dataset["stimulus"].values[i]),
+            "whisker": str(dataset["whisker"].values[j]),
+            "reason": str(dataset["reason"].values[i, j]),
+        }
+        for i, j in np.argwhere(bad)
+    ]
 
 
 def _summary(dataset: Any) -> list[dict[str, Any]]:
