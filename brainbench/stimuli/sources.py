@@ -128,9 +128,7 @@ def load_stimulus_set(
         dataset = simulate(recipe.scenes, fidelity=fidelity, backend=backend, progress=progress, cache=cache)
         return dataset, recipe.description.strip() or recipe.name
     if _is_array_file(source):
-        raise UsageError(
-            f"{os.fspath(source)!r} holds arrays, not forces of whiskers with names."
-        )
+        raise UsageError(f"{os.fspath(source)!r} holds arrays, not forces of whiskers with names.")
     path = Path(source)
     if _is_file(source):
         dataset = read_stimulus_set(path)
