@@ -6,7 +6,7 @@ import logging
 import math
 import time
 from abc import abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -88,6 +88,12 @@ class FrameSteps:
     def nearest(self) -> NDArray[np.int_]:
         """[n] nearer of the two steps."""
         return np.where(self.share[:, 0] < 0.5, self.before, self.after)
+
+    def interpolate(self, values: Callable[[NDArray[np.int_]], NDArray[np.float64]]) -> NDArray[np.float64]:
+        """Return values [n, …] at the frames from those that ``values`` gives for steps [n]."""
+        before, after = values(self.before), values(self.after)
+        share = self.share.reshape(-1, *[1] * (before.ndim - 1))
+        return (1 - share) * before + share * after
 
 
 @dataclass(frozen=True, eq=False)

@@ -58,11 +58,10 @@ class BulletEngine(SteppedEngine):
             run.integrate()
         failed, reason = stepped.end(run.failed, run.reason)
         frames = stepped.frames(failed)
-        wrench = (1 - frames.share) * run.wrench[frames.before] + frames.share * run.wrench[frames.after]
         nearest = frames.nearest
         return stepped.trace(
             frames,
-            wrench,
+            frames.interpolate(lambda steps: run.wrench[steps]),
             np.isfinite(run.arc[nearest]),
             run.arc[nearest],
             np.stack([run.shapes[step] for step in nearest.tolist()]) / MILLI if stepped.record_shape else np.zeros(0),

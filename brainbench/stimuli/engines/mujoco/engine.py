@@ -54,9 +54,8 @@ class MujocoWhiskerEngine(SteppedEngine):
     def simulate(self, stepped: SteppedJob) -> tuple[Trace, float]:
         """See :meth:`SteppedEngine.simulate`."""
         job, chain = stepped.job, stepped.chain
-        twists = stepped.fidelity.twist is not False
-        if twists:
-            twists = not stays_in_plane(job, stepped.reach, *stepped.pose, stepped.times)
+        free = stepped.fidelity.twist is not False
+        twists = free and not stays_in_plane(job, stepped.reach, *stepped.pose, stepped.times)
         tolerance = stepped.fidelity.contact_tolerance
         built = build_model(
             job, chain, stepped.reach, stepped.step, stepped.times, twists=twists, contact_tolerance=tolerance
@@ -64,17 +63,15 @@ class MujocoWhiskerEngine(SteppedEngine):
         sensors, hinges, failed, reason = _integrate(built, job, stepped.times)
         failed, reason = stepped.end(failed, reason)
         frames = stepped.frames(failed)
-        share, nearest = frames.share, frames.nearest
-        wrench = (1 - share) * _wrench(built, sensors, frames.before) + share * _wrench(built, sensors, frames.after)
+        nearest = frames.nearest
         shape = _shape(built, chain, hinges[nearest], nearest)
         contact, arc = _contacts(sensors[nearest, 6:], shape, chain)
         if stepped.record_shape:
             # As the wrench: between steps a whisking follicle turns by more than its whisker bends.
-            first, second = (_shape(built, chain, hinges[steps], steps) for steps in (frames.before, frames.after))
-            shape = (1 - share)[..., None] * first + share[..., None] * second
+            shape = frames.interpolate(lambda steps: _shape(built, chain, hinges[steps], steps))
         return stepped.trace(
             frames,
-            wrench,
+            frames.interpolate(lambda steps: _wrench(built, sensors, steps)),
             contact,
             arc,
             shape / MILLI,

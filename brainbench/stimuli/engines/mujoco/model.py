@@ -102,8 +102,8 @@ def build_model(
 ) -> WhiskerModel:
     """Compile the model of ``job`` for the step times [n + 1] (s), with or without the hinges for twist."""
     step = time_step * MILLI
-    position, euler = (np.asarray(values, dtype=float) for values in job.follicle.pose(times))
-    position = position * MILLI
+    place, euler = (np.asarray(values, dtype=float) for values in job.follicle.pose(times))
+    position = place * MILLI
     root = ElementTree.Element("mujoco")
     _add(root, "compiler", angle="radian")
     # The solver's cost is an energy, minute in these units and quadratic in the errors of the forces. Its usual
@@ -129,7 +129,7 @@ def build_model(
     if path.shape[1]:
         drives.append(drive_scalars(path, step))
     _add(base, "site", name="base", size=1e-3)
-    moves = (step_travel(job.whisker, position / MILLI, euler, obstacle, times) for obstacle in reach.obstacles)
+    moves = (step_travel(job.whisker, place, euler, obstacle, times) for obstacle in reach.obstacles)
     # How far a point of the unbent whisker can move against an obstacle in one step at most.
     travel = max((float(move.max(initial=0.0)) for move in moves), default=0.0) * MILLI
     cores = [_thickness(chain, link, travel) for link in range(chain.links)]

@@ -171,29 +171,19 @@ def _simulate_alike(
         parts = [np.arange(len(given)) if which is None else np.flatnonzero(which[:, 0]) for which, _ in tries]
         rows, counts = np.concatenate(parts), [len(part) for part in parts]
         finer = np.repeat([divisor for _, divisor in tries], counts)
-        result, spent = _launch([given[row] for row in rows], fidelity, device, record_shape, finer)
-        np.add.at(seconds, rows, spent / len(rows))
+        started = time.thread_time()
+        packed = PackedTasks.of([given[row] for row in rows], finer)
+        # Compiling is done once; it is no cost of a whisker.
+        paused = time.thread_time()
+        solver = WhiskerSolver(packed.chains, fidelity, device, packed.shapes.needs, twists=given[0].twists)
+        started += time.thread_time() - paused
+        result = packed.launch(solver, record_shape=record_shape)
+        np.add.at(seconds, rows, (time.thread_time() - started) / len(rows))
         return result.split(counts)
 
     result = run_with_retries(launch, retry, ahead=lambda: tries_ahead(device))
     found = (trace_of(result, row, task.job, fidelity, seconds[row]) for row, task in enumerate(given))
     return dict(zip(tasks, found, strict=True))
-
-
-def _launch(
-    tasks: Sequence[JobTask], fidelity: Fidelity, device: Any, record_shape: bool, finer: NDArray[np.integer]
-) -> tuple[LaunchResult, float]:
-    """Simulate tasks and return their results, a row each, with the processor time (s) that it took.
-
-    ``finer`` [task] divides their steps.
-    """
-    started = time.thread_time()
-    packed = PackedTasks.of(tasks, finer)
-    # Compiling is done once; it is no cost of a whisker.
-    paused = time.thread_time()
-    solver = WhiskerSolver(packed.chains, fidelity, device, packed.shapes.needs, twists=tasks[0].twists)
-    started += time.thread_time() - paused
-    return packed.launch(solver, record_shape=record_shape), time.thread_time() - started
 
 
 def trace_of(result: LaunchResult, row: int, job: Job, fidelity: Fidelity, seconds: float) -> Trace:

@@ -197,12 +197,19 @@ class WhiskerSolver:
         wrench, missed = found["wrench"], table(residual(found["miss"], found["load"]))
         depth = table(found["depth"].astype(float)) / MILLI
         force = np.sqrt(np.einsum("...d,...d", wrench[..., :3], wrench[..., :3]))
+        strongest = table(self.strongest[jobs.whisker])
+        strength, strong_at = _first_beyond(strongest, force, readings)
+        travel, farthest, fast_at = np.full((3, *size), np.inf) if fast is None else fast
         facts = RunFacts(
-            counts["status"],
+            status=counts["status"],
             # Single precision rounds a late time; the reading at it must not pass for one before it.
-            start + table(found["failed"].astype(float)) * (1 - 2e-7) / MILLI,
-            *_strong(force, table(self.strongest[jobs.whisker]), readings),
-            *(np.full((3, *size), np.inf) if fast is None else fast),
+            failed=start + table(found["failed"].astype(float)) * (1 - 2e-7) / MILLI,
+            strength=strength,
+            strong_at=strong_at,
+            strongest=strongest,
+            travel=travel,
+            farthest=farthest,
+            fast_at=fast_at,
             residual=missed,
             crowded=counts["crowded"],
             steps=counts["steps"],
@@ -295,12 +302,12 @@ def _readings(times: NDArray[np.float64]) -> dict[str, NDArray]:
     return {"time": np.stack([tick, all_times - tick], axis=1), "row": row}
 
 
-def _strong(
-    strength: NDArray[np.floating], strongest: NDArray[np.float64], readings: NDArray[np.float64]
-) -> tuple[NDArray[np.floating], NDArray[np.float64], NDArray[np.float64]]:
-    """Return ``strength``, ``strong_at`` and ``strongest`` of :class:`RunFacts`, [row, column]."""
+def _first_beyond(
+    strongest: NDArray[np.float64], strength: NDArray[np.floating], readings: NDArray[np.float64]
+) -> tuple[NDArray[np.floating], NDArray[np.float64]]:
+    """Return the first force beyond ``strongest``, and its time (s; inf without), [row, column]."""
     # Written as "not at most" so that NaN counts as too strong.
     wild = ~(strength <= strongest[:, None])
     first = wild.argmax(axis=1)
     at = np.where(wild.any(axis=1), readings[first], np.inf)
-    return np.take_along_axis(strength, first[:, None], axis=1)[:, 0], at, strongest
+    return np.take_along_axis(strength, first[:, None], axis=1)[:, 0], at
