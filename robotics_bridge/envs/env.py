@@ -24,6 +24,8 @@ from robotics_bridge.sensors.sensor import check_kind
 from robotics_bridge.tasks.registry import load
 from robotics_bridge.tasks.task import Task
 
+_NOISE_SEED = "noise_seed"
+"""Name in kept states of the seed of tactile noise."""
 _ADVICE = (
     "Terms and the state of a task may not copy from the processor or wait for it (brainbench.core.rotations.constant "
     "keeps constants on the device); change them, or make the environment with graphs=False."
@@ -223,6 +225,8 @@ class Env:
         state = self.state
         own = {name: value.clone() for name, value in state.memory().items()}
         own["generator"] = state.generator.get_state()
+        if self.touch is not None:
+            own[_NOISE_SEED] = torch.tensor(self.touch.suite.context.seed)
         own |= {f"simulation.{name}": value for name, value in state.simulation.state_dict().items()}
         return own | {f"observations.{name}": value.clone() for name, value in state.observations.items()}
 
@@ -234,6 +238,9 @@ class Env:
         """
         state = self.state
         for name, own in self.state_dict().items():
+            # States that were kept before the noise could be seeded anew have the seed of the options.
+            if name == _NOISE_SEED and name not in values:
+                continue
             if name not in values or (name != "generator" and values[name].shape != own.shape):
                 other = tuple(values[name].shape) if name in values else "none"
                 raise UsageError(
@@ -244,6 +251,8 @@ class Env:
         def under(part: str) -> dict[str, torch.Tensor]:
             return {name.removeprefix(part): value for name, value in values.items() if name.startswith(part)}
 
+        if self.touch is not None and _NOISE_SEED in values:
+            self.touch.suite.seed(int(values[_NOISE_SEED]))
         for name, value in state.memory().items():
             value.copy_(values[name])
         state.generator.set_state(values["generator"].cpu())

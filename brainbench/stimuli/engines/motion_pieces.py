@@ -104,14 +104,13 @@ def cut(
     wanted = KNOT / min(step, KNOT / LOOKS) if finest is None else 16 * KNOT / finest
     looks = int(2 ** math.ceil(math.log2(min(max(wanted, 4), 4 * MOST_PIECES))))
     motion = _Sampled(path, start, what)
-    errors, speed, moves = np.empty((2, cells)), 0.0, False
+    errors, speed = np.empty((2, cells)), 0.0
     some = max(1, _AT_ONCE // looks)
     for first in range(0, cells, some):
         which = np.arange(first, min(first + some, cells))
         place, rate, fastest = motion.errors(which, 1, looks)
         errors[:, which] = place[:, 0], rate[:, 0]
         speed = max(speed, fastest)
-    moves = speed > 0
     limit = SPEED_ERROR * speed + _SLOW
     count = np.ones(cells, dtype=np.int32)
     needed = count.copy()
@@ -120,7 +119,7 @@ def cut(
     for first in range(0, len(left), some):
         which = left[first : first + some]
         count[which], needed[which] = _refine(motion, which, max(looks, LOOKS), limit)
-    return MotionPieces(count, needed, moves)
+    return MotionPieces(count, needed, moves=speed > 0)
 
 
 def _poses(

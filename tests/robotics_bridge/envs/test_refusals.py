@@ -39,12 +39,19 @@ def _course(env, seed: int) -> list[torch.Tensor]:
 
 
 def test_one_seed_gives_one_course_with_noisy_touch_too() -> None:
-    options = {"num_envs": 2, "observe": "bool", "noisy": True, "resolution": "low", "threads": 1}
+    options = {"num_envs": 2, "observe": "depth", "noisy": True, "resolution": "low", "threads": 1}
     env, other = (tasks.make("in_palm_rotate", seed=seed, **options) for seed in (0, 9))
     first = _course(env, 5)
     for again in (_course(env, 5), _course(other, 5)):
         assert all(torch.equal(a, b) for a, b in zip(first, again, strict=True))
     assert not all(torch.equal(a, b) for a, b in zip(first, _course(env, 6), strict=True))
+    # A kept state brings the seed of its noise along.
+    action, kept = torch.zeros(2, env.num_actions), env.state_dict()
+    fresh = tasks.make("in_palm_rotate", seed=3, **options)
+    fresh.load_state_dict(kept)
+    for one in (env, fresh):
+        one.reset()
+    assert torch.equal(env.step(action)[0]["tactile"], fresh.step(action)[0]["tactile"])
 
 
 def test_what_does_not_fit_the_environments_is_refused() -> None:
