@@ -15,6 +15,11 @@ from numpy.typing import ArrayLike, NDArray
 from brainbench.core.errors import UsageError
 from brainbench.core.reading.ranges import check_fields, check_number
 
+SOFTEST = 1e3
+"""Young's modulus [Pa] below which a number looks like gigapascals."""
+LIGHTEST = 10.0
+"""Density [kg/m³] below which a number looks like grams per cubic centimetre."""
+
 
 @dataclass(frozen=True)
 class Whisker:
@@ -49,7 +54,8 @@ class Whisker:
 
     def __post_init__(self) -> None:
         of = "{} of a whisker (SI units)"
-        check_fields(self, "arc_length", "base_radius", "tip_radius", "young_modulus", above=0, of=of)
+        check_fields(self, "arc_length", "base_radius", "tip_radius", above=0, of=of)
+        check_fields(self, "young_modulus", least=SOFTEST, of=of)
         check_fields(self, "damping_ratio", "friction", least=0, of=of)
         check_fields(self, "curvature", of=of)
         check_fields(self, "poisson_ratio", above=-1, most=0.5, of=of)
@@ -60,7 +66,7 @@ class Whisker:
                 )
             object.__setattr__(self, "density", (float(self.density[0]), float(self.density[1])))
         for value in self.densities:
-            check_number("density of a whisker (kg/m³)", value, above=0)
+            check_number("density of a whisker (kg/m³)", value, least=LIGHTEST)
         thickest = max(self.base_radius, self.tip_radius)
         if thickest > self.arc_length / 5:
             raise UsageError(

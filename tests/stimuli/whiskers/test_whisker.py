@@ -77,6 +77,8 @@ def test_poissons_ratio_is_in_hashes_only_where_it_is_not_the_default():
         ({"arc_length": -1.0}, r"arc_length .*received -1"),
         ({"tip_radius": 0.0}, r"tip_radius .*received 0"),
         ({"young_modulus": math.nan}, r"young_modulus .*received nan"),
+        ({"young_modulus": 5.0}, r"young_modulus .*SI.*received 5"),
+        ({"density": 1.3}, r"density .*kg.*received 1.3"),
         ({"density": (1.0, 2.0, 3.0)}, "one number or \\(base, tip\\)"),
         ({"density": (1260.0, -1.0)}, r"density .*received -1"),
         ({"damping_ratio": -0.1}, r"damping_ratio .*received -0"),
