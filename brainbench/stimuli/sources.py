@@ -8,7 +8,7 @@ import os
 import tomllib
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeGuard
 
 import numpy as np
 from numpy.typing import NDArray
@@ -87,7 +87,7 @@ def load_stimuli(
             raise UsageError("These stimuli are arrays, in which whiskers have no names; leave the selection at 'all'.")
         return source if whiskers == "all" else load_stimuli(source.dataset, whiskers=whiskers)  # type: ignore[arg-type]
     if _is_array_file(source):
-        return _from_arrays(Path(source), whiskers)  # type: ignore[arg-type]
+        return _from_arrays(Path(source), whiskers)
     dataset, description = load_stimulus_set(
         source, whiskers=whiskers, fidelity=fidelity, backend=backend, progress=progress, cache=cache
     )
@@ -138,7 +138,7 @@ def load_stimulus_set(
     raise unknown_name("stimuli", os.fspath(source), list_recipes(), hint=hint)
 
 
-def _is_file(source: object) -> bool:
+def _is_file(source: object) -> TypeGuard[str | os.PathLike[str]]:
     """Return whether a source is the path of a file of finished stimuli, there or not."""
     if not isinstance(source, (str, os.PathLike)) or is_packaged(source):
         return False
@@ -146,11 +146,11 @@ def _is_file(source: object) -> bool:
     return path.suffix in _HDF5 or (path.suffix != ".toml" and path.is_file())
 
 
-def _is_array_file(source: object) -> bool:
+def _is_array_file(source: object) -> TypeGuard[str | os.PathLike[str]]:
     """Return whether a source is an HDF5 file without forces of whiskers."""
     if not _is_file(source):
         return False
-    with open_hdf5(Path(source), "stimulus file") as file:  # type: ignore[arg-type]
+    with open_hdf5(Path(source), "stimulus file") as file:
         return "wrench" not in file
 
 
