@@ -22,8 +22,8 @@ from robotics_bridge.envs.simulation import Simulation
 from robotics_bridge.envs.tactile import TactileObservation
 from robotics_bridge.hands import Hand
 from robotics_bridge.tasks.scenes import TaskModel, build
+from robotics_bridge.tasks.step_context import TaskState
 from robotics_bridge.tasks.task import Task
-from robotics_bridge.tasks.task_state import TaskState
 
 
 @dataclass(eq=False)

@@ -1,10 +1,13 @@
-"""A control step as reward terms see it. Letters: B environment, J joint, A action, F finger tip."""
+"""A control step as reward terms see it, and a part of a task that keeps a state of its own over the steps.
+
+Such a part are thermometers and what they showed so far. Letters: B environment, J joint, A action, F finger tip.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 if TYPE_CHECKING:
     import torch
@@ -71,3 +74,34 @@ class StepContext:
     """Name → [B] bool: conditions of the task that end the episode in this step."""
     extras: dict[str, Any] = field(default_factory=dict)
     """Additions of the task's own state, by name."""
+
+
+class TaskState(Protocol):
+    """Made once by ``task.task_state(state)``, given the ``EnvState`` of B environments.
+
+    It reads there poses and contacts, and may write ``episode.target`` [B], the number of the object that counts.
+    """
+
+    def reset(self, mask: torch.Tensor) -> None:
+        """Begin new episodes where the mask [B] is set."""
+
+    def after_physics_step(self, dt: float) -> None:
+        """Take in the state after a physics step of duration dt (s)."""
+
+    def after_control_step(self, context: StepContext) -> None:
+        """Add to what reward terms see at the end of a control step."""
+
+    def metric(self) -> torch.Tensor:
+        """Return the success metric [B] of the episode so far."""
+        ...
+
+    def observe(self, group: str) -> torch.Tensor:
+        """Return an observation group [B, ...] that the task adds."""
+        ...
+
+    def memory(self) -> dict[str, torch.Tensor]:
+        """Return the tensors themselves that the future depends on, by name."""
+        ...
+
+    def restored(self) -> None:
+        """Take note that other values were written to :meth:`memory`."""

@@ -14,7 +14,7 @@ from robotics_bridge.tasks.contact_model import CONTACTS, ContactModel
 from robotics_bridge.tasks.goals import Goal
 from robotics_bridge.tasks.objects import PRIMITIVES, ObjectShape
 from robotics_bridge.tasks.settings import AuxiliaryDecoder, StudentSettings, TeacherSettings
-from robotics_bridge.tasks.task_state import TaskState
+from robotics_bridge.tasks.step_context import TaskState
 
 if TYPE_CHECKING:
     from robotics_bridge.envs.state import EnvState
