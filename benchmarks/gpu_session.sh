@@ -15,9 +15,10 @@
 #               PLAN="0:ft_hand,reservoir_50 3:ft_hand" bash /w/gpu.sh lane 0 students-for; bash /w/gpu.sh look SECOND
 #               (PLAN: seed:arms …, TEACHER a run's folder, one lane of two students, or two lanes a GPU with TOGETHER=1
 #               and LANE=-0a, which never wait for each other; JOB=NAME-0 … lane 1 teachers; TASK=screwdriver NAME=-a
-#               CONFIG=careful WITH="--seed 1" … lane 2a teacher-of, and another as 2b beside it: two teachers of 4,096
-#               environments share a GPU well; SECOND of the machine's life; policies/jobs.toml says what to compare; on a
-#               fresh machine 140 s go into compiling; kill what fails by `pkill -f "run/NAME-[b]"`, not by its own name)
+#               CONFIG=default JUDGED=careful WITH="--seed 1" … lane 2a teacher-of, and another as 2b beside it: two
+#               teachers of 4,096 environments share a GPU well; `whiskers` trains networks whose …/best PRETRAINED may
+#               name; SECOND of the machine's life; policies/jobs.toml says what to compare; on a fresh machine 140 s go
+#               into compiling; kill what fails by `pkill -f "run/NAME-[b]"`, not by its own name)
 #   here:       git checkout -f main && git branch -D device; python -m benchmarks.report after copying results/*.json
 #
 # Calls follow one another within 30 s, or the machine goes back with all that is on it: on 2026-11-26 that happened twice,
@@ -44,8 +45,9 @@ touch     320  python3 -m benchmarks.tactile.throughput --device cuda --part sen
 friction  150  python3 -m benchmarks.tactile.friction_cost --device cuda --write
 gradients 500  python3 -m benchmarks.whiskers.gradient_cost --device cuda --each 1 --input inputs/gradients.npz --write
 teachers  590  python3 -m benchmarks.policies.jobs run $JOB --minutes ${MINUTES:-7.5}
-students-for 1700  for one in $PLAN; do python3 -m benchmarks.policies.students --teacher ${TEACHER:-in_palm_rotate.teacher} --config careful --seed ${one%%:*} --arms $(echo ${one#*:} | tr , ' ') ${AGENTS---no-agents} --evaluations 1 --device cuda --envs 4096 --iterations 110 --learning-rate 5e-4 --episodes 512 --together ${TOGETHER:-2} --end $(($(cat /w/t0) + 1670)) --reserve 60 --out /tmp/run/students-${one%%:*}${LANE:-}; done
-teacher-of 1650 python3 -m brainbench policy train $TASK $WITH --config ${CONFIG:-default} --envs ${ENVS:-8192} --minutes $(python3 -c "print(max(0.05, ($(cat /w/t0) + ${UNTIL:-1500} - $(date +%s)) / 60))") --loggers csv --device cuda --out /tmp/run/$TASK${NAME:-} && python3 -m brainbench policy evaluate $TASK /tmp/run/$TASK${NAME:-} --config ${CONFIG:-default} --envs 1024 --episodes 1024 --seeds 1 --device cuda --out /tmp/run/$TASK${NAME:-}/evaluated.json
+students-for 1700  for one in $PLAN; do python3 -m benchmarks.policies.students --teacher ${TEACHER:-in_palm_rotate.teacher} --config careful --seed ${one%%:*} --arms $(echo ${one#*:} | tr , ' ') ${PRETRAINED:+--pretrained $PRETRAINED} ${AGENTS---no-agents} --evaluations 1 --device cuda --envs 4096 --iterations 110 --learning-rate 5e-4 --episodes 512 --together ${TOGETHER:-2} --end $(($(cat /w/t0) + 1670)) --reserve 60 --out /tmp/run/students-${one%%:*}${LANE:-}; done
+teacher-of 1650 python3 -m brainbench policy train $TASK $WITH --config ${CONFIG:-default} --envs ${ENVS:-8192} --minutes $(python3 -c "print(max(0.05, ($(cat /w/t0) + ${UNTIL:-1500} - $(date +%s)) / 60))") --loggers csv --device cuda --out /tmp/run/$TASK${NAME:-} && python3 -m brainbench policy evaluate $TASK /tmp/run/$TASK${NAME:-} --config ${JUDGED:-${CONFIG:-default}} --envs 1024 --episodes 1024 --seeds 1 --device cuda --out /tmp/run/$TASK${NAME:-}/evaluated.json
+whiskers 1650  python3 -m benchmarks.models.campaign --work /tmp/campaign --again --places 4 --only 'zhuang-intersection-ln-small\.(supervised|simclr)\.seed[12]$' --until $(($(cat /w/t0) + ${UNTIL:-1500}))
 shipped   150  python3 -m brainbench policy evaluate in_palm_rotate in_palm_rotate.teacher in_palm_rotate.student --config careful --envs 1024 --episodes 1024 --seeds 1 --device cuda --out /w/out/shipped.json
 few       240  python3 -m brainbench stimuli sweep thesis-low procedural:30 --split sweep --device cuda $P --out /tmp/few
 training  300  python3 -m benchmarks.models.data_parallel /tmp/few --counts $COUNTS --networks zhuang-intersection-ln+gpt.supervised --out /w/out/data-parallel-$COUNTS.json
@@ -56,7 +58,7 @@ prepare() {
   local top out tree; top=$(git rev-parse --show-toplevel); out=$top/.session; tree=$(mktemp -d); rm -rf "$out"; mkdir -p "$out"
   grep -qx '/.session/' "$top/.git/info/exclude" || echo '/.session/' >>"$top/.git/info/exclude"
   git -C "$top" archive HEAD brainbench robotics_bridge leaderboards benchmarks tests docs README.md pyproject.toml | tar x -C "$tree"
-  rm -rf "$tree"/leaderboards/{reproduction/records,results}/*.json "$tree"/benchmarks/results/* "$tree"/docs/images
+  rm -rf "$tree"/benchmarks/policies/records/*.tar.xz "$tree"/leaderboards/{reproduction/records,results}/*.json "$tree"/benchmarks/results/* "$tree"/docs/images
   mkdir "$tree/inputs"
   (cd "$top" && python -m benchmarks.tactile.throughput --device cpu --write-input "$tree/inputs/pyramid.npz" &&
     python -m benchmarks.whiskers.gradient_cost --each 1 --write-input "$tree/inputs/gradients.npz")
@@ -90,12 +92,13 @@ look() {
   nvidia-smi --query-gpu=utilization.gpu,memory.used --format=csv,noheader
   set +e  # files change while they are packed, and the rest shall come back all the same
   cd / && tar czf "$OUT/seen.tar.gz" w/out/*.log w/head/benchmarks/results $(find tmp/run -maxdepth 4 -name '*.json' -o -name '*.jsonl' -o -name log.csv 2>/dev/null)
-  # The newest model of each teacher, and students that were evaluated and may ship: eight files may come back.
-  local model runs=()
+  [ ! -d tmp/campaign/jobs ] || tar czf "$OUT/trainings.tar.gz" tmp/campaign/jobs
+  # The last models of each teacher, or the policy of a run that has one; eight files may come back.
+  local run
   for run in /tmp/run/*/; do
-    model=$(ls -v "$run"model_*.safetensors 2>/dev/null | tail -n 1); [ -z "$model" ] || runs+=("$model" "$run"config.json); [ ! -d "$run"policy ] || runs+=("$run"policy)
+    if [ -d "$run"policy ]; then tar czf "$OUT/$(basename "$run").tar.gz" "$run"policy
+    elif [ -e "$run"config.json ]; then tar czf "$OUT/$(basename "$run").tar.gz" "$run"config.json $(ls -v "$run"model_*.safetensors 2>/dev/null | tail -n "${MODELS:-6}"); fi
   done
-  [ -z "${runs[*]}" ] || tar czf "$OUT/teachers.tar.gz" "${runs[@]}"
   for run in /tmp/run/students-*/raw_rnn/seed*/; do
     [ ! -e "$run/evaluation.json" ] || tar cJf "$OUT/raw_rnn-$(basename "$run").tar.xz" -C "$run" model.safetensors config.json evaluation.json
   done; cp /w/out/*.json "$OUT" 2>/dev/null || true

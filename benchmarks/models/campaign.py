@@ -61,6 +61,7 @@ def parser() -> argparse.ArgumentParser:
     told.add_argument("--epochs", type=int, help="fewer epochs, for a trial")
     told.add_argument("--data", action="store_true", help="make the data and stop")
     told.add_argument("--only", help="pattern in the names of jobs to do")
+    told.add_argument("--again", action="store_true", help="also jobs that are done, on sweeps of today's solver")
     told.add_argument("--device", help="cpu for a trial; all GPUs if not given")
     told.add_argument("--pack", type=int, help="write the n-th part of the results to --out")
     told.add_argument("--out", type=Path, default=Path("campaign-out"))
@@ -177,7 +178,7 @@ def make_data(args: argparse.Namespace, gpus: int) -> None:
     manifest = generate(wanted, folder)
     _log.info("%d sweeps, hash %s, %d unstable", manifest["sweeps"], manifest["content_hash"], manifest["unstable"])
     used = {line["data"]["hash"] for line in finished().values()} - {manifest["content_hash"]}
-    if used and gpus:
+    if used and gpus and not args.again:
         raise SystemExit(
             f"These sweeps are not those of the trainings done so far ({', '.join(used)}): train with the code of the "
             f"commit {SOLVER}, whose solver made them."
@@ -241,7 +242,7 @@ class Worker:
         """Claim the first job that nobody has done or claimed and that there is time for."""
         for job in campaign():
             known = job.name in self.done or job.model in self.done  # baselines are listed by what is read
-            if known or (self.args.only and not re.search(self.args.only, job.name)):
+            if (known and not self.args.again) or (self.args.only and not re.search(self.args.only, job.name)):
                 continue
             if job.trained and job.seed and self._rate(job) is None:
                 continue

@@ -28,7 +28,7 @@ HEADLINES = (
 SEEDS = 3
 FULL_SIZE = ("zhuang+gpt", "zhuang-intersection-ln+gpt")
 VARIED = "zhuang-intersection-ln"
-"""Architecture with which augmentations and masking are compared."""
+"""Architecture with which augmentations and masking are compared, and whose weights serve students of a hand."""
 SHIPPED = (
     "resnet18-small.supervised", "resnet18-small+gpt.supervised", "resnet18-small+gpt.simclr",
     "s4-small+gpt.supervised", "zhuang-small.supervised", "zhuang-small.simclr",
@@ -166,3 +166,5 @@ def _jobs() -> Iterator[Job]:
         yield _job(name, "untrained", small=False)
     for name in RATE_CHECKED:
         yield dataclasses.replace(_job(name, "supervised"), rate=HIGHER_RATE)
+    for seed in range(1, SEEDS):
+        yield _job(VARIED, "simclr", seed)

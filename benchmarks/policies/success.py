@@ -22,6 +22,7 @@ from scipy.stats import norm
 from benchmarks.policies.alignment import RECORD, board, partial_spearman
 from benchmarks.policies.students import NETWORKS, arm_of, found_logs, seen
 from benchmarks.report import table, with_notes, write_section
+from brainbench.core.errors import UsageError
 from brainbench.core.figures.style import COLORS, PALE, panels, save_figure
 from brainbench.core.files import read_json
 from brainbench.models.architecture import Architecture
@@ -64,9 +65,18 @@ def networks(results: Sequence[StudentResult], folders: list[Path]) -> list[dict
 
 
 def weights_seed(config: DistillConfig) -> int:
-    """Return the seed of a student's frozen weights as the board states it: 0 for weights with a tag."""
+    """Return the seed of a student's frozen weights as the board states it: 0 for weights with a tag.
+
+    Raises:
+        UsageError: the weights are of another training than the board's.
+    """
     tactile = config.tactile
     assert tactile is not None
+    if tactile.pretrained is not None:
+        raise UsageError(
+            f"The weights {tactile.pretrained!r} of {config.name!r} are not scored on the board; leave the folder of "
+            "that student out."
+        )
     return 0 if Architecture.parse(tactile.arm).tag else tactile.seed
 
 

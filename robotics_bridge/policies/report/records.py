@@ -62,7 +62,6 @@ def records(results: Sequence[StudentResult]) -> list[ResultRecord]:
             command(replace(one, teacher=config.teacher), stop_at=learned)
             for one, learned in zip(result.configs, result.learned, strict=True)
         ]
-        crossed = len(set(result.seeds)) < len(result.seeds)
         settings = {
             "episodes": result.episodes, "metric": result.metric, "iterations_learned": result.iterations,
             "seeds": list(result.seeds), **{f"mean_{name}": mean for name, (mean, _) in result.graded.items()},
@@ -80,7 +79,7 @@ def records(results: Sequence[StudentResult]) -> list[ResultRecord]:
             reasons=(result.note,) if result.note else (),
             interval=result.interval,
             subjects=tuple(
-                SubjectScore(f"seed {one.seed}{f', {one.draw}' * crossed}", share, math.nan, math.nan)
+                SubjectScore(f"seed {one.seed}{f', {one.draw}' * result.nested}", share, math.nan, math.nan)
                 for one, share in zip(result.configs, result.success, strict=True)
             ),
             estimator="policy-success",

@@ -115,6 +115,12 @@ class StudentResult:
         return float(np.mean(self.success))
 
     @property
+    def nested(self) -> bool:
+        """Whether some of the students share a training seed or, of several, a draw, so that they are no repeats."""
+        draws = [config.draw for config in self.configs if config.draw is not None]
+        return len(set(self.seeds)) < len(self.seeds) or 1 < len(set(draws)) < len(draws)
+
+    @property
     def world(self) -> tuple[str, str, str]:
         """Task, hand and contacts: results of different worlds are not compared."""
         return self.config.task, self.config.hand, self.config.contacts or "–"
@@ -125,8 +131,8 @@ def read_results(folders: Iterable[str | Path], *, at_least: int = 0) -> list[St
 
     Where a student was trained more than once with the same training seed and draw of its encoder, the one that learned
     longest counts: two runs of one seed are no two seeds. Students of another version of the tasks are left out, and
-    those that learned fewer iterations than ``at_least``; those that do not say how many stay. Where draws and seeds
-    are crossed, intervals are those of :func:`mixed_model`.
+    those that learned fewer iterations than ``at_least``; those that do not say how many stay. Where students of an
+    arm share draws or seeds, intervals are those of :func:`mixed_model`.
 
     Raises:
         DataFileNotFoundError: no student was evaluated there, or none of them learned so long.
@@ -156,8 +162,8 @@ def read_results(folders: Iterable[str | Path], *, at_least: int = 0) -> list[St
         raise DataFileNotFoundError(
             f"None of the students learned {at_least} iterations; the longest that any did is {longest}."
         )
-    crossed = {result.world for result in results if len(set(result.seeds)) < len(result.seeds)}
-    models = {world: mixed_model([r for r in results if r.world == world]) for world in crossed}
+    nested = {result.world for result in results if result.nested}
+    models = {world: mixed_model([r for r in results if r.world == world]) for world in nested}
     results = [
         r if r.world not in models else replace(r, interval=_share(models[r.world].mean(r.name).interval or r.interval))
         for r in results

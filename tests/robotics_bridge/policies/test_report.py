@@ -304,6 +304,19 @@ def test_draws_of_an_encoder_are_crossed_with_training_seeds(tmp_path) -> None:
     assert [one.subject for one in subjects][:2] == ["seed 0, seed 0", "seed 0, seed 1"]
 
 
+def test_students_of_one_training_of_a_network_are_no_repeats_of_trainings(tmp_path) -> None:
+    # Three trainings that differ by .1, two students of each that differ by .01, each of another seed.
+    for seed, (number, share) in enumerate(itertools.product(range(3), (0.0, 0.01))):
+        settings = {"encoder": "zhuang-small.simclr", "encoder_settings": {"pretrained": f"runs/{number}/best"}}
+        _write(tmp_path / str(number), [0.5 + 0.1 * number + share] * 3, seed=seed, **settings)
+    (drawn,) = read_results([tmp_path])
+    # t of three trainings has 4.3 × .1 / √3 = .25 on either side; of six independent students it would have .09.
+    assert drawn.interval is not None
+    assert (drawn.interval.high - drawn.interval.low) / 2 == pytest.approx(4.303 * 0.1 / 3**0.5, rel=0.02)
+    (record,) = records([drawn])
+    assert [one.subject for one in record.score.subjects][:2] == ["seed 0, runs/0/best", "seed 1, runs/0/best"]
+
+
 @pytest.mark.parametrize(
     ("settings", "draw"),
     [
