@@ -266,7 +266,7 @@ def lay_out(options: argparse.Namespace) -> None:
     parts = [f"{title}.", table(columns, rows)]
     parts += [f"Notes: {'; '.join(notes)}."] if notes else []
     logs = found_logs(options.lay_out, named)
-    parts += [every_student(named, logs), differences(named, logs)]
+    parts += [every_student(named, logs), *every_draw(named, logs), differences(named, logs)]
     body = with_notes("\n\n".join(parts), options.notes)
     print(body)
     if options.write:
@@ -339,6 +339,21 @@ def every_student(named: dict[str, StudentResult], logs: dict[tuple[str, int], l
     span = f"{least - _SMOOTH + 1} to {least}"
     columns = ["arm", "training seed", "iterations", "control steps", f"imitation loss, last {_SMOOTH}"]
     return table([*columns, f"success in training, iterations {span}", "success in evaluation"], rows)
+
+
+def every_draw(named: dict[str, StudentResult], logs: dict[tuple[str, int], list[dict[str, Any]]]) -> list[str]:
+    """Return the table of networks that serve several students, where an arm has more than one; empty if none has."""
+    from benchmarks.report import table
+
+    least = min(learned or 0 for result in named.values() for learned in result.learned)
+    rows = []
+    for arm, result in ((arm, result) for arm, result in named.items() if result.nested):
+        for draw in dict.fromkeys(config.draw for config in result.configs):
+            own = [number for number, config in enumerate(result.configs) if config.draw == draw]
+            told = [[result.success[number] for number in own], [seen(logs[arm, result.seeds[n]], least) for n in own]]
+            rows.append([arm, f"`{draw}`", str(len(own)), *(f"{sum(shares) / len(own):.3f}" for shares in told)])
+    columns = ["arm", "network", "students", "success in evaluation", "success in training"]
+    return ["Means over the students of each network:", table(columns, rows)] if rows else []
 
 
 def differences(named: dict[str, StudentResult], logs: dict[tuple[str, int], list[dict[str, Any]]]) -> str:

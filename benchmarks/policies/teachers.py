@@ -4,7 +4,7 @@
     python -m benchmarks.policies.teachers --evaluated ENGINE=FILE … [--curves NAME=LOG.csv …] [--notes FILE] [--write]
 
 is the section of the teacher of in_palm_rotate: its evaluations, kept in ``records``, and how it learned. With
-``--others`` it is that of the other tasks: evaluations, and what episodes of training were like on the way.
+``--others TITLE`` it is another section: evaluations, and what episodes of training were like on the way.
 """
 
 from __future__ import annotations
@@ -116,7 +116,7 @@ def draw(curves: dict[str, Path]) -> None:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--evaluated", nargs="+", required=True)
-    parser.add_argument("--others", action="store_true", help="of other tasks than in_palm_rotate")
+    parser.add_argument("--others", help="title of the section of other policies than the teacher of in_palm_rotate")
     parser.add_argument("--curves", nargs="*", default=[], help="log.csv of each run")
     parser.add_argument("--notes", type=Path, help="text that follows the table")
     parser.add_argument("--device", default="one NVIDIA H200 per run")
@@ -129,16 +129,18 @@ def main() -> None:
     print(text)
     if not options.write:
         return
-    title, what = "Teacher of in_palm_rotate", "in_palm_rotate in_palm_rotate.teacher --config careful"
+    what, other = "in_palm_rotate in_palm_rotate.teacher --config careful", ""
     if options.others:
-        title, what = "Teachers of other tasks", "TASK RUN …"
+        what, other = "TASK RUN …", f"--others {options.others!r} "
     else:
         draw(curves)
     command = (
-        f"brainbench policy evaluate {what} --out FILE; python -m benchmarks.policies.teachers "
-        f"{'--others ' * options.others}--evaluated ENGINE=FILE … --curves NAME=LOG.csv … --write"
+        f"brainbench policy evaluate {what} --out FILE; python -m benchmarks.policies.teachers {other}"
+        "--evaluated ENGINE=FILE … --curves NAME=LOG.csv … --write"
     )
-    write_section(title, command, text, where=options.device, subject="policies")
+    write_section(
+        options.others or "Teacher of in_palm_rotate", command, text, where=options.device, subject="policies"
+    )
 
 
 if __name__ == "__main__":

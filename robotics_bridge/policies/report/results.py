@@ -132,7 +132,7 @@ def read_results(folders: Iterable[str | Path], *, at_least: int = 0) -> list[St
     Where a student was trained more than once with the same training seed and draw of its encoder, the one that learned
     longest counts: two runs of one seed are no two seeds. Students of another version of the tasks are left out, and
     those that learned fewer iterations than ``at_least``; those that do not say how many stay. Where students of an
-    arm share draws or seeds, intervals are those of :func:`mixed_model`.
+    arm share draws or seeds, its interval is that of :func:`mixed_model`.
 
     Raises:
         DataFileNotFoundError: no student was evaluated there, or none of them learned so long.
@@ -165,7 +165,7 @@ def read_results(folders: Iterable[str | Path], *, at_least: int = 0) -> list[St
     nested = {result.world for result in results if result.nested}
     models = {world: mixed_model([r for r in results if r.world == world]) for world in nested}
     results = [
-        r if r.world not in models else replace(r, interval=_share(models[r.world].mean(r.name).interval or r.interval))
+        replace(r, interval=_share(models[r.world].mean(r.name).interval or r.interval)) if r.nested else r
         for r in results
     ]
     # With memory and without, the better of the two is what touch has to beat.
