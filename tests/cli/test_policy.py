@@ -164,8 +164,9 @@ def test_a_task_of_ones_own_is_trained_and_evaluated(tmp_path: Path, quick: Path
     [
         (("--hidden", "12,x"), "--hidden takes whole numbers joined by commas; received '12,x'"),
         (("--hidden", "12,-4"), "width of the hidden layers .*received -4"),
-        (("--encoder", "rnn", "--unroll", "full"), "--unroll and --pretrained are of models; 'rnn' is none"),
-        (("--encoder", "reservoir", "--units", "3"), "'reservoir' has none"),
+        (("--encoder", "rnn", "--unroll", "full"), "'options' = {'unroll': 'full'} is for .* network .*'rnn'"),
+        (("--encoder", "mlp", "--time", "resampled"), "'time' = 'resampled' is for .* network .*'mlp'"),
+        (("--encoder", "reservoir", "--units", "3"), "'units' = 3 is for .*'reservoir'"),
     ],
 )
 def test_settings_that_reach_nothing_are_refused(tmp_path: Path, words: tuple[str, ...], told: str) -> None:

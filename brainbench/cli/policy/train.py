@@ -85,8 +85,10 @@ def distill(
     encoder: Annotated[
         str, typer.Option(help="mlp, rnn, tactile_cnn, tactile_convrnn, …, or a model's name; auto as published.")
     ] = "auto",
-    learning: Annotated[str, typer.Option(help="Of a model: frozen or finetuned.")] = "frozen",
-    time: Annotated[str, typer.Option(help="Of a model: native or resampled to its own 9 ms.")] = "native",
+    learning: Annotated[str | None, typer.Option(help="Of a model: frozen or finetuned. [default: frozen]")] = None,
+    time: Annotated[
+        str | None, typer.Option(help="Of a model: native or resampled to its own 9 ms. [default: native]")
+    ] = None,
     unroll: Annotated[
         str | None, typer.Option(help="Of a graph model: full answers at once, biological after a step per layer.")
     ] = None,
@@ -102,18 +104,17 @@ def distill(
     as_json: JsonOption = False,
 ) -> None:
     """Distil a teacher into a student that feels; a run that was interrupted goes on when it is started again."""
-    from brainbench.core.errors import UsageError
     from robotics_bridge.policies.encoders.arms import ARMS, AUTO
     from robotics_bridge.policies.training.distill_config import DistillConfig
     from robotics_bridge.policies.training.students import train_student
 
-    given = {"seed": draw, "units": units, "pretrained": pretrained and str(pretrained)}
-    settings: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
-    if encoder not in (AUTO, *ARMS):
-        settings |= {"learning": learning, "time": time}
-        settings |= {} if unroll is None else {"options": {"unroll": unroll}}
-    elif (learning, time, unroll, pretrained) != ("frozen", "native", None, None):
-        raise UsageError(f"--learning, --time, --unroll and --pretrained are of models; {encoder!r} is none of them.")
+    given = {
+        "learning": learning, "time": time, "seed": draw, "units": units, "pretrained": pretrained and str(pretrained),
+        "options": unroll and {"unroll": unroll},
+    }  # fmt: skip
+    # The learning of a network is stated in the names and tables of students.
+    settings: dict[str, Any] = {} if encoder in (AUTO, *ARMS) else {"learning": "frozen", "time": "native"}
+    settings |= {name: value for name, value in given.items() if value is not None}
     config = DistillConfig(task=task, teacher=str(teacher), encoder=encoder, encoder_settings=settings, **options)
     folder = out or Path("students") / config.name
     with progress_bar() as progress:

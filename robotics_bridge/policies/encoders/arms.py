@@ -8,7 +8,7 @@ sizes are those of the thesis (section 4.3.4). Letters: B batch, S sub-step, N i
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import MISSING, asdict, dataclass, field, fields
 from functools import partial
 from typing import Any
 
@@ -16,8 +16,8 @@ import torch
 from torch import nn
 
 from brainbench.core.contracts import GRID_SHAPE
-from brainbench.core.errors import UsageError, check_name, unknown_name
-from brainbench.core.reading.ranges import check_number
+from brainbench.core.errors import UsageError, check_name, shown, unknown_name
+from brainbench.core.reading.ranges import check_fields
 from brainbench.models.architecture import Architecture
 from brainbench.models.cells import GRU
 from brainbench.models.registry import list_models
@@ -25,14 +25,16 @@ from robotics_bridge import hands
 from robotics_bridge.hands.observations import observation_type
 from robotics_bridge.policies.encoders.calibration import HandCalibration
 from robotics_bridge.policies.encoders.conv_gru import MOST_CELLS, ConvGRUProducts
-from robotics_bridge.policies.encoders.front_end import FrontEnd, Learning
+from robotics_bridge.policies.encoders.front_end import LEARNING, FrontEnd, Learning
 from robotics_bridge.policies.encoders.reservoir import UNITS, EchoState, FeatureNorm
 from robotics_bridge.policies.encoders.taxel_grid import TaxelGrid
-from robotics_bridge.policies.encoders.timing import Time
+from robotics_bridge.policies.encoders.timing import TIMES, Time
 
 AUTO = "auto"
 """The published choice: ``tactile_convrnn`` where every link has a grid of taxels, ``rnn`` elsewhere."""
 _HIDDEN, _CHANNELS, _KERNEL = 64, (16, 32), 3
+_OF_NETWORKS = ("time", "learning", "pretrained", "options", "calibration")
+"""Settings that encoders which are learned with the policy, and the reservoir, do not have."""
 _COUNTED = 1 << 24
 """Values per channel whose squares are added up at a time."""
 Stepped = tuple[torch.Tensor, torch.Tensor]
@@ -44,7 +46,7 @@ class EncoderConfig:
     """A tactile encoder and what it reads; plain values only, so that it can stand in a file.
 
     Raises:
-        UsageError: a size is out of range.
+        UsageError: a size is out of range, or a setting is given to an encoder that does not have it.
     """
 
     name: str = AUTO
@@ -74,11 +76,24 @@ class EncoderConfig:
     """Force and moment that are one unit to a network."""
 
     def __post_init__(self) -> None:
-        check_number("'slots' of a tactile encoder", self.slots, least=1, most=1000, whole=True)
-        for name in ("features", "units"):
-            check_number(f"{name!r} of a tactile encoder", getattr(self, name), least=1, most=8192, whole=True)
-        if self.units != _HIDDEN and self.arm != "rnn":
-            raise UsageError(f"'units' is of the tactile encoder 'rnn'; {self.arm!r} has none. Leave it out.")
+        of = "'{}' of a tactile encoder"
+        check_fields(self, "slots", least=1, most=1000, whole=True, of=of)
+        check_fields(self, "features", "units", least=1, most=8192, whole=True, of=of)
+        check_fields(self, "seed", least=0, whole=True, of=of)
+        check_name("time of an encoder", self.time, TIMES)
+        check_name("way of learning of an encoder", self.learning, LEARNING)
+        # Equal to its default a setting may stand anywhere: a configuration in a file holds them all.
+        owner = {"units": "'rnn'"} if self.arm != "rnn" else {}
+        owner |= dict.fromkeys(_OF_NETWORKS, "a network (brainbench models list)") if self.arm in ARMS else {}
+        for item in fields(self):
+            value, usual = getattr(self, item.name), item.default
+            if item.default_factory is not MISSING:
+                usual = item.default_factory()
+            if item.name in owner and value != usual:
+                raise UsageError(
+                    f"{item.name!r} = {shown(value)} is for the tactile encoder {owner[item.name]}; {self.arm!r} has "
+                    "no such setting. Leave it out."
+                )
 
     @classmethod
     def of(cls, value: Mapping[str, Any] | EncoderConfig) -> EncoderConfig:

@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from brainbench.core.errors import check_name
+from brainbench.core.errors import UsageError, check_name, listing
 from brainbench.core.reading.ranges import check_number
 from brainbench.models.architecture import Architecture
 from robotics_bridge.hands.observations import observation_type
@@ -18,6 +18,8 @@ from robotics_bridge.tasks.contact_model import CONTACTS
 from robotics_bridge.tasks.settings import StudentSettings, check_widths
 
 _HIDDEN = (512, 256, 128)
+_SHARED = ("hand", "observe", "placement", "resolution")
+"""Fields of an encoder that are those of its student."""
 LOSSES = ("mse", "inv_var_mse")
 """``inv_var_mse``: each action's squared error over the variance of the teacher's action in the rollout."""
 MOST = {"learning_rate": 1.0, "clip": 100.0, "max_grad_norm": 1e6}
@@ -104,6 +106,9 @@ class DistillConfig:
         for name in (*sorted(positive), "teacher_iterations", "aggregate", "seed"):
             if (value := getattr(self, name)) is not None:
                 check_number(name, value, least=int(name in positive), whole=True)
+        if own := {"name", *_SHARED} & set(self.encoder_settings):
+            raise UsageError(f"{listing(own)} of an encoder: set it for the student (its 'encoder' is the name).")
+        _ = self.tactile  # whose settings are checked by its own class
 
     @classmethod
     def of(cls, value: Mapping[str, Any]) -> DistillConfig:
@@ -127,7 +132,7 @@ class DistillConfig:
         """The tactile encoder; None without touch."""
         if observation_type(self.observe).sensor is None:
             return None
-        shared = {name: getattr(self, name) for name in ("hand", "observe", "placement", "resolution")}
+        shared = {name: getattr(self, name) for name in _SHARED}
         # Another seed is another draw of what is random in the encoder too.
         return EncoderConfig.of({"seed": self.seed, **self.encoder_settings, "name": self.encoder, **shared})
 

@@ -16,6 +16,7 @@ from robotics_bridge.policies.encoders.arms import ARMS, EncoderConfig, RunningS
 from robotics_bridge.policies.export import StepPolicy, compare, export_policy
 from robotics_bridge.policies.runners import read_policy
 from robotics_bridge.policies.student import TactilePolicy
+from robotics_bridge.policies.training.distill_config import DistillConfig
 
 NETWORK = "zhuang-intersection-ln-small"
 ITEMS = 45
@@ -287,5 +288,37 @@ def test_units_are_of_the_lstm_alone() -> None:
     assert (small.state_size, usual.state_size) == (18, 128)
     count = [sum(weight.numel() for weight in each.parameters()) for each in (small, usual)]
     assert count[0] < count[1] / 6
-    with pytest.raises(UsageError, match="'units' is of the tactile encoder 'rnn'"):
-        EncoderConfig(name="reservoir", units=9)
+
+
+@pytest.mark.parametrize(
+    ("name", "own", "told"),
+    [
+        ("reservoir", {"units": 9}, "'units' = 9 .*'rnn'; 'reservoir'"),
+        ("zhuang-small", {"units": 9}, "'units' = 9 .*'rnn'; 'zhuang-small'"),
+        ("auto", {"time": "resampled"}, "'time' .*network.*'tactile_convrnn'"),
+        ("reservoir", {"learning": "finetuned"}, "'learning' .*network.*'reservoir'"),
+        ("mlp", {"pretrained": "a.safetensors"}, "'pretrained' .*network.*'mlp'"),
+        ("rnn", {"options": {"unroll": "full"}}, "'options' .*network.*'rnn'"),
+        ("tactile_cnn", {"calibration": {"force": 2.0}}, "'calibration' .*network.*'tactile_cnn'"),
+        ("zhuang-small", {"time": "resample"}, "did you mean 'resampled'"),
+        ("zhuang-small", {"learning": "froze"}, "did you mean 'frozen'"),
+        ("reservoir", {"seed": -1}, "'seed' .*at least 0"),
+    ],
+)
+def test_settings_that_an_encoder_does_not_have_are_refused(name, own, told) -> None:
+    with pytest.raises(UsageError, match=told):
+        EncoderConfig.of({"name": name, **own})
+    with pytest.raises(UsageError, match=told):
+        DistillConfig(task="in_palm_rotate", encoder=name, encoder_settings=own)
+
+
+@pytest.mark.parametrize("name", [*ARMS, "zhuang-small"])
+def test_settings_at_their_defaults_are_of_every_encoder(name) -> None:
+    config = EncoderConfig(name=name)
+    assert EncoderConfig.of(config.plain()) == config
+
+
+@pytest.mark.parametrize("own", ["hand", "observe", "placement", "resolution", "name"])
+def test_what_is_the_students_own_cannot_be_set_for_its_encoder(own) -> None:
+    with pytest.raises(UsageError, match=f"'{own}'"):
+        DistillConfig(task="in_palm_rotate", encoder_settings={own: "tips"})
