@@ -32,16 +32,6 @@ def check_number(
     )
 
 
-def check_vector(name: str, value: Any) -> None:
-    """Raise a :class:`UsageError` unless ``value`` is three finite numbers."""
-    try:
-        fits = len(value) == 3 and all(map(math.isfinite, value))
-    except TypeError:
-        fits = False
-    if not fits:
-        raise UsageError(f"{name} must be three finite numbers; received {shown(value)}.")
-
-
 def check_fields(options: Any, *names: str, of: str = "{}", items: int = 0, **bounds: Any) -> None:
     """Check fields of a dataclass as :func:`check_number` does; None passes where the type of the field allows it.
 

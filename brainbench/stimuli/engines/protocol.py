@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from brainbench.core.errors import UsageError
 from brainbench.core.progress import Progress as NamedProgress
-from brainbench.core.reading.ranges import check_number, check_vector
+from brainbench.core.reading.ranges import check_fields, check_number
 from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.engines.sweep_batch import SweepBatch
 from brainbench.stimuli.objects.obstacle import Obstacle
@@ -55,8 +55,8 @@ class StillFollicle:
     """(θ, φ, ζ) [rad]; the default lays the base frame on the world frame."""
 
     def __post_init__(self) -> None:
-        check_vector("The position (m) of a base that stands still", self.position)
-        check_vector("The angles (rad) of a base that stands still", self.euler)
+        check_fields(self, "position", items=3, of="The {} (m) of a base that stands still")
+        check_fields(self, "euler", items=3, of="The angles {} (rad) of a base that stands still")
 
     def pose(self, times: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the same pose at every time."""
@@ -100,13 +100,13 @@ class Job:
         times = np.array(self.times, dtype=float)
         if times.ndim != 1 or not len(times) or not np.isfinite(times).all() or np.any(np.diff(times) <= 0):
             raise UsageError("The frame times of a job must be one increasing list of finite seconds.")
-        check_number("start of a job (s)", self.start)
-        check_vector("gravity of a job (m/s²)", self.gravity)
+        check_fields(self, "start", of="{} of a job (s)")
+        check_fields(self, "gravity", items=3, of="{} of a job (m/s²)")
         if times[0] < self.start:
             raise UsageError(f"The first frame ({times[0]:g} s) lies before the start of the job ({self.start:g} s).")
         for load in self.loads:
             check_number("arc of a load on this whisker (m)", load.arc, above=0, most=self.whisker.arc_length)
-            check_vector("force of a load (N)", load.force)
+            check_fields(load, "force", items=3, of="{} of a load (N)")
             if math.isnan(load.stop):
                 raise UsageError("stop of a load (s) must be a number, inf for a load that stays; received nan.")
         times.setflags(write=False)

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from brainbench.core.errors import UsageError, check_name, unknown_name
-from brainbench.core.reading.ranges import check_fields, check_vector
+from brainbench.core.reading.ranges import check_fields
 
 Vector = tuple[float, float, float]
 
@@ -52,9 +52,8 @@ class Camera:
         if isinstance(self.view, str) and self.view not in VIEWS:
             raise unknown_name("view", self.view, VIEWS)
         check_name("projection", self.projection, PROJECTIONS)
-        for name, value in {"view": self.view, "target": self.target}.items():
-            if value is not None and not isinstance(value, str):
-                check_vector(f"{name} of a camera", value)
+        vectors = ("target",) if isinstance(self.view, str) else ("view", "target")
+        check_fields(self, *vectors, items=3, of="{} of a camera")
         if not any(self.view):
             raise UsageError("The view of a camera is a direction; (0, 0, 0) is none.")
         check_fields(self, "width", above=0, of="{} (m)")

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from brainbench.core.contracts import CHANNELS
 from brainbench.core.errors import DataError, UsageError, check_name
-from brainbench.core.reading.ranges import check_fields, check_number, check_vector
+from brainbench.core.reading.ranges import check_fields, check_number
 from brainbench.stimuli.engines.protocol import Job, Load, StillFollicle, Trace
 from brainbench.stimuli.fitting.curves import normal_offsets
 from brainbench.stimuli.fitting.parameters import Condition
@@ -53,7 +53,7 @@ class Pluck:
 
     def __post_init__(self) -> None:
         check_fields(self, "deflection", "arc", above=0, of="The {} (m) of a held whisker")
-        check_vector("The direction of a held whisker", self.direction)
+        check_fields(self, "direction", items=3, of="The {} of a held whisker")
         check_number("The length of the direction of a held whisker", math.hypot(*self.direction), above=0)
 
     def loads(self, condition: Condition, start: float) -> tuple[Load, Load]:

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brainbench.core.errors import UsageError
-from brainbench.core.reading.ranges import check_fields, check_number, check_vector
+from brainbench.core.reading.ranges import check_fields, check_number
 from brainbench.stimuli.engines.protocol import base_rotation
 from brainbench.stimuli.motion.hinge_angles import follow_angles
 from brainbench.stimuli.whiskers.array import MountedWhisker
@@ -141,7 +141,7 @@ class _SteadyMotion(_Motion):
 
     def __post_init__(self) -> None:
         name = type(self).__name__.lower()
-        check_vector(f"velocity of a {name} ({self._unit})", self.velocity)
+        check_fields(self, "velocity", items=3, of=f"{{}} of a {name} ({self._unit})")
         check_number(f"{name} onset (s)", self.onset, least=0)
 
     @property

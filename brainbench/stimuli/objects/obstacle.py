@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import ClassVar, Self, get_args
@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brainbench.core.errors import UsageError, check_name
-from brainbench.core.reading.ranges import check_number, check_vector
+from brainbench.core.reading.ranges import check_fields
 from brainbench.core.rotations import from_matrices, to_matrices
 
 RigidMotion = Callable[[NDArray[np.float64]], tuple[NDArray[np.float64], NDArray[np.float64]]]
@@ -107,14 +107,10 @@ class _Primitive:
     """Names of the fields that only grow with it."""
 
     def __post_init__(self) -> None:
-        name = type(self).__name__.lower()
-        for field in (*self._points, *self._sizes):
-            value = getattr(self, field)
-            if isinstance(value, Sequence):
-                check_vector(f"{field} of a {name} (m)", value)
-        for field in self._sizes:
-            for size in np.atleast_1d(getattr(self, field)).tolist():
-                check_number(f"{field} of a {name} (m)", size, above=0)
+        of = f"{{}} of a {type(self).__name__.lower()} (m)"
+        check_fields(self, *self._points, items=3, of=of)
+        for name in self._sizes:
+            check_fields(self, name, items=0 if name == "radius" else 3, above=0, of=of)
 
     def moved(self, rotation: NDArray[np.float64], translation: NDArray[np.float64]) -> Self:
         """Return the body rotated by a matrix [3, 3] about the origin, then translated by [3] (m)."""
@@ -242,8 +238,7 @@ class Obstacle:
             check_name("part of an obstacle", type(part).__name__, [kind.__name__ for kind in get_args(Part)])
         if not self.parts and self.surface is None:
             raise UsageError("An obstacle needs at least one part or a surface.")
-        if self.friction is not None:
-            check_number("friction of an obstacle", self.friction, least=0)
+        check_fields(self, "friction", least=0, of="{} of an obstacle")
 
     @cached_property
     def bounds(self) -> NDArray[np.float64]:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from brainbench.core.reading.ranges import check_number, check_vector
+from brainbench.core.reading.ranges import check_fields
 from brainbench.core.rotations import euler_matrix, from_matrices
 from brainbench.stimuli.motion.trajectories import Path, Spin, Still, Translation
 from brainbench.stimuli.objects.obstacle import Obstacle, Vector
@@ -52,10 +52,9 @@ class PlacedObject:
     """Coulomb coefficient of its contacts; None takes each whisker's own."""
 
     def __post_init__(self) -> None:
-        check_vector("position of an object (m)", self.position)
-        check_vector("rotation of an object (rad)", self.rotation)
-        if self.friction is not None:
-            check_number("The friction of an object", self.friction, least=0)
+        check_fields(self, "position", items=3, of="{} of an object (m)")
+        check_fields(self, "rotation", items=3, of="{} of an object (rad)")
+        check_fields(self, "friction", least=0, of="The {} of an object")
 
     def obstacle(self, frame: tuple[ArrayLike, ArrayLike] | None = None) -> Obstacle:
         """Return what the physics sees in a frame, given by its rotation [3, 3] and origin [3] (m), or in the world."""

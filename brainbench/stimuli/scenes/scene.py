@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brainbench.core.errors import UsageError
-from brainbench.core.reading.ranges import check_vector
+from brainbench.core.reading.ranges import check_fields
 from brainbench.core.rotations import euler_matrix
 from brainbench.stimuli.engines.protocol import Job, base_rotation
 from brainbench.stimuli.motion.recorded import Recorded
@@ -35,8 +35,8 @@ class Head:
     motion: Still | Translation | Path = field(default_factory=Still)
 
     def __post_init__(self) -> None:
-        check_vector("position of a head (m)", self.position)
-        check_vector("rotation of a head (rad)", self.rotation)
+        check_fields(self, "position", items=3, of="{} of a head (m)")
+        check_fields(self, "rotation", items=3, of="{} of a head (rad)")
 
     @property
     def matrix(self) -> NDArray[np.float64]:
