@@ -55,9 +55,6 @@ class Simulation:
             self._warmstart = warp().to_torch(self.engine.data.qacc_warmstart)
             self.fields = {name: self.engine.field(name) for name in FIELDS}
         else:
-            for each in models:
-                # An environment that diverges shows it; C MuJoCo would put it back silently.
-                each.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
             self.engine = MujocoEngine(list(models), num_envs, fields=nominal, threads=threads)
             self.qpos = torch.from_numpy(self.engine.qpos.astype(np.float32))
             self.qvel = torch.from_numpy(self.engine.qvel.astype(np.float32))

@@ -10,6 +10,8 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
+from brainbench.core.reading.ranges import check_number
+
 
 @dataclass(frozen=True)
 class Pose:
@@ -26,9 +28,12 @@ class Pose:
 
 
 _ABOVE, _PRESSED, _LIGHT = 0.008, -0.002, -0.001
+STEP = 1e-3
+"""Seconds past the end of a procedure at which its pose is known, for forward differences there."""
 
 
 def _ramp(time: float, start: float, end: float) -> float:
+    check_number("time in an exploratory procedure (s)", time, least=0, most=1 + STEP)
     # 3 s² − 2 s³: starts and ends at rest, so that prescribed objects do not jerk.
     share = min(max((time - start) / (end - start), 0.0), 1.0)
     return share * share * (3 - 2 * share)
@@ -65,4 +70,4 @@ PROCEDURES: Mapping[str, Callable[[float], Pose]] = {
     "enclosure": _enclosure,
     "contour_following": _contour,
 }
-"""Name → movement over one second: time from 0 to 1 s → pose."""
+"""Name → movement over one second: time from 0 to 1 s → pose; UsageError for another time."""

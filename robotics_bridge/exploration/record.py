@@ -18,14 +18,14 @@ from numpy.typing import NDArray
 
 from brainbench import __version__
 from brainbench.core.contracts import CHANNELS, GRID_SHAPE, check_stimulus_set
-from brainbench.core.errors import UsageError, check_name
+from brainbench.core.errors import DataError, UsageError, check_name, check_once, listing
 from brainbench.core.files import content_hash, to_json
 from brainbench.core.progress import Progress
 from brainbench.core.reading.ranges import check_fields, check_number
 from brainbench.core.rotations import from_matrices, from_rpy, to_matrices
 from brainbench.models.network import SUB_STEP_SECONDS, SUB_STEPS
 from robotics_bridge import hands
-from robotics_bridge.exploration.procedures import PROCEDURES, Pose
+from robotics_bridge.exploration.procedures import PROCEDURES, STEP, Pose
 from robotics_bridge.hands.observations import observe, sensors_for
 from robotics_bridge.hands.scenes import OBJECT, closing, holding_spec, replace_drives
 from robotics_bridge.physics import Geometry, MujocoEngine
@@ -49,7 +49,7 @@ class Explored:
     """An object to explore.
 
     Raises:
-        UsageError: the orientation or the retreat is not valid.
+        UsageError: the orientation or the retreat is not valid, or the object is larger than 2 m.
     """
 
     label: str
@@ -66,7 +66,9 @@ class Explored:
                 f"The orientation of {self.label!r} is a quaternion (w, x, y, z) that is finite and not zero; received "
                 f"{self.quaternion!r}."
             )
-        check_fields(self, "retreat")
+        check_fields(self, "retreat", least=-1, most=1, of="{} of an explored object (m)")
+        extent = float(np.max(self.geometry.reach(np.concatenate([np.eye(3), -np.eye(3)]))))
+        check_number(f"extent of {self.label!r} from its origin (m)", extent, most=1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -166,9 +168,11 @@ def record_exploration(
 
     Raises:
         UsageError: a name is unknown or occurs twice, or nothing is to be explored.
+        DataError: the simulation of the hand diverged.
     """
     for name in procedures:
         check_name("exploratory procedure", name, PROCEDURES)
+    check_once("procedures", procedures)
     labels = [item.label for item in objects]
     check_number("frames", frames, least=1, whole=True)
     if not labels or not procedures or len(set(labels)) < len(labels):
@@ -188,6 +192,10 @@ def record_exploration(
         felt.append(grid(taxels).flatten(2).transpose(1, 2).numpy())
         if progress is not None:
             progress(frame + 1, frames, "exploring")
+    labels = [f"{item.label}/{name}" if len(procedures) > 1 else item.label for item, name in conditions]
+    # What is no number stays so from step to step.
+    if bad := [label for label, flaw in zip(labels, suite.diverged.tolist(), strict=True) if flaw]:
+        raise DataError(f"The simulation of the hand became unstable while it explored {listing(bad)}.")
     config = {
         "hand": hand, "resolution": resolution, "placement": placement, "noisy": noisy, "twist": TWIST,
         "frames": frames, "seed": seed,
@@ -203,8 +211,7 @@ def record_exploration(
     }  # fmt: skip
     return HandRecording(
         world.hand.name,
-        tuple(f"{item.label}/{name}" if len(procedures) > 1 else item.label for item, name in conditions),
-        tuple(item.label for item, _ in conditions), tuple(name for _, name in conditions),
+        tuple(labels), tuple(item.label for item, _ in conditions), tuple(name for _, name in conditions),
         np.linspace(SUB_STEP_SECONDS, SUB_STEP_SECONDS * frames, frames), np.stack(felt, axis=1), config,
     )  # fmt: skip
 
@@ -229,26 +236,26 @@ class _World:
         self._at, self._speed = int(model.jnt_qposadr[joint]), int(model.jnt_dofadr[joint])
         self._place = model.body(OBJECT).pos.copy()
         self._drives = [model.actuator(name).id for name in self.hand.joints] if all(self.hand.joints) else slice(None)
-        self._closed = closing(self.hand, 1.0)
+        # Jaws are not at zero when they are open.
+        self._open, self._closed = closing(self.hand, 0.0), closing(self.hand, 1.0)
         # How far the lowest point of a held object lies below its body's origin (m), by the support function downwards:
         # row 2 of the rotation is the vertical in the object's frame.
         self._bottoms = {id(item): float(item.geometry.reach(-to_matrices(item.quaternion)[2])) for item in kinds}
 
     def move(self, conditions: Sequence[tuple[Explored, str]], time: float) -> None:
         """Put every object where it is at a time (0 to 1 of its procedure), and step the hand once."""
-        step = 1e-3
         for data, (item, procedure) in zip(self.engine.data, conditions, strict=True):
-            pose, after = PROCEDURES[procedure](time), PROCEDURES[procedure](time + step)
+            pose, after = PROCEDURES[procedure](time), PROCEDURES[procedure](time + STEP)
             data.qpos[self._at : self._at + 7] = self._held(pose, item)
             # Velocity by a forward difference over 1 ‰ of the procedure: friction needs the speed of an object that is
             # put in place.
-            names, span = ("x", "y", "z", "yaw"), step * self.span
+            names, span = ("x", "y", "z", "yaw"), STEP * self.span
             *rates, spin = [(getattr(after, name) - getattr(pose, name)) / span for name in names]
             data.qvel[self._speed : self._speed + 3] = rates
             # MuJoCo wants the angular velocity in the body's own axes.
             upright = to_matrices(data.qpos[self._at + 3 : self._at + 7])[2]
             data.qvel[self._speed + 3 : self._speed + 6] = spin * upright
-            data.ctrl[self._drives] = pose.closing * self._closed
+            data.ctrl[self._drives] = self._open + pose.closing * (self._closed - self._open)
         self.engine.step()
 
     def _held(self, pose: Pose, item: Explored) -> NDArray[np.float64]:

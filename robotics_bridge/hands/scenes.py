@@ -124,7 +124,12 @@ def _between(hand: Hand, spec: Any, jaws: dict[int, tuple[float, float]]) -> Any
 
 
 def closing(hand: Hand, share: float) -> NDArray[np.float64]:
-    """Return servo targets [joints] (rad, m) at which every joint is flexed, or closed, by a share of its range."""
+    """Return servo targets [joints] (rad, m) at which every joint is flexed, or closed, by a share of its range.
+
+    Raises:
+        UsageError: the share is not between 0 and 1.
+    """
+    check_number("share by which a hand closes", share, least=0, most=1)
     model = hand.model
     joints = model.actuator_trnid[:, 0] if model.nu else np.arange(model.njnt)
     low, high = model.jnt_range[joints].T

@@ -30,15 +30,15 @@ class MujocoEngine:
 
     Args:
         model: a compiled ``mujoco.MjModel``, or variants of one that differ in numbers only (see
-            :func:`~robotics_bridge.physics.variants.compile_variants`).
+            :func:`~robotics_bridge.physics.variants.compile_variants`); its flag ``autoreset`` is switched off.
         num_envs: B.
-        threads: how many work at once; every processor by default.
+        threads: how many work at once, at least 1; every processor by default.
         fields: values per environment [B, ...] of any model field, e.g. ``{"body_mass": …}``.
         assignment: variant of environment e is ``assignment[e % len(assignment)]``; each in turn by default.
         contacts: room for contacts per environment.
 
     Raises:
-        UsageError: a field or a number of environments is not valid.
+        UsageError: a field, or a number of environments, threads or contacts, is not valid.
     """
 
     def __init__(
@@ -52,9 +52,14 @@ class MujocoEngine:
         contacts: int = 64,
     ) -> None:
         check_number("environments of an engine", num_envs, least=1, most=MOST_ENVS, whole=True)
+        if threads is not None:
+            check_number("threads of an engine", threads, least=1, whole=True)
         models = list(model) if isinstance(model, (list, tuple)) else [model]
         self.model: Any = models[0]
         """The model, or the first of its variants."""
+        for each in models:
+            # An environment that diverges shows it; C MuJoCo would put it back to its start and go on.
+            each.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
         order = list(assignment) or list(range(len(models)))
         self.scene: TouchScene = TouchScene.from_mujoco(models[0], models[1:], assignment)
         self.num_envs = num_envs
@@ -143,7 +148,8 @@ class MujocoEngine:
         self._each(work)
 
     def step(self, steps: int = 1) -> None:
-        """Advance every environment and refresh the state."""
+        """Advance every environment by so many steps and refresh the state."""
+        check_number("steps of an engine", steps, least=1, whole=True)
         self._each(lambda env: mujoco.mj_step(self._models[env], self._data[env], steps))
 
     def forward(self) -> None:
@@ -151,8 +157,10 @@ class MujocoEngine:
         self._each(lambda env: mujoco.mj_forward(self._models[env], self._data[env]))
 
     def reset(self, env_ids: Sequence[int] | NDArray[np.int64] | None = None) -> None:
-        """Put environments (all by default) back to the model's start and refresh the state."""
-        for env in range(self.num_envs) if env_ids is None else np.asarray(env_ids, dtype=int).reshape(-1).tolist():
+        """Put environments (all by default), given by numbers or a mask, back to the model's start."""
+        ids = np.arange(self.num_envs) if env_ids is None else np.asarray(env_ids).reshape(-1)
+        for env in (np.flatnonzero(ids) if ids.dtype == bool else ids).tolist():
+            check_number("environment to reset", env, least=0, below=self.num_envs, whole=True)
             mujoco.mj_resetData(self._models[env], self._data[env])
         self.forward()
 

@@ -139,7 +139,8 @@ class MujocoWarpEngine:
                 ) from None
 
     def step(self, steps: int = 1) -> None:
-        """Advance every environment and refresh the state."""
+        """Advance every environment by so many steps and refresh the state."""
+        check_number("steps of an engine", steps, least=1, whole=True)
         with warp().ScopedDevice(self._device):
             for _ in range(steps):
                 if self._replay:
@@ -157,13 +158,14 @@ class MujocoWarpEngine:
             self._fill()
 
     def reset(self, env_ids: Sequence[int] | torch.Tensor | None = None) -> None:
-        """Put environments (all by default) back to the model's start and refresh the state."""
+        """Put environments (all by default), given by numbers or a mask, back to the model's start."""
         wp = warp()
         with wp.ScopedDevice(self._device):
             mask = None
             if env_ids is not None:
                 chosen = torch.zeros(self.num_envs, dtype=torch.bool, device=wp.device_to_torch(self._device))
-                chosen[torch.as_tensor(env_ids, device=chosen.device, dtype=torch.long)] = True
+                ids = torch.as_tensor(env_ids, device=chosen.device)
+                chosen[ids if ids.dtype == torch.bool else ids.long()] = True
                 mask = wp.from_torch(chosen)
             self._engine.reset_data(self._m, self._d, mask)
         self.forward()

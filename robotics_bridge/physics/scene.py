@@ -58,21 +58,24 @@ class Geometry:
     def __post_init__(self) -> None:
         check_name("kind of geometry", self.kind, KINDS)
         needed, of = _SIZES[self.kind], f"{{}} of {self.name!r}"
-        if len(self.size) < needed:
+        if len(self.size) != needed:
             raise UsageError(
                 f"The {self.kind} {self.name!r} needs {needed} positive size(s) in metres; received {self.size}."
             )
-        for size in self.size[:needed]:
+        for size in self.size:
             check_number(f"size of {self.name!r}", size, above=0)
         check_fields(self, "contype", "affinity", of=of, whole=True)
         check_fields(self, "position", of=of, items=3)
         check_fields(self, "quaternion", of=of, items=4)
-        if self.kind == "mesh" and self.mesh is None:
-            raise UsageError(f"The geometry {self.name!r} is of kind 'mesh' and names no mesh; pass mesh=Mesh(...).")
+        if (self.kind == "mesh") != (self.mesh is not None):
+            verb = "has" if self.mesh is not None else "names no"
+            raise UsageError(
+                f"The geometry {self.name!r} of kind {self.kind!r} {verb} mesh; kind='mesh' goes with mesh=Mesh(...)."
+            )
         norm = float(np.linalg.norm(self.quaternion))
         check_number(f"length of the quaternion of {self.name!r}", norm, above=1e-6)
         object.__setattr__(self, "quaternion", tuple(float(q) / norm for q in self.quaternion))
-        object.__setattr__(self, "size", tuple(float(s) for s in self.size[:needed]))
+        object.__setattr__(self, "size", tuple(float(s) for s in self.size))
 
     def reach(self, directions: ArrayLike) -> NDArray[np.float64]:
         """Return the support function: how far the solid reaches along unit directions [..., 3] of its frame (m)."""
@@ -228,7 +231,7 @@ def _geometries(model: Any, links: tuple[str, ...]) -> tuple[Geometry, ...]:
         found.append(
             Geometry(
                 name=_name(model, int(mujoco.mjtObj.mjOBJ_GEOM), index), link=links[model.geom_bodyid[index]],
-                kind=kind, size=size, position=position, quaternion=quaternion,
+                kind=kind, size=size[: _SIZES[kind]], position=position, quaternion=quaternion,
                 mesh=meshes[data] if kind == "mesh" else None, contype=int(model.geom_contype[index]),
                 affinity=int(model.geom_conaffinity[index]),
             )

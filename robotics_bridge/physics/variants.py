@@ -26,7 +26,7 @@ def check_fields(model: Any, fields: Mapping[str, ArrayLike], num_envs: int) -> 
     """Return the fields as arrays [B, ...] after checking names and shapes.
 
     Raises:
-        UsageError: the model has no such field, or its shape is not one value per environment.
+        UsageError: the model has no such field, its shape is not one value per environment, or a value is NaN.
     """
     checked = {}
     for name, values in fields.items():
@@ -39,6 +39,8 @@ def check_fields(model: Any, fields: Mapping[str, ArrayLike], num_envs: int) -> 
                 f"The field {name!r} needs one value per environment, shape {(num_envs, *own.shape)}; "
                 f"received {array.shape}."
             )
+        if array.dtype.kind == "f" and np.isnan(array).any():
+            raise UsageError(f"The field {name!r} holds values that are no numbers (NaN).")
         checked[name] = array
     return checked
 
@@ -82,7 +84,7 @@ def compile_variants(spec: Any, geometry: str, shapes: Sequence[Geometry], *, de
     """
     check_number("density (kg/m³)", density, above=0)
     models = []
-    for shape in shapes:
+    for number, shape in enumerate(shapes):
         if shape.kind not in KINDS[1:-1]:
             raise UsageError(f"A {shape.kind} cannot be a variant of an object; use one of {', '.join(KINDS[1:-1])}.")
         copy = spec.copy()
@@ -97,6 +99,6 @@ def compile_variants(spec: Any, geometry: str, shapes: Sequence[Geometry], *, de
         target.size = [*shape.size, 0.0, 0.0, 0.0][:3]
         target.density = density
         if shape.mesh is not None:
-            target.meshname = f"variant{list(shapes).index(shape)}"
+            target.meshname = f"variant{number}"
         models.append(copy.compile())
     return models

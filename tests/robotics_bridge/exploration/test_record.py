@@ -7,12 +7,12 @@ import pytest
 import torch
 
 from brainbench import load_model
-from brainbench.core.errors import UsageError
+from brainbench.core.errors import DataError, UsageError
 from brainbench.stimuli import load_stimuli
 from brainbench.stimuli.stimulus_set import hash_stimulus_set
 from robotics_bridge.exploration.procedures import PROCEDURES
 from robotics_bridge.exploration.record import Explored, record_exploration
-from robotics_bridge.physics import Geometry
+from robotics_bridge.physics import Geometry, MujocoEngine
 from robotics_bridge.policies.encoders.taxel_grid import TaxelGrid
 
 
@@ -78,6 +78,8 @@ def test_requests_that_make_no_sense_are_refused() -> None:
         record_exploration([_box()], ["enclosur"])
     with pytest.raises(UsageError, match="different labels"):
         record_exploration([_box(), _box()], ["enclosure"])
+    with pytest.raises(UsageError, match="'enclosure' more than once"):
+        record_exploration([_box()], ["enclosure", "enclosure"])
     for frames in (0, 1.5, True, np.nan):
         with pytest.raises(UsageError, match=rf"frames .*{frames}"):
             record_exploration([_box()], ["enclosure"], frames=frames)
@@ -96,6 +98,33 @@ def test_objects_are_held_in_some_way(value) -> None:
     with pytest.raises(UsageError, match=rf"retreat .*received {value}"):
         _box(retreat=value)
     assert _box(quaternion=(2.0, 0, 0, 0), retreat=-1e-3).retreat < 0
+
+
+def test_millimetres_in_place_of_metres_are_refused() -> None:
+    with pytest.raises(UsageError, match=r"extent of 'ball' .*received 25"):
+        Explored("ball", Geometry(name="o", link="o", kind="sphere", size=(25,)))
+    with pytest.raises(UsageError, match=r"retreat .*received 1\.5"):
+        _box(retreat=1.5)
+
+
+@pytest.mark.parametrize("name", PROCEDURES)
+def test_a_procedure_has_no_pose_before_it_begins_or_after_its_end(name) -> None:
+    assert PROCEDURES[name](0.0).z > PROCEDURES[name](1.0).z
+    for time in (np.nan, -0.01, 1.01, np.inf):
+        with pytest.raises(UsageError, match=rf"time .*received {time}"):
+            PROCEDURES[name](time)
+
+
+def test_a_hand_that_diverges_gives_no_recording(monkeypatch) -> None:
+    step = MujocoEngine.step
+
+    def burst(engine: MujocoEngine) -> None:
+        engine.data[1].qvel[0] = np.nan
+        step(engine)
+
+    monkeypatch.setattr(MujocoEngine, "step", burst)
+    with pytest.raises(DataError, match=r"unstable .*'far'"):
+        record_exploration([_box(), _box("far")], ["enclosure"], resolution="low", frames=5)
 
 
 GRIPPER = """<mujoco model="jaws"><worldbody><body name="base"><geom type="box" size=".05 .03 .015"/>
@@ -118,3 +147,18 @@ def test_a_gripper_explores_whatever_drives_its_file_has(tmp_path, drive: str) -
     found = record_exploration([_box()], ["static_pressure"], hand=str(path), resolution="low", frames=20)
     assert np.isfinite(found.wrench).all()
     assert np.abs(found.wrench[..., :3]).max() > 0.1
+
+
+def test_jaws_that_are_open_away_from_zero_open_before_they_close(tmp_path) -> None:
+    servos = "".join(f'<position name="slide_{side}" joint="slide_{side}" kp="200"/>' for side in ("left", "right"))
+    text, felt = GRIPPER.format(servos), []
+    shut_at_zero = text.replace("-.03 0", "-.002 0").replace(".03 0 .05", ".002 0 .05")
+    shut_at_zero = shut_at_zero.replace('axis="1', 'axis="?').replace('axis="-1', 'axis="1').replace("?", "-1")
+    for name, file in {"open.xml": text, "shut.xml": shut_at_zero}.items():
+        (tmp_path / name).write_text(file)
+        options = {"hand": str(tmp_path / name), "resolution": "low", "frames": 60}
+        felt.append(np.abs(record_exploration([_box()], ["enclosure"], **options).wrench[0, :, :, :3]).max((1, 2)))
+    # The one file starts with its jaws shut; a tenth of the procedure later both are open.
+    assert not felt[0][6]
+    assert not felt[1][6]
+    np.testing.assert_allclose(felt[0][12:], felt[1][12:], rtol=1e-3)

@@ -48,6 +48,12 @@ def test_an_impossible_ball_is_refused():
         holding(hands.load("xhand1"), reach=float("nan"))
 
 
+@pytest.mark.parametrize("share", [float("nan"), float("inf"), -0.1, 1.1, 72, None])
+def test_a_hand_closes_by_a_share_between_none_and_all(share):
+    with pytest.raises(UsageError, match=f"closes .*received {share}"):
+        closing(hands.load("xhand1"), share)
+
+
 @pytest.mark.shared
 def test_a_urdf_without_drives_gets_servos_and_closes_too(reference):
     hand = hands.load(reference / "hands/sharpa/sharpa_right_updated_effort.urdf")

@@ -118,6 +118,41 @@ def test_unknown_fields_and_wrong_shapes_are_refused() -> None:
         MujocoEngine(model, 2).set(qvel=np.zeros(5))
 
 
+@pytest.mark.parametrize("wrong", [0, -1, 2.5, np.nan, True, "2"])
+def test_threads_and_steps_are_whole_and_positive(wrong) -> None:
+    model = mujoco.MjModel.from_xml_string(TWO)
+    with pytest.raises(UsageError, match=f"threads .*{wrong}"):
+        MujocoEngine(model, 2, threads=wrong)
+    with pytest.raises(UsageError, match=f"steps .*{wrong}"):
+        MujocoEngine(model, 2, threads=1).step(wrong)
+
+
+def test_values_of_fields_that_are_no_numbers_are_refused() -> None:
+    model = mujoco.MjModel.from_xml_string(TWO)
+    with pytest.raises(UsageError, match=r"'body_mass' .*NaN"):
+        MujocoEngine(model, 1, fields={"body_mass": np.full((1, 3), np.nan)})
+
+
+def test_a_mask_puts_back_the_environments_that_it_names() -> None:
+    engine = MujocoEngine(mujoco.MjModel.from_xml_string(TWO), 3, threads=1)
+    engine.step(2)
+    engine.reset(np.array([False, False, True]))
+    assert (engine.state.time.numpy() > 0).tolist() == [True, True, False]
+    for wrong in ([3], [-1], [0.5]):
+        with pytest.raises(UsageError, match=rf"reset .*received {wrong[0]}"):
+            engine.reset(wrong)
+
+
+def test_an_environment_that_diverges_is_not_put_back_in_silence() -> None:
+    engine = MujocoEngine(mujoco.MjModel.from_xml_string(TWO), 2, threads=1)
+    engine.step(5)
+    engine.data[1].qpos[0] = np.nan
+    engine.step(5)
+    assert np.isfinite(engine.qpos[0]).all()
+    assert not np.isfinite(engine.qpos[1]).all()
+    assert engine.data[1].time == pytest.approx(engine.data[0].time)
+
+
 def test_states_refuse_what_does_not_fit() -> None:
     state = HandState.empty(2, 3, contacts=1)
     with pytest.raises(UsageError, match="1 contacts; received 2"):

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from brainbench.core.errors import UsageError
+from brainbench.geometry import Mesh
 from robotics_bridge.physics import Geometry, MujocoEngine, TouchScene, compile_variants
 
 CHAIN = """<mujoco><worldbody>
@@ -17,6 +18,7 @@ CHAIN = """<mujoco><worldbody>
       <geom name="ghost" type="sphere" size="0.3" contype="0" conaffinity="0"/></body></body></body>
 <body name="ball"><freejoint/><geom name="g3" type="ellipsoid" size="0.1 0.2 0.3" contype="2" conaffinity="2"/></body>
 </worldbody><contact><exclude body1="tip" body2="world"/></contact></mujoco>"""
+TRIANGLE = Mesh(np.eye(3), np.array([[0, 1, 2]]))
 
 
 def _names(scene: TouchScene, link: str) -> list[str]:
@@ -87,6 +89,11 @@ def test_compiled_variants_differ_where_they_should() -> None:
         (lambda: Geometry(name="a", link="b", kind="plane", quaternion=(1, 0, 0, np.nan)), "quaternion of 'a' .*nan"),
         (lambda: Geometry(name="a", link="b", kind="plane", contype=1.5), r"contype of 'a' .*received 1\.5"),
         (lambda: Geometry(name="a", link="b", kind="mesh"), "names no mesh"),
+        (lambda: Geometry(name="a", link="b", kind="sphere", size=(1.0, 2.0)), r"needs 1 .*received \(1\.0, 2\.0\)"),
+        (
+            lambda: Geometry(name="a", link="b", kind="sphere", size=(1.0,), mesh=TRIANGLE),
+            "'sphere' has mesh",
+        ),
         (lambda: TouchScene(("w", "w")), "two of the link 'w'"),
         (lambda: TouchScene(("w",), (Geometry(name="a", link="v", kind="plane"),)), "Geometry 'a' is fixed"),
         (lambda: TouchScene(("w",), variants={0: ()}), "at least one shape"),
