@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from brainbench.core.errors import UsageError
+from brainbench.core.errors import UsageError, check_name
 from brainbench.core.reading.ranges import check_number
 from robotics_bridge.deploy.driver import Driver, HandReading, Source
 from robotics_bridge.deploy.safety import ClockOffset, SafetyLimits
@@ -81,14 +81,15 @@ class Controller:
         run: The policy: groups → action [A] (:func:`~robotics_bridge.policies.export.read_policy`).
         driver: The hand.
         contract: What the policy reads and moves, and how often.
-        limits: In the order of the driver's joints.
+        limits: One of each kind per joint of the driver, in its order.
         sources: Group → what gives it, for groups other than ``proprio``: for ``tactile`` a
             :class:`~robotics_bridge.deploy.touch.RealTouch`.
         clock: Tells the time and waits.
         record: Called after each tick with (reading, groups, action, targets [J]).
 
     Raises:
-        UsageError: a group has no source, the hand lacks a joint, or the rate is out of range.
+        UsageError: a group has no source or a source no group, the hand lacks a joint or has others than the limits, or
+            the rate is out of range.
     """
 
     def __init__(
@@ -107,6 +108,10 @@ class Controller:
         self.rate, self.sources, self.clock, self.record = contract.rate, dict(sources or {}), clock or Clock(), record
         if missing := [name for name in contract.inputs if name not in {"proprio", *self.sources}]:
             raise UsageError(f"The policy reads the group {missing[0]!r}, and nothing here gives it.")
+        for name in self.sources:
+            check_name("group that the policy reads and something else gives", name, {*contract.inputs} - {"proprio"})
+        if len(limits.low) != len(driver.joints):
+            raise UsageError(f"There are limits of {len(limits.low)} joints; the hand has {len(driver.joints)}.")
         if missing := [name for name in contract.joints if name not in driver.joints]:
             raise UsageError(f"The policy moves the joint {missing[0]!r}, which the hand does not have.")
         self.actions = ActionMap(contract.moved, **{name: np.array(row) for name, row in contract.action_map.items()})
@@ -199,8 +204,7 @@ class Controller:
     def _observe(self, reading: HandReading) -> dict[str, NDArray[np.float32]]:
         position, velocity = reading.position[self._order], reading.velocity[self._order]
         proprio = np.concatenate([position, VELOCITY * velocity, self._action]).astype(np.float32)
-        sources = {name: source for name, source in self.sources.items() if name in self.contract.inputs}
-        found = {name: np.asarray(source(reading), np.float32) for name, source in sources.items()}
+        found = {name: np.asarray(source(reading), np.float32) for name, source in self.sources.items()}
         return {name: found.get(name, proprio) for name in self.contract.inputs}
 
     def _limit(self, targets: Mapping[str, float], reading: HandReading) -> NDArray[np.float64]:

@@ -1,9 +1,9 @@
 """Episodes as a LeRobot data set (layout v3.0), written with our own Parquet and JSON; lerobot itself is not needed.
 
 Per frame: ``observation.state`` (joint positions, rad), ``observation.velocity``, ``action`` (joint targets, rad),
-``observation.tactile`` [N, 6] (force N and torque N·m of each point, link frame, about the link's origin) and
-``observation.wrench`` [6] (their sum in the palm's frame, about its origin). Where the points sit stands once in
-``meta/tactile.json``. Arrays of two axes are nested lists, as LeRobot stores them.
+``observation.tactile`` [N, 6] (force and torque of each point, link frame, about the link's origin) and
+``observation.wrench`` [6] (their sum in the palm's frame, about its origin). Where the points sit, and the unit of the
+forces, stands once in ``meta/tactile.json``. Arrays of two axes are nested lists, as LeRobot stores them.
 """
 
 from __future__ import annotations
@@ -78,6 +78,8 @@ def total_wrench(
 class SessionRecorder:
     """Keeps a session of a deployed policy; touch is one point per finger tip, where the hand senses it.
 
+    Forces stay in the unit in which the hand reports pressure.
+
     Args:
         contract: Of the policy.
     """
@@ -112,7 +114,13 @@ class SessionRecorder:
         task = self.contract.more.get("task", "deployed policy")
         episode = Episode(task, *(np.array([frame[part] for frame in self.frames]) for part in range(5)))
         return write_lerobot(
-            folder, [episode], fps=self.contract.rate, joints=joints, points=self.points, robot=self.hand.name
+            folder,
+            [episode],
+            fps=self.contract.rate,
+            joints=joints,
+            points=self.points,
+            robot=self.hand.name,
+            unit="unit of the hand's pressure",
         )
 
 
@@ -139,6 +147,7 @@ def write_lerobot(
     joints: Sequence[str],
     points: TactilePoints,
     robot: str = "xhand1",
+    unit: str = "N",
 ) -> Path:
     """Write episodes as a data set that LeRobot opens.
 
@@ -149,6 +158,7 @@ def write_lerobot(
         joints: Names of the joints J.
         points: Where the tactile points sit.
         robot: Name of the robot.
+        unit: Of forces; torques are in that times metres.
 
     Raises:
         UsageError: the folder is not empty, or an episode does not fit.
@@ -193,7 +203,7 @@ def write_lerobot(
     write_json(
         folder / "meta" / "tactile.json",
         {
-            "frame": "link axes; torques about the link's origin", "units": ["N", "N·m"], "links": points.links,
+            "frame": "link axes; torques about the link's origin", "units": [unit, f"{unit}·m"], "links": points.links,
             "link": points.link, "position": points.position, "normal": points.normal,
         },
     )  # fmt: skip

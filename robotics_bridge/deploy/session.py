@@ -94,7 +94,7 @@ class DeployedPolicy:
         Args:
             driver: The hand.
             limits: Changes of :class:`~robotics_bridge.deploy.safety.SafetyLimits`, such as ``timeout``.
-            sources: Group → what gives it, for every group but ``tactile`` of :attr:`unmeasured`.
+            sources: Group → what gives it, for every group of :attr:`unmeasured` but ``tactile``.
             calibration: Of the hand's pressure.
             fallback: Simulated or constant touch where the hand senses nothing.
             threads: Of the network's computations.
@@ -105,6 +105,10 @@ class DeployedPolicy:
         """
         contract, body, sources = self.contract, hands.load(self.contract.hand), dict(sources or {})
         self.require({*sources, *(("tactile",) if fallback is not None else ())}, driver.fingers)
+        if "tactile" in sources:
+            raise UsageError("Touch is measured; give what stands in where it is not as fallback, not among sources.")
+        if "tactile" not in self.groups and (calibration is not None or fallback is not None):
+            raise UsageError("The policy reads no touch, so a calibration or fallback of it reaches nothing.")
         if "command" in self.groups and "command" in contract.more:
             sources.setdefault("command", constant("command", contract.more["command"], self.groups["command"]))
         if "tactile" in self.groups:

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brainbench.core.errors import DataError, UsageError, check_once
-from brainbench.core.reading.ranges import check_fields
+from brainbench.core.reading.ranges import check_fields, check_number
 from robotics_bridge import hands
 from robotics_bridge.deploy.driver import HandReading
 from robotics_bridge.deploy.frames import new_key
@@ -32,6 +32,7 @@ from robotics_bridge.sensors import SensorSuite
 from robotics_bridge.tasks.contact_model import CONTACTS, ContactModel, set_contacts
 from robotics_bridge.tasks.overrides import set_field
 
+_RATE = "reports per second of a simulated hand"
 HOLD_AFTER = 0.25
 """Seconds without a command after which the hand holds by itself."""
 
@@ -95,6 +96,9 @@ class SimulatedHand:
         resolution: Of its taxels.
         twist: Torsional friction of force taxels (N·m·s); None: they hold what they touch.
         contacts: Firmness of contacts and strength of the drives.
+
+    Raises:
+        UsageError: a name is unknown, or the rate is out of range.
     """
 
     def __init__(
@@ -108,6 +112,7 @@ class SimulatedHand:
         twist: float | None = None,
         contacts: ContactModel = CONTACTS["firm"],
     ) -> None:
+        check_number(_RATE, rate, least=10)
         self.hand, self.rate, self._substeps = hands.load(hand), rate, contacts.substeps
         body = holding(self.hand, timestep=1 / rate / contacts.substeps)
         set_contacts(body, contacts)
@@ -138,9 +143,14 @@ class SimulatedHand:
         self.drive(self.position)
 
     def drive(self, targets: NDArray[np.float64]) -> None:
-        """Set the targets [J] of the position drives."""
-        ctrl = self.engine.data[0].ctrl
-        ctrl[self._drives] = targets
+        """Set the targets [J] (rad) of the position drives.
+
+        Raises:
+            UsageError: there are not as many targets as joints, or one is not finite.
+        """
+        if np.shape(targets) != (len(self.joints),) or not np.isfinite(targets).all():
+            raise UsageError(f"A hand takes {len(self.joints)} finite targets (rad); received {str(targets)[:80]}.")
+        self.engine.data[0].ctrl[self._drives] = targets
 
     @property
     def position(self) -> NDArray[np.float64]:
@@ -266,8 +276,11 @@ def simulated_hand(
     """Run a simulated hand in a process of its own; yield its address, joints, fingers and key.
 
     Raises:
+        UsageError: the rate, or the time until it ends by itself (s), is out of range.
         DataError: the process did not start.
     """
+    check_number(_RATE, rate, least=10)
+    check_number("seconds of a simulated hand", seconds, above=0)
     context = multiprocessing.get_context("spawn")
     ours, theirs = context.Pipe()
     key = new_key()

@@ -73,6 +73,7 @@ def deploy(
 
     Exit status 1: it was stopped for safety.
     """
+    from brainbench.core.errors import UsageError
     from robotics_bridge.deploy import session
     from robotics_bridge.deploy.controller import check_duration
     from robotics_bridge.deploy.episodes import SessionRecorder, check_folder
@@ -89,6 +90,8 @@ def deploy(
     faults = Faults.parse(fault or [])
     given = _inputs(deployed, inputs or [])
     contacts = contract.more["contacts"]
+    if fault and driver != "sim":
+        raise UsageError("--fault is of the simulated hand; a hand behind a socket has faults of its own.")
     remote = None if driver == "sim" else _remote(driver, key, deployed)
     # What is missing is said before a hand is started or greeted.
     beside = f"simulated beside the hand, {contacts_name(contacts)} contacts"

@@ -256,3 +256,15 @@ def test_histogram_and_rate() -> None:
     rates = [monitor.tick(0.05 * step) for step in range(60)]
     assert rates[5] == 40  # too early to tell
     assert rates[-1] == pytest.approx(20)
+
+
+def test_limits_are_of_the_joints_of_the_hand() -> None:
+    one = SafetyLimits(np.array([-1.0]), np.array([1.0]), np.array([8.0]))
+    clock = OwnClock()
+    with pytest.raises(UsageError, match="limits of 1 joints; the hand has 3"):
+        Controller(lambda obs, forget: np.zeros(2), PaperHand(clock), _contract(), one, clock=clock)
+
+
+def test_a_source_that_the_policy_does_not_read_is_refused() -> None:
+    with pytest.raises(UsageError, match=r"'comand'.*did you mean 'command'"):
+        _control(groups=("proprio", "command"), sources={"comand": None, "command": lambda reading: np.zeros(1)})

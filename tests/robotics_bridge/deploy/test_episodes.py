@@ -11,7 +11,9 @@ from pyarrow import parquet
 
 from brainbench.core.errors import DataError, UsageError
 from robotics_bridge import hands
-from robotics_bridge.deploy.episodes import Episode, TactilePoints, total_wrench, write_lerobot
+from robotics_bridge.deploy.driver import HandReading
+from robotics_bridge.deploy.episodes import Episode, SessionRecorder, TactilePoints, total_wrench, write_lerobot
+from robotics_bridge.policies.contract import PolicyContract
 from robotics_bridge.policies.encoders.finger_axes import finger_axes_of
 from robotics_bridge.policies.encoders.taxel_grid import TaxelGrid
 
@@ -73,6 +75,18 @@ def test_episodes_and_tasks_are_found_as_lerobot_looks_for_them(folder) -> None:
     points = json.loads((folder / "meta" / "tactile.json").read_text())
     assert len(points["position"]) == len(points["link"]) == 45
     assert set(points["links"]) == set(HAND.tips)
+    assert points["units"] == ["N", "N·m"]
+
+
+def test_a_session_states_forces_in_the_unit_of_the_hand(tmp_path) -> None:
+    recorder = SessionRecorder(PolicyContract({}, 40.0, "xhand1", HAND.joints, HAND.joints, {}, {}))
+    pressure = np.zeros((5, 3))
+    pressure[0] = 0.2
+    reading = HandReading(1, 0.0, 0.0, np.zeros(12), np.zeros(12), pressure)
+    recorder(reading, None, None, np.zeros(12))
+    folder = recorder.write(tmp_path / "set", HAND.joints)
+    points = json.loads((folder / "meta" / "tactile.json").read_text())
+    assert all("pressure" in unit for unit in points["units"])
 
 
 def test_the_wrench_is_the_sum_of_the_points() -> None:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -13,8 +14,9 @@ import torch
 from brainbench.core.errors import UsageError
 from robotics_bridge import tasks
 from robotics_bridge.deploy.controller import Clock
-from robotics_bridge.deploy.driver import HandReading, LinkCounters
+from robotics_bridge.deploy.driver import Driver, HandReading, LinkCounters
 from robotics_bridge.deploy.session import DeployedPolicy, read_deployed
+from robotics_bridge.deploy.touch import PressureCalibration
 from robotics_bridge.policies.contract import PolicyContract
 from robotics_bridge.policies.evaluate import Policy
 from robotics_bridge.policies.export import export_policy
@@ -43,6 +45,17 @@ def test_a_command_that_the_contract_states_needs_no_word_of_the_user() -> None:
     assert "command" not in _deployed("command", command=[1.0]).require({"tactile"})
     with pytest.raises(UsageError, match=r"command \(\[4\], what the hand is told"):
         _deployed("command", 4).require({"tactile"})
+
+
+def test_touch_of_a_policy_without_touch_reaches_nothing_and_is_refused() -> None:
+    deployed, hand = _deployed("command", command=[0.5]), SimpleNamespace(joints=(), fingers=())
+    inputs = {name: shape for name, shape in deployed.groups.items() if name != "tactile"}
+    deployed = replace(deployed, contract=replace(deployed.contract, inputs=inputs, links=()))
+    for options in ({"fallback": lambda reading: None}, {"calibration": PressureCalibration()}):
+        with pytest.raises(UsageError, match="reads no touch"):
+            deployed.controller(cast("Driver", hand), **options)
+    with pytest.raises(UsageError, match="fallback, not among sources"):
+        deployed.controller(cast("Driver", hand), sources={"tactile": lambda reading: None})
 
 
 class _OwnClock(Clock):

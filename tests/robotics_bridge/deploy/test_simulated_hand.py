@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
+from brainbench.core.errors import UsageError
 from robotics_bridge import hands
 from robotics_bridge.deploy.driver import HandReading
-from robotics_bridge.deploy.simulated_hand import ShadowTouch, SimulatedHand
+from robotics_bridge.deploy.simulated_hand import ShadowTouch, SimulatedHand, simulated_hand
 from robotics_bridge.deploy.touch import RealTouch
 from robotics_bridge.hands.scenes import closing
 from robotics_bridge.policies.contract import PolicyContract
@@ -73,3 +75,18 @@ def test_measured_links_replace_simulated_ones() -> None:
     np.testing.assert_allclose(felt[:, tip_rows], np.broadcast_to([-10.0, -10.0, 10.0], (5, 5, 3)), rtol=1e-5)
     palm = list(layout).index(HAND.palm)
     assert np.abs(felt[:, palm]).max() > 0.1  # the ball lies on the simulated palm
+
+
+@pytest.mark.parametrize("targets", [np.zeros(3), np.full(12, np.nan), 0.5])
+def test_a_simulated_hand_takes_a_finite_target_per_joint(targets) -> None:
+    with pytest.raises(UsageError, match="12 finite targets"):
+        SimulatedHand().drive(targets)
+
+
+@pytest.mark.parametrize("options", [{"rate": 0}, {"rate": np.nan}, {"seconds": np.nan}, {"seconds": -1.0}])
+def test_a_simulated_hand_is_not_started_for_a_rate_or_time_that_is_none(options) -> None:
+    with (
+        pytest.raises(UsageError, match=rf"simulated hand .*{next(iter(options.values()))}"),
+        simulated_hand(**options),
+    ):
+        pass
