@@ -59,7 +59,8 @@ def write_recordings(path: str | os.PathLike[str], recordings: xr.Dataset | Sess
             :func:`~brainbench.datasets.sessions.make_session`).
 
     Raises:
-        DataError: the data set does not fulfil the contract, or a session has no units.
+        DataError: the data set does not fulfil the contract, or a session has no units or spike times that are not
+            finite.
         UsageError: two sessions share subject and name, or there is none.
     """
     import h5py
@@ -168,6 +169,7 @@ def _write_sessions(file: h5py.File, sessions: list[Session]) -> None:
             raise UsageError(f"Two sessions are called {name!r}; give each its own session name.")
         if session.units is None:
             raise DataError(f"Session {name!r} has no units table; there are no spikes to write.")
+        session.units.rows(SPIKES)  # what no reader takes is not written
         group = root.create_group(name)
         for key in ("subject", "session", "start", "synthetic", "stimuli"):
             group.attrs[key] = getattr(session, key)

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from brainbench.core.errors import DataError
 from brainbench.core.files import atomic_path
 from brainbench.datasets.nwb import STIMULI
-from brainbench.datasets.sessions import Session, SessionTable, as_labels
+from brainbench.datasets.sessions import SPIKES, Session, SessionTable, as_labels
 
 if TYPE_CHECKING:
     import h5py
@@ -57,12 +57,13 @@ def write_nwb(
     ``/general`` and ``/general/subject``; ``columns`` says what columns mean, by name.
 
     Raises:
-        DataError: ids are no integers or a table has no ``stop_time``, which NWB needs.
+        DataError: a spike time is not finite, ids are no integers, or a table has no ``stop_time``, which NWB needs.
     """
     import h5py
 
     if session.units is None:
         raise DataError(f"{session.source} has no units table; there are no spikes to write.")
+    session.units.rows(SPIKES)  # what no reader takes is not written
     made = "SYNTHETIC: " if session.synthetic else ""
     keywords = ["synthetic"] * session.synthetic + ["brainbench"]
     stimuli = {"stimulus": STIMULI + session.stimuli} if session.stimuli else {}

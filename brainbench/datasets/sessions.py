@@ -102,6 +102,28 @@ class SessionTable:
             )
         return ends
 
+    def rows(self, name: str) -> list[NDArray[np.float64]]:
+        """Read a ragged column of numbers: one array per row.
+
+        Raises:
+            DataError: the ragged index is missing or inconsistent, or a number is not finite.
+        """
+        what = name.replace("_", " ")
+        if f"{name}_index" not in self:
+            raise DataError(f"{self.label} has {name} without {name}_index; the {what} belong to no row.")
+        ends = self.ends(name)
+        flat = np.asarray(self.data[name][...], dtype=np.float64)
+        bad = ~np.isfinite(flat)
+        if bad.any():
+            row = int(np.searchsorted(ends, np.flatnonzero(bad)[0], side="right"))
+            raise DataError(
+                f"{int(bad.sum())} {what} of {self.label} are not finite (first with id {self.ids()[row]}); the "
+                "data are damaged or were exported wrongly."
+            )
+        # NWB stores a ragged column as all values in one array and the end of each row, so all ends but the last cut
+        # it.
+        return np.split(flat, ends[:-1]) if len(ends) else []
+
     def with_columns(self, **columns: NDArray[Any]) -> SessionTable:
         """Return the table with further columns [rows]."""
         return replace(self, data={**self.data, **columns})
@@ -220,12 +242,12 @@ def make_session(
 ) -> Session:
     """Build a session from arrays, to be written with :func:`~brainbench.datasets.write_recordings`.
 
-    ``spikes`` are the times (s) of each unit, ``tables`` mappings of columns with at least ``start_time``,
-    ``unit_columns`` such as ``id``, ``depth`` (µm) and ``layer``, ``observed`` the recorded spans [n, 2] (s) of each
+    ``spikes`` are the times (s) of each unit, below 0 before the clock began; ``tables`` mappings of columns with at
+    least ``start_time``, ``unit_columns`` such as ``id``, ``depth`` (µm) and ``layer``, ``observed`` the recorded spans [n, 2] (s) of each
     unit. The session's name is unique within the animal.
 
     Raises:
-        DataError: columns differ in length or a table has no ``start_time``.
+        DataError: columns differ in length, a table has no ``start_time``, or a spike time is not finite.
     """
     data: dict[str, Any] = {"id": np.arange(len(spikes))}
     data |= {name: np.asarray(values) for name, values in (unit_columns or {}).items()}
@@ -241,6 +263,7 @@ def make_session(
         for name in table.columns:
             if f"{name}_index" not in table and len(table.data[name]) != len(table):
                 raise DataError(f"Column {name!r} of {table.label} has {len(table.data[name])} of {len(table)} rows.")
+    units.rows(SPIKES)
     for table in made.values():
         table.require("start_time")
     stated = {"source": session, "start": start, "synthetic": synthetic, "stimuli": stimuli}

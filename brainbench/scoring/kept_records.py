@@ -14,7 +14,12 @@ from brainbench.scoring.options import ScoreOptions
 
 
 def record_path(model: str, options: ScoreOptions, command: str) -> Path | None:
-    """Return where the cache keeps the record of a model's score; None for one that depends on files of the user."""
+    """Return where the cache keeps the record of a model's score; None for one that depends on code or files of others.
+
+    Their changes do not show in the name of the entry: models and metrics of a file, and those that another package
+    registered.
+    """
+    from brainbench.metrics.measures.registry import get_metric
     from brainbench.models.registry import locate_model
 
     # A path, or FILE.py:NAME, has characters that no name of the package has.
@@ -23,12 +28,14 @@ def record_path(model: str, options: ScoreOptions, command: str) -> Path | None:
     if str(options.recordings) not in DEMOS or options.stimuli is not None or options.match is not None:
         return None
     try:
-        found = locate_model(model)
+        found, metric = locate_model(model), get_metric(options.metric)
     except UsageError:
         return None
     package = Path(__file__).parents[1]
     ours = found.record.source == package.name and (found.weights is None or package in found.weights.parents)
-    return cache_dir("scores") / f"{content_hash(model, options, command, code_stamp())}.json" if ours else None
+    if not ours or type(metric).__module__.partition(".")[0] != package.name:
+        return None
+    return cache_dir("scores") / f"{content_hash(model, options, command, code_stamp(), vars(metric))}.json"
 
 
 def read_kept(path: Path | None) -> ResultRecord | None:

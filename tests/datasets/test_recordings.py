@@ -234,7 +234,7 @@ def test_spike_times_that_are_not_finite_are_refused(tmp_path):
     path = write(tmp_path / "a.h5", unit_columns={"id": [7, 8, 9]})
     with h5py.File(path, "a") as file:
         file["sessions/mouse-1/units/spike_times"][500] = np.nan
-    with pytest.raises(DataError, match=r"\(first in unit 8\)"):
+    with pytest.raises(DataError, match=r"\(first with id 8\)"):
         open_recordings(path, conditions="trials:stimulus")
 
 

@@ -4,6 +4,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from brainbench.core.errors import DataError, UsageError
+from brainbench.datasets import write_recordings
+from brainbench.datasets.nwb_writer import write_nwb
 from brainbench.datasets.sessions import SessionTable, as_labels, decode, make_session, natural_key
 
 
@@ -67,3 +69,17 @@ def test_make_session_refuses_columns_of_different_length():
         make_session("m", "1", [np.zeros(1)], {"trials": {"start_time": [0.0, 1.0], "stimulus": ["a"]}})
     with pytest.raises(UsageError, match=r"'start_time'.*'stimulus'"):
         make_session("m", "1", [np.zeros(1)], {"trials": {"stimulus": ["a"]}})
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+@pytest.mark.parametrize("write", [write_recordings, write_nwb])
+def test_spike_times_that_no_reader_takes_are_neither_made_nor_written(tmp_path, value, write) -> None:
+    table = {"start_time": [0.0], "stop_time": [1.0], "stimulus": ["a"]}
+    with pytest.raises(DataError, match=r"1 spike times .*not finite \(first with id 1\)"):
+        make_session("m", "1", [np.arange(3.0), np.array([0.5, value])], {"trials": table})
+    session = make_session("m", "1", [np.array([-0.5, 0.5])], {"trials": table})
+    assert session.units is not None
+    session.units.data["spike_times"][1] = value
+    with pytest.raises(DataError, match="not finite"):
+        write(tmp_path / "a", session)
+    assert not (tmp_path / "a").exists()

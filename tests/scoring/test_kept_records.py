@@ -3,6 +3,10 @@ from pathlib import Path
 import pytest
 
 from brainbench.core.records import ModelCard, ResultRecord, Score
+from brainbench.metrics.measures import registry
+from brainbench.metrics.measures.patterns import LinearCKA
+from brainbench.metrics.measures.registry import register_metric
+from brainbench.metrics.measures.rsa import RSA
 from brainbench.scoring import kept_records
 from brainbench.scoring.options import ScoreOptions
 
@@ -38,6 +42,25 @@ def test_equal_scores_have_one_entry_and_others_another(monkeypatch: pytest.Monk
 )  # fmt: skip
 def test_what_depends_on_files_of_the_user_is_scored_each_time(model: str, changes: dict):
     assert _path(model, **changes) is None
+
+
+def test_a_metric_that_another_package_registered_is_scored_each_time(monkeypatch: pytest.MonkeyPatch):
+    class Mine(LinearCKA):
+        name = "mine"
+
+    monkeypatch.setattr(registry, "_METRICS", dict(registry._METRICS))
+    register_metric(Mine())
+    assert _path(metric="mine") is None
+    assert _path(metric="cka") is not None
+    assert _path(metric="no-such-metric") is None
+
+
+def test_a_metric_of_ours_with_options_of_another_package_has_an_entry_for_each(monkeypatch: pytest.MonkeyPatch):
+    def entry(comparison: str) -> Path | None:
+        monkeypatch.setattr(registry, "_METRICS", {"mine": RSA("mine", "t", comparison=comparison)})
+        return _path(metric="mine")
+
+    assert entry("pearson") not in (None, entry("spearman"))
 
 
 def test_a_kept_record_is_read_and_a_damaged_one_is_not(caplog: pytest.LogCaptureFixture):

@@ -162,19 +162,7 @@ def read_spikes(units: SessionTable, notes: list[str]) -> list[NDArray[np.float6
     Raises:
         DataError: the ragged index is inconsistent or a time is not finite.
     """
-    if f"{SPIKES}_index" not in units:
-        raise DataError(f"{units.label} has spike_times without spike_times_index; the spikes belong to no unit.")
-    ends = units.ends(SPIKES)
-    flat = np.asarray(units.data[SPIKES][...], dtype=np.float64)
-    bad = ~np.isfinite(flat)
-    if bad.any():
-        row = int(np.searchsorted(ends, np.flatnonzero(bad)[0], side="right"))
-        raise DataError(
-            f"{int(bad.sum())} spike times of {units.label} are not finite (first in unit {units.ids()[row]}); "
-            f"the file is damaged or was exported wrongly."
-        )
-    # NWB stores a ragged column as all values in one array and the end of each row, so all ends but the last cut it.
-    spikes = np.split(flat, ends[:-1]) if len(ends) else []
+    spikes = units.rows(SPIKES)
     unsorted = [index for index, times in enumerate(spikes) if np.any(np.diff(times) < 0)]
     if unsorted:
         notes.append(f"{units.label}: spike times of {len(unsorted)} units were not in order and have been sorted")
