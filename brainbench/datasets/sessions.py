@@ -243,8 +243,8 @@ def make_session(
     """Build a session from arrays, to be written with :func:`~brainbench.datasets.write_recordings`.
 
     ``spikes`` are the times (s) of each unit, below 0 before the clock began; ``tables`` mappings of columns with at
-    least ``start_time``, ``unit_columns`` such as ``id``, ``depth`` (µm) and ``layer``, ``observed`` the recorded spans [n, 2] (s) of each
-    unit. The session's name is unique within the animal.
+    least ``start_time``, ``unit_columns`` such as ``id``, ``depth`` (µm) and ``layer``, ``observed`` the recorded spans
+    [n, 2] (s) of each unit. The session's name is unique within the animal.
 
     Raises:
         DataError: columns differ in length, a table has no ``start_time``, or a spike time is not finite.

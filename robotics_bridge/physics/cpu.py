@@ -197,6 +197,7 @@ class _Gatherer:
         self._warned = False
 
     def gather(self, env: int) -> None:
+        """Copy poses, spatial velocities and contacts of one environment; threads may do so at once."""
         data = self._data[env]
         xpos, xquat, cvel, com = self._views[env]
         pose = self._pose[env]
@@ -235,6 +236,7 @@ class _Gatherer:
         return normal, (slip[:, :, None] * tangent).sum(axis=1)
 
     def finish(self) -> None:
+        """Turn what was gathered into velocities of link origins and the contacts of all environments."""
         omega = self._twist[..., :3]
         # v + ω × (p − com): MuJoCo's spatial velocities refer to the centre of mass of the kinematic tree.
         lever = self._pose[..., :3] - self._com[:, self._root]

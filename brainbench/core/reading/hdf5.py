@@ -78,6 +78,7 @@ class _Worker:
 
     @classmethod
     def ask(cls, path: str, seconds: float) -> str:
+        """Return the answer about a file; empty where the process died over it or took longer than so many seconds."""
         with cls._lock:
             process = cls._running()
             watch = threading.Timer(seconds, process.kill)

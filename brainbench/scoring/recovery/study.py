@@ -38,6 +38,7 @@ class _Job:
 
     @property
     def file(self) -> str:
+        """Name of the file of its boards in the folder of a study."""
         return f"boards-{self.true:03d}-{self.numbers[0]:05d}.json"
 
 

@@ -122,6 +122,7 @@ class _Learner(nn.Module):
         self.world = nn.Module()
 
     def keep(self, tensors: Mapping[str, torch.Tensor]) -> None:
+        """Hold tensors of the world by name, for the file of a state."""
         for name, value in tensors.items():
             if value.is_floating_point():
                 # Files hold finite numbers alone; a deadline that never comes is as far away at the largest of them.
@@ -130,6 +131,7 @@ class _Learner(nn.Module):
             self.world.register_buffer(name.replace(".", "/"), value)
 
     def kept(self, prefix: str) -> dict[str, torch.Tensor]:
+        """Return the held tensors whose names begin with a prefix, without it."""
         found = {name.replace("/", "."): value for name, value in self.world.named_buffers(recurse=False)}
         return {name.removeprefix(prefix): value for name, value in found.items() if name.startswith(prefix)}
 
@@ -170,6 +172,7 @@ class _Run:
         self.log = RunLog(out, step=self.iteration)
 
     def run(self, allowed: float, stop_at: int | None, progress: Progress) -> DistillResult:
+        """Learn to the last iteration, for ``allowed`` seconds, or up to ``stop_at`` iterations in all."""
         started, total = time.monotonic(), self.config.iterations or 0
         status: Literal["finished", "stopped", "diverged"] = "finished"
         reason = ""

@@ -41,8 +41,9 @@ def find_modes(
         material: What it is made of; decays follow from its Rayleigh damping.
         count: Number of modes.
         cells: Elements along the longest edge.
-        strike: Point [3] (m) that is struck; None takes the root mean square over the surface.
-        hear: Point [3] (m) whose normal velocity is heard; None as above.
+        strike: Point [3] (m, frame of the solid) that is struck; the nearest of the surface counts. None takes the root
+            mean square over the surface.
+        hear: Point [3] (m, frame of the solid) whose normal velocity is heard; otherwise as ``strike``.
         cache: Whether the result is kept in the cache folder.
 
     Raises:
