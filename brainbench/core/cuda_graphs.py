@@ -235,7 +235,7 @@ class _BetweenStreams:
         self._graph, self._warp = graph, warp_stream
 
     def replay(self) -> None:
-        """Launch the graph on torch's current stream, after what Warp was given before and ahead of what comes later."""
+        """Launch the graph on torch's current stream, in order with what Warp is given before and after."""
         import torch
 
         current = torch.cuda.current_stream(self._warp.device)
