@@ -13,6 +13,7 @@ from concurrent.futures.process import BrokenProcessPool
 from typing import Any
 
 from brainbench.core.errors import DataError, UsageError, missing_dependency
+from brainbench.core.reading.ranges import check_number
 
 TIMEOUT = 30
 """Seconds that the scheduler of a cluster may take to answer."""
@@ -46,8 +47,8 @@ def run_jobs(
     """
     from brainbench.core.devices import usable_processors
 
-    if workers is not None and workers < 1:
-        raise UsageError(f"workers must be at least 1; received {workers}.")
+    if workers is not None:
+        check_number("workers", workers, least=1, whole=True)
     if scheduler is not None:
         yield from run_on_cluster(function, jobs, scheduler)
         return

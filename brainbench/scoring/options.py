@@ -29,7 +29,8 @@ TIME_BIN = 0.05
 """Bin width of scores over time, seconds."""
 
 _NO_NUMBERS = (
-    "recordings", "stimuli", "match", "select", "window", "whiskers", "fidelity", "metric", "layer", "estimator",
+    "recordings", "title", "stimuli", "match", "select", "window", "whiskers", "fidelity", "metric", "layer",
+    "estimator",
 )  # fmt: skip
 """Fields that take much in Python, and a number nowhere; a batch file can hold one."""
 _ELSEWHERE = ("recordings", "match", "explain", "title", "strict")
@@ -106,9 +107,13 @@ class ScoreOptions:
                 raise UsageError(f"{name} must be a text; received {shown(getattr(self, name))}.")
         check_fields(self, "seed", "weights_seed", least=0, whole=True)
         check_fields(self, "bin", above=0)
-        if self.layers is not None and not self.layers:
-            raise UsageError("layers names none; leave it out for all.")
-        check_once("layers", self.layers or ())
+        if self.layers is not None:
+            if not (isinstance(self.layers, (list, tuple)) and all(isinstance(name, str) for name in self.layers)):
+                raise UsageError(f"layers must be a list of names; received {shown(self.layers)}.")
+            if not self.layers:
+                raise UsageError("layers names none; leave it out for all.")
+            check_once("layers", self.layers)
+            object.__setattr__(self, "layers", tuple(self.layers))
         if not isinstance(self.recordings, (str, os.PathLike, Sequence)):
             for name in ("conditions", "select", "window", "bin"):
                 if getattr(self, name) is not None:
@@ -129,12 +134,7 @@ class ScoreOptions:
         known = [item.name for item in fields(cls)]
         for name in values:
             check_name("option of a score", name, known)
-        layers = values.get("layers")
-        if layers is not None and not (
-            isinstance(layers, (list, tuple)) and all(isinstance(name, str) for name in layers)
-        ):
-            raise UsageError(f"layers must be a list of names; received {shown(layers)}.")
-        return cls(**{**values, "layers": None if layers is None else tuple(layers)})
+        return cls(**values)
 
     @classmethod
     def stated_in(cls, settings: Mapping[str, Any], **others: Any) -> ScoreOptions:

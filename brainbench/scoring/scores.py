@@ -181,6 +181,8 @@ def _check_inputs(resolved: ResolvedModel, brain: NeuralResponses, options: Scor
         raise UsageError(
             f"The estimator {options.estimator!r} takes all units of a published file; leave out units_reliability."
         )
+    if resolved.activations is not None and (options.whiskers != "all" or options.fidelity not in (None, "balanced")):
+        raise UsageError("whiskers and fidelity are of a simulation, and these features were computed elsewhere.")
     source = DEFAULT_STIMULI if options.stimuli is None else options.stimuli
     if resolved.labels is not None or (shown := known_labels(source)) is None:
         return

@@ -41,3 +41,9 @@ def test_without_dask_the_extra_is_named(monkeypatch):
     monkeypatch.setitem(sys.modules, "distributed", None)
     with pytest.raises(MissingDependencyError, match="cluster"):
         list(run_jobs(abs, [1], scheduler="tcp://127.0.0.1:9"))
+
+
+@pytest.mark.parametrize("workers", [0, -1, 1.5, math.nan, True, "2"])
+def test_workers_are_whole_and_positive(workers):
+    with pytest.raises(UsageError, match=f"workers .*{workers}"):
+        list(run_jobs(abs, [1, 2], workers=workers))

@@ -84,3 +84,16 @@ def test_options_are_written_as_flags():
 def test_a_fidelity_of_the_callers_own_comes_back_from_the_settings_of_a_record(fidelity: Fidelity):
     stated = to_plain(ScoreOptions(fidelity=fidelity).settings)
     assert Fidelity.of(ScoreOptions.stated_in(stated).fidelity) == fidelity
+
+
+@pytest.mark.parametrize("wrong", ["fc", ("fc", 5), 5])
+def test_layers_are_a_list_of_names(wrong):
+    assert ScoreOptions(layers=["fc"]).layers == ("fc",)
+    with pytest.raises(UsageError, match="layers must be a list of names"):
+        ScoreOptions(layers=wrong)
+
+
+@pytest.mark.parametrize("option", [{"fidelity": "fast"}, {"whiskers": "C0-C3"}])
+def test_a_simulation_cannot_be_chosen_for_features_computed_elsewhere(option):
+    with pytest.raises(UsageError, match="computed elsewhere"):
+        brainbench.score({"layer": [[1.0]]}, **option)

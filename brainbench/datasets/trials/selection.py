@@ -20,6 +20,12 @@ _RULE = re.compile(r"^\s*(?:(?P<scope>trials|units)\.)?(?P<column>[^=!<>]+?)\s*(
 _RANGE = re.compile(r"^(?P<low>[-+.\deE]*)\.\.(?P<high>[-+.\deE]*)$")
 
 
+def _check_texts(what: str, texts: Any) -> None:
+    # A text is a sequence too: of its letters.
+    if isinstance(texts, str) or not all(isinstance(text, str) for text in texts):
+        raise UsageError(f"{what} must be a tuple of texts; received {shown(texts)}.")
+
+
 @dataclass(frozen=True)
 class Rule:
     """One condition on one column; rows that fail it are removed and counted.
@@ -28,7 +34,7 @@ class Rule:
     A row without a value fails ``allow``, ``low`` and ``high`` and passes ``refuse``.
 
     Raises:
-        UsageError: it states nothing, an empty value, or a range that no number is in.
+        UsageError: it states nothing, an empty value, a text for several, or a range that no number is in.
     """
 
     column: str
@@ -44,6 +50,8 @@ class Rule:
     """False: a table without the column passes, and the result says that the rule did not apply."""
 
     def __post_init__(self) -> None:
+        for name in ("allow", "refuse"):
+            _check_texts(f"{name} of the rule on {self.column!r}", getattr(self, name))
         values = (*self.allow, *self.refuse)
         if not all(values) or (not values and self.low is None and self.high is None):
             raise UsageError(f"The rule on {self.column!r} has an empty value; write a|b or low..high.")
@@ -95,7 +103,11 @@ class Rule:
 
 @dataclass(frozen=True)
 class Selection:
-    """Rules for trials and units. Each row is counted under the first rule that removes it."""
+    """Rules for trials and units. Each row is counted under the first rule that removes it.
+
+    Raises:
+        UsageError: ``min_spikes`` is no whole number from 0, or a text stands for several subjects.
+    """
 
     trials: tuple[Rule, ...] = ()
     units: tuple[Rule, ...] = ()
@@ -104,6 +116,10 @@ class Selection:
     subjects: tuple[str, ...] = ()
     """Keep only these subjects; empty keeps all."""
     name: str = "custom"
+
+    def __post_init__(self) -> None:
+        check_fields(self, "min_spikes", least=0, whole=True)
+        _check_texts("subjects", self.subjects)
 
     @classmethod
     def parse(cls, source: str) -> Selection:
@@ -123,6 +139,8 @@ class Selection:
         units: list[Rule] = []
         own: list[str] = []
         selection = cls(name=source.strip())
+        if not source.strip(" ;"):
+            raise UsageError(f"The selection {shown(source)} states no rule; leave it out for the usual one.")
         for part in filter(None, (item.strip() for item in source.split(";"))):
             match = _RULE.match(part)
             if match is None:

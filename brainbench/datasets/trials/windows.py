@@ -37,7 +37,7 @@ class Window:
     starts inside the trial and before the window's end.
 
     Raises:
-        UsageError: it has no end, no positive length, or ends at the first contact.
+        UsageError: it has no end, no positive length, ends at the first contact, or a setting means nothing to it.
     """
 
     anchor: str = "start"
@@ -56,6 +56,10 @@ class Window:
             raise UsageError(f"The window from {self.anchor!r} has no end; give stop (an anchor) or length (s).")
         check_fields(self, "offset", "stop_offset", "shortest_contact", of="A window's {} (s)")
         check_fields(self, "length", above=0, of="A window's {} (s)")
+        if self.stop is None and self.stop_offset:
+            raise UsageError("stop_offset is after an event, and this window has no stop; give length alone.")
+        if self.anchor != FIRST_CONTACT and (self.shortest_contact or self.fallback is not None):
+            raise UsageError(f"shortest_contact and fallback are of a window from {FIRST_CONTACT!r}; leave them out.")
         if self.stop == FIRST_CONTACT:
             raise UsageError("A window cannot end at the first contact, which is sought before its end.")
 

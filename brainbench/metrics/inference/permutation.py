@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from brainbench.core.errors import UsageError
+from brainbench.core.reading.ranges import check_number
 from brainbench.core.records import Status
 from brainbench.metrics.arrays import find_device
 from brainbench.metrics.rdms.comparison import check_comparison, permuted_comparisons
@@ -199,7 +200,11 @@ def label_orders(
 
     All orders are taken up to ``exact`` stimuli (:data:`EXACT_STIMULI` by default), ``draws`` random ones above
     (:data:`RANDOM_PERMUTATIONS`).
+
+    Raises:
+        UsageError: the seed is no whole number from 0.
     """
+    check_number("seed", seed, least=0, whole=True)
     if stimuli <= (EXACT_STIMULI if exact is None else exact):
         orders = itertools.permutations(range(stimuli))
         while some := list(itertools.islice(orders, step)):

@@ -10,12 +10,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from brainbench.core.errors import UsageError
+from brainbench.core.errors import UsageError, check_name
+from brainbench.core.reading.ranges import check_fields
 from brainbench.core.records import Score
 from brainbench.metrics.measures.metric import Metric, usable_features
 from brainbench.metrics.rdms.comparison import check_comparison, compare_all, permuted_comparisons
 from brainbench.metrics.rdms.comparison import compare as compare_rdms
-from brainbench.metrics.rdms.dissimilarity import rdm
+from brainbench.metrics.rdms.dissimilarity import RDM_METHODS, rdm
+from brainbench.metrics.rdms.noise import NOISE_METHODS
 from brainbench.metrics.rdms.pairs import Floats, Ints, permuted_pairs, rdm_stack, square, stimulus_count
 from brainbench.metrics.reliability.noise_correction import ESTIMATORS, Corrected, noise_corrected
 from brainbench.metrics.reliability.subject_rdm import SubjectRDM, is_flat
@@ -33,6 +35,9 @@ class RSA(Metric):
     corrected for the animal's noise, and the score is the mean over animals; a single animal chooses on one half of its
     trials and is scored on the other. ``thesis`` and ``thesis-input`` are the published estimators with their maximum
     over layers, which is optimistic and says so.
+
+    Raises:
+        UsageError: a method or comparison is unknown, or there is no split.
     """
 
     name: str = "rsa"
@@ -43,12 +48,20 @@ class RSA(Metric):
     """RDM method of the activations, which have no trial noise."""
     comparison: str = "whitened-cosine"
     splits: int = 300
+    """Random halves of the trials of each animal."""
 
     of_rdms = True
     orders = 1999
     orders_between = 499
     fewest = 3
     estimators = ESTIMATORS
+
+    def __post_init__(self) -> None:
+        for method in (self.brain_method, self.model_method):
+            check_name("RDM method", method, RDM_METHODS)
+        check_name("noise covariance method", self.noise, ("none", *NOISE_METHODS))
+        check_comparison(self.comparison)
+        check_fields(self, "splits", least=1, whole=True)
 
     def layer(self, features: ArrayLike) -> Floats:
         """Return the RDM [P] of a layer's features [K, F]."""

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from brainbench.core.errors import UsageError
+from brainbench.core.errors import UsageError, check_once
 from brainbench.metrics.rdms.pairs import Floats, rdm_stack, square, stimulus_count
 
 _LARGEST_LABELLED = 24
@@ -40,7 +40,7 @@ class RDM:
         """Name an RDM [P]; stimuli are numbered without names.
 
         Raises:
-            UsageError: not one RDM vector, or another number of names.
+            UsageError: not one RDM vector, another number of names, or one of them twice.
         """
         array = rdm_stack(values, "values")
         if array.ndim != 1:
@@ -49,6 +49,7 @@ class RDM:
         names = tuple(map(str, range(count))) if stimuli is None else tuple(map(str, stimuli))
         if len(names) != count:
             raise UsageError(f"This RDM is of {count} stimuli; received {len(names)} names.")
+        check_once("An RDM", names)
         for name, value in (("values", array), ("stimuli", names), ("title", title)):
             object.__setattr__(self, name, value)
 

@@ -33,6 +33,9 @@ POISSON_PRIOR_MEAN = 1.0
 POISSON_PRIOR_WEIGHT = 0.1
 """Gamma prior that keeps the logarithm of a silent unit finite (rsatoolbox's defaults)."""
 
+_ASYMMETRY = 1e-6
+"""Largest difference across the diagonal of a noise precision, as a share of its largest number."""
+
 
 @dataclass(frozen=True)
 class _Responses:
@@ -82,7 +85,11 @@ class _Responses:
         shape = tuple(np.shape(self.precision))
         if shape != (units, units):
             raise UsageError(f"The noise precision of {units} units has shape ({units}, {units}); received {shape}.")
-        return left, right @ place(self.precision, self.device)
+        precision = place(self.precision, self.device)
+        scale = abs(precision).max()
+        if not (abs(precision - precision.T).max() <= _ASYMMETRY * scale and (precision.diagonal() > 0).all()):
+            raise UsageError("A noise precision is a symmetric matrix of numbers with a positive diagonal.")
+        return left, right @ precision
 
 
 def rdm(

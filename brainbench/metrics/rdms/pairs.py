@@ -19,6 +19,8 @@ from brainbench.metrics.arrays import is_tensor, library
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
+LARGEST = 1e150
+"""Largest dissimilarity, whose square is still a number."""
 
 
 def stimulus_count(pairs: int) -> int:
@@ -86,10 +88,13 @@ def rdm_stack(rdms: ArrayLike | Sequence[ArrayLike], what: str) -> Floats:
     """Return float64 RDM vectors [..., P], checked.
 
     Raises:
-        UsageError: not numbers, no pair axis, or a length that is no K(K−1)/2.
+        UsageError: not real numbers, no pair axis, a length that is no K(K−1)/2, or a number above :data:`LARGEST`.
     """
     try:
-        array = np.asarray(rdms, dtype=np.float64)
+        array = np.asarray(rdms)
+        if array.dtype.kind in "cSU":
+            raise TypeError("dissimilarities are real numbers")
+        array = array.astype(np.float64, copy=False)
     except (TypeError, ValueError) as error:
         raise UsageError(
             f"{what} must be RDM vectors of one length; received {type(rdms).__name__} ({error})."
@@ -97,4 +102,7 @@ def rdm_stack(rdms: ArrayLike | Sequence[ArrayLike], what: str) -> Floats:
     if array.ndim == 0:
         raise UsageError(f"{what} must be an RDM vector [P]; received a single number.")
     stimulus_count(array.shape[-1])
+    # Comparisons with NaN are false: a missing pair passes, an infinite one must not be taken for one.
+    if (np.abs(array) > LARGEST).any():
+        raise UsageError(f"{what} must hold dissimilarities up to {LARGEST:g}, NaN where one is missing; larger came.")
     return array

@@ -90,3 +90,19 @@ def test_a_selection_made_in_python_is_read_from_its_text():
 def test_unreadable_rules_show_the_form(source, message):
     with pytest.raises(UsageError, match=message):
         Selection.parse(source)
+
+
+@pytest.mark.parametrize(
+    ("make", "told"),
+    [
+        (lambda: Selection(min_spikes=-1), "min_spikes .*-1"),
+        (lambda: Selection(min_spikes=2.5), r"min_spikes .*2\.5"),
+        (lambda: Selection(min_spikes=float("nan")), "min_spikes .*nan"),
+        (lambda: Selection(subjects="mouse1"), "subjects .*'mouse1'"),
+        (lambda: Rule("layer", allow="4"), "allow .*'4'"),
+        (lambda: Selection.parse(" ; "), "states no rule"),
+    ],
+)  # fmt: skip
+def test_selections_that_would_select_something_else_are_refused(make, told):
+    with pytest.raises(UsageError, match=told):
+        make()

@@ -124,3 +124,16 @@ def test_with_stop_and_length_whichever_comes_first_ends_the_window():
 def test_an_unknown_anchor_suggests_the_nearest_column():
     with pytest.raises(UsageError, match="did you mean 'choice_time'"):
         edges(Window("choice_tim", length=1.0), make_contacts())
+
+
+@pytest.mark.parametrize(
+    ("options", "told"),
+    [
+        ({"length": 1.0, "stop_offset": 0.2}, "stop_offset"),
+        ({"length": 1.0, "shortest_contact": 0.01}, "shortest_contact"),
+        ({"stop": "choice", "fallback": Window("start", length=1.0)}, "fallback"),
+    ],
+)
+def test_settings_that_mean_nothing_to_a_window_are_refused(options, told):
+    with pytest.raises(UsageError, match=told):
+        Window("start", **options)

@@ -158,3 +158,9 @@ def test_orders_without_a_value_take_no_part_in_the_largest_layer_or_in_the_word
     assert layer_p(null)[1].tolist() == [0.75, 1.0]
     test = make_test(np.array([0.4, -np.inf, 0.2]), exact=True)
     assert "0.30" in test.summary(1)
+
+
+@pytest.mark.parametrize("seed", [-1, 1.5, np.nan, "1"])
+def test_a_seed_is_whole_also_where_all_orders_are_taken(seed) -> None:
+    with pytest.raises(UsageError, match=f"seed .*{seed}"):
+        permutation_test(np.arange(6.0), np.arange(6.0), seed=seed)

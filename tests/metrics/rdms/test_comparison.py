@@ -114,3 +114,10 @@ def test_misuse_is_told_in_a_sentence():
         compare(np.ones((2, 3)), np.ones((4, 3)))
     with pytest.raises(UsageError, match="must be RDM vectors"):
         compare([[1, 2, 3], [1, 2]], np.ones(3))
+
+
+@pytest.mark.parametrize("wrong", [[1, 2, np.inf], [1, -np.inf, 2], [1e200, 2, 3], [1, 2j, 3], ["1", "2", "3"]])
+def test_what_is_no_dissimilarity_is_not_taken_for_a_missing_one(wrong) -> None:
+    assert compare([1, 2, np.nan], [1, 2, 4]) == pytest.approx(1.0)
+    with pytest.raises(UsageError, match="a must"):
+        compare(wrong, [1, 2, 4])

@@ -59,3 +59,8 @@ def test_what_is_no_rdm_is_refused():
         RDM(np.ones((2, 3)))
     with pytest.raises(UsageError, match="no stimulus 'z'"):
         RDM([1, 2, 3]).between("0", "z")
+
+
+def test_stimuli_of_one_name_cannot_be_told_apart() -> None:
+    with pytest.raises(UsageError, match="'near' more than once"):
+        RDM([1.0, 2.0, 3.0], ["near", "near", "far"])

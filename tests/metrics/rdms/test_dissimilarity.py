@@ -268,3 +268,9 @@ def test_a_single_unit_has_distances_but_no_correlations():
     responses = np.array([[1.0], [2.0], [4.0]])
     assert np.isnan(rdm(responses)).all()
     np.testing.assert_array_equal(rdm(responses, method="sqeuclidean"), [1.0, 9.0, 4.0])
+
+
+@pytest.mark.parametrize("wrong", [np.full((2, 2), np.nan), [[1.0, 0.5], [0.1, 1.0]], -np.eye(2), np.zeros((2, 2))])
+def test_a_noise_precision_is_symmetric_and_positive(wrong) -> None:
+    with pytest.raises(UsageError, match="noise precision is a symmetric"):
+        rdm(np.arange(6.0).reshape(3, 2), method="mahalanobis", precision=wrong)
