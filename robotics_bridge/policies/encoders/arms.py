@@ -82,6 +82,8 @@ class EncoderConfig:
         check_fields(self, "seed", least=0, whole=True, of=of)
         check_name("time of an encoder", self.time, TIMES)
         check_name("way of learning of an encoder", self.learning, LEARNING)
+        if not isinstance(self.name, str):
+            raise unknown_name("tactile encoder", self.name, ARMS)
         # Equal to its default a setting may stand anywhere: a configuration in a file holds them all.
         owner = {"units": "'rnn'"} if self.arm != "rnn" else {}
         owner |= dict.fromkeys(_OF_NETWORKS, "a network (brainbench models list)") if self.arm in ARMS else {}

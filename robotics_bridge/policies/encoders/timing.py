@@ -14,6 +14,7 @@ import torch
 from torch import nn
 
 from brainbench.core.errors import UsageError
+from brainbench.core.reading.ranges import check_number
 from brainbench.models.network import SUB_STEP_SECONDS
 
 Time = Literal["native", "resampled"]
@@ -30,7 +31,8 @@ class Resampler(nn.Module):
     sub-step lasts ``seconds``, an encoder's ``target`` (s).
 
     Raises:
-        UsageError: control is slower than the encoder, so one control step would complete several steps.
+        UsageError: a number is no time, or control is slower than the encoder, so that one control step would complete
+            several steps.
     """
 
     weights: torch.Tensor
@@ -40,6 +42,9 @@ class Resampler(nn.Module):
         self, values: int, *, sub_steps: int = 5, seconds: float = CONTROL_SUB_STEP, target: float = SUB_STEP_SECONDS
     ) -> None:
         super().__init__()
+        check_number("sub_steps of a resampler", sub_steps, least=1, whole=True)
+        for name, time in {"seconds": seconds, "target": target}.items():
+            check_number(f"{name} of a resampler (s)", time, above=0)
         ratio = Fraction(seconds / target).limit_denominator(1000)
         if not 0 < ratio <= 1:
             raise UsageError(

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
-from brainbench.core.errors import UsageError, check_name, listing
+from brainbench.core.errors import UsageError, check_name, listing, shown
 from brainbench.core.reading.ranges import check_number
 from brainbench.models.architecture import Architecture
+from robotics_bridge.hands.layouts import check_names
 from robotics_bridge.hands.observations import observation_type
 from robotics_bridge.policies.encoders.arms import ARMS, AUTO, EncoderConfig
 from robotics_bridge.policies.student import EMBEDDERS
@@ -20,6 +21,8 @@ from robotics_bridge.tasks.settings import StudentSettings, check_widths
 _HIDDEN = (512, 256, 128)
 _SHARED = ("hand", "observe", "placement", "resolution")
 """Fields of an encoder that are those of its student."""
+FELT = ("placement", "resolution", "noisy", "encoder", "encoder_settings")
+"""Fields of a student's touch, which one without touch does not have."""
 LOSSES = ("mse", "inv_var_mse")
 """``inv_var_mse``: each action's squared error over the variance of the teacher's action in the rollout."""
 MOST = {"learning_rate": 1.0, "clip": 100.0, "max_grad_norm": 1e6}
@@ -92,7 +95,17 @@ class DistillConfig:
     def __post_init__(self) -> None:
         object.__setattr__(self, "hidden", tuple(self.hidden))
         check_widths(self.hidden)
-        observation_type(self.observe)
+        kind = observation_type(self.observe)
+        check_names("med" if self.resolution.endswith(".json") else self.resolution, self.placement)
+        if not isinstance(self.noisy, bool):
+            raise UsageError(f"'noisy' must be true or false; received {shown(self.noisy)}.")
+        if not isinstance(self.encoder_settings, Mapping):
+            raise UsageError(f"'encoder_settings' must be names and values; received {shown(self.encoder_settings)}.")
+        usual = {item.name: item.default for item in fields(self)} | {"encoder_settings": {}}
+        if idle := [name for name in FELT if kind.sensor is None and getattr(self, name) != usual[name]]:
+            raise UsageError(f"A student that observes {self.observe!r} has no touch; leave out {listing(idle)}.")
+        if self.teacher_iterations and not self.teacher_share:
+            raise UsageError("'teacher_iterations' is the time in which 'teacher_share' falls, and that is 0.")
         if self.contacts is not None:
             check_name("contacts of a task", self.contacts, CONTACTS)
         check_name("encoder of flat groups", self.embedder, EMBEDDERS)

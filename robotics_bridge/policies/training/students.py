@@ -15,6 +15,7 @@ from brainbench.core.progress import Progress
 from robotics_bridge import tasks
 from robotics_bridge.policies.encoders.arms import ARMS, EncoderConfig
 from robotics_bridge.policies.encoders.calibration import HandCalibration
+from robotics_bridge.policies.encoders.timing import CONTROL_SUB_STEP
 from robotics_bridge.policies.evaluate import Policy, evaluate
 from robotics_bridge.policies.fit import with_contacts_of
 from robotics_bridge.policies.report import EVALUATION, GRADED
@@ -81,6 +82,11 @@ def train_student(
         task = replace(task, contacts=CONTACTS[config.contacts])
     elif config.variant != "published":
         task = with_contacts_of(task, [config.teacher])
+    if config.tactile is not None and config.tactile.time == "resampled" and task.solver.timestep != CONTROL_SUB_STEP:
+        raise UsageError(
+            f"time='resampled' is for readings every {CONTROL_SUB_STEP:g} s; those of {config.task!r} come every "
+            f"{task.solver.timestep:g} s. Use time='native'."
+        )
     env = tasks.make(
         task, num_envs=config.num_envs, device=device, hand=config.hand, observe=config.observe,
         placement=config.placement, resolution=config.resolution, noisy=config.noisy,

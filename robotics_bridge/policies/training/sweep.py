@@ -19,7 +19,7 @@ from brainbench.core.reading.regular import readable
 from brainbench.core.reading.texts import read_toml
 from robotics_bridge.hands.layouts import check_names
 from robotics_bridge.hands.observations import observation_type
-from robotics_bridge.policies.training.distill_config import DistillConfig
+from robotics_bridge.policies.training.distill_config import FELT, DistillConfig
 
 PUBLISHED = Path(__file__).parents[1] / "sweeps" / "table-4.10.toml"
 """The sweep of the thesis."""
@@ -104,7 +104,7 @@ class StudentSweep:
         resolutions = (self.pinned_resolution,) if pin else self.resolutions
         noises = (self.pinned_noisy,) if pin else self.noisy
         return [
-            DistillConfig(**common, observe="none"),
+            DistillConfig(**{name: value for name, value in common.items() if name not in FELT}, observe="none"),
             *(
                 DistillConfig(**common, observe=kind, placement=placement, resolution=resolution, noisy=noisy)
                 for kind, placement, resolution, noisy in product(types, entry.placements, resolutions, noises)
@@ -144,7 +144,7 @@ def _sweep(path: Path, document: Mapping[str, Any]) -> StudentSweep:
     lists = ("types", "extra_types", "resolutions", "noisy", "seeds")
     sweep = StudentSweep(
         name=path.stem, entries=entries, pinned_resolution=pinned.get("resolution", "med"),
-        pinned_noisy=bool(pinned.get("noisy", False)), encoder_types=tuple(encoders.get("types", ())),
+        pinned_noisy=pinned.get("noisy", False), encoder_types=tuple(encoders.get("types", ())),
         arms=tuple(encoders.get("arms", ())),
         **{key: tuple(document[key]) for key in lists if key in document},
         **{key: document[key] for key in ("variant", "teacher") if key in document},
@@ -158,7 +158,8 @@ def _sweep(path: Path, document: Mapping[str, Any]) -> StudentSweep:
         if "encoder" not in arm:
             raise UsageError(f"An arm of the sweep {path.name!r} names no 'encoder': {shown(dict(arm))}.")
     # Every student is made once, so that no value is found wrong in the middle of a sweep.
-    sweep.students()
+    for subset in SUBSETS:
+        sweep.students(subset)
     return sweep
 
 

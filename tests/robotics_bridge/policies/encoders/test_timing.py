@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import pytest
 import torch
 from hypothesis import given
@@ -74,3 +76,10 @@ def test_rows_keep_their_own_clock() -> None:
 def test_slow_control_is_refused() -> None:
     with pytest.raises(UsageError, match="use time='native'"):
         Resampler(1, seconds=0.02)
+
+
+@pytest.mark.parametrize("options", [{"seconds": math.nan}, {"seconds": 0}, {"target": 0.0}, {"sub_steps": 0}])
+def test_times_that_are_none_are_refused(options) -> None:
+    ((name, value),) = options.items()
+    with pytest.raises(UsageError, match=f"{name} of a resampler .*{value}"):
+        Resampler(2, **options)

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import logging
+from dataclasses import replace
 
 import pytest
 
 from brainbench.core.errors import UsageError
 from brainbench.core.files import read_json, write_json
+from robotics_bridge import tasks
 from robotics_bridge.policies.contract import trained_contacts
 from robotics_bridge.policies.training.distill_config import DistillConfig
 from robotics_bridge.policies.training.students import calibrated, train_student
@@ -35,7 +37,8 @@ def test_a_networks_hand_calibration_is_measured_while_the_teacher_acts_and_then
 
 def test_learned_encoders_and_given_calibrations_are_left_alone(tmp_path) -> None:
     for config in (
-        _config(encoder="mlp"), _config(observe="none"), _config(encoder_settings={"calibration": {"force": 2.0}}),
+        _config(encoder="mlp"), DistillConfig(task="follow", observe="none"),
+        _config(encoder_settings={"calibration": {"force": 2.0}}),
     ):  # fmt: skip
         assert calibrated(config, TouchWorld(2), Follower(), tmp_path) is config
 
@@ -78,3 +81,31 @@ def test_a_student_is_taught_in_the_contacts_of_its_teacher_unless_told_otherwis
     described = read_json(tmp_path / "run" / "config.json")
     assert described["distill"]["contacts"] == contacts
     assert trained_contacts(described) == trained_contacts(described["deployment"]) == CONTACTS[contacts]
+
+
+def test_resampled_time_is_for_readings_as_often_as_the_encoder_assumes(tmp_path, monkeypatch) -> None:
+    task = tasks.load("in_palm_rotate")
+    slow = replace(task, solver=replace(task.solver, timestep=0.004))
+    monkeypatch.setattr(tasks, "load", lambda name, variant: slow)
+    config = _config(task="in_palm_rotate", teacher="in_palm_rotate.teacher", encoder_settings={"time": "resampled"})
+    with pytest.raises(UsageError, match=r"every 0\.005 s; those of 'in_palm_rotate' come every 0\.004 s"):
+        train_student(config, tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("options", "told"),
+    [
+        ({"observe": "none", "encoder": "rnn"}, "'none' has no touch; leave out 'encoder'"),
+        ({"observe": "none", "placement": "tips", "noisy": True}, "leave out 'placement', 'noisy'"),
+        ({"observe": "none", "encoder_settings": {"seed": 1}}, "leave out 'encoder_settings'"),
+        ({"noisy": "no"}, "'noisy' must be true or false; received 'no'"),
+        ({"encoder_settings": []}, "'encoder_settings' must be names and values"),
+        ({"placement": "tip"}, "did you mean 'tips'"),
+        ({"resolution": "mid"}, "did you mean 'med'"),
+        ({"teacher_iterations": 5}, "'teacher_share' falls, and that is 0"),
+        ({"encoder": 5}, "tactile encoder 5"),
+    ],
+)
+def test_settings_of_a_student_that_reach_nothing_are_refused(options, told) -> None:
+    with pytest.raises(UsageError, match=told):
+        DistillConfig(task="in_palm_rotate", **options)

@@ -86,3 +86,16 @@ def test_a_sweep_may_name_a_probe_file_in_place_of_a_resolution(tmp_path) -> Non
     _, one, other = read_sweep(path).students("force_torque")
     assert (one.resolution, other.resolution) == ("med", "some/fifty.json")
     assert "_fifty_" in other.name
+
+
+def test_students_of_every_subset_are_looked_at_when_a_sweep_is_read(tmp_path) -> None:
+    path = tmp_path / "s.toml"
+    encoders = '[encoders]\ntypes = ["force_torque"]\narms = [{encoder = "mlp", time = "resampled"}]\n'
+    path.write_text(f"{encoders}{ENTRY}")
+    with pytest.raises(UsageError, match=r"'time' = 'resampled' is for .*'mlp'"):
+        read_sweep(path)
+    path.write_text(f'types = ["bool"]\n[pinned]\nnoisy = "no"\n{ENTRY}')
+    with pytest.raises(UsageError, match="'noisy' must be true or false"):
+        read_sweep(path)
+    path.write_text(f'types = ["bool"]\n[settings]\nencoder = "rnn"\n{ENTRY}')
+    assert [student.encoder for student in read_sweep(path).students()] == ["auto", "rnn"]
