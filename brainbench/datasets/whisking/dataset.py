@@ -22,6 +22,7 @@ from brainbench.core.contracts import CHANNELS, GRID_SHAPE
 from brainbench.core.errors import DataError, UsageError, check_name, listing
 from brainbench.core.files import cache_dir, content_hash
 from brainbench.core.progress import Progress, track
+from brainbench.core.reading.ranges import check_number
 from brainbench.core.reading.sealed import read_sealed, write_sealed
 from brainbench.datasets.whisking.files import Buffers, most_open, open_shard, read_manifest
 from brainbench.datasets.whisking.sweep_tree import is_sweep_tree, open_sweep_tree
@@ -111,11 +112,10 @@ class WhiskingDataset:
             ("treatment of unstable sweeps", unstable, get_args(Unstable)),
         ):
             check_name(kind, value, allowed)
-        if batch_size < 1 or not 0 <= part[0] < part[1]:
-            raise UsageError(
-                f"A batch has at least one sweep and a part is (rank, number) with 0 ≤ rank < number; received "
-                f"batch_size {batch_size!r} and part {part!r}."
-            )
+        for name, value, least in (("batch_size", batch_size, 1), ("substeps", substeps, 1), ("seed", seed, 0)):
+            check_number(name, value, least=least, whole=True)
+        if not 0 <= part[0] < part[1]:
+            raise UsageError(f"A part is (rank, number) with 0 ≤ rank < number; received {part!r}.")
         self.folder = Path(folder)
         self.split, self.view, self.substeps, self.unstable = split, view, substeps, unstable
         self.batch_size, self.shuffle, self.seed, self.device = batch_size, shuffle, seed, device
@@ -136,7 +136,7 @@ class WhiskingDataset:
         """Number of the epoch that the next batch belongs to, from 0."""
         self._batch = 0
         frames, cells = self._shards[0].shape[0], self._shards[0].cells
-        if view == "grid" and (substeps < 1 or frames % substeps):
+        if view == "grid" and frames % substeps:
             raise UsageError(f"{frames} frames do not divide into time steps of {substeps} sub-steps.")
         if view == "grid" and len(np.unique(cells)) < len(cells):
             raise UsageError("The data set has two whiskers in one cell of the grid; read it with view='raw'.")

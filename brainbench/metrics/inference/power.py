@@ -104,9 +104,10 @@ def power(design: ExperimentDesign, *, simulations: int = SIMULATIONS, seed: int
     """Simulate experiments of one design.
 
     Raises:
-        UsageError: no positive number of simulations.
+        UsageError: no positive number of simulations, or the seed is no whole number from 0.
     """
     check_number("The number of simulations", simulations, least=1, whole=True)
+    check_number("seed", seed, least=0, whole=True)
     smallest = smallest_p(design.stimuli, RSA.orders)
     if design.stimuli < SMALLEST_STIMULI or smallest > design.alpha:
         reason = f"{design.stimuli} stimuli allow no p below {smallest:.3g}, whatever is true"

@@ -19,10 +19,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brainbench.core.errors import DataError, UsageError, check_name
+from brainbench.core.reading.ranges import check_number
 from brainbench.core.records import Interval
 from brainbench.core.trials import Trials
 from brainbench.metrics.rdms.comparison import check_comparison, compare
 from brainbench.metrics.rdms.dissimilarity import RDM_METHODS
+from brainbench.metrics.rdms.noise import NOISE_METHODS
 from brainbench.metrics.rdms.pairs import Floats, Ints, permuted_pairs, stimulus_count
 from brainbench.metrics.reliability.halves import SplitRDMs, half_rdms
 from brainbench.metrics.reliability.noise_correction import spearman_brown
@@ -121,13 +123,14 @@ def subject_rdm(
     crossnobis unbiased; shrinkage leaves a bias of up to .01 per unit (docs/calibration.md).
 
     Raises:
-        UsageError: unknown method, bad shapes or labels, repeated trial keys, no positive ``splits``.
+        UsageError: unknown method, bad shapes or labels, repeated trial keys, a number out of range.
         DataError: infinite responses, or negative ones for ``poisson``.
     """
     check_name("RDM method of an animal", method, RDM_METHODS)
     check_comparison(comparison)
-    if splits < 1 or n_stimuli < 2:
-        raise UsageError(f"Split halves need splits ≥ 1 and 2 or more stimuli; received {splits} and {n_stimuli}.")
+    check_name("noise covariance method", noise, ("none", *NOISE_METHODS))
+    for name, value, least in (("splits", splits, 1), ("n_stimuli", n_stimuli, 2), ("seed", seed, 0)):
+        check_number(name, value, least=least, whole=True)
     names = [str(name) for name in (range(n_stimuli) if stimuli is None else stimuli)]
     if len(names) != n_stimuli:
         raise UsageError(f"There are {n_stimuli} stimuli but {len(names)} names.")

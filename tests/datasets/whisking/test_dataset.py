@@ -1,5 +1,6 @@
 import itertools
 import json
+import math
 import os
 import shutil
 
@@ -214,7 +215,11 @@ def test_folders_without_a_finished_data_set_say_what_to_do(copy, tmp_path):
         ({"split": "validate"}, "Unknown split 'validate'; did you mean 'validation'"),
         ({"view": "grids"}, "did you mean 'grid'"),
         ({"substeps": 3}, "10 frames do not divide into time steps of 3"),
-        ({"batch_size": 0}, "at least one sweep"),
+        ({"batch_size": 0}, "batch_size .*0"),
+        ({"batch_size": 2.5}, r"batch_size .*2\.5"),
+        ({"batch_size": math.nan}, "batch_size .*nan"),
+        ({"substeps": 0}, "substeps .*0"),
+        ({"seed": math.nan, "shuffle": False}, "seed .*nan"),
         ({"part": (2, 2)}, "0 ≤ rank < number"),
         ({"batch_size": 50, "drop_last": True}, "make no batch of 50"),
     ],

@@ -154,6 +154,8 @@ def test_other_misuse_is_told_in_a_sentence():
         needed(ExperimentDesign(), "trials")
     with pytest.raises(UsageError, match="target power"):
         needed(ExperimentDesign(), target=1.0)
+    with pytest.raises(UsageError, match=r"seed .*received -1"):
+        power(ExperimentDesign(), seed=-1)
     with pytest.raises(UsageError, match=r"simulations .*at least 1"):
         power(ExperimentDesign(), simulations=0)
 

@@ -7,6 +7,7 @@ import warnings
 import numpy as np
 import pytest
 
+from brainbench.core.errors import UsageError
 from brainbench.core.trials import Trials
 from brainbench.metrics import noise_precision, rdm
 from brainbench.metrics.reliability.halves import SplitRDMs, half_rdms, split_members
@@ -123,3 +124,16 @@ def test_crossnobis_needs_four_trials_of_each_stimulus():
     block = make_block(make_latent(), repeats=3)
     found = subject_rdm("a", [block], 6, method="crossnobis")
     assert "fewer than 4 trials of 0 (3)" in found.problem
+
+
+@pytest.mark.parametrize(
+    ("options", "told"),
+    [
+        ({"splits": 0}, "splits .*0"), ({"splits": 2.5}, r"splits .*2\.5"), ({"seed": -1}, "seed .*-1"),
+        ({"seed": 1.5}, r"seed .*1\.5"), ({"noise": "dag"}, "did you mean 'diag'"),
+    ],
+)  # fmt: skip
+def test_options_of_an_animals_rdm_are_checked_whatever_its_method(options, told) -> None:
+    trials = Trials(np.arange(24.0).reshape(12, 2) % 5, np.repeat(range(3), 4))
+    with pytest.raises(UsageError, match=told):
+        subject_rdm("m", [trials], 3, **options)
