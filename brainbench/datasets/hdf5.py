@@ -164,6 +164,8 @@ def _write_sessions(file: h5py.File, sessions: list[Session]) -> None:
     file.attrs["kind"] = "spikes"
     root = file.create_group("sessions")
     for session in sessions:
+        if not isinstance(session, Session):
+            raise UsageError(f"Recordings are a data set or sessions of make_session; received {shown(session)}.")
         name = f"{session.subject}-{session.session}".replace("/", "_")
         if name in root:
             raise UsageError(f"Two sessions are called {name!r}; give each its own session name.")

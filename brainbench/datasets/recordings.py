@@ -77,7 +77,8 @@ def open_recordings(
 
     Raises:
         DataFileNotFoundError: the source names nothing.
-        UsageError: an unknown table, column, layout or rule, or no conditions where they are needed.
+        UsageError: an unknown table, column, layout or rule, no conditions where they are needed, or a bin longer than
+            every window.
         DataError: a file is damaged or unusable, a session appears twice, or fewer than two
             conditions, no trial or no unit remain.
     """
@@ -202,6 +203,11 @@ class _Reader:
         name = self.layout.name if self.layout else ""
         name += "" if self.named or not name else " (detected from its columns)"
         made = join_sessions(self.counted, self.options, source=source, layout=name, notes=self.notes + skipped)
+        if self.bin is not None and (longest := float(made["duration"].max())) < (1 - 1e-6) * self.bin:
+            raise UsageError(
+                f"A bin of {self.bin:g} s is longer than every window (up to {longest:g} s), so it cuts nothing; leave "
+                "it out, or give it in seconds."
+            )
         made.attrs["skipped"] = skipped
         return check_recordings(made)
 

@@ -10,12 +10,13 @@ import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from datetime import datetime
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from brainbench.core.errors import DataError, check_name, unknown_name
+from brainbench.core.errors import DataError, UsageError, check_name, shown, unknown_name
 
 SPIKES = "spike_times"
 OBSERVED = "obs_intervals"
@@ -247,8 +248,17 @@ def make_session(
     [n, 2] (s) of each unit. The session's name is unique within the animal.
 
     Raises:
-        DataError: columns differ in length, a table has no ``start_time``, or a spike time is not finite.
+        DataError: columns differ in length, a table has no ``start_time``, a spike time is not finite, or a recorded
+            span does not end after it begins.
+        UsageError: ``start`` is no date and time of ISO 8601.
     """
+    if start:
+        try:
+            datetime.fromisoformat(start)
+        except ValueError:
+            raise UsageError(
+                f"A session starts at a time of ISO 8601, such as 2025-01-31T12:00:00+00:00; received {shown(start)}."
+            ) from None
     data: dict[str, Any] = {"id": np.arange(len(spikes))}
     data |= {name: np.asarray(values) for name, values in (unit_columns or {}).items()}
     data |= ragged(SPIKES, spikes)
@@ -264,6 +274,10 @@ def make_session(
             if f"{name}_index" not in table and len(table.data[name]) != len(table):
                 raise DataError(f"Column {name!r} of {table.label} has {len(table.data[name])} of {len(table)} rows.")
     units.rows(SPIKES)
+    if observed is not None:
+        units.ends(OBSERVED)
+        if not (data[OBSERVED][:, 0] <= data[OBSERVED][:, 1]).all():
+            raise DataError(f"Recorded spans of {units.label} must be [begin, end] in seconds, the earlier time first.")
     for table in made.values():
         table.require("start_time")
     stated = {"source": session, "start": start, "synthetic": synthetic, "stimuli": stimuli}

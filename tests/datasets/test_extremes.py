@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from brainbench.core.errors import DataError
+from brainbench.core.errors import DataError, UsageError
 from brainbench.core.trials import Trials
 from brainbench.datasets import check, inspect, open_recordings, write_recordings
 from brainbench.datasets.sessions import SessionTable, make_session
@@ -146,9 +146,11 @@ def test_a_single_animal_with_a_single_session_goes_through():
     assert 0 < found.reliability <= 1
 
 
-def test_a_bin_wider_than_the_window_is_one_bin_and_a_tiny_one_is_many(tmp_path):
+def test_a_bin_wider_than_every_window_is_a_slip_and_a_tiny_one_makes_many(tmp_path):
     path = many(tmp_path)
-    assert open_recordings(path, conditions="trials:stimulus", bin=100.0).sizes["time"] == 1
+    with pytest.raises(UsageError, match=r"bin of 100 s is longer than every window \(up to 0\.8 s\)"):
+        open_recordings(path, conditions="trials:stimulus", bin=100.0)
+    assert open_recordings(path, conditions="trials:stimulus", bin=0.8).sizes["time"] == 1
     fine = open_recordings(path, conditions="trials:stimulus", bin=1e-4)
     assert fine.sizes["time"] == 8000
     assert np.nanmax(fine["counts"].values) <= 2

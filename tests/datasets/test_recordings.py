@@ -238,6 +238,18 @@ def test_spike_times_that_are_not_finite_are_refused(tmp_path):
         open_recordings(path, conditions="trials:stimulus")
 
 
+def test_recorded_spans_without_a_beginning_hold_nothing_and_spoil_no_others(tmp_path):
+    spikes, table = (
+        [np.arange(0.0, 12.0, 0.1)],
+        {"start_time": [1.0, 3.0], "stop_time": [2.0, 4.0], "stimulus": ["a", "b"]},
+    )
+    session = make_session("m", "1", spikes, {"trials": table}, observed=[[[0.0, 0.5], [0.9, 10.0]]])
+    path = write_recordings(tmp_path / "a.h5", session)
+    with h5py.File(path, "a") as file:
+        file["sessions/m-1/units/obs_intervals"][0] = [np.nan, 0.95]
+    assert open_recordings(path, conditions="trials:stimulus").sizes["trial"] == 2
+
+
 def test_an_inconsistent_ragged_index_is_refused(tmp_path):
     path = write(tmp_path / "a.h5")
     with h5py.File(path, "a") as file:

@@ -83,3 +83,23 @@ def test_spike_times_that_no_reader_takes_are_neither_made_nor_written(tmp_path,
     with pytest.raises(DataError, match="not finite"):
         write(tmp_path / "a", session)
     assert not (tmp_path / "a").exists()
+
+
+@pytest.mark.parametrize(
+    ("options", "told"),
+    [
+        ({"observed": [[[5.0, 1.0]]]}, "earlier time first"),
+        ({"observed": [[[np.nan, 1.0]]]}, "earlier time first"),
+        ({"observed": [[[0.0, 1.0]], [[0.0, 1.0]]]}, "obs_intervals_index .*2 ends for 1 rows"),
+        ({"start": "yesterday"}, "ISO 8601.*'yesterday'"),
+    ],
+)
+def test_spans_and_starts_that_are_no_times_are_refused(options, told) -> None:
+    with pytest.raises((DataError, UsageError), match=told):
+        make_session("m", "1", [np.arange(3.0)], {}, **options)
+    assert make_session("m", "1", [np.arange(3.0)], {}, observed=[[[-np.inf, np.inf]]], start="2025-01-31").start
+
+
+def test_what_is_no_session_is_not_written(tmp_path) -> None:
+    with pytest.raises(UsageError, match="received 'm1'"):
+        write_recordings(tmp_path / "a.h5", ["m1"])  # type: ignore[list-item]

@@ -91,6 +91,8 @@ def test_metrics_without_rdms_and_recordings_without_time_are_refused(moving):
     with pytest.raises(UsageError, match="'ridge'"):
         _score(moving, metric="ridge")
     with pytest.raises(DataError, match="--bin"):
+        _score(moving, bin=0.5)
+    with pytest.raises(UsageError, match="bin of 1 s is longer"):
         _score(moving, bin=1.0)
 
 

@@ -271,7 +271,8 @@ def inside_observed_spans(units: SessionTable, edges: NDArray[np.float64]) -> ND
 def _merged(spans: NDArray[np.float64]) -> list[tuple[float, float]]:
     """Join the spans [n, 2] (s) that touch or overlap."""
     merged: list[tuple[float, float]] = []
-    for low, high in sorted(map(tuple, spans.tolist())):
+    # What ends before it begins, or at no known time, holds nothing; NaN would also undo the order.
+    for low, high in sorted(map(tuple, spans[spans[:, 0] <= spans[:, 1]].tolist())):
         # Spans that touch are one recording: a window across their common end lies inside it.
         if merged and low <= merged[-1][1]:
             merged[-1] = (merged[-1][0], max(high, merged[-1][1]))
