@@ -108,6 +108,13 @@ def check_name(kind: str, name: object, options: Iterable[str], *, hint: str = "
         raise unknown_name(kind, name, choices, hint=hint)
 
 
+def check_each(kind: str, names: Iterable[object], options: Iterable[str]) -> None:
+    """Raise the error of :func:`unknown_name` for the first name that is not among the options."""
+    choices = list(options)
+    for name in names:
+        check_name(kind, name, choices)
+
+
 def repeats(names: Iterable[Hashable]) -> list[Any]:
     """Return what occurs more than once, in order of appearance.
 

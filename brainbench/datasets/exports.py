@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from brainbench.core.errors import DataError, UsageError, check_name
+from brainbench.core.errors import DataError, UsageError, check_each
 from brainbench.datasets.hdf5 import write_recordings
 from brainbench.datasets.nwb_writer import write_nwb
 from brainbench.datasets.reading import Source, each_session, find_recordings, open_file, resolve_selection
@@ -54,8 +54,7 @@ def export(source: Source, target: str | os.PathLike[str], *, select: Selection 
                     tallies.append(Tally())
                     table = found.conditions.table if found else "trials"
                     sessions.append(subset(session, chosen, table, tallies[-1]))
-    for subject in chosen.subjects:
-        check_name("subject", subject, sorted(subjects))
+    check_each("subject", chosen.subjects, sorted(subjects))
     check_values(tallies)
     if not sessions:
         raise DataError(f"None of the {len(paths)} files of {source} holds units with spike times; nothing to copy.")

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
 from brainbench.core.contracts import check_recordings
-from brainbench.core.errors import DataError, UsageError, check_name, listing, unknown_name
+from brainbench.core.errors import DataError, UsageError, check_each, listing, unknown_name
 from brainbench.core.progress import Progress, track
 from brainbench.datasets import hdf5
 from brainbench.datasets.inspection import propose
@@ -195,8 +195,7 @@ class _Reader:
         if self.options is None:
             more = f" ({len(self.without_units) - 1} more files likewise)" if len(self.without_units) > 1 else ""
             raise DataError(f"{self.without_units[0]}{more}" if self.without_units else "The file holds no session.")
-        for subject in self.options.selection.subjects:
-            check_name("subject", subject, sorted(self.subjects))
+        check_each("subject", self.options.selection.subjects, sorted(self.subjects))
         skipped = self.skipped + self.without_units + [*dict.fromkeys(self.other_tables.values())]
         if not self.counted:
             raise DataError(f"No session of the chosen subjects can be counted. {skipped[0]}")

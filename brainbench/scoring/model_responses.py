@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from brainbench.core.contracts import CHANNELS
-from brainbench.core.errors import UsageError, check_name, unknown_name
+from brainbench.core.errors import UsageError, check_each, unknown_name
 from brainbench.core.files import content_hash, file_hash
 from brainbench.core.progress import Progress
 from brainbench.core.reading.regular import readable
@@ -96,8 +96,7 @@ class ResolvedModel:
             labels, origin = shown.labels, {**origin, "stimuli": _stated(shown)}
         if self.module is None or shown is None:
             found = self.activations or {}
-            for layer in options.layers or ():
-                check_name("layer", layer, found)
+            check_each("layer", options.layers or (), found)
             activations = {layer: _as_steps(layer, found[layer], len(labels)) for layer in options.layers or found}
         else:
             from brainbench.models.activations import extract

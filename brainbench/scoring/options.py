@@ -12,7 +12,7 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from brainbench.core.errors import UsageError, check_name, check_once, shown
+from brainbench.core.errors import UsageError, check_each, check_name, check_once, shown
 from brainbench.core.reading.ranges import check_fields
 
 if TYPE_CHECKING:
@@ -132,8 +132,7 @@ class ScoreOptions:
             UsageError: there is no such option.
         """
         known = [item.name for item in fields(cls)]
-        for name in values:
-            check_name("option of a score", name, known)
+        check_each("option of a score", values, known)
         return cls(**values)
 
     @classmethod

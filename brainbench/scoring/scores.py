@@ -112,9 +112,8 @@ def score_record(
     scores, between = _compare(named, brain, animals, metric, kept, options, layer=layer, agreement=baselines)
     stage_done()
     settings = {"estimator_version": ESTIMATOR_VERSION, "model": model if isinstance(model, str) else None}
-    if (
-        resolved.labels is not None
-    ):  # features with labels of their own were computed elsewhere, of stimuli unknown here
+    # Features with labels of their own were computed elsewhere, of stimuli unknown here.
+    if resolved.labels is not None:
         settings |= dict.fromkeys(("stimuli", "whiskers", "fidelity"))
     origin = Provenance.of(
         provenance(

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from brainbench.core.errors import UsageError, check_name
+from brainbench.core.errors import UsageError, check_each
 from brainbench.core.reading.ranges import check_number
 from robotics_bridge.deploy.driver import Driver, HandReading, Source
 from robotics_bridge.deploy.safety import ClockOffset, SafetyLimits
@@ -108,8 +108,7 @@ class Controller:
         self.rate, self.sources, self.clock, self.record = contract.rate, dict(sources or {}), clock or Clock(), record
         if missing := [name for name in contract.inputs if name not in {"proprio", *self.sources}]:
             raise UsageError(f"The policy reads the group {missing[0]!r}, and nothing here gives it.")
-        for name in self.sources:
-            check_name("group that the policy reads and something else gives", name, {*contract.inputs} - {"proprio"})
+        check_each("group of a policy with a source", self.sources, {*contract.inputs} - {"proprio"})
         if len(limits.low) != len(driver.joints):
             raise UsageError(f"There are limits of {len(limits.low)} joints; the hand has {len(driver.joints)}.")
         if missing := [name for name in contract.joints if name not in driver.joints]:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from brainbench.core.errors import UsageError, check_name
+from brainbench.core.errors import UsageError, check_each
 from brainbench.core.reading.ranges import check_fields
 from robotics_bridge.deploy.driver import HandReading
 from robotics_bridge.hands import Hand
@@ -67,8 +67,7 @@ class SafetyLimits:
         if missing := [name for name in joints if name not in names]:
             raise UsageError(f"The hand {hand.name!r} has no joint {missing[0]!r}.")
         ranges = np.array([model.jnt_range[names[name]] for name in joints])
-        for name in changes:
-            check_name("safety limit", name, LIMITS)
+        check_each("safety limit", changes, LIMITS)
         return cls(ranges[:, 0], ranges[:, 1], hand.rated_speeds(joints), **changes)
 
     def fault(self, reading: HandReading, age: float) -> str | None:

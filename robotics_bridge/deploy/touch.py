@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from brainbench.core.errors import UsageError, check_name
+from brainbench.core.errors import UsageError, check_each
 from brainbench.core.reading.ranges import check_fields, check_number
 from robotics_bridge import hands
 from robotics_bridge.deploy.driver import HandReading, Source
@@ -89,8 +89,7 @@ class RealTouch:
     ) -> None:
         self.observe, self.shape, self.fallback = contract.observe, contract.inputs["tactile"], fallback
         self.calibration, self.fingers = calibration or PressureCalibration(), fingers
-        for finger in self.calibration.per_finger:
-            check_name("finger of a pressure calibration", finger, fingers)
+        check_each("finger of a pressure calibration", self.calibration.per_finger, fingers)
         real = contract.observe in REAL_TYPES
         if not real and fallback is None:
             raise UsageError(

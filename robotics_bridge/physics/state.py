@@ -15,7 +15,7 @@ import torch
 from numpy.typing import ArrayLike
 
 from brainbench.core.devices import pick_device, warp
-from brainbench.core.errors import UsageError, check_name
+from brainbench.core.errors import UsageError, check_each
 from brainbench.core.reading.ranges import check_number
 from robotics_bridge.physics.kernels.state import StateArrays
 
@@ -172,8 +172,7 @@ class HandState:
             raise UsageError(f"Every contact needs one pair of geometries; received {count} and {len(pairs)}.")
         for environment in (environments.min(initial=0), environments.max(initial=0)):
             check_number("environment of a contact", environment, least=0, below=self.num_envs)
-        for name in optional:
-            check_name("quantity of a contact", name, _CONTACT)
+        check_each("quantity of a contact", optional, _CONTACT)
         for name, values in {"env": environments, "geom": pairs, **_CONTACT, **optional}.items():
             view = wp.to_torch(getattr(self, f"contact_{name}"))[:count]
             if isinstance(values, float):

@@ -13,7 +13,7 @@ from itertools import groupby
 import numpy as np
 from numpy.typing import NDArray
 
-from brainbench.core.errors import UsageError, check_name
+from brainbench.core.errors import UsageError, check_each
 from brainbench.core.trials import Trials
 from brainbench.datasets.synthetic.design import MODULATION, PopulationDesign
 from brainbench.datasets.synthetic.geometry import ResponseGeometry
@@ -55,8 +55,7 @@ def simulate(
     Raises:
         UsageError: an unknown fault, or a missing stimulus that does not exist.
     """
-    for name in faults:
-        check_name("fault", name, FAULTS)
+    check_each("fault", faults, FAULTS)
     animals = []
     for subject, group in groupby(draw_sessions(geometry, design, seed), key=lambda item: item.subject):
         drawn = list(group)

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from brainbench.core.errors import DataError, UsageError, check_name, missing_dependency
+from brainbench.core.errors import DataError, UsageError, check_each, missing_dependency
 from brainbench.core.progress import Progress
 from brainbench.core.records import Interval, Status
 
@@ -166,8 +166,7 @@ def _choose_classes(
     most: int,
 ) -> tuple[str, ...]:
     if asked is not None:
-        for name in asked:
-            check_name("class", name, known)
+        check_each("class", asked, known)
         if len(set(asked)) < most:
             raise UsageError(f"{most} classes at a time need {most} different classes; received {', '.join(asked)}.")
         return tuple(asked)

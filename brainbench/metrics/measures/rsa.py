@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from brainbench.core.errors import UsageError, check_name
+from brainbench.core.errors import UsageError, check_each, check_name
 from brainbench.core.reading.ranges import check_fields
 from brainbench.core.records import Score
 from brainbench.metrics.measures.metric import Metric, usable_features
@@ -57,8 +57,7 @@ class RSA(Metric):
     estimators = ESTIMATORS
 
     def __post_init__(self) -> None:
-        for method in (self.brain_method, self.model_method):
-            check_name("RDM method", method, RDM_METHODS)
+        check_each("RDM method", (self.brain_method, self.model_method), RDM_METHODS)
         check_name("noise covariance method", self.noise, ("none", *NOISE_METHODS))
         check_comparison(self.comparison)
         check_fields(self, "splits", least=1, whole=True)

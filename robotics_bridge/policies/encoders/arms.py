@@ -16,7 +16,7 @@ import torch
 from torch import nn
 
 from brainbench.core.contracts import GRID_SHAPE
-from brainbench.core.errors import UsageError, check_name, shown, unknown_name
+from brainbench.core.errors import UsageError, check_each, check_name, shown, unknown_name
 from brainbench.core.reading.ranges import check_fields
 from brainbench.models.architecture import Architecture
 from brainbench.models.cells import GRU
@@ -102,8 +102,7 @@ class EncoderConfig:
         """Return a configuration from a mapping of its fields; raise UsageError for a field that does not exist."""
         if isinstance(value, EncoderConfig):
             return value
-        for name in value:
-            check_name("setting of a tactile encoder", name, cls.__dataclass_fields__)
+        check_each("setting of a tactile encoder", value, cls.__dataclass_fields__)
         return cls(**{**value, "calibration": HandCalibration.of(value.get("calibration"))})
 
     def plain(self) -> dict[str, Any]:
@@ -295,16 +294,12 @@ class _Images(_Learned):
         self.register_buffer("index", index.flatten(), persistent=False)
 
     def observe_scale(self, taxels: torch.Tensor) -> None:
-        self.scale.update(self._sites(taxels.flatten(0, -4)) if self.canvas else taxels)
-
-    def _sites(self, taxels: torch.Tensor) -> torch.Tensor:
-        """Return the wrenches [B, S, 5, 7, 6] of the hand's grid."""
-        return self.grid(taxels).unflatten(1, (-1, 6)).movedim(2, -1)
+        self.scale.update(self.grid.wrenches(taxels.flatten(0, -4)) if self.canvas else taxels)
 
     def pictures(self, taxels: torch.Tensor) -> torch.Tensor:
         """Return images [B·images, planes, rows, columns]."""
         if self.canvas:
-            return self.scale(self._sites(taxels)).movedim(-1, 2).flatten(1, 2)
+            return self.scale(self.grid.wrenches(taxels)).movedim(-1, 2).flatten(1, 2)
         planes = self.scale(taxels).permute(0, 1, 3, 2).flatten(1, 2)
         # Fillers point at one item more than there are, a zero: a single gather lays out all links.
         cells = torch.cat((planes, torch.zeros_like(planes[..., :1])), 2)[..., self.index]
@@ -408,13 +403,10 @@ class _Reservoir(TactileEncoder):
         self.norm, self.project = FeatureNorm(UNITS), nn.Linear(UNITS, self.features)
 
     def observe_scale(self, taxels: torch.Tensor) -> None:
-        self.scale.update(self._sites(taxels.flatten(0, -4)))
-
-    def _sites(self, taxels: torch.Tensor) -> torch.Tensor:
-        return self.grid(taxels).unflatten(1, (-1, 6)).movedim(2, -1)
+        self.scale.update(self.grid.wrenches(taxels.flatten(0, -4)))
 
     def forward(self, taxels: torch.Tensor, h_in: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        felt = self.scale(self._sites(taxels)).flatten(1)
+        felt = self.scale(self.grid.wrenches(taxels)).flatten(1)
         h_out = self.echo(self.echo.drive(felt), h_in)
         return self.project(self.norm(h_out)), h_out
 

@@ -10,7 +10,7 @@ import torch
 
 from brainbench.core.contracts import CHANNELS, GRID_SHAPE
 from brainbench.core.errors import DataError, UsageError
-from brainbench.core.reading.ranges import check_number
+from brainbench.core.reading.ranges import check_fields
 from brainbench.models.normaliser import FORCE_SCALE, MOMENT_SCALE
 
 _TOUCHING = 1e-3
@@ -34,8 +34,7 @@ class HandCalibration:
     """N·m that count as :data:`~brainbench.models.normaliser.MOMENT_SCALE`."""
 
     def __post_init__(self) -> None:
-        for name in ("force", "moment"):
-            check_number(f"The {name} of a hand calibration", getattr(self, name), above=0)
+        check_fields(self, "force", "moment", above=0, of="The {} of a hand calibration")
 
     @classmethod
     def fit(cls, grid: torch.Tensor) -> HandCalibration:

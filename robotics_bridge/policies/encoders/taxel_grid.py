@@ -105,6 +105,10 @@ class TaxelGrid(nn.Module):
         grid = sites.unflatten(2, (SITES, len(CHANNELS))).transpose(2, 3)
         return grid.reshape(taxels.shape[0], -1, *GRID_SHAPE)
 
+    def wrenches(self, taxels: torch.Tensor) -> torch.Tensor:
+        """Return the grid as wrenches [B, S, 5, 7, 6]."""
+        return self(taxels).unflatten(1, (-1, len(CHANNELS))).movedim(2, -1)
+
 
 def _scatter(axes: FingerAxes, link: str, probes: Probes, observe: str) -> NDArray[np.float64]:
     """Return the part [SITES, 6, items, C] of a link's items."""

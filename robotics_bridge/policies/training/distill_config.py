@@ -8,8 +8,8 @@ from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
-from brainbench.core.errors import UsageError, check_name, listing, shown
-from brainbench.core.reading.ranges import check_number
+from brainbench.core.errors import UsageError, check_each, check_name, listing, shown
+from brainbench.core.reading.ranges import check_fields
 from brainbench.models.architecture import Architecture
 from robotics_bridge.hands.layouts import check_names
 from robotics_bridge.hands.observations import observation_type
@@ -111,14 +111,12 @@ class DistillConfig:
         check_name("encoder of flat groups", self.embedder, EMBEDDERS)
         check_name("loss", self.loss or "mse", LOSSES)
         check_name("precision", self.precision, ("float32", "bf16"))
-        check_number("teacher_share", self.teacher_share, least=0, most=1)
+        check_fields(self, "teacher_share", least=0, most=1)
         for name, most in MOST.items():
-            if (value := getattr(self, name)) is not None:
-                check_number(name, value, above=0, most=most)
-        positive = {"num_envs", "steps_per_env", "save_interval", "iterations", "epochs", "gradient_length"}
-        for name in (*sorted(positive), "teacher_iterations", "aggregate", "seed"):
-            if (value := getattr(self, name)) is not None:
-                check_number(name, value, least=int(name in positive), whole=True)
+            check_fields(self, name, above=0, most=most)
+        positive = ("num_envs", "steps_per_env", "save_interval", "iterations", "epochs", "gradient_length")
+        check_fields(self, *positive, least=1, whole=True)
+        check_fields(self, "teacher_iterations", "aggregate", "seed", least=0, whole=True)
         if own := {"name", *_SHARED} & set(self.encoder_settings):
             raise UsageError(f"{listing(own)} of an encoder: set it for the student (its 'encoder' is the name).")
         _ = self.tactile  # whose settings are checked by its own class
@@ -126,8 +124,7 @@ class DistillConfig:
     @classmethod
     def of(cls, value: Mapping[str, Any]) -> DistillConfig:
         """Return a configuration from a mapping of its fields; raise UsageError for a field that does not exist."""
-        for name in value:
-            check_name("setting of a student", name, cls.__dataclass_fields__)
+        check_each("setting of a student", value, cls.__dataclass_fields__)
         return cls(**value)
 
     def plain(self) -> dict[str, Any]:

@@ -14,7 +14,7 @@ from itertools import product
 from pathlib import Path
 from typing import Any
 
-from brainbench.core.errors import UsageError, check_name, repeats, shown
+from brainbench.core.errors import UsageError, check_each, check_name, repeats, shown
 from brainbench.core.reading.regular import readable
 from brainbench.core.reading.texts import read_toml
 from robotics_bridge.hands.layouts import check_names
@@ -24,11 +24,11 @@ from robotics_bridge.policies.training.distill_config import FELT, DistillConfig
 PUBLISHED = Path(__file__).parents[1] / "sweeps" / "table-4.10.toml"
 """The sweep of the thesis."""
 SUBSETS = ("all", "types", "encoders")
-_KEYS = {
+_KEYS = (
     "types", "extra_types", "resolutions", "noisy", "seeds", "variant", "teacher", "pinned", "encoders", "entries",
     "settings",
-}  # fmt: skip
-_ENTRY = {"task", "hand", "placements", "iterations", "settings"}
+)  # fmt: skip
+_ENTRY = ("task", "hand", "placements", "iterations", "settings")
 
 
 @dataclass(frozen=True)
@@ -134,13 +134,13 @@ def read_sweep(path: str | Path = PUBLISHED) -> StudentSweep:
 
 
 def _sweep(path: Path, document: Mapping[str, Any]) -> StudentSweep:
-    _check_keys(document, _KEYS, "key of a sweep")
+    check_each("key of a sweep", document, _KEYS)
     entries = tuple(_entry(item, document.get("settings", {})) for item in document.get("entries", ()))
     if not entries:
         raise UsageError(f"The sweep {str(path)!r} has no entries; each is a table [[entries]] with a task and a hand.")
     pinned, encoders = document.get("pinned", {}), document.get("encoders", {})
-    _check_keys(pinned, {"resolution", "noisy"}, "key of 'pinned'")
-    _check_keys(encoders, {"types", "arms"}, "key of 'encoders'")
+    check_each("key of 'pinned'", pinned, ("resolution", "noisy"))
+    check_each("key of 'encoders'", encoders, ("types", "arms"))
     lists = ("types", "extra_types", "resolutions", "noisy", "seeds")
     sweep = StudentSweep(
         name=path.stem, entries=entries, pinned_resolution=pinned.get("resolution", "med"),
@@ -164,7 +164,7 @@ def _sweep(path: Path, document: Mapping[str, Any]) -> StudentSweep:
 
 
 def _entry(item: Mapping[str, Any], settings: Mapping[str, Any]) -> SweepEntry:
-    _check_keys(item, _ENTRY, "key of a sweep's entry")
+    check_each("key of a sweep's entry", item, _ENTRY)
     for key in ("task", "hand", "placements"):
         if not item.get(key):
             raise UsageError(f"An entry of a sweep needs {key!r}; received {shown(dict(item))}.")
@@ -172,8 +172,3 @@ def _entry(item: Mapping[str, Any], settings: Mapping[str, Any]) -> SweepEntry:
     if "iterations" in item:
         own["iterations"] = item["iterations"]
     return SweepEntry(item["task"], item["hand"], tuple(item["placements"]), own)
-
-
-def _check_keys(mapping: Mapping[str, Any], known: set[str], what: str) -> None:
-    for key in mapping:
-        check_name(what, key, sorted(known))
