@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from brainbench.core.errors import DataError, DataFileNotFoundError
+from brainbench.core.errors import DataError, DataFileNotFoundError, UsageError
 
 MAGIC = b"BBH2"
 HELLO, WELCOME, START, STATE, COMMAND, STOP = range(1, 7)
@@ -94,6 +94,12 @@ def session_keys(key: bytes, controller: bytes, hand: bytes) -> tuple[bytes, byt
 def new_key() -> bytes:
     """Return a new random key."""
     return secrets.token_bytes(KEY)
+
+
+def check_key(key: bytes) -> None:
+    """Raise UsageError unless a key has :data:`KEY` bytes: a short one, or none, would let strangers move the hand."""
+    if not isinstance(key, bytes) or len(key) != KEY:
+        raise UsageError(f"The key of a hand is {KEY} bytes, as new_key and read_key give it; another came.")
 
 
 def read_key(path: str | os.PathLike[str]) -> bytes:

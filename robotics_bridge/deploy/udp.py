@@ -14,7 +14,7 @@ import time
 import numpy as np
 from numpy.typing import NDArray
 
-from brainbench.core.errors import UsageError
+from brainbench.core.errors import UsageError, check_once
 from brainbench.core.reading.ranges import check_number
 from robotics_bridge.deploy import frames
 from robotics_bridge.deploy.driver import HandReading, LinkCounters
@@ -42,7 +42,7 @@ class UdpDriver:
         max_age: Oldest report that is used (s).
 
     Raises:
-        UsageError: there is no such host or port, or a number is out of range.
+        UsageError: there is no such host or port, a name occurs twice, or a number or the key is out of range.
     """
 
     def __init__(
@@ -56,6 +56,10 @@ class UdpDriver:
     ) -> None:
         check_number("joints of a hand", len(joints), least=1, most=frames.MOST)
         check_number("fingers of a hand", len(fingers), most=frames.MOST)
+        check_once("joints of a hand", joints)
+        check_once("fingers of a hand", fingers)
+        check_number("port of a hand", address[1], least=1, most=65535, whole=True)
+        frames.check_key(key)
         check_number("max_age (s)", max_age, above=0, most=MOST_AGE)
         self.address, self.joints, self.fingers = (address[0] or LOOPBACK, address[1]), joints, fingers
         self.counters = LinkCounters()
@@ -71,7 +75,7 @@ class UdpDriver:
         try:
             # Connected: the system binds it to the one interface on the way and drops what other sources send.
             self._socket.connect(self.address)
-        except (OSError, OverflowError, UnicodeError) as error:
+        except (OSError, UnicodeError) as error:
             self._socket.close()
             raise UsageError(f"There is no way to a hand at {self.address[0]}:{self.address[1]} ({error}).") from error
         self._greet(time.monotonic())

@@ -101,7 +101,7 @@ class TouchScene:
     """Links, their geometries and the pairs that may touch; says nothing about motion.
 
     Raises:
-        UsageError: a name occurs twice, a geometry names an unknown link, or variants are empty.
+        UsageError: a name occurs twice, a link or number is unknown, or variants are empty.
     """
 
     links: tuple[str, ...]
@@ -119,6 +119,13 @@ class TouchScene:
                 raise UsageError(f"The scene has two of the {what} {twice[0]!r}; names must differ.")
         if not all(self.variants.values()):
             raise UsageError("Variants of a geometry need at least one shape.")
+        numbered = (
+            ("link", len(self.links), {n for pair in self.excluded for n in pair}),
+            ("geometry", len(self.geometries), {*self.variants, *(n for pair in self.included for n in pair)}),
+        )
+        for what, count, numbers in numbered:
+            if strange := sorted(number for number in numbers if not 0 <= number < count):
+                raise UsageError(f"The scene has {count} of what is called {what}; there is no number {strange[0]}.")
         for geometry in self.geometries:
             check_name("link", geometry.link, self.links, hint=f"Geometry {geometry.name!r} is fixed to it.")
 

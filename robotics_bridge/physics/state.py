@@ -158,20 +158,22 @@ class HandState:
                 is set to 0, and forces to NaN: nothing is left of earlier contacts.
 
         Raises:
-            UsageError: there are more contacts than room, or an environment or a quantity is unknown.
+            UsageError: there are more contacts than room, an environment or quantity is unknown, or a shape is another.
         """
         wp = warp()
-        environments = np.asarray(env, dtype=np.int32).reshape(-1)
-        pairs = np.asarray(geometries, dtype=np.int32).reshape(-1, 2)
+        environments, pairs = (np.asarray(values, dtype=np.float64).reshape(-1) for values in (env, geometries))
         count, room = len(environments), self.contact_env.shape[0]
         if count > room:
             raise UsageError(
                 f"The state has room for {room} contacts; received {count}. Make it with contacts={count}."
             )
-        if len(pairs) != count:
-            raise UsageError(f"Every contact needs one pair of geometries; received {count} and {len(pairs)}.")
+        if len(pairs) != 2 * count:
+            raise UsageError(f"Every contact needs one pair of geometries; received {count} and {len(pairs) / 2:g}.")
         for environment in (environments.min(initial=0), environments.max(initial=0)):
             check_number("environment of a contact", environment, least=0, below=self.num_envs)
+        numbers = np.concatenate([environments, pairs])
+        if not (numbers == np.floor(np.abs(numbers))).all():
+            raise UsageError("Environments and geometries of contacts are whole numbers from 0; others came.")
         check_each("quantity of a contact", optional, _CONTACT)
         for name, values in {"env": environments, "geom": pairs, **_CONTACT, **optional}.items():
             view = wp.to_torch(getattr(self, f"contact_{name}"))[:count]
@@ -179,6 +181,10 @@ class HandState:
                 view.fill_(values)
             else:
                 rows = np.asarray(values, dtype=np.float32 if view.dtype.is_floating_point else np.int32)
+                if rows.size != view.numel():
+                    raise UsageError(
+                        f"{name} of {count} contacts has the shape {tuple(view.shape)}; received {rows.shape}."
+                    )
                 view.copy_(_tensor(rows.reshape(tuple(view.shape))))
         self.contact_count.fill_(count)
 

@@ -154,7 +154,7 @@ def test_faults_have_ranges(name, value) -> None:
 @pytest.mark.parametrize(("joints", "fingers"), [(0, 0), (256, 0), (1, 256), (100_000, 1)])
 def test_hands_of_no_or_too_many_joints_are_refused(joints, fingers) -> None:
     with pytest.raises(UsageError, match=rf"(joints|fingers) of a hand .*received ({joints}|{fingers})\."):
-        UdpDriver(("", 9), ("j",) * joints, ("f",) * fingers, new_key())
+        UdpDriver(("", 9), tuple(map(str, range(joints))), tuple(map(str, range(fingers))), new_key())
     for age in (*NOT_FINITE, 0.0, 100.0):
         with pytest.raises(UsageError, match="max_age"):
             UdpDriver(("", 9), ("j",), (), new_key(), max_age=age)

@@ -213,3 +213,23 @@ def test_the_controller_listens_on_loopback_alone_and_bad_addresses_are_refused(
     for address in (("127.0.0.1", 70_000), ("no such host", 5000), ("x" * 300, 5000)):
         with pytest.raises(UsageError, match=str(address[1])):
             UdpDriver(address, ("a",), (), KEY)
+
+
+@pytest.mark.parametrize("key", [b"", b"short", "k" * 32, bytes(33)])
+def test_a_hand_without_a_whole_key_is_open_to_nobody(key) -> None:
+    with pytest.raises(UsageError, match="key of a hand is 32 bytes"):
+        UdpDriver(("", 9), ("a",), (), key)
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as link, pytest.raises(UsageError, match="32 bytes"):
+        HandLink(link, key, 1, 0)
+
+
+@pytest.mark.parametrize(
+    ("address", "joints", "fingers", "told"),
+    [
+        (("", 0), ("a",), (), "port of a hand .*received 0"), (("", "9"), ("a",), (), "port of a hand .*'9'"),
+        (("", 9), ("a", "a"), (), "joints of a hand names 'a'"), (("", 9), ("a",), ("f", "f"), "fingers .*'f'"),
+    ],
+)  # fmt: skip
+def test_a_hand_that_cannot_be_told_apart_is_not_called(address, joints, fingers, told) -> None:
+    with pytest.raises(UsageError, match=told):
+        UdpDriver(address, joints, fingers, KEY)

@@ -228,3 +228,19 @@ def test_sensors_read_the_same_from_both_engines_with_objects_that_differ() -> N
     scale = np.abs(read[0]["taxel"]).max()
     np.testing.assert_allclose(read[1]["taxel"], read[0]["taxel"], atol=0.03 * scale)
     assert np.abs(read[0]["depth"][0] - read[0]["depth"][1]).max() > 1e-4
+
+
+@pytest.mark.parametrize(
+    ("env", "geometries", "options", "told"),
+    [
+        ([0.5], [[0, 1]], {}, "whole numbers"), ([0], [[-1, 1]], {}, "whole numbers"),
+        ([0], [[0, np.nan]], {}, "whole numbers"), ([0], [0, 1, 2], {}, r"received 1 and 1\.5"),
+        ([0], [[0, 1]], {"normal": [1, 0]}, r"normal of 1 contacts .*received \(2,\)"),
+    ],
+)  # fmt: skip
+def test_contacts_are_of_whole_numbers_and_have_their_shapes(env, geometries, options, told) -> None:
+    state = HandState.empty(2, 3, contacts=2)
+    state.set_contacts([], [])
+    state.set_contacts([1.0], [[0, 1]], force=[2.0])
+    with pytest.raises(UsageError, match=told):
+        state.set_contacts(env, geometries, **options)

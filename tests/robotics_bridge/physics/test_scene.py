@@ -97,6 +97,9 @@ def test_compiled_variants_differ_where_they_should() -> None:
         (lambda: TouchScene(("w", "w")), "two of the link 'w'"),
         (lambda: TouchScene(("w",), (Geometry(name="a", link="v", kind="plane"),)), "Geometry 'a' is fixed"),
         (lambda: TouchScene(("w",), variants={0: ()}), "at least one shape"),
+        (lambda: TouchScene(("w",), excluded=frozenset({(0, 1)})), "no number 1"),
+        (lambda: TouchScene(("w",), included=frozenset({(0, 1)})), "no number 0"),
+        (lambda: TouchScene(("w",), variants={-1: (Geometry(name="a", link="w", kind="plane"),)}), "no number -1"),
     ],
 )
 def test_mistakes_are_named(make: object, message: str) -> None:
