@@ -172,8 +172,8 @@ class HandState:
         for environment in (environments.min(initial=0), environments.max(initial=0)):
             check_number("environment of a contact", environment, least=0, below=self.num_envs)
         numbers = np.concatenate([environments, pairs])
-        if not (numbers == np.floor(np.abs(numbers))).all():
-            raise UsageError("Environments and geometries of contacts are whole numbers from 0; others came.")
+        if not (numbers == np.rint(numbers)).all():
+            raise UsageError("Environments and geometries of contacts are whole numbers; others came.")
         check_each("quantity of a contact", optional, _CONTACT)
         for name, values in {"env": environments, "geom": pairs, **_CONTACT, **optional}.items():
             view = wp.to_torch(getattr(self, f"contact_{name}"))[:count]

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brainbench.core.errors import UsageError, check_each
+from brainbench.core.reading.ranges import check_number
 from brainbench.core.trials import Trials
 from brainbench.datasets.synthetic.design import MODULATION, PopulationDesign
 from brainbench.datasets.synthetic.geometry import ResponseGeometry
@@ -78,7 +79,11 @@ def measure_ceiling(
     all, are left out. ``simulations`` studies are drawn, each of ``design.animals`` animals. Returns the ceiling and
     its Monte-Carlo standard error; NaN if no animal has all stimuli, an RDM is flat (two stimuli), or there is one
     animal only for the error.
+
+    Raises:
+        UsageError: no positive number of simulations.
     """
+    check_number("simulations", simulations, least=1, whole=True)
     truth, stimuli = geometry.rdm, len(geometry.labels)
     scores: list[float] = []
     for number in range(simulations):
@@ -112,13 +117,15 @@ def calibrate(
 
     from scipy.optimize import root_scalar
 
+    check_number("ceiling", ceiling, above=0, most=1)
+
     def excess(modulation: float) -> float:
         """Return by how much the ceiling at a modulation exceeds the wanted one."""
         tried = replace(design, modulation=modulation)
         return measure_ceiling(geometry, tried, simulations=simulations, seed=seed)[0] - ceiling
 
     highest = excess(MODULATION)
-    if not (ceiling > 0 and highest >= 0):
+    if not highest >= 0:
         raise UsageError(
             f"A noise ceiling of {ceiling:g} is out of reach: this design has up to {highest + ceiling:.3f}. "
             f"More units or trials, a higher rate, less dispersion or a smaller individual share raise it."

@@ -64,7 +64,10 @@ class ResponseGeometry:
 
 def _checked(features: ArrayLike, width: int) -> NDArray[np.float64]:
     """Return features [K, F] as finite numbers, K ≥ 2 and F ≥ width."""
-    values = np.asarray(features, dtype=np.float64)
+    given = np.asarray(features)
+    if given.dtype.kind not in "biuf":
+        raise UsageError(f"Features are real numbers; received {given.dtype}.")
+    values = given.astype(np.float64)
     if values.ndim != 2 or len(values) < 2 or values.shape[1] < width:
         raise UsageError(f"Features are [stimulus, feature], at least 2 × {width}; received shape {values.shape}.")
     if not np.isfinite(values).all():

@@ -303,3 +303,18 @@ def test_trial_blocks_take_simulated_sessions_as_they_are():
     found = subject_rdm(animal.subject, trials, 6, splits=50)
     np.testing.assert_allclose(found.rdm, measured([animal])[0])
     assert found.reliability > 0.8
+
+
+@pytest.mark.parametrize(
+    ("ask", "told"),
+    [
+        (lambda geometry, design: measure_ceiling(geometry, design, simulations=0), "simulations .*0"),
+        (lambda geometry, design: measure_ceiling(geometry, design, simulations=1.5), r"simulations .*1\.5"),
+        (lambda geometry, design: calibrate(geometry, design, ceiling=np.nan), "ceiling .*nan"),
+        (lambda geometry, design: calibrate(geometry, design, ceiling=90), "ceiling .*received 90"),
+        (lambda geometry, design: ResponseGeometry.from_features([[1j, 2], [3, 4]]), "real numbers"),
+    ],
+)
+def test_ceilings_and_features_that_are_none_are_refused_before_anything_is_drawn(ask, told):
+    with pytest.raises(UsageError, match=told):
+        ask(ResponseGeometry.from_features(np.eye(3)), PopulationDesign(animals=1, units=2))
