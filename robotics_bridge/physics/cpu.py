@@ -54,7 +54,7 @@ class MujocoEngine:
         check_number("environments of an engine", num_envs, least=1, most=MOST_ENVS, whole=True)
         if threads is not None:
             check_number("threads of an engine", threads, least=1, whole=True)
-        models = list(model) if isinstance(model, (list, tuple)) else [model]
+        models: list[Any] = list(model) if isinstance(model, (list, tuple)) else [model]
         self.model: Any = models[0]
         """The model, or the first of its variants."""
         for each in models:
