@@ -133,7 +133,7 @@ def test_a_spin_turns_about_its_axis_by_the_integral_of_its_speed():
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (((1.0, 2.0),), r"\(rad/s\) must be three"),
+        (((1.0, 2.0),), r"\(rad/s\) holds 3 numbers"),
         (((0, 0, 1), -1.0), "spin onset .s. .*at least 0; received -1"),
     ],
 )
