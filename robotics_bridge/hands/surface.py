@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from brainbench.core.devices import mujoco_module
 from brainbench.core.errors import UsageError
-from brainbench.core.reading.ranges import check_number, check_vector
+from brainbench.core.reading.ranges import check_number, check_numbers
 from brainbench.core.rotations import to_matrices
 from robotics_bridge.sensors.probes.placement import Probes
 
@@ -51,7 +51,7 @@ def cast_grid(
     for name, number in {"rows": rows, "columns": columns}.items():
         check_number(name, number, least=1, whole=True)
     check_number("extent", extent, above=0, most=1)
-    check_vector("facing", facing)
+    check_numbers("facing", facing, 3)
     body = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, link)
     if body < 0:
         raise UsageError(f"The model has no link {link!r}.")

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from brainbench.core.errors import UsageError, shown
-from brainbench.core.reading.ranges import check_number
+from brainbench.core.reading.ranges import check_number, check_numbers
 
 
 def check_range(name: str, value: Any, *, least: float = -math.inf) -> None:
@@ -20,27 +20,15 @@ def check_range(name: str, value: Any, *, least: float = -math.inf) -> None:
         raise UsageError(f"{name} is a range (low, high); received {shown(value)}.")
 
 
-def check_place(name: str, value: Any) -> None:
-    """Raise UsageError unless a value is three finite coordinates."""
-    _check_vector(name, value, 3)
-
-
 def unit_vector(name: str, value: Any, count: int) -> tuple[float, ...]:
     """Return an axis (3 numbers) or a quaternion (4) of unit length; one that has it stays as it is.
 
     Raises:
         UsageError: there are not so many finite numbers, or they have no length.
     """
-    _check_vector(name, value, count)
+    check_numbers(name, value, count)
     length = math.hypot(*value)
     if not length > 0:
         raise UsageError(f"{name} has no length; received {shown(value)}.")
     # Numbers that are written with a few digits count as they are written.
     return tuple(value) if abs(length - 1) < 1e-6 else tuple(one / length for one in value)
-
-
-def _check_vector(name: str, value: Any, count: int) -> None:
-    if not (isinstance(value, Sequence) and not isinstance(value, str) and len(value) == count):
-        raise UsageError(f"{name} holds {count} numbers; received {shown(value)}.")
-    for one in value:
-        check_number(f"A number of {name}", one)

@@ -14,8 +14,8 @@ from typing import Any
 
 from brainbench.core.devices import mujoco_module
 from brainbench.core.errors import UsageError, shown
-from brainbench.core.reading.ranges import check_fields
-from robotics_bridge.tasks.checks import check_place, unit_vector
+from brainbench.core.reading.ranges import check_fields, check_numbers
+from robotics_bridge.tasks.checks import unit_vector
 
 GRAIN = 1e-4
 """Half size of the stand-in for a solid that a shape lacks [m]."""
@@ -50,7 +50,7 @@ class ObjectPrimitive:
                 f"A {self.kind} has {_SIZES[self.kind]} positive size(s) in metres, at most {LARGEST:g}; received "
                 f"{shown(self.size)}."
             )
-        check_place(f"The position of a {self.kind}", self.position)
+        check_numbers(f"The position of a {self.kind}", self.position, 3)
         object.__setattr__(self, "quaternion", unit_vector(f"The quaternion of a {self.kind}", self.quaternion, 4))
 
 

@@ -8,8 +8,8 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 from brainbench.core.errors import UsageError, check_name
-from brainbench.core.reading.ranges import check_fields, check_number
-from robotics_bridge.tasks.checks import check_place, check_range, unit_vector
+from brainbench.core.reading.ranges import check_fields, check_number, check_numbers
+from robotics_bridge.tasks.checks import check_range, unit_vector
 from robotics_bridge.tasks.contact_model import CONTACTS, ContactModel
 from robotics_bridge.tasks.goals import Goal
 from robotics_bridge.tasks.objects import PRIMITIVES, ObjectShape
@@ -135,7 +135,7 @@ class Placement:
         for name in ("x", "y", "yaw"):
             check_range(f"placement.{name}", getattr(self, name))
         for site in self.sites:
-            check_place("A site of placement.sites", site)
+            check_numbers("A site of placement.sites", site, 3)
         object.__setattr__(self, "quaternion", unit_vector("placement.quaternion", self.quaternion, 4))
 
 
@@ -307,7 +307,7 @@ class Task:
     def _check_places(self, of: str) -> None:
         poses = {}
         for hand, (place, quaternion) in self.hand_poses.items():
-            check_place(f"The place of {hand!r} in hand_poses {of}", place)
+            check_numbers(f"The place of {hand!r} in hand_poses {of}", place, 3)
             poses[hand] = (tuple(place), unit_vector(f"The quaternion of {hand!r} in hand_poses {of}", quaternion, 4))
         object.__setattr__(self, "hand_poses", poses)
         if self.turn_axis is not None:

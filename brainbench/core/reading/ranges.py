@@ -32,6 +32,15 @@ def check_number(
     )
 
 
+def check_numbers(name: str, value: Any, count: int, **bounds: Any) -> None:
+    """Raise a :class:`UsageError` unless ``value`` holds so many numbers that :func:`check_number` takes."""
+    values = list(value) if isinstance(value, Iterable) else []
+    if len(values) != count:
+        raise UsageError(f"{name} holds {count} numbers; received {shown(value)}.")
+    for one in values:
+        check_number(name, one, **bounds)
+
+
 def check_fields(options: Any, *names: str, of: str = "{}", items: int = 0, **bounds: Any) -> None:
     """Check fields of a dataclass as :func:`check_number` does; None passes where the type of the field allows it.
 
@@ -43,8 +52,7 @@ def check_fields(options: Any, *names: str, of: str = "{}", items: int = 0, **bo
         value, told = getattr(options, name), of.replace("{}", name)
         if value is None and "None" in kinds[name]:
             continue
-        values = [value] if not items else list(value) if isinstance(value, Iterable) else []
-        if len(values) != max(items, 1):
-            raise UsageError(f"{told} holds {items} numbers; received {shown(value)}.")
-        for one in values:
-            check_number(told, one, **bounds)
+        if items:
+            check_numbers(told, value, items, **bounds)
+        else:
+            check_number(told, value, **bounds)

@@ -15,7 +15,7 @@ from scipy.sparse.linalg import eigsh
 
 from brainbench.core.errors import UsageError, shown
 from brainbench.core.files import cache_dir, content_hash, to_plain
-from brainbench.core.reading.ranges import check_number, check_vector
+from brainbench.core.reading.ranges import check_number, check_numbers
 from brainbench.core.reading.sealed import read_sealed, write_sealed
 from robotics_bridge.physics.scene import Geometry
 from robotics_bridge.sensors.audio import tetrahedra
@@ -55,7 +55,7 @@ def find_modes(
     chosen = elastic_material(material)
     for name, point in {"strike": strike, "hear": hear}.items():
         if point is not None:
-            check_vector(f"{name} (m)", point)
+            check_numbers(f"{name} (m)", point, 3)
     shape = (solid.kind, list(solid.size), None if solid.mesh is None else solid.mesh.content_hash)
     points = [None if point is None else np.asarray(point, float).tolist() for point in (strike, hear)]
     path = cache_dir("modes") / f"{content_hash(_VERSION, shape, to_plain(chosen), count, cells, points)}.npz"

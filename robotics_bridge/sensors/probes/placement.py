@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from brainbench.core.errors import UsageError, shown
-from brainbench.core.reading.ranges import check_fields, check_number, check_vector
+from brainbench.core.reading.ranges import check_fields, check_number, check_numbers
 from brainbench.geometry import Mesh
 
 
@@ -96,7 +96,7 @@ class Probes:
         """
         for name, number in {"rows": rows, "columns": columns}.items():
             check_number(name, number, least=1, whole=True)
-        check_vector("center", center)
+        check_numbers("center", center, 3)
         if np.shape(size) != (2,):
             raise UsageError(f"size is the extent along rows and columns (m); received {size!r}.")
         n = _direction("normal", normal)
