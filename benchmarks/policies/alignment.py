@@ -29,11 +29,11 @@ from brainbench.core.figures.style import COLORS, PALE, panels, save_figure
 from brainbench.core.files import read_json, write_json
 from brainbench.datasets import WhiskingDataset
 from brainbench.models.architecture import Architecture
-from brainbench.models.graph.temporal_graph import TemporalGraph
 from brainbench.models.network import EncoderAttenderDecoder
 from brainbench.models.registry import load_model
 from brainbench.models.streaming import StreamingStep
 from robotics_bridge.policies.encoders.taxel_grid import TaxelGrid
+from robotics_bridge.policies.readouts.arms import without_latency
 from robotics_bridge.policies.readouts.probe import ProbeOptions, plain, read_arm, roll_out
 from robotics_bridge.policies.readouts.rollout import TARGETS, TouchRollout, calibrate
 
@@ -66,8 +66,7 @@ def board() -> dict[str, dict[str, Any]]:
 
 def network_of(name: str, seed: int) -> EncoderAttenderDecoder:
     """Return a network of the registry that answers without added latency."""
-    graph = isinstance(load_model(name, seed=seed).encoder, TemporalGraph)  # pyright: ignore[reportAttributeAccessIssue]
-    network = load_model(name, seed=seed, **({"unroll": "full"} if graph else {}))
+    network = load_model(name, seed=seed, **without_latency(name))
     assert isinstance(network, EncoderAttenderDecoder)
     return network.eval().requires_grad_(False)
 

@@ -23,6 +23,9 @@ def probe(
     options: Any,
     agent: Annotated[str, typer.Option(help="Policy that acts: a shipped teacher, or a run's folder.")],
     arm: Annotated[list[str] | None, typer.Option(help="Only this arm; once for each.")] = None,
+    network: Annotated[
+        list[str] | None, typer.Option(help="One more network: a model, local-dir:FOLDER, …; once for each.")
+    ] = None,
     envs: EnvsOption = 48,
     device: DeviceOption = "cpu",
     layout: Annotated[
@@ -45,7 +48,7 @@ def probe(
     from robotics_bridge.policies.readouts import probe as readouts
     from robotics_bridge.tasks.contact_model import contacts_name
 
-    options = replace(options, arms=tuple(arm or ()))
+    options = replace(options, arms=tuple(arm or ()), networks=tuple(network or ()))
     if layout is not None and options.place is None:
         raise UsageError("--layout takes the taxels that --place NUMBER chooses; received none.")
     world.check([agent])

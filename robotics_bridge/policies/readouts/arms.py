@@ -11,6 +11,8 @@ from dataclasses import dataclass, replace
 import torch
 
 from brainbench.core.contracts import CHANNELS
+from brainbench.models.graph.temporal_graph import TemporalGraph
+from brainbench.models.registry import load_model
 from robotics_bridge.hands.observations import TAXELS_IN_CONTACT
 from robotics_bridge.policies.encoders.calibration import HandCalibration
 from robotics_bridge.policies.encoders.front_end import FrontEnd
@@ -57,11 +59,21 @@ def bits(rollout: TouchRollout, links: Sequence[int]) -> Features:
     return torch.stack(parts, -1).float().flatten(2)
 
 
+def without_latency(model: str) -> dict[str, str]:
+    """Return the options with which a network answers at once; only temporal graphs add latency.
+
+    Raises:
+        UsageError: there is no such network.
+    """
+    graph = isinstance(getattr(load_model(model), "encoder", None), TemporalGraph)
+    return {"unroll": "full"} if graph else {}
+
+
 def network(
     rollout: TouchRollout, grid: TaxelGrid, calibration: HandCalibration, *, model: str, time: Time, seed: int
 ) -> Features:
     """Return the features of a network that steps through the rollout, its memory forgotten where episodes begin."""
-    front = FrontEnd(model, grid, time=time, calibration=calibration, seed=seed, options={"unroll": "full"})
+    front = FrontEnd(model, grid, time=time, calibration=calibration, seed=seed, options=without_latency(model))
     front = front.to(rollout.taxels.device)
     state, found = front.init_state(rollout.taxels.shape[1]), []
     for reading, first in zip(rollout.taxels, rollout.begun, strict=True):
@@ -102,7 +114,8 @@ class Subject:
     """Of the first reservoir."""
 
 
-def _networks(time: Time, name: str, one: Subject, seeds: Sequence[int] = (0,)) -> list[Features]:
+def networks(time: Time, name: str, one: Subject, seeds: Sequence[int] = (0,)) -> list[Features]:
+    """Return the features of a network, once for each seed of weights that are drawn."""
     return [network(one.rollout, one.grid, one.calibration, model=name, time=time, seed=seed) for seed in seeds]
 
 
@@ -141,13 +154,13 @@ ARMS: Mapping[str, Callable[[Subject], list[Features]]] = {
     "grid, posture, memory": _with_traces(lambda one: grid(bent(one))),
     "reservoir": _reservoirs,
     "reservoir, posture": lambda one: _reservoirs(bent(one)),
-    "untrained": lambda one: _networks("native", NETWORK, one, range(one.untrained)),
-    "simclr": lambda one: _networks("native", f"{NETWORK}.simclr", one),
-    "simclr, posture": lambda one: _networks("native", f"{NETWORK}.simclr", bent(one)),
-    "supervised": lambda one: _networks("native", f"{NETWORK}.supervised", one),
-    "untrained, 45 ms": lambda one: _networks("resampled", NETWORK, one, range(one.untrained)),
-    "simclr, 45 ms": lambda one: _networks("resampled", f"{NETWORK}.simclr", one),
-    "supervised, 45 ms": lambda one: _networks("resampled", f"{NETWORK}.supervised", one),
+    "untrained": lambda one: networks("native", NETWORK, one, range(one.untrained)),
+    "simclr": lambda one: networks("native", f"{NETWORK}.simclr", one),
+    "simclr, posture": lambda one: networks("native", f"{NETWORK}.simclr", bent(one)),
+    "supervised": lambda one: networks("native", f"{NETWORK}.supervised", one),
+    "untrained, 45 ms": lambda one: networks("resampled", NETWORK, one, range(one.untrained)),
+    "simclr, 45 ms": lambda one: networks("resampled", f"{NETWORK}.simclr", one),
+    "supervised, 45 ms": lambda one: networks("resampled", f"{NETWORK}.supervised", one),
 }
 """Arm → its features, once for each draw; every arm has the joints beside them. ``none`` feels nothing, ``bits`` has
 one bit per link, ``force`` and ``taxels`` every taxel's force, and force with torque; ``memory`` adds two leaky

@@ -12,13 +12,14 @@ from typing import Any
 import numpy as np
 import torch
 
-from brainbench.core.errors import UsageError, check_name
+from brainbench.core.errors import UsageError, check_each, check_once
 from brainbench.core.progress import Progress
 from robotics_bridge.envs.env import Env
 from robotics_bridge.hands.layouts import PLACEMENTS, Layout
+from robotics_bridge.policies.encoders.front_end import FrontEnd
 from robotics_bridge.policies.encoders.taxel_grid import TaxelGrid
 from robotics_bridge.policies.evaluate import Acting
-from robotics_bridge.policies.readouts.arms import ARMS, Features, Subject
+from robotics_bridge.policies.readouts.arms import ARMS, Features, Subject, networks
 from robotics_bridge.policies.readouts.placement import (
     HALVES,
     Placed,
@@ -46,15 +47,17 @@ class ProbeOptions:
     """Seed of the episodes, of the reservoirs and of random placements."""
     arms: tuple[str, ...] = ()
     """Arms of :data:`ARMS`; all by default."""
+    networks: tuple[str, ...] = ()
+    """More networks, each an arm of its name: models of the registry, ``local-dir:FOLDER``."""
     place: int | None = None
     """Choose so many taxels, and compare them with all and with others, in place of the arms."""
     draws: int = 10
     """Random placements of so many taxels."""
 
     def __post_init__(self) -> None:
-        for name in self.arms:
-            check_name("arm of a probe", name, ARMS)
-        if self.place is not None and self.arms:
+        check_each("arm of a probe", self.arms, ARMS)
+        check_once("networks of a probe", self.networks)
+        if self.place is not None and (self.arms or self.networks):
             raise UsageError("A probe either compares arms or places taxels; received both.")
         if not (0.5 <= self.seconds <= 600 and min(self.reservoirs, self.untrained, self.draws) >= 1):
             raise UsageError(
@@ -91,15 +94,17 @@ def probe(env: Env, policy: Acting, options: ProbeOptions, progress: Progress | 
     """Roll a policy out once and read the targets from every arm.
 
     Raises:
-        UsageError: the environment does not fit, or too few environments touch the object.
+        UsageError: the environment or a network does not fit, or too few environments touch the object.
         DataError: nothing is touched.
     """
     check_environments(env)
     say = progress or (lambda done, total, what: None)
-    names = options.arms or tuple(ARMS)
+    names = (*(options.arms or ARMS), *options.networks)
     say(0, len(names) + 1, "rolling out")
     touch, layout = env.options, env.hand.layout(env.options.resolution, env.options.placement)
     grid = TaxelGrid(env.hand, placement=touch.placement, resolution=touch.resolution).to(env.device)
+    for name in options.networks:
+        FrontEnd(name, grid)  # refuses what no policy can step, before anything is slow
     calibration = calibrate(env, policy, grid, options.seed)
     rollout = roll_out(env, policy, options)
     links = tuple(int(probes.active.sum()) for probes in layout.values())
@@ -107,7 +112,8 @@ def probe(env: Env, policy: Acting, options: ProbeOptions, progress: Progress | 
     found = []
     for index, name in enumerate(names):
         say(index + 1, len(names) + 1, f"reading {name}")
-        found.append(read_arm(name, rollout, ARMS[name](subject)))
+        draws = ARMS[name](subject) if name in ARMS else networks("native", name, subject)
+        found.append(read_arm(name, rollout, draws))
     return found
 
 
@@ -170,9 +176,10 @@ def plain(one: Readout, less: Readout | None = None) -> dict[str, Any]:
 
 
 def differences(readouts: Sequence[Readout]) -> list[dict[str, Any]]:
-    """Return the differences of :data:`CONTRASTS` whose two arms are there."""
+    """Return the differences of :data:`CONTRASTS` whose arms are there, and of other networks from the reservoir."""
     by_name = {one.arm: one for one in readouts}
-    return [plain(by_name[a], by_name[b]) for a, b in CONTRASTS if a in by_name and b in by_name]
+    pairs = [*CONTRASTS, *((name, "reservoir") for name in by_name if name not in ARMS)]
+    return [plain(by_name[a], by_name[b]) for a, b in pairs if a in by_name and b in by_name]
 
 
 def placements(found: Sequence[Placed]) -> dict[str, Any]:

@@ -7,12 +7,13 @@ import pytest
 import torch
 
 from brainbench.core.errors import UsageError
+from brainbench.models.training.checkpoints import shipped
 from robotics_bridge import tasks
 from robotics_bridge.policies.encoders.calibration import HandCalibration
 from robotics_bridge.policies.encoders.taxel_grid import TaxelGrid
 from robotics_bridge.policies.evaluate import agent
 from robotics_bridge.policies.readouts import arms
-from robotics_bridge.policies.readouts.probe import ProbeOptions, probe
+from robotics_bridge.policies.readouts.probe import ProbeOptions, differences, probe
 from robotics_bridge.policies.readouts.regression import Readout, read_targets
 from robotics_bridge.policies.readouts.rollout import TARGETS, TouchRollout, calibrate, collect
 
@@ -100,11 +101,19 @@ def test_a_rollout_in_a_task_is_read_from_every_arm_of_a_probe() -> None:
     env = tasks.make(
         "in_palm_rotate", num_envs=10, observe="force_torque", placement="tips", resolution="low", threads=1
     )
-    options = ProbeOptions(seconds=1.0, arms=("none", "bits", "taxels, memory", "reservoir"), reservoirs=2)
-    found = {one.arm: one for one in probe(env, agent("random", env), options)}
-    assert [len(one.errors) for one in found.values()] == [1, 1, 1, 2]
+    names = ("none", "bits", "taxels, memory", "reservoir", "simclr")
+    own = f"local-dir:{shipped()[f'{arms.NETWORK}.simclr']}"
+    options = ProbeOptions(seconds=1.0, arms=names, reservoirs=2, networks=("s4-small", own))
+    read = probe(env, agent("random", env), options)
+    found = {one.arm: one for one in read}
+    assert [len(one.errors) for one in found.values()] == [1, 1, 1, 2, 1, 1, 1]
+    # A folder of the same weights is the same network.
+    assert found[own].r2("position") == found["simclr"].r2("position") != found["s4-small"].r2("position")
+    assert {(row["arm"], row["less"]) for row in differences(read)} >= {("s4-small", "reservoir"), (own, "reservoir")}
     assert found["none"].features == 0
     assert all(np.isfinite([one.r2(name) for name in TARGETS]).all() for one in found.values())
+    with pytest.raises(UsageError, match="runs without end"):
+        probe(env, agent("random", env), ProbeOptions(networks=("zhuang-small+gpt",)))
     with pytest.raises(UsageError, match="observe='force_torque'"):
         probe(tasks.make("in_palm_rotate", num_envs=10, threads=1), agent("zero", env), options)
     with pytest.raises(UsageError, match="at least 10 environments; received 2"):
