@@ -6,6 +6,7 @@ import re
 import shlex
 import subprocess
 import sys
+from functools import cache
 from itertools import groupby
 from pathlib import Path
 from typing import Any
@@ -93,18 +94,23 @@ def test_a_page_needs_no_renderer_of_its_own(page: str):
 
 @pytest.mark.parametrize("page", [*FRONT, *PAGES, *(page for page in OTHERS if page != "CHANGELOG.md")])
 def test_commands_and_options_of_a_page_exist(page: str):
-    import typer
-
-    from brainbench.cli import app
-
     for line in _commands(page):
-        command, words = typer.main.get_command(app), shlex.split(line, comments=True)[1:]
+        command, words = _program(), shlex.split(line, comments=True)[1:]
         while words and words[0] in getattr(command, "commands", {}):
             command = command.commands[words.pop(0)]
         assert not getattr(command, "commands", None) or not words or words[0].startswith("-"), f"{page}: {line}"
         known = {name for param in command.params for name in (*param.opts, *param.secondary_opts)} | {"--help"}
         used = {word.partition("=")[0] for word in words if re.fullmatch(r"--?[a-z][a-z-]*(=.*)?", word)}
         assert used <= known, f"{page}: {line} has {sorted(used - known)}; known are {sorted(known)}"
+
+
+@cache
+def _program() -> Any:
+    import typer
+
+    from brainbench.cli import app
+
+    return typer.main.get_command(app)
 
 
 def _commands(page: str) -> list[str]:

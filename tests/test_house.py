@@ -25,7 +25,11 @@ def _name(path: Path) -> str:
 
 
 MODULES = {_name(path): path for path in PRODUCT}
-TREES = {name: ast.parse(path.read_text(encoding="utf-8")) for name, path in MODULES.items()}
+
+
+@pytest.fixture(scope="module")
+def trees() -> dict[str, ast.Module]:
+    return {name: ast.parse(path.read_text(encoding="utf-8")) for name, path in MODULES.items()}
 
 
 def _imports(tree: ast.AST) -> Iterator[str]:
@@ -53,9 +57,9 @@ def test_no_module_is_private():
     assert {name for name in names if not name.endswith(("__init__.py", "__main__.py"))} == set()
 
 
-def test_no_public_class_name_is_defined_twice():
+def test_no_public_class_name_is_defined_twice(trees):
     homes = defaultdict(set)
-    for name, tree in TREES.items():
+    for name, tree in trees.items():
         for node in ast.walk(tree):
             if isinstance(node, ast.ClassDef) and not node.name.startswith("_"):
                 homes[node.name].add(name)
@@ -72,22 +76,22 @@ def test_folders_and_modules_are_small():
     assert {name: count for name, count in lines.items() if count > MOST_LINES} == {}
 
 
-def test_every_folder_says_what_is_in_it():
+def test_every_folder_says_what_is_in_it(trees):
     mute = [path.parent.relative_to(ROOT).as_posix() for path in PRODUCT if path.name == "__init__.py"]
-    assert [name for name in mute if not ast.get_docstring(TREES[name.replace("/", ".")])] == []
+    assert [name for name in mute if not ast.get_docstring(trees[name.replace("/", ".")])] == []
 
 
-def test_no_file_imports_in_a_circle():
-    graph = {name: {other for other in _imports(tree) if other in MODULES} - {name} for name, tree in TREES.items()}
+def test_no_file_imports_in_a_circle(trees):
+    graph = {name: {other for other in _imports(tree) if other in MODULES} - {name} for name, tree in trees.items()}
     try:
         TopologicalSorter(graph).prepare()
     except CycleError as error:
         pytest.fail(f"circle of imports: {' -> '.join(error.args[1])}")
 
 
-def test_kernels_stand_in_folders_of_that_name():
+def test_kernels_stand_in_folders_of_that_name(trees):
     found = []
-    for name, tree in TREES.items():
+    for name, tree in trees.items():
         for node in ast.walk(tree):
             if isinstance(node, ast.FunctionDef) and ".kernels" not in name:
                 kinds = [ast.unparse(item) for item in node.decorator_list]

@@ -72,26 +72,36 @@ def _student(folder: Path) -> Path:
 
 
 def test_playing_needs_no_package_for_training_and_checks_names_first() -> None:
-    code = (
-        "import sys\n"
-        "for name in ('rsl_rl', 'tensordict', 'tensorboard', 'gymnasium'): sys.modules[name] = None\n"
-        "from brainbench.cli import main\n"
-        "main()\n"
-    )
+    code = """
+import sys
 
-    def play(agent: str, *more: str) -> subprocess.CompletedProcess[str]:
-        words = ["policy", "play", "in_palm_rotate", "--agent", agent, "--seconds", "0.1", *more]
-        return subprocess.run([sys.executable, "-c", code, *words], capture_output=True, text=True, check=False)
+lacking, *lines = sys.argv[1:]
+sys.modules |= dict.fromkeys(lacking.split())
+from brainbench.cli import main
 
-    for agent in ("in_palm_rotate.teacher", "in_palm_rotate.student"):
-        done = play(agent)
-        assert done.returncode == 0, done.stderr
-        assert "CUDA" not in done.stderr
-    light = code.replace("'gymnasium'", "'gymnasium', 'torch', 'warp', 'mujoco'")
-    for words in (["--agent", "in_palm_rotate.teachr"], ["--video", "x.mpx"]):
-        given = [sys.executable, "-c", light, "policy", "play", "in_palm_rotate", *words]
-        done = subprocess.run(given, capture_output=True, text=True, check=False)
-        assert (done.returncode, done.stderr.count("\n")) == (2, 1), done.stderr
+for line in lines:
+    sys.argv = ["brainbench", "policy", "play", "in_palm_rotate", *line.split()]
+    try:
+        main()
+        ended = 0
+    except SystemExit as stop:
+        ended = stop.code or 0
+    print("ended", ended)
+"""
+
+    def play(lacking: str, *lines: str) -> tuple[list[str], str]:
+        """Play once for each line of arguments in a process that lacks modules: how each ended, and stderr."""
+        command = [sys.executable, "-c", code, lacking, *lines]
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+        return [line for line in done.stdout.splitlines() if line.startswith("ended")], done.stderr
+
+    training = "rsl_rl tensordict tensorboard gymnasium"
+    agents = [f"--agent in_palm_rotate.{kind} --seconds 0.1" for kind in ("teacher", "student")]
+    ended, told = play(training, *agents)
+    assert ended == ["ended 0"] * 2, told
+    assert "CUDA" not in told
+    ended, told = play(f"{training} torch warp mujoco", "--agent in_palm_rotate.teachr", "--video x.mpx")
+    assert (ended, told.count("\n")) == (["ended 2"] * 2, 2), told
 
 
 def test_shipped_policies_are_listed_with_the_contacts_that_they_were_trained_in() -> None:

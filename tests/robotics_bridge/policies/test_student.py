@@ -136,7 +136,7 @@ def test_onnx_file_follows_the_policy_for_sixty_steps_with_resets(name, tmp_path
 
 
 def test_a_policy_that_was_sampled_in_training_is_exported_and_never_as_a_program(tmp_path) -> None:
-    policy = _make_policy(distribution_cfg={"class_name": "GaussianDistribution", "init_std": 1.0})
+    policy = _make_policy("zhuang-small", distribution_cfg={"class_name": "GaussianDistribution", "init_std": 1.0})
     assert export_policy(policy, tmp_path / "policy").difference < 1e-4
     with pytest.raises(UsageError, match="ONNX"):
         policy.as_jit()
@@ -179,7 +179,7 @@ class _Numb(StepPolicy):
 def test_an_export_that_loses_the_encoder_fails_and_leaves_no_file(wrong, message, tmp_path) -> None:
     with torch.random.fork_rng():
         torch.manual_seed(0)
-        tactile = {"name": NETWORK, "placement": "tips", "resolution": "low"}
+        tactile = {"name": "mlp", "placement": "tips", "resolution": "low"}
         policy = _Forgetful(_observations(1)[0], GROUPS, "student", 12, tactile=tactile)
     policy.exported = wrong
     with pytest.raises(DataError, match=message):

@@ -44,10 +44,22 @@ def _shapes(rung, seed=0):
     return measure_shapes(trial, trace, TRUTH, 20e-6, np.random.default_rng(seed)).measured
 
 
-def test_stiffness_and_damping_of_a_ring_down_come_back(rung):
-    result = fit(
-        Trial.ringdown(KNOWN, _wrenches(rung), 8e-4), ["young_modulus", "damping_ratio", "deflection"], options=QUICK
-    )
+@pytest.fixture(scope="module")
+def pulled(rung):
+    """The measured wrenches and their fit."""
+    trial = Trial.ringdown(KNOWN, _wrenches(rung), 8e-4)
+    return trial, fit(trial, ["young_modulus", "damping_ratio", "deflection"], options=QUICK)
+
+
+@pytest.fixture(scope="module")
+def traced(rung):
+    """The traced shapes and their fit."""
+    trial = Trial.ringdown(KNOWN, _shapes(rung), 8e-4)
+    return trial, fit(trial, ["young_modulus", "density", "damping_ratio", "deflection"], options=QUICK)
+
+
+def test_stiffness_and_damping_of_a_ring_down_come_back(rung, pulled):
+    _, result = pulled
     assert result.status == "ok"
     assert result["young_modulus"].value == pytest.approx(3.5e9, rel=0.02)
     assert result["damping_ratio"].value == pytest.approx(0.2, rel=0.02)
@@ -57,9 +69,8 @@ def test_stiffness_and_damping_of_a_ring_down_come_back(rung):
     assert result.noise["Mz"] == pytest.approx(0.01 * np.abs(rung[1].wrench[:, 5]).max(), rel=0.2)
 
 
-def test_traced_shapes_tell_stiffness_over_density_and_not_both(rung):
-    trial = Trial.ringdown(KNOWN, _shapes(rung), 8e-4)
-    result = fit(trial, ["young_modulus", "density", "damping_ratio", "deflection"], options=QUICK)
+def test_traced_shapes_tell_stiffness_over_density_and_not_both(traced):
+    _, result = traced
     assert result.status == "undefined"
     assert {result[name].status for name in ("young_modulus", "density")} == {"undefined"}
     assert result["damping_ratio"].status == "ok"
@@ -144,9 +155,8 @@ def test_an_outlier_pulls_a_robust_fit_less(rung):
     assert errors[1] < 0.5 * errors[0]
 
 
-def test_two_trials_are_more_certain_than_one(rung):
-    names = ["young_modulus", "damping_ratio", "deflection"]
-    one = fit(Trial.ringdown(KNOWN, _wrenches(rung), 1e-3), names, options=QUICK)
+def test_two_trials_are_more_certain_than_one(rung, pulled):
+    names, (_, one) = ["young_modulus", "damping_ratio", "deflection"], pulled
     both = fit([Trial.ringdown(KNOWN, _wrenches(rung, seed=seed), 1e-3) for seed in (0, 1)], names, options=QUICK)
     ratio = both["young_modulus"].relative_deviation / one["young_modulus"].relative_deviation
     assert ratio == pytest.approx(np.sqrt(0.5), rel=0.15)
@@ -291,29 +301,25 @@ def test_an_iteration_costs_one_simulation(rung):
     assert model.simulated == 1
 
 
-@pytest.mark.parametrize("kind", ["wrench", "shape"])
-def test_a_fit_is_drawn(rung, tmp_path, kind):
+@pytest.mark.parametrize("kind", ["pulled", "traced"])
+def test_a_fit_is_drawn(request, tmp_path, kind):
     from PIL import Image
 
     from brainbench.stimuli.fitting.figure import draw_fit
 
-    trial = Trial.ringdown(KNOWN, _wrenches(rung) if kind == "wrench" else _shapes(rung), 1e-3)
-    result = fit(trial, ["young_modulus", "damping_ratio", "deflection"], options=QUICK)
-    path = draw_fit(trial, result, tmp_path / "fit.png")
+    path = draw_fit(*request.getfixturevalue(kind), tmp_path / "fit.png")
     pixels = np.asarray(Image.open(path).convert("RGB")).reshape(-1, 3)
     # The colour of the first series is on it, and most of it is white.
     assert (np.abs(pixels.astype(int) - [0, 114, 178]).sum(axis=1) < 40).sum() > 50
     assert 0.5 < np.mean(pixels.min(axis=1) > 250) < 0.99
 
 
-def test_the_summary_is_plain(rung):
+def test_the_summary_is_plain(traced):
     import json
 
     from brainbench.core.files import to_json
 
-    trial = Trial.ringdown(KNOWN, _shapes(rung), 1e-3)
-    result = fit(trial, ["young_modulus", "density"], options=QUICK)
-    data = json.loads(to_json(result.summary()))
+    data = json.loads(to_json(traced[1].summary()))
     assert data["status"] == "undefined"
     assert data["directions"][0]["deviation"] is None or data["directions"][0]["deviation"] > 1
     assert data["provenance"]["simulated_whiskers"] > 5
