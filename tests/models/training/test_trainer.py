@@ -47,9 +47,9 @@ def _equal(first, second):
 
 
 def test_a_run_learns_what_can_be_learned_and_leaves_a_model_to_load(tmp_path):
-    result = train(_config(epochs=8), tiny(), out=tmp_path, device="cpu")
+    result = train(_config(epochs=5), tiny(), out=tmp_path, device="cpu")
     assert result.status == "finished"
-    assert (result.steps, result.epochs) == (24, 8)
+    assert (result.steps, result.epochs) == (15, 5)
     assert result.evaluation.top1 > 0.8
     assert not result.evaluation.collapsed
     model = load_model(f"local-dir:{result.folder}")
@@ -62,7 +62,7 @@ def test_a_run_learns_what_can_be_learned_and_leaves_a_model_to_load(tmp_path):
     assert (known.trained["twin"]["name"], known.trained["twin"]["seed"]) == (MODEL, 0)
     card = (result.folder / "README.md").read_text()
     assert f"{MODEL}.supervised" in card
-    assert "8 (published: 100)" in card
+    assert "5 (published: 100)" in card
     losses = [line["loss"] for line in read_log(tmp_path, "epoch")]
     assert losses[-1] < losses[0]
 
@@ -249,7 +249,7 @@ def test_missing_data_and_devices_are_named(tmp_path):
 
 
 def test_mixed_precision_trains_and_half_precision_weights_are_evaluated_as_shipped(tmp_path):
-    config = _config(epochs=4, precision="bf16", weights_dtype="float16")
+    config = _config(epochs=1, precision="bf16", weights_dtype="float16")
     result = train(config, tiny(), out=tmp_path, device="cpu")
     assert {str(value.dtype) for name, value in _weights(tmp_path).items() if "scale" not in name} >= {"torch.float16"}
     x, labels = sweeps(9, 2)

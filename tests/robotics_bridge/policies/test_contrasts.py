@@ -80,7 +80,7 @@ def test_more_policies_of_a_draw_are_no_more_draws() -> None:
 def test_intervals_hold_the_truth_as_often_as_they_say() -> None:
     # Three draws × five seeds against five draws of one seed each; benchmarks.policies.coverage has more designs.
     rng, held = np.random.default_rng(3), []
-    for _ in range(400):
+    for _ in range(200):
         some = _crossed(rng, {"trained": 0.5}, draw=0.03).policies
         five = [TrainedPolicy("random", 0.5 + rng.normal(0, 0.03) + rng.normal(0, 0.02), s, s) for s in range(5)]
         interval = MixedModel((*some, *five)).contrast("trained", "random").interval

@@ -47,7 +47,7 @@ def _check_mutants(path, folder, cases: int) -> None:
 
 
 def test_damaged_files_are_refused_or_compute_finite_actions(exported, tmp_path) -> None:
-    _check_mutants(exported, tmp_path, 30)
+    _check_mutants(exported, tmp_path, 15)
 
 
 @pytest.mark.slow

@@ -158,11 +158,12 @@ def test_what_went_wrong_on_one_of_several_gpus_is_told(plan, tmp_path, monkeypa
         running.run_on_gpus(plan.shards, tmp_path / "file", 2, print)
 
 
-def test_a_process_of_a_gpu_that_dies_is_told(plan, tmp_path, monkeypatch):
+def test_a_process_of_a_gpu_that_dies_is_told(tmp_path, monkeypatch):
     monkeypatch.setattr(running, "gpus", lambda: ["0", "1"])
     monkeypatch.setattr(running, "_run_share", os._exit)
+    # Two shards that no process comes to.
     with pytest.raises(DataError, match="ended unexpectedly"):
-        running.run_on_gpus(plan.shards, tmp_path, 2, print)
+        running.run_on_gpus([None, None], tmp_path, 2, print)
 
 
 def test_a_shard_that_fails_ends_the_others_and_is_told(plan, tmp_path, monkeypatch):

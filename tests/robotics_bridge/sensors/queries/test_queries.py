@@ -37,7 +37,7 @@ def _read(query: str) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray], dic
         for g in OBJECTS
     }
     poses = np.stack([np.stack([random_pose(rng, 0.01) for _ in scene.links])])
-    suite = SensorSuite(scene, sensors, num_envs=1, resolution=96)
+    suite = SensorSuite(scene, sensors, num_envs=1, resolution=64)
     suite.update(state_of(scene, poses, touch=False))
     hand = poses[0, 1]
     world = rotation_of(hand[3:]).apply(_points()) + hand[:3]
@@ -155,7 +155,7 @@ def test_a_box_of_triangles_presses_like_a_box(query: str) -> None:
     for name, shape in shapes.items():
         scene = pad_scene(shape)
         taxel = KinematicTaxel(link="hand", probes=grid, query=query)  # type: ignore[arg-type]
-        suite = SensorSuite(scene, {"t": taxel}, num_envs=1, resolution=96)
+        suite = SensorSuite(scene, {"t": taxel}, num_envs=1, resolution=64)
         suite.update(state_of(scene, poses_at(3, {2: (0.0003, -0.0004, 0.005 + 0.0035)})))
         read[name] = suite.read("t").numpy()
     error = np.linalg.norm(read["mesh"] - read["box"]) / np.linalg.norm(read["box"])

@@ -104,7 +104,7 @@ def _distances(surface, points):
 @pytest.mark.parametrize("hint", [False, True])
 def test_the_nearest_triangle_is_found_wherever_the_search_begins(hint):
     surface = _surface()
-    starts, stops = _segments(surface, 60)
+    starts, stops = _segments(surface, 40)
     size = np.ptp(surface.vertices, axis=0).max()
     leaves = np.random.default_rng(1).integers(-(-len(surface.faces) // WIDE), size=len(starts)) if hint else None
     # Within so much of each, everything is found on its own.
@@ -115,10 +115,10 @@ def test_the_nearest_triangle_is_found_wherever_the_search_begins(hint):
     first = found.argmin(axis=1) == 2
     assert first.any()
     np.testing.assert_allclose(ends[first, 1], _distances(surface, starts)[first], atol=1e-9 * size)
-    share = np.linspace(0, 1, 41)[:, None, None]
-    along = _distances(surface, (starts + share * (stops - starts)).reshape(-1, 3)).reshape(41, -1).min(axis=0)
+    share = np.linspace(0, 1, 21)[:, None, None]
+    along = _distances(surface, (starts + share * (stops - starts)).reshape(-1, 3)).reshape(21, -1).min(axis=0)
     nearest = np.sqrt(found.min(axis=1))
-    half_gap = np.linalg.norm(stops - starts, axis=1) / 80
+    half_gap = np.linalg.norm(stops - starts, axis=1) / 40
     assert (nearest <= along + 1e-9 * size).all()
     assert (nearest >= along - half_gap - 1e-9 * size).all()
 
@@ -180,12 +180,12 @@ def test_a_link_outside_is_never_told_that_it_overlaps_wherever_the_search_begin
     surface = TriangleMesh(surface.vertices * (3.0 / np.ptp(surface.vertices, axis=0).max()), surface.faces)
     # Links that stand on a face, most of each further away than what is looked for on its own.
     rng = np.random.default_rng(0)
-    corners = surface.vertices[surface.faces[rng.integers(len(surface.faces), size=200)]]
+    corners = surface.vertices[surface.faces[rng.integers(len(surface.faces), size=120)]]
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     normal /= np.maximum(np.linalg.norm(normal, axis=1), 1e-12)[:, None]
     starts = corners.mean(axis=1) + 0.02 * normal
     stops = starts + 0.3 * (normal + 0.5 * rng.normal(size=normal.shape))
-    share = np.linspace(0, 1, 11)[:, None, None]
+    share = np.linspace(0, 1, 9)[:, None, None]
     points = starts + share * (stops - starts)
     outside = ~np.array([_inside(surface, some) for some in points]).any(axis=0)
     away = np.array([_distances(surface, some) for some in points]).min(axis=0)
