@@ -58,14 +58,16 @@ def _plainly(work: Callable[[], Any], monkeypatch: pytest.MonkeyPatch) -> Any:
         return work()
 
 
-@pytest.mark.parametrize("kind", ["intersection", "gru", "time-decay"])
-@pytest.mark.parametrize("unroll", ["biological", "full"])
+@pytest.mark.parametrize(
+    ("kind", "unroll"),
+    [("intersection", "biological"), ("intersection", "full"), ("gru", "full"), ("time-decay", "biological")],
+)
 def test_answers_and_gradients_in_single_precision_are_those_of_pytorch(
     kind: str, unroll: str, single: torch.device, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     # The norm of a trace is PyTorch's own and, where a trace is all but constant, magnifies rounding.
     graph = _make_graph(kind, layer_norm=kind != "time-decay").to(single)
-    x = torch.randn(3, 5, 2, 4, 5, device=single)
+    x = torch.randn(2, 4, 2, 4, 5, device=single)
     expected = _plainly(lambda: _gradients(graph, x, unroll=unroll), monkeypatch)
     for ours, theirs in zip(_gradients(graph, x, unroll=unroll), expected, strict=True):
         assert (ours - theirs).norm() <= 1e-4 * theirs.norm() + 1e-6

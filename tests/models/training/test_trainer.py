@@ -314,8 +314,8 @@ def test_a_run_killed_at_any_moment_ends_with_the_weights_of_an_unbroken_one(kil
                 break
             time.sleep(0.005)
         process.send_signal(signal.SIGKILL)
-        process.wait()
-    assert not (tmp_path / "killed" / "best" / "model.safetensors").exists() or kills > 1
+        # Only the last of several may have come to its end.
+        assert process.wait() == -signal.SIGKILL or kills > 1
     _run_here(tmp_path / "killed", monkeypatch)
     assert _equal(_weights(tmp_path / "whole"), _weights(tmp_path / "killed"))
     assert _equal(load_file(tmp_path / "whole" / "state.safetensors"), load_file(state))
