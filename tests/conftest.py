@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from hypothesis import settings
 
 # Processes that a test spawns inherit this path and find the test's module; at the end, so that the installed
 # package is the one under test.
@@ -15,6 +16,10 @@ sys.path.append(str(Path(__file__).parents[1]))
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 # So would OpenBLAS's: on two busy cores the small products of a fit took ten times as long with two threads.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+# A deadline would fail tests on a busy machine.
+settings.register_profile("untimed", deadline=None)
+settings.load_profile("untimed")
 
 REFERENCE = Path(os.environ.get("BRAINBENCH_REFERENCE", Path(__file__).parents[2] / "shared" / "reference"))
 

@@ -16,7 +16,7 @@ def _draw(seed: int, count: int = 5) -> tuple[torch.Tensor, Rotation]:
     return torch.as_tensor(turn.as_quat(scalar_first=True)), turn
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 @given(st.integers(0, 10_000))
 def test_products_and_turned_vectors_agree_with_scipy(seed: int) -> None:
     a, turn_a = _draw(seed)
@@ -32,7 +32,7 @@ def test_products_and_turned_vectors_agree_with_scipy(seed: int) -> None:
     )
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 @given(st.floats(-3.0, 3.0), st.floats(0.0, 1.5), st.floats(0.0, 6.28))
 def test_a_turn_splits_into_the_twist_and_swing_it_was_made_of(twist: float, swing: float, where: float) -> None:
     axis = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)

@@ -38,7 +38,7 @@ def shuffled(session: Session, random: np.random.Generator) -> Session:
     return Session(session.subject, session.session, type(table)("units", moved), tables)
 
 
-@settings(max_examples=4, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=4, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(seed=st.integers(0, 2**16))
 def test_order_of_trials_units_sessions_and_files_changes_nothing(tmp_path_factory, seed):
     random = np.random.default_rng(seed)

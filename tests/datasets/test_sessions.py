@@ -28,7 +28,7 @@ def test_natural_order_reads_numbers_in_text():
     assert sorted(labels, key=natural_key) == ["-1", "9", "10", "a", "b2", "b10"]
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(st.lists(st.text(), unique=True), st.randoms())
 def test_natural_order_does_not_depend_on_appearance(labels, random):
     shuffled = labels.copy()

@@ -36,7 +36,7 @@ def test_a_hemisphere_wraps_half_way_round_its_centre():
     assert winding_number(Mesh(ball.vertices, upper), [[0, 0, 0]])[0] == pytest.approx(0.5, abs=0.01)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(arrays(float, (4, 3), elements=st.floats(-1, 1, width=32)))
 def test_the_distance_from_a_triangle_is_that_of_its_nearest_point(corners):
     point, triangle = corners[0], corners[1:]

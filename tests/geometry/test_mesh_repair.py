@@ -38,7 +38,7 @@ def test_an_inside_out_mesh_is_diagnosed_and_turned():
     assert result.done == ("the surface was inside out and was turned",)
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 @given(st.data())
 def test_triangles_turned_at_random_are_made_to_agree(data):
     mesh = _ball()

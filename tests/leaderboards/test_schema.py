@@ -76,7 +76,7 @@ def test_missing_field_is_named(make_record):
     assert "score lacks 'status'" in str(_fault(data))
 
 
-@settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=150, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(data=st.data())
 def test_reading_agrees_with_jsonschema_on_damaged_records(make_record, data):
     record = json.loads(make_record().to_json())

@@ -62,7 +62,7 @@ def test_a_damaged_file_is_replaced_on_writing(make_record, tmp_path):
     assert read_record(write_record(record, tmp_path)) == record
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(name=st.text())
 def test_any_name_gives_a_plain_file_name(name):
     file_name = ResultRecord(Score(name, 0.5, "ok")).file_name

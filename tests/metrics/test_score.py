@@ -106,7 +106,7 @@ def test_one_layer_needs_no_choice():
     assert score.r == pytest.approx(np.mean([float(compare(layer, animal.rdm)) for animal in animals]))
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=15)
 @given(st.integers(0, 2**32 - 1), st.sampled_from(["default", "thesis", "thesis-input"]), st.sampled_from([1, 3]))
 def test_the_order_of_animals_sessions_trials_units_and_stimuli_is_irrelevant(seed, estimator, animals):
     rng = np.random.default_rng(seed)

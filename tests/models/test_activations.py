@@ -61,7 +61,7 @@ def test_layers_can_be_chosen_and_unknown_ones_name_the_nearest(stimuli):
         extract(model, stimuli, layers=["fc7"])
 
 
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=10)
 @given(chunk=st.integers(1, 9))
 def test_the_chunk_changes_nothing(chunk):
     x = torch.from_numpy(np.random.default_rng(1).standard_normal((7, T, 30, 5, 7)).astype(np.float32))

@@ -133,7 +133,7 @@ def test_a_normalised_cell_follows_its_equations(kind):
             torch.testing.assert_close(state, expected, atol=1e-5, rtol=1e-4)
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(tau=st.floats(-1.5, 1.5), steps=st.integers(1, 8))
 def test_time_decay_is_a_geometric_sum_of_its_inputs(tau, steps):
     cell = TimeDecay(2, 2, tau=tau)
@@ -160,7 +160,7 @@ def test_time_decay_starts_without_memory():
 
 
 @pytest.mark.parametrize("kind", [UGRNN, GRU])
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=15)
 @given(scale=st.floats(0.0, 1e4))
 def test_a_convex_gate_never_leaves_the_range_of_tanh(kind, scale):
     cell = kind(2, 2, kernel_size=2)

@@ -44,7 +44,7 @@ def pearson(one, two):
 # Geometry
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(seed=st.integers(0, 2**16), stimuli=st.integers(2, 12), features=st.integers(3, 40))
 def test_the_truth_of_features_is_their_correlation_distance(seed, stimuli, features):
     values = np.random.default_rng(seed).normal(size=(stimuli, features)) + 5.0

@@ -10,7 +10,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
 
@@ -101,7 +101,6 @@ def test_untrained_networks_do_not_count_among_the_models_cut_from_the_accuracie
     assert "Shown are the first" in _figures(*plain)["accuracy"].caption
 
 
-@settings(deadline=None)
 @given(st.lists(st.tuples(st.floats(-5, 5), st.floats(-5, 5)), min_size=4, max_size=20))
 def test_regression_agrees_with_scipy(points):
     x, y = (np.array(values) for values in zip(*points, strict=True))
@@ -131,7 +130,6 @@ def test_layers_stand_at_their_scores(make_record):
     assert any(text.startswith("conv4: 0.688") for text in texts)
 
 
-@settings(deadline=None)
 @given(low=st.floats(-3, 2), width=st.floats(0.1, 5), value=st.floats(-10, 10))
 def test_scales_keep_order_and_stay_inside(low, width, value):
     scale = Scale(low, low + width, 10, 200)

@@ -91,7 +91,7 @@ def test_comparisons_without_any_common_pair_are_nan():
     assert np.isnan(compare([1.0], [2.0])), "two stimuli have one pair"
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(st.integers(0, 2**32 - 1), st.sampled_from(COMPARISONS), st.integers(3, 8))
 def test_permuting_the_stimuli_of_both_changes_nothing_and_arguments_commute(seed, method, stimuli):
     rng = np.random.default_rng(seed)

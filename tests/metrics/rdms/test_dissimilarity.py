@@ -195,7 +195,7 @@ def test_string_labels_are_sorted_and_integer_labels_are_positions():
     np.testing.assert_allclose(rdm(trials, names), rdm(trials, labels)[order], rtol=1e-12)
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(st.integers(0, 2**32 - 1), st.sampled_from(RDM_METHODS))
 def test_the_order_of_trials_units_and_stimuli_is_irrelevant(seed, method):
     trials, labels, folds = _make_trials(seed=seed % 50, stimuli=5, units=9, repeats=6)

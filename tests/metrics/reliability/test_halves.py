@@ -56,7 +56,7 @@ def test_halves_are_fair_disjoint_and_nearly_equal():
     assert together == pytest.approx((3 + 6) / 21, abs=0.02)
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(st.integers(0, 2**32 - 1), st.booleans())
 def test_the_order_of_trials_sessions_units_and_stimuli_is_irrelevant(seed, keys):
     rng = np.random.default_rng(seed)
@@ -71,7 +71,7 @@ def test_the_order_of_trials_sessions_units_and_stimuli_is_irrelevant(seed, keys
     assert found.reliability == pytest.approx(expected.reliability, abs=1e-12)
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(st.integers(0, 2**32 - 1))
 def test_order_is_irrelevant_for_sparse_counts_whose_trials_hold_the_same_values(seed):
     rng = np.random.default_rng(seed)

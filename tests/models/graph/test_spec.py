@@ -105,7 +105,7 @@ def test_shapes_that_do_not_fit_name_the_node(nodes, edges, message):
         shapes()
 
 
-@settings(max_examples=80, deadline=None)
+@settings(max_examples=80)
 @given(
     size=st.tuples(st.integers(1, 4), st.integers(1, 4)),
     stride=st.none() | st.tuples(st.integers(1, 4), st.integers(1, 4)),
@@ -120,7 +120,7 @@ def test_pooled_shapes_equal_pytorchs(size, stride, grid, padded, ceil_mode):
     assert pool.output_shape((2, *grid)) == tuple(layer(zeros(1, 2, *grid)).shape[1:])
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(
     kernel=st.tuples(st.integers(1, 4), st.integers(1, 4)),
     stride=st.tuples(st.integers(1, 3), st.integers(1, 3)),

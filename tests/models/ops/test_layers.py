@@ -15,7 +15,7 @@ from brainbench.models.ops.layers import Conv2d, Linear, activation, draw_silent
 from brainbench.models.ops.seeding import seeded
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(
     kernel=st.tuples(st.integers(1, 4), st.integers(1, 4)),
     grid=st.tuples(st.integers(1, 7), st.integers(1, 7)),

@@ -51,7 +51,7 @@ def test_whiskers_go_where_the_mirror_takes_them():
     assert (along[0, 4], along[2, 0]) == (1.0, 2.0)  # A4, the last of its row; C0
 
 
-@settings(deadline=None, max_examples=20)
+@settings(max_examples=20)
 @given(st.integers(0, 2**31), st.sampled_from(["vertical", "horizontal"]))
 def test_a_flip_loses_nothing_keeps_empty_cells_empty_and_undoes_itself(seed, direction):
     x = torch.randn(2, 3, 30, 5, 7, generator=_generator(seed)) * OCCUPIED

@@ -33,7 +33,7 @@ FEW_OR_MANY = pytest.mark.parametrize("examples", [4, pytest.param(15, marks=pyt
 
 
 def _for_all(examples, check, *more):
-    settings(max_examples=examples, deadline=None, derandomize=examples < 10)(given(SCENES, *more)(check))()
+    settings(max_examples=examples, derandomize=examples < 10)(given(SCENES, *more)(check))()
 
 
 def _job(curvature, kind, at, size, lift, *, side=1.0, friction=0.0, turn=None, place=(0.0, 0.0, 0.0), **options):

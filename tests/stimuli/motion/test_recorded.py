@@ -91,7 +91,7 @@ def test_hinge_angles_give_back_the_rotation(seed):
     np.testing.assert_allclose(base_rotation(principal_angles(rotation)), rotation, atol=1e-9)
 
 
-@settings(deadline=None, max_examples=30)
+@settings(max_examples=30)
 @given(st.floats(-7, 7), st.floats(-1.4, 1.4), st.floats(-7, 7))
 def test_followed_angles_start_in_the_turn_of_the_first_and_never_jump(theta, phi, zeta):
     first = np.array([theta, phi, zeta])

@@ -50,7 +50,7 @@ def test_every_family_makes_one_closed_outward_body_of_diagonal_one_and_no_two_a
     assert members[0].mesh.volume != pytest.approx(members[1].mesh.volume, rel=1e-6)
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=15)
 @given(family=st.sampled_from(FAMILIES), seed=st.integers(0, 2**31), detail=st.integers(*procedural.DETAIL))
 def test_any_seed_and_detail_give_a_sound_shape(family, seed, detail):
     _check(procedural.make(family, seed, detail=detail), family)

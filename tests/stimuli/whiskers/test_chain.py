@@ -59,7 +59,7 @@ def test_natural_frequencies_are_those_of_the_rod(links, tolerance):
     length=st.floats(0.004, 0.06),
     curvature=st.floats(-40, 40),
 )
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 def test_every_joint_is_elastic_and_every_link_has_mass_whatever_the_taper(links, tip, length, curvature):
     whisker = Whisker(length, 9e-5, tip, young_modulus=4e9, density=1300.0, damping_ratio=0.2, curvature=curvature)
     chain = build_chain(whisker, links)

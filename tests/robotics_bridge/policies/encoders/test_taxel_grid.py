@@ -68,7 +68,7 @@ def test_force_and_torque_of_the_whole_hand_are_conserved(name, placement, resol
     np.testing.assert_allclose(found[1], moment, atol=1e-4)
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(
     name=st.sampled_from(HANDS), item=st.integers(0, 198), force=st.tuples(*[st.floats(-5, 5)] * 3),
     torque=st.tuples(*[st.floats(-0.1, 0.1)] * 3),

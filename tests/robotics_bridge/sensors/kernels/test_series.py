@@ -77,7 +77,7 @@ def test_logarithms_are_right_over_the_whole_range() -> None:
 
 
 @given(NORMAL)
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=200)
 def test_the_logarithm_of_any_normal_number_is_right(x: float) -> None:
     e, rest = _run("split", np.float32(x), pairs=True)[0]
     assert e * np.log(2) + rest == pytest.approx(np.log(x), rel=3e-7, abs=1e-12)
@@ -107,7 +107,7 @@ def test_powers_are_right_over_the_whole_range() -> None:
 
 
 @given(NORMAL, st.floats(0.25, 4.0, width=32))
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=200)
 def test_any_power_of_any_normal_number_is_right(x: float, exponent: float) -> None:
     exact = float(np.exp(min(exponent * np.log(x), 200.0)))
     if TINY <= exact <= HUGE:

@@ -65,7 +65,7 @@ def test_hysteresis_follows_the_published_sequence():
     assert read == pytest.approx([0.045, 0.042281, 0.040055, 0.038232, 0.036740], abs=1e-6)
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=15)
 @given(st.floats(-1.0, 2.0), st.floats(0.002, 1.0), st.sampled_from([1e-3, 5e-3, 0.03]))
 def test_hysteresis_equals_its_two_equations_for_any_signal(strength, tau, dt):
     x = np.cumsum(np.random.default_rng(0).normal(size=(40, 1, 3, 1)), axis=0).astype(np.float32)

@@ -42,7 +42,7 @@ def _gpu(envs: int) -> Any:
     mode=st.sampled_from([CLEAN, FUSED, STAGED]),
     cuda=st.booleans(),
 )
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 def test_every_probe_is_taken_once_and_by_its_own_sensor(counts: list[int], envs: int, mode: int, cuda: bool) -> None:
     context = _gpu(envs)
     context.device.is_cuda = cuda
@@ -119,7 +119,7 @@ def test_triangles_are_asked_alike_by_probes_that_share_a_thread(monkeypatch: py
 
 
 @given(seed=st.integers(0, 10_000), spare=st.integers(0, 9))
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 def test_where_a_contact_stands_in_the_list_changes_nothing(seed: int, spare: int) -> None:
     rng, scene, envs = np.random.default_rng(seed), pad_scene(*OBJECTS), 5
     probes = Probes(rng.uniform(-0.02, 0.02, (9, 3)), np.tile([0, 0, 1.0], (9, 1)), 0.004)

@@ -45,7 +45,7 @@ def _by_the_equations(
 
 @pytest.mark.parametrize("convention", ["physical", "thesis"])
 @given(seed=st.integers(0, 10_000))
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 def test_forces_and_torques_are_those_of_the_equations(convention: Convention, seed: int) -> None:
     rng = np.random.default_rng(seed)
     radius = rng.uniform(0.005, 0.02)

@@ -59,7 +59,7 @@ def _face(state: HandState, half: float, envs=(0,), depth: float = 0.0, height: 
     )  # fmt: skip
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(st.integers(1, 40), st.floats(1e-4, 1e-1), st.floats(1e-12, 1e2))
 def test_diffusion_keeps_heat_makes_no_new_extremes_and_forgets_at_last(cells, edge, spread):
     matrix = diffusion(cells, edge, spread)

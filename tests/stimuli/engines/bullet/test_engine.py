@@ -209,7 +209,7 @@ def test_more_links_than_pybullet_moves_are_refused():
 
 
 @given(seed=st.integers(0, 10**6), contacts=st.integers(1, 4))
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 def test_contact_forces_obey_signorini_and_coulomb(seed, contacts):
     generator = np.random.default_rng(seed)
     rows = generator.normal(size=(3 * contacts, 3 * contacts + 4))

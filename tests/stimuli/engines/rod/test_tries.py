@@ -5,7 +5,7 @@ from itertools import cycle
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from brainbench.stimuli.engines.rod.tries import ONE_BY_ONE, run_with_retries
@@ -85,6 +85,7 @@ def _one_after_the_other(fate, retry):
     ],
 )
 @pytest.mark.parametrize("retry", [1, 2, 3, 5])
+@settings(max_examples=30)
 @given(fates=st.lists(FATES, min_size=1, max_size=6))
 def test_tries_at_the_same_time_give_what_tries_one_after_the_other_give(retry, ahead, most, fates):
     seen = Counter()
