@@ -18,6 +18,7 @@ from typing import Any
 from benchmarks.report import table, with_notes, write_section
 from brainbench.core.figures.style import COLORS, PALE, panels, save_figure
 from brainbench.core.files import read_json, write_json
+from robotics_bridge.policies.readouts.arms import NETWORK
 from robotics_bridge.policies.readouts.rollout import TARGETS
 
 _ROOT = Path(__file__).resolve().parents[2]
@@ -29,13 +30,18 @@ def body(record: Mapping[str, Any]) -> str:
     """Return both tables."""
     size = "taxels" if "place" in record else "features"
     arms = [
-        [one["arm"], str(one[size]), str(one["draws"]), *(_cell(one[name], "") for name in TARGETS)]
+        [label(one["arm"]), str(one[size]), str(one["draws"]), *(_cell(one[name], "") for name in TARGETS)]
         for one in record["arms"]
     ]
-    pairs = [[one["arm"], one["less"], *(_cell(one[name], "+") for name in TARGETS)] for one in record["differences"]]
+    pairs = [[label(one["arm"]), one["less"], *(_cell(one[name], "+") for name in TARGETS)] for one in record["differences"]]
     extent = f"{record['environments']} environments of {record['task']} for {record['seconds']:g} s"
     head = f"**{extent} under `{record['agent']}`, {record['contacts']} contacts**"
     return "\n\n".join([head, table(["arm", size, "draws", *TARGETS], arms), table(["arm", "less", *TARGETS], pairs)])
+
+
+def label(arm: str) -> str:
+    """Return the name of an arm for a table; of a network in a folder RUN/best, that of RUN."""
+    return Path(arm).parent.name.removeprefix(f"{NETWORK}.") if ":" in arm else arm
 
 
 def _cell(one: Mapping[str, float], sign: str) -> str:
@@ -50,13 +56,13 @@ def draw(record: Mapping[str, Any]) -> None:
         for height, one in enumerate(arms):
             value = one[name]
             random = one["arm"].startswith(("reservoir", "untrained", "random"))
-            trained = one["arm"].startswith(("simclr", "supervised", "chosen"))
+            trained = label(one["arm"]).startswith(("simclr", "supervised", "chosen"))
             color = COLORS[0] if trained else COLORS[1] if random else PALE
             error = [[max(value["r2"] - value["low"], 0)], [max(value["high"] - value["r2"], 0)]]
             panel.errorbar(value["r2"], height, xerr=error, fmt="o", markersize=4, color=color, capsize=2)
         panel.axvline(0, color=PALE, linewidth=0.8)
         panel.set(title=name, xlabel="R² on environments left out")
-    axes[0, 0].set_yticks(range(len(arms)), [one["arm"] for one in arms])
+    axes[0, 0].set_yticks(range(len(arms)), [label(one["arm"]) for one in arms])
     save_figure(figure, IMAGES / f"policy-{kind(record)}.png", dpi=120)
 
 
@@ -71,6 +77,7 @@ def command(record: Mapping[str, Any]) -> str:
     words += [word for change in record["change"] for word in ("--change", change)]
     words += ["--envs", str(record["environments"]), "--seconds", f"{record['seconds']:g}"]
     words += ["--place", str(record["place"])] if "place" in record else []
+    words += [word for one in record["arms"] if ":" in one["arm"] for word in ("--network", one["arm"])]
     return f"brainbench policy probe {' '.join(words)} --out FILE"
 
 
