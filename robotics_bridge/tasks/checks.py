@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import inspect
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
-from brainbench.core.errors import UsageError, shown
+from brainbench.core.errors import UsageError, check_each, shown
 from brainbench.core.reading.ranges import check_number, check_numbers
 
 
@@ -32,3 +33,29 @@ def unit_vector(name: str, value: Any, count: int) -> tuple[float, ...]:
         raise UsageError(f"{name} has no length; received {shown(value)}.")
     # Numbers that are written with a few digits count as they are written.
     return tuple(value) if abs(length - 1) < 1e-6 else tuple(one / length for one in value)
+
+
+def check_parameters(of: str, function: Callable[..., Any], given: Iterable[str]) -> None:
+    """Check that a function of a :class:`~robotics_bridge.tasks.step_context.StepContext` can be called by these names.
+
+    Args:
+        of: what the function is, for the message (``reward 'work' of task 'mine'``).
+        function: takes the context first, then its parameters.
+        given: names of the parameters that it will be given.
+
+    Raises:
+        UsageError: it is no function, a name is none of its parameters (with the nearest), or a needed one is missing.
+    """
+    if not callable(function):
+        raise UsageError(f"The {of} needs a function of a step; received {shown(function)}.")
+    try:
+        signature = inspect.signature(function)
+    except ValueError:  # Written in C, which tells no parameters.
+        return
+    own = list(signature.parameters.values())[1:]
+    if not any(one.kind is one.VAR_KEYWORD for one in own):
+        check_each(f"parameter of {of}", given, [one.name for one in own if one.kind is not one.VAR_POSITIONAL])
+    try:
+        signature.bind(None, **dict.fromkeys(given))
+    except TypeError as error:
+        raise UsageError(f"The {of} cannot be called: {error}.") from None

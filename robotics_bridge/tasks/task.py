@@ -7,9 +7,10 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
-from brainbench.core.errors import UsageError, check_name
+from brainbench.core.errors import UsageError, check_each, check_name
 from brainbench.core.reading.ranges import check_fields, check_number, check_numbers
-from robotics_bridge.tasks.checks import check_range, unit_vector
+from robotics_bridge.tasks import terms
+from robotics_bridge.tasks.checks import check_parameters, check_range, unit_vector
 from robotics_bridge.tasks.contact_model import CONTACTS, ContactModel
 from robotics_bridge.tasks.goals import Goal
 from robotics_bridge.tasks.objects import PRIMITIVES, ObjectShape
@@ -280,13 +281,21 @@ class Task:
                 f"contacts.time_constant {of} is at least two physics steps ({least:g} s); received "
                 f"{self.contacts.time_constant:g}: take more contacts.substeps."
             )
-        for name, reward in self.rewards.items():
-            check_number(f"weight of {name!r} {of}", reward.weight)
+        self._check_terms(of)
         if not self.objects:
             raise UsageError(f"Task {self.name!r} needs at least one object.")
         self._check_names(of)
         self._check_places(of)
         check_fields(self, "taxel_twist", least=0, of=own)
+
+    def _check_terms(self, of: str) -> None:
+        for name, reward in self.rewards.items():
+            check_number(f"weight of {name!r} {of}", reward.weight)
+            check_parameters(f"reward {name!r} {of}", reward.term, reward.params)
+            if reward.term is terms.ended:
+                check_each(f"ending in reward {name!r} {of}", reward.params["names"], self.endings)
+        for name, ending in self.endings.items():
+            check_parameters(f"ending {name!r} {of}", ending.condition, ending.params)
 
     def _check_names(self, of: str) -> None:
         if self.task_state is None:

@@ -11,11 +11,12 @@ import torch
 
 from brainbench.core.errors import UsageError
 from robotics_bridge import hands, tasks
+from robotics_bridge.tasks import terms
 from robotics_bridge.tasks.goals import SteppingRotation, TimedRotation
 from robotics_bridge.tasks.objects import ObjectPrimitive, ObjectShape, ball
 from robotics_bridge.tasks.scenes import build
 from robotics_bridge.tasks.settings import StudentSettings
-from robotics_bridge.tasks.task import ActuatorRandomisation, ObjectRandomisation, Placement, Push, Success
+from robotics_bridge.tasks.task import ActuatorRandomisation, Ending, ObjectRandomisation, Placement, Push, Success
 from robotics_bridge.tasks.thermometers import ThermalSettings
 
 
@@ -40,6 +41,31 @@ def _changed(**changes: Any) -> tasks.Task:
 def test_names_within_a_task_are_known(changes, suggested) -> None:
     with pytest.raises(UsageError, match=f"'in_palm_rotate'.*{suggested}|{suggested}"):
         _changed(**changes)
+
+
+@pytest.mark.parametrize(
+    ("part", "message"),
+    [
+        (tasks.Reward(1.0, terms.near_surface, {"nearestk": 1, "sigma": 0.1}), "'nearestk'.*'nearest_k'"),
+        (tasks.Reward(1.0, terms.near_surface, {"nearest_k": 1}), "'sigma'"),
+        (tasks.Reward(1.0, lambda m, scale: scale, {"scael": 1}), "'scael'.*'scale'"),
+        (tasks.Reward(1.0, lambda m: m, {"m": 1}), "'m'"),
+        (tasks.Reward(1.0, lambda: 0), "too many"),
+        (tasks.Reward(1.0, "work"), "'work'"),
+        (tasks.Reward(1.0, terms.ended, {"names": ("obj_droped",)}), "'obj_droped'.*'obj_dropped'"),
+        (Ending(terms.below, {"hight": 0.4}), "'hight'.*'height'"),
+    ],
+)
+def test_terms_are_called_by_their_parameters(part, message) -> None:
+    kind = "rewards" if isinstance(part, tasks.Reward) else "endings"
+    rotate = tasks.load("in_palm_rotate")
+    with pytest.raises(UsageError, match=f"{kind[:-1]} 'mine' of task 'in_palm_rotate'.*{message}|{message}.*'mine'"):
+        replace(rotate, **{kind: {**getattr(rotate, kind), "mine": part}})
+
+
+def test_terms_with_defaults_or_any_parameters_are_taken() -> None:
+    given = {"a": tasks.Reward(1.0, lambda m, k=1: k), "b": tasks.Reward(1.0, lambda m, **rest: 0, {"any": 2})}
+    assert _changed(rewards=given).rewards == given
 
 
 def test_turns_are_counted_about_an_axis() -> None:
