@@ -20,7 +20,7 @@ from brainbench.core.reading.ranges import check_number
 from robotics_bridge.physics.kernels.state import StateArrays
 
 DIVERGED = 1
-"""Bit of :attr:`HandState.status`: a pose or velocity of the environment is not a finite number."""
+"""Bit of :attr:`HandState.status`: a pose or velocity is not a finite number, or a quaternion not of unit length."""
 CROWDED = 2
 """Bit of :attr:`HandState.status`: contacts were lost because there was no room for them."""
 UNFELT = 4
@@ -113,7 +113,11 @@ class HandState:
 
     @property
     def pose_torch(self) -> torch.Tensor:
-        """World poses [B, L, 7] as Warp stores them (x, y, z, qx, qy, qz, qw), a view of the same memory."""
+        """World poses [B, L, 7] as Warp stores them (x, y, z, qx, qy, qz, qw), a view of the same memory.
+
+        What is written here is not normalised: an environment with a quaternion whose length differs from 1 by more
+        than .001 counts as :data:`DIVERGED`.
+        """
         return warp().to_torch(self.pose)
 
     @property

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -181,6 +183,21 @@ def test_poses_and_velocities_that_are_not_finite_are_a_status_and_stay_in_their
         reading = suite.read(name)
         assert torch.isfinite(reading[0]).all()
         assert reading[1].isnan().all()
+
+
+@pytest.mark.parametrize(("length", "wrong"), [(1.0, False), (1 + 1e-6, False), (1.01, True), (0.9, True), (0.0, True)])
+@pytest.mark.parametrize("pairs", ["contact", "all"])
+def test_quaternions_that_are_not_of_unit_length_are_a_status(length, wrong, pairs) -> None:
+    scene, sensors = _pad()
+    suite = SensorSuite(scene, {name: replace(sensor, pairs=pairs) for name, sensor in sensors.items()}, num_envs=2)
+    state = state_of(scene, np.repeat(poses_at(3, {2: (0, 0, 0.014)}), 2, axis=0))
+    state.set_contacts([0, 1], [(1, 2)] * 2)
+    turn = state.pose_torch[1, 2, 3:]
+    turn *= length
+    suite.update(state)
+    assert suite.diverged.tolist() == [False, wrong]
+    for name in sensors:
+        assert suite.read(name).flatten(1).isnan().any(dim=1).tolist() == [False, wrong]
 
 
 @pytest.mark.parametrize("count", [0, -1, 10**9, 10**15])

@@ -8,6 +8,8 @@ from typing import Any
 from brainbench.core.devices import warp
 
 wp = warp()
+UNIT_TOLERANCE = wp.constant(1e-3)
+"""Largest difference of a quaternion's length from 1; the rounding of float32 is a ten-thousandth of it."""
 
 
 @wp.struct
@@ -33,7 +35,7 @@ class StateArrays:
     contact_force: wp.array(dtype=wp.float32)
     """[C] normal force; NaN where the engine does not tell."""
     status: wp.array(dtype=wp.int32)
-    """[B] bits: 1 diverged, 2 more contacts than room."""
+    """[B] bits: 1 diverged (:func:`link_fails`), 2 more contacts than room."""
 
 
 @wp.func
@@ -44,7 +46,7 @@ def in_scene(pair: wp.vec2i, geometries: int) -> bool:
 
 @wp.func
 def link_fails(state: StateArrays, env: int, link: int) -> bool:
-    """Return whether a pose or a velocity holds a number that is not finite."""
+    """Return whether a pose or a velocity holds a number that is not finite, or the quaternion is not of unit length."""
     at = state.pose[env, link]
     speed = state.velocity[env, link]
     total = float(0.0)
@@ -53,7 +55,8 @@ def link_fails(state: StateArrays, env: int, link: int) -> bool:
         total += at[k] * 0.0
     for k in range(6):
         total += speed[k] * 0.0
-    return wp.isnan(total)
+    # Rotating by a quaternion of another length would scale what is rotated: plausible readings, all wrong.
+    return wp.isnan(total) or wp.abs(wp.length(wp.transform_get_rotation(at)) - 1.0) > UNIT_TOLERANCE
 
 
 @wp.func
