@@ -146,12 +146,17 @@ SLOW = ("docs/tactile-hands.md",)
     ],
 )
 def test_the_code_of_a_page_runs_from_top_to_bottom(
-    page: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, registry
+    page: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, registry, capsys: pytest.CaptureFixture[str]
 ):
     monkeypatch.chdir(tmp_path)
     names: dict[str, Any] = {}
-    for block in (PRELUDES.get(page, ""), *_blocks(page, "python")):
+    exec(compile(PRELUDES.get(page, ""), page, "exec"), names)
+    text = (ROOT / page).read_text(encoding="utf-8")
+    # A block of text right after one of code is what that code prints.
+    for block, shown in re.findall(r"```python\n(.*?)```\n(?:\n```text\n(.*?)```\n)?", text, flags=re.DOTALL):
+        capsys.readouterr()
         exec(compile(block, page, "exec"), names)
+        assert not shown or capsys.readouterr().out == shown
     if page == "docs/score.md":
         assert names["record"].score.layer == "rotated"
         assert names["record"].score.p < 0.05
