@@ -16,3 +16,12 @@ def test_the_records_of_the_page_become_a_site(tmp_path: Path, monkeypatch: pyte
     assert (tmp_path / "site" / "index.html").is_file()
     assert [item.problem for item in made["stored"]] == [None, None]  # type: ignore[union-attr]
     assert len(list((tmp_path / "site" / "models").iterdir())) == 2
+
+
+def test_the_batch_file_of_the_page_names_scores(tmp_path: Path):
+    from brainbench.cli.leaderboard.scoring import read_batch
+
+    (block,) = re.findall(r"```toml\n(.*?)```", PAGE.read_text(encoding="utf-8"), flags=re.DOTALL)
+    (tmp_path / "batch.toml").write_text(block, encoding="utf-8")
+    jobs = read_batch(tmp_path / "batch.toml")
+    assert {"zhuang-small", "resnet18-small+gpt"} <= {job.model for job in jobs}
