@@ -103,6 +103,7 @@ def pretend(folder: Path, arch: int, sm_count: int) -> list[tuple[str, float]]:
         "capture_while": loop,
         "capture_if": branch,
         "is_cuda_available": lambda: True,
+        "get_cuda_device_count": lambda: 1,
         "is_cpu_available": lambda: False,
         "is_conditional_graph_supported": lambda: True,
     }

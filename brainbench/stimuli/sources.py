@@ -87,7 +87,8 @@ def load_stimuli(
             raise UsageError("These stimuli are arrays, in which whiskers have no names; leave the selection at 'all'.")
         return source if whiskers == "all" else load_stimuli(source.dataset, whiskers=whiskers)  # type: ignore[arg-type]
     if _is_array_file(source):
-        return _from_arrays(Path(source), whiskers)
+        with open_hdf5(Path(source), "stimulus file") as file:
+            return _read_arrays(file, os.fspath(source), whiskers)
     dataset, description = load_stimulus_set(
         source, whiskers=whiskers, fidelity=fidelity, backend=backend, progress=progress, cache=cache
     )
@@ -228,13 +229,8 @@ def _select(dataset: xr.Dataset, whiskers: str) -> xr.Dataset:
     return chosen.assign_attrs(content_hash=hash_stimulus_set(chosen), config_hash=config)
 
 
-def _from_arrays(path: Path, whiskers: str) -> Stimuli:
-    """Read ``stimuli`` [K, T, …] and ``labels`` [K]."""
-    with open_hdf5(path, "stimulus file") as file:
-        return _read_arrays(file, os.fspath(path), whiskers)
-
-
 def _read_arrays(file: Any, name: str, whiskers: str) -> Stimuli:
+    """Read ``stimuli`` [K, T, …] and ``labels`` [K]."""
     import h5py
 
     if whiskers != "all":

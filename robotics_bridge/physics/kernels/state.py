@@ -46,7 +46,7 @@ def in_scene(pair: wp.vec2i, geometries: int) -> bool:
 
 @wp.func
 def link_fails(state: StateArrays, env: int, link: int) -> bool:
-    """Return whether a pose or a velocity holds a number that is not finite, or the quaternion is not of unit length."""
+    """Return whether a pose or a velocity holds a number that is not finite, or a quaternion is not of unit length."""
     at = state.pose[env, link]
     speed = state.velocity[env, link]
     total = float(0.0)
