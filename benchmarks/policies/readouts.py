@@ -33,7 +33,9 @@ def body(record: Mapping[str, Any]) -> str:
         [label(one["arm"]), str(one[size]), str(one["draws"]), *(_cell(one[name], "") for name in TARGETS)]
         for one in record["arms"]
     ]
-    pairs = [[label(one["arm"]), one["less"], *(_cell(one[name], "+") for name in TARGETS)] for one in record["differences"]]
+    pairs = [
+        [label(one["arm"]), one["less"], *(_cell(one[name], "+") for name in TARGETS)] for one in record["differences"]
+    ]
     extent = f"{record['environments']} environments of {record['task']} for {record['seconds']:g} s"
     head = f"**{extent} under `{record['agent']}`, {record['contacts']} contacts**"
     return "\n\n".join([head, table(["arm", size, "draws", *TARGETS], arms), table(["arm", "less", *TARGETS], pairs)])
