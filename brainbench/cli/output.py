@@ -85,12 +85,7 @@ def table(title: str, columns: list[str], rows: list[list[str]], *, right: tuple
     from rich.console import Console
     from rich.table import Table
 
-    grid = Table(
-        show_header=any(columns),
-        box=None,
-        pad_edge=False,
-        header_style="bold",
-    )
+    grid = Table(show_header=any(columns), box=None, pad_edge=False, header_style="bold")
     terminal = sys.stdout.isatty()
     lengths = [max(map(len, column)) for column in zip(columns, *rows, strict=True)]
     whole = {0, *(() if terminal else right)}

@@ -26,12 +26,7 @@ if TYPE_CHECKING:
 
 
 def score_agreement(
-    metric: Metric,
-    subjects: Sequence[SubjectRDM],
-    *,
-    stimuli: Sequence[str],
-    estimator: str = "default",
-    seed: int = 0,
+    metric: Metric, subjects: Sequence[SubjectRDM], *, stimuli: Sequence[str], estimator: str = "default", seed: int = 0
 ) -> Score:
     """Score each reliable animal against the others together, by a metric.
 
@@ -122,12 +117,7 @@ def _null(metric: Metric, animals: Animals, factors: Floats, seed: int) -> Float
 
 
 def _verdict(
-    metric: Metric,
-    animals: Animals,
-    factors: dict[int, Corrected],
-    found: list[int],
-    count: int,
-    smallest: float,
+    metric: Metric, animals: Animals, factors: dict[int, Corrected], found: list[int], count: int, smallest: float
 ) -> tuple[Status, tuple[str, ...]]:
     """Return the status of the agreement and its reasons, the gravest first."""
     told = tuple(f"{animals.subjects[i].subject}: {factors[i].reason}" for i in factors if factors[i].reason)

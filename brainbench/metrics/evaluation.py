@@ -65,12 +65,7 @@ def defined_layers(metric: Metric, layers: Mapping[str, Floats]) -> list[str]:
 
 
 def evaluate(
-    compared: LayerComparisons,
-    names: list[str],
-    animals: Animals,
-    estimator: str,
-    committed: str | None,
-    seed: int,
+    compared: LayerComparisons, names: list[str], animals: Animals, estimator: str, committed: str | None, seed: int
 ) -> tuple[LayerEvaluation | None, list[str], tuple[str, ...]]:
     """Compare, choose layers by the rule and test; also return the layers with a value, and notes."""
     metric, factors = compared.metric, animals.factors(animals.scored)

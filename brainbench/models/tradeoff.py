@@ -103,9 +103,7 @@ def round_weights(model: nn.Module) -> None:
 
 
 def settings(
-    precisions: Iterable[str] = PRECISIONS,
-    unrolls: Iterable[str] = ("biological",),
-    steps: Iterable[int] = (22,),
+    precisions: Iterable[str] = PRECISIONS, unrolls: Iterable[str] = ("biological",), steps: Iterable[int] = (22,)
 ) -> list[ModelSetting]:
     """Return every combination of the choices."""
     return [ModelSetting(p, u, s) for p, u, s in product(precisions, unrolls, steps)]  # pyright: ignore[reportArgumentType]

@@ -45,11 +45,7 @@ def description(item: Architecture) -> str:
 
 
 def build(
-    item: Architecture,
-    *,
-    classes: int = 117,
-    decoder: str = "linear",
-    unroll: Unroll = "biological",
+    item: Architecture, *, classes: int = 117, decoder: str = "linear", unroll: Unroll = "biological"
 ) -> EncoderAttenderDecoder:
     """Build the network with new random weights.
 

@@ -32,8 +32,7 @@ class World:
     hand: HandOption = "xhand1"
     config: Annotated[str, typer.Option(help="Configuration of the task: default, published, …")] = "default"
     change: Annotated[
-        list[str] | None,
-        typer.Option(help="Another number of the task: contacts=firm, is_dropped=-300, entropy=0, …"),
+        list[str] | None, typer.Option(help="Another number of the task: contacts=firm, is_dropped=-300, entropy=0, …")
     ] = None
     task_file: Annotated[Path | None, typer.Option(help="Python file that registers a task of your own.")] = None
 

@@ -11,16 +11,7 @@ import typer
 from brainbench.cli.destinations import out_file, out_file_option
 from brainbench.cli.options import with_options
 from brainbench.cli.output import JsonOption, emit, facts, progress_bar, table_of
-from brainbench.cli.policy.options import (
-    ENV,
-    TOUCH,
-    DeviceOption,
-    EnvsOption,
-    World,
-    agent_of,
-    in_world,
-    touch_of,
-)
+from brainbench.cli.policy.options import ENV, TOUCH, DeviceOption, EnvsOption, World, agent_of, in_world, touch_of
 
 
 def list_tasks(as_json: JsonOption = False) -> None:

@@ -11,12 +11,7 @@ import typer
 from brainbench.cli.destinations import out_folder, out_folder_option
 from brainbench.cli.options import part_of, with_options
 from brainbench.cli.output import JsonOption, emit, facts, progress_bar, table
-from brainbench.cli.policy.options import (
-    DeviceOption,
-    TaskArgument,
-    World,
-    in_world,
-)
+from brainbench.cli.policy.options import DeviceOption, TaskArgument, World, in_world
 
 
 @with_options(

@@ -48,8 +48,7 @@ def convert(
     ] = None,
     stimulus: Annotated[str | None, typer.Option("--stimulus", "-s", help="Stimulus of a set to write.")] = None,
     dialect: Annotated[
-        str | None,
-        typer.Option(help="Of a written run: thesis (default), or sense-lab, where commas end lines."),
+        str | None, typer.Option(help="Of a written run: thesis (default), or sense-lab, where commas end lines.")
     ] = None,
     as_json: JsonOption = False,
 ) -> None:

@@ -127,10 +127,7 @@ def bench(
     emit({"results": results, "envs": envs, "device": device}, text, as_json=as_json)
 
 
-def check(
-    device: Annotated[str, typer.Option(help="cpu or cuda.")] = "cpu",
-    as_json: JsonOption = False,
-) -> None:
+def check(device: Annotated[str, typer.Option(help="cpu or cuda.")] = "cpu", as_json: JsonOption = False) -> None:
     """Compare sensors with closed forms on this machine; exit status 1 if one is off."""
     from robotics_bridge.sensors.checks import CHECKS
 

@@ -146,10 +146,7 @@ def _contacts(session: Session, trials: SessionTable) -> Iterator[Finding]:
 
 
 def check_coverage(
-    session: Session,
-    spikes: list[NDArray[np.float64]],
-    layout: RecordingLayout | None,
-    conditions: Conditions | None,
+    session: Session, spikes: list[NDArray[np.float64]], layout: RecordingLayout | None, conditions: Conditions | None
 ) -> Iterator[Finding]:
     """Yield the findings about trials without recording, and breaks inside it.
 

@@ -29,10 +29,7 @@ _WHISKER = re.compile(rf"^(?P<prefix>acquisition/(?:principal_)?whisker_(?P<name
 WHISKER = "C2"
 """The files do not name the whisker; the paper recorded around the C2 column with one whisker left."""
 
-SELECTION = (
-    Rule("type", refuse=("N/A",)),
-    Rule("stim_present", refuse=("true",), required=False),
-)
+SELECTION = (Rule("type", refuse=("N/A",)), Rule("stim_present", refuse=("true",), required=False))
 """Photostimulated trials are not the neuron's own answer to touch."""
 
 

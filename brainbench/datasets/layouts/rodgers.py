@@ -40,11 +40,7 @@ SELECTION = Selection(
 """The trials that the data descriptor (its table 6) says to ignore, and the detection task's
 ``nothing``. ``ignore_trial`` stands last, so that it counts only trials ruined in some other way."""
 
-WINDOW = Window(
-    anchor=FIRST_CONTACT,
-    stop="choice",
-    fallback=Window(anchor="choice", offset=-1.0, length=1.0),
-)
+WINDOW = Window(anchor=FIRST_CONTACT, stop="choice", fallback=Window(anchor="choice", offset=-1.0, length=1.0))
 """First contact to choice, as in the published analysis; the last second before the choice where a
 session has no contact tables."""
 
@@ -109,9 +105,7 @@ DISCRIMINATION = replace(
     name="rodgers-discrimination",
     title=f"{TITLE}, sessions of the discrimination task",
     selection=replace(
-        SELECTION,
-        name="rodgers-discrimination",
-        trials=(Rule("task", allow=("discrimination",)), *SELECTION.trials),
+        SELECTION, name="rodgers-discrimination", trials=(Rule("task", allow=("discrimination",)), *SELECTION.trials)
     ),
 )
 DETECTION = replace(

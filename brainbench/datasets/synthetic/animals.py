@@ -18,11 +18,7 @@ from brainbench.core.reading.ranges import check_number
 from brainbench.core.trials import Trials
 from brainbench.datasets.synthetic.design import MODULATION, PopulationDesign
 from brainbench.datasets.synthetic.geometry import ResponseGeometry
-from brainbench.datasets.synthetic.populations import (
-    draw_sessions,
-    entropy,
-    stimulus_means,
-)
+from brainbench.datasets.synthetic.populations import draw_sessions, entropy, stimulus_means
 from brainbench.datasets.synthetic.truth import correlation_rdm
 
 _EXACT = 2e-4
@@ -159,10 +155,7 @@ def _first_appearance(block: Trials, stimuli: int) -> Trials:
     return replace(block, labels=number[block.labels])
 
 
-FAULTS: dict[str, Callable[[Trials, int], Trials]] = {
-    "first-appearance": _first_appearance,
-    "zero-fill": _zero_fill,
-}
+FAULTS: dict[str, Callable[[Trials, int], Trials]] = {"first-appearance": _first_appearance, "zero-fill": _zero_fill}
 """Faults of the released analysis, as functions of a session and the number of stimuli: stimuli
 numbered by first appearance (so that sessions and animals disagree about the axes), and zeros in
 place of what a trial did not show."""

@@ -159,11 +159,7 @@ def separate(
 
 
 def _choose_classes(
-    known: Sequence[str],
-    labels: NDArray[np.int64],
-    objects: NDArray[np.str_],
-    asked: Sequence[str] | None,
-    most: int,
+    known: Sequence[str], labels: NDArray[np.int64], objects: NDArray[np.str_], asked: Sequence[str] | None, most: int
 ) -> tuple[str, ...]:
     if asked is not None:
         check_each("class", asked, known)

@@ -97,10 +97,7 @@ def _split_products(
     means = (member / member.sum(axis=2, keepdims=True)) @ values
     units = generator.permutation(values.shape[1])
     one, two = np.array_split(units, 2)
-    return (
-        _products(means[0][:, one], means[1][:, one]),
-        _products(means[2][:, two], means[3][:, two]),
-    )
+    return (_products(means[0][:, one], means[1][:, one]), _products(means[2][:, two], means[3][:, two]))
 
 
 def _products(left: Floats, right: Floats) -> Floats:

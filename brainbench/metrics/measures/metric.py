@@ -63,13 +63,7 @@ class Metric:
     reasons: tuple[str, ...] = ()
     """Remarks for a reader of every score, in words."""
 
-    def animal(
-        self,
-        subject: str,
-        blocks: Sequence[Trials],
-        n_stimuli: int,
-        **options: Any,
-    ) -> SubjectRDM:
+    def animal(self, subject: str, blocks: Sequence[Trials], n_stimuli: int, **options: Any) -> SubjectRDM:
         """Prepare one animal from the trials of its sessions; what cannot be used says so in the score.
 
         Options are ``stimuli``, ``seed`` and ``splits`` of :func:`subject_rdm`.

@@ -79,11 +79,7 @@ def corrected_splits(
 
 
 def noise_corrected(
-    r_xy: ArrayLike,
-    split_half_r: ArrayLike,
-    *,
-    estimator: str = "default",
-    other_split_half_r: ArrayLike | None = None,
+    r_xy: ArrayLike, split_half_r: ArrayLike, *, estimator: str = "default", other_split_half_r: ArrayLike | None = None
 ) -> Corrected:
     """Correct the comparison of a model with a brain for the brain's noise.
 

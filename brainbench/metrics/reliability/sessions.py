@@ -19,12 +19,7 @@ from brainbench.core.errors import UsageError
 from brainbench.core.trials import Trials
 from brainbench.metrics.rdms.pairs import Floats, Ints
 from brainbench.metrics.reliability.trial_hashes import Hashes, content_hashes, key_hashes
-from brainbench.metrics.stimulus_labels import (
-    check_finite,
-    labelled_trials,
-    listed,
-    stimulus_means,
-)
+from brainbench.metrics.stimulus_labels import check_finite, labelled_trials, listed, stimulus_means
 
 _SLICE_ELEMENTS = 1 << 20
 

@@ -92,14 +92,7 @@ class GPTAttender(nn.Module):
     """
 
     def __init__(
-        self,
-        features: int,
-        width: int,
-        *,
-        blocks: int = 8,
-        heads: int = 4,
-        context: int = 65,
-        dropout: float = 0.1,
+        self, features: int, width: int, *, blocks: int = 8, heads: int = 4, context: int = 65, dropout: float = 0.1
     ) -> None:
         super().__init__()
         check_number("The share dropped by a GPT attender", dropout, least=0, most=1)

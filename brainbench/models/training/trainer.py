@@ -143,13 +143,7 @@ class _Position:
 
 class _Run:
     def __init__(
-        self,
-        config: TrainingConfig,
-        data: Data,
-        out: Path,
-        where: Processes,
-        progress: Progress | None,
-        controls: Path,
+        self, config: TrainingConfig, data: Data, out: Path, where: Processes, progress: Progress | None, controls: Path
     ) -> None:
         if config.precision == "auto":
             config = replace(config, precision="bf16" if where.device.type == "cuda" else "float32")

@@ -174,11 +174,7 @@ def gates_backward_kernel(
 
 
 def apply_gates(
-    fused: torch.Tensor,
-    x: torch.Tensor,
-    state: torch.Tensor,
-    norms: torch.Tensor | None,
-    state_type: torch.dtype,
+    fused: torch.Tensor, x: torch.Tensor, state: torch.Tensor, norms: torch.Tensor | None, state_type: torch.dtype
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Return (y, state), both [B, C, H, W] with channels innermost.
 

@@ -66,11 +66,7 @@ def unfold_kernel(
 
 
 def unfold_into(
-    out: torch.Tensor,
-    inputs: list[torch.Tensor],
-    grid: tuple[int, int],
-    kernel: tuple[int, int],
-    pads: tuple[int, int],
+    out: torch.Tensor, inputs: list[torch.Tensor], grid: tuple[int, int], kernel: tuple[int, int], pads: tuple[int, int]
 ) -> None:
     """Fill ``out`` [R, taps · ΣC] with windows of inputs [B, C, H, W] whose channels lie side by side.
 
