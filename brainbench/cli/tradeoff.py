@@ -140,7 +140,7 @@ def model(
             if score:
                 import brainbench
 
-                found["score"] = brainbench.score(reduced, normalize=False).value
+                found["score"] = brainbench.score(reduced).value
             if data is not None:
                 from brainbench.datasets import WhiskingDataset
                 from brainbench.models.training.evaluation import evaluate

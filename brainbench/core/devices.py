@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from brainbench.core.errors import MissingDependencyError, UsageError
+from brainbench.core.errors import MissingDependencyError, UsageError, shown
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
@@ -90,7 +90,7 @@ def mujoco_module() -> Any:
 
 
 def pick_device(name: Any) -> Any:
-    """Return the Warp device called ``cpu``, ``cuda`` or ``cuda:1``; a Warp device passes through.
+    """Return the Warp device called ``cpu``, ``cuda`` or ``cuda:1`` or as a torch device; a Warp device passes through.
 
     ``auto`` is the processor, or the GPU where this build of Warp lacks the compiler for processors.
 
@@ -98,12 +98,13 @@ def pick_device(name: Any) -> Any:
         UsageError: there is no such device here, or nothing compiles for it.
     """
     wp = warp()
-    if not isinstance(name, str):
+    if name is None or isinstance(name, wp.Device):
         return wp.get_device(name)
+    name = str(name)  # torch devices are called as Warp's are
     if name == "auto":
         name = "cuda" if not wp.is_cpu_available() and wp.is_cuda_available() else "cpu"
     if not re.fullmatch(r"cpu|cuda(:\d{1,9})?", name):
-        raise UsageError(f"A device is 'cpu', 'cuda' or 'cuda:N'; received {name!r}.")
+        raise UsageError(f"A device is 'cpu', 'cuda' or 'cuda:N'; received {shown(name)}.")
     if name != "cpu" and int(name.partition(":")[2] or 0) >= (count := wp.get_cuda_device_count()):
         raise UsageError(f"There are {count} CUDA devices here, so {name!r} cannot be used; use 'cpu' or another one.")
     if name == "cpu" and not wp.is_cpu_available():

@@ -14,7 +14,8 @@ import torch
 from torch import nn
 
 from brainbench.core.contracts import CHANNELS
-from brainbench.core.errors import UsageError, check_name
+from brainbench.core.errors import UsageError, check_each, check_name
+from brainbench.core.reading.ranges import check_number
 from brainbench.models.graph.spec import UNROLLS, Unroll
 from brainbench.models.graph.temporal_graph import TemporalGraph
 from brainbench.models.heads.decoders import AllStepsDecoder, make_decoder
@@ -168,8 +169,7 @@ class EncoderAttenderDecoder(nn.Module):
             UsageError: a layer does not exist, or as for :meth:`forward`.
         """
         wanted = self.layers if layers is None else tuple(layers)
-        for name in wanted:
-            check_name("layer", name, self.layers)
+        check_each("layer", wanted, self.layers)
         features, found = _named(self.encoder, self._normalise(x), "encoder", wanted, **self._unroll)
         if self.attender is not None and any(not name.startswith("encoder.") for name in wanted):
             features, attended = _named(self.attender, features, "attender", wanted)
@@ -189,7 +189,8 @@ class EncoderAttenderDecoder(nn.Module):
         return self.encoder.multiply_adds() + attender + decoder
 
     def init_state(self, batch: int) -> NetworkState:
-        """Return the state before the first step."""
+        """Return the state before the first step of so many sweeps; UsageError where that is no whole number."""
+        check_number("batch of a state", batch, least=0, whole=True)
         attender, decoder = self.attender, self.decoder
         return NetworkState(
             self.encoder.init_state(batch),

@@ -16,6 +16,7 @@ from torch import nn
 from torch.nn import functional
 
 from brainbench.core.errors import UsageError
+from brainbench.core.reading.ranges import check_number
 from brainbench.models.attenders.gpt import GPTAttender
 from brainbench.models.attenders.mamba import MambaAttender, MambaMemory
 from brainbench.models.encoders.s4 import S4Encoder
@@ -55,7 +56,8 @@ class StreamingStep(nn.Module):
         """S."""
 
     def init_state(self, batch: int) -> torch.Tensor:
-        """Return the state [B, S] before the first step: zeros."""
+        """Return the state [B, S] before the first step, zeros; UsageError where the batch is no whole number."""
+        check_number("batch of a state", batch, least=0, whole=True)
         like = next(self.parameters())
         return torch.zeros(batch, self.state_size, dtype=like.dtype, device=like.device)
 

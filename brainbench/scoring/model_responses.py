@@ -77,6 +77,9 @@ class ResolvedModel:
     def respond(self, options: ScoreOptions, *, progress: Progress | None = None) -> ModelResponses:
         """Run the model on the stimuli, or take the features that were computed elsewhere."""
         card, labels, origin, model_input = self.card, self.labels, self.origin, None
+        if not options.normalize and (self.module is None or hasattr(self.module, "spec")):
+            reads = "was computed elsewhere" if self.module is None else "normalises SI values by itself"
+            raise UsageError(f"normalize=False gives SI values to plain modules; {card.name!r} {reads}: leave it out.")
         card, shown = replace(card, layer=options.layer or card.layer), None
         names = getattr(self.module, "layers", None) if self.module is not None else self.activations
         if options.readout == "published":

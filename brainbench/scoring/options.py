@@ -86,7 +86,7 @@ class ScoreOptions:
     units_reliability: float | None = None
     """Leave out units whose tuning is less reliable than this (published: .5); a choice made on the scored data."""
     normalize: bool = True
-    """Give plain modules forces in 1e-4 N and moments in 1e-6 N·m instead of SI."""
+    """Give plain modules forces in 1e-4 N and moments in 1e-6 N·m instead of SI; other models take no choice."""
     seed: int = 0
     """Seed of untrained weights, of split halves and of random features."""
     weights_seed: int | None = None

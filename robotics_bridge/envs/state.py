@@ -149,10 +149,13 @@ class EnvState:
         # An action of 1 is the same share of every joint's range.
         self.action_scale = self.task.action_ratio * (self.high - self.low)[self.moved]
         """[A] change of a target per unit of action (rad)."""
-        slides = [name.startswith("carriage_") for name in model.moved]
-        speeds = np.where(slides, self.task.carriage_speed, self.hand.rated_speeds(model.moved))
-        self.target_step = floats(self.step_dt * speeds) if self.task.rated_speed else None
+        self.target_step: torch.Tensor | None = None
         """[A] largest change of a target in a control step (rad or m); None where it may jump."""
+        if self.task.rated_speed:
+            driven = [name for name in model.moved if not name.startswith("carriage_")]
+            rated = dict(zip(driven, self.hand.rated_speeds(driven), strict=True))
+            speeds = np.array([rated.get(name, self.task.carriage_speed) for name in model.moved])
+            self.target_step = floats(self.step_dt * speeds)
         bodies = [first.body(name).id for name in model.objects]
         self.object_bodies = integers(bodies)
         """[K] numbers of the objects' bodies."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import logging
 import os
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
@@ -15,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brainbench.core.devices import mujoco_module
-from brainbench.core.errors import DataError, UsageError, check_name, shown
+from brainbench.core.errors import DataError, UsageError, check_each, listing, shown
 from brainbench.core.reading.regular import check_file, readable
 from brainbench.core.reading.texts import read_text
 from robotics_bridge.hands.facing import palmar_directions
@@ -23,6 +24,8 @@ from robotics_bridge.hands.layouts import Layout, check_names, pad_probes, read_
 from robotics_bridge.hands.spec import HandSpec, build
 from robotics_bridge.sensors.probes.placement import Probes
 from robotics_bridge.sensors.sensor import check_kind
+
+_log = logging.getLogger(__name__)
 
 _AUTO_GRIDS = {
     "low": {"tips": (3, 3, 0.004), "fingers": (2, 3, 0.004), "palm": (4, 3, 0.004)},
@@ -79,9 +82,16 @@ class Hand:
         return tuple(model.joint(index).name for index in range(model.njnt) if model.jnt_type[index] in (2, 3))
 
     def rated_speeds(self, joints: Iterable[str]) -> NDArray[np.float64]:
-        """Return the largest speeds [J] (rad/s or m/s) of joints; :data:`UNKNOWN_SPEED` where none is stated."""
+        """Return the largest speeds [J] (rad/s or m/s) of joints.
+
+        Where none is stated (as in any URDF or MJCF file), it is taken to be :data:`UNKNOWN_SPEED`, with a warning.
+        """
+        names = list(joints)
         known = {joint.name: joint.velocity for joint in self.spec.joints} if self.spec is not None else {}
-        return np.array([known.get(name, UNKNOWN_SPEED) for name in joints])
+        if assumed := [name for name in names if name not in known]:
+            told = f"{UNKNOWN_SPEED:g} rad/s (or m/s) counts as the largest of {listing(assumed)}"
+            _log.warning("Hand %s states no speed for %d joints: %s.", shown(self.name), len(assumed), told)
+        return np.array([known.get(name, UNKNOWN_SPEED) for name in names])
 
     @property
     def tips(self) -> tuple[str, ...]:
@@ -129,8 +139,8 @@ class Hand:
         if not layout:
             raise UsageError(f"A layout of hand {self.name!r} needs at least one link with probes; received none.")
         known = [self.model.body(index).name for index in range(1, self.model.nbody)]
+        check_each("link", layout, known)
         for link, probes in layout.items():
-            check_name("link", link, known)
             check_kind(f"layout of link {link!r}", probes, Probes, "Probes(...)")
         return replace(self, custom=layout)
 

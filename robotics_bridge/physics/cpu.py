@@ -13,11 +13,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from brainbench.core.devices import mujoco_module
-from brainbench.core.errors import UsageError
+from brainbench.core.errors import UsageError, unknown_name
 from brainbench.core.reading.ranges import check_number
 from robotics_bridge.physics.scene import TouchScene
 from robotics_bridge.physics.state import MOST_ENVS, HandState
-from robotics_bridge.physics.variants import check_fields
+from robotics_bridge.physics.variants import check_fields, model_fields
 
 mujoco = mujoco_module()
 
@@ -99,15 +99,19 @@ class MujocoEngine:
         return np.stack([data.qvel for data in self._data])
 
     def set(self, **values: ArrayLike) -> None:
-        """Write ``qpos``, ``qvel``, ``ctrl``, … of every environment [B, n] (or one row [n] for all)."""
+        """Write ``qpos``, ``qvel``, ``ctrl``, … of every environment [B, n] (or one row [n] for all).
+
+        Raises:
+            UsageError: the simulation has no such array, or it has another shape.
+        """
         for name, value in values.items():
-            shape = getattr(self._data[0], name).shape
+            if not isinstance(own := getattr(self._data[0], name, None), np.ndarray):
+                raise unknown_name("array of the simulation", name, model_fields(self._data[0]))
+            shape = (self.num_envs, *own.shape)
             try:
-                rows = np.broadcast_to(np.asarray(value, dtype=float), (self.num_envs, *shape))
+                rows = np.broadcast_to(np.asarray(value, dtype=float), shape)
             except ValueError:
-                raise UsageError(
-                    f"{name} has the shape {(self.num_envs, *shape)} here; received {np.shape(value)}."
-                ) from None
+                raise UsageError(f"{name} has the shape {shape} here; received {np.shape(value)}.") from None
             for data, row in zip(self._data, rows, strict=True):
                 getattr(data, name)[...] = row
 

@@ -127,16 +127,23 @@ class MujocoWarpEngine:
             self._fill_links()
 
     def set(self, **values: ArrayLike | torch.Tensor) -> None:
-        """Write ``qpos``, ``qvel``, ``ctrl``, … of every environment [B, n] (or one row [n] for all)."""
+        """Write ``qpos``, ``qvel``, ``ctrl``, … of every environment [B, n] (or one row [n] for all).
+
+        Raises:
+            UsageError: the simulation has no such array, or it has another shape.
+        """
+        wp = warp()
         for name, value in values.items():
-            view = warp().to_torch(getattr(self._d, name))
+            if not isinstance(own := getattr(self._d, name, None), wp.array):
+                arrays = [key for key, item in vars(self._d).items() if isinstance(item, wp.array)]
+                raise unknown_name("array of the simulation", name, arrays)
+            view = wp.to_torch(own)
             rows = value if isinstance(value, torch.Tensor) else torch.as_tensor(np.array(value))
             try:
                 view.copy_(rows.to(view.dtype).expand_as(view))
             except RuntimeError:
-                raise UsageError(
-                    f"{name} has the shape {tuple(view.shape)} here; received {tuple(rows.shape)}."
-                ) from None
+                shapes = f"has the shape {tuple(view.shape)} here; received {tuple(rows.shape)}"
+                raise UsageError(f"{name} {shapes}.") from None
 
     def step(self, steps: int = 1) -> None:
         """Advance every environment by so many steps and refresh the state."""

@@ -17,7 +17,7 @@ mujoco = mujoco_module()
 
 
 def model_fields(model: Any) -> tuple[str, ...]:
-    """Return the names of the numeric array fields of a ``mujoco.MjModel``."""
+    """Return the names of the numeric array fields of a ``mujoco.MjModel`` or ``MjData``."""
     names = (name for name in dir(model) if not name.startswith("_"))
     return tuple(name for name in names if isinstance(getattr(model, name, None), np.ndarray))
 

@@ -37,6 +37,14 @@ def test_zeroing_a_row_resets_it_alone(name):
     torch.testing.assert_close(features[1:], model.encode(x[1:])[:, 3], atol=1e-4, rtol=1e-4)
 
 
+@pytest.mark.parametrize("wrong", [-1, 1.5, None, True])
+def test_states_are_of_a_whole_number_of_sweeps(wrong):
+    model = load_model("zhuang-small")
+    for of in (model, StreamingStep(model)):
+        with pytest.raises(UsageError, match=f"batch .*{wrong}"):
+            of.init_state(wrong)
+
+
 @torch.no_grad()
 def test_a_full_context_gives_nan_until_it_is_reset():
     model = load_model("zhuang-small+gpt")

@@ -250,6 +250,14 @@ def test_a_plain_module_is_scored_on_arrays_without_registration(recordings: xr.
     assert record.card.input == "as given"
 
 
+def test_units_can_be_chosen_for_plain_modules_alone(recordings: xr.Dataset, arrays: Path, truth: Path):
+    given = {"recordings": recordings, "stimuli": str(arrays), "normalize": False}
+    assert brainbench.score(_Tiny(), **given).status == "ok"
+    for model, why in ((str(truth), "elsewhere"), ("zhuang-small", "by itself")):
+        with pytest.raises(UsageError, match=f"normalize=False .*{why}"):
+            brainbench.score(model, **given)
+
+
 def test_the_published_readout_scores_the_layers_of_the_study(recordings: xr.Dataset, tmp_path: Path):
     import h5py
 

@@ -12,7 +12,7 @@ import pytest
 from brainbench.core.errors import DataError, UsageError
 from brainbench.core.rotations import from_rpy
 from robotics_bridge import hands
-from robotics_bridge.hands.hand import palmar_directions
+from robotics_bridge.hands.hand import UNKNOWN_SPEED, palmar_directions
 from robotics_bridge.hands.layouts import RESOLUTIONS, active_count, fillers, read_probes, write_probes
 from robotics_bridge.hands.spec import CapsuleGeometry, HandSpec, Joint, Link, build
 
@@ -190,6 +190,19 @@ def test_a_menagerie_like_file_becomes_a_hand_with_probes_on_its_palmar_sides(tm
         assert np.linalg.norm(away, axis=1) == pytest.approx(0.008, abs=1e-9)
     palm = hand.layout("low", "palm")["palm"]
     assert palm.position[:, 0] == pytest.approx(0.02)
+
+
+def test_speeds_that_no_file_states_are_told_with_their_joints(tmp_path, caplog):
+    path = tmp_path / "other.xml"
+    path.write_text(MENAGERIE_LIKE)
+    hand = hands.load(str(path))
+    assert (hand.rated_speeds(hand.joints) == UNKNOWN_SPEED).all()
+    (told,) = caplog.messages
+    assert all(word in told for word in ("'other'", f"{UNKNOWN_SPEED:g} rad/s", repr(hand.joints[0])))
+    caplog.clear()
+    ours = hands.load("xhand1")
+    assert UNKNOWN_SPEED not in ours.rated_speeds(ours.joints)
+    assert not caplog.messages
 
 
 def test_a_layout_survives_its_file(tmp_path):

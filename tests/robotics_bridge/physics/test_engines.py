@@ -116,6 +116,9 @@ def test_unknown_fields_and_wrong_shapes_are_refused() -> None:
         MujocoEngine(model, 0)
     with pytest.raises(UsageError, match=r"qvel .*received \(5,\)"):
         MujocoEngine(model, 2).set(qvel=np.zeros(5))
+    for wrong in ("qvell", "time", "contact"):
+        with pytest.raises(UsageError, match=f"array of the simulation '{wrong}'"):
+            MujocoEngine(model, 2).set(**{wrong: 0.0})
 
 
 @pytest.mark.parametrize("wrong", [0, -1, 2.5, np.nan, True, "2"])

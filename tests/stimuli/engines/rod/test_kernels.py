@@ -4,6 +4,7 @@ import os
 import threading
 
 import pytest
+import torch
 
 from brainbench.core import devices as _device
 from brainbench.core.errors import UsageError
@@ -70,6 +71,13 @@ def test_a_device_that_is_not_there_is_told_in_one_sentence(monkeypatch, name):
 
 def test_the_automatic_device_is_the_processor_wherever_that_works():
     assert _device.pick_device("auto").is_cpu
+
+
+def test_devices_of_torch_are_taken_and_other_objects_refused():
+    assert _device.pick_device(torch.device("cpu")).is_cpu
+    for wrong in (3, torch.device("meta")):
+        with pytest.raises(UsageError, match=f"A device is .*'{wrong}'"):
+            _device.pick_device(wrong)
 
 
 def test_only_the_line_about_the_missing_driver_is_kept_back(capfd):
