@@ -60,9 +60,7 @@ class Commitment:
         if not data.is_file() or not salt.is_file():
             raise DataError(f"The secret folder {os.fspath(secret)!r} lacks {DATA!r} or {SALT!r}.")
         if digest(data, read_text(salt, "salt").strip()) != self.digest:
-            raise DataError(
-                f"{os.fspath(data)!r} is not the file that the published hash {self.digest[:12]}… commits to."
-            )
+            raise DataError(f"{os.fspath(data)!r} is not what the published hash {self.digest[:12]}… commits to.")
         return data
 
 

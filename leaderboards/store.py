@@ -94,9 +94,7 @@ def read_records(source: str | os.PathLike[str] | Iterable[str | os.PathLike[str
     paths: list[Path] = []
     for item in sources:
         if not item.exists():
-            raise DataFileNotFoundError(
-                f"There is no file or folder {os.fspath(item)!r} to read result records from; {MAKE_ONE}"
-            )
+            raise DataFileNotFoundError(f"There is no file or folder {os.fspath(item)!r} of records; {MAKE_ONE}")
         # A hidden name is another process's unfinished write.
         paths += [path for path in item.rglob("*.json") if path.name[0] != "."] if item.is_dir() else [item]
     if not paths:

@@ -168,9 +168,8 @@ def provenance_rows(provenance: Mapping[str, Any]) -> list[tuple[str, str]]:
         if isinstance(value, Mapping) and key not in ("packages", "pairs"):
             # Each layer's p stands in the table of layers; other statistics are measured, so few digits say all.
             found = {name: item for name, item in value.items() if (key, name) != ("statistics", "layer_tests")}
-            rows += [
-                (f"{key}: {name}", _rounded(item) if key == "statistics" else item) for name, item in found.items()
-            ]
+            found = _rounded(found) if key == "statistics" else found
+            rows += [(f"{key}: {name}", item) for name, item in found.items()]
         elif key != "command":
             rows.append((key, value))
     return [(key.replace("_", " "), _inline(item)) for key, item in rows if item not in (None, "", {}, [])]

@@ -44,11 +44,8 @@ def doctor(as_json: JsonOption = False) -> None:
         f"cache {data['cache']} ({data['cache_bytes'] / 1e6:.1f} MB)",
     ]
     told = f"\n\nAn extra is installed, in the checkout of brainbench, with: {install_command('EXTRA')}"
-    emit(
-        data,
-        "\n".join(head) + "\n\n" + table("", ["part", "version", "extra", "enables"], rows) + told,
-        as_json=as_json,
-    )
+    text = "\n".join(head) + "\n\n" + table("", ["part", "version", "extra", "enables"], rows) + told
+    emit(data, text, as_json=as_json)
 
 
 def diagnose() -> dict[str, Any]:

@@ -24,9 +24,7 @@ import typer
 from brainbench.core.errors import UsageError, shown
 
 WorkersOption = Annotated[int | None, typer.Option(min=1, help="Processes. [default: as many as there are processors]")]
-SchedulerOption = Annotated[
-    str | None, typer.Option(help="Let the workers of this Dask scheduler (tcp://host:8786) do it.")
-]
+SchedulerOption = Annotated[str | None, typer.Option(help="Let workers of a Dask scheduler (tcp://host:8786) do it.")]
 
 SCORE = "brainbench.scoring.options:ScoreOptions"
 SCORE_FLAGS = {

@@ -62,9 +62,8 @@ def table_of(title: str, items: Iterable[Any], columns: Mapping[str, str | Calla
     ``columns`` maps a heading, set flush right if it begins with ``>``, to a format of an item (``"{0.error:.2%}"``,
     ``"{0[cost]:.3g}"``) or a function of it.
     """
-    rows = [
-        [cell.format(item) if isinstance(cell, str) else str(cell(item)) for cell in columns.values()] for item in items
-    ]
+    cells = columns.values()
+    rows = [[cell.format(item) if isinstance(cell, str) else str(cell(item)) for cell in cells] for item in items]
     right = tuple(index for index, heading in enumerate(columns) if heading.startswith(">"))
     return table(title, [heading.removeprefix(">") for heading in columns], rows, right=right)
 
@@ -135,10 +134,8 @@ def progress_bar(what: str = "") -> Iterator[Progress]:
     from rich.progress import Progress as ProgressBar
 
     counts = () if what else (MofNCompleteColumn(), TimeRemainingColumn())
-    bar = ProgressBar(
-        TextColumn("{task.description}"), BarColumn(), *counts, console=Console(stderr=True), transient=True
-    )
-    with bar:
+    parts = (TextColumn("{task.description}"), BarColumn(), *counts)
+    with ProgressBar(*parts, console=Console(stderr=True), transient=True) as bar:
         tasks: dict[str, Any] = {what: bar.add_task(what, total=None)} if what else {}
 
         def update(done: int, total: int, what: str) -> None:

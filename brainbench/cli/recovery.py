@@ -17,6 +17,7 @@ from brainbench.cli.options import SCORE, SchedulerOption, WorkersOption, option
 from brainbench.cli.output import JsonOption, emit, progress_bar, table_of
 from brainbench.core.errors import UsageError
 from brainbench.core.files import provenance, to_plain, write_json
+from brainbench.core.reading.ranges import check_number
 
 if TYPE_CHECKING:
     from brainbench.scoring.recovery import Candidate, Recovery, RecoveryDesign
@@ -79,12 +80,11 @@ def recovery(
         raise UsageError("Stimuli are picked with both --pool STIMULI and --keep NUMBER; received one of them.")
     if keep is not None and show is not None:
         raise UsageError("All stimuli that --keep picks are shown; leave out --show.")
-    if want is not None and not 0 < want < 1:
-        raise UsageError(f"A wanted rate lies between 0 and 1; received {want}.")
+    if want is not None:
+        check_number("--want", want, above=0, below=1)
     started = time.perf_counter()
-    design = RecoveryDesign(
-        PopulationDesign(**options, trials=parse_trials(trials)), show, metric=metric, layer=layer, seed=seed
-    )
+    population = PopulationDesign(**options, trials=parse_trials(trials))
+    design = RecoveryDesign(population, show, metric=metric, layer=layer, seed=seed)
     chosen = ScoreOptions(stimuli=pool or stimuli, whiskers=whiskers, fidelity=fidelity, metric=metric, seed=seed)
     where: dict[str, Any] = {"workers": workers, "scheduler": scheduler}
     with progress_bar() as progress:

@@ -12,9 +12,8 @@ from brainbench.cli.options import items, numbers
 from brainbench.cli.output import JsonOption, emit, progress_bar, table_of
 from brainbench.stimuli.engines import DEFAULT_ENGINE
 
-PlotOption = Annotated[
-    Path | None, typer.Option(callback=picture_file, help="Also draw error against cost (.png, .svg, .pdf).")
-]
+_PLOT = typer.Option(callback=picture_file, help="Also draw error against cost (.png, .svg, .pdf).")
+PlotOption = Annotated[Path | None, _PLOT]
 
 app = typer.Typer(no_args_is_help=True, help="Measure accuracy against cost.")
 

@@ -90,7 +90,7 @@ def mujoco_module() -> Any:
 
 
 def pick_device(name: Any) -> Any:
-    """Return the Warp device called ``cpu``, ``cuda`` or ``cuda:1`` or as a torch device; a Warp device passes through.
+    """Return the Warp device called ``cpu``, ``cuda`` or ``cuda:1``, or like a torch device; a Warp device passes.
 
     ``auto`` is the processor, or the GPU where this build of Warp lacks the compiler for processors.
 

@@ -97,9 +97,7 @@ def run_on_cluster(
     with client:
         threads = sum(client.nthreads().values())
         if not threads:
-            raise UsageError(
-                f"The Dask scheduler at {scheduler!r} has no workers; start some: dask worker {scheduler}."
-            )
+            raise UsageError(f"The Dask scheduler at {scheduler!r} has no workers; start one: dask worker {scheduler}.")
         waiting = iter(range(len(jobs)))
         futures = as_completed(loop=client.loop)
         running: dict[str, int] = {}

@@ -36,9 +36,7 @@ def load_object(target: str, kind: str) -> Any:
     """
     path, _, name = target.rpartition(":")
     if not path or not name:
-        raise UsageError(
-            f"A {kind} of your own is given as path/to/FILE.py:NAME or package.module:NAME; received {target!r}."
-        )
+        raise UsageError(f"A {kind} of your own is FILE.py:NAME or package.module:NAME; received {target!r}.")
     module = load_module(path)
     if not hasattr(module, name):
         choices = [key for key, value in vars(module).items() if not key.startswith("_") and callable(value)]

@@ -71,9 +71,7 @@ def gather(metric: Metric, subjects: Sequence[SubjectRDM], stimuli: int, *, esti
         raise UsageError(f"Subject {twice[0]!r} appears twice; join the sessions of an animal in one SubjectRDM.")
     for subject in ordered:
         if subject.count != stimuli:
-            raise UsageError(
-                f"Subject {subject.subject!r} has an RDM of {subject.count} stimuli; {stimuli} are scored."
-            )
+            raise UsageError(f"{subject.subject!r} has an RDM of {subject.count} stimuli; {stimuli} are scored.")
     corrections = tuple(_correction(metric, subject, estimator) for subject in ordered)
     usable = tuple(i for i, found in enumerate(corrections) if found.status != "undefined")
     good = tuple(i for i in usable if corrections[i].status == "ok")

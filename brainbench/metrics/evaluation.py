@@ -57,9 +57,8 @@ def defined_layers(metric: Metric, layers: Mapping[str, Floats]) -> list[str]:
     found = []
     for label, layer in layers.items():
         known = metric.known(layer)
-        if known.sum() >= max(metric.fewest, len(known) / 2) and metric.varies(
-            metric.take(layer, np.flatnonzero(known))
-        ):
+        enough = known.sum() >= max(metric.fewest, len(known) / 2)
+        if enough and metric.varies(metric.take(layer, np.flatnonzero(known))):
             found.append(label)
     return found
 

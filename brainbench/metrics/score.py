@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from brainbench.core.errors import UsageError, unknown_name
+from brainbench.core.errors import check_name, check_once
 from brainbench.core.provenance import Provenance
 from brainbench.core.records import LayerScore, Score, Status, SubjectScore
 from brainbench.core.statistics import t_interval, two_factor_interval
@@ -52,17 +52,15 @@ def score_layers(
     Raises:
         UsageError: no animals, subjects of other stimuli, or an unknown estimator or layer.
     """
-    if len(set(map(str, stimuli))) < len(stimuli):
-        raise UsageError(f"Stimulus names repeat: {list(stimuli)}.")
-    if committed is not None and committed not in layers:
-        raise unknown_name("layer", committed, layers)
+    check_once("A score", map(str, stimuli))
+    if committed is not None:
+        check_name("layer", committed, layers)
     animals = gather(metric, subjects, len(stimuli), estimator=estimator)
     names, result, notes = list(layers), None, ()
     usable = defined = defined_layers(metric, layers)
     if animals.scored and defined and len(stimuli) >= metric.fewest:
-        compared = LayerComparisons(
-            metric, [metric.take(layers[label], animals.order) for label in defined], animals.sorted, device
-        )
+        taken = [metric.take(layers[label], animals.order) for label in defined]
+        compared = LayerComparisons(metric, taken, animals.sorted, device)
         result, defined, notes = evaluate(compared, defined, animals, estimator, committed, seed)
     lacking = {
         "constant or not finite": [name for name in names if name not in usable],
@@ -144,9 +142,7 @@ def _verdict(
     """Return the status of the score and its reasons, the gravest first; ``lacking`` are layers without a value."""
     if result is None:
         if stimuli < metric.fewest:
-            reason = (
-                f"{stimuli} stimuli are too few for the metric {metric.name!r}; at least {metric.fewest} are needed"
-            )
+            reason = f"{stimuli} stimuli are too few for the metric {metric.name!r}, which needs {metric.fewest}"
         elif committed is not None and committed not in defined and animals.scored:
             why = next(words for words, layers in lacking.items() if committed in layers)
             reason = f"activations of the layer committed to, {committed!r}, are {why}"
@@ -164,9 +160,8 @@ def _verdict(
     reasons += animals.reasons
     if result.rule.kind == "maximum":
         reasons.append("optimistic: the layer was chosen as the maximum on the data that are scored")
-    reasons += [
-        f"layers without a value ({why}), never chosen: {', '.join(found)}" for why, found in lacking.items() if found
-    ]
+    told = {why: ", ".join(found) for why, found in lacking.items() if found}
+    reasons += [f"layers without a value ({why}), never chosen: {names}" for why, names in told.items()]
     reasons += [*metric.reasons, *interval_reasons(len(animals.scored), stimuli)]
     unreliable = not animals.reliable or stimuli < SMALLEST_STIMULI
     return "unreliable" if unreliable else "ok", tuple(reasons)

@@ -44,9 +44,7 @@ def stimulus_codes(labels: ArrayLike, count: int | None = None) -> tuple[Ints, t
     codes = array.astype(np.int64)
     total = int(codes.max(initial=-1)) + 1 if count is None else count
     if codes.min(initial=0) < 0 or codes.max(initial=-1) >= total:
-        raise UsageError(
-            f"Integer labels of {total} stimuli run from 0 to {total - 1}; received {codes.min()} to {codes.max()}."
-        )
+        raise UsageError(f"Integer labels run from 0 to {total - 1}; received {codes.min()} to {codes.max()}.")
     return codes, tuple(str(code) for code in range(total))
 
 

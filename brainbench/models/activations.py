@@ -224,9 +224,7 @@ def _hooked_run(
         activity = _over_calls(name, outputs, batch, steps)
         if not activity and strict:
             seen = [list(output.shape) for output in outputs] or "nothing"
-            raise _LayerError(
-                f"Layer {name!r} gave {seen} for {batch} stimuli of {steps} steps: no activation per stimulus."
-            )
+            raise _LayerError(f"Layer {name!r} gave {seen} for {batch} stimuli of {steps} steps, not one each.")
         found |= activity
     return found
 

@@ -100,9 +100,7 @@ def _layers(group: h5py.Group, rows: int, path: str) -> dict[str, NDArray[np.flo
                 "rounds; scale them or write them as floating point."
             )
         if infinite := int(np.isinf(values).sum()):
-            raise DataError(
-                f"Layer {shown(name)} of {shown(path)} has {infinite:,} infinite values; missing ones are NaN."
-            )
+            raise DataError(f"Layer {shown(name)} of {shown(path)} has {infinite:,} infinite values; use NaN for none.")
         # NaN is a missing value: the layer is scored on the rest, or its score is undefined and says so.
         layers[name.replace("\N{DIVISION SLASH}", "/")] = values[:, None, :] if values.ndim == 2 else values
 
@@ -112,8 +110,6 @@ def _layers(group: h5py.Group, rows: int, path: str) -> dict[str, NDArray[np.flo
 
 def _check_shape(layer: str, shape: tuple[int, ...], rows: int, path: str) -> None:
     if len(shape) not in (2, 3) or shape[0] != rows:
-        raise DataError(
-            f"Layer {layer!r} of {path!r} has shape {list(shape)}; expected [K, F] or [K, T, F] with K = {rows} labels."
-        )
+        raise DataError(f"Layer {layer!r} of {path!r} is {list(shape)}; expected [{rows}, F] or [{rows}, T, F].")
     if 0 in shape[1:]:
         raise DataError(f"Layer {layer!r} of {path!r} has shape {list(shape)}; expected at least one feature.")

@@ -101,9 +101,7 @@ class EncoderAttenderDecoder(nn.Module):
         self.decoder = decoder or make_decoder("linear", self.features)
         linear = [module for module in self.decoder.modules() if isinstance(module, nn.Linear)]
         if not linear:
-            raise UsageError(
-                f"A decoder must end in a linear layer; received {type(self.decoder).__name__} without any."
-            )
+            raise UsageError(f"A decoder must end in a linear layer; {type(self.decoder).__name__} has none.")
         every = isinstance(self.decoder, AllStepsDecoder)
         limits = [attender.max_steps if attender is not None else None, self.decoder.steps if every else None]
         self.spec = ModelSpec(
@@ -142,9 +140,7 @@ class EncoderAttenderDecoder(nn.Module):
         """
         if self.spec.max_steps is not None and x.ndim == 5 and x.shape[1] > self.spec.max_steps:
             # Said before the encoder has worked for nothing.
-            raise UsageError(
-                f"The model remembers at most {self.spec.max_steps} steps; received {x.shape[1]:,}. Shorten the sweep."
-            )
+            raise UsageError(f"The model remembers at most {self.spec.max_steps} steps; the sweep has {x.shape[1]:,}.")
         x = self._normalise(x)
         if last and self.attender is None and isinstance(self.encoder, TemporalGraph):
             return self.encoder(x, **self._unroll, last=True)

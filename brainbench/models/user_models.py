@@ -134,9 +134,7 @@ def read_user_models() -> dict[str, UserModel]:
         isinstance(item, dict) and item.keys() == fields and all(isinstance(text, str) for text in item.values())
         for item in stored.values()
     ):
-        raise DataError(
-            f"{str(path)!r} does not hold models as brainbench models add writes them; remove it and add them again."
-        )
+        raise DataError(f"{str(path)!r} is not what brainbench models add writes; remove it and add your models again.")
     return {name: UserModel(name, **item) for name, item in stored.items()}
 
 

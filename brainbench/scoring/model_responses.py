@@ -211,9 +211,7 @@ def _trained(config: Mapping[str, Any] | None) -> dict[str, Any]:
 def _as_steps(layer: str, values: Any, rows: int) -> NDArray[np.floating]:
     array = np.asarray(values)
     if array.ndim not in (2, 3) or array.shape[0] != rows:
-        raise UsageError(
-            f"Layer {layer!r} has shape {list(array.shape)}; expected [K, F] or [K, T, F] with K = {rows}."
-        )
+        raise UsageError(f"Layer {layer!r} has shape {list(array.shape)}; expected [{rows}, F] or [{rows}, T, F].")
     return array[:, None, :] if array.ndim == 2 else array
 
 

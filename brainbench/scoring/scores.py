@@ -177,9 +177,7 @@ def _check_inputs(resolved: ResolvedModel, brain: NeuralResponses, options: Scor
     from brainbench.stimuli.sources import known_labels
 
     if brain.published and options.estimator != "default" and options.units_reliability is not None:
-        raise UsageError(
-            f"The estimator {options.estimator!r} takes all units of a published file; leave out units_reliability."
-        )
+        raise UsageError(f"The estimator {options.estimator!r} takes all published units; leave out units_reliability.")
     if resolved.activations is not None and (options.whiskers != "all" or options.fidelity not in (None, "balanced")):
         raise UsageError("whiskers and fidelity are of a simulation, and these features were computed elsewhere.")
     source = DEFAULT_STIMULI if options.stimuli is None else options.stimuli

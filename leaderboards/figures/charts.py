@@ -131,9 +131,7 @@ def accuracy(entries: Sequence[Entry]) -> Figure:
     key, title = "accuracy", "Task accuracy (as figure 3.6)"
     stated = sorted((e for e in entries if e.card.top1 is not None), key=lambda e: -(e.card.top1 or 0))
     if not stated:
-        return Figure(
-            key, title, lacking="no record states a task accuracy (top1 on its model card); trained models do"
-        )
+        return Figure(key, title, lacking="no record states a task accuracy (top1 of its model card); trained ones do")
     # Untrained networks are drawn as twins; a board of such alone still shows them.
     stated = [e for e in stated if e.trained] or stated
     models, untrained = stated[:SHOWN], twins(entries)

@@ -131,9 +131,8 @@ def _pages(stored: Sequence[StoredRecord], title: str) -> Iterator[tuple[str, st
     )
     for entry in (entry for board in boards for entry in board.entries):
         yield f"models/{entry.page}", model_page(entry)
-    texts = {
-        record.file_name: record_text(record) for board in boards for entry in board.entries for record in entry.records
-    }
+    kept = (record for board in boards for entry in board.entries for record in entry.records)
+    texts = {record.file_name: record_text(record) for record in kept}
     yield from ((f"records/{name}", text) for name, text in texts.items())
     rows = [row for board in boards for row in table_rows(board)]
     data = (table_csv(rows), to_json(rows) + "\n", _records_zip(texts), to_json(record_schema()) + "\n")

@@ -77,9 +77,7 @@ def check_site(root: Path) -> tuple[_Hashes, set[str]]:
         listed = (known or {}).get(name, [])
         if path.is_symlink() or not path.is_file() or file_hash(path, length=64) not in listed:
             what = "was changed since the last build" if listed else "no build of a leaderboard wrote"
-            raise UsageError(
-                f"The folder {str(root)!r} holds {name[-80:]!r}, which {what}; move it away or give a new folder."
-            )
+            raise UsageError(f"The folder {str(root)!r} holds {name[-80:]!r}, which {what}; name a new folder.")
         present.add(name)
     return known or {}, present
 

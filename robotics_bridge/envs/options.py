@@ -66,6 +66,4 @@ class EnvOptions:
             raise UsageError("Poses of tactile links belong to tactile sensors; choose an observation type.")
         pick_device(self.device)
         if self.graphs and not self.device.startswith("cuda"):
-            raise UsageError(
-                f"Graphs are recorded on CUDA only, and the environment is on {self.device}; leave it out."
-            )
+            raise UsageError(f"Graphs are recorded on CUDA only, not on {self.device}; leave it out.")

@@ -105,9 +105,8 @@ class EnvState:
         """Physics steps of a control step."""
         self.generator = torch.Generator(device=self.device)
         self.generator.manual_seed(options.seed)
-        self.actuators = Actuators(
-            self.simulation, self.model, task.actuators, substeps=self.substeps, seed=options.seed
-        )
+        steps = self.substeps
+        self.actuators = Actuators(self.simulation, self.model, task.actuators, substeps=steps, seed=options.seed)
         axes = [shape.round_about or (0.0, 0.0, 0.0) for shape in self.model.shapes]
         round_about = torch.tensor([axes[shape] for shape in self.simulation.shape_of], device=self.device)
         self.goals = GoalState(task, self.num_envs, self.device, round_about)
@@ -115,9 +114,8 @@ class EnvState:
         if options.observe != "none":
             from robotics_bridge.envs.tactile import TactileObservation
 
-            self.touch = TactileObservation(
-                self.model, hand, self.simulation, options, substeps=self.substeps, twist=task.taxel_twist
-            )
+            how = {"substeps": steps, "twist": task.taxel_twist}
+            self.touch = TactileObservation(self.model, hand, self.simulation, options, **how)
         self._index()
         self.episode = EpisodeState.start(
             self.num_envs, self.device, actions=len(self.model.moved), terms=len(task.rewards), rest=self.rest

@@ -199,9 +199,8 @@ def read_mjspec(path: Path) -> Any:
         spec.compiler.discardvisual = True
         # Fixed links join their parents, as their solids should; a sensor keeps the palm from joining the world.
         root = spec.worldbody.first_body()
-        spec.add_sensor(
-            name="palm_pose", type=mujoco.mjtSensor.mjSENS_FRAMEPOS, objtype=mujoco.mjtObj.mjOBJ_BODY, objname=root.name
-        )
+        kinds = {"type": mujoco.mjtSensor.mjSENS_FRAMEPOS, "objtype": mujoco.mjtObj.mjOBJ_BODY}
+        spec.add_sensor(name="palm_pose", objname=root.name, **kinds)
     spec.compiler.boundmass = max(spec.compiler.boundmass, 1e-6)
     spec.compiler.boundinertia = max(spec.compiler.boundinertia, 1e-9)
     return spec

@@ -11,7 +11,7 @@ from typing import Any
 
 import torch
 
-from brainbench.core.errors import UsageError, check_name
+from brainbench.core.errors import UsageError, check_each, check_name
 from robotics_bridge import sensors
 from robotics_bridge.hands.layouts import Layout
 from robotics_bridge.sensors.sensor import Sensor
@@ -101,8 +101,7 @@ def sensors_for(
         settings.setdefault("dilation", "direct")
     make, found = getattr(sensors, kind.sensor), {}
     own = [field.name for field in fields(make) if field.name not in ("link", "probes")]
-    for knob in settings:
-        check_name(f"setting of {kind.sensor}", knob, own)
+    check_each(f"setting of {kind.sensor}", settings, own)
     for link, probes in layout.items():
         placed = probes.with_radius(PROXIMITY_RADIUS) if kind.sensor == "ProximityTaxel" else probes
         found[link] = make(link=link, probes=placed, **settings)

@@ -112,9 +112,8 @@ def _between(hand: Hand, spec: Any, jaws: dict[int, tuple[float, float]]) -> Any
                 jaw, slide = model.jnt_bodyid[joint], spec.joints[joint]
                 slide.ref = opened + share * (closed - opened)
                 way = to_matrices(model.body_quat[jaw]) @ model.jnt_axis[joint]
-                spec.body(model.body(jaw).name).pos = (
-                    starts[joint] + (slide.ref - model.qpos0[model.jnt_qposadr[joint]]) * way
-                )
+                moved = slide.ref - model.qpos0[model.jnt_qposadr[joint]]
+                spec.body(model.body(jaw).name).pos = starts[joint] + moved * way
             made = spec.compile()
             start = mujoco.MjData(made)
             mujoco.mj_forward(made, start)

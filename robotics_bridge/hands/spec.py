@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from brainbench.core.devices import mujoco_module
-from brainbench.core.errors import UsageError
+from brainbench.core.errors import UsageError, check_once
 from brainbench.core.rotations import from_rpy
 
 Vector = tuple[float, float, float]
@@ -147,8 +147,7 @@ class HandSpec:
 
     def __post_init__(self) -> None:
         names = [link.name for link in self.links]
-        if len(set(names)) != len(names):
-            raise UsageError(f"Hand {self.name!r} has two links of one name.")
+        check_once(f"Hand {self.name!r}", names)
         used = {self.palm, *(item for joint in self.joints for item in (joint.parent, joint.child))}
         used |= {name for chain in self.fingers.values() for name in chain}
         if missing := sorted(used - set(names)):

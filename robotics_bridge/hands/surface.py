@@ -105,9 +105,8 @@ def _nearest(model: Any, geoms: list[int], origin: NDArray, direction: NDArray) 
             data.geom_xpos[geom], data.geom_xmat[geom] = model.geom_pos[geom], matrix
             distance = mujoco.mj_rayMesh(model, data, geom, origin, direction, normal)
         else:
-            distance = mujoco.mju_rayGeom(
-                model.geom_pos[geom], matrix, model.geom_size[geom], origin, direction, kind, normal
-            )
+            place, size = model.geom_pos[geom], model.geom_size[geom]
+            distance = mujoco.mju_rayGeom(place, matrix, size, origin, direction, kind, normal)
         # A ray that misses has the distance −1.
         if distance >= 0 and (best is None or distance < best[0]):
             best = (distance, normal)

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from brainbench.core.devices import mujoco_module
 from brainbench.core.errors import UsageError, check_name, repeats
-from brainbench.core.reading.ranges import check_fields, check_number
+from brainbench.core.reading.ranges import check_fields, check_number, check_numbers
 from brainbench.geometry import Mesh
 
 mujoco = mujoco_module()
@@ -57,21 +57,14 @@ class Geometry:
 
     def __post_init__(self) -> None:
         check_name("kind of geometry", self.kind, KINDS)
-        needed, of = _SIZES[self.kind], f"{{}} of {self.name!r}"
-        if len(self.size) != needed:
-            raise UsageError(
-                f"The {self.kind} {self.name!r} needs {needed} positive size(s) in metres; received {self.size}."
-            )
-        for size in self.size:
-            check_number(f"size of {self.name!r}", size, above=0)
+        of = f"{{}} of {self.name!r}"
+        check_numbers(f"size of {self.name!r}", self.size, _SIZES[self.kind], above=0)
         check_fields(self, "contype", "affinity", of=of, whole=True)
         check_fields(self, "position", of=of, items=3)
         check_fields(self, "quaternion", of=of, items=4)
         if (self.kind == "mesh") != (self.mesh is not None):
             verb = "has" if self.mesh is not None else "names no"
-            raise UsageError(
-                f"The geometry {self.name!r} of kind {self.kind!r} {verb} mesh; kind='mesh' goes with mesh=Mesh(...)."
-            )
+            raise UsageError(f"The {self.kind} {self.name!r} {verb} mesh; kind='mesh' goes with mesh=Mesh(...).")
         norm = float(np.linalg.norm(self.quaternion))
         check_number(f"length of the quaternion of {self.name!r}", norm, above=1e-6)
         object.__setattr__(self, "quaternion", tuple(float(q) / norm for q in self.quaternion))
@@ -130,18 +123,14 @@ class TouchScene:
             check_name("link", geometry.link, self.links, hint=f"Geometry {geometry.name!r} is fixed to it.")
 
     @cached_property
-    def _links(self) -> dict[str, int]:
-        return {name: index for index, name in enumerate(self.links)}
-
-    @cached_property
     def link_of(self) -> NDArray[np.int32]:
         """Link number [G] of every geometry."""
-        return np.array([self._links[geometry.link] for geometry in self.geometries], dtype=np.int32)
+        return np.array([self.links.index(geometry.link) for geometry in self.geometries], dtype=np.int32)
 
     def link_index(self, name: str) -> int:
         """Return the number of a link; an unknown name raises UsageError."""
         check_name("link", name, self.links)
-        return self._links[name]
+        return self.links.index(name)
 
     def geometries_of(self, link: str) -> tuple[int, ...]:
         """Return the numbers of the geometries that a link carries."""
@@ -232,9 +221,8 @@ def _geometries(model: Any, links: tuple[str, ...]) -> tuple[Geometry, ...]:
         data = int(model.geom_dataid[index])
         if kind == "mesh" and data not in meshes:
             meshes[data] = _mesh(model, data)
-        size, position, quaternion = (
-            tuple(getattr(model, f"geom_{name}")[index].tolist()) for name in ("size", "pos", "quat")
-        )
+        rows = (model.geom_size[index], model.geom_pos[index], model.geom_quat[index])
+        size, position, quaternion = (tuple(row.tolist()) for row in rows)
         found.append(
             Geometry(
                 name=_name(model, int(mujoco.mjtObj.mjOBJ_GEOM), index), link=links[model.geom_bodyid[index]],

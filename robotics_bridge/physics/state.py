@@ -169,7 +169,7 @@ class HandState:
         count, room = len(environments), self.contact_env.shape[0]
         if count > room:
             raise UsageError(
-                f"The state has room for {room} contacts; received {count}. Make it with contacts={count}."
+                f"The state has room for {room} contacts; received {count}: make it with contacts={count}."
             )
         if len(pairs) != 2 * count:
             raise UsageError(f"Every contact needs one pair of geometries; received {count} and {len(pairs) / 2:g}.")
@@ -186,9 +186,7 @@ class HandState:
             else:
                 rows = np.asarray(values, dtype=np.float32 if view.dtype.is_floating_point else np.int32)
                 if rows.size != view.numel():
-                    raise UsageError(
-                        f"{name} of {count} contacts has the shape {tuple(view.shape)}; received {rows.shape}."
-                    )
+                    raise UsageError(f"{name} of contacts has the shape {tuple(view.shape)}; received {rows.shape}.")
                 view.copy_(_tensor(rows.reshape(tuple(view.shape))))
         self.contact_count.fill_(count)
 

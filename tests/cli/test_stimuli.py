@@ -106,7 +106,7 @@ def test_plot_writes_one_file_per_stimulus(run, scene, tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["render", "{scene}", "-o", "a.png"], "choose with --stimulus (whisking, still)"),
+        (["render", "{scene}", "-o", "a.png"], "Name one stimulus with --stimulus; there are 'whisking', 'still'"),
         (["render", "{scene}", "-o", "a.png", "-s", "stil"], "did you mean 'still'"),
         (["render", "{scene}", "-o", "a.png", "-s", "still", "--view", "1,2"], "--view takes 3 numbers"),
         (["render", "{scene}", "-o", "a.gif", "-s", "still", "--at", "5"], "--start, --stop and --step"),

@@ -309,11 +309,11 @@ def test_a_score_survives_json():
     ("change", "message"),
     [
         ({"layer_rdms": {}}, "no layers"),
-        ({"layer_rdms": {"a": np.ones(10)}}, r"layer 'a' has shape \(10,\); 6 stimuli have 15 pairs"),
+        ({"layer_rdms": {"a": np.ones(10)}}, r"Layer 'a' has an RDM \[10\]; 6 stimuli have 15 pairs"),
         ({"subjects": []}, "no animals"),
         ({"estimator": "defualt"}, "did you mean 'default'"),
         ({"compare": "pearsn"}, "did you mean 'pearson'"),
-        ({"stimuli": ["a"] * 6}, "names repeat"),
+        ({"stimuli": ["a"] * 6}, "more than once"),
     ],
 )
 def test_misuse_is_told_in_a_sentence(change, message):

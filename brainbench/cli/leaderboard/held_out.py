@@ -14,6 +14,7 @@ from brainbench.cli.options import SCORE, with_options
 from brainbench.cli.output import JsonOption, emit, progress_bar
 from brainbench.core.errors import UsageError
 from brainbench.core.files import content_hash, write_json
+from brainbench.core.reading.ranges import check_number
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -61,17 +62,12 @@ def hold_out(
         whole = open_neural_responses(recordings, progress=progress, **options).dataset
     names = list(whole.attrs["vocabulary"]) if stimuli else sorted(set(map(str, whole["subject"].values)))
     held_count = animals or stimuli
-    if min(held_count, len(names) - held_count) < FEWEST[kind]:
-        raise UsageError(
-            f"Of {len(names)} {kind} {FEWEST[kind]} to {len(names) - FEWEST[kind]} can be held back; "
-            f"received {held_count}."
-        )
+    check_number(f"{kind} held back", held_count, least=FEWEST[kind], most=len(names) - FEWEST[kind])
     drawn = set(secrets.SystemRandom().sample(names, held_count))
     held, public = (split(whole, kind, [n for n in names if (n in drawn) is kept]) for kept in (True, False))
     data = write_recordings(secret / DATA, held)
-    commitment = Commitment(
-        kind, held_count, len(names) - held_count, str(whole.attrs["content_hash"]), digest(data, new_salt(secret))
-    )
+    of, hashed = str(whole.attrs["content_hash"]), digest(data, new_salt(secret))
+    commitment = Commitment(kind, held_count, len(names) - held_count, of, hashed)
     files = [
         write_recordings(out / PUBLIC, public),
         # Stimuli without recordings are left out only where the pairs are named.

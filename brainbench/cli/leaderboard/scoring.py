@@ -91,9 +91,7 @@ def score_again(record: ResultRecord, *, recordings: str | None = None, trust_co
         )
     refuse_foreign_code(record, trusted=trust_code)
     if recordings is None and (not isinstance(source, str) or source not in DEMOS):
-        raise UsageError(
-            f"The record was made with the recordings {str(source)[:80]!r}; give them with --recordings PATH."
-        )
+        raise UsageError(f"The record was made with recordings {str(source)[:80]!r}; give them with --recordings PATH.")
     options = ScoreOptions.stated_in(origin.settings, recordings=recordings or source, match=origin.pairs or None)
     return score_record(model, options)
 
@@ -115,9 +113,7 @@ def _check_kinds(record: ResultRecord, model: Any, source: Any) -> None:
         try:
             msgspec.convert(value, kind | None)
         except msgspec.ValidationError as error:
-            raise DataError(
-                f"The settings of the record of {record.score.name[:80]!r} cannot be used: {name}: {error}."
-            ) from error
+            raise DataError(f"The settings of {record.score.name[:80]!r} cannot be used: {name}: {error}.") from error
 
 
 def refuse_foreign_code(record: ResultRecord, *, trusted: bool) -> None:

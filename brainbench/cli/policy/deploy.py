@@ -135,7 +135,7 @@ def deploy(
 
 def _inputs(deployed: DeployedPolicy, words: list[str]) -> dict[str, Any]:
     """Return group → its constant, as --input gives them."""
-    from brainbench.core.errors import UsageError, check_name, check_once
+    from brainbench.core.errors import UsageError, check_each, check_once
     from robotics_bridge.deploy.session import constant
 
     wanted = [name for name in deployed.groups if name != "proprio"]
@@ -147,8 +147,7 @@ def _inputs(deployed: DeployedPolicy, words: list[str]) -> dict[str, Any]:
         except ValueError:
             raise UsageError(f"An input is NAME=NUMBER or NAME=NUMBER,NUMBER…; received {word[:80]!r}.") from None
     check_once("--input", [word.partition("=")[0] for word in words])
-    for name in found:
-        check_name("input that the policy reads and a constant can replace", name, wanted)
+    check_each("input that the policy reads and a constant can replace", found, wanted)
     return {name: constant(name, values, deployed.groups[name]) for name, values in found.items()}
 
 

@@ -68,15 +68,13 @@ def play(
     as_json: JsonOption = False,
 ) -> None:
     """Run an agent in one environment of a task and show what happens, as numbers and as a film."""
-    from brainbench.core.errors import UsageError
     from brainbench.core.figures.style import check_format
+    from brainbench.core.reading.ranges import check_number
     from robotics_bridge.tasks.contact_model import contacts_name
 
-    if not (seconds > 0 and rate > 0 and width >= 64):
-        raise UsageError(
-            f"A film has a positive length and rate, and 64 pixels or more across; received {seconds} s, "
-            f"{rate} frames/s and {width} pixels."
-        )
+    check_number("--seconds", seconds, above=0)
+    check_number("--rate", rate, above=0)
+    check_number("--width (pixels)", width, least=64)
     world.check([agent])
     pictures = [path for path in (video, strip) if path is not None]
     for path, endings in ((video, (".mp4", ".gif")), (strip, (".png",))):
@@ -157,12 +155,11 @@ def evaluate(
     touched the object (rad/s), the mean duration (s) and the share of episodes that a drop (or another ending of the
     task) ended.
     """
-    from brainbench.core.errors import UsageError
+    from brainbench.core.reading.ranges import check_number
     from robotics_bridge.policies.evaluate import evaluate as run
     from robotics_bridge.tasks.contact_model import contacts_name
 
-    if seeds < 1:
-        raise UsageError(f"An evaluation needs at least one seed; received {seeds}.")
+    check_number("--seeds", seeds, least=1)
     world.check(agents or [])
     touch = touch_of(list(agents or []))
     env = world.make(agents or (), num_envs=envs, device=device, **touch)

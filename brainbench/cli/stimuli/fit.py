@@ -162,7 +162,7 @@ def _whisker(name: str, scene: Any, known: dict[str, Any]) -> Whisker:
     """Return the whisker that a fit starts from."""
     from dataclasses import fields, replace
 
-    from brainbench.core.errors import check_name
+    from brainbench.core.errors import check_each, check_name
     from brainbench.stimuli import Whisker, WhiskerArray
 
     if scene is not None:
@@ -171,14 +171,11 @@ def _whisker(name: str, scene: Any, known: dict[str, Any]) -> Whisker:
     else:
         species, colon, label = name.partition(":")
         if not colon:
-            raise UsageError(
-                f"Without a scene --whisker names species and whisker, as mouse:{name}; received {name!r}."
-            )
+            raise UsageError(f"Without a scene --whisker is species and whisker, as mouse:{name}; received {name!r}.")
         array = WhiskerArray.of(species)
         check_name(f"whisker of the {species}", label, array.names)
         whisker = array[label].whisker
-    for key in known:
-        check_name("property of a whisker", key, [item.name for item in fields(Whisker)])
+    check_each("property of a whisker", known, [item.name for item in fields(Whisker)])
     return replace(whisker, **known)
 
 

@@ -69,9 +69,7 @@ def _families() -> tuple[dict[str, Any], str]:
     from brainbench.stimuli.objects import procedural
 
     data = {family: procedural.describe_family(family) for family in procedural.list_families()}
-    hint = (
-        '\n\nin scene files: shape = "family:NAME", seed, diagonal_mm; one in detail: brainbench stimuli objects NAME'
-    )
+    hint = '\n\nin scene files: shape = "family:NAME", seed, diagonal_mm; in detail: brainbench stimuli objects NAME'
     return data, table("", ["family", ""], [[name, text] for name, text in data.items()]) + hint
 
 
@@ -87,18 +85,16 @@ def _folder(source: str, ids: Path | None, categories: Path | None) -> tuple[dic
 def _member(
     name: str, seed: int, detail: int, diagonal: float | None, collision: str | None, settings: DecompositionSettings
 ) -> tuple[dict[str, Any], Solid]:
-    from brainbench.core.errors import unknown_name
+    from brainbench.core.errors import check_name
     from brainbench.stimuli.objects import procedural
     from brainbench.stimuli.objects.mesh_solids import shape_solid
 
     family = name.removeprefix("family:")
-    if family not in procedural.list_families():
-        hint = "Or the path of a mesh file or of a ShapeNet folder."
-        raise unknown_name("object", name, procedural.list_families(), hint=hint)
+    hint = "Or the path of a mesh file or of a ShapeNet folder."
+    check_name("object", family, procedural.list_families(), hint=hint)
     shape = procedural.make(family, seed, detail=detail)
-    solid = shape_solid(
-        shape, diagonal=0.04 if diagonal is None else diagonal, collision=collision, decomposition=settings
-    )
+    size = 0.04 if diagonal is None else diagonal
+    solid = shape_solid(shape, diagonal=size, collision=collision, decomposition=settings)
     about = {"family": family, "description": procedural.describe_family(family), "seed": seed}
     mesh = solid.mesh or shape.mesh
     return {**about, "parameters": dict(shape.parameters), **_measures(mesh, solid)}, solid

@@ -10,7 +10,7 @@ import typer
 
 from brainbench.cli.options import SCORE, option
 from brainbench.cli.output import JsonOption, emit, table
-from brainbench.core.errors import UsageError, check_name
+from brainbench.core.errors import UsageError, check_name, choose_name
 from brainbench.core.reading.regular import readable
 
 if TYPE_CHECKING:
@@ -28,9 +28,7 @@ FidelityOption = Annotated[
     ),
 ]
 BackendOption = Annotated[str, typer.Option(help="Physics engine: rod (our own), mujoco, or bullet.")]
-StimulusOption = Annotated[
-    str | None, typer.Option("--stimulus", "-s", help="Label of the stimulus; needed where there are several.")
-]
+StimulusOption = Annotated[str | None, typer.Option("--stimulus", "-s", help="Its label, where there are several.")]
 
 _SHOWN = 20
 """Scenes that are printed in full; any number is written as JSON."""
@@ -53,9 +51,7 @@ def open_recipe(source: str, whiskers: str) -> Recipe:
             "scene file (.toml) that it was made from."
         )
     if Path(source).is_file():
-        raise UsageError(
-            f"{source!r} is no scene file; scene files end in .toml. Recipes: {', '.join(list_recipes())}."
-        )
+        raise UsageError(f"{source!r} is no scene file, which ends in .toml. Recipes: {', '.join(list_recipes())}.")
     return get_recipe(source, whiskers=whiskers)
 
 
@@ -65,15 +61,8 @@ def choose_scene(recipe: Recipe, stimulus: str | None) -> Scene:
     Raises:
         UsageError: there is no such scene, or there are several and none was named.
     """
-    if stimulus is None:
-        if len(recipe.scenes) == 1:
-            return recipe.scenes[0]
-        raise UsageError(
-            f"{recipe.name!r} has {len(recipe.scenes)} scenes and one is drawn at a time; choose with --stimulus "
-            f"({', '.join(recipe.labels[:8])}{', …' if len(recipe.labels) > 8 else ''})."
-        )
-    check_name("stimulus", stimulus, recipe.labels)
-    return recipe.scenes[recipe.labels.index(stimulus)]
+    chosen = choose_name("stimulus", stimulus, recipe.labels, how="with --stimulus")
+    return recipe.scenes[recipe.labels.index(chosen)]
 
 
 def list_(as_json: JsonOption = False) -> None:

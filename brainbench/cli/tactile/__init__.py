@@ -6,8 +6,6 @@ import typer
 
 from brainbench.cli.tactile import commands
 
-app = typer.Typer(
-    no_args_is_help=True, help="Tactile sensors of robot hands: demo, layouts, speed, checks, calibration."
-)
+app = typer.Typer(no_args_is_help=True, help="Tactile sensors of robot hands: demo, layouts, speed, checks, noise.")
 for _command in (commands.demo, commands.layouts, commands.bench, commands.check, commands.calibrate):
     app.command(_command.__name__)(_command)

@@ -79,13 +79,8 @@ def layouts(
                  ["resolution", *layouts.PLACEMENTS], rows, right=(1, 2, 3, 4))  # fmt: skip
     if links:
         text += "\n\n" + table("", ["resolution", "link", "grid", "active", "radius (mm)"], detail, right=(3,))
-    data = {
-        "hand": chosen.name,
-        "palm": chosen.palm,
-        "joints": chosen.joints,
-        "fingers": chosen.fingers,
-        "counts": counts,
-    }
+    told = {name: getattr(chosen, name) for name in ("palm", "joints", "fingers")}
+    data = {"hand": chosen.name, **told, "counts": counts}
     emit(data, text, as_json=as_json)
 
 
@@ -104,10 +99,10 @@ def bench(
     The benchmark against peers and rooflines is benchmarks/tactile/throughput.py in the repository.
     """
     from brainbench.cli.tactile import scenes
-    from brainbench.core.errors import UsageError
+    from brainbench.core.reading.ranges import check_number
 
-    if envs < 1 or repeats < 1:
-        raise UsageError(f"--envs and --repeats are at least 1; received {envs} and {repeats}.")
+    for name, number in (("--envs", envs), ("--repeats", repeats)):
+        check_number(name, number, least=1)
     grip = scenes.Grip(hand, envs=envs, device=device)
     grip.run(60)
     results = [
@@ -159,12 +154,11 @@ def calibrate(
     'reference' holds the true signal in the sensor's unit (a load cell, a stage); without it the device was at rest.
     Load the preset with robotics_bridge.sensors.Noise.load(path).
     """
-    from brainbench.core.errors import UsageError
+    from brainbench.core.reading.ranges import check_number
     from robotics_bridge.sensors.calibration.calibrate import calibrate as fit
     from robotics_bridge.sensors.calibration.log import read_log
 
-    if not max_delay >= 0:
-        raise UsageError(f"--max-delay is zero or positive (s); received {max_delay:g}.")
+    check_number("--max-delay (s)", max_delay, least=0)
     found = fit(read_log(log), max_delay=max_delay)
     if out is not None:
         found.save(out, log=log.name)

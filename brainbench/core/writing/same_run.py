@@ -20,9 +20,7 @@ def check_same(folder: Path, known: object, identity: Mapping[str, Any], what: s
     names = [*mine, *(name for name in other if name not in mine and name.partition(".")[0] in identity)]
     if differing := [name for name in names if other.get(name) != mine.get(name)]:
         told = ", ".join(f"{name} {shown(other.get(name))} (now {shown(mine.get(name))})" for name in differing[:4])
-        raise UsageError(
-            f"{str(folder)!r} holds another {what}: {told}. Choose another folder, or delete it to start anew."
-        )
+        raise UsageError(f"{str(folder)!r} holds another {what}: {told}. Choose another folder, or delete this one.")
 
 
 def _leaves(values: Mapping[str, Any], above: str = "") -> Iterator[tuple[str, Any]]:

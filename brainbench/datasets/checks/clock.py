@@ -171,9 +171,7 @@ def _advice(session: Session, lag: float) -> str:
                 f"That is the starting_time of {series.name} ({series.start:g} s): it was "
                 f"{'added' if lag > 0 else 'subtracted'} though spikes are on the session's clock already."
             )
-    return (
-        f"Subtract about {_seconds(lag)} s from all spike times, or find out which clock they are on, before scoring."
-    )
+    return f"Subtract about {_seconds(lag)} s from all spike times, or find out their clock, before scoring."
 
 
 def _seconds(lag: float) -> str:

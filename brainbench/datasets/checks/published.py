@@ -74,9 +74,7 @@ def _of_file(
         f"in {share(ordered, len(sessions))} sessions the slots first appear in the order 1 to {len(SLOTS)}: a slot's "
         "number says when its stimulus came first, not which stimulus it is, and no names are stored"
     )
-    advice = (
-        "No score on this file can be trusted. The original files have names: `brainbench recordings fetch rodgers`."
-    )
+    advice = "No score on it can be trusted. The original files have names: `brainbench recordings fetch rodgers`."
     yield Finding("error", "labels", message, advice, {"by_first_appearance": ordered})
     yield from _agreement(sessions)
 

@@ -96,9 +96,7 @@ def read_arrays(path: Path) -> tuple[dict[str, NDArray[np.float64]], bool]:
             "folder of sweeps is what `brainbench train MODEL --data FOLDER` takes."
         )
     if {"r_xy", "r_yy"} <= arrays.keys():
-        raise DataError(
-            f"{path} holds split halves of a score, not recordings; try `brainbench score {path} --explain-estimator`."
-        )
+        raise DataError(f"{path} holds split halves, no recordings; try `brainbench score {path} --explain-estimator`.")
     stray = STRAY in arrays and not arrays[STRAY].ndim
     animals = {name: array for name, array in arrays.items() if not (stray and name == STRAY)}
     if not animals:

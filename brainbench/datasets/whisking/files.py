@@ -83,9 +83,7 @@ def read_manifest(folder: Path) -> Mapping[str, Any]:
     path = folder / "manifest.json"
     if not path.is_file():
         if (folder / "config.json").is_file():
-            raise DataError(
-                f"The data set in {str(folder)!r} is not finished: give the command that began it again; it goes on."
-            )
+            raise DataError(f"The data set in {str(folder)!r} is not finished: give its command again; it goes on.")
         raise DataFileNotFoundError(
             f"There is no data set of sweeps in {str(folder)!r} (no manifest.json, and no folders train, validate and "
             "test with published sweeps); make one with: brainbench stimuli sweep thesis-low --objects "

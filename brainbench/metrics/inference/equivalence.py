@@ -98,9 +98,8 @@ def equivalence_test(differences: ArrayLike, without_stimulus: ArrayLike, *, mar
     few = count < FEWEST_ANIMALS or len(without) < FEWEST_STIMULI
     needed = f"at least {FEWEST_ANIMALS} and {FEWEST_STIMULI} are needed"
     reason = f"{count} animals and {len(without)} stimuli; {needed}" if few else ""
-    return EquivalenceTest(
-        mean, margin, interval, max(lower, upper), verdict, "unreliable" if few else "ok", reason, count
-    )
+    status = "unreliable" if few else "ok"
+    return EquivalenceTest(mean, margin, interval, max(lower, upper), verdict, status, reason, count)
 
 
 def turing_test(score: Score, animal_to_animal: Score, *, margin: float = MARGIN) -> EquivalenceTest:

@@ -136,9 +136,8 @@ def permutation_test(
         reason = "an RDM has missing pairs, so its stimuli cannot be permuted"
     else:
         # The given order comes first, so the observed statistic went through the same arithmetic.
-        null = permuted_values(
-            model[None], brain, lambda r: r[:, 0].mean(axis=-1), method=method, seed=seed, device=device
-        )
+        how = {"method": method, "seed": seed, "device": device}
+        null = permuted_values(model[None], brain, lambda r: r[:, 0].mean(axis=-1), **how)
         if np.isfinite(null[0]):
             return make_test(null, exact=exact, smallest=smallest)
         reason = "the comparison is undefined (a constant RDM)"

@@ -21,7 +21,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from brainbench.core.errors import UsageError
+from brainbench.core.errors import UsageError, check_name
 from brainbench.core.reading.ranges import check_fields, check_number
 from brainbench.core.records import Interval
 from brainbench.core.statistics import wilson_interval
@@ -143,8 +143,7 @@ def needed(
         UsageError: ``vary`` is neither, or a target outside (0, 1).
     """
     tried = {"stimuli": STIMULUS_COUNTS, "animals": ANIMAL_COUNTS}
-    if vary not in tried:
-        raise UsageError(f"A power analysis varies 'stimuli' or 'animals'; received {vary!r}.")
+    check_name("number that a power analysis varies", vary, tried)
     check_number("The target power", target, above=0, below=1)
     for number in tried[vary]:
         changed = replace(design, **{vary: number})

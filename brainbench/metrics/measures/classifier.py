@@ -71,9 +71,7 @@ def decode(
             f"{len(matrix)} rows."
         )
     if len(names) < 2 or np.bincount(codes).min() < 2:
-        raise UsageError(
-            f"Each of at least 2 classes needs at least 2 stimuli, or leaving one out loses it: {classes}."
-        )
+        raise UsageError(f"Each of at least 2 classes needs 2 stimuli or more: leaving one out loses it: {classes}.")
     if not np.isfinite(matrix).all():
         raise UsageError("Responses to be decoded must be finite; leave out units or trials with missing values.")
     check_number("The penalty of decoding", penalty, above=0)

@@ -188,9 +188,7 @@ def check_features(features: Mapping[str, Any], stimuli: Sequence[str]) -> None:
         raise UsageError("There are no layers to score; give the features of at least one layer.")
     for layer, values in features.items():
         if len(values) != len(stimuli):
-            raise UsageError(
-                f"The features of layer {layer!r} have {len(values)} rows; {len(stimuli)} stimuli are scored."
-            )
+            raise UsageError(f"Features of layer {layer!r} have {len(values)} rows; {len(stimuli)} stimuli are scored.")
 
 
 def usable_features(features: ArrayLike) -> Floats:

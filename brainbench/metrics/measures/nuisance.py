@@ -68,9 +68,7 @@ def variance_partition(
     rivals = np.stack([rdm_stack(given, f"The nuisance {name!r}") for name, given in nuisance_rdms.items()])
     pairs = brain.shape[1]
     if model.shape != (pairs,) or rivals.shape[1:] != (pairs,):
-        raise UsageError(
-            f"The RDMs have different numbers of stimuli: {model.shape}, {rivals.shape[1:]} and {(pairs,)}."
-        )
+        raise UsageError(f"RDMs have different numbers of stimuli: {model.shape}, {rivals.shape[1:]} and {(pairs,)}.")
     if not all(np.isfinite(part).all() for part in (model, brain, rivals)):
         raise DataError("An RDM has missing pairs; variance can be partitioned over complete RDMs only.")
     if pairs < len(rivals) + 3:

@@ -188,7 +188,5 @@ def check_layers(layer_rdms: Mapping[str, ArrayLike], stimuli: Sequence[str]) ->
     pairs = len(stimuli) * (len(stimuli) - 1) // 2
     for layer, values in rdms.items():
         if values.shape != (pairs,):
-            raise UsageError(
-                f"The RDM of layer {layer!r} has shape {values.shape}; {len(stimuli)} stimuli have {pairs} pairs."
-            )
+            raise UsageError(f"Layer {layer!r} has an RDM [{len(values)}]; {len(stimuli)} stimuli have {pairs} pairs.")
     return rdms

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from brainbench.core.errors import UsageError, check_once
+from brainbench.core.errors import UsageError, check_each, check_once
 from brainbench.metrics.rdms.pairs import Floats, rdm_stack, square, stimulus_count
 
 _LARGEST_LABELLED = 24
@@ -64,9 +64,7 @@ class RDM:
         Raises:
             UsageError: a name is not among the stimuli.
         """
-        for name in (one, other):
-            if name not in self.stimuli:
-                raise UsageError(f"There is no stimulus {name!r}; this RDM is of {', '.join(self.stimuli)}.")
+        check_each("stimulus of this RDM", (one, other), self.stimuli)
         return float(self.matrix[self.stimuli.index(one), self.stimuli.index(other)])
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> np.ndarray:

@@ -78,9 +78,8 @@ class _Responses:
                     f"The noise covariance {self.precision!r} is estimated from trials: give labels, or a matrix as "
                     "precision."
                 )
-            return estimate_noise(self.responses, self.codes, self.count, self.precision, device=self.device).sides(
-                left, right
-            )
+            noise = estimate_noise(self.responses, self.codes, self.count, self.precision, device=self.device)
+            return noise.sides(left, right)
         units = left.shape[-1]
         shape = tuple(np.shape(self.precision))
         if shape != (units, units):
@@ -172,9 +171,7 @@ def _mahalanobis(given: _Responses) -> Array:
 
 def _crossnobis(given: _Responses) -> Array:
     if given.codes is None or given.folds is None:
-        raise UsageError(
-            "method='crossnobis' needs labels and folds: one stimulus and one cross-validation fold per trial."
-        )
+        raise UsageError("method='crossnobis' needs labels and folds: a stimulus and a fold for each trial.")
     folds = fetch(given.folds)
     if folds.shape != given.codes.shape:
         raise UsageError(f"There are {len(given.codes)} trials but folds of shape {folds.shape}; give one per trial.")

@@ -96,9 +96,7 @@ def rdm_stack(rdms: ArrayLike | Sequence[ArrayLike], what: str) -> Floats:
             raise TypeError("dissimilarities are real numbers")
         array = array.astype(np.float64, copy=False)
     except (TypeError, ValueError) as error:
-        raise UsageError(
-            f"{what} must be RDM vectors of one length; received {type(rdms).__name__} ({error})."
-        ) from error
+        raise UsageError(f"{what} must be RDM vectors of one length; received {type(rdms).__name__}.") from error
     if array.ndim == 0:
         raise UsageError(f"{what} must be an RDM vector [P]; received a single number.")
     stimulus_count(array.shape[-1])

@@ -40,9 +40,7 @@ class GatedCell(Cell):
     def _convolution(self, gates: int, kernel_size: Pair) -> Conv2d:
         size = (kernel_size, kernel_size) if isinstance(kernel_size, int) else tuple(kernel_size)
         if len(size) != 2 or not all(isinstance(item, int) and item > 0 for item in size):
-            raise UsageError(
-                f"The kernel size of a cell must be a positive integer or a pair of them; received {kernel_size!r}."
-            )
+            raise UsageError(f"A kernel size is a positive integer or a pair of them; received {kernel_size!r}.")
         return Conv2d(self.in_channels + self.out_channels, gates * self.out_channels, kernel_size=size, gain=1.0)
 
     @property

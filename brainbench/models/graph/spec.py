@@ -322,9 +322,7 @@ class GraphSpec:
             if source is None:
                 raise UsageError(f"Node {name!r} has only feedback inputs; say with shape_from whose grid it takes.")
         if source not in outputs:
-            raise UsageError(
-                f"Node {name!r} takes its shape from {source!r}, which comes later in the feedforward order."
-            )
+            raise UsageError(f"Node {name!r} takes its shape from {source!r}, which comes later in feedforward order.")
         return outputs[source][1:]
 
     def _channels(self, name: str, outputs: Mapping[str, Shape]) -> int:

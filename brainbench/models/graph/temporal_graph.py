@@ -278,9 +278,7 @@ class TemporalGraph(nn.Module):
         for name in asked:
             check_name("node", name, self.layers)
         if x.ndim != 5 or x.shape[1] < 1:
-            raise UsageError(
-                f"A temporal graph expects [batch, time, channels, rows, columns]; received {list(x.shape)}."
-            )
+            raise UsageError(f"A graph takes [batch, time, channels, rows, columns]; received {list(x.shape)}.")
         self._accept(tuple(x.shape[2:]))
         if x.is_cuda:
             # Tensor cores and norms over channels both want channels innermost.

@@ -191,9 +191,7 @@ def _operation(part: _Section) -> Convolution | Dense | None:
     common["batch_norm"] = norm is not None and norm is not False
     whole = type(norm) is int and norm == channels
     if common["batch_norm"] and not whole and not (norm is True and kind == "FullyConnected"):
-        raise DataError(
-            f"'batchnorm' in {part.where} must be false or the number of channels, {channels}; found {shown(norm)}."
-        )
+        raise DataError(f"'batchnorm' in {part.where} must be false or the channels, {channels}; found {shown(norm)}.")
     if kind == "FullyConnected":
         operation: Convolution | Dense = Dense(channels, **common)
     else:

@@ -92,9 +92,7 @@ def read_config(folder: str | os.PathLike[str]) -> dict[str, Any]:
         )
     config = read_mapping(path)
     if (found := config.get("brainbench_model")) != FORMAT:
-        raise DataError(
-            f"{os.fspath(path)!r} is not the configuration of a brainbench model (format {found!r}, expected {FORMAT})."
-        )
+        raise DataError(f"{os.fspath(path)!r} is no configuration of a model (format {found!r}, expected {FORMAT}).")
     if not isinstance(config.get("architecture"), str) or not isinstance(config.get("options"), dict):
         raise DataError(f"{os.fspath(path)!r} lacks the name 'architecture' or the mapping 'options'.")
     version, known = config.get("version", 1), Architecture.parse(config["architecture"]).version
@@ -139,9 +137,7 @@ def find_folder(source: str) -> Path:
     place, _, revision = source.removeprefix(HUB).partition("@")
     owner, name, *inner = place.split("/") if "/" in place else ("", "")
     if not source.startswith(HUB) or not all((owner, name, *inner)):
-        raise UsageError(
-            f"A model's folder is local-dir:PATH or hf-hub:OWNER/NAME[/FOLDER][@REVISION]; received {source!r}."
-        )
+        raise UsageError(f"A folder is local-dir:PATH or hf-hub:OWNER/NAME[/FOLDER][@REVISION]; received {source!r}.")
     try:
         from huggingface_hub import snapshot_download
     except ImportError as error:

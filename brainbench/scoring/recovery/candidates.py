@@ -46,9 +46,7 @@ class Candidate:
         for layer, values in layers.items():
             array = np.asarray(values, dtype=np.float64)
             if array.ndim != 2 or len(array) != len(stimuli):
-                raise UsageError(
-                    f"Layer {layer!r} of {name} has shape {list(array.shape)}; expected [{len(stimuli)}, features]."
-                )
+                raise UsageError(f"Layer {layer!r} of {name} is {list(array.shape)}; expected [{len(stimuli)}, F].")
             if np.isfinite(array).all() and np.ptp(array, axis=0).any():
                 usable[str(layer)] = array
         if not usable:

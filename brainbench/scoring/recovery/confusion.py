@@ -113,9 +113,7 @@ class Recovery:
         """Remarks for a reader, beside the numbers."""
         notes = []
         if self.design.population.animals < FEWEST_ANIMALS or self.stimuli < FEWEST_STIMULI:
-            notes.append(
-                f"No pair is tested with fewer than {FEWEST_ANIMALS} animals or {FEWEST_STIMULI} stimuli, so all tie."
-            )
+            notes.append(f"All pairs tie: tests need {FEWEST_ANIMALS} animals and {FEWEST_STIMULI} stimuli.")
         undefined = sum(board.first is None for board in self.boards)
         if undefined:
             notes.append(f"{undefined} boards have no score: their animals cannot be compared.")

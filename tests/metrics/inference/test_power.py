@@ -150,7 +150,7 @@ def test_impossible_designs_are_refused_in_a_sentence(change, message):
 
 
 def test_other_misuse_is_told_in_a_sentence():
-    with pytest.raises(UsageError, match="received 'trials'"):
+    with pytest.raises(UsageError, match="power analysis varies 'trials'"):
         needed(ExperimentDesign(), "trials")
     with pytest.raises(UsageError, match="target power"):
         needed(ExperimentDesign(), target=1.0)

@@ -67,7 +67,7 @@ def test_many_units_cost_no_more_than_trials():
 
 def test_misuse_is_told_in_a_sentence():
     rng = np.random.default_rng(4)
-    with pytest.raises(UsageError, match="needs at least 2 stimuli"):
+    with pytest.raises(UsageError, match="needs 2 stimuli"):
         decode(rng.normal(size=(6, 3)), range(6), ["a", "a", "a", "a", "a", "b"])
     with pytest.raises(UsageError, match="one stimulus 0 … 5"):
         decode(rng.normal(size=(5, 3)), range(5), SHAPES)

@@ -57,7 +57,7 @@ def test_what_is_no_rdm_is_refused():
         RDM([1, 2, 3], ["a", "b"])
     with pytest.raises(UsageError, match=r"received shape \(2, 3\)"):
         RDM(np.ones((2, 3)))
-    with pytest.raises(UsageError, match="no stimulus 'z'"):
+    with pytest.raises(UsageError, match="stimulus of this RDM 'z'"):
         RDM([1, 2, 3]).between("0", "z")
 
 

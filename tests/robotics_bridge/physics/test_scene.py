@@ -80,7 +80,7 @@ def test_compiled_variants_differ_where_they_should() -> None:
     ("make", "message"),
     [
         (lambda: Geometry(name="a", link="b", kind="bx"), "did you mean 'box'"),
-        (lambda: Geometry(name="a", link="b", kind="box", size=(1.0,)), "needs 3 positive"),
+        (lambda: Geometry(name="a", link="b", kind="box", size=(1.0,)), "size of 'a' holds 3"),
         (lambda: Geometry(name="a", link="b", kind="box", size=(1.0, 1.0, 0.0)), r"size of 'a' .*received 0\.0"),
         (lambda: Geometry(name="a", link="b", kind="box", size=(1.0, "1", 1.0)), "size of 'a' .*received '1'"),
         (lambda: Geometry(name="a", link="b", kind="plane", position=(0, 0, True)), "position of 'a' .*received True"),
@@ -89,10 +89,13 @@ def test_compiled_variants_differ_where_they_should() -> None:
         (lambda: Geometry(name="a", link="b", kind="plane", quaternion=(1, 0, 0, np.nan)), "quaternion of 'a' .*nan"),
         (lambda: Geometry(name="a", link="b", kind="plane", contype=1.5), r"contype of 'a' .*received 1\.5"),
         (lambda: Geometry(name="a", link="b", kind="mesh"), "names no mesh"),
-        (lambda: Geometry(name="a", link="b", kind="sphere", size=(1.0, 2.0)), r"needs 1 .*received \(1\.0, 2\.0\)"),
+        (
+            lambda: Geometry(name="a", link="b", kind="sphere", size=(1.0, 2.0)),
+            r"size of 'a' holds 1 .*received \(1\.0, 2\.0\)",
+        ),
         (
             lambda: Geometry(name="a", link="b", kind="sphere", size=(1.0,), mesh=TRIANGLE),
-            "'sphere' has mesh",
+            "sphere 'a' has mesh",
         ),
         (lambda: TouchScene(("w", "w")), "two of the link 'w'"),
         (lambda: TouchScene(("w",), (Geometry(name="a", link="v", kind="plane"),)), "Geometry 'a' is fixed"),
