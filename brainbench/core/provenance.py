@@ -46,9 +46,8 @@ class Provenance(Mapping[str, Any]):
         """Return the provenance that a mapping states; as a mapping it is equal to that."""
         kinds = {item.name: {"str": str, "float": (int, float)}.get(str(item.type), Mapping) for item in fields(cls)}
         del kinds["more"]
-        typed: dict[str, Any] = {
-            name: value for name, value in stated.items() if value and isinstance(value, kinds.get(name, ()))
-        }
+        fits = (name for name, value in stated.items() if value and isinstance(value, kinds.get(name, ())))
+        typed: dict[str, Any] = {name: stated[name] for name in fits}
         return cls(**typed, more={name: value for name, value in stated.items() if name not in typed})
 
     @property

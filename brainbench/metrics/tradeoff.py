@@ -13,8 +13,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from brainbench.core.errors import UsageError
 from brainbench.core.progress import Progress, track
+from brainbench.core.reading.ranges import check_number
 from brainbench.core.trials import Trials
 from brainbench.metrics.inference.permutation import label_orders
 from brainbench.metrics.measures.rsa import RSA
@@ -63,8 +63,8 @@ def measure_tradeoff(
     Raises:
         UsageError: fewer than two repeats, or numbers that are not positive.
     """
-    if repeats < 2 or min(*splits, *permutations, animals, units, trials) < 1:
-        raise UsageError("A trade-off needs at least 2 repeats and positive numbers.")
+    check_number("repeats of a trade-off", repeats, least=2)
+    check_number("numbers of a trade-off", min(*splits, *permutations, animals, units, trials), least=1)
     (blocks, features), metric = _data(animals, units, trials), RSA()
 
     def value(seed: int, count: int) -> float:
@@ -91,9 +91,8 @@ def measure_tradeoff(
             start = time.perf_counter()
             found.append(job(seed))
             seconds.append(time.perf_counter() - start)
-        points.append(
-            MonteCarloPoint(quantity, count, float(np.std(found, ddof=1)), of, float(np.median(seconds)), default)
-        )
+        error, middle = float(np.std(found, ddof=1)), float(np.median(seconds))
+        points.append(MonteCarloPoint(quantity, count, error, of, middle, default))
     return tuple(points)
 
 

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from brainbench.core.errors import BrainbenchError, UsageError, check_name
+from brainbench.core.errors import BrainbenchError, UsageError, check_each, check_name
 from brainbench.core.reading.ranges import check_number
 
 if TYPE_CHECKING:
@@ -185,8 +185,7 @@ def named_reader(model: nn.Module, layers: Collection[str] | None) -> Any:
     named, read = getattr(model, "layers", None), getattr(model, "activations", None)
     if not isinstance(named, tuple) or not all(isinstance(name, str) for name in named) or not callable(read):
         return None
-    for name in layers or ():
-        check_name("layer", name, named)
+    check_each("layer", layers or (), named)
     wanted = named if layers is None else tuple(name for name in named if name in layers)
     return lambda part: read(part, wanted)
 
@@ -197,8 +196,7 @@ def _hooked(model: nn.Module, layers: Collection[str] | None) -> dict[str, nn.Mo
         leaves = {name: module for name, module in every.items() if not any(True for _ in module.children())}
         return leaves | {OUTPUT: model}
     choices = every if OUTPUT in every else {**every, OUTPUT: model}
-    for name in layers:
-        check_name("layer", name, choices)
+    check_each("layer", layers, choices)
     return {name: choices[name] for name in choices if name in layers}
 
 

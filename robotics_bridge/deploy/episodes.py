@@ -251,9 +251,9 @@ def _row(number: int, task: str, first: int, length: int, table: Mapping[str, ND
         "dataset_to_index": first + length, "data/chunk_index": 0, "data/file_index": 0,
         "meta/episodes/chunk_index": 0, "meta/episodes/file_index": 0,
     }  # fmt: skip
-    return row | {
-        f"stats/{name}/{key}": value for name, values in table.items() for key, value in _stats(values).items()
-    }
+    for name, values in table.items():
+        row |= {f"stats/{name}/{key}": value for key, value in _stats(values).items()}
+    return row
 
 
 def _write_frames(path: Path, tables: list[dict[str, NDArray]], shapes: Mapping[str, tuple[int, ...]]) -> None:

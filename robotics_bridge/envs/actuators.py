@@ -16,7 +16,7 @@ from brainbench.core.devices import warp
 from robotics_bridge.envs.kernels.actuation import ActuatorArrays, actuate, count_launch
 from robotics_bridge.envs.simulation import Simulation
 from robotics_bridge.tasks.scenes import TaskModel
-from robotics_bridge.tasks.task import ActuatorRandomisation
+from robotics_bridge.tasks.task import Task
 
 _IMPERFECTIONS = ("strength", "bias", "deadband", "backlash", "kick")
 
@@ -24,16 +24,8 @@ _IMPERFECTIONS = ("strength", "bias", "deadband", "backlash", "kick")
 class Actuators:
     """Actuators of all joints of all environments."""
 
-    def __init__(
-        self,
-        simulation: Simulation,
-        model: TaskModel,
-        changes: ActuatorRandomisation | None,
-        *,
-        substeps: int,
-        seed: int,
-    ) -> None:
-        self._simulation, self._changes, self._substeps = simulation, changes, substeps
+    def __init__(self, simulation: Simulation, model: TaskModel, task: Task, *, seed: int) -> None:
+        self._simulation, self._changes, self._substeps = simulation, task.actuators, task.solver.decimation
         device, first = simulation.device, simulation.model
         ids = [first.joint(name).id for name in model.joints]
         self.qpos_columns = torch.as_tensor(np.array(first.jnt_qposadr[ids]), device=device).long()
@@ -58,7 +50,7 @@ class Actuators:
         self._noise_state = torch.zeros(2, dtype=torch.int32, device=device)
         """[2] launches so far, and the seed of the torque noise."""
         self.seed(seed)
-        self._noise = self.nominal["effort"] * (changes.torque_noise if changes else 0.0)
+        self._noise = self.nominal["effort"] * (task.actuators.torque_noise if task.actuators else 0.0)
         wp = warp()
         self._actuate, self._count = actuate, count_launch
         self._arrays = ActuatorArrays()

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from brainbench.core.errors import UsageError, check_name, missing_dependency
+from brainbench.core.errors import UsageError, check_each, missing_dependency
 from robotics_bridge import tasks
 from robotics_bridge.envs.env import Env
 from robotics_bridge.tasks.task import ACTION_LIMIT, MEASURED, check_measured
@@ -46,8 +46,7 @@ class GymVectorEnv(VectorEnv):
     def __init__(self, env: Env, groups: tuple[str, ...] = (), *, privileged: bool = False) -> None:
         if not env.options.keep_final:
             raise UsageError("Gymnasium needs the last observations of episodes: tasks.make(..., keep_final=True).")
-        for name in groups:
-            check_name("observation group of the task", name, env.observation_shapes)
+        check_each("observation group of the task", groups, env.observation_shapes)
         if not privileged:
             check_measured(groups, "Without privileged=True, a policy in gymnasium")
         self.native = env
@@ -77,8 +76,7 @@ class GymVectorEnv(VectorEnv):
             raise UsageError("Environments draw their random numbers together: give one seed, not a list.")
         if seed is not None:
             self.native.seed(seed)
-        for name in options or ():
-            check_name("option of a reset", name, ("reset_mask",))
+        check_each("option of a reset", options or (), ("reset_mask",))
         mask = (options or {}).get("reset_mask")
         chosen = None if mask is None else torch.as_tensor(np.asarray(mask, dtype=bool), device=self.native.device)
         return self._numpy(self.native.reset(chosen)), {}

@@ -14,6 +14,7 @@ import torch
 
 from brainbench.core.devices import mujoco_module, pick_device, warp
 from brainbench.core.errors import UsageError
+from robotics_bridge.envs.options import EnvOptions
 from robotics_bridge.physics import MujocoEngine, MujocoWarpEngine
 
 mujoco = mujoco_module()
@@ -29,11 +30,9 @@ class Simulation:
         UsageError: the engine does not run on the device.
     """
 
-    def __init__(
-        self, models: Sequence[Any], num_envs: int, *, device: str, engine: str | None, threads: int | None = None,
-        substeps: int = 1,
-    ) -> None:  # fmt: skip
-        if engine == "mujoco" and device != "cpu":
+    def __init__(self, models: Sequence[Any], options: EnvOptions, *, substeps: int = 1) -> None:
+        device, num_envs = options.device, options.num_envs
+        if options.engine == "mujoco" and device != "cpu":
             raise UsageError("C MuJoCo runs on the processor: use device='cpu', or engine='warp'.")
         self.model = models[0]
         self.num_envs, self._substeps = num_envs, substeps
@@ -46,7 +45,7 @@ class Simulation:
         self.shape_of = order
         """Number [B] of the shape that each environment has."""
         nominal = {name: np.stack([getattr(m, name) for m in models])[order] for name in FIELDS}
-        self.uses_warp = engine == "warp"
+        self.uses_warp = options.engine == "warp"
         """True for MuJoCo Warp, False for C MuJoCo."""
         if self.uses_warp:
             self.engine: Any = MujocoWarpEngine(list(models), num_envs, device=device, fields=nominal)
@@ -55,7 +54,7 @@ class Simulation:
             self._warmstart = warp().to_torch(self.engine.data.qacc_warmstart)
             self.fields = {name: self.engine.field(name) for name in FIELDS}
         else:
-            self.engine = MujocoEngine(list(models), num_envs, fields=nominal, threads=threads)
+            self.engine = MujocoEngine(list(models), num_envs, fields=nominal, threads=options.threads)
             self.qpos = torch.from_numpy(self.engine.qpos.astype(np.float32))
             self.qvel = torch.from_numpy(self.engine.qvel.astype(np.float32))
             self.ctrl = torch.zeros(num_envs, self.model.nu)

@@ -94,10 +94,7 @@ class EnvState:
     def __init__(self, task: Task, hand: Hand, options: EnvOptions) -> None:
         self.task, self.hand, self.options, self.num_envs = task, hand, options, options.num_envs
         self.model: TaskModel = build(task, hand)
-        self.simulation = Simulation(
-            self.model.models, options.num_envs, device=options.device, engine=options.engine, threads=options.threads,
-            substeps=task.contacts.substeps,
-        )  # fmt: skip
+        self.simulation = Simulation(self.model.models, options, substeps=task.contacts.substeps)
         self.device: torch.device = self.simulation.device
         self.step_dt: float = task.step_dt
         """Duration of a control step (s)."""
@@ -105,8 +102,7 @@ class EnvState:
         """Physics steps of a control step."""
         self.generator = torch.Generator(device=self.device)
         self.generator.manual_seed(options.seed)
-        steps = self.substeps
-        self.actuators = Actuators(self.simulation, self.model, task.actuators, substeps=steps, seed=options.seed)
+        self.actuators = Actuators(self.simulation, self.model, task, seed=options.seed)
         axes = [shape.round_about or (0.0, 0.0, 0.0) for shape in self.model.shapes]
         round_about = torch.tensor([axes[shape] for shape in self.simulation.shape_of], device=self.device)
         self.goals = GoalState(task, self.num_envs, self.device, round_about)
@@ -114,8 +110,7 @@ class EnvState:
         if options.observe != "none":
             from robotics_bridge.envs.tactile import TactileObservation
 
-            how = {"substeps": steps, "twist": task.taxel_twist}
-            self.touch = TactileObservation(self.model, hand, self.simulation, options, **how)
+            self.touch = TactileObservation(self.model, hand, self.simulation, options, task)
         self._index()
         self.episode = EpisodeState.start(
             self.num_envs, self.device, actions=len(self.model.moved), terms=len(task.rewards), rest=self.rest

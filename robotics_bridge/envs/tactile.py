@@ -18,29 +18,19 @@ from robotics_bridge.hands.observations import PATCH_FORCE_SCALE, TAXELS_IN_CONT
 from robotics_bridge.physics.state import HandState
 from robotics_bridge.sensors import SensorSuite
 from robotics_bridge.tasks.scenes import TaskModel
+from robotics_bridge.tasks.task import Task
 
 
 class TactileObservation:
-    """The tactile sensors of an environment, read after every physics step; the observation type is not ``none``.
+    """The tactile sensors of an environment, read after every physics step; the observation type is not ``none``."""
 
-    ``twist`` is the torsional friction of the task's force taxels (N·m·s), where the options' knobs name none.
-    """
-
-    def __init__(
-        self,
-        model: TaskModel,
-        hand: Hand,
-        simulation: Simulation,
-        options: EnvOptions,
-        *,
-        substeps: int,
-        twist: float | None,
-    ) -> None:
+    def __init__(self, model: TaskModel, hand: Hand, simulation: Simulation, options: EnvOptions, task: Task) -> None:
         observe, num_envs, device = options.observe, options.num_envs, simulation.warp_device
         kind = observation_type(observe)
         taxels = hand.layout(options.resolution, options.placement)
         taxels = {link: probes for link, probes in taxels.items() if probes.active.any()}
-        knobs = {"twist": twist, **options.knobs}
+        # The task's torsional friction of force taxels, where the options name none.
+        knobs = {"twist": task.taxel_twist, **options.knobs}
         sensors = sensors_for(observe, taxels, noisy=options.noisy, track=model.objects, **knobs)
         self.suite = SensorSuite(simulation.engine.scene, sensors, num_envs=num_envs, device=device, seed=options.seed)
         self._name, self.links = observe, tuple(taxels)
@@ -68,7 +58,7 @@ class TactileObservation:
             normal = np.concatenate([probes.normal[active[link]] for link, probes in taxels.items()])
             pool[np.arange(len(links)), links] = 1.0 if observe == "agg_bool" else PATCH_FORCE_SCALE * normal[:, ::-1]
             self._pool = torch.as_tensor(pool, dtype=torch.float32, device=where).flatten(1)
-        self.reading = torch.zeros(num_envs, substeps, columns, kind.channels, device=where)
+        self.reading = torch.zeros(num_envs, task.solver.decimation, columns, kind.channels, device=where)
         """[B, S, N, C] of the last control step, oldest first; zeros after a reset."""
 
     def update(self, state: HandState, dt: float, substep: int) -> None:

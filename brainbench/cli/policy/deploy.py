@@ -100,10 +100,8 @@ def deploy(
         for name, what in deployed.require({*given, *(("tactile",) if shadow else ())}).items()
     }
     with contextlib.ExitStack() as stack:
-        ends = remote or stack.enter_context(
-            simulated_hand(contract.hand, contacts=contacts, faults=faults, seconds=seconds + 60)
-        )
-        address, joints, fingers, secret = ends
+        simulated = simulated_hand(contract.hand, contacts=contacts, faults=faults, seconds=seconds + 60)
+        address, joints, fingers, secret = remote or stack.enter_context(simulated)
         link = stack.enter_context(UdpDriver(address, joints, fingers, secret))
         recorder = SessionRecorder(contract) if record is not None else None
         fallback = ShadowTouch(contract, joints) if shadow else given.pop("tactile", None)

@@ -72,9 +72,8 @@ def play(
     from brainbench.core.reading.ranges import check_number
     from robotics_bridge.tasks.contact_model import contacts_name
 
-    check_number("--seconds", seconds, above=0)
-    check_number("--rate", rate, above=0)
-    check_number("--width (pixels)", width, least=64)
+    for flag, number, bound in (("--seconds", seconds, 0), ("--rate", rate, 0), ("--width (pixels)", width, 63)):
+        check_number(flag, number, above=bound)
     world.check([agent])
     pictures = [path for path in (video, strip) if path is not None]
     for path, endings in ((video, (".mp4", ".gif")), (strip, (".png",))):

@@ -42,15 +42,14 @@ def design(
     recipe = scenes.open_recipe(source, whiskers)
     with progress_bar("searching"):
         result: DesignResult | NetworkDesign
+        how = {"options": options, "backend": backend}
         if networks:
             from brainbench.scoring.recovery import design_for_networks
 
-            result = design_for_networks(
-                recipe.scenes, items(networks), items(variables), options=options, backend=backend
-            )
+            result = design_for_networks(recipe.scenes, items(networks), items(variables), **how)
             told = _of_networks(result)
         else:
-            result = run(recipe.scenes, items(variables), options=options, backend=backend)
+            result = run(recipe.scenes, items(variables), **how)
             told = _of_objects(result)
     rows = [(name, result.start[name], value, VARIABLES[name].unit) for name, value in result.values.items()]
     chosen = table_of("", rows, {"variable": "{0[0]}", ">given": "{0[1]:.4g}", ">chosen": "{0[2]:.4g} {0[3]}"})

@@ -63,10 +63,8 @@ def sweep(
     check_name("sweep grid", grid, GRIDS)
     if out is None and scheduler is not None:
         raise UsageError("--scheduler simulates, and needs a folder for it: --out.")
-    surfaces = get_engine(backend).surfaces
-    found = resolve_objects(
-        [*(objects or ()), *(more_objects or ())], unit=unit, collision=collision, surfaces=surfaces
-    )
+    surfaces, named = get_engine(backend).surfaces, [*(objects or ()), *(more_objects or ())]
+    found = resolve_objects(named, unit=unit, collision=collision, surfaces=surfaces)
     scenes = SweepScenes(GRIDS[grid], {name: item.load for name, item in found.items()}, whiskers=whiskers)
     settings = GenerationSettings(Fidelity.parse(fidelity), backend=backend, **options)
     plan = GenerationPlan(grid, GRIDS[grid], found, settings, whiskers)

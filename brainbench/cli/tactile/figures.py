@@ -112,9 +112,8 @@ def draw_forces(
     axes.set_axis_off()
     part = ListedColormap(palette(np.linspace(0.15, 0.9, 256)))
     scale = cm.ScalarMappable(Normalize(0, peak), part)
-    bar = figure.colorbar(
-        scale, cax=figure.add_axes((0.3, 0.55 / inches[1], 0.4, 0.14 / inches[1])), orientation="horizontal"
-    )
+    below = figure.add_axes((0.3, 0.55 / inches[1], 0.4, 0.14 / inches[1]))
+    bar = figure.colorbar(scale, cax=below, orientation="horizontal")
     bar.set_label("force on a taxel (N); arrows push on the skin; blue taxels feel nothing", labelpad=2)
     save_figure(figure, path, dpi=110)
 

@@ -56,9 +56,8 @@ def _names_axes(item: Any, key: str) -> bool:
     kind = item.attrs.get_id(key).dtype
     if key == "DIMENSION_LIST":
         held = h5py.check_vlen_dtype(kind)
-        return (
-            held is not None and h5py.check_ref_dtype(held) is h5py.Reference and item.attrs[key].shape == (item.ndim,)
-        )
+        refers = held is not None and h5py.check_ref_dtype(held) is h5py.Reference
+        return refers and item.attrs[key].shape == (item.ndim,)
     return key != "REFERENCE_LIST" or (kind.names is not None and h5py.check_ref_dtype(kind[0]) is h5py.Reference)
 
 

@@ -34,9 +34,8 @@ def check_file(path: str | os.PathLike[str], kind: str = "file", *, most: int | 
     except (FileNotFoundError, NotADirectoryError) as error:
         wanted, guess = Path(path).expanduser(), None
         with contextlib.suppress(OSError):
-            guess = nearest(
-                wanted.name, (item.name for item in wanted.parent.iterdir() if item.suffix == wanted.suffix)
-            )
+            alike = (item.name for item in wanted.parent.iterdir() if item.suffix == wanted.suffix)
+            guess = nearest(wanted.name, alike)
         hint = f"; did you mean {shown(str(Path(path).with_name(guess)))}?" if guess else "."
         raise DataFileNotFoundError(f"There is no {kind} {name}{hint}") from error
     except (OSError, ValueError, RuntimeError) as error:

@@ -96,9 +96,8 @@ def _answers(table: SessionTable) -> Iterator[Finding]:
     decided = np.isin(outcome, ("correct", "error")) & np.isin(choice, ("left", "right"))
     wrong = decided & ((outcome == "correct") != (choice == side))
     if decided.any() and wrong.sum() > 0.02 * decided.sum():
-        message = (
-            f"outcome contradicts choice and rewarded_side in {share(int(wrong.sum()), int(decided.sum()))} trials"
-        )
+        those = share(int(wrong.sum()), int(decided.sum()))
+        message = f"outcome contradicts choice and rewarded_side in {those} trials"
         advice = "A column of the table has slipped, or outcome follows another rule; labels may be wrong too."
         yield Finding("error", "labels", message, advice, {"contradicted": int(wrong.sum())})
     if "stimulus" not in table:

@@ -28,9 +28,8 @@ def adapt(session: Session) -> Session:
     bump = np.isin(np.char.lower(as_labels(table.column("ctr_hold_bump"))), ("true", "1"))
     # Angles that differ by whole turns are one direction and must get one label.
     angle = table.times("cond_dir") % 360
-    return session.with_table(
-        table.with_columns(movement=np.where(bump, PASSIVE, "active"), direction=as_labels(angle))
-    )
+    movement = np.where(bump, PASSIVE, "active")
+    return session.with_table(table.with_columns(movement=movement, direction=as_labels(angle)))
 
 
 LAYOUT = RecordingLayout(

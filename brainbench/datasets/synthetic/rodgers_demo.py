@@ -131,10 +131,8 @@ def ensure_rodgers_demo(
 
 def _definition(stimuli: xr.Dataset, seed: int, animals: int) -> str:
     """Return the hash of how recordings are made, equal on every machine where that of the stimuli is."""
-    attributes = stimuli.attrs
-    return content_hash(
-        "demo-rodgers", attributes.get("config_hash", attributes["content_hash"]), seed, animals, VERSION
-    )
+    made = stimuli.attrs.get("config_hash", stimuli.attrs["content_hash"])
+    return content_hash("demo-rodgers", made, seed, animals, VERSION)
 
 
 def wrench_features(stimuli: xr.Dataset) -> NDArray[np.float64]:

@@ -223,9 +223,8 @@ def tracked_contacts(
         if name in whiskers:
             # Rows of a change lie before their frame, so begin and end come out in pairs.
             change = np.diff(contact[:, :, whiskers.index(name)].astype(np.int8), axis=1, prepend=0, append=0)
-            found[name] = [
-                np.stack([np.flatnonzero(row == 1), np.flatnonzero(row == -1)], axis=1) * frame for row in change
-            ]
+            ends = ((np.flatnonzero(row == 1), np.flatnonzero(row == -1)) for row in change)
+            found[name] = [np.stack(pair, axis=1) * frame for pair in ends]
     return found
 
 
@@ -236,9 +235,8 @@ def first_contacts(
     known = {name: items for name, items in runs.items() if name != lost}
     first = np.full(len(labels), np.inf)
     for stimulus, label in enumerate(labels):
-        first[stimulus] = min(
-            (items[stimulus][0, 0] for items in known.values() if len(items[stimulus])), default=np.inf
-        )
+        begins = (items[stimulus][0, 0] for items in known.values() if len(items[stimulus]))
+        first[stimulus] = min(begins, default=np.inf)
         if first[stimulus] >= CHOICE[0]:
             raise DataError(f"The stimulus {label!r} touches none of {listing(known)} in time for the demo's choices.")
     return first

@@ -83,9 +83,8 @@ def join_sessions(
         **{name: ("unit", np.concatenate([part.columns[name] for part in parts])) for name in UNIT_COLUMNS},
         **{name: ("trial", _covariate(parts, name)) for name in COVARIATES if any(name in p.covariates for p in parts)},
     }
-    dataset = xr.Dataset(
-        {"counts": (("trial", "time", "unit"), counts), "duration": (("trial", "time"), duration)}, coordinates
-    )
+    variables = {"counts": (("trial", "time", "unit"), counts), "duration": (("trial", "time"), duration)}
+    dataset = xr.Dataset(variables, coordinates)
     recipes = {part.stimuli for part in everything}
     # What makes the data; all else (window, selection, file names) only says how they came about.
     names = [(part.subject, part.session, part.labels, part.trial_ids, part.unit_ids) for part in parts]

@@ -141,9 +141,8 @@ def separate(
         found = cross_val_predict(machine, kernel[np.ix_(mine, mine)], kind, groups=objects[mine], cv=folds)
         hit = np.asarray(found == kind)
         tallies.append({number: _by_object(objects[mine[kind == number]], hit[kind == number]) for number in choice})
-    accuracies = tuple(
-        float(np.mean([rows[:, 0].sum() / rows[:, 1].sum() for rows in tally.values()])) for tally in tallies
-    )
+    shares = ([rows[:, 0].sum() / rows[:, 1].sum() for rows in tally.values()] for tally in tallies)
+    accuracies = tuple(float(np.mean(share)) for share in shares)
     reason = f"a class has only {fewest} objects; {FEW_OBJECTS} are the least to trust an interval"
     found = Separability(
         count=count,

@@ -184,9 +184,7 @@ class PartialRSA(PatternMetric):
         """Return the shares of variance of the chosen layer, averaged over animals."""
         if not np.isfinite(layer).all():
             return {}
-        parts = [
-            variance_partition(rdm(layer), animal.nuisances, rdm(animal.patterns), seed=seed) for animal in animals
-        ]
+        parts = [variance_partition(rdm(layer), one.nuisances, rdm(one.patterns), seed=seed) for one in animals]
         names = ("total", "unique_model", "unique_nuisance", "shared", "chance")
         nuisances = sorted({name for part in parts for name in part.nuisances})
         shares = {name: float(np.mean([getattr(part, name) for part in parts])) for name in names}

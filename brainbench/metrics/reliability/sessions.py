@@ -106,9 +106,8 @@ def usable_sessions(
         total += trials
         if trials.min() < least:
             few = [f"{names[k]} ({trials[k]})" for k in np.flatnonzero(trials < least)]
-            lacking.append(
-                f"fewer than {least} trials of {', '.join(few[:4])}" + (" and others" if len(few) > 4 else "")
-            )
+            others = " and others" if len(few) > 4 else ""
+            lacking.append(f"fewer than {least} trials of {', '.join(few[:4])}{others}")
             continue
         # Both halves need recorded trials of every stimulus in each unit that is kept.
         groups = [codes == stimulus for stimulus in range(count)]

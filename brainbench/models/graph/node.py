@@ -39,9 +39,8 @@ class NodeModule(nn.Module):
 
     def resized(self, inputs: list[torch.Tensor]) -> list[torch.Tensor]:
         """Return the inputs [B, C, H, W] on the node's grid."""
-        return [
-            x if x.shape[2:] == self.grid else functional.interpolate(x, size=self.grid, **_RESIZED) for x in inputs
-        ]
+        size = self.grid
+        return [x if x.shape[2:] == size else functional.interpolate(x, size=size, **_RESIZED) for x in inputs]
 
     def operate(self, inputs: list[torch.Tensor]) -> torch.Tensor:
         """Join the resized inputs on channels and operate on them; return what the memory sees [B, ...]."""

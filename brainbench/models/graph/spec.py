@@ -254,9 +254,8 @@ class GraphSpec:
         return reach
 
     def _sorted(self) -> tuple[str, ...]:
-        waiting = {
-            node.name: {e.source for e in self.edges if e.target == node.name and not e.feedback} for node in self.nodes
-        }
+        ahead = [edge for edge in self.edges if not edge.feedback]
+        waiting = {node.name: {edge.source for edge in ahead if edge.target == node.name} for node in self.nodes}
         order: list[str] = []
         while waiting:
             # Kahn (1962), always taking the first listed node that is ready: equal configurations give equal orders.

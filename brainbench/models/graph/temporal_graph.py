@@ -19,7 +19,7 @@ from typing import Any, cast
 import torch
 from torch import nn
 
-from brainbench.core.errors import UsageError, check_name
+from brainbench.core.errors import UsageError, check_each, check_name
 from brainbench.models.graph.node import NodeModule
 from brainbench.models.graph.spec import UNROLLS, GraphSpec, Shape, Unroll
 from brainbench.models.graph.tnn_import import read_graph
@@ -275,8 +275,7 @@ class TemporalGraph(nn.Module):
         """
         check_name("unrolling", unroll, UNROLLS)
         asked = set(wanted(self.layers, return_activations))
-        for name in asked:
-            check_name("node", name, self.layers)
+        check_each("node", asked, self.layers)
         if x.ndim != 5 or x.shape[1] < 1:
             raise UsageError(f"A graph takes [batch, time, channels, rows, columns]; received {list(x.shape)}.")
         self._accept(tuple(x.shape[2:]))

@@ -160,9 +160,8 @@ def _node(item: Any) -> Node:
     operation = _operation(_Section(node.take("pre_memory"), f"the pre-memory of {name!r}"))
     memory = _memory(_Section(node.take("recurrent_cell"), f"the recurrent cell of {name!r}"))
     activation, pool, chain = _after(_Section(node.take("post_memory"), f"the post-memory of {name!r}"))
-    built = Node(
-        name, operation, memory, activation, pool, chain, node.take("shape_from", None), policy == "ResizeConcat"
-    )
+    source, resize = node.take("shape_from", None), policy == "ResizeConcat"
+    built = Node(name, operation, memory, activation, pool, chain, source, resize)
     node.done()
     made = {Convolution: "channels", Dense: "features"}.get(type(operation))
     if made is not None and getattr(operation, made) != channels:

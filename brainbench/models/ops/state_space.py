@@ -119,9 +119,8 @@ class StateSpace(nn.Module):
         """Advance by one step of input [B, H]; return the answer [B, H] and the next memory [B, H, N, 2]."""
         # x ← Ā x + B̄ u with Ā diagonal less rank one; twice the real part stands for the conjugate states.
         seen = 2 * _real_product(system.right, memory).sum(-1)
-        memory = (
-            _product(system.decay, memory) - system.left * seen[..., None, None] + system.drive * u[..., None, None]
-        )
+        decayed = _product(system.decay, memory) - system.left * seen[..., None, None]
+        memory = decayed + system.drive * u[..., None, None]
         return 2 * _real_product(system.readout, memory).sum(-1) + self.skip * u, memory
 
     def _double(self) -> tuple[torch.Tensor, ...]:

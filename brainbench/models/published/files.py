@@ -50,9 +50,8 @@ def read_weights(path: str | os.PathLike[str]) -> ForeignWeights:
         DataError: it is no such file, is cut short, needs pickle, or a weight is not finite.
     """
     path, kind = Path(path), "file of weights"
-    content: Mapping[str, Any] = (
-        read_tensors(path, kind) if path.suffix == ".safetensors" else read_checkpoint(path, kind)
-    )
+    read = read_tensors if path.suffix == ".safetensors" else read_checkpoint
+    content: Mapping[str, Any] = read(path, kind)
     state: Any = content.get("state_dict", content)
     named = isinstance(state, Mapping) and all(isinstance(name, str) for name in state)
     if not named or not state or not all(isinstance(value, torch.Tensor) for value in state.values()):

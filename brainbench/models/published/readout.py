@@ -17,7 +17,7 @@ from collections.abc import Callable, Collection, Iterable
 import torch
 from torch import nn
 
-from brainbench.core.errors import UsageError, check_name
+from brainbench.core.errors import UsageError, check_each
 from brainbench.models.attenders.gpt import GPTAttender
 from brainbench.models.attenders.mamba import MambaAttender
 from brainbench.models.encoders.resnet import ResNet18Encoder
@@ -61,8 +61,7 @@ def published_activations(model: nn.Module, x: torch.Tensor, layers: Collection[
         UsageError: the network is of another kind, a layer does not exist, or the sweeps do not fit.
     """
     names = published_layers(model)
-    for name in layers or ():
-        check_name("published layer", name, names)
+    check_each("published layer", layers or (), names)
     assert isinstance(model, EncoderAttenderDecoder)
     features, found = _encode(model, model.normaliser(x), names)
     attended, stream = _through(features, _attender_layers(model.attender))
@@ -73,9 +72,8 @@ def published_activations(model: nn.Module, x: torch.Tensor, layers: Collection[
             attended[name] = after - before
     elif isinstance(model.attender, GPTAttender):
         stream = stream[:, 1::2]
-    read, _ = _through(
-        stream if isinstance(model.decoder, AllStepsDecoder) else stream[:, -1], _decoder_layers(model.decoder)
-    )
+    stream = stream if isinstance(model.decoder, AllStepsDecoder) else stream[:, -1]
+    read, _ = _through(stream, _decoder_layers(model.decoder))
     found |= attended | {name: value[:, None] for name, value in read.items()}
     return {name: found[name].flatten(2) for name in names if layers is None or name in layers}
 

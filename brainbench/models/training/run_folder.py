@@ -104,9 +104,8 @@ def load_state(path: Path, learner: nn.Module, optimizer: torch.optim.Optimizer)
             raise DataError(f"{shown(str(path))} belongs to another network ({reason(error)}). {RESTART}") from error
         optimizer.load_state_dict({"state": entries, "param_groups": header["groups"]})
         for name in {name for kept in optimizer.state.values() for name in kept}:
-            shapes = [
-                (getattr(kept.get(name), "shape", None), weight.shape) for weight, kept in optimizer.state.items()
-            ]
+            states = optimizer.state.items()
+            shapes = [(getattr(kept.get(name), "shape", None), weight.shape) for weight, kept in states]
             # Moments have the shapes of the weights; counts of steps are alike for all.
             if any(own != shape for own, shape in shapes) and len({own for own, _ in shapes}) > 1:
                 raise DataError(f"{shown(name)} of the optimiser in {shown(str(path))} fits no weights. {RESTART}")

@@ -212,9 +212,8 @@ class _Run:
                     return self._result("diverged", failure)
                 self.progress(self.at.step, self._steps, f"training {self.config.model}")
                 now = time.monotonic()
-                over, due = self.where.any(
-                    now - self.started > allowed, now - self.saved > self.config.checkpoint_seconds
-                )
+                late = now - self.saved > self.config.checkpoint_seconds
+                over, due = self.where.any(now - self.started > allowed, late)
                 # After an epoch's last batch the end of the epoch saves; a state between the two would lose it.
                 if (over or due) and self.at.step % steps:
                     self._save()
@@ -235,9 +234,8 @@ class _Run:
         config = self.config
         x, labels = x.to(self.where.device, non_blocking=True), labels.to(self.where.device, non_blocking=True)
         views = self._views(x, self.at.step)
-        factor = rate_factor(
-            config.schedule, self.at.step / steps, epochs=config.epochs, warmup_epochs=config.warmup_epochs
-        )
+        span = {"epochs": config.epochs, "warmup_epochs": config.warmup_epochs}
+        factor = rate_factor(config.schedule, self.at.step / steps, **span)
         # The rate is a function of the step alone, so a resumed run needs no state of a scheduler.
         for group in self.optimizer.param_groups:
             group["lr"] = config.learning_rate * factor
@@ -322,14 +320,8 @@ class _Run:
             load_weights(self.model, self.out / BEST / WEIGHTS, what=self.config.model)
             if self.config.objective != "supervised" and self.config.probe_epochs:
                 self.progress(self._steps, self._steps, "fitting the linear probe")
-                fit_probe(
-                    self.model,
-                    self._batches("train", shuffle=False, part=False) or (),
-                    classes=len(self.data.classes),
-                    epochs=self.config.probe_epochs,
-                    seed=self.config.seed,
-                    device=self.where.device,
-                )
+                train = self._batches("train", shuffle=False, part=False) or ()
+                fit_probe(self.model, train, classes=len(self.data.classes), device=self.where.device, **self._probe)
             # The split that was used least for training, of those that the data set has.
             for split in ("test", "validation", "train"):
                 batches = self._batches(split, shuffle=False, part=False)
@@ -352,7 +344,7 @@ class _Run:
         features, train = getattr(self.model, "features", None), self._batches("train", shuffle=True, part=False)
         if features is None or train is None or not self.config.probe_epochs:
             return {}
-        probe: dict[str, Any] = {"epochs": self.config.probe_epochs, "seed": self.config.seed}
+        probe = self._probe
         # The probes are fitted to the training sweeps; where their data set names no hash, their content is hashed.
         fitted = dict(self.data.summary) or sweeps_hash(self._batches("train", shuffle=False, part=False) or ())
         key = {**probe, "classes": list(self.data.classes), "data": result.data, "train": fitted, "twin": self.twin}
@@ -372,26 +364,16 @@ class _Run:
         write_json(self.controls_file, {"of": key, "controls": {name: asdict(item) for name, item in found.items()}})
         return found
 
+    @property
+    def _probe(self) -> dict[str, Any]:
+        return {"epochs": self.config.probe_epochs, "seed": self.config.seed}
+
     def _publish(self, result: Evaluation | None) -> None:
-        info = checkpoint_info(
-            self.config,
-            self.data.classes,
-            epochs_done=self.at.epoch,
-            best_epoch=self.at.best_epoch,
-            evaluation=result,
-            twin=self.twin,
-            controls=self.controls,
-            data=self.data.summary,
-        )
-        save_checkpoint(
-            self.out / BEST,
-            self.model,
-            architecture=self.config.model,
-            options=self.options,
-            info=info,
-            card=model_card(self.config, info),
-            dtype=self.config.stored_dtype,
-        )
+        config, reached = self.config, {"epochs_done": self.at.epoch, "best_epoch": self.at.best_epoch}
+        told = {"twin": self.twin, "controls": self.controls, "data": self.data.summary}
+        info = checkpoint_info(config, self.data.classes, evaluation=result, **reached, **told)
+        kept = {"options": self.options, "info": info, "card": model_card(config, info), "dtype": config.stored_dtype}
+        save_checkpoint(self.out / BEST, self.model, architecture=config.model, **kept)
 
     def _save(self) -> None:
         self.saved = time.monotonic()

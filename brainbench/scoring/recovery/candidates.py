@@ -122,9 +122,8 @@ def open_candidates(
     if twice := repeats(names):
         raise UsageError(f"The candidate {twice[0]!r} is given twice; candidates have different names.")
     if any(item.labels is None for item in resolved):
-        shown = load_stimuli(
-            options.stimuli or "objects", whiskers=options.whiskers, fidelity=options.fidelity, progress=progress
-        )
+        how = {"whiskers": options.whiskers, "fidelity": options.fidelity}
+        shown = load_stimuli(options.stimuli or "objects", **how, progress=progress)
         options, stimuli = replace(options, stimuli=shown, whiskers="all"), shown.labels
     else:  # activations from files alone, whose labels name the stimuli
         stimuli = next(item.labels for item in resolved if item.labels)

@@ -61,32 +61,24 @@ def find_cheapest(
     grid = sorted(product(ANIMALS, UNITS, TRIALS, sizes), key=lambda one: (one[0] * one[2] * one[3], one[1], one[0]))
     tried: list[TriedDesign] = []
     failed: list[tuple[int, ...]] = []
+
+    def measured(animals: int, units: int, trials: int, stimuli: int, **counted: int) -> TriedDesign:
+        population = replace(design.population, animals=animals, units=units, trials=trials)
+        changed = replace(design, population=population, stimuli=stimuli)
+        found = recover(candidates, changed, **counted, **where)
+        return TriedDesign(animals, units, trials, stimuli, found.win_rate, found.wins())
+
     for numbers in track(grid, "trying designs", progress):
         if any(all(mine <= other for mine, other in zip(numbers, one, strict=True)) for one in failed):
             continue
-        found = _try(candidates, design, numbers, boards, 0, where)
+        found = measured(*numbers, boards=boards, first=0)
         tried.append(found)
         if found.interval.high < wanted:
             failed.append(numbers)
         elif found.win_rate >= wanted:
             # The first to reach a rate by luck would be returned too often: it must do so again.
-            again = _try(candidates, design, numbers, 2 * boards, boards, where)
+            again = measured(*numbers, boards=2 * boards, first=boards)
             tried[-1] = again
             if again.win_rate >= wanted:
                 return again, tuple(tried)
     return None, tuple(tried)
-
-
-def _try(
-    candidates: Sequence[Candidate],
-    design: RecoveryDesign,
-    numbers: tuple[int, int, int, int],
-    boards: int,
-    first: int,
-    where: dict[str, Any],
-) -> TriedDesign:
-    animals, units, trials, stimuli = numbers
-    population = replace(design.population, animals=animals, units=units, trials=trials)
-    changed = replace(design, population=population, stimuli=stimuli)
-    found = recover(candidates, changed, boards=boards, first=first, **where)
-    return TriedDesign(animals, units, trials, stimuli, found.win_rate, found.wins())

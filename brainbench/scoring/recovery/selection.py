@@ -98,13 +98,11 @@ def select_stimuli(
 
 def keep_stimuli(candidates: Sequence[Candidate], rows: Sequence[int]) -> tuple[Candidate, ...]:
     """Return the candidates with some of their stimuli alone."""
-    names = tuple(candidates[0].stimuli[row] for row in rows)
-    return tuple(
-        Candidate.of(
-            item.name, names, {layer: values[list(rows)] for layer, values in item.features.items()}, item.weights
-        )
-        for item in candidates
-    )
+    names, found = tuple(candidates[0].stimuli[row] for row in rows), []
+    for item in candidates:
+        kept = {layer: values[list(rows)] for layer, values in item.features.items()}
+        found.append(Candidate.of(item.name, names, kept, item.weights))
+    return tuple(found)
 
 
 def _worth(margins: Floats, scale: float) -> float:

@@ -84,9 +84,8 @@ def recover(
     missing = [job for job in jobs if job not in found]
     total = done = sum(len(job.numbers) for job in jobs)
     done -= sum(len(job.numbers) for job in missing)
-    for place, made in run_jobs(
-        partial(_make_boards, tuple(candidates), design), missing, workers=workers, scheduler=scheduler
-    ):
+    work = partial(_make_boards, tuple(candidates), design)
+    for place, made in run_jobs(work, missing, workers=workers, scheduler=scheduler):
         job = missing[place]
         found[job] = made
         done += len(made)
