@@ -41,10 +41,9 @@ class Sample:
     @classmethod
     def of(cls, scores: Sequence[Score]) -> Sample:
         """Return the sample of one model's scores, which differ in the seed of the weights alone."""
-        found = [
-            {item.subject: score.on_scale(item.value) for item in score.subjects if item.status == "ok"}
-            for score in scores
-        ]
+        known = [[item for item in score.subjects if item.status == "ok"] for score in scores]
+        both = zip(scores, known, strict=True)
+        found = [{item.subject: score.on_scale(item.value) for item in items} for score, items in both]
         shared = [name for name in found[0] if all(math.isfinite(one.get(name, math.nan)) for one in found)]
         left_out = [[score.on_scale(value) for value in score.without_stimulus] for score in scores]
         alike = len({len(values) for values in left_out}) == 1

@@ -63,11 +63,8 @@ def rdm(
     labels = brain.vocabulary
     animals = brain.animals(labels, get_metric("rsa-correlation"), ScoreOptions(seed=seed))
     told = ("subject", "units", "trials", "reliability", "problem", "rdm")
-    data = {
-        "labels": labels,
-        "recordings": brain.origin,
-        "animals": [{name: getattr(item, name) for name in told} for item in animals],
-    }
+    shown = [{name: getattr(item, name) for name in told} for item in animals]
+    data = {"labels": labels, "recordings": brain.origin, "animals": shown}
     text = table_of(
         f"{brain.dataset.attrs['conditions']}, {brain.dataset.attrs['window']}; RDM: correlation distance",
         animals,

@@ -108,10 +108,8 @@ def pick_device(name: Any) -> Any:
     if name != "cpu" and int(name.partition(":")[2] or 0) >= (count := wp.get_cuda_device_count()):
         raise UsageError(f"There are {count} CUDA devices here, so {name!r} cannot be used; use 'cpu' or another one.")
     if name == "cpu" and not wp.is_cpu_available():
-        raise UsageError(
-            "This build of warp-lang has no compiler for processors; install the one from PyPI, or use the engine "
-            "'mujoco'."
-        )
+        hint = "install the one from PyPI, or use the engine 'mujoco'"
+        raise UsageError(f"This build of warp-lang has no compiler for processors; {hint}.")
     return wp.get_device(name)
 
 

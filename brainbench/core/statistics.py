@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from brainbench.core.errors import DataError, UsageError
+from brainbench.core.reading.ranges import check_number
 from brainbench.core.records import Interval, Score
 
 LEVEL = 0.95
@@ -149,8 +150,7 @@ def is_finite(interval: Interval | None) -> TypeGuard[Interval]:
 
 def check_level(level: float) -> None:
     """Raise UsageError unless a confidence level lies between 0 and 1."""
-    if not 0 < level < 1:
-        raise UsageError(f"A confidence level lies between 0 and 1, such as 0.95; received {level}.")
+    check_number("confidence level", level, above=0, below=1)
 
 
 @dataclass(frozen=True)

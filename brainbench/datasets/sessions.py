@@ -264,10 +264,8 @@ def make_session(
     data |= ragged(SPIKES, spikes)
     if observed is not None:
         data |= ragged(OBSERVED, [np.reshape(item, (-1, 2)) for item in observed])
-    made = {
-        name: SessionTable(name, {key: np.asarray(item) for key, item in table.items()}, session)
-        for name, table in tables.items()
-    }
+    arrays = {name: {key: np.asarray(item) for key, item in table.items()} for name, table in tables.items()}
+    made = {name: SessionTable(name, columns, session) for name, columns in arrays.items()}
     units = SessionTable("units", data, session)
     for table in (units, *made.values()):
         for name in table.columns:

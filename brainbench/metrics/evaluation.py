@@ -130,11 +130,8 @@ def attainable_value(metric: Metric, animals: Animals, result: LayerEvaluation, 
 
 
 def _partly(compared: LayerComparisons, names: Sequence[str]) -> tuple[str, ...]:
-    lacking = [
-        f"{name} ({(~known).sum()} of {len(known)})"
-        for name, known in zip(names, compared.known, strict=True)
-        if not known.all()
-    ]
+    counts = [(name, (~known).sum(), len(known)) for name, known in zip(names, compared.known, strict=True)]
+    lacking = [f"{name} ({number} of {count})" for name, number, count in counts if number]
     if not lacking:
         return ()
     return (f"layers without a value for some stimuli, compared over the others: {', '.join(lacking)}",)

@@ -201,11 +201,8 @@ def explain_score(layer_rdms: Mapping[str, ArrayLike], subjects: Sequence[Subjec
 def _step(change: str, switches: Switches, rdms: Floats, subjects: list[SubjectRDM]) -> Step:
     targets = [(subject.subject, subject.rdm, subject.split_half_by("pearson")) for subject in subjects]
     if not switches.no_gate:
-        targets = [
-            target
-            for target in targets
-            if float(spearman_brown(target[2][np.isfinite(target[2])].mean())) >= RELIABILITY_GATE
-        ]
+        trusted = [float(spearman_brown(r[np.isfinite(r)].mean())) >= RELIABILITY_GATE for _, _, r in targets]
+        targets = [target for target, keep in zip(targets, trusted, strict=True) if keep]
     if switches.best_target and len(subjects) > 1:
         # The published pool joined units, which are not kept here; the animals' mean RDM stands for it.
         splits = min(len(subject.halves) for subject in subjects)

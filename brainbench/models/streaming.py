@@ -144,10 +144,8 @@ class _S4Part(nn.Module):
         return self
 
     def _kept(self) -> list[System]:
-        return [
-            System(*(getattr(self, f"{name}{number}") for name in System._fields))
-            for number in range(len(self.part.blocks))
-        ]
+        numbers = range(len(self.part.blocks))
+        return [System(*(getattr(self, f"{name}{number}") for name in System._fields)) for number in numbers]
 
     def forward(self, x: torch.Tensor, state: _Tensors) -> tuple[torch.Tensor, _Tensors]:
         # Weights that learn are discretised in every step, so that gradients reach them.

@@ -125,10 +125,8 @@ def _pages(stored: Sequence[StoredRecord], title: str) -> Iterator[tuple[str, st
         if len(boards) > 1:
             figures = [replace(figure, key=f"{figure.key}-{place}") for figure in figures]
         shown.append({"label": board_label(board), "figures": figures})
-    yield (
-        "figures.html",
-        render("board_figures.html.j2", title="Figures", boards=shown, synthetic=synthetic, here="figures", root=""),
-    )
+    about = {"title": "Figures", "synthetic": synthetic, "here": "figures", "root": ""}
+    yield "figures.html", render("board_figures.html.j2", boards=shown, **about)
     for entry in (entry for board in boards for entry in board.entries):
         yield f"models/{entry.page}", model_page(entry)
     kept = (record for board in boards for entry in board.entries for record in entry.records)

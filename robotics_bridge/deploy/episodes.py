@@ -113,15 +113,8 @@ class SessionRecorder:
         """Write the session as a data set; see :func:`write_lerobot`."""
         task = self.contract.more.get("task", "deployed policy")
         episode = Episode(task, *(np.array([frame[part] for frame in self.frames]) for part in range(5)))
-        return write_lerobot(
-            folder,
-            [episode],
-            fps=self.contract.rate,
-            joints=joints,
-            points=self.points,
-            robot=self.hand.name,
-            unit="unit of the hand's pressure",
-        )
+        about = {"robot": self.hand.name, "unit": "unit of the hand's pressure"}
+        return write_lerobot(folder, [episode], fps=self.contract.rate, joints=joints, points=self.points, **about)
 
 
 def check_folder(folder: Path, fps: float) -> None:

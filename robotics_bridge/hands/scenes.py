@@ -14,6 +14,7 @@ from brainbench.core.reading.ranges import check_number
 from brainbench.core.rotations import from_z_axis, to_matrices
 from robotics_bridge.hands.facing import half_open, link_middle, palmar_directions, slide_of
 from robotics_bridge.hands.hand import Hand
+from robotics_bridge.hands.spec import add_servo
 
 mujoco = mujoco_module()
 
@@ -150,11 +151,7 @@ def replace_drives(spec: Any) -> None:
         if slides or joint.type == mujoco.mjtJoint.mjJNT_HINGE:
             stiffness, damping = (_PUSH, _DRAG) if slides else (_STIFFNESS, _DAMPING)
             joint.armature = max(joint.armature, _ARMATURE)
-            spec.add_actuator(
-                name=joint.name, target=joint.name, trntype=mujoco.mjtTrn.mjTRN_JOINT,
-                gaintype=mujoco.mjtGain.mjGAIN_FIXED, biastype=mujoco.mjtBias.mjBIAS_AFFINE,
-                gainprm=[stiffness] + [0.0] * 9, biasprm=[0.0, -stiffness, -damping] + [0.0] * 7,
-            )  # fmt: skip
+            add_servo(spec, joint.name, stiffness, damping)
 
 
 def palm_surface(hand: Hand) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:

@@ -217,17 +217,23 @@ def build(hand: HandSpec) -> Any:
             bodies[joint.child] = body
         waiting = [joint for joint in waiting if joint not in ready]
     for joint in hand.joints:
-        spec.add_actuator(
-            name=joint.name, target=joint.name, trntype=mujoco.mjtTrn.mjTRN_JOINT,
-            gaintype=mujoco.mjtGain.mjGAIN_FIXED, biastype=mujoco.mjtBias.mjBIAS_AFFINE,
-            gainprm=[joint.stiffness] + [0.0] * 9, biasprm=[0.0, -joint.stiffness, -joint.damping] + [0.0] * 7,
-            ctrllimited=True, ctrlrange=joint.limits, forcelimited=True, forcerange=(-joint.effort, joint.effort),
-        )  # fmt: skip
+        limits = {"ctrlrange": joint.limits, "forcerange": (-joint.effort, joint.effort)}
+        add_servo(spec, joint.name, joint.stiffness, joint.damping, ctrllimited=True, forcelimited=True, **limits)
     # MuJoCo lets a body collide with one that is fixed to the world, even with its parent.
     neighbours = [(hand.palm, joint.child) for joint in hand.joints if joint.parent == hand.palm]
     for first, second in (*neighbours, *hand.apart):
         spec.add_exclude(bodyname1=first, bodyname2=second)
     return spec
+
+
+def add_servo(spec: Any, joint: str, stiffness: float, damping: float, **limits: Any) -> None:
+    """Add the position servo of a joint, of the joint's name, to a ``mujoco.MjSpec``."""
+    mujoco = mujoco_module()
+    spec.add_actuator(
+        name=joint, target=joint, trntype=mujoco.mjtTrn.mjTRN_JOINT, gaintype=mujoco.mjtGain.mjGAIN_FIXED,
+        biastype=mujoco.mjtBias.mjBIAS_AFFINE, gainprm=[stiffness] + [0.0] * 9,
+        biasprm=[0.0, -stiffness, -damping] + [0.0] * 7, **limits,
+    )  # fmt: skip
 
 
 def _add_solids(body: Any, link: Link) -> None:

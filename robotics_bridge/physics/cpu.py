@@ -60,7 +60,7 @@ class MujocoEngine:
         for each in models:
             # An environment that diverges shows it; C MuJoCo would put it back to its start and go on.
             each.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
-        order = list(assignment) or list(range(len(models)))
+        order = list(assignment) or range(len(models))
         self.scene: TouchScene = TouchScene.from_mujoco(models[0], models[1:], assignment)
         self.num_envs = num_envs
         varied = check_fields(models[0], fields or {}, num_envs)

@@ -35,10 +35,8 @@ def check_fields(model: Any, fields: Mapping[str, ArrayLike], num_envs: int) -> 
             raise unknown_name("model field", name, model_fields(model))
         array = np.asarray(values, dtype=own.dtype)
         if array.shape != (num_envs, *own.shape):
-            raise UsageError(
-                f"The field {name!r} needs one value per environment, shape {(num_envs, *own.shape)}; "
-                f"received {array.shape}."
-            )
+            needed = (num_envs, *own.shape)
+            raise UsageError(f"The field {name!r} has the shape {needed}, by environment; received {array.shape}.")
         if array.dtype.kind == "f" and np.isnan(array).any():
             raise UsageError(f"The field {name!r} holds values that are no numbers (NaN).")
         checked[name] = array

@@ -63,6 +63,6 @@ def test_what_cannot_be_asked_is_one_sentence(run, networks, arguments, culprit)
 
 def test_one_network_is_too_few(run, networks):
     found = run("recovery", networks[0])
-    assert (found.status, "at least two" in found.err) == (2, True)
+    assert (found.status, "at least 2" in found.err) == (2, True)
     found = run("recovery", "zhuang-smal.simclr", "zhuang-small.simclr")
     assert (found.status, "'zhuang-small" in found.err) == (2, True)

@@ -61,11 +61,8 @@ def jobs_of(patterns: Sequence[str], seeds: Sequence[int] | None, options: Mappi
         for seed in ([common.model_seed] if seeds is None else seeds)
     }
     fixed = [replace(common, weights_seed=None)]
-    return [
-        ScoringJob(name, seeded)
-        for name in find_models(patterns)
-        for seeded in (by_seed.values() if follows_seed(name) else fixed)
-    ]
+    asked = {name: by_seed.values() if follows_seed(name) else fixed for name in find_models(patterns)}
+    return [ScoringJob(name, seeded) for name, each in asked.items() for seeded in each]
 
 
 def score_again(record: ResultRecord, *, recordings: str | None = None, trust_code: bool = False) -> ResultRecord:

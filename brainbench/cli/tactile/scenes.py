@@ -127,16 +127,8 @@ def markers(path: Path, *, noisy: bool) -> dict[str, float]:
     )
     noise = Noise.preset("published-elastomer") if noisy else Noise()
     # A soft thin gel: markers move by tenths of a millimetre, and shear stays near where it is applied.
-    sensor = ElastomerTaxel(
-        link="pad",
-        probes=probes,
-        noise=noise,
-        points=2000,
-        dilate_scale=8.0,
-        dilate_spread=1e5,
-        shear_scale=8.0,
-        shear_spread=1e5,
-    )
+    gel = {"dilate_scale": 8.0, "dilate_spread": 1e5, "shear_scale": 8.0, "shear_spread": 1e5}
+    sensor = ElastomerTaxel(link="pad", probes=probes, noise=noise, points=2000, **gel)
     suite = SensorSuite(TouchScene(("pad", "ball"), shapes), {"pad": sensor}, num_envs=1)
     state = HandState.empty(1, 2, 1)
     state.set_contacts([0], [[0, 1]])
@@ -161,13 +153,10 @@ def temperature(path: Path, hand: str) -> dict[str, float]:
     """Draw the warming of the finger tips by a ball of 45 °C, for three materials."""
     grip = Grip(hand)
     tips = grip.hand.tips
-    members = {
-        f"{name}/{link}": TemperatureGrid(
-            link=link, cells=(12, 12, 12), material="steel", bodies={"object": ThermalBody(name, 45.0)}
-        )
-        for name in ("aluminium", "glass", "wood")
-        for link in tips
-    }
+    members, skin = {}, {"cells": (12, 12, 12), "material": "steel"}
+    for name in ("aluminium", "glass", "wood"):
+        bodies = {"object": ThermalBody(name, 45.0)}
+        members |= {f"{name}/{link}": TemperatureGrid(link=link, bodies=bodies, **skin) for link in tips}
     suite = SensorSuite(grip.engine.scene, members, num_envs=1)
     times, traces = [], {name: [] for name in members}
     for step in range(1500):

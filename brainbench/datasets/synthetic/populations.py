@@ -100,15 +100,9 @@ def _draw_session(
     expected = expected_rates(geometry, design, own, random)
     labels = _labels(design, stimuli, absent, random)
     counts = draw_counts(random, design, expected[labels], design.window)
-    return DrawnSession(
-        subject=f"synthetic{animal + 1:02d}",
-        session=f"{session + 1:02d}",
-        stream=(*seed, animal, session),
-        counts=counts,
-        labels=labels,
-        expected=expected,
-        window=design.window,
-    )
+    names = {"subject": f"synthetic{animal + 1:02d}", "session": f"{session + 1:02d}"}
+    drawn = {"counts": counts, "labels": labels, "expected": expected}
+    return DrawnSession(**names, **drawn, stream=(*seed, animal, session), window=design.window)
 
 
 def expected_rates(

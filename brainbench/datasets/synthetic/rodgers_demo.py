@@ -83,10 +83,8 @@ def make_rodgers_demo(
     contact = stimuli["contact"].transpose("stimulus", "time", "whisker").values.astype(bool)
     names = tuple(str(name) for name in stimuli["whisker"].values)
     contacts = tracked_contacts(names, contact, float(np.median(np.diff(stimuli["time"].values))))
-    plans = [
-        [replace(plan, subject=f"demo{index + 1:02d}") for plan in _ANIMALS[index % len(_ANIMALS)]]
-        for index in range(animals)
-    ]
+    turns = ((f"demo{index + 1:02d}", _ANIMALS[index % len(_ANIMALS)]) for index in range(animals))
+    plans = [[replace(plan, subject=subject) for plan in own] for subject, own in turns]
     # Stimuli that do not suit are told before a folder is made.
     for plan in (plan for own in plans for plan in own):
         first_contacts(contacts, rodgers.LABELS, plan.lost_whisker)

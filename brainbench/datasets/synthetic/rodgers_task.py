@@ -126,16 +126,9 @@ def draw_session(
         for whisker, times in contacts.items()
         if whisker != plan.lost_whisker
     }
-    session = make_session(
-        plan.subject,
-        plan.session,
-        spikes,
-        tables,
-        unit_columns=units,
-        observed=observed,
-        start="2025-01-01T12:00:00+00:00",
-        synthetic=True,
-    )
+    about = {"start": "2025-01-01T12:00:00+00:00", "synthetic": True}
+    named = (plan.subject, plan.session)
+    session = make_session(*named, spikes, tables, unit_columns=units, observed=observed, **about)
     choice = behaviour.columns["choice"]
     licked = choice != "nogo"
     # 1 left, 2 right.

@@ -109,12 +109,6 @@ def spike_session(geometry: ResponseGeometry, drawn: DrawnSession) -> Session:
         },
         "contacts_by_whisker_C1": {"start_time": begin, "stop_time": begin + _TOUCH},
     }
-    return make_session(
-        drawn.subject,
-        drawn.session,
-        spikes,
-        tables,
-        observed=[np.array([[0.0, end]])] * len(spikes),
-        start="2025-01-01T12:00:00+00:00",
-        synthetic=True,
-    )
+    observed = [np.array([[0.0, end]])] * len(spikes)
+    about = {"start": "2025-01-01T12:00:00+00:00", "synthetic": True}
+    return make_session(drawn.subject, drawn.session, spikes, tables, observed=observed, **about)

@@ -59,10 +59,7 @@ class Shard:
             arrays = {name: file[name][()] for name in file if name != "wrench"}
             found = hash_arrays({**arrays, "wrench": self.forces()})
         if found != self.content_hash:
-            raise DataError(
-                f"The numbers in {str(self.path)!r} do not match the hash in the manifest: it was damaged or edited. "
-                f"{_AGAIN}"
-            )
+            raise DataError(f"{str(self.path)!r} does not match its hash: it was damaged or edited. {_AGAIN}")
 
     def verify_once(self) -> None:
         """Verify, unless the file was found whole before and did not change since; the cache remembers it."""

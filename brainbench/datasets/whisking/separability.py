@@ -16,6 +16,7 @@ import numpy as np
 
 from brainbench.core.errors import DataError, UsageError, check_each, missing_dependency
 from brainbench.core.progress import Progress
+from brainbench.core.reading.ranges import check_number
 from brainbench.core.records import Interval, Status
 
 if TYPE_CHECKING:
@@ -119,8 +120,7 @@ def separate(
         from sklearn.svm import SVC
     except ImportError as error:
         raise missing_dependency("scikit-learn", extra="learn", purpose="Separability") from error
-    if not 2 <= count <= len(names):
-        raise UsageError(f"Between 2 and {len(names)} classes can be told apart here; received {count!r}.")
+    check_number("number of classes to tell apart", count, least=2, most=len(names), whole=True)
     members = [np.unique(objects[labels == number]) for number in range(len(names))]
     fewest = min(map(len, members))
     if fewest < 2:

@@ -82,10 +82,8 @@ def compare_models(
         raise UsageError("There are no models to compare; give the layers' RDMs of at least one.")
     check_comparison(compare)
     metric, options = RSA(comparison=compare), {"stimuli": stimuli, "seed": seed, "device": device}
-    found = {
-        name: score_layers(metric, check_layers(layers, stimuli), subjects, name=name, **options)
-        for name, layers in models.items()
-    }
+    checked = {name: check_layers(layers, stimuli) for name, layers in models.items()}
+    found = {name: score_layers(metric, rdms, subjects, name=name, **options) for name, rdms in checked.items()}
     # All models met the same permutations, so the maximum over models keeps the correlations between them.
     tested = {name: test.null for name, (_, test) in found.items() if test is not None and math.isfinite(test.p)}
     corrected = dict(zip(tested, step_down(np.stack(list(tested.values()))), strict=True)) if tested else {}

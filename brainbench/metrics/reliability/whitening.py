@@ -56,11 +56,8 @@ def whitened(session: SortedTrials, count: int, noise: str) -> tuple[SortedTrial
         return session, ""
     varies, power, number = (np.concatenate(part) for part in zip(*_noise(session, count), strict=True))
     usable = varies if noise == "diag" else varies & np.isfinite(session.responses).all(axis=0)
-    told = (
-        f"{int((~usable).sum())} units or bins left out: without noise or not in every trial"
-        if not usable.all()
-        else ""
-    )
+    lost = int((~usable).sum())
+    told = f"{lost} units or bins left out: without noise or not in every trial" if lost else ""
     if not usable.any():
         return None, "no unit has noise to divide by"
     responses = session.responses if usable.all() else session.responses[:, usable]

@@ -185,10 +185,8 @@ def _checked(layers: Mapping[str, ArrayLike], animals: Sequence[AnimalMovie], wi
 def _reasons(animals: Sequence[AnimalMovie], points: tuple[TimePoint, ...], stimuli: int) -> tuple[str, ...]:
     reasons = []
     if len(animals) < FEWEST_ANIMALS or stimuli < FEWEST_STIMULI:
-        reasons.append(
-            f"intervals need {FEWEST_ANIMALS} animals and {FEWEST_STIMULI} stimuli; there are {len(animals)} and "
-            f"{stimuli}"
-        )
+        needed = f"{FEWEST_ANIMALS} animals and {FEWEST_STIMULI} stimuli"
+        reasons.append(f"intervals need {needed}; there are {len(animals)} and {stimuli}")
     blind = sum(point.animals == 0 for point in points)
     if blind:
         reasons.append(f"no animal is reliable in {blind} of {len(points)} bins, which have no corrected value")

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from brainbench.core.errors import UsageError
+from brainbench.core.reading.ranges import check_number
 
 
 @contextmanager
@@ -16,8 +16,7 @@ def seeded(seed: int) -> Iterator[None]:
         UsageError: the seed is not a whole number from 0 to 2**63 − 1.
     """
     # PyTorch keeps seeds as signed 64-bit numbers.
-    if isinstance(seed, bool) or not isinstance(seed, int) or not 0 <= seed < 2**63:
-        raise UsageError(f"A seed must be a whole number of 0 or more, below 2**63; received {seed!r}.")
+    check_number("seed", seed, least=0, below=2**63, whole=True)
     import torch
 
     with torch.random.fork_rng(devices=[]):

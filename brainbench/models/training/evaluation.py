@@ -142,10 +142,8 @@ def evaluate(model: nn.Module, batches: Iterable[tuple[Any, Any]], *, device: An
             else:
                 features, answers = None, model(x).float()
             if answers.ndim != 2 or len(answers) != len(labels):
-                raise DataError(
-                    f"{type(model).__name__} answers {list(answers.shape)} to {len(labels)} sweeps; expected "
-                    "[batch, classes]."
-                )
+                told = f"{list(answers.shape)} to {len(labels)} sweeps; expected [batch, classes]"
+                raise DataError(f"{type(model).__name__} answers {told}.")
             seen += len(labels)
             first += topk(answers, labels, 1)
             # Of five classes or fewer every one would be among the first five: one answer fewer keeps it a test.

@@ -65,14 +65,8 @@ def make_board(candidates: Sequence[Candidate], design: RecoveryDesign, true: in
     """Draw the animals of a board from candidate ``true`` and score all candidates, by the arguments alone."""
     layer, rows, animals = draw_board(candidates, design, true, number)
     scores = score_board(candidates, rows, animals, design)
-    return RecoveryBoard(
-        true,
-        number,
-        layer,
-        tuple(one.scaled for one in scores),
-        tuple(told_apart(scores)[true].tolist()),
-        scores[true].reliability,
-    )
+    scaled, told = tuple(one.scaled for one in scores), tuple(told_apart(scores)[true].tolist())
+    return RecoveryBoard(true, number, layer, scaled, told, scores[true].reliability)
 
 
 def draw_board(

@@ -13,9 +13,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from brainbench.core.errors import UsageError, listing, repeats, unknown_name
+from brainbench.core.errors import UsageError, repeats, unknown_name
 from brainbench.core.files import content_hash
 from brainbench.core.progress import Progress, track
+from brainbench.core.reading.ranges import check_number
 from brainbench.datasets.synthetic.geometry import ResponseGeometry, principal_axes
 from brainbench.metrics.measures.metric import Metric
 from brainbench.scoring.options import ScoreOptions
@@ -111,11 +112,7 @@ def open_candidates(
     from brainbench.scoring.model_responses import resolve_model
     from brainbench.stimuli import load_stimuli
 
-    if len(models) < 2:
-        raise UsageError(
-            f"A recovery tells candidates apart and needs at least two; received {len(models)}: "
-            f"{listing(map(str, models)) or 'none'}."
-        )
+    check_number("number of candidates, which a recovery tells apart,", len(models), least=2)
     # Whatever can be wrong with a name is found before stimuli are simulated.
     resolved = [resolve_model(model, seed=options.model_seed) for model in models]
     names = [item.card.name for item in resolved]

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from brainbench.core.contracts import GRID_SHAPE
 from brainbench.core.errors import DataError, UsageError
+from brainbench.core.reading.ranges import check_number
 from brainbench.core.records import Interval, Status
 from brainbench.core.statistics import t_interval
 from brainbench.metrics.measures.patterns import LinearCKA
@@ -102,11 +103,7 @@ def design_for_networks(
         DataError: whiskers are unstable with the given motion.
     """
     options, study = options or DesignOptions(), replace(study or RecoveryDesign(), stimuli=None)
-    if len(scenes) < 2 * FEWEST_STIMULI:
-        raise UsageError(
-            f"A design for networks needs at least {2 * FEWEST_STIMULI} scenes, half of which are held out; received "
-            f"{len(scenes)}."
-        )
+    check_number("number of scenes, half of which are held out,", len(scenes), least=2 * FEWEST_STIMULI)
     if len(networks) != 2:
         raise UsageError(f"A design tells two networks apart; received {len(networks)}.")
     begin, limits = read_limits(scenes, variables, {})

@@ -104,8 +104,7 @@ def _make_boards(candidates: tuple[Candidate, ...], design: RecoveryDesign, job:
 
 def check_candidates(candidates: Sequence[Candidate], design: RecoveryDesign, boards: int) -> None:
     """Raise UsageError for what cannot be run, before any work."""
-    if len(candidates) < 2:
-        raise UsageError(f"A recovery tells candidates apart and needs at least two; received {len(candidates)}.")
+    check_number("number of candidates, which a recovery tells apart,", len(candidates), least=2)
     check_number("The number of boards", boards, least=1, whole=True)
     pool = len(candidates[0].stimuli)
     if any(item.stimuli != candidates[0].stimuli for item in candidates):

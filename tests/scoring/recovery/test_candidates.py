@@ -51,7 +51,7 @@ def test_files_of_activations_are_joined_by_label(tmp_path):
 
 def test_a_recovery_needs_two_different_candidates_of_the_same_stimuli(tmp_path):
     one = _features(tmp_path / "one.h5", ["p", "q", "r"], 0)
-    with pytest.raises(UsageError, match="at least two"):
+    with pytest.raises(UsageError, match="at least 2"):
         open_candidates([one], ScoreOptions())
     with pytest.raises(UsageError, match="'one' is given twice"):
         open_candidates([one, one], ScoreOptions())

@@ -51,7 +51,7 @@ def test_more_stimuli_than_the_pool_has_are_refused():
     for keep in (3, 9, 4.5):
         with pytest.raises(UsageError, match=f"the 8 of the pool .*received {keep}"):
             select_stimuli(make_candidates(8), keep, DESIGN)
-    with pytest.raises(UsageError, match="at least two"):
+    with pytest.raises(UsageError, match="at least 2"):
         select_stimuli(make_candidates(8, names=("a",)), 4, DESIGN)
     with pytest.raises(UsageError, match="'procrustes'"):
         select_stimuli(make_candidates(8), 4, replace(DESIGN, metric="procrustes"))

@@ -55,7 +55,7 @@ def test_a_folder_of_another_recovery_is_refused(tmp_path):
 @pytest.mark.parametrize(
     ("candidates", "changes", "boards", "culprit"),
     [
-        (make_candidates(names=("a",)), {}, 1, "at least two"),
+        (make_candidates(names=("a",)), {}, 1, "at least 2"),
         (make_candidates(8), {"stimuli": 9}, 1, "9 stimuli .* the pool has 8"),
         (make_candidates(8), {"metric": "rsaa"}, 1, "'rsa'"),
         (make_candidates(8), {"layer": "layr1"}, 1, "'layer1'"),
