@@ -127,7 +127,7 @@ def markers(path: Path, *, noisy: bool) -> dict[str, float]:
     )
     noise = Noise.preset("published-elastomer") if noisy else Noise()
     # A soft thin gel: markers move by tenths of a millimetre, and shear stays near where it is applied.
-    gel = {"dilate_scale": 8.0, "dilate_spread": 1e5, "shear_scale": 8.0, "shear_spread": 1e5}
+    gel: dict[str, Any] = {"dilate_scale": 8.0, "dilate_spread": 1e5, "shear_scale": 8.0, "shear_spread": 1e5}
     sensor = ElastomerTaxel(link="pad", probes=probes, noise=noise, points=2000, **gel)
     suite = SensorSuite(TouchScene(("pad", "ball"), shapes), {"pad": sensor}, num_envs=1)
     state = HandState.empty(1, 2, 1)
@@ -153,7 +153,8 @@ def temperature(path: Path, hand: str) -> dict[str, float]:
     """Draw the warming of the finger tips by a ball of 45 °C, for three materials."""
     grip = Grip(hand)
     tips = grip.hand.tips
-    members, skin = {}, {"cells": (12, 12, 12), "material": "steel"}
+    members: dict[str, TemperatureGrid] = {}
+    skin: dict[str, Any] = {"cells": (12, 12, 12), "material": "steel"}
     for name in ("aluminium", "glass", "wood"):
         bodies = {"object": ThermalBody(name, 45.0)}
         members |= {f"{name}/{link}": TemperatureGrid(link=link, bodies=bodies, **skin) for link in tips}

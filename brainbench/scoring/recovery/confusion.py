@@ -143,8 +143,9 @@ def plot_confusion(recovery: Recovery, path: str | os.PathLike[str]) -> Path:
     shown = axes.imshow(share, cmap="BuGn", vmin=0, vmax=1)
     figure.colorbar(shown, ax=axes, label="share of the boards in which it came first", shrink=0.6)
     for row, column in np.argwhere(share > 0).tolist():
-        value, centred = share[row, column], {"ha": "center", "va": "center"}
-        axes.text(column, row, f"{value:.0%}", fontsize=7, color="white" if value > 0.6 else INK, **centred)
+        value = share[row, column]
+        ink = "white" if value > 0.6 else INK
+        axes.text(column, row, f"{value:.0%}", ha="center", va="center", fontsize=7, color=ink)
     axes.set_xticks(range(count), recovery.names, rotation=90, fontsize=8, color=INK)
     axes.set_yticks(range(count), recovery.names, fontsize=8, color=INK)
     axes.set_xlabel("network that came first", color=PALE)
