@@ -36,7 +36,7 @@ def check_fields(model: Any, fields: Mapping[str, ArrayLike], num_envs: int) -> 
         array = np.asarray(values, dtype=own.dtype)
         if array.shape != (num_envs, *own.shape):
             needed = (num_envs, *own.shape)
-            raise UsageError(f"The field {name!r} has the shape {needed}, by environment; received {array.shape}.")
+            raise UsageError(f"The field {name!r} needs a value per environment, {needed}; received {array.shape}.")
         if array.dtype.kind == "f" and np.isnan(array).any():
             raise UsageError(f"The field {name!r} holds values that are no numbers (NaN).")
         checked[name] = array

@@ -88,7 +88,7 @@ def test_few_objects_make_it_unreliable_and_one_makes_it_impossible():
 
 
 def test_more_classes_than_there_are_cannot_be_told_apart():
-    with pytest.raises(UsageError, match="Between 2 and 4"):
+    with pytest.raises(UsageError, match="at least 2 and at most 4"):
         separate(*_made(), count=5, names=NAMES)
 
 
