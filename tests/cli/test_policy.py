@@ -192,7 +192,7 @@ def test_settings_that_reach_nothing_are_refused(tmp_path: Path, words: tuple[st
 def test_wrong_requests_are_refused(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="did you mean 'random'"):
         _run("play", "in_palm_rotate", "--agent", "randm", "--seconds", "0.1")
-    with pytest.raises(UsageError, match="positive length"):
+    with pytest.raises(UsageError, match="--seconds must be"):
         _run("play", "in_palm_rotate", "--seconds", "0")
     with pytest.raises(DataError, match=r"none\.py"):
         _run("play", "in_palm_rotate", "--task-file", str(tmp_path / "none.py"))

@@ -302,7 +302,7 @@ def test_scores_of_mappings_follow_the_order_of_the_stimuli(recordings: xr.Datas
         {"other": _geometry(9), "true": _geometry()}, recordings=recordings, stimuli=str(arrays)
     )
     assert by_mapping.value == pytest.approx(by_file.value, abs=1e-6)
-    with pytest.raises(UsageError, match="expected .6, F"):
+    with pytest.raises(UsageError, match=r"expected \[6, F\]"):
         brainbench.score({"fc": np.ones((5, 2))}, recordings=recordings, stimuli=str(arrays))
 
 
