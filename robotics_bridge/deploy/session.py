@@ -131,7 +131,9 @@ def read_deployed(path: str | Path) -> DeployedPolicy:
     contract = path.with_name(f"{path.name}.json")
     for file in (path, contract):
         if not file.is_file():
-            raise DataFileNotFoundError(f"There is no file {str(file)!r}; brainbench policy export writes both.")
+            raise DataFileNotFoundError(
+                f"There is no file {str(file)!r}; brainbench policy export writes a policy and its contract."
+            )
     found = PolicyContract.read(contract)
     if found.sha256 and found.sha256 != file_hash(path, length=64):
         raise DataError(f"{str(path)!r} is not the file that its contract describes; export the policy again.")

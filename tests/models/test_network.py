@@ -90,7 +90,7 @@ def test_any_decoder_fits():
     network = _network(decoder=make_decoder("mlp", 96, 4))
     assert network(random_sweeps(2, 6)).shape == (2, 4)
     assert network.spec.outputs == 4
-    with pytest.raises(UsageError, match="received Identity"):
+    with pytest.raises(UsageError, match="Identity has none"):
         _network(decoder=torch.nn.Identity())
 
 
