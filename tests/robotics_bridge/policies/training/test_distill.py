@@ -23,7 +23,8 @@ def _config(**changes) -> DistillConfig:
         "task": "follow", "placement": "tips", "resolution": "low", "encoder": "mlp", "embedder": "none",
         "hidden": (32, 32), "num_envs": 16, "steps_per_env": 8, "save_interval": 2,
     }  # fmt: skip
-    return DistillConfig(**{**plain, **changes})
+    felt = ("placement", "resolution", "encoder") if changes.get("observe") == "none" else ()
+    return DistillConfig(**{key: value for key, value in {**plain, **changes}.items() if key not in felt})
 
 
 def _run(out, env=None, teacher=None, **changes):
