@@ -54,7 +54,7 @@ def score_big(folder: Path, *, seconds: float = 1.0, least: float = 1.0, **optio
         [sys.executable, "-m", "benchmarks.scores.memory", "--prepare", str(path), str(seconds), str(least)], check=True
     )
     features = {"layer": np.random.default_rng(1).normal(size=(len(LABELS), 110, 50))}
-    how: dict[str, Any] = {"stimuli": "rodgers", "whiskers": "C2", "fidelity": "fast", "bin": BIN, **options}
+    how: dict[str, Any] = {"stimuli": "rodgers", "bin": BIN, **options}
     found = brainbench.score(features, recordings=str(path), conditions="trials:stimulus", **how)
     assert np.isfinite(found.value), found
 
