@@ -124,6 +124,12 @@ def repeats(names: Iterable[Hashable]) -> list[Any]:
     return [name for name, count in Counter(names).items() if count > 1]
 
 
+def check_kind(name: str, value: object, kind: type | tuple[type, ...], wanted: str) -> None:
+    """Raise a :class:`UsageError` unless a value is of a kind, of which ``wanted`` is an example."""
+    if not isinstance(value, kind):
+        raise UsageError(f"The {name} must be {wanted}; received {shown(value)} ({type(value).__name__}).")
+
+
 def check_once(where: str, names: Iterable[str]) -> None:
     """Raise a :class:`UsageError` if a name stands more than once.
 

@@ -12,7 +12,7 @@ from typing import Any
 import torch
 
 from brainbench.core.cuda_graphs import CudaGraphStep, warp_recorder
-from brainbench.core.errors import UsageError
+from brainbench.core.errors import UsageError, check_kind
 from brainbench.core.reading.ranges import check_number
 from robotics_bridge import hands
 from robotics_bridge.envs.observations import observe
@@ -20,7 +20,6 @@ from robotics_bridge.envs.options import EnvOptions
 from robotics_bridge.envs.reset import EpisodeReset
 from robotics_bridge.envs.state import EnvState
 from robotics_bridge.envs.step import STATISTICS, ActionMap, StepResult, apply_action, compute_step, run_physics
-from robotics_bridge.sensors.sensor import check_kind
 from robotics_bridge.tasks.registry import load
 from robotics_bridge.tasks.task import Task
 

@@ -7,12 +7,11 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from brainbench.core.devices import pick_device
-from brainbench.core.errors import UsageError, check_name
+from brainbench.core.errors import UsageError, check_kind, check_name
 from brainbench.core.reading.ranges import check_fields
 from robotics_bridge.hands.layouts import check_names
 from robotics_bridge.hands.observations import observation_type
 from robotics_bridge.physics.state import MOST_ENVS
-from robotics_bridge.sensors.sensor import check_kind
 
 ENGINES = ("mujoco", "warp")
 

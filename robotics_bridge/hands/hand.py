@@ -16,14 +16,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brainbench.core.devices import mujoco_module
-from brainbench.core.errors import DataError, UsageError, check_each, listing, shown
+from brainbench.core.errors import DataError, UsageError, check_each, check_kind, listing, shown
 from brainbench.core.reading.regular import check_file, readable
 from brainbench.core.reading.texts import read_text
 from robotics_bridge.hands.facing import palmar_directions
 from robotics_bridge.hands.layouts import Layout, check_names, pad_probes, read_probes, select
 from robotics_bridge.hands.spec import HandSpec, build
 from robotics_bridge.sensors.probes.placement import Probes
-from robotics_bridge.sensors.sensor import check_kind
 
 _log = logging.getLogger(__name__)
 

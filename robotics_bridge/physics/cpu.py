@@ -7,7 +7,7 @@ import os
 import warnings
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -18,6 +18,9 @@ from brainbench.core.reading.ranges import check_number
 from robotics_bridge.physics.scene import TouchScene
 from robotics_bridge.physics.state import MOST_ENVS, HandState
 from robotics_bridge.physics.variants import check_fields, model_fields
+
+if TYPE_CHECKING:
+    from robotics_bridge.physics.selection import EnvIds
 
 mujoco = mujoco_module()
 
@@ -160,11 +163,15 @@ class MujocoEngine:
         """Refresh the state at the current positions and velocities, without advancing."""
         self._each(lambda env: mujoco.mj_forward(self._models[env], self._data[env]))
 
-    def reset(self, env_ids: Sequence[int] | NDArray[np.int64] | None = None) -> None:
-        """Put environments (all by default), given by numbers or a mask, back to the model's start."""
-        ids = np.arange(self.num_envs) if env_ids is None else np.asarray(env_ids).reshape(-1)
-        for env in (np.flatnonzero(ids) if ids.dtype == bool else ids).tolist():
-            check_number("environment to reset", env, least=0, below=self.num_envs, whole=True)
+    def reset(self, env_ids: EnvIds | None = None) -> None:
+        """Put environments (all by default), given by numbers or a mask, back to the model's start.
+
+        Raises:
+            UsageError: an environment does not exist, or these are neither numbers nor a mask.
+        """
+        from robotics_bridge.physics.selection import select_envs
+
+        for env in select_envs(env_ids, self.num_envs, "cpu").nonzero().flatten().tolist():
             mujoco.mj_resetData(self._models[env], self._data[env])
         self.forward()
 

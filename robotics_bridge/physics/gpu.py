@@ -16,6 +16,7 @@ from brainbench.core.errors import UsageError, missing_dependency, unknown_name
 from brainbench.core.reading.ranges import check_number
 from robotics_bridge.physics.kernels.state import fill_contacts, fill_links
 from robotics_bridge.physics.scene import TouchScene
+from robotics_bridge.physics.selection import EnvIds, select_envs
 from robotics_bridge.physics.state import MOST_ENVS, HandState
 from robotics_bridge.physics.variants import check_fields, differing_fields
 
@@ -164,16 +165,17 @@ class MujocoWarpEngine:
             self._engine.forward(self._m, self._d)
             self._fill()
 
-    def reset(self, env_ids: Sequence[int] | torch.Tensor | None = None) -> None:
-        """Put environments (all by default), given by numbers or a mask, back to the model's start."""
+    def reset(self, env_ids: EnvIds | None = None) -> None:
+        """Put environments (all by default), given by numbers or a mask, back to the model's start.
+
+        Raises:
+            UsageError: these are neither numbers nor a mask; on the processor also where an environment does not exist.
+        """
         wp = warp()
         with wp.ScopedDevice(self._device):
             mask = None
             if env_ids is not None:
-                chosen = torch.zeros(self.num_envs, dtype=torch.bool, device=wp.device_to_torch(self._device))
-                ids = torch.as_tensor(env_ids, device=chosen.device)
-                chosen[ids if ids.dtype == torch.bool else ids.long()] = True
-                mask = wp.from_torch(chosen)
+                mask = wp.from_torch(select_envs(env_ids, self.num_envs, wp.device_to_torch(self._device)))
             self._engine.reset_data(self._m, self._d, mask)
         self.forward()
 

@@ -20,7 +20,7 @@ from brainbench.core.reading.ranges import check_fields, check_number
 if TYPE_CHECKING:
     import torch
 
-    from robotics_bridge.sensors.selection import EnvIds
+    from robotics_bridge.physics.selection import EnvIds
 
 
 @dataclass(frozen=True)
@@ -134,7 +134,7 @@ class AfferentFilter:
         Raises:
             UsageError: an environment does not exist, or the signal has another shape than before.
         """
-        from robotics_bridge.sensors.selection import select_envs
+        from robotics_bridge.physics.selection import select_envs
 
         if env_ids is None and x is None:
             self._state = {}

@@ -7,7 +7,7 @@ from collections.abc import Hashable
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, ClassVar, Literal
 
-from brainbench.core.errors import UsageError, check_name, shown
+from brainbench.core.errors import check_kind, check_name
 from brainbench.core.reading.ranges import check_fields
 from robotics_bridge.sensors.noise.model import BASE_KNOBS, PROBE_KNOBS, Noise
 from robotics_bridge.sensors.probes.placement import Probes
@@ -16,12 +16,6 @@ if TYPE_CHECKING:
     from robotics_bridge.physics.scene import TouchScene
 
 Convention = Literal["physical", "thesis"]
-
-
-def check_kind(name: str, value: object, kind: type | tuple[type, ...], wanted: str) -> None:
-    """Raise UsageError unless a value is of a kind, of which ``wanted`` is an example."""
-    if not isinstance(value, kind):
-        raise UsageError(f"The {name} must be {wanted}; received {shown(value)} ({type(value).__name__}).")
 
 
 @dataclass(frozen=True, kw_only=True)

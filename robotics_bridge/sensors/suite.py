@@ -10,10 +10,11 @@ import torch
 
 from brainbench.core.cuda_graphs import record_launches
 from brainbench.core.devices import pick_device, warp
-from brainbench.core.errors import UsageError, unknown_name
+from brainbench.core.errors import UsageError, check_kind, unknown_name
 from brainbench.core.plugins import load_object
 from brainbench.core.reading.ranges import check_number
 from robotics_bridge.physics.scene import TouchScene
+from robotics_bridge.physics.selection import EnvIds, select_envs
 from robotics_bridge.physics.state import DIVERGED, MOST_ENVS, UNFELT, HandState
 from robotics_bridge.sensors.context import SuiteContext
 from robotics_bridge.sensors.fidelity import SensorFidelity
@@ -24,8 +25,7 @@ from robotics_bridge.sensors.queries.kernels.pairs import count_update, reset_cl
 from robotics_bridge.sensors.queries.pairs import PairTable
 from robotics_bridge.sensors.queries.solids import Solids
 from robotics_bridge.sensors.runtime import History, Runtime
-from robotics_bridge.sensors.selection import EnvIds, select_envs
-from robotics_bridge.sensors.sensor import Sensor, check_kind
+from robotics_bridge.sensors.sensor import Sensor
 
 wp = warp()
 

@@ -9,12 +9,11 @@ from typing import Any, cast
 import torch
 
 from brainbench.core.devices import warp
-from brainbench.core.errors import UsageError
+from brainbench.core.errors import UsageError, check_kind
 from brainbench.core.reading.ranges import check_fields, check_number
 from robotics_bridge.physics.state import HandState
 from robotics_bridge.sensors.audio.kernels import sound as k
 from robotics_bridge.sensors.audio.sensors import AudioSensor
-from robotics_bridge.sensors.sensor import check_kind
 from robotics_bridge.sensors.suite import SensorSuite
 
 

@@ -16,10 +16,10 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal, cast
 import numpy as np
 
 from brainbench.core.devices import warp
-from brainbench.core.errors import UsageError, check_name
+from brainbench.core.errors import UsageError, check_kind, check_name
 from brainbench.core.reading.ranges import check_fields, check_number
 from brainbench.core.rotations import to_matrices
-from robotics_bridge.sensors.sensor import Sensor, check_kind
+from robotics_bridge.sensors.sensor import Sensor
 from robotics_bridge.sensors.temperature.materials import ABSOLUTE_ZERO, ThermalBody, ThermalMaterial, material
 
 if TYPE_CHECKING:

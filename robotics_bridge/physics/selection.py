@@ -31,8 +31,9 @@ def select_envs(env_ids: EnvIds | None, num_envs: int, device: torch.device | st
         return chosen | numbers
     if numbers.numel():
         if numbers.is_floating_point() or numbers.is_complex():
-            raise UsageError(f"Environments are whole numbers or a mask; received {numbers.tolist()}.")
-        if device.type == "cpu" and bool(((numbers < 0) | (numbers >= num_envs)).any()):
-            raise UsageError(f"Environments are 0 to {num_envs - 1}; received {numbers.tolist()}.")
+            first = numbers.flatten()[0].item()
+            raise UsageError(f"Environments to reset are whole numbers or a mask; received {first}.")
+        if device.type == "cpu" and (outside := numbers[(numbers < 0) | (numbers >= num_envs)]).numel():
+            raise UsageError(f"Environments to reset are 0 to {num_envs - 1}; received {outside[0].item()}.")
         chosen[numbers.long()] = True
     return chosen
