@@ -89,7 +89,7 @@ def load_stimuli(
     if _is_array_file(source):
         with open_hdf5(Path(source), "stimulus file") as file:
             return _read_arrays(file, os.fspath(source), whiskers)
-    dataset, description = load_stimulus_set(
+    dataset, description = _stimulus_set(
         source, whiskers=whiskers, fidelity=fidelity, backend=backend, progress=progress, cache=cache
     )
     labels = tuple(str(label) for label in dataset["stimulus"].values)
@@ -117,6 +117,16 @@ def load_stimulus_set(
         UsageError: nothing has this name, an option does not fit the source, or the file holds arrays.
         DataError: a file cannot be used; the message says what it holds and what is needed.
     """
+    if _is_array_file(source):
+        raise UsageError(f"{os.fspath(source)!r} holds arrays, not forces of whiskers with names.")
+    return _stimulus_set(source, whiskers=whiskers, fidelity=fidelity, backend=backend, progress=progress, cache=cache)
+
+
+def _stimulus_set(
+    source: str | os.PathLike[str] | xr.Dataset, *, whiskers: str, fidelity: Fidelity | str | None,
+    backend: WhiskerEngine | str, progress: Progress | None, cache: bool,
+) -> tuple[xr.Dataset, str]:  # fmt: skip
+    """Return what :func:`load_stimulus_set` does of a source that is known to be no file of arrays."""
     if not isinstance(source, (str, os.PathLike)):
         return _select(check_stimulus_set(source), whiskers), "stimulus set"
     if cache and isinstance(backend, str) and is_packaged(source):
@@ -128,8 +138,6 @@ def load_stimulus_set(
 
         dataset = simulate(recipe.scenes, fidelity=fidelity, backend=backend, progress=progress, cache=cache)
         return dataset, recipe.description.strip() or recipe.name
-    if _is_array_file(source):
-        raise UsageError(f"{os.fspath(source)!r} holds arrays, not forces of whiskers with names.")
     path = Path(source)
     if _is_file(source):
         dataset = read_stimulus_set(path)
