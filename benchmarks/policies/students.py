@@ -115,6 +115,7 @@ def put(out: Path, row: dict[str, Any]) -> None:
 
 def train(options: argparse.Namespace) -> None:
     """Train and evaluate one student in this process."""
+    from robotics_bridge.policies.readouts.arms import without_latency
     from robotics_bridge.policies.training.distill_config import DistillConfig
     from robotics_bridge.policies.training.students import train_student
 
@@ -123,9 +124,8 @@ def train(options: argparse.Namespace) -> None:
         # A draw of a random arm is its seed; networks answer without added latency.
         own = {"seed": options.draw if options.draw is not None else options.seed}
         if _is_network(settings):
-            # Networks without a graph know no latency.
-            graph = settings["encoder"].startswith("zhuang")
-            own |= {"learning": "frozen"} | ({"options": {"unroll": "full"}} if graph else {})
+            options_of = without_latency(settings["encoder"])
+            own |= {"learning": "frozen"} | ({"options": options_of} if options_of else {})
         if options.pretrained is not None and settings["encoder"].startswith(f"{NETWORK}."):
             own["pretrained"] = str(options.pretrained)
         settings["encoder_settings"] = own | settings.get("encoder_settings", {})

@@ -12,7 +12,7 @@ import torch
 
 from brainbench.core.contracts import CHANNELS
 from brainbench.models.graph.temporal_graph import TemporalGraph
-from brainbench.models.registry import load_model
+from brainbench.models.registry import locate_model
 from robotics_bridge.hands.observations import TAXELS_IN_CONTACT
 from robotics_bridge.policies.encoders.calibration import HandCalibration
 from robotics_bridge.policies.encoders.front_end import FrontEnd
@@ -65,7 +65,7 @@ def without_latency(model: str) -> dict[str, str]:
     Raises:
         UsageError: there is no such network.
     """
-    graph = isinstance(getattr(load_model(model), "encoder", None), TemporalGraph)
+    graph = isinstance(getattr(locate_model(model).outline(), "encoder", None), TemporalGraph)
     return {"unroll": "full"} if graph else {}
 
 
