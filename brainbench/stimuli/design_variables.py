@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from brainbench.core.errors import UsageError, check_name, check_once
+from brainbench.core.errors import UsageError, check_each, check_once
 from brainbench.stimuli.motion.trajectories import Whisking
 from brainbench.stimuli.scenes.scene import Scene
 
@@ -73,10 +73,8 @@ def read_limits(
             of the scenes, or starts outside its bounds.
     """
     check_once("--variables", variables)
-    for name in variables:
-        check_name("variable of a design", name, VARIABLES)
-    for name in bounds:
-        check_name("chosen variable with bounds", name, variables)
+    check_each("variable of a design", variables, VARIABLES)
+    check_each("chosen variable with bounds", bounds, variables)
     limits = np.array([bounds.get(name, (VARIABLES[name].low, VARIABLES[name].high)) for name in variables])
     first = scenes[0]
     if any(one.names != first.names or one.whisking.config() != first.whisking.config() for one in scenes):

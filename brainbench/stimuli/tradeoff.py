@@ -33,7 +33,7 @@ from typing import Any
 
 import numpy as np
 
-from brainbench.core.errors import BrainbenchError, DataError, check_name, unknown_name
+from brainbench.core.errors import BrainbenchError, DataError, check_each, unknown_name
 from brainbench.core.files import read_json, write_json, write_text
 from brainbench.core.progress import Progress, track
 from brainbench.core.tradeoffs import TradeoffPoint, pareto_front
@@ -118,8 +118,7 @@ def settings(
         for n, (step, _) in steps
     ]
     fidelities = {"dynamic": dict.fromkeys([*presets, *grid]), "quasistatic": still}
-    for solver in solvers:
-        check_name("solver", solver, fidelities)
+    check_each("solver", solvers, fidelities)
     chosen = [
         SimulationSetting(fidelity, name)
         for solver in fidelities

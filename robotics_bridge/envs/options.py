@@ -58,7 +58,7 @@ class EnvOptions:
         object.__setattr__(self, "engine", self.engine or ("mujoco" if self.device == "cpu" else "warp"))
         check_name("engine", self.engine, ENGINES)
         observation_type(self.observe)
-        check_names("low" if self.resolution.endswith((".json", "custom")) else self.resolution, self.placement)
+        check_names("low" if self.resolution == "custom" else self.resolution, self.placement)
         if self.observe == "none" and (self.noisy or self.knobs):
             raise UsageError("noisy and knobs are settings of tactile sensors; choose an observation type.")
         if self.link_pose and self.observe == "none":

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from brainbench import __version__
 from brainbench.core.contracts import CHANNELS, GRID_SHAPE, check_stimulus_set
-from brainbench.core.errors import DataError, UsageError, check_name, check_once, listing
+from brainbench.core.errors import DataError, UsageError, check_each, check_once, listing
 from brainbench.core.files import content_hash, to_json
 from brainbench.core.progress import Progress
 from brainbench.core.reading.ranges import check_fields, check_number
@@ -170,8 +170,7 @@ def record_exploration(
         UsageError: a name is unknown or occurs twice, or nothing is to be explored.
         DataError: the simulation of the hand diverged.
     """
-    for name in procedures:
-        check_name("exploratory procedure", name, PROCEDURES)
+    check_each("exploratory procedure", procedures, PROCEDURES)
     check_once("procedures", procedures)
     labels = [item.label for item in objects]
     check_number("frames", frames, least=1, whole=True)

@@ -102,8 +102,9 @@ def active_count(layout: Mapping[str, Probes]) -> int:
 
 
 def check_names(resolution: str, placement: str) -> None:
-    """Raise UsageError for an unknown resolution or placement."""
-    check_name("resolution", resolution, RESOLUTIONS)
+    """Raise UsageError for an unknown resolution or placement; a probe file (.json) stands for a resolution."""
+    if not resolution.endswith(".json"):
+        check_name("resolution", resolution, RESOLUTIONS)
     check_name("placement", placement, PLACEMENTS)
 
 

@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import stdtr, stdtrit
 
-from brainbench.core.errors import UsageError, check_name, repeats
+from brainbench.core.errors import UsageError, check_each, check_name, repeats
 from brainbench.core.records import Interval
 
 MARGIN = 0.05
@@ -156,8 +156,7 @@ class MixedModel:
 
     def contrast(self, one: str, other: str) -> Contrast:
         """Return the difference of two arms' means."""
-        for name in (one, other):
-            check_name("arm", name, self.arms)
+        check_each("arm", (one, other), self.arms)
         return self._estimate(np.array([float(one == arm) - float(other == arm) for arm in self.arms]))
 
     def judge(self, arm: str, random: Collection[str]) -> Help:
@@ -166,8 +165,7 @@ class MixedModel:
         Raises:
             UsageError: an arm is unknown, or no random one is named.
         """
-        for name in (arm, *random):
-            check_name("arm", name, self.arms)
+        check_each("arm", (arm, *random), self.arms)
         if not random or arm in random:
             raise UsageError(f"The arm {arm!r} is held against at least one random arm other than itself.")
         best = max(random, key=lambda name: self.mean(name).difference)

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.signal import butter, sosfilt_zi
 
-from brainbench.core.errors import UsageError, check_name, shown
+from brainbench.core.errors import UsageError, check_each, shown
 from brainbench.core.reading.ranges import check_fields, check_number
 
 if TYPE_CHECKING:
@@ -89,9 +89,9 @@ class AfferentFilter:
     ) -> None:
         check_number("rate (Hz)", rate, above=0)
         if not isinstance(bands, Mapping):
-            for name in (bands,) if isinstance(bands, str) else bands:
-                check_name("afferent", name, AFFERENTS)
-            bands = {name: AFFERENTS[name] for name in ((bands,) if isinstance(bands, str) else bands)}
+            names = (bands,) if isinstance(bands, str) else tuple(bands)
+            check_each("afferent", names, AFFERENTS)
+            bands = {name: AFFERENTS[name] for name in names}
         if not bands:
             raise UsageError(f"A filter needs a band, such as {next(iter(AFFERENTS))!r}; received none.")
         self.rate, self.bands, self.rectify = rate, dict(bands), rectify

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brainbench.core.devices import mujoco_module
-from brainbench.core.errors import UsageError, check_name
+from brainbench.core.errors import UsageError, check_each
 from robotics_bridge.hands.hand import Hand
 from robotics_bridge.hands.scenes import palm_surface
 from robotics_bridge.physics.scene import excluded_links
@@ -96,8 +96,7 @@ def build(task: Task, hand: Hand) -> TaskModel:
     low = np.where(limited, first.jnt_range[ids, 0], -np.pi)
     high = np.where(limited, first.jnt_range[ids, 1], np.pi)
     given = task.joints.get(hand.name, {})
-    for name in given:
-        check_name(f"joint in task {task.name!r} of hand {hand.name!r}:", name, joints)
+    check_each(f"joint in task {task.name!r} of hand {hand.name!r}:", given, joints)
     for name, position in given.items():
         least, most = low[joints.index(name)], high[joints.index(name)]
         if not least - _ROUNDED <= position <= most + _ROUNDED:

@@ -24,6 +24,10 @@ def check_widths(hidden: Sequence[int]) -> None:
         check_number("A width of the hidden layers", width, least=1, most=65_536, whole=True)
 
 
+LOSSES = ("mse", "inv_var_mse")
+"""``inv_var_mse``: each action's squared error over the variance of the teacher's action in the rollout."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class TeacherSettings:
     """PPO of the privileged teacher, upper half of table 4.4.
@@ -146,13 +150,13 @@ class StudentSettings:
     max_grad_norm: float | None = None
     """Norm to which longer gradients are cut; None leaves them."""
     loss: str = "mse"
-    """``mse`` or ``inv_var_mse`` (each action weighted by the inverse of its variance)."""
+    """One of :data:`LOSSES`."""
 
     def __post_init__(self) -> None:
         check_fields(self, "iterations", least=0, whole=True)
         check_fields(self, "epochs", "gradient_length", least=1, whole=True)
         check_fields(self, "learning_rate", "clip", "max_grad_norm", above=0)
-        check_name("loss of a student", self.loss, ("mse", "inv_var_mse"))
+        check_name("loss of a student", self.loss, LOSSES)
 
 
 @dataclass(frozen=True)

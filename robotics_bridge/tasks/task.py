@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
@@ -307,11 +308,9 @@ class Task:
         if self.copies > len(self.placement.sites) > 0:
             raise UsageError(f"placement.sites {of} has {len(self.placement.sites)} places for {self.copies} objects.")
         check_name(f"distances_in {of}", self.distances_in, GROUPS)
-        for name in (*self.auxiliary, *(name for names in self.groups.values() for name in names)):
-            check_name("observation group", name, GROUPS)
-        for group, known in {"command": COMMANDS, "goal_terms": GOAL_TERMS}.items():
-            for name in getattr(self, group):
-                check_name(f"content of {group} {of}", name, known)
+        check_each("observation group", (*self.auxiliary, *itertools.chain(*self.groups.values())), GROUPS)
+        check_each(f"content of command {of}", self.command, COMMANDS)
+        check_each(f"content of goal_terms {of}", self.goal_terms, GOAL_TERMS)
 
     def _check_places(self, of: str) -> None:
         poses = {}

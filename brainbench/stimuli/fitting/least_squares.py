@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from brainbench.core.errors import DataError, UsageError, check_name
+from brainbench.core.errors import DataError, UsageError, check_each
 from brainbench.core.files import provenance
 from brainbench.core.records import Status
 from brainbench.stimuli.fitting.identifiability import directions, unknown_parameters
@@ -74,8 +74,7 @@ def fit(
             for trial in trials
         ]
     free = FreeParameters(tuple(parameters), condition, bounds or {})
-    for name in priors or {}:
-        check_name("fitted parameter with a prior", name, free.names)
+    check_each("fitted parameter with a prior", priors or {}, free.names)
     model = FitModel(trials, free, options)
     chosen = {**(PUBLISHED if options.priors == "published" else {}), **(priors or {})}
     problem = _Problem(model, {index: chosen[name] for index, name in enumerate(free.names) if name in chosen})

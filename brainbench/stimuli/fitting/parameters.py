@@ -14,7 +14,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from brainbench.core.errors import UsageError, check_name
+from brainbench.core.errors import UsageError, check_each
 from brainbench.core.reading.ranges import check_number
 from brainbench.stimuli.engines.protocol import Job
 from brainbench.stimuli.gradients.parameters import WHISKER, JobParameters, whisker_value, with_values
@@ -127,10 +127,8 @@ class FreeParameters:
     """Bounds of single parameters, in their units; others as in :data:`PARAMETERS`."""
 
     def __post_init__(self) -> None:
-        for name in self.names:
-            check_name("parameter of a fit", name, PARAMETERS)
-        for name in self.bounds:
-            check_name("fitted parameter with bounds", name, self.names)
+        check_each("parameter of a fit", self.names, PARAMETERS)
+        check_each("fitted parameter with bounds", self.bounds, self.names)
         if not self.names or len(set(self.names)) < len(self.names):
             raise UsageError(f"A fit needs at least one parameter, each once; received {list(self.names)}.")
         for name in self.names:

@@ -16,15 +16,13 @@ from robotics_bridge.hands.observations import observation_type
 from robotics_bridge.policies.encoders.arms import ARMS, AUTO, EncoderConfig
 from robotics_bridge.policies.student import EMBEDDERS
 from robotics_bridge.tasks.contact_model import CONTACTS
-from robotics_bridge.tasks.settings import StudentSettings, check_widths
+from robotics_bridge.tasks.settings import LOSSES, StudentSettings, check_widths
 
 _HIDDEN = (512, 256, 128)
 _SHARED = ("hand", "observe", "placement", "resolution")
 """Fields of an encoder that are those of its student."""
 FELT = ("placement", "resolution", "noisy", "encoder", "encoder_settings")
 """Fields of a student's touch, which one without touch does not have."""
-LOSSES = ("mse", "inv_var_mse")
-"""``inv_var_mse``: each action's squared error over the variance of the teacher's action in the rollout."""
 MOST = {"learning_rate": 1.0, "clip": 100.0, "max_grad_norm": 1e6}
 """Largest value of settings that are numbers above 0."""
 
@@ -96,7 +94,7 @@ class DistillConfig:
         object.__setattr__(self, "hidden", tuple(self.hidden))
         check_widths(self.hidden)
         kind = observation_type(self.observe)
-        check_names("med" if self.resolution.endswith(".json") else self.resolution, self.placement)
+        check_names(self.resolution, self.placement)
         if not isinstance(self.noisy, bool):
             raise UsageError(f"'noisy' must be true or false; received {shown(self.noisy)}.")
         if not isinstance(self.encoder_settings, Mapping):

@@ -153,7 +153,7 @@ def _sweep(path: Path, document: Mapping[str, Any]) -> StudentSweep:
         observation_type(kind)
     for entry in entries:
         for placement, resolution in product(entry.placements, (*sweep.resolutions, sweep.pinned_resolution)):
-            check_names("med" if resolution.endswith(".json") else resolution, placement)
+            check_names(resolution, placement)
     for arm in sweep.arms:
         if "encoder" not in arm:
             raise UsageError(f"An arm of the sweep {path.name!r} names no 'encoder': {shown(dict(arm))}.")

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from brainbench.core.contracts import CHANNELS
-from brainbench.core.errors import DataError, UsageError, check_name
+from brainbench.core.errors import DataError, UsageError, check_each
 from brainbench.core.reading.ranges import check_number
 
 if TYPE_CHECKING:
@@ -86,8 +86,7 @@ def new_wrenches(
     """
     import xarray as xr
 
-    for name in channels:
-        check_name("channel of a wrench", name, CHANNELS)
+    check_each("channel of a wrench", channels, CHANNELS)
     if len(set(channels)) < len(channels):
         raise UsageError(f"The channels of a wrench stand once each; received {list(channels)}.")
     array = np.asarray(values, dtype=float)

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from brainbench.core.errors import DataError, check_name, choose_name, shown
+from brainbench.core.errors import DataError, check_each, choose_name, shown
 from brainbench.core.reading.hdf5 import open_hdf5
 from brainbench.core.reading.tables import read_rows, to_numbers
 from brainbench.stimuli.fitting.tracks.options import TrackOptions
@@ -37,8 +37,7 @@ def read_deeplabcut(path: str | os.PathLike[str], options: TrackOptions) -> tupl
     individuals = list(dict.fromkeys(individual for individual, _, _ in columns))
     wanted = choose_name(f"individual of {name}", options.track, individuals, how="as track")
     parts = list(dict.fromkeys(part for individual, part, _ in columns if individual == wanted))
-    for part in options.parts:
-        check_name(f"body part of {name}", part, parts)
+    check_each(f"body part of {name}", options.parts, parts)
     points = []
     for part in options.parts or parts:
         axes = [axis for axis in ("x", "y", "z") if (wanted, part, axis) in columns]
