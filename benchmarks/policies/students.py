@@ -89,13 +89,19 @@ CONTRASTS = (
     ("ead_simclr", "reservoir"), ("ead_supervised", "reservoir"), ("ft_hand", "ead_simclr"), ("ft_hand", "reservoir"),
     ("ft_hand", "none_memory"), ("reservoir", "none_memory"), ("ead_simclr", "none_memory"), ("none_memory", "none"),
     ("reservoir_50", "reservoir"), ("bool_hand", "none_memory"), ("raw_rnn", "ft_hand"), ("raw_rnn", "reservoir"),
-    ("ead_finetuned", "ead_scratch"), ("ead_finetuned", "ead_simclr"), ("ead_finetuned", "ft_hand"),
+    ("ead_finetuned", "ead_scratch"), ("ead_finetuned", "ead_simclr"), ("ead_finetuned", "reservoir_large"),
+    ("ft_hand_large", "ead_finetuned"), ("raw_rnn", "ead_finetuned"),
     ("raw_rnn_small", "ft_hand"), ("raw_rnn", "ft_hand_large"), ("raw_rnn", "reservoir_large"),
     ("ft_hand_large", "ft_hand"), ("reservoir_large", "reservoir"),
 )  # fmt: skip
 """Arms whose differences are tested."""
-RANDOM, TRAINED = ("reservoir", "ead_untrained"), ("ead_simclr", "ead_supervised")
-"""Frozen arms that learned nothing, and those that are said to help only beyond the best of them."""
+JUDGED: dict[str, tuple[str, ...]] = {
+    "ead_simclr": ("reservoir", "ead_untrained"),
+    "ead_supervised": ("reservoir", "ead_untrained"),
+    "ead_finetuned": ("reservoir_large", "ead_scratch"),
+}
+"""Arms with whisker-trained networks, and those that never saw a whisker and learn as many parameters: whiskers are said
+to help only beyond the best of these."""
 _TAR = 15 << 20
 _SMOOTH = 8
 """Last iterations over which a loss and a success are averaged."""
@@ -390,12 +396,14 @@ def differences(named: dict[str, StudentResult], logs: dict[tuple[str, int], lis
         f"training, iterations {least - _SMOOTH + 1} to {least}: {spreads[1]}. Differences of arms with 95 % intervals:"
     )
     lines = [said, table(["arms", "students", "success in evaluation", "p (Holm)", "success in training"], rows)]
-    random = {named[arm].name: arm for arm in RANDOM if arm in named}
-    for arm in (arm for arm in TRAINED if arm in named and random):
+    for arm, rivals in JUDGED.items():
+        random = {named[rival].name: rival for rival in rivals if rival in named}
+        if arm not in named or not random:
+            continue
         judged = model.judge(named[arm].name, random)
         gain = f"{judged.contrast.difference:+.3f} {_span(judged.contrast.interval)}"
         word = "helps" if judged.helps else "is not shown to help"
-        lines.append(f"`{arm}` {word}: {gain} over `{random[judged.best]}`, the best random arm.")
+        lines.append(f"`{arm}` {word}: {gain} over `{random[judged.best]}`, the best rival.")
     return "\n\n".join(lines)
 
 
