@@ -11,14 +11,16 @@
 #   device, 2:  carry .gpu/b            cp .gpu/b/* /opt/w/
 #   device, 3:  carry .gpu/c .session   bash .gpu/c/install.sh && bash .session/gpu_session.sh start && bash /w/gpu.sh run tests
 #   device, 4…: bash /w/gpu.sh run PART …                             each at most as long as it says; all below 600 s
-#   or, on a machine of several GPUs, parts in the background, one after the other on each GPU, and a look at them:
-#               PLAN="0:ft_hand,reservoir_50 3:ft_hand" bash /w/gpu.sh lane 0 students-for; bash /w/gpu.sh look SECOND
-#               (PLAN: seed:arms …, TEACHER a run's folder, one lane of two students, or two lanes a GPU with TOGETHER=1
-#               and LANE=-0a, which never wait for each other; JOB=NAME-0 … lane 1 teachers; TASK=screwdriver NAME=-a
-#               CONFIG=default JUDGED=careful WITH="--seed 1" … lane 2a teacher-of, and another as 2b beside it: two
-#               teachers of 4,096 environments share a GPU well; `whiskers` trains networks whose …/best PRETRAINED may
-#               name; SECOND of the machine's life; policies/jobs.toml says what to compare; on a fresh machine 140 s go
-#               into compiling; kill what fails by `pkill -f "run/NAME-[b]"`, not by its own name)
+#   or, on a machine of several GPUs, parts in the background and a look at them:
+#               bash /w/gpu.sh queue FILE 0a 0b 1a 1b …           two lanes a GPU, which take the next SEED:ARM[,ARM] of the
+#               file when they are done; 33 students, of which seven learn their network, took four GPUs 26 minutes
+#               bash /w/gpu.sh lane 0c tests                       a part in a lane of its own
+#               TASK=screwdriver NAME=-a CONFIG=default JUDGED=careful WITH="--seed 1" bash /w/gpu.sh lane 2a teacher-of
+#               JOB=NAME-0 MINUTES=25 bash /w/gpu.sh lane 1 teachers          a piece of a job, which another session goes on with
+#               bash /w/gpu.sh look SECOND                         of the machine's life
+#               (two teachers of 4,096 environments share a GPU well; `whiskers` trains networks whose …/best PRETRAINED may
+#               name; policies/jobs.toml says what to compare; on a fresh machine 140 s go into compiling; kill what fails by
+#               `pkill -f "run/NAME-[b]"`, not by its own name)
 #   here:       git checkout -f main && git branch -D device; python -m benchmarks.report after copying results/*.json
 #
 # Calls follow one another within 30 s, or the machine goes back with all that is on it: on 2026-11-26 that happened twice,
@@ -44,8 +46,8 @@ free      150  python3 -m benchmarks.whiskers.throughput --only free --blocks 64
 touch     320  python3 -m benchmarks.tactile.throughput --device cuda --part sensors --input inputs/pyramid.npz --write
 friction  150  python3 -m benchmarks.tactile.friction_cost --device cuda --write
 gradients 500  python3 -m benchmarks.whiskers.gradient_cost --device cuda --each 1 --input inputs/gradients.npz --write
-teachers  590  python3 -m benchmarks.policies.jobs run $JOB --minutes ${MINUTES:-7.5}
-students-for 1700  for one in $PLAN; do python3 -m benchmarks.policies.students --teacher ${TEACHER:-in_palm_rotate.teacher} --config careful --seed ${one%%:*} --arms $(echo ${one#*:} | tr , ' ') ${PRETRAINED:+--pretrained $PRETRAINED} ${AGENTS---no-agents} --evaluations 1 --device cuda --envs 4096 --iterations 110 --learning-rate 5e-4 --episodes 512 --together ${TOGETHER:-2} --end $(($(cat /w/t0) + 1670)) --reserve 60 --out /tmp/run/students-${one%%:*}${LANE:-}; done
+teachers 1700  python3 -m benchmarks.policies.jobs run $JOB --minutes ${MINUTES:-7.5}
+students-for 1700  python3 -m benchmarks.policies.students --teacher ${TEACHER:-in_palm_rotate.teacher} --config careful --seed ${PLAN%%:*} --arms $(echo ${PLAN#*:} | tr , ' ') ${PRETRAINED:+--pretrained $PRETRAINED} ${AGENTS---no-agents} --evaluations 1 --device cuda --envs 4096 --iterations 110 --learning-rate 5e-4 --episodes 512 --together 1 --end $(($(cat /w/t0) + 1670)) --reserve 60 --out /tmp/run/students-${PLAN%%:*}-$LANE
 teacher-of 1650 python3 -m brainbench policy train $TASK $WITH --config ${CONFIG:-default} --envs ${ENVS:-8192} --minutes $(python3 -c "print(max(0.05, ($(cat /w/t0) + ${UNTIL:-1500} - $(date +%s)) / 60))") --loggers csv --device cuda --out /tmp/run/$TASK${NAME:-} && python3 -m brainbench policy evaluate $TASK /tmp/run/$TASK${NAME:-} --config ${JUDGED:-${CONFIG:-default}} --envs 1024 --episodes 1024 --seeds 1 --device cuda --out /tmp/run/$TASK${NAME:-}/evaluated.json
 whiskers 1650  python3 -m benchmarks.models.campaign --work /tmp/campaign --again --places 4 --only 'zhuang-intersection-ln-small\.(supervised|simclr)\.seed[12]$' --until $(($(cat /w/t0) + ${UNTIL:-1500}))
 shipped   150  python3 -m brainbench policy evaluate in_palm_rotate in_palm_rotate.teacher in_palm_rotate.student --config careful --envs 1024 --episodes 1024 --seeds 1 --device cuda --out /w/out/shipped.json
@@ -86,6 +88,21 @@ lane() {
   OUT=/w/out CUDA_VISIBLE_DEVICES=${name%%[a-z]*} setsid bash /w/gpu.sh run "$@" >>"/w/out/lane-$name.log" 2>&1 </dev/null &
 }
 
+# Students of a list, by lanes that each take the next one.
+queue() {
+  local list=$1 lane; shift
+  for lane in "$@"; do
+    setsid bash /w/gpu.sh take "$list" "$lane" >>"/w/out/lane-$lane.log" 2>&1 </dev/null &
+  done
+}
+
+take() {
+  local one; export OUT=/w/out CUDA_VISIBLE_DEVICES=${2%%[a-z]*} LANE=$2
+  while one=$(flock "$1.lock" sh -c "head -n 1 '$1'; sed -i 1d '$1'") && [ -n "$one" ]; do
+    PLAN=$one bash /w/gpu.sh run students-for || true
+  done
+}
+
 look() {
   while [ $(($(date +%s) - $(cat /w/t0))) -lt "$1" ]; do sleep 1; done
   tail -n "${2:-15}" /w/out/lane-*.log
@@ -101,7 +118,7 @@ look() {
   done
   for run in /tmp/run/students-*/raw_rnn/seed*/; do
     [ ! -e "$run/evaluation.json" ] || tar cJf "$OUT/raw_rnn-$(basename "$run").tar.xz" -C "$run" model.safetensors config.json evaluation.json
-  done; cp /w/out/*.json "$OUT" 2>/dev/null || true
+  done; cp /w/out/*.json /w/out/*.tar.gz.[0-9]* "$OUT" 2>/dev/null || true
 }
 
 "$@"
