@@ -100,8 +100,8 @@ JUDGED: dict[str, tuple[str, ...]] = {
     "ead_supervised": ("reservoir", "ead_untrained"),
     "ead_finetuned": ("reservoir_large", "ead_scratch"),
 }
-"""Arms with whisker-trained networks, and those that never saw a whisker and learn as many parameters: whiskers are said
-to help only beyond the best of these."""
+"""Arms with whisker-trained networks, and those that never saw a whisker and learn as many parameters. Whiskers are
+said to help only beyond the best of these."""
 _TAR = 15 << 20
 _SMOOTH = 8
 """Last iterations over which a loss and a success are averaged."""

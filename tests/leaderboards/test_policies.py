@@ -28,13 +28,11 @@ def test_records_are_intact_and_make_one_board_on_which_touch_leads(stored) -> N
         VALIDATOR.validate(json.loads(item.path.read_text(encoding="utf-8")))
     (board,) = rank(item.record for item in stored if item.record)
     names = [entry.name for entry in board.entries]
-    assert names[0].startswith("in_palm_rotate_xhand1_force_torque_hand")
-    assert names[-1] == "in_palm_rotate_xhand1_none"
     forgets, remembers = (names.index(f"in_palm_rotate_xhand1_none{more}") for more in ("", "_lstm_head-1024-256-128"))
     assert remembers < forgets
-    frozen = [names.index(name) for name in names if "frozen" in name]
+    untaught = [names.index(name) for name in names if "frozen" in name] + [remembers]
     assert max(names.index(f"in_palm_rotate_xhand1_force_torque_hand_med_clean_{arm}") for arm in
-               ("tactile_convrnn", "reservoir", "rnn")) < min(frozen)  # fmt: skip
+               ("tactile_convrnn", "reservoir", "rnn")) < min(untaught)  # fmt: skip
 
 
 def test_every_training_seed_has_a_command_that_exists_and_students_stopped_early_are_unreliable(
