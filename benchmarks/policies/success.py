@@ -4,7 +4,7 @@
     python -m benchmarks.policies.success --students STUDENTS … --at-least 110 [--notes FILE] [--device NAME] [--write]
 
 A student has a frozen network of the shipped board as its encoder (arms ``ead_*`` and the networks of
-:mod:`benchmarks.policies.students`). A point is a network: the mean over its students, and the score of the same
+:mod:`benchmarks.policies.arms`). A point is a network: the mean over its students, and the score of the same
 weights on the board, an untrained network's initial states of the same seeds. Whisker accuracy and read-outs are those
 that :mod:`benchmarks.policies.alignment` measured.
 """
@@ -20,7 +20,8 @@ import numpy as np
 from scipy.stats import norm
 
 from benchmarks.policies.alignment import RECORD, board, partial_spearman
-from benchmarks.policies.students import NETWORKS, arm_of, found_logs, seen
+from benchmarks.policies.arms import NETWORKS, arm_of
+from benchmarks.policies.comparison import found_logs, seen
 from benchmarks.report import table, with_notes, write_section
 from brainbench.core.errors import UsageError
 from brainbench.core.figures.style import COLORS, PALE, panels, save_figure
