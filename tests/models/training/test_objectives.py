@@ -69,12 +69,13 @@ def test_gradients_reach_what_an_objective_trains_and_nothing_else(objective):
 
 
 @pytest.mark.parametrize("objective", NAMES)
-def test_a_few_steps_on_one_batch_lower_the_loss(objective):
+def test_ten_steps_on_one_batch_lower_the_loss(objective):
     learner = _learner(objective, "zhuang-ugrnn-ln-small")
     batch = _batch(learner)
     optimizer = torch.optim.Adam([p for p in learner.parameters() if p.requires_grad], lr=1e-3)
     losses = []
-    for _ in range(3):
+    # The first steps may raise it: which way depends on the processor's last digits.
+    for _ in range(10):
         loss = learner(*batch)
         optimizer.zero_grad()
         loss.backward()
