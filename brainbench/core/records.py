@@ -70,7 +70,7 @@ def spanned(value: float, interval: Interval | None = None, *, most: float = mat
     A value without interval has two digits, NaN is a dash. The interval is cut at ``most``, the largest possible value.
 
     >>> spanned(0.14021, Interval(0.0409, 0.2391)), spanned(0.97, Interval(0.9412, 1.1), most=1.0)
-    ('0.14 [0.04, 0.24]', '0.97 [0.94, 1.00]')
+    ('0.140 [0.041, 0.239]', '0.970 [0.941, 1.000]')
     """
     if not math.isfinite(value):
         return "–"
