@@ -409,7 +409,8 @@ def ceiling(run: Run) -> Result:
 
 
 def faults(run: Run) -> Result:
-    from brainbench.datasets.synthetic import PopulationDesign, ResponseGeometry, simulate
+    from brainbench.datasets.synthetic import PopulationDesign, ResponseGeometry
+    from tests.factories.synthetic_animals import simulate
 
     rows, metric = [], get_metric("rsa")
     quiet = {"rate": 8.0, "window": 1.0, "modulation": 0.3, "emphasis": 0.0, "dispersion": 0.0, "shared_gain": 0.0}

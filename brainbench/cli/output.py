@@ -3,21 +3,17 @@
 from __future__ import annotations
 
 import contextlib
-import math
 import sys
 import threading
 import time as clock
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 
 from brainbench.core.files import to_json, write_json
 from brainbench.core.progress import Item, Progress, track
-
-if TYPE_CHECKING:
-    from brainbench.core.records import Interval
 
 JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON document on stdout, nothing else.")]
 
@@ -36,24 +32,6 @@ def emit(data: Any, text: str, *, as_json: bool, out: Path | None = None) -> Non
     if out is not None:
         write_json(out, data)
     print(to_json(data) if as_json else text)
-
-
-def spanned(value: float, interval: Interval | None = None, *, most: float = math.inf) -> str:
-    """Return ``value [low, high]`` with as many digits as the interval carries: two of its half-width.
-
-    A value without interval has two digits, NaN is a dash. The interval is cut at ``most``, the largest possible value.
-
-    >>> from brainbench.core.records import Interval
-    >>> spanned(0.14021, Interval(0.0409, 0.2391)), spanned(0.97, Interval(0.9412, 1.1), most=1.0)
-    ('0.14 [0.04, 0.24]', '0.97 [0.94, 1.00]')
-    """
-    if not math.isfinite(value):
-        return "–"
-    if interval is None or not math.isfinite(interval.high - interval.low):
-        return f"{value:.2f}" if abs(value) >= 0.1 else f"{value:.2g}"
-    half = (interval.high - interval.low) / 2
-    digits = min(max(1 - math.floor(math.log10(half)), 0), 9) if half > 0 else 3
-    return f"{value:.{digits}f} [{interval.low:.{digits}f}, {min(interval.high, most):.{digits}f}]"
 
 
 def table_of(title: str, items: Iterable[Any], columns: Mapping[str, str | Callable[[Any], object]]) -> str:

@@ -9,7 +9,7 @@ import functools
 import math
 import os
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from typing import Any
 
@@ -43,50 +43,40 @@ DISTRIBUTIONS = {
     "rsl_rl": "rsl-rl-lib", "imageio_ffmpeg": "imageio-ffmpeg", "sklearn": "scikit-learn", "skfem": "scikit-fem",
 }  # fmt: skip
 """Packages whose name for pip is another one than that of the module."""
-_ONNX = ("onnx", "onnxscript", "onnxruntime")
+_PICTURES = Requirement(("matplotlib",), "report", "Drawing pictures")
+_MP4 = Requirement(("imageio_ffmpeg",), "report", "Writing an MP4")
+_POLICIES = Requirement(("rsl_rl", "tensordict"), "policies", "Training policies")
 _CLUSTER = Requirement(("distributed",), "cluster", "A --scheduler", _given("scheduler"))
-_PLOT = Requirement(("matplotlib",), "report", "Drawing pictures", _given("plot"))
+_ONNX = Requirement(
+    ("onnx", "onnxscript", "onnxruntime"), "export", "Exporting to ONNX",
+    lambda values: values.get("format", "onnx") == "onnx",
+)  # fmt: skip
+_PDF = Requirement(
+    ("weasyprint",), "board", "A report as PDF",
+    lambda values: (values.get("format") or str(values.get("out") or "").rpartition(".")[2]) == "pdf",
+)  # fmt: skip
 
 EXTRAS: dict[str, tuple[Requirement, ...]] = {
-    "export": (Requirement(_ONNX, "export", "Exporting to ONNX", lambda values: values.get("format") == "onnx"),),
-    "policy export": (
-        Requirement(_ONNX, "export", "Exporting to ONNX", lambda values: values.get("format", "onnx") == "onnx"),
-    ),
-    "policy train": (Requirement(("rsl_rl", "tensordict", "tensorboard"), "policies", "Training policies"),),
-    "policy distill": (Requirement(("rsl_rl", "tensordict"), "policies", "Training policies"),),
-    "policy sweep": (
-        Requirement(
-            ("rsl_rl", "tensordict"), "policies", "Training policies",
-            lambda values: not (values.get("count") or values.get("names")),
-        ),
-    ),
+    "export": (_ONNX,),
+    "policy export": (_ONNX,),
+    "policy train": (replace(_POLICIES, packages=(*_POLICIES.packages, "tensorboard")),),
+    "policy distill": (_POLICIES,),
+    "policy sweep": (replace(_POLICIES, when=lambda values: not (values.get("count") or values.get("names"))),),
     "policy play": (
-        Requirement(("matplotlib",), "report", "Drawing pictures", _given("video", "strip")),
-        Requirement(("imageio_ffmpeg",), "report", "Writing an MP4", _ends("video", ".mp4")),
+        replace(_PICTURES, when=_given("video", "strip")), replace(_MP4, when=_ends("video", ".mp4")),
     ),
-    "policy report": (Requirement(("matplotlib",), "report", "Drawing pictures", _given("picture")),),
+    "policy report": (replace(_PICTURES, when=_given("picture")),),
     "policy deploy": (Requirement(("pyarrow",), "board", "Writing a LeRobot data set", _given("record")),),
-    "stimuli render": (
-        Requirement(("matplotlib",), "report", "Drawing pictures"),
-        Requirement(("imageio_ffmpeg",), "report", "Writing an MP4", _ends("out", ".mp4")),
-    ),
-    "stimuli plot": (Requirement(("matplotlib",), "report", "Drawing pictures"),),
+    "stimuli render": (_PICTURES, replace(_MP4, when=_ends("out", ".mp4"))),
+    "stimuli plot": (_PICTURES,),
     "stimuli separability": (Requirement(("sklearn",), "learn", "Separability"),),
     "stimuli sweep": (_CLUSTER,),
-    "recovery": (_CLUSTER, Requirement(("matplotlib",), "report", "Drawing pictures", _given("out"))),
+    "recovery": (_CLUSTER, replace(_PICTURES, when=_given("out"))),
     "leaderboard add": (_CLUSTER,),
-    "leaderboard report": (
-        Requirement(
-            ("weasyprint",), "board", "A report as PDF",
-            lambda values: (values.get("format") or str(values.get("out") or "").rpartition(".")[2]) == "pdf",
-        ),
-    ),
-    "tradeoff whisker": (_PLOT,),
-    "tradeoff tactile": (_PLOT,),
-    "tactile demo": (
-        Requirement(("matplotlib",), "report", "Drawing pictures"),
-        Requirement(("skfem",), "tactile", "The sound of a struck ball"),
-    ),
+    "leaderboard report": (_PDF,),
+    "tradeoff whisker": (replace(_PICTURES, when=_given("plot")),),
+    "tradeoff tactile": (replace(_PICTURES, when=_given("plot")),),
+    "tactile demo": (_PICTURES, Requirement(("skfem",), "tactile", "The sound of a struck ball")),
 }  # fmt: skip
 
 CACHED = (

@@ -6,8 +6,8 @@ import math
 from collections.abc import Iterator, Mapping
 from typing import Any
 
-from brainbench.cli.output import spanned, table, table_of
-from brainbench.core.records import ResultRecord, Score
+from brainbench.cli.output import table, table_of
+from brainbench.core.records import ResultRecord, Score, spanned
 from brainbench.core.statistics import compare_scores
 
 RAW_INPUT = "raw input"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import functools
 import hashlib
 import json
 import math
@@ -255,8 +256,9 @@ def _update(digest: Any, value: Any) -> None:
     digest.update(b"\x00")
 
 
+@functools.cache
 def library_versions() -> dict[str, str]:
-    """Return the versions of the :data:`LIBRARIES` that are installed."""
+    """Return the versions of the :data:`LIBRARIES` that are installed; the result is shared: do not change it."""
     from importlib import metadata
 
     versions: dict[str, str] = {}
@@ -276,7 +278,7 @@ def provenance(**extra: Any) -> dict[str, Any]:
     return {
         "version": __version__,
         "python": platform.python_version(),
-        "packages": library_versions(),
+        "packages": dict(library_versions()),
         "machine": f"{platform.system()} {platform.machine()}",
         "time": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
         **extra,

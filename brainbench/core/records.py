@@ -64,6 +64,23 @@ class Interval(_NullIsNaN):
     """Method that made it, over what, and why it may be unreliable."""
 
 
+def spanned(value: float, interval: Interval | None = None, *, most: float = math.inf) -> str:
+    """Return ``value [low, high]`` with as many digits as the interval carries: two of its half-width.
+
+    A value without interval has two digits, NaN is a dash. The interval is cut at ``most``, the largest possible value.
+
+    >>> spanned(0.14021, Interval(0.0409, 0.2391)), spanned(0.97, Interval(0.9412, 1.1), most=1.0)
+    ('0.140 [0.041, 0.239]', '0.970 [0.941, 1.000]')
+    """
+    if not math.isfinite(value):
+        return "–"
+    if interval is None or not math.isfinite(interval.high - interval.low):
+        return f"{value:.2f}" if abs(value) >= 0.1 else f"{value:.2g}"
+    half = (interval.high - interval.low) / 2
+    digits = min(max(1 - math.floor(math.log10(half)), 0), 9) if half > 0 else 3
+    return f"{value:.{digits}f} [{interval.low:.{digits}f}, {min(interval.high, most):.{digits}f}]"
+
+
 @dataclass(frozen=True)
 class Ceiling(_NullIsNaN):
     """Noise ceiling of the raw (uncorrected) comparison: what a perfect model could reach."""
@@ -247,16 +264,17 @@ class Score(_NullIsNaN, _Document):
         """Show the score as a small table in a notebook."""
         from html import escape
 
+        ceiling = f"{spanned(self.ceiling.lower)} to {spanned(self.ceiling.upper)}" if self.ceiling else "none"
         rows = [
-            ("score, from chance (0) to all that is reliable (1)", _with_span(self.scaled, self.scaled_interval)),
-            ("value", f"{_with_span(self.value, self.interval)}; chance {_number(self.chance)}"),
+            ("score, from chance (0) to all that is reliable (1)", spanned(self.scaled, self.scaled_interval)),
+            ("value", f"{spanned(self.value, self.interval)}; chance {spanned(self.chance)}"),
             ("status", ": ".join([self.status, *filter(None, ["; ".join(self.reasons)])])),
-            ("raw r", _number(self.r)),
-            ("reliability", _number(self.reliability)),
-            ("permutation p", _number(self.p)),
-            ("noise ceiling (raw r)", _span(self.ceiling) if self.ceiling else "none"),
+            ("raw r", spanned(self.r)),
+            ("reliability", spanned(self.reliability)),
+            ("permutation p", spanned(self.p)),
+            ("noise ceiling (raw r)", ceiling),
             ("layer", self.layer_rule if self.layer is None else f"{self.layer} ({self.layer_rule})"),
-            ("optimistic maximum", f"{_number(self.best_layer_value)} at {self.best_layer}" if self.best_layer else ""),
+            ("optimistic maximum", f"{spanned(self.best_layer_value)} at {self.best_layer}" if self.best_layer else ""),
             ("estimator", f"{self.estimator}; {self.metric}"),
         ]
         body = "".join(f"<tr><th>{escape(key)}</th><td>{escape(text)}</td></tr>" for key, text in rows if text)
@@ -410,19 +428,6 @@ def _steady(score: Mapping[str, Any] | None) -> dict[str, Any] | None:
     volatile = ("time", "machine", "python", "packages", "seconds", "command")
     kept = {name: value for name, value in (score.get("provenance") or {}).items() if name not in volatile}
     return {**score, "provenance": kept}
-
-
-def _number(value: float) -> str:
-    return f"{value:.3g}" if math.isfinite(value) else "undefined"
-
-
-def _span(interval: Interval | Ceiling) -> str:
-    low, high = (interval.low, interval.high) if isinstance(interval, Interval) else (interval.lower, interval.upper)
-    return f"[{_number(low)}, {_number(high)}]"
-
-
-def _with_span(value: float, interval: Interval | None) -> str:
-    return f"{_number(value)} {_span(interval)}" if interval is not None else _number(value)
 
 
 def _convert(kind: type, data: Any) -> Any:

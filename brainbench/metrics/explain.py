@@ -100,7 +100,7 @@ def corrected_value(
         sides = [float(spearman_brown(side[keep].mean())) for side in (halves, others)]
         value = float(raw[keep].mean()) / math.sqrt(math.prod(sides)) if min(sides) > 0 else math.nan
         return value, int(keep.sum())
-    ratios, _ = corrected_splits(raw[keep], halves[keep], others[keep])
+    ratios = corrected_splits(raw[keep], halves[keep], others[keep])
     real = ratios[np.isfinite(ratios) & (switches.negative_pairs | (halves[keep] > 0))]
     if not real.size:
         return math.nan, 0

@@ -44,11 +44,11 @@ class LayerRule:
         if self.kind == "halves":
             # Animals are the halves of one animal's splits: each is scored by the layer best on its other half.
             pairs = r.reshape(*r.shape[:-1], -1, 2)[..., ::-1]
-            return _first_best(pairs.reshape(r.shape))
+            return first_best(pairs.reshape(r.shape))
         shape = (*r.shape[:-2], r.shape[-1])
         if self.kind == "maximum":
             weighted = r if self.factors is None else r * self.factors
-            return np.broadcast_to(_first_best(weighted.mean(axis=-1)[..., None]), shape)
+            return np.broadcast_to(first_best(weighted.mean(axis=-1)[..., None]), shape)
         return np.full(shape, self.fixed)
 
     def held(self, r: Floats) -> Floats:
@@ -84,7 +84,7 @@ def choose_on_others(r: Floats) -> Ints:
     """
     # All leave-one-out means from one sum over animals.
     others = (r.sum(axis=-1, keepdims=True) - r) / (r.shape[-1] - 1)
-    return _first_best(others)
+    return first_best(others)
 
 
 def held_out(r: Floats) -> Floats:
@@ -97,13 +97,8 @@ def most_chosen(chosen: Ints) -> int:
     return int(np.argmax(np.bincount(np.ravel(chosen))))
 
 
-def first_best(values: Floats) -> int:
-    """Return the index of the largest value [L]; the first among equals."""
-    return int(_first_best(np.asarray(values)[:, None])[0])
-
-
-def _first_best(values: Floats) -> Ints:
-    """Return the first index along axis −2 whose value equals the largest up to rounding."""
+def first_best(values: Floats) -> Ints:
+    """Return the first index [..., A] of the layers [..., L, A] whose value equals the largest up to rounding."""
     # A tolerance for ties: layers with equal RDMs differ by rounding, and the first of them is to win on every machine.
     return np.argmax(values >= values.max(axis=-2, keepdims=True) - _TIE, axis=-2)
 

@@ -88,7 +88,7 @@ def score_layers(
         parts = tuple(_subject(animals, index, math.nan, math.nan, None) for index in range(len(animals.subjects)))
         return Score(value=math.nan, layers=empty, subjects=parts, provenance=Provenance.of(stated), **about), None
     means = result.layer_values.mean(axis=1)
-    best, chosen = first_best(means), most_chosen(result.chosen)
+    best, chosen = first_best(means[:, None]).item(), most_chosen(result.chosen)
     layer, scored = layers[defined[chosen]], [animals.subjects[i] for i in animals.scored]
     attainable, hopeless = attainable_value(metric, animals, result, seed)
     if hopeless:

@@ -75,11 +75,6 @@ class ModelDescription(ModelFacts):
     trained: Mapping[str, Any] | None = None
     """For a name of trained weights: what their configuration says."""
 
-    @property
-    def architecture(self) -> Architecture:
-        """Parts of the architecture's name, without a tag."""
-        return replace(Architecture.parse(self.trained["architecture"] if self.trained else self.name), tag=None)
-
 
 _records: dict[str, ModelRecord] = {}
 _loaded: set[str] = set()

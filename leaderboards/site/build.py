@@ -26,7 +26,7 @@ from leaderboards.schema import record_schema
 from leaderboards.site.folder import rebuilt
 from leaderboards.site.page import render, script_json
 from leaderboards.site.score_page import model_page
-from leaderboards.site.table import COLUMNS, board_label, page_data, table_csv, table_rows
+from leaderboards.site.table import COLUMNS, board_label, page_board, table_csv, table_rows
 from leaderboards.store import MAKE_ONE, StoredRecord, record_text
 
 PAGE = 50
@@ -102,6 +102,7 @@ def _pages(stored: Sequence[StoredRecord], title: str) -> Iterator[tuple[str, st
     """Yield each file of the site with its content, the first page first."""
     boards = rank([item.record for item in stored if item.record is not None], remarks(stored))
     synthetic = any(board.synthetic for board in boards)
+    columns = [page_board(str(place), board) for place, board in enumerate(boards, start=1)]
     yield (
         "index.html",
         render(
@@ -114,7 +115,7 @@ def _pages(stored: Sequence[StoredRecord], title: str) -> Iterator[tuple[str, st
             synthetic=synthetic,
             problems=[item for item in stored if item.record is None],
             downloads=DOWNLOADS.items(),
-            data=script_json({"boards": page_data(boards), "columns": COLUMNS, "page": PAGE}),
+            data=script_json({"boards": columns, "columns": COLUMNS, "page": PAGE}),
             here="table",
             root="",
         ),

@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from typing import Any
 
 from brainbench.core.records import Score
@@ -74,12 +74,8 @@ def table_csv(rows: Iterable[dict[str, Any]]) -> str:
     return stream.getvalue()
 
 
-def page_data(boards: Sequence[Board]) -> list[dict[str, Any]]:
-    """Return every board as columns: what the script of the first page shows."""
-    return [_page_board(str(index), board) for index, board in enumerate(boards, start=1)]
-
-
-def _page_board(key: str, board: Board) -> dict[str, Any]:
+def page_board(key: str, board: Board) -> dict[str, Any]:
+    """Return a board as columns, by a key: what the script of the first page shows."""
     rows = table_rows(board)
     # Records of earlier versions state no chance: a board of such alone shows the metric's own values.
     scaled = any(row["scaled"] is not None for row in rows)

@@ -11,10 +11,11 @@ from brainbench.core.errors import DataError, UsageError
 from brainbench.core.trials import Trials
 from brainbench.datasets import check, inspect, open_recordings, write_recordings
 from brainbench.datasets.sessions import SessionTable, make_session
-from brainbench.datasets.synthetic import ResponseGeometry, simulate
+from brainbench.datasets.synthetic import ResponseGeometry
 from brainbench.datasets.trials.session_trials import pooled, trials_by_subject
 from brainbench.metrics.reliability.subject_rdm import subject_rdm
 from tests.factories.recordings import as_recordings, make_simple_session, quiet_design
+from tests.factories.synthetic_animals import simulate
 
 
 def make_geometry(stimuli):

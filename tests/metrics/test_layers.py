@@ -31,7 +31,7 @@ def test_what_is_chosen_on_one_half_is_evaluated_on_the_other():
 
 
 def test_ties_go_to_the_first_layer_even_when_rounding_differs():
-    assert first_best(np.array([0.1, 0.5, 0.5 + 1e-15])) == 1
+    assert first_best(np.array([[0.1], [0.5], [0.5 + 1e-15]])).tolist() == [1]
     assert most_chosen(np.array([2, 1, 2, 1])) == 1
 
 

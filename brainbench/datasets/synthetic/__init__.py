@@ -1,7 +1,7 @@
 """Synthetic recordings whose truth is known, as arrays, sessions of spike times, or files.
 
 A ``geometry`` (from a network's features) and a ``design`` give ``populations``: expected rates, trials and
-counts. ``animals`` keeps them as arrays with their truth, ``sessions`` writes files (``spikes`` places their spikes),
+counts. ``animals`` relates a design to its noise ceiling, ``sessions`` writes files (``spikes`` places their spikes),
 ``truth`` what the neurons encode beside them, and makes files once per machine. ``rodgers_demo`` puts the same
 neurons into the task and file layout of Rodgers 2022 (``rodgers_task``).
 """
@@ -13,27 +13,23 @@ from typing import TYPE_CHECKING
 from brainbench.core.lazy import lazy_exports
 
 if TYPE_CHECKING:
-    from brainbench.datasets.synthetic.animals import FAULTS, SyntheticAnimal, calibrate, measure_ceiling, simulate
+    from brainbench.datasets.synthetic.animals import calibrate, measure_ceiling
     from brainbench.datasets.synthetic.design import PopulationDesign
     from brainbench.datasets.synthetic.geometry import ResponseGeometry
-    from brainbench.datasets.synthetic.populations import draw_animals, stimulus_means
+    from brainbench.datasets.synthetic.populations import draw_animals
     from brainbench.datasets.synthetic.rodgers_demo import ensure_rodgers_demo, make_rodgers_demo
     from brainbench.datasets.synthetic.sessions import write_files
     from brainbench.datasets.synthetic.truth import read_truth
 
 __all__ = [
-    "FAULTS",
     "PopulationDesign",
     "ResponseGeometry",
-    "SyntheticAnimal",
     "calibrate",
     "draw_animals",
     "ensure_rodgers_demo",
     "make_rodgers_demo",
     "measure_ceiling",
     "read_truth",
-    "simulate",
-    "stimulus_means",
     "write_files",
 ]
 

@@ -1,68 +1,26 @@
-"""Animals as arrays with their truth: the instrument by which statistics are validated.
+"""The noise ceiling that a design of synthetic animals has, and the design that has a given one.
 
-:func:`simulate` draws animals and may repeat the faults of the released analysis; :func:`measure_ceiling` and
-:func:`calibrate` relate a design to the noise ceiling that it has. Letters: K stimulus, R trial, U unit, P pair.
+Letters: K stimulus, R trial, U unit, P pair.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
-from itertools import groupby
+from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from brainbench.core.errors import UsageError, check_each
+from brainbench.core.errors import UsageError
 from brainbench.core.reading.ranges import check_number
 from brainbench.core.trials import Trials
 from brainbench.datasets.synthetic.design import MODULATION, PopulationDesign
 from brainbench.datasets.synthetic.geometry import ResponseGeometry
-from brainbench.datasets.synthetic.populations import draw_sessions, entropy, stimulus_means
+from brainbench.datasets.synthetic.populations import draw_animals, entropy
 from brainbench.datasets.synthetic.truth import correlation_rdm
 
 _EXACT = 2e-4
 """Largest error of the modulation that calibration leaves, on the studies it draws."""
-
-
-@dataclass(frozen=True)
-class SyntheticAnimal:
-    """One animal's trials, and the truth about it."""
-
-    subject: str
-    sessions: tuple[Trials, ...]
-    """Every session: ``responses`` [R, 1, U] Hz, ``labels`` [R], ``keys``."""
-    truth: NDArray[np.float64] = field(repr=False)
-    """[P] correlation-distance RDM of its units' expected rates, free of noise."""
-
-
-def simulate(
-    geometry: ResponseGeometry,
-    design: PopulationDesign | None = None,
-    *,
-    seed: int | Sequence[int] = 0,
-    faults: Sequence[str] = (),
-) -> tuple[SyntheticAnimal, ...]:
-    """Draw animals that share a geometry.
-
-    Every animal and session has its own random stream, so the first animals of a larger design are those of a smaller
-    one. The seed is one integer, or several (such as study and simulation). ``faults`` names those of :data:`FAULTS`,
-    to show what they cost.
-
-    Raises:
-        UsageError: an unknown fault, or a missing stimulus that does not exist.
-    """
-    check_each("fault", faults, FAULTS)
-    animals = []
-    for subject, group in groupby(draw_sessions(geometry, design, seed), key=lambda item: item.subject):
-        drawn = list(group)
-        sessions = [item.trials for item in drawn]
-        # The order of the stimuli goes wrong before trials are filled up.
-        for name in sorted(faults):
-            sessions = [FAULTS[name](trials, len(geometry.labels)) for trials in sessions]
-        truth = correlation_rdm(np.concatenate([item.expected for item in drawn], axis=1))
-        animals.append(SyntheticAnimal(subject, tuple(sessions), truth))
-    return tuple(animals)
 
 
 def measure_ceiling(
@@ -83,8 +41,8 @@ def measure_ceiling(
     truth, stimuli = geometry.rdm, len(geometry.labels)
     scores: list[float] = []
     for number in range(simulations):
-        for animal in simulate(geometry, design, seed=(*entropy(seed), number)):
-            means = np.concatenate([stimulus_means(block, stimuli) for block in animal.sessions], axis=1)
+        for sessions in draw_animals(geometry, design, (*entropy(seed), number)).values():
+            means = np.concatenate([stimulus_means(block, stimuli) for block in sessions], axis=1)
             scores.append(_pearson(correlation_rdm(means), truth))
     known = np.array([score for score in scores if np.isfinite(score)])
     if not len(known):
@@ -135,30 +93,14 @@ def calibrate(
     return replace(design, modulation=float(found.root))
 
 
-def _zero_fill(block: Trials, stimuli: int) -> Trials:
-    """Give every trial a response of zero to each stimulus that it did not show."""
-    trials, bins, units = block.responses.shape
-    # What was not shown counts as a response of zero, as in the released analysis, and pulls all means together.
-    filled = np.zeros((trials, stimuli, bins, units))
-    filled[np.arange(trials), block.labels] = block.responses
-    keys = tuple(f"{key}/{stimulus}" for key in block.keys or () for stimulus in range(stimuli))
-    labels = np.tile(np.arange(stimuli), trials)
-    return Trials(filled.reshape(trials * stimuli, bins, units), labels, keys)
-
-
-def _first_appearance(block: Trials, stimuli: int) -> Trials:
-    """Renumber the stimuli in the order in which the session shows them."""
-    _, first = np.unique(block.labels, return_index=True)
-    order = block.labels[np.sort(first)]
-    number = np.full(stimuli, -1)
-    number[order] = np.arange(len(order))
-    return replace(block, labels=number[block.labels])
-
-
-FAULTS: dict[str, Callable[[Trials, int], Trials]] = {"first-appearance": _first_appearance, "zero-fill": _zero_fill}
-"""Faults of the released analysis, as functions of a session and the number of stimuli: stimuli
-numbered by first appearance (so that sessions and animals disagree about the axes), and zeros in
-place of what a trial did not show."""
+def stimulus_means(block: Trials, stimuli: int) -> NDArray[np.float64]:
+    """Return the mean response [K, U] to every stimulus; NaN where there is no trial."""
+    # Indicators [K, R]: one product sums the trials of every stimulus.
+    member = np.zeros((stimuli, len(block.labels)))
+    member[block.labels, np.arange(len(block.labels))] = 1.0
+    number = member.sum(axis=1, keepdims=True)
+    total = member @ block.responses.mean(axis=1)
+    return np.divide(total, number, out=np.full(total.shape, np.nan), where=number > 0)
 
 
 def _pearson(one: NDArray[np.float64], two: NDArray[np.float64]) -> float:

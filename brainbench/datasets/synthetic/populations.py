@@ -152,16 +152,6 @@ def draw_counts(
     return random.poisson(rates * window)
 
 
-def stimulus_means(block: Trials, stimuli: int) -> NDArray[np.float64]:
-    """Return the mean response [K, U] to every stimulus; NaN where there is no trial."""
-    # Indicators [K, R]: one product sums the trials of every stimulus.
-    member = np.zeros((stimuli, len(block.labels)))
-    member[block.labels, np.arange(len(block.labels))] = 1.0
-    number = member.sum(axis=1, keepdims=True)
-    total = member @ block.responses.mean(axis=1)
-    return np.divide(total, number, out=np.full(total.shape, np.nan), where=number > 0)
-
-
 def _project(directions: NDArray[np.float64], units: int, random: np.random.Generator) -> NDArray[np.float64]:
     """Return the tuning [K, U] of units with random preferred directions: normal, covariance over units = cosines."""
     return directions @ random.standard_normal((directions.shape[1], units))

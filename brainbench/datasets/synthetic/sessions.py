@@ -1,4 +1,4 @@
-"""Synthetic recordings as sessions of spike times, and as NWB or HDF5 files: the counts of ``simulate`` by one seed."""
+"""Synthetic recordings as sessions of spike times, and as NWB or HDF5 files: the counts of ``draw_animals``."""
 
 from __future__ import annotations
 

@@ -5,10 +5,8 @@ They are made once per machine and then found in the cache.
 
 from __future__ import annotations
 
-import contextlib
 import logging
 import os
-import time
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import partial
@@ -118,9 +116,6 @@ def correlation_rdm(responses: NDArray[np.float64]) -> NDArray[np.float64]:
         return 1.0 - np.atleast_2d(np.corrcoef(responses))[rows, columns]
 
 
-_ABANDONED = 24 * 3600.0
-"""Age from which an unfinished file belongs to no running process, s."""
-
 _log = logging.getLogger(__name__)
 
 
@@ -139,11 +134,6 @@ def ensure_recordings(name: str, *key: object, make: Callable[[Path], object]) -
         # Before the stimuli are simulated, which is slow.
         check_folder(target, "The cache")
         make(target)
-        # What a killed process left; a younger file may be one that is being written.
-        for item in target.glob(".*"):
-            with contextlib.suppress(OSError):
-                if time.time() - item.stat().st_mtime > _ABANDONED:
-                    item.unlink()
     return target
 
 

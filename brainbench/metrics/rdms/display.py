@@ -15,10 +15,11 @@ from brainbench.core.errors import UsageError, check_each, check_once
 from brainbench.metrics.rdms.pairs import Floats, rdm_stack, square, stimulus_count
 
 _LARGEST_LABELLED = 24
-"""Stimuli up to which names and values are written; above, the picture alone is drawn."""
+"""Stimuli up to which names are written; above, the cells alone are drawn."""
 _LARGEST_DRAWN = 120
-_SIDE = 300.0
-_DARK, _LIGHT, _MISSING = np.array([14, 77, 84]), np.array([240, 246, 245]), "#d6d0c4"
+_SIDE = 300
+"""Side of the matrix in pixels."""
+_DARK, _LIGHT, _MISSING = np.array([14, 77, 84]), np.array([240, 246, 245]), np.array([214, 208, 196])
 
 
 @dataclass(frozen=True, init=False, eq=False)
@@ -74,72 +75,31 @@ class RDM:
         return len(self.values)
 
     def _repr_html_(self) -> str:
-        """Draw the matrix as an inline SVG: dark is unlike, grey is missing."""
-        count = len(self.stimuli)
+        """Show the matrix as a table: dark is unlike, grey is missing; the value of a cell appears under the mouse."""
+        title, count = escape(self.title or "RDM"), len(self.stimuli)
         if count > _LARGEST_DRAWN:
-            return f"<p>{escape(self.title or 'RDM')}: {count} stimuli, {len(self):,} pairs</p>"
-        named = count <= _LARGEST_LABELLED
-        margin = 10 + 7.0 * max(map(len, self.stimuli)) if named else 4.0
-        cell, top = _SIDE / count, 26.0 if self.title else 6.0
+            return f"<p>{title}: {count} stimuli, {len(self):,} pairs</p>"
         finite = self.values[np.isfinite(self.values)]
         low, high = (float(finite.min()), float(finite.max())) if len(finite) else (0.0, 1.0)
-        parts = [
-            f'<text x="{margin:.1f}" y="16" font-weight="600">{escape(self.title)}</text>' if self.title else "",
-            *self._cells(margin, top, cell, low, high, named=named),
-        ]
-        width, height = margin + _SIDE + 110, top + _SIDE + (margin if named else 8)
-        parts += _scale(margin + _SIDE + 18, top, low, high)
-        label = f"{self.title or 'RDM'} of {count} stimuli, from {low:.3g} to {high:.3g}"
-        return (
-            f'<svg xmlns="http://www.w3.org/2000/svg" role="img" aria-label="{escape(label)}" width="{width:.0f}" '
-            f'height="{height:.0f}" viewBox="0 0 {width:.0f} {height:.0f}" font-family="system-ui, sans-serif" '
-            f'font-size="11" fill="currentColor">{"".join(parts)}</svg>'
-        )
-
-    def _cells(self, left: float, top: float, cell: float, low: float, high: float, *, named: bool) -> list[str]:
-        parts, matrix = [], self.matrix
-        # Two figures of the largest difference tell values apart; more do not fit in a cell.
-        digits = min(max(1 - math.floor(math.log10(high - low)), 0), 4) if high > low else 2
-        for row, name in enumerate(map(escape, self.stimuli)):
-            y = top + row * cell
-            for column, other in enumerate(map(escape, self.stimuli)):
-                if row == column:
-                    continue
-                value, x = float(matrix[row, column]), left + column * cell
-                colour, ink = _colour(value, low, high)
-                parts.append(
-                    f'<rect x="{x:.1f}" y="{y:.1f}" width="{cell:.2f}" height="{cell:.2f}" fill="{colour}">'
-                    f"<title>{name} – {other}: {value:.3g}</title></rect>"
-                )
-                if named and cell >= 26 and math.isfinite(value):
-                    how = f'text-anchor="middle" fill="{ink}" pointer-events="none"'
-                    parts.append(_text(x + cell / 2, y + cell / 2 + 4, f"{value:.{digits}f}", how))
-            if named:
-                middle = row * cell + cell / 2
-                below = f"{left + middle + 4:.1f},{top + _SIDE + 6:.1f}"
-                parts.append(_text(left - 6, top + middle + 4, name, 'text-anchor="end"'))
-                parts.append(f'<text transform="translate({below}) rotate(-90)" text-anchor="end">{name}</text>')
-        return parts
+        names = [escape(name) for name in self.stimuli]
+        # Names of many stimuli do not fit beside cells of a few pixels.
+        heads = names if count <= _LARGEST_LABELLED else [""] * count
+        rows = []
+        for place, values in enumerate(self.matrix):
+            cells = [
+                _cell(float(value), low, high, f"{names[place]} – {other}", max(_SIDE // count, 3))
+                for value, other in zip(values, names, strict=True)
+            ]
+            cells[place] = "<td></td>"
+            rows.append(f"<tr><th>{heads[place]}</th>{''.join(cells)}</tr>")
+        top = "".join(f'<th style="writing-mode: vertical-rl">{head}</th>' for head in heads)
+        caption = f"{title} of {count} stimuli, from {low:.3g} to {high:.3g}"
+        return f"<table><caption>{caption}</caption><tr><th></th>{top}</tr>{''.join(rows)}</table>"
 
 
-def _text(x: float, y: float, text: str, how: str = "") -> str:
-    return f'<text x="{x:.1f}" y="{y:.1f}"{how and " " + how}>{text}</text>'
-
-
-def _colour(value: float, low: float, high: float) -> tuple[str, str]:
-    """Return the colour of a value and that of ink on it."""
-    if not math.isfinite(value):
-        return _MISSING, "#333"
+def _cell(value: float, low: float, high: float, pair: str, side: int) -> str:
+    """Return the cell of a pair, coloured by where its value lies between the lowest and the highest."""
     share = (value - low) / (high - low) if high > low else 0.5
-    red, green, blue = (_LIGHT + share * (_DARK - _LIGHT)).round().astype(int).tolist()
-    return f"rgb({red},{green},{blue})", "#fff" if share > 0.65 else "#123"
-
-
-def _scale(x: float, top: float, low: float, high: float) -> list[str]:
-    """Draw the colours beside their values."""
-    steps, parts = 24, []
-    for step in range(steps):
-        colour, _ = _colour(step / (steps - 1), 0.0, 1.0)
-        y = top + _SIDE * (1 - (step + 1) / steps)
-        parts.append(f'<rect x="{x:.1f}" y="{y:.1f}" width="12" height="{_SIDE / steps + 0.5:.2f}" fill="{colour}"/>')
-    return [*parts, _text(x + 18, top + 10, f"{high:.3g}"), _text(x + 18, top + _SIDE, f"{low:.3g}")]
+    red, green, blue = _LIGHT + share * (_DARK - _LIGHT) if math.isfinite(value) else _MISSING
+    style = f"background: rgb({red:.0f},{green:.0f},{blue:.0f}); padding: 0; min-width: {side}px; height: {side}px"
+    return f'<td style="{style}" title="{pair}: {value:.3g}"></td>'

@@ -64,18 +64,15 @@ def spearman_brown(r: ArrayLike) -> Floats:
         return np.where(half == -1.0, np.nan, 2 * half / (1 + half))
 
 
-def corrected_splits(
-    r_xy: ArrayLike, split_half_r: ArrayLike, other_split_half_r: ArrayLike | None = None
-) -> tuple[Floats, Floats]:
-    """Return each split's ratio r_xy/√(SB(r_xx) SB(r_yy)) and its denominator, as published; NaN where it is imaginary.
+def corrected_splits(r_xy: ArrayLike, split_half_r: ArrayLike, other_split_half_r: ArrayLike | None = None) -> Floats:
+    """Return each split's ratio r_xy/√(SB(r_xx) SB(r_yy)), as published; NaN where it is imaginary.
 
     As published, two negative reliabilities have a positive product and pass.
     """
     other = 1.0 if other_split_half_r is None else spearman_brown(other_split_half_r)
     # Thesis, equation 3.4, split by split; a negative product has no real root.
     product = spearman_brown(split_half_r) * other
-    denominator = np.sqrt(np.where(product > 0, product, np.nan))
-    return np.asarray(r_xy, dtype=np.float64) / denominator, denominator
+    return np.asarray(r_xy, dtype=np.float64) / np.sqrt(np.where(product > 0, product, np.nan))
 
 
 def noise_corrected(
@@ -143,7 +140,7 @@ def _by_split(average: Callable[[Floats], Any], least: float, lacking: str) -> _
     """Return a published estimator: the average ratio of splits whose raw correlation is at least ``least``."""
 
     def corrected(r_xy: Floats, halves: Floats, others: Floats | None, sides: list[float]) -> tuple[float, int, str]:
-        ratio, _ = corrected_splits(np.where(halves >= least, r_xy, np.nan), halves, others)
+        ratio = corrected_splits(np.where(halves >= least, r_xy, np.nan), halves, others)
         # Imaginary ratios vanish, as published.
         kept = ratio[np.isfinite(ratio)]
         return (float(average(kept)), kept.size, "") if kept.size else (math.nan, 0, lacking)

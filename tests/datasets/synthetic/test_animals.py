@@ -10,20 +10,19 @@ from brainbench.core.errors import DataError, UsageError
 from brainbench.core.trials import Trials
 from brainbench.datasets import open_recordings
 from brainbench.datasets.synthetic import (
-    FAULTS,
     PopulationDesign,
     ResponseGeometry,
     calibrate,
     measure_ceiling,
     read_truth,
-    simulate,
-    stimulus_means,
     write_files,
 )
+from brainbench.datasets.synthetic.animals import stimulus_means
 from brainbench.datasets.trials.session_trials import trials_by_subject
 from brainbench.metrics import noise_ceiling, rdm
 from brainbench.metrics.reliability.subject_rdm import subject_rdm
 from tests.factories.recordings import as_recordings, make_sessions, quiet_design
+from tests.factories.synthetic_animals import FAULTS, simulate
 
 SMALL = quiet_design(animals=3, sessions=2, units=12, trials=5)
 
@@ -69,7 +68,6 @@ def test_the_truth_of_features_is_their_correlation_distance(seed, stimuli, feat
         (lambda: PopulationDesign(dispersion=-1.0), UsageError, r"dispersion .*received -1"),
         (lambda: PopulationDesign(modulation=0.9), UsageError, r"modulation .*0\.4; received 0\.9"),
         (lambda: PopulationDesign(individual=2.0), UsageError, r"individual .*received 2"),
-        (lambda: simulate(make_geometry(), SMALL, faults=["zero-fil"]), UsageError, "did you mean 'zero-fill'"),
         (lambda: simulate(make_geometry(), replace(SMALL, missing=((0, 6),))), UsageError, "numbered 0 to 5"),
     ],
 )
