@@ -17,8 +17,8 @@ from brainbench.metrics.rdms.pairs import Floats, rdm_stack, square, stimulus_co
 _LARGEST_LABELLED = 24
 """Stimuli up to which names are written; above, the cells alone are drawn."""
 _LARGEST_DRAWN = 120
-_SIDE = 300
-"""Side of the matrix in pixels."""
+_SIDE, _WIDE = 300, 26
+"""Side of the matrix, and of the smallest cell that holds a number, in pixels."""
 _DARK, _LIGHT, _MISSING = np.array([14, 77, 84]), np.array([240, 246, 245]), np.array([214, 208, 196])
 
 
@@ -75,7 +75,7 @@ class RDM:
         return len(self.values)
 
     def _repr_html_(self) -> str:
-        """Show the matrix as a table: dark is unlike, grey is missing; the value of a cell appears under the mouse."""
+        """Show the matrix as a table: dark is unlike, grey is missing; small cells show their value under the mouse."""
         title, count = escape(self.title or "RDM"), len(self.stimuli)
         if count > _LARGEST_DRAWN:
             return f"<p>{title}: {count} stimuli, {len(self):,} pairs</p>"
@@ -100,6 +100,9 @@ class RDM:
 def _cell(value: float, low: float, high: float, pair: str, side: int) -> str:
     """Return the cell of a pair, coloured by where its value lies between the lowest and the highest."""
     share = (value - low) / (high - low) if high > low else 0.5
+    number = f"{value:.2g}" if side >= _WIDE and math.isfinite(value) else ""
+    ink = "white" if share > 0.65 else "black"
     red, green, blue = _LIGHT + share * (_DARK - _LIGHT) if math.isfinite(value) else _MISSING
-    style = f"background: rgb({red:.0f},{green:.0f},{blue:.0f}); padding: 0; min-width: {side}px; height: {side}px"
-    return f'<td style="{style}" title="{pair}: {value:.3g}"></td>'
+    size = f"padding: 0; text-align: center; min-width: {side}px; height: {side}px"
+    style = f"background: rgb({red:.0f},{green:.0f},{blue:.0f}); color: {ink}; {size}"
+    return f'<td style="{style}" title="{pair}: {value:.3g}">{number}</td>'

@@ -31,6 +31,7 @@ def test_the_table_has_a_cell_with_its_value_for_every_pair():
     colours = {cell.get("title"): cell.get("style") for cell in root.iter("td") if cell.get("title")}
     assert len(colours) == 6
     assert "near – far: 0.25" in colours
+    assert [cell.text for cell in root.iter("td") if cell.get("title")] == ["0", "0.25", "0", "1", "0.25", "1"]
     assert "rgb(240,246,245)" in colours["near – medium: 0"]
     assert "rgb(14,77,84)" in colours["medium – far: 1"]
     assert [head.text for head in root.iter("th") if head.text] == ["near", "medium", "far"] * 2
@@ -47,7 +48,7 @@ def test_missing_pairs_and_equal_pairs_can_be_drawn():
 def test_many_stimuli_are_drawn_without_names_and_very_many_are_told():
     forty = _draw(RDM(np.arange(780.0)))
     assert len(list(forty.iter("td"))) == 1600
-    assert not [head.text for head in forty.iter("th") if head.text]
+    assert not [shown.text for shown in (*forty.iter("th"), *forty.iter("td")) if shown.text]
     assert RDM(np.ones(499_500))._repr_html_() == "<p>RDM: 1000 stimuli, 499,500 pairs</p>"
 
 
