@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
@@ -106,10 +105,6 @@ class Track:
 
 def follicle_track(follicle: Follicle, size: float, cutting: Cutting) -> Track:
     """Return the track of a follicle whose whisker has the arc length ``size`` (m)."""
-    if getattr(follicle, "finest", None) == math.inf:
-        place, euler = (np.asarray(values, dtype=float) for values in follicle.pose(np.array([cutting.start])))
-        return still_track(place[0], rotations.from_matrices(base_rotation(euler))[0])
-
     return _track(follicle.pose, base_rotation, cutting.follicle(follicle, size), cutting.start)
 
 
