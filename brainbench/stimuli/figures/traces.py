@@ -66,7 +66,7 @@ def plot(
     check_stimulus_set(dataset)
     path = Path(out)
     check_format(path, FORMATS)
-    check_channel(channel)
+    check_name("channel", channel, QUANTITIES)
     cells = list(zip(dataset["row"].values.tolist(), dataset["col"].values.tolist(), strict=True))
     if len(set(cells)) < len(cells):
         raise UsageError("The stimulus set has two whiskers in one cell; select one side (or one animal) first.")
@@ -86,11 +86,6 @@ def plot(
     for label, one in zip(chosen, paths, strict=True):
         save_figure(_figure(dataset.isel(stimulus=labels.index(label)), label, channel, limits, size), one)
     return tuple(paths)
-
-
-def check_channel(channel: str) -> None:
-    """Raise a :class:`UsageError` unless ``channel`` is one of :data:`QUANTITIES`."""
-    check_name("channel", channel, QUANTITIES)
 
 
 def _within(dataset: xr.Dataset, window: tuple[float, float] | None) -> xr.Dataset:
