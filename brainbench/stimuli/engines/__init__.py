@@ -40,7 +40,7 @@ def get_engine(name: str, *, device: str | None = None, retry: int | None = None
     Args:
         name: one of :func:`list_engines`.
         device: ``cpu`` or ``cuda``; the engine's own choice when None.
-        retry: as :attr:`WhiskerEngine.retry`, for engines that retry; the engine's own choice when None.
+        retry: as :attr:`WhiskerEngine.retry`; the engine's own choice when None.
 
     Raises:
         UsageError: there is no such engine, or it does not run on the device.
@@ -51,5 +51,5 @@ def get_engine(name: str, *, device: str | None = None, retry: int | None = None
     engine: type[WhiskerEngine] = getattr(import_module(module), symbol)
     if device is not None and device not in engine.devices:
         raise UsageError(f"The backend {name!r} does not run on {device!r}; it runs on {listing(engine.devices)}.")
-    options = {"device": device, "retry": retry if engine.retries else None}
+    options = {"device": device, "retry": retry}
     return engine(**{key: value for key, value in options.items() if value is not None})

@@ -240,6 +240,11 @@ class Obstacle:
             raise UsageError("An obstacle needs at least one part or a surface.")
         check_fields(self, "friction", least=0, of="{} of an obstacle")
 
+    def moved(self, rotation: NDArray[np.float64], translation: NDArray[np.float64]) -> Obstacle:
+        """Return the body with its geometry rotated by a matrix [3, 3] about the origin, then translated by [3] (m)."""
+        surface = self.surface and self.surface.moved(rotation, translation)
+        return replace(self, parts=tuple(part.moved(rotation, translation) for part in self.parts), surface=surface)
+
     @cached_property
     def bounds(self) -> NDArray[np.float64]:
         """Lowest and highest corner [2, 3] (m) of what is touched, in the frame of the obstacle."""
