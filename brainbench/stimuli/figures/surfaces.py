@@ -53,7 +53,7 @@ def object_surface(item: PlacedObject) -> DrawnSurface:
     """Return the surface of an object: its mesh, or what whiskers touch when it has none."""
     obstacle = item.obstacle()
     if item.solid.mesh is None and obstacle.surface is not None:
-        meshes = [Mesh(obstacle.surface.vertices, obstacle.surface.faces.astype(np.int64))]
+        meshes = [obstacle.surface]
     elif item.solid.mesh is None:
         meshes = [part_mesh(part) for part in obstacle.parts]
     else:

@@ -202,7 +202,7 @@ def _hash_solid(solid: Solid) -> str:
     if solid.origin is not None:
         return content_hash(solid.origin, round(solid.diagonal, 12))
     if solid.surface is not None:
-        return content_hash(solid.surface.vertices, solid.surface.faces)
+        return content_hash(solid.surface.vertices, solid.surface.faces.astype(np.int32))
     return str(solid.config()["hash"])
 
 
