@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from brainbench.core.errors import UsageError, check_name, listing
 from brainbench.core.figures.style import check_format
-from brainbench.core.progress import Progress
+from brainbench.core.progress import Progress, track
 from brainbench.core.reading.ranges import check_fields
 from brainbench.stimuli.engines import DEFAULT_ENGINE
 from brainbench.stimuli.engines.fidelity import Fidelity
@@ -234,9 +234,9 @@ def render(
     annotation = Annotation(picture)
     if suffix == ".png":
         return annotation.save(path)
-    frames = (annotation.frame(index) for index in range(len(times)))
+    frames = (annotation.frame(index) for index in track(range(len(times)), "drawing frames", progress))
     sample = [annotation.frame(index) for index in {0, len(times) // 2, len(times) - 1}] if suffix == ".gif" else []
-    return write_film(path, frames, len(times), style, palette_from=sample, progress=progress)
+    return write_film(path, frames, style, palette_from=sample)
 
 
 def still_time(scene: Scene) -> float:
