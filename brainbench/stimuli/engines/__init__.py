@@ -9,7 +9,7 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING
 
-from brainbench.core.errors import UsageError, listing, unknown_name
+from brainbench.core.errors import UsageError, check_name, listing
 
 if TYPE_CHECKING:
     from brainbench.stimuli.engines.protocol import WhiskerEngine
@@ -45,8 +45,7 @@ def get_engine(name: str, *, device: str | None = None, retry: int | None = None
     Raises:
         UsageError: there is no such engine, or it does not run on the device.
     """
-    if name not in _ENGINES:
-        raise unknown_name("backend", name, list_engines())
+    check_name("backend", name, list_engines())
     module, symbol = _ENGINES[name]
     engine: type[WhiskerEngine] = getattr(import_module(module), symbol)
     if device is not None and device not in engine.devices:

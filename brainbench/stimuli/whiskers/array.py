@@ -15,7 +15,7 @@ from functools import cache
 from importlib import resources
 from typing import Any, Literal
 
-from brainbench.core.errors import UsageError, check_name, unknown_name
+from brainbench.core.errors import UsageError, check_each, check_name, unknown_name
 from brainbench.stimuli.whiskers.selection import match_whiskers
 from brainbench.stimuli.whiskers.whisker import Whisker
 
@@ -164,9 +164,7 @@ class WhiskerArray:
         """
         own = {"position", "angles"}
         allowed = own | {field.name for field in dataclasses.fields(Whisker)}
-        for key in changes:
-            if key not in allowed:
-                raise unknown_name("whisker property", key, sorted(allowed))
+        check_each("whisker property", changes, sorted(allowed))
         mounted = {key: tuple(map(float, value)) for key, value in changes.items() if key in own}
         rod = {key: value for key, value in changes.items() if key not in own}
         chosen = set(self.select(pattern).mounts)

@@ -62,7 +62,7 @@ def test_the_travel_of_a_step_adds_that_of_the_whisker_and_that_of_the_object():
     ("obstacle", "thickness"),
     [
         (Obstacle((Capsule((0.01, -0.02, -5e-3), (0.01, -0.02, 5e-3), 2e-4),), _moving((0, 4.0, 0))), 0.5),
-        (Obstacle((), _moving((0.0, 4.0, 0)), surface=TETRAHEDRON.transformed(np.eye(3), np.array([0.01, -0.02, 0]))), 1.1),
+        (Obstacle((), _moving((0.0, 4.0, 0)), surface=TETRAHEDRON.transformed(np.eye(3), [0.01, -0.02, 0])), 1.1),
     ],
     ids=["part", "surface"],
 )
