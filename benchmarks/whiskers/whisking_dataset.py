@@ -28,8 +28,8 @@ from brainbench.stimuli.objects.collections import NamedObject, resolve_objects
 from brainbench.stimuli.objects.primitives import box
 from brainbench.stimuli.sweeps import running, shards
 from brainbench.stimuli.sweeps.generation import generate
-from brainbench.stimuli.sweeps.plan import GenerationPlan, GenerationSettings
-from brainbench.stimuli.sweeps.shards import _write_all, prepare_shard
+from brainbench.stimuli.sweeps.plan import GenerationPlan, GenerationSettings, ShardTask
+from brainbench.stimuli.sweeps.shards import BuiltObject, _conditions, _write_all, build_object, shard_tables
 from brainbench.stimuli.sweeps.sweep_scenes import GRIDS
 
 WHISKERS, FRAMES = 30, 110
@@ -118,8 +118,14 @@ def write_set(folder: Path, sweeps: int) -> list[list[str]]:
         lambda tasks, where, workers, done: running.run_pipelined(tasks, where, 1, done),
     )
     # What other processes do while the GPU works is measured by itself.
-    each = [seconds(lambda task=task: prepare_shard(task), 1) for task in plan.shards]
-    ready = [(task, prepare_shard(task)) for task in plan.shards]
+    built = [[build_object(item, task.settings, task.grid) for item in task.objects] for task in plan.shards]
+
+    def tables(task: ShardTask, objects: list[BuiltObject]) -> None:
+        shard_tables(task, plan.array, task.grid.frames.times, [one.hash for one in objects])
+        _conditions(task)
+
+    ready = list(zip(plan.shards, built, strict=True))
+    each = [seconds(lambda pair=pair: tables(*pair), 1) for pair in ready]
     ahead, running._built_ahead = running._built_ahead, lambda tasks, pool, ahead: iter(ready)
     pool, running.worker_pool = running.worker_pool, ThreadPoolExecutor  # type: ignore[assignment]
     try:

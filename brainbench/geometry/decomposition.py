@@ -9,7 +9,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from importlib import metadata
 from importlib.util import find_spec
 from pathlib import Path
@@ -89,7 +89,6 @@ class Decomposition:
     """Deviation of the union of the pieces from the solid inside the mesh [m]."""
     notes: tuple[str, ...]
     """Sentences on what was done and how far the pieces are from the mesh; relative, so scaling keeps them true."""
-    settings: DecompositionSettings = field(default_factory=DecompositionSettings)
     key: str = ""
     """Names what the pieces were computed from: the shape of the mesh, the settings, the versions of the packages."""
     cached: bool = False
@@ -122,7 +121,6 @@ def decompose(mesh: Mesh, settings: DecompositionSettings | None = None) -> Deco
         pieces=placed,
         deviation=Deviation(outward * diagonal, inward * diagonal, int(samples)),
         notes=_notes(unit, settings, len(pieces), (outward, inward, decimated)),
-        settings=settings,
         key=key,
         cached=found is not None,
     )
@@ -226,8 +224,8 @@ def _key(unit: Mesh, settings: DecompositionSettings) -> str:
     return content_hash(_VERSION, unit.content_hash, settings.config(), versions, length=24)
 
 
-def _read(path: Path | None, name: str) -> tuple[tuple[Mesh, ...], Any] | None:
-    if path is None or (stored := read_sealed(path, "decomposition")) is None:
+def _read(path: Path, name: str) -> tuple[tuple[Mesh, ...], Any] | None:
+    if (stored := read_sealed(path, "decomposition")) is None:
         return None
     vertices = np.split(stored["vertices"], np.cumsum(stored["vertex_counts"])[:-1])
     faces = np.split(stored["faces"], np.cumsum(stored["face_counts"])[:-1])

@@ -17,6 +17,7 @@ from brainbench.geometry.mesh import Mesh
 SAMPLES = 4000
 """Points that are looked at in each direction."""
 _NEIGHBOURS = 24
+_SPOTS = 20_000
 _BLOCK = 4_000_000
 
 
@@ -100,11 +101,11 @@ def winding_number(mesh: Mesh, points: ArrayLike) -> NDArray[np.float64]:
 class _Surface:
     """Distances to a surface: near samples choose candidate triangles, whose distance is exact."""
 
-    def __init__(self, mesh: Mesh, rng: np.random.Generator, *, spots: int = 20_000) -> None:
+    def __init__(self, mesh: Mesh, rng: np.random.Generator) -> None:
         from scipy.spatial import KDTree
 
         self._triangles = mesh.vertices[mesh.faces]
-        points, owner = sample_surface(mesh, spots, rng)
+        points, owner = sample_surface(mesh, _SPOTS, rng)
         # Centres as well, so that no small triangle is out of every list.
         self._tree = KDTree(np.concatenate([points, self._triangles.mean(axis=1)]))
         self._owner = np.concatenate([owner, np.arange(len(mesh.faces))])

@@ -102,6 +102,23 @@ class Mesh:
         return float(np.linalg.norm(high - low))
 
     @cached_property
+    def boxes(self) -> NDArray[np.float64]:
+        """Axis-aligned boxes [k, 2, 3] of at most 64 patches of neighbouring triangles: together they hold all of it.
+
+        They follow a concave surface much closer than its bounds do.
+        """
+        corners = self.vertices[self.faces]
+        low, high = corners.min(axis=1), corners.max(axis=1)
+        middle = (low + high) / 2
+        patches = [np.arange(len(corners))]
+        while len(patches) < 64 and len(patches[0]) > 1:
+            # Each is split where its longest side is halved by number.
+            axes = [np.ptp(middle[patch], axis=0).argmax() for patch in patches]
+            ordered = [p[np.argsort(middle[p, axis], kind="stable")] for p, axis in zip(patches, axes, strict=True)]
+            patches = [half for p in ordered for half in (p[: len(p) // 2], p[len(p) // 2 :]) if len(half)]
+        return np.array([[low[patch].min(axis=0), high[patch].max(axis=0)] for patch in patches])
+
+    @cached_property
     def diagnosis(self) -> Diagnosis:
         """Faults of this mesh as a solid."""
         solid = self.to_trimesh()

@@ -31,9 +31,10 @@ class Repair:
 def repair(mesh: Mesh) -> Repair:
     """Remove broken triangles, close cracks and turn every surface outward; nothing is invented.
 
-    Triangles that name a vertex twice and copies of a triangle are removed; on an open mesh, vertices within
-    :data:`MERGE` of the diagonal are merged and tiny cracks of three or four edges are closed; neighbours are made to
-    agree on the outside; closed bodies that are inside out are turned. Larger holes stay: their shape is unknown.
+    Triangles that name a vertex twice, copies of a triangle and vertices of no triangle are removed; on an open mesh,
+    vertices within :data:`MERGE` of the diagonal are merged and tiny cracks of three or four edges are closed;
+    neighbours are made to agree on the outside; closed bodies that are inside out are turned. Larger holes stay: their
+    shape is unknown.
 
     Raises:
         DataError: no triangle is left.
@@ -69,6 +70,11 @@ def _drop(mesh: Mesh, done: list[str]) -> Mesh:
     if len(first) < len(faces):
         done.append(f"{_count(len(faces) - len(first), 'duplicate triangle')} removed")
         faces = faces[first]
+    # Hulls and bounds go through every vertex, whether a triangle names it or not.
+    used, renumbered = np.unique(faces, return_inverse=True)
+    if len(used) < len(mesh.vertices):
+        done.append(f"points without a triangle removed: {len(mesh.vertices) - len(used)}")
+        return Mesh(mesh.vertices[used], renumbered.reshape(-1, 3), mesh.name)
     return mesh if faces is mesh.faces else Mesh(mesh.vertices, faces, mesh.name)
 
 

@@ -71,8 +71,7 @@ def simulate(
         UsageError: the scenes do not fit together, or a name is unknown.
     """
     chosen = _checked(scenes)
-    engine = get_engine(backend) if isinstance(backend, str) else backend
-    fidelity = _resolved(fidelity, chosen, engine)
+    engine, fidelity = resolve(backend, fidelity, chosen)
     path = cache_path(chosen, fidelity, engine) if cache and isinstance(backend, str) else None
     if path is not None and (dataset := read_entry(path)) is not None:
         return dataset
@@ -122,15 +121,17 @@ def prepare(
     the same arguments and waits for the rest.
     """
     chosen = list(scenes)
-    engine = get_engine(backend)
-    fidelity = _resolved(fidelity, chosen, engine)
+    engine, fidelity = resolve(backend, fidelity, chosen)
     if find_entry(cache_path(chosen, fidelity, engine)) is None:
         _begin(engine, chosen, fidelity, progress)
 
 
-def _resolved(fidelity: Fidelity | str | None, scenes: Iterable[Scene], engine: WhiskerEngine) -> Fidelity:
-    """Return a fidelity that says whether whiskers twist."""
-    return Fidelity.of(fidelity).resolved(engine.twists and any(scene.twist for scene in scenes))
+def resolve(
+    backend: WhiskerEngine | str, fidelity: Fidelity | str | None, scenes: Iterable[Scene]
+) -> tuple[WhiskerEngine, Fidelity]:
+    """Return the engine of some scenes, and the fidelity with whether their whiskers twist."""
+    engine = get_engine(backend) if isinstance(backend, str) else backend
+    return engine, Fidelity.of(fidelity).resolved(engine.twists and any(scene.twist for scene in scenes))
 
 
 def _begin(

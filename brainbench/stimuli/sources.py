@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import functools
 import os
-import tomllib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeGuard
@@ -129,13 +128,13 @@ def _stimulus_set(
     """Return what :func:`load_stimulus_set` does of a source that is known to be no file of arrays."""
     if not isinstance(source, (str, os.PathLike)):
         return _select(check_stimulus_set(source), whiskers), "stimulus set"
-    if cache and isinstance(backend, str) and is_packaged(source):
-        found = _kept(source, whiskers, Fidelity.of(fidelity), backend)
-        if found is not None:
-            return found
-    if (recipe := _recipe(source, whiskers)) is not None:
-        from brainbench.stimuli.simulation import simulate
+    from brainbench.stimuli.simulation import read_entry, simulate
 
+    if cache and isinstance(backend, str) and is_packaged(source):
+        kept = find_kept(source, whiskers, Fidelity.of(fidelity), backend)
+        if kept is not None and (shipped := read_entry(kept[0])) is not None:
+            return shipped, kept[1]
+    if (recipe := _recipe(source, whiskers)) is not None:
         dataset = simulate(recipe.scenes, fidelity=fidelity, backend=backend, progress=progress, cache=cache)
         return dataset, recipe.description.strip() or recipe.name
     path = Path(source)
@@ -171,10 +170,9 @@ def is_finished(source: object) -> bool:
 def known_labels(source: object) -> tuple[str, ...] | None:
     """Return the labels of a packaged recipe or a scene file, before its scenes are built; None for anything else."""
     with contextlib.suppress(BrainbenchError, OSError, KeyError, TypeError):
-        if is_packaged(source):
-            return tuple(item["label"] for item in tomllib.loads(recipe_file(source).read_text("utf-8"))["scene"])
-        if isinstance(source, (str, os.PathLike)) and Path(source).suffix == ".toml":
-            return tuple(item["label"] for item in read_toml(Path(source), "scene file")["scene"])
+        path = Path(str(recipe_file(source))) if is_packaged(source) else source
+        if isinstance(path, (str, os.PathLike)) and Path(path).suffix == ".toml":
+            return tuple(item["label"] for item in read_toml(path, "scene file")["scene"])
     return None
 
 
@@ -196,15 +194,6 @@ def prepare_stimuli(
             return
         if isinstance(source, (str, os.PathLike)) and (recipe := _recipe(source, whiskers)) is not None:
             prepare(recipe.scenes, fidelity=fidelity, progress=progress)
-
-
-def _kept(source: str, whiskers: str, fidelity: Fidelity, backend: str) -> tuple[xr.Dataset, str] | None:
-    """Return a stimulus set that the package holds and its description; None without it."""
-    from brainbench.stimuli.simulation import read_entry
-
-    found = find_kept(source, whiskers, fidelity, backend)
-    dataset = None if found is None else read_entry(found[0])
-    return None if found is None or dataset is None else (dataset, found[1])
 
 
 def _recipe(source: str | os.PathLike[str], whiskers: str) -> Recipe | None:

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from brainbench.core.errors import UsageError
 from brainbench.core.progress import Progress
 from brainbench.core.reading.sealed import read_sealed, write_sealed
-from brainbench.stimuli.engines import DEFAULT_ENGINE, get_engine
+from brainbench.stimuli.engines import DEFAULT_ENGINE
 from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.engines.protocol import Job, WhiskerEngine
 from brainbench.stimuli.scenes.scene import Scene
@@ -71,11 +71,10 @@ def record(
     Raises:
         UsageError: the times do not increase, or the backend reports no shapes.
     """
-    from brainbench.stimuli.simulation import cache_path
+    from brainbench.stimuli.simulation import cache_path, resolve
 
     times = np.atleast_1d(np.asarray(times, dtype=float))
-    engine = get_engine(backend) if isinstance(backend, str) else backend
-    fidelity = Fidelity.of(fidelity).resolved(engine.twists and scene.twist)
+    engine, fidelity = resolve(backend, fidelity, [scene])
     jobs = [replace(job, times=times) for job in scene.jobs()]
     path = None
     if cache and isinstance(backend, str):

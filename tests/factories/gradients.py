@@ -7,10 +7,11 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from brainbench.geometry import Mesh
 from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.engines.protocol import Job, StillFollicle, Trace
 from brainbench.stimuli.gradients import GradientRun, JobParameters
-from brainbench.stimuli.objects.obstacle import Obstacle, Part, TriangleMesh
+from brainbench.stimuli.objects.obstacle import Obstacle, Part
 from brainbench.stimuli.whiskers.whisker import Whisker
 
 COARSE = Fidelity(links=8, time_step=1e-4)
@@ -28,9 +29,9 @@ class Swing:
         return position, euler + 0.35 * np.sin(20 * np.pi * times)[:, None] * [1.0, 0.3, 0.4]
 
 
-def touching_job(solid: Part | TriangleMesh, *, friction: float = 0.0, frames: int = 30) -> Job:
+def touching_job(solid: Part | Mesh, *, friction: float = 0.0, frames: int = 30) -> Job:
     """Return the job of a whisker that swings onto a solid, which stands beside its middle."""
-    whole = ((), solid) if isinstance(solid, TriangleMesh) else ((solid,), None)
+    whole = ((), solid) if isinstance(solid, Mesh) else ((solid,), None)
     obstacle = Obstacle(whole[0], surface=whole[1])
     whisker = replace(WHISKER, friction=friction)
     return Job(whisker, Swing(), (obstacle,), np.linspace(1e-3, frames * 1e-3, frames))

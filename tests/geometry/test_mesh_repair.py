@@ -30,6 +30,17 @@ def test_a_sound_mesh_is_left_alone():
     assert (result.done, result.remaining) == ((), ())
 
 
+def test_points_that_no_triangle_names_are_removed_so_that_no_hull_reaches_them():
+    mesh = _ball()
+    strayed = Mesh(np.vstack([[5.0, 0.0, 0.0], mesh.vertices]), mesh.faces + 1, mesh.name)
+    result = repair(strayed)
+    np.testing.assert_array_equal(result.mesh.hull().bounds, mesh.bounds)
+    assert result.done == ("points without a triangle removed: 1",)
+    # Nor those of triangles without an area, which go first.
+    slim = Mesh(strayed.vertices, np.vstack([strayed.faces, [[0, 0, 1]]]), mesh.name)
+    np.testing.assert_array_equal(repair(slim).mesh.hull().bounds, mesh.bounds)
+
+
 def test_an_inside_out_mesh_is_diagnosed_and_turned():
     inward = _flipped(_ball())
     assert "inside out" in str(inward.diagnosis)

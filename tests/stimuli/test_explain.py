@@ -7,6 +7,7 @@ import pytest
 import xarray as xr
 
 from brainbench.core.errors import DataError, UsageError
+from brainbench.geometry import Mesh
 from brainbench.stimuli import simulation
 from brainbench.stimuli.engines import reach as _reach
 from brainbench.stimuli.engines import stepping
@@ -16,7 +17,7 @@ from brainbench.stimuli.engines.mujoco.model import build_model
 from brainbench.stimuli.engines.reach import Reach
 from brainbench.stimuli.explain import Explanation
 from brainbench.stimuli.motion.trajectories import Still, Translation
-from brainbench.stimuli.objects.obstacle import Obstacle, TriangleMesh
+from brainbench.stimuli.objects.obstacle import Obstacle
 from brainbench.stimuli.objects.placed_object import PlacedObject
 from brainbench.stimuli.objects.primitives import box, rodgers_solid, sphere
 from brainbench.stimuli.scenes.recipes import get_recipe
@@ -125,7 +126,7 @@ def test_a_whisker_inside_the_bounds_of_a_surface_but_far_from_its_triangles_doe
     quads = np.array([[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]])
     faces = np.vstack([quads[:, :3], quads[:, [0, 2, 3]]])
     vertices = np.concatenate([corners * size + place for size, place in _RING])
-    ring = TriangleMesh(vertices, np.concatenate([faces + 8 * bar for bar in range(4)]))
+    ring = Mesh(vertices, np.concatenate([faces + 8 * bar for bar in range(4)]))
     (job,) = _scene("ring", *bars, array=ARRAY.select("C2")).jobs()
     times = np.array([0.0, 1e-3])
     base = np.tile(np.zeros(3), (2, 1))

@@ -7,7 +7,7 @@ import pytest
 
 from brainbench.core.errors import UsageError
 from brainbench.core.rotations import euler_matrix
-from brainbench.stimuli import whisker_shapes
+from brainbench.stimuli import simulation
 from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.engines.mujoco.engine import MujocoWhiskerEngine
 from brainbench.stimuli.engines.protocol import base_rotation
@@ -74,7 +74,7 @@ def test_shapes_come_from_the_cache_and_from_nowhere_else(monkeypatch, tmp_path,
             runs.append(len(jobs))
             return super().run(jobs, *args, **options)
 
-    monkeypatch.setattr(whisker_shapes, "get_engine", lambda name: Counted())
+    monkeypatch.setattr(simulation, "get_engine", lambda name: Counted())
     scene = Scene("air", ARRAY, whisking=Whisking())
     first = _record(scene, [0.002, 0.004], cache=True)
     second = _record(scene, [0.002, 0.004], cache=True)

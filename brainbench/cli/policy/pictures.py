@@ -79,7 +79,7 @@ class Stage:
 def write_video(path: Path, frames: Sequence[NDArray[np.uint8]], size: tuple[int, int], rate: float) -> None:
     """Write frames to an ``.mp4`` or ``.gif``."""
     style, sample = Style(size=size, frames_per_second=rate), frames[:: max(1, len(frames) // 4)]
-    write_film(path, frames, len(frames), style, palette_from=sample)
+    write_film(path, frames, style, palette_from=sample)
 
 
 def write_strip(path: Path, frames: Sequence[NDArray[np.uint8]], times: Sequence[float]) -> None:

@@ -100,13 +100,14 @@ def plot(
     """Plot forces or moments of every whisker on the 5 × 7 layout, to one scale, contacts shaded."""
     import math
 
+    from brainbench.core.errors import check_name
     from brainbench.core.figures.style import check_format
-    from brainbench.stimuli.figures.traces import FORMATS, check_channel
+    from brainbench.stimuli.figures.traces import FORMATS, QUANTITIES
     from brainbench.stimuli.figures.traces import plot as draw
     from brainbench.stimuli.sources import load_stimulus_set
 
     check_format(out, FORMATS)
-    check_channel(channel)
+    check_name("channel", channel, QUANTITIES)
     with progress_bar() as progress:
         dataset, _ = load_stimulus_set(source, whiskers=whiskers, fidelity=fidelity, backend=backend, progress=progress)
     low = -math.inf if start is None else start * 1e-3

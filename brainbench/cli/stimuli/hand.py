@@ -139,6 +139,4 @@ def _geometry(mesh: Any) -> Any:
 
 def _surface(solid: Any) -> Any:
     """Return the mesh of a solid."""
-    from brainbench.geometry import Mesh
-
-    return solid.mesh if solid.surface is None else Mesh(solid.surface.vertices, solid.surface.faces)
+    return solid.mesh if solid.surface is None else solid.surface

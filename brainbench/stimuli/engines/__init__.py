@@ -9,7 +9,7 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING
 
-from brainbench.core.errors import UsageError, listing, unknown_name
+from brainbench.core.errors import UsageError, check_name, listing
 
 if TYPE_CHECKING:
     from brainbench.stimuli.engines.protocol import WhiskerEngine
@@ -40,16 +40,15 @@ def get_engine(name: str, *, device: str | None = None, retry: int | None = None
     Args:
         name: one of :func:`list_engines`.
         device: ``cpu`` or ``cuda``; the engine's own choice when None.
-        retry: as :attr:`WhiskerEngine.retry`, for engines that retry; the engine's own choice when None.
+        retry: as :attr:`WhiskerEngine.retry`; the engine's own choice when None.
 
     Raises:
         UsageError: there is no such engine, or it does not run on the device.
     """
-    if name not in _ENGINES:
-        raise unknown_name("backend", name, list_engines())
+    check_name("backend", name, list_engines())
     module, symbol = _ENGINES[name]
     engine: type[WhiskerEngine] = getattr(import_module(module), symbol)
     if device is not None and device not in engine.devices:
         raise UsageError(f"The backend {name!r} does not run on {device!r}; it runs on {listing(engine.devices)}.")
-    options = {"device": device, "retry": retry if engine.retries else None}
+    options = {"device": device, "retry": retry}
     return engine(**{key: value for key, value in options.items() if value is not None})

@@ -59,9 +59,7 @@ def move_obstacle(
     middle = obstacle.bounds.mean(axis=0)
     if obstacle.motion is not None:
         return replace(obstacle, motion=_MovedMotion(obstacle.motion, rotation, way, middle, start))
-    about = middle - rotation @ middle + way
-    parts = tuple(part.moved(rotation, about) for part in obstacle.parts)
-    return replace(obstacle, parts=parts, surface=obstacle.surface and obstacle.surface.moved(rotation, about))
+    return obstacle.moved(rotation, middle - rotation @ middle + way)
 
 
 class _MovedMotion:

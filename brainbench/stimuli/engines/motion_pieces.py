@@ -85,43 +85,6 @@ def side_of(count: NDArray[np.int32] | int) -> NDArray[np.float64]:
     return np.minimum(1e-5, KNOT / (8 * np.asarray(count, dtype=float)))
 
 
-def cut(
-    path: Path, start: float, stop: float, *, step: float, tail: float, finest: float | None, what: str
-) -> MotionPieces:
-    """Cut a motion from ``start`` to ``stop`` (s) into pieces, for time steps of ``step`` (s).
-
-    Args:
-        path: the motion; not evaluated before 0 when it starts at 0 or later.
-        start, stop, step: as above.
-        tail: time (s) behind ``stop`` at whose end the last step may look at the pose.
-        finest: shortest period (s) of anything in it, None when unknown.
-        what: its name in messages.
-
-    Raises:
-        UsageError: the motion is not finite, its position jumps, or the finest pieces do not follow it.
-    """
-    cells = max(1, math.ceil((stop - start) / KNOT - 1e-9)) + max(1, math.ceil(tail / KNOT - 1e-9))
-    wanted = KNOT / min(step, KNOT / LOOKS) if finest is None else 16 * KNOT / finest
-    looks = int(2 ** math.ceil(math.log2(min(max(wanted, 4), 4 * MOST_PIECES))))
-    motion = _Sampled(path, start, what)
-    errors, speed = np.empty((2, cells)), 0.0
-    some = max(1, _AT_ONCE // looks)
-    for first in range(0, cells, some):
-        which = np.arange(first, min(first + some, cells))
-        place, rate, fastest = motion.errors(which, 1, looks)
-        errors[:, which] = place[:, 0], rate[:, 0]
-        speed = max(speed, fastest)
-    limit = SPEED_ERROR * speed + _SLOW
-    count = np.ones(cells, dtype=np.int32)
-    needed = count.copy()
-    left = np.flatnonzero((errors[0] > PLACE_ERROR) | (errors[1] > limit))
-    some = _AT_ONCE // (4 * MOST_PIECES)
-    for first in range(0, len(left), some):
-        which = left[first : first + some]
-        count[which], needed[which] = _refine(motion, which, max(looks, LOOKS), limit)
-    return MotionPieces(count, needed, moves=speed > 0)
-
-
 def _poses(
     found: tuple[ArrayLike, ArrayLike], times: NDArray[np.float64], width: int, what: str
 ) -> tuple[NDArray, NDArray]:
@@ -165,16 +128,16 @@ class Cutting:
     """Longest step of all whiskers that may share a motion: the last step looks at the pose so far behind ``stop``."""
 
     def follicle(self, follicle: Follicle, size: float) -> MotionPieces:
-        """Cut the motion of a base whose whisker has the arc length ``size`` (m); errors as :func:`cut`."""
+        """Cut the motion of a base whose whisker has the arc length ``size`` (m); errors as :meth:`cut`."""
 
         def path(times: NDArray[np.float64]) -> NDArray[np.float64]:
             position, euler = _poses(follicle.pose(times), times, 3, "the base of a whisker")
             return np.concatenate([position, euler * size], axis=1) * MILLI
 
-        return self._cut(path, follicle, "the base of a whisker")
+        return self.cut(path, getattr(follicle, "finest", None), "the base of a whisker")
 
     def obstacle(self, obstacle: Obstacle, anchor: NDArray[np.float64]) -> MotionPieces:
-        """Cut the motion of an obstacle, by that of its point ``anchor`` [3] (m) and its turns; errors as above."""
+        """Cut the motion of an obstacle, by its point ``anchor`` [3] (m) and its turns; errors as :meth:`cut`."""
         pose = carried_pose(obstacle.motion, anchor)
         size = float(np.linalg.norm(obstacle.bounds - anchor, axis=1).max())
 
@@ -182,11 +145,37 @@ class Cutting:
             place, turn = pose(times)
             return np.concatenate([place, turn.reshape(-1, 9) * size], axis=1) * MILLI
 
-        return self._cut(path, obstacle.motion, "an object")
+        return self.cut(path, getattr(obstacle.motion, "finest", None), "an object")
 
-    def _cut(self, path: Path, motion: object, what: str) -> MotionPieces:
-        finest = getattr(motion, "finest", None)
-        return cut(path, self.start, self.stop, step=self.step, tail=self.longest_step, finest=finest, what=what)
+    def cut(self, path: Path, finest: float | None, what: str) -> MotionPieces:
+        """Cut a motion, which is not evaluated before 0 when it starts at 0 or later; ``what`` names it in messages.
+
+        ``finest`` is the shortest period (s) of anything in it, None when unknown.
+
+        Raises:
+            UsageError: the motion is not finite, its position jumps, or the finest pieces do not follow it.
+        """
+        spans = self.stop - self.start, self.longest_step
+        cells = sum(max(1, math.ceil(span / KNOT - 1e-9)) for span in spans)
+        wanted = KNOT / min(self.step, KNOT / LOOKS) if finest is None else 16 * KNOT / finest
+        looks = int(2 ** math.ceil(math.log2(min(max(wanted, 4), 4 * MOST_PIECES))))
+        motion = _Sampled(path, self.start, what)
+        errors, speed = np.empty((2, cells)), 0.0
+        some = max(1, _AT_ONCE // looks)
+        for first in range(0, cells, some):
+            which = np.arange(first, min(first + some, cells))
+            place, rate, fastest = motion.errors(which, 1, looks)
+            errors[:, which] = place[:, 0], rate[:, 0]
+            speed = max(speed, fastest)
+        limit = SPEED_ERROR * speed + _SLOW
+        count = np.ones(cells, dtype=np.int32)
+        needed = count.copy()
+        left = np.flatnonzero((errors[0] > PLACE_ERROR) | (errors[1] > limit))
+        some = _AT_ONCE // (4 * MOST_PIECES)
+        for first in range(0, len(left), some):
+            which = left[first : first + some]
+            count[which], needed[which] = _refine(motion, which, max(looks, LOOKS), limit)
+        return MotionPieces(count, needed, moves=speed > 0)
 
 
 @dataclass(frozen=True, eq=False)

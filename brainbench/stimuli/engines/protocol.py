@@ -152,7 +152,7 @@ class WhiskerEngine(ABC):
     """Device it runs on, one of :attr:`devices`."""
     retry: int = 1
     """Divisor of the time step for whiskers that cannot be trusted, which are then simulated again, and those left once
-    more with steps divided by twice this; 1 leaves them ``unstable``. Only engines that :attr:`retries` use it."""
+    more with steps divided by twice this; 1 leaves them ``unstable``. Of the engines ``rod`` uses it."""
 
     name: ClassVar[str]
     """Name under which :func:`brainbench.stimuli.engines.get_engine` finds it."""
@@ -166,8 +166,6 @@ class WhiskerEngine(ABC):
     """True when whiskers can twist about their axis; in other engines they only bend."""
     surfaces: ClassVar[bool] = False
     """True when it collides the exact surface of obstacles that have one; others collide convex parts."""
-    retries: ClassVar[bool] = False
-    """True when it simulates whiskers that cannot be trusted again with finer steps."""
     batches: ClassVar[bool] = False
     """True when :meth:`run_sweeps` simulates many passive sweeps at once, without a scene for each."""
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brainbench.core.rotations import to_matrices
-from brainbench.geometry import Mesh, winding_number
+from brainbench.geometry import winding_number
 from brainbench.stimuli.objects.obstacle import Obstacle
 from brainbench.stimuli.whiskers.chain import Chain
 from brainbench.stimuli.whiskers.whisker import Whisker
@@ -111,7 +111,7 @@ def _encloses(obstacle: Obstacle, point: NDArray[np.float64]) -> bool:
     surface = obstacle.surface
     if surface is None or ((point < obstacle.bounds[0]) | (point > obstacle.bounds[1])).any():
         return False
-    return bool(winding_number(Mesh(surface.vertices, surface.faces.astype(np.int64)), point)[0] > 0.5)
+    return bool(winding_number(surface, point)[0] > 0.5)
 
 
 def touched(obstacle: Obstacle, *, surfaces: bool) -> Obstacle:

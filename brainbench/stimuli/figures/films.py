@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from brainbench.core.errors import DataError, missing_dependency
 from brainbench.core.files import atomic_path
-from brainbench.core.progress import Progress
 
 if TYPE_CHECKING:
     from brainbench.stimuli.figures.scenes import Style
@@ -23,19 +22,12 @@ _UNCHANGED = 255
 
 
 def write_film(
-    path: Path,
-    frames: Iterable[NDArray[np.uint8]],
-    count: int,
-    style: Style,
-    *,
-    palette_from: Sequence[NDArray[np.uint8]] = (),
-    progress: Progress | None = None,
+    path: Path, frames: Iterable[NDArray[np.uint8]], style: Style, *, palette_from: Sequence[NDArray[np.uint8]] = ()
 ) -> Path:
     """Write frames [H, W, 3] to a ``.gif`` that repeats for ever, or to an ``.mp4`` (H.264); the suffix chooses.
 
     Args:
         path, frames: file to write, and pictures of one size.
-        count, progress: ``progress(done, count, what)`` is called after each frame.
         style: size and frames per second.
         palette_from: frames whose colours the 255 colours of a GIF are chosen from.
 
@@ -44,7 +36,7 @@ def write_film(
     """
     write = _write_gif if path.suffix.lower() == ".gif" else _write_mp4
     with atomic_path(path) as temporary:
-        write(temporary, _counted(frames, count, progress), style, palette_from)
+        write(temporary, frames, style, palette_from)
     return path
 
 
@@ -58,13 +50,6 @@ def require_writer(suffix: str) -> None:
             import_module(module)
         except ImportError as error:
             raise missing_dependency(package, extra="report", purpose=purpose) from error
-
-
-def _counted(frames: Iterable[Any], count: int, progress: Progress | None) -> Iterator[Any]:
-    for done, frame in enumerate(frames, start=1):
-        yield frame
-        if progress is not None:
-            progress(done, count, "drawing frames")
 
 
 def _write_gif(path: Path, frames: Iterable[NDArray[np.uint8]], style: Style, palette_from: Sequence[Any]) -> None:

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from brainbench.core.errors import UsageError, check_name, listing
 from brainbench.core.figures.style import check_format
-from brainbench.core.progress import Progress
+from brainbench.core.progress import Progress, track
 from brainbench.core.reading.ranges import check_fields
 from brainbench.stimuli.engines import DEFAULT_ENGINE
 from brainbench.stimuli.engines.fidelity import Fidelity
@@ -130,6 +130,7 @@ class Picture:
         return self._cached
 
     def _whiskers(self, index: int, lens: Lens) -> Triangles:
+        from matplotlib import colormaps
         from matplotlib.colors import to_rgb
 
         found = []
@@ -146,16 +147,11 @@ class Picture:
             thinnest = _THINNEST * self.style.supersampling * lens.pixel_size(line)
             colors = np.broadcast_to(row, line.shape)
             if self.style.color == "moment" and known:
-                colors = self._moment_colors(bending)
+                colors = colormaps[MOMENT_MAP](np.clip(bending / self.moment_limit, 0, 1))[:, :3]
             found.append(tube(line, np.maximum(radii, thinnest), colors))
             ink = 0.45 * row if self.style.color == "row" else np.full(3, 0.25)
             found.append(ball(points[0], 1.6 * max(radii[0], float(thinnest[0])), ink))
         return Triangles.joined(found)
-
-    def _moment_colors(self, moments: NDArray[np.float64]) -> NDArray[np.float64]:
-        from matplotlib import colormaps
-
-        return colormaps[MOMENT_MAP](np.clip(moments / self.moment_limit, 0, 1))[:, :3]
 
     @cached_property
     def _framed(self) -> NDArray[np.float64]:
@@ -238,9 +234,9 @@ def render(
     annotation = Annotation(picture)
     if suffix == ".png":
         return annotation.save(path)
-    frames = (annotation.frame(index) for index in range(len(times)))
+    frames = (annotation.frame(index) for index in track(range(len(times)), "drawing frames", progress))
     sample = [annotation.frame(index) for index in {0, len(times) // 2, len(times) - 1}] if suffix == ".gif" else []
-    return write_film(path, frames, len(times), style, palette_from=sample, progress=progress)
+    return write_film(path, frames, style, palette_from=sample)
 
 
 def still_time(scene: Scene) -> float:

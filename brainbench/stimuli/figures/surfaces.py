@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from brainbench.core.rotations import euler_matrix, to_matrices
-from brainbench.geometry import Mesh
+from brainbench.geometry import Mesh, convex_hull
 from brainbench.stimuli.figures.raster import Triangles
 from brainbench.stimuli.motion.trajectories import Path, Spin
 from brainbench.stimuli.objects.obstacle import Box, Capsule, ConvexPart, Cylinder, Part, RigidMotion, Sphere
@@ -53,7 +53,7 @@ def object_surface(item: PlacedObject) -> DrawnSurface:
     """Return the surface of an object: its mesh, or what whiskers touch when it has none."""
     obstacle = item.obstacle()
     if item.solid.mesh is None and obstacle.surface is not None:
-        meshes = [Mesh(obstacle.surface.vertices, obstacle.surface.faces.astype(np.int64))]
+        meshes = [obstacle.surface]
     elif item.solid.mesh is None:
         meshes = [part_mesh(part) for part in obstacle.parts]
     else:
@@ -88,7 +88,7 @@ def part_mesh(part: Part) -> Mesh:
             solid.apply_transform(align_vectors([0.0, 0.0, 1.0], along))
             solid.apply_translation(np.add(part.start, part.end) / 2)
         case ConvexPart():
-            return Mesh(part.vertices, np.array([[0, 1, 2]])).hull()
+            return convex_hull(part.vertices)
     return Mesh(solid.vertices, solid.faces)
 
 

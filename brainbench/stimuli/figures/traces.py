@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brainbench.core.contracts import CHANNELS, GRID_SHAPE, check_stimulus_set
-from brainbench.core.errors import UsageError, check_name, unknown_name
+from brainbench.core.errors import UsageError, check_name, choose_name
 from brainbench.core.figures.style import INK, PALE, check_format, new_figure, save_figure
 from brainbench.stimuli.figures.canvas import round_up
 from brainbench.stimuli.whiskers.selection import ROWS
@@ -66,31 +66,24 @@ def plot(
     check_stimulus_set(dataset)
     path = Path(out)
     check_format(path, FORMATS)
-    check_channel(channel)
+    check_name("channel", channel, QUANTITIES)
     cells = list(zip(dataset["row"].values.tolist(), dataset["col"].values.tolist(), strict=True))
     if len(set(cells)) < len(cells):
         raise UsageError("The stimulus set has two whiskers in one cell; select one side (or one animal) first.")
     labels = [str(label) for label in dataset["stimulus"].values]
-    if stimulus is not None and stimulus not in labels:
-        raise unknown_name("stimulus", stimulus, labels)
+    chosen = labels if stimulus is None else [choose_name("stimulus", stimulus, labels)]
     dataset = _within(dataset, window)
     values = _values(dataset, channel)
     largest = float(np.nanmax(np.abs(values), initial=0.0)) or 1.0
     # Each side ends where its values end, but never so close to 0 that its number would overlap that of 0.
     low, high = (max(float(np.nanmax(side * values, initial=0.0)), 0.2 * largest) for side in (-1, 1))
     limits = (0.0 if channel in _UNITS else -round_up(low), round_up(high))
-    chosen = labels if stimulus is None else [stimulus]
     several = len(chosen) > 1
     names = [re.sub(r"[^\w.+-]+", "_", label) for label in chosen]
     paths = [path.with_name(f"{path.stem}-{name}{path.suffix}") if several else path for name in names]
     for label, one in zip(chosen, paths, strict=True):
         save_figure(_figure(dataset.isel(stimulus=labels.index(label)), label, channel, limits, size), one)
     return tuple(paths)
-
-
-def check_channel(channel: str) -> None:
-    """Raise a :class:`UsageError` unless ``channel`` is one of :data:`QUANTITIES`."""
-    check_name("channel", channel, QUANTITIES)
 
 
 def _within(dataset: xr.Dataset, window: tuple[float, float] | None) -> xr.Dataset:

@@ -18,29 +18,22 @@ _SHOWN = 6
 """Shapes that are drawn of a trial."""
 
 
-def draw_fit(trial: Trial, result: FitResult, path: str | os.PathLike[str], *, index: int = 0) -> Path:
-    """Draw measured and predicted values above, and residuals in standard deviations below.
-
-    Args:
-        trial: the trial that was fitted.
-        result: its result.
-        path: ``.png``, ``.svg`` or ``.pdf``.
-        index: which of the trials of the result it is.
-    """
+def draw_fit(trial: Trial, result: FitResult, path: str | os.PathLike[str]) -> Path:
+    """Draw measured and predicted values of the first trial above, and residuals in standard deviations below."""
     figure, axes = panels(2, 2 if trial.of_shapes else 1, (9.5, 6.2))
     if trial.of_shapes:
-        _draw_shapes(axes, trial, result, index)
+        _draw_shapes(axes, trial, result)
     else:
-        _draw_wrenches(axes[:, 0], trial, result, index)
+        _draw_wrenches(axes[:, 0], trial, result)
     words = ", ".join(f"{one.name} {one.value:.3g} {one.unit}".strip() for one in result.estimates)
     figure.suptitle(f"{words}  ({result.status})", fontsize=10, color=INK)
     return save_figure(figure, Path(path), dpi=150)
 
 
-def _draw_wrenches(axes: Any, trial: Trial, result: FitResult, index: int) -> None:
+def _draw_wrenches(axes: Any, trial: Trial, result: FitResult) -> None:
     """Draw the channels that were measured, each over its largest value."""
     times = 1e3 * trial.job.times
-    values, predicted = trial.measured["wrench"].values, result.predicted[index]
+    values, predicted = trial.measured["wrench"].values, result.predicted[0]
     for column, name in enumerate(trial.channels):
         if not np.nan_to_num(values[:, column]).any():
             continue
@@ -49,17 +42,17 @@ def _draw_wrenches(axes: Any, trial: Trial, result: FitResult, index: int) -> No
         colour = COLORS[column % len(COLORS)]
         axes[0].plot(times, values[:, column] / size, ".", ms=3.5, color=colour, alpha=0.6, label=f"{name} / {unit}")
         axes[0].plot(times, predicted[:, column] / size, color=colour, lw=1.1)
-        axes[1].plot(times, result.residuals[index][:, column] / result.noise[name], ".", ms=3.5, color=colour)
+        axes[1].plot(times, result.residuals[0][:, column] / result.noise[name], ".", ms=3.5, color=colour)
     axes[0].set(ylabel="measured (dots) and fitted", xlabel="time (ms)")
     axes[0].legend(frameon=False, fontsize=8.5, ncol=3)
     _noise_band(axes[1], "time (ms)")
 
 
-def _draw_shapes(axes: Any, trial: Trial, result: FitResult, index: int) -> None:
+def _draw_shapes(axes: Any, trial: Trial, result: FitResult) -> None:
     """Draw some shapes, residuals over time and along the whisker, and their distribution."""
     from scipy.interpolate import CubicSpline
 
-    points, joints = 1e3 * trial.measured["shape"].values, 1e3 * result.predicted[index]
+    points, joints = 1e3 * trial.measured["shape"].values, 1e3 * result.predicted[0]
     nodes = build_chain(result.whisker, joints.shape[1] - 1).nodes
     s = np.linspace(0, nodes[-1], PER_LINK * joints.shape[1])
     picked = np.unique(np.linspace(0, len(points) - 1, _SHOWN).round().astype(int))
@@ -69,7 +62,7 @@ def _draw_shapes(axes: Any, trial: Trial, result: FitResult, index: int) -> None
         axes[0, 0].plot(curve[:, 0], curve[:, 1], color=colour, lw=1, label=f"{1e3 * trial.job.times[frame]:.1f} ms")
     axes[0, 0].set(xlabel="x (mm)", ylabel="y (mm)", title="traced (dots) and fitted shapes")
     axes[0, 0].legend(frameon=False, fontsize=8)
-    scaled = result.residuals[index] / result.noise["shape"]
+    scaled = result.residuals[0] / result.noise["shape"]
     known = scaled[np.isfinite(scaled)]
     axes[0, 1].hist(known, bins=40, density=True, color=COLORS[0], alpha=0.5)
     x = np.linspace(-4, 4, 200)

@@ -17,7 +17,7 @@ from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.engines.planarity import stays_in_plane
 from brainbench.stimuli.engines.protocol import Job, Trace, base_rotation
 from brainbench.stimuli.engines.reach import reachable
-from brainbench.stimuli.engines.rod.adjoint import OutputDerivatives, RecordingSolver
+from brainbench.stimuli.engines.rod.adjoint import RecordingSolver
 from brainbench.stimuli.engines.rod.differences import (
     Numbers,
     PackedPlaces,
@@ -251,7 +251,7 @@ class GradientRun:
         given: list[Given] = [[None] * count if some is None else some for some in outputs]
         by_job = np.zeros((count, len(self.values)))
         events: dict[int, ContactEvents] = {}
-        passes = _at_once(lambda group: group.solver.reverse(self._outputs(group, given)), self._groups)
+        passes = _at_once(lambda group: group.solver.reverse(*self._outputs(group, given)), self._groups)
         for group, found in zip(self._groups, passes, strict=True):
             for row, index in enumerate(group.indices):
                 trace = self.traces[index]
@@ -296,7 +296,8 @@ class GradientRun:
                 found[index] = Tangents(*(part if trusted else np.full_like(part, np.nan) for part in parts))
         return [found[index] for index in range(len(self.jobs))]
 
-    def _outputs(self, group: _Group, given: Sequence[Given]) -> OutputDerivatives:
+    def _outputs(self, group: _Group, given: Sequence[Given]) -> list[NDArray[np.float64]]:
+        """Return the arguments of :meth:`RecordingSolver.reverse`; what is not given is zero."""
         frames, nodes = len(group.packed.tasks[0].job.times), group.solver.capacity + 1
         shapes = ((frames, 6), (frames, nodes, 3), (frames, 6))
         arrays = [np.zeros((len(group.indices), *shape)) for shape in shapes]
@@ -305,7 +306,7 @@ class GradientRun:
                 value = some[index]
                 if value is not None:
                     array[row][tuple(slice(n) for n in np.shape(value))] = value
-        return OutputDerivatives(*arrays)
+        return arrays
 
 
 def _at_once(function: Callable[[T], R], items: Sequence[T]) -> list[R]:

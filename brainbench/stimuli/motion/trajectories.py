@@ -151,7 +151,13 @@ class _SteadyMotion(_Motion):
 
     def _moved(self, times: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the integral [n, 3] of the velocity since t = 0."""
-        return _smooth_path(times, self.onset)[:, None] * np.array(self.velocity)
+        times = np.asarray(times, dtype=float)
+        way = np.maximum(times - self.onset, 0.0)
+        if self.onset > 0:
+            u = np.clip(times / self.onset, 0.0, 1.0)
+            # Integral of the quintic; it is ½ at u = 1, so half of the onset is lost against full speed.
+            way = self.onset * (u**6 - 3 * u**5 + 2.5 * u**4) + way
+        return way[:, None] * np.array(self.velocity)
 
 
 class Translation(_SteadyMotion):
@@ -285,13 +291,3 @@ def smooth_step(times: NDArray[np.float64], duration: float) -> NDArray[np.float
     u = np.clip(np.asarray(times, dtype=float) / duration, 0.0, 1.0)
     # Quintic: velocity and acceleration are 0 at both ends, so no step of the acceleration makes whiskers ring.
     return u**3 * (u * (6 * u - 15) + 10)
-
-
-def _smooth_path(times: NDArray[np.float64], onset: float) -> NDArray[np.float64]:
-    """Return the integral [n] (s) of a speed that grows from 0 to 1 during ``onset`` (s) as :func:`smooth_step`."""
-    times = np.asarray(times, dtype=float)
-    if onset == 0:
-        return np.maximum(times, 0.0)
-    u = np.clip(times / onset, 0.0, 1.0)
-    # Integral of that quintic; it is ½ at u = 1, so half of the onset is lost against full speed.
-    return onset * (u**6 - 3 * u**5 + 2.5 * u**4) + np.maximum(times - onset, 0.0)

@@ -19,7 +19,7 @@ from brainbench.core.reading.regular import readable
 from brainbench.geometry import Mesh
 from brainbench.stimuli.objects.mesh_solids import mesh_solid, shape_solid
 from brainbench.stimuli.objects.procedural import DETAIL, describe_family, list_families, make
-from brainbench.stimuli.objects.solid import Solid, to_surface
+from brainbench.stimuli.objects.solid import Solid
 
 PROCEDURAL_24 = (
     "arch", "basket", "bolt", "bottle", "bowl", "brick", "chair", "cone", "cross", "cylinder", "dumbbell", "ellipsoid",
@@ -136,7 +136,7 @@ def _make(family: str, seed: int, detail: int, collision: str | None) -> Solid:
     if collision != SURFACE:
         return shape_solid(shape, diagonal=DIAGONAL, collision=collision)
     mesh = Mesh(shape.mesh.vertices, shape.mesh.faces, f"{family}-{seed}")
-    return Solid(mesh.name, (), mesh, (), {"mesh": mesh.content_hash}, to_surface(mesh)).to_diagonal(DIAGONAL)
+    return Solid(mesh.name, (), mesh, (), {"mesh": mesh.content_hash}, mesh).to_diagonal(DIAGONAL)
 
 
 def _detail(family: str, seed: int) -> int:

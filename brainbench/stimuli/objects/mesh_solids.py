@@ -11,7 +11,7 @@ from brainbench.core.files import content_hash
 from brainbench.geometry import DecompositionSettings, Mesh, decompose, deviation, load_mesh, repair
 from brainbench.stimuli.objects.obstacle import ConvexPart
 from brainbench.stimuli.objects.procedural import Shape
-from brainbench.stimuli.objects.solid import Solid, to_surface
+from brainbench.stimuli.objects.solid import Solid
 
 _LOG = logging.getLogger(__name__)
 
@@ -81,7 +81,7 @@ def shape_solid(
         )
     parts = tuple(ConvexPart(part.vertices) for part in shape.parts)
     origin = {"mesh": mesh.content_hash, "parts": content_hash([*shape.part_points])}
-    return Solid(name, parts, mesh, notes, origin, to_surface(mesh)).to_diagonal(diagonal)
+    return Solid(name, parts, mesh, notes, origin, mesh).to_diagonal(diagonal)
 
 
 def touchable(mesh: Mesh, collision: str, settings: DecompositionSettings | None) -> Solid:
@@ -98,7 +98,7 @@ def touchable(mesh: Mesh, collision: str, settings: DecompositionSettings | None
     if any(_is_concave(piece, hull) for piece, hull in zip(pieces, hulls, strict=True)):
         what = "the mesh" if collision == "hull" else "its pieces"
         notes = (f"whiskers touch the convex hull of {what}: concavities are filled",)
-    surface = to_surface(hulls[0]) if collision == "hull" else None
+    surface = hulls[0] if collision == "hull" else None
     return Solid(mesh.name, tuple(ConvexPart(hull.vertices) for hull in hulls), mesh, notes, surface=surface)
 
 
@@ -112,11 +112,11 @@ def _exact(mesh: Mesh) -> Solid:
     # The parts of a convex mesh do not tell a shallow dent, which the surface has.
     origin, hull = {"mesh": mesh.content_hash, "collision": "exact"}, mesh.hull()
     if not _is_concave(mesh, hull):
-        return Solid(mesh.name, (ConvexPart(hull.vertices),), mesh, (), origin, to_surface(mesh))
+        return Solid(mesh.name, (ConvexPart(hull.vertices),), mesh, (), origin, mesh)
     notes = (
         f"whiskers touch the {len(mesh.faces)} triangles of this concave mesh themselves: that takes the backend 'rod'",
     )
-    return Solid(mesh.name, (), mesh, notes, origin, to_surface(mesh))
+    return Solid(mesh.name, (), mesh, notes, origin, mesh)
 
 
 def _is_concave(mesh: Mesh, hull: Mesh) -> bool:

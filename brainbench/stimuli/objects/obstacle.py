@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from brainbench.core.errors import UsageError, check_name
 from brainbench.core.reading.ranges import check_fields
 from brainbench.core.rotations import from_matrices, to_matrices
+from brainbench.geometry import Mesh
 
 RigidMotion = Callable[[NDArray[np.float64]], tuple[NDArray[np.float64], NDArray[np.float64]]]
 """Times [n] (s) → positions [n, 3] (m, world) and unit quaternions [n, 4] (w, x, y, z), body to world."""
@@ -22,20 +23,24 @@ Vector = tuple[float, float, float]
 
 
 @dataclass(frozen=True, eq=False)
-class _Polyhedron:
-    """Base of the bodies that their vertices describe."""
+class ConvexPart:
+    """The convex hull of some points that do not lie in one plane."""
 
     vertices: NDArray[np.float64]
-    """[m, 3] (m)."""
+    """[m, 3] (m), at least four."""
 
-    def _checked_points(self, kind: str) -> NDArray[np.float64]:
-        """Check the vertices, keep a copy of them that cannot be written, and return it."""
+    def __post_init__(self) -> None:
         points = np.array(self.vertices, dtype=float)
         if points.ndim != 2 or points.shape[1] != 3 or len(points) < 4 or not np.isfinite(points).all():
-            raise UsageError(f"A {kind} needs at least four finite vertices [m, 3]; received shape {points.shape}.")
+            raise UsageError(
+                f"A convex part needs at least four finite vertices [m, 3]; received shape {points.shape}."
+            )
+        # Singular values of centred points are their extents along the principal axes; the last is the thickness.
+        spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
+        if spread[2] < 1e-6 * spread[0]:
+            raise UsageError("The vertices of a convex part lie in one plane; a part needs volume to be touched.")
         points.setflags(write=False)
         object.__setattr__(self, "vertices", points)
-        return points
 
     def bounds(self) -> NDArray[np.float64]:
         """Return axis-aligned bounds [2, 3]: lowest and highest corner."""
@@ -48,53 +53,6 @@ class _Polyhedron:
     def scaled(self, factor: float) -> Self:
         """Return the body scaled about the origin."""
         return replace(self, vertices=self.vertices * factor)
-
-
-@dataclass(frozen=True, eq=False)
-class ConvexPart(_Polyhedron):
-    """The convex hull of ``vertices`` [m, 3]: at least four points that do not lie in one plane."""
-
-    def __post_init__(self) -> None:
-        points = self._checked_points("convex part")
-        # Singular values of centred points are their extents along the principal axes; the last is the thickness.
-        spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
-        if spread[2] < 1e-6 * spread[0]:
-            raise UsageError("The vertices of a convex part lie in one plane; a part needs volume to be touched.")
-
-
-@dataclass(frozen=True, eq=False)
-class TriangleMesh(_Polyhedron):
-    """A closed surface of any shape, concavities included: vertices [m, 3] (m) and faces [k, 3], outward by the
-    right-hand rule.
-    """
-
-    faces: NDArray[np.int32]
-
-    def __post_init__(self) -> None:
-        points, faces = self._checked_points("triangle mesh"), np.array(self.faces, dtype=np.int32)
-        if faces.ndim != 2 or faces.shape[1:] != (3,) or len(faces) < 4:
-            raise UsageError(f"A closed triangle mesh needs at least four faces [k, 3]; got shape {faces.shape}.")
-        if faces.min() < 0 or faces.max() >= len(points):
-            raise UsageError(f"The faces of a triangle mesh must name its {len(points)} vertices, counted from 0.")
-        faces.setflags(write=False)
-        object.__setattr__(self, "faces", faces)
-
-    @cached_property
-    def boxes(self) -> NDArray[np.float64]:
-        """Axis-aligned boxes [k, 2, 3] of at most 64 patches of neighbouring triangles: together they hold all of it.
-
-        They follow a concave surface much closer than its bounds do.
-        """
-        corners = self.vertices[self.faces]
-        low, high = corners.min(axis=1), corners.max(axis=1)
-        middle = (low + high) / 2
-        patches = [np.arange(len(corners))]
-        while len(patches) < 64 and len(patches[0]) > 1:
-            # Each is split where its longest side is halved by number.
-            axes = [np.ptp(middle[patch], axis=0).argmax() for patch in patches]
-            ordered = [p[np.argsort(middle[p, axis], kind="stable")] for p, axis in zip(patches, axes, strict=True)]
-            patches = [half for p in ordered for half in (p[: len(p) // 2], p[len(p) // 2 :]) if len(half)]
-        return np.array([[low[patch].min(axis=0), high[patch].max(axis=0)] for patch in patches])
 
 
 @dataclass(frozen=True)
@@ -209,9 +167,11 @@ class Box(_Primitive):
 Part = ConvexPart | Sphere | Capsule | Cylinder | Box
 
 
-def bounds_of(bodies: Iterable[Part | TriangleMesh]) -> NDArray[np.float64]:
-    """Return the lowest and highest corner [2, 3] (m) of some bodies."""
-    corners = np.stack([body.bounds() for body in bodies])
+def bounds_of(parts: Iterable[Part], surface: Mesh | None) -> NDArray[np.float64]:
+    """Return the lowest and highest corner [2, 3] (m) of a surface, or of some parts without one."""
+    if surface is not None:
+        return surface.bounds
+    corners = np.stack([part.bounds() for part in parts])
     return np.stack([corners[:, 0].min(axis=0), corners[:, 1].max(axis=0)])
 
 
@@ -228,7 +188,7 @@ class Obstacle:
     """Times [n] (s) → position [n, 3] (m) and quaternion [n, 4]; None for an obstacle that stands still."""
     friction: float | None = None
     """Coulomb coefficient of the contact; None takes the whisker's own."""
-    surface: TriangleMesh | None = None
+    surface: Mesh | None = None
     """The exact surface of the body. Engines that collide meshes (``rod``) touch it instead of ``parts``; those that
     collide convex bodies only (``mujoco``, ``bullet``) touch ``parts`` and refuse a surface without parts."""
 
@@ -238,9 +198,17 @@ class Obstacle:
             check_name("part of an obstacle", type(part).__name__, [kind.__name__ for kind in get_args(Part)])
         if not self.parts and self.surface is None:
             raise UsageError("An obstacle needs at least one part or a surface.")
+        if self.surface is not None and min(len(self.surface.vertices), len(self.surface.faces)) < 4:
+            shapes = f"{self.surface.vertices.shape} and {self.surface.faces.shape}"
+            raise UsageError(f"A closed surface has at least four vertices and four faces; received shapes {shapes}.")
         check_fields(self, "friction", least=0, of="{} of an obstacle")
+
+    def moved(self, rotation: NDArray[np.float64], translation: NDArray[np.float64]) -> Obstacle:
+        """Return the body with its geometry rotated by a matrix [3, 3] about the origin, then translated by [3] (m)."""
+        surface = self.surface and self.surface.transformed(rotation, translation)
+        return replace(self, parts=tuple(part.moved(rotation, translation) for part in self.parts), surface=surface)
 
     @cached_property
     def bounds(self) -> NDArray[np.float64]:
         """Lowest and highest corner [2, 3] (m) of what is touched, in the frame of the obstacle."""
-        return bounds_of(self.parts if self.surface is None else (self.surface,))
+        return bounds_of(self.parts, self.surface)

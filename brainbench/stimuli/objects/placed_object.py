@@ -63,10 +63,8 @@ class PlacedObject:
         place = axes.T @ (np.asarray(self.position) - origin)
         # What turns is expressed about its own origin, which stays near it.
         shift = np.zeros(3) if isinstance(self.motion, (Spin, Path)) else place
-        parts = tuple(part.moved(rotation, shift) for part in self.solid.parts)
-        surface = self.solid.surface and self.solid.surface.moved(rotation, shift)
         motion = None if isinstance(self.motion, Still) else _PlacedMotion(self.motion, axes, place)
-        return Obstacle(parts=parts, motion=motion, friction=self.friction, surface=surface)
+        return Obstacle(self.solid.parts, motion, self.friction, self.solid.surface).moved(rotation, shift)
 
     def config(self) -> dict[str, Any]:
         """Return plain values that determine the physics."""

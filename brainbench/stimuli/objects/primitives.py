@@ -7,7 +7,7 @@ import numpy as np
 from brainbench.core.reading.ranges import check_number
 from brainbench.geometry import Mesh
 from brainbench.stimuli.objects.obstacle import Box, Capsule, ConvexPart, Cylinder, Sphere, Vector
-from brainbench.stimuli.objects.solid import Solid, to_surface
+from brainbench.stimuli.objects.solid import Solid
 
 RODGERS_CONTROL = ((-0.720943, 0.195148), (-0.167777, 0.219684), (0.235608, -0.057831), (0.631506, -0.409149))
 """Control points (x, y) of the cubic Bézier curve that is the convex face of the Rodgers solid, in the
@@ -65,4 +65,4 @@ def rodgers_solid(diagonal: float = 0.055, *, segments: int = 24) -> Solid:
     faces = np.vstack([quads[:, [0, 2, 1]], quads[:, [0, 3, 2]]])
     mesh = Mesh(rings.reshape(-1, 3), faces, "rodgers")
     parts = tuple(ConvexPart(np.vstack([rings[i], rings[i + 1]])) for i in range(segments))
-    return Solid("rodgers", parts, mesh, surface=to_surface(mesh)).to_diagonal(diagonal)
+    return Solid("rodgers", parts, mesh, surface=mesh).to_diagonal(diagonal)

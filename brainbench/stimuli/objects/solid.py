@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from brainbench.core.files import content_hash, portable
 from brainbench.core.reading.ranges import check_number
 from brainbench.geometry import Mesh
-from brainbench.stimuli.objects.obstacle import ConvexPart, Part, TriangleMesh, bounds_of
+from brainbench.stimuli.objects.obstacle import ConvexPart, Part, bounds_of
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,16 +29,14 @@ class Solid:
     """Remarks for the user, such as a concavity lost to the convex hull."""
     origin: Mapping[str, Any] | None = None
     """Source of the parts, where their last digits depend on the machine; :meth:`config` has it."""
-    surface: TriangleMesh | None = None
+    surface: Mesh | None = None
     """The exact surface [m], for engines that collide meshes; None where the parts are exact by themselves
     (primitives) or stand for the solid (``pieces``, ``decomposition``)."""
 
     @cached_property
     def bounds(self) -> NDArray[np.float64]:
         """Lowest and highest corner [2, 3] (m)."""
-        if self.mesh is not None:
-            return self.mesh.bounds
-        return bounds_of(self.parts if self.surface is None else (self.surface,))
+        return bounds_of(self.parts, self.mesh or self.surface)
 
     @property
     def diagonal(self) -> float:
@@ -67,16 +65,12 @@ class Solid:
         if self.origin is not None:
             return content_hash(self.origin, round(self.diagonal, 12))
         parts = [{"kind": type(part).__name__, **portable(part)} for part in self.parts]
-        told = () if self.surface is None or _through_corners(self.surface, self.parts) else (self.surface,)
-        return content_hash(parts, *map(portable, told))
+        if self.surface is None or _through_corners(self.surface, self.parts):
+            return content_hash(parts)
+        return content_hash(parts, portable({"vertices": self.surface.vertices, "faces": self.surface.faces}))
 
 
-def to_surface(mesh: Mesh) -> TriangleMesh:
-    """Return a mesh as the surface that whiskers touch."""
-    return TriangleMesh(mesh.vertices, mesh.faces.astype(np.int32))
-
-
-def _through_corners(surface: TriangleMesh, parts: tuple[Part, ...]) -> bool:
+def _through_corners(surface: Mesh, parts: tuple[Part, ...]) -> bool:
     """Return whether the surface runs through corners of the convex parts alone, so that the parts tell it."""
     corners = {tuple(corner) for part in parts if isinstance(part, ConvexPart) for corner in part.vertices.tolist()}
     return all(tuple(vertex) in corners for vertex in surface.vertices.tolist())

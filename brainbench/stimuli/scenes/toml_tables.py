@@ -7,7 +7,7 @@ import math
 from collections.abc import Callable, Collection, Mapping
 from typing import Any, TypeVar
 
-from brainbench.core.errors import UsageError, unknown_name
+from brainbench.core.errors import UsageError, check_name, unknown_name
 
 MILLI = 1e-3
 """Metres in a millimetre, seconds in a millisecond."""
@@ -106,8 +106,7 @@ def choice(kind: str, options: Collection[str]) -> Convert:
     """Return a converter of texts that takes one of ``options``, and its value where these are a mapping."""
 
     def convert(value: Any) -> Any:
-        if text(value) not in options:
-            raise unknown_name(kind, value, options)
+        check_name(kind, text(value), options)
         return options[value] if isinstance(options, Mapping) else value
 
     return convert

@@ -20,7 +20,7 @@ from brainbench.core.files import content_hash
 from brainbench.core.reading.ranges import check_fields
 from brainbench.core.rotations import euler_matrix
 from brainbench.stimuli.motion.trajectories import Still, Translation
-from brainbench.stimuli.objects.obstacle import bounds_of
+from brainbench.stimuli.objects.obstacle import Obstacle
 from brainbench.stimuli.objects.placed_object import PlacedObject
 from brainbench.stimuli.objects.solid import Solid
 from brainbench.stimuli.scenes.frames import Frames
@@ -220,5 +220,4 @@ def _turned_bounds(solid: Solid, rotation: NDArray[np.float64]) -> NDArray[np.fl
     """Return lowest and highest corner [2, 3] (m) of the solid turned about its origin."""
     if solid.mesh is not None:
         return solid.mesh.transformed(rotation).bounds
-    bodies = solid.parts if solid.surface is None else (solid.surface,)
-    return bounds_of(body.moved(rotation, np.zeros(3)) for body in bodies)
+    return Obstacle(solid.parts, surface=solid.surface).moved(rotation, np.zeros(3)).bounds

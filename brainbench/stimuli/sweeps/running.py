@@ -20,10 +20,8 @@ from brainbench.core.jobs import STOPPING, pool_died, run_jobs, run_on_cluster, 
 from brainbench.stimuli.sweeps.plan import ShardTask
 from brainbench.stimuli.sweeps.shards import (
     BuiltObject,
-    PreparedShard,
     build_object,
     make_shard,
-    prepare_shard,
     simulate_shard,
     warm_up,
     write_shard,
@@ -141,9 +139,9 @@ def run_pipelined(tasks: Sequence[ShardTask], folder: Path, workers: int, done: 
     at_once = _shards_at_once(tasks[0])
     free = threading.Semaphore(at_once)
 
-    def make(task: ShardTask, prepared: PreparedShard) -> int:
+    def make(task: ShardTask, objects: Sequence[BuiltObject]) -> int:
         with free:
-            content = simulate_shard(task, prepared, workers)
+            content = simulate_shard(task, objects, workers)
         return write_shard(content, folder)
 
     most = min(at_once + WRITERS, len(tasks))
@@ -154,9 +152,9 @@ def run_pipelined(tasks: Sequence[ShardTask], folder: Path, workers: int, done: 
             try:
                 # Fails where the first shard will fail, which tells of it.
                 threads.submit(warm_up, tasks[0])
-                for task, prepared in _built_ahead(tasks, builders, processes):
-                    making.add(threads.submit(make, task, prepared))
-                    del prepared
+                for task, objects in _built_ahead(tasks, builders, processes):
+                    making.add(threads.submit(make, task, objects))
+                    del objects
                     if len(making) == most:
                         ended, making = wait(making, return_when=FIRST_COMPLETED)
                         for shard in ended:
@@ -183,7 +181,7 @@ def _shards_at_once(task: ShardTask) -> int:
 
 def _built_ahead(
     tasks: Sequence[ShardTask], builders: ProcessPoolExecutor, processes: int
-) -> Iterator[tuple[ShardTask, PreparedShard]]:
+) -> Iterator[tuple[ShardTask, list[BuiltObject]]]:
     """Yield shards in order while the objects of the next ones are built, each by any of the processes."""
     coming: deque[list[Future[BuiltObject]]] = deque()
     waiting = iter(tasks)
@@ -193,4 +191,4 @@ def _built_ahead(
                 break
             build = partial(build_object, settings=later.settings, grid=later.grid)
             coming.append([builders.submit(build, item) for item in later.objects])
-        yield task, prepare_shard(task, [one.result() for one in coming.popleft()])
+        yield task, [one.result() for one in coming.popleft()]

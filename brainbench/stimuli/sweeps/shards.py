@@ -60,18 +60,9 @@ class BuiltObject:
     """Result of :meth:`WhiskerEngine.pack`; None when the engine takes no sweeps."""
 
 
-@dataclass(frozen=True, eq=False)
-class PreparedShard:
-    """Objects and tables of a shard before it is simulated."""
-
-    objects: tuple[BuiltObject, ...]
-    tables: Mapping[str, NDArray[Any]]
-    """The arrays that do not depend on the simulation."""
-
-
 def make_shard(task: ShardTask, folder: str, workers: int | None = None) -> int:
-    """Prepare, simulate and write one shard with ``workers`` threads; return the number of its sweeps."""
-    return write_shard(simulate_shard(task, prepare_shard(task), workers), folder)
+    """Build, simulate and write one shard with ``workers`` threads; return the number of its sweeps."""
+    return write_shard(simulate_shard(task, workers=workers), folder)
 
 
 def build_object(item: NamedObject, settings: GenerationSettings, grid: SweepGrid) -> BuiltObject:
@@ -85,14 +76,6 @@ def build_object(item: NamedObject, settings: GenerationSettings, grid: SweepGri
     return BuiltObject(solid, "", _hash_solid(solid), packed)
 
 
-def prepare_shard(task: ShardTask, objects: Iterable[BuiltObject] = ()) -> PreparedShard:
-    """List the sweeps of a shard; build its objects, unless they are given."""
-    built = tuple(objects) or tuple(build_object(item, task.settings, task.grid) for item in task.objects)
-    array = WhiskerArray.of(task.grid.species).select(task.whiskers)
-    tables = shard_tables(task, array, task.grid.frames.times, [one.hash for one in built])
-    return PreparedShard(built, {**tables, **_conditions(task)})
-
-
 def warm_up(task: ShardTask) -> None:
     """Do what the first shard would wait for beside its objects, such as loading kernels."""
     settings, objects = task.settings, {item.name: item.load for item in task.objects}
@@ -101,17 +84,19 @@ def warm_up(task: ShardTask) -> None:
         engine.prepare_sweeps(SweepScenes(task.grid, objects, whiskers=task.whiskers), settings.fidelity)
 
 
-def simulate_shard(task: ShardTask, prepared: PreparedShard, workers: int | None = None) -> ShardContent:
-    """Simulate the sweeps of a shard past its objects."""
+def simulate_shard(task: ShardTask, objects: Sequence[BuiltObject] = (), workers: int | None = None) -> ShardContent:
+    """Simulate the sweeps of a shard past its objects, which are built unless they are given."""
+    built = objects or [build_object(item, task.settings, task.grid) for item in task.objects]
     count, frames = task.grid.count, task.grid.frames
-    whiskers = len(task.config["whiskers"]["names"])
-    usable = {owner: one for owner, one in enumerate(prepared.objects) if one.solid is not None}
+    array = WhiskerArray.of(task.grid.species).select(task.whiskers)
+    whiskers = len(array)
+    usable = {owner: one for owner, one in enumerate(built) if one.solid is not None}
     place = {owner: rank for rank, owner in enumerate(usable)}
     chosen = np.flatnonzero(np.isin(task.owner, list(place)))
     shape = (len(task), frames.count, whiskers, 6)
     contact = np.zeros((len(task), whiskers), dtype=np.float32)
     status = np.full((len(task), whiskers), UNUSABLE, dtype=np.uint8)
-    reasons = [prepared.objects[owner].reason for owner in task.owner.tolist()]
+    reasons = [built[owner].reason for owner in task.owner.tolist()]
     counts: dict[str, int] = dict.fromkeys(COUNTS, 0)
     wrench = np.empty((0, *shape[1:]), dtype=np.float32)
     if len(chosen):
@@ -132,7 +117,8 @@ def simulate_shard(task: ShardTask, prepared: PreparedShard, workers: int | None
         known, wrench = wrench, np.full(shape, np.nan, dtype=np.float32)
         wrench[chosen] = known
     arrays = {
-        **prepared.tables,
+        **shard_tables(task, array, frames.times, [one.hash for one in built]),
+        **_conditions(task),
         "contact": contact,
         "status": status,
         "reason": encode_texts(reasons),
@@ -202,7 +188,7 @@ def _hash_solid(solid: Solid) -> str:
     if solid.origin is not None:
         return content_hash(solid.origin, round(solid.diagonal, 12))
     if solid.surface is not None:
-        return content_hash(solid.surface.vertices, solid.surface.faces)
+        return content_hash(solid.surface.vertices, solid.surface.faces.astype(np.int32))
     return str(solid.config()["hash"])
 
 

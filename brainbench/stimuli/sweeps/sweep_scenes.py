@@ -7,7 +7,7 @@ asked for.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, overload
 
 import numpy as np
@@ -17,7 +17,7 @@ from brainbench.core.rotations import euler_matrix
 from brainbench.stimuli.objects.solid import Solid
 from brainbench.stimuli.scenes.frames import Frames
 from brainbench.stimuli.scenes.scene import Head, Scene
-from brainbench.stimuli.sweeps.grid import Span, Sweep, SweepGrid
+from brainbench.stimuli.sweeps.grid import Span, SweepGrid
 from brainbench.stimuli.whiskers.array import WhiskerArray
 
 
@@ -51,13 +51,7 @@ class SweepScenes(Sequence[Scene]):
     @property
     def labels(self) -> tuple[str, ...]:
         """Labels of the scenes in order; no object is loaded."""
-        return tuple(f"{name}/{sweep.label}" for name, sweep in self.enumerate())
-
-    def enumerate(self) -> Iterator[tuple[str, Sweep]]:
-        """Yield (object name, sweep) in the order of the scenes, without loading or building anything."""
-        for name in self.objects:
-            for sweep in self.grid.sweeps(name):
-                yield name, sweep
+        return tuple(f"{name}/{sweep.label}" for name in self.objects for sweep in self.grid.sweeps(name))
 
     def __len__(self) -> int:
         return len(self.objects) * self.grid.count

@@ -78,12 +78,8 @@ def _draw(
     scale = mount.whisker.arc_length / 0.02
     solid, turn, place = _object(kind, scale, hollow, random)
     rotation = axes @ turn
-    shift = point - rotation @ place
-    obstacle = Obstacle(
-        tuple(part.moved(rotation, shift) for part in solid.parts),
-        friction=friction,
-        surface=solid.surface and solid.surface.moved(rotation, shift),
-    )
+    body = Obstacle(solid.parts, friction=friction, surface=solid.surface)
+    obstacle = body.moved(rotation, point - rotation @ place)
     duration = max(0.15, 1.5 / frequency)
     return Job(mount.whisker, ArrayFollicle(mount, whisking), (obstacle,), np.arange(1e-3, duration, 1e-3))
 
@@ -128,7 +124,9 @@ def _object(
     # The trough lies along the whisker: its axis z becomes the contact's −x.
     factor = 0.36 * size
     turn = euler_matrix((0.0, roll - math.pi / 2, 0.0))
-    return hollow.scaled(factor), turn, factor * _floor(random.uniform(0.35, 0.65))
+    # A point of the hollow face, a fraction of the way along its curve.
+    along = round(random.uniform(0.35, 0.65) * (len(_faces()) - 1))
+    return hollow.scaled(factor), turn, factor * _faces()[along, 2:].mean(axis=0)
 
 
 @cache
@@ -137,8 +135,3 @@ def _faces() -> NDArray[np.float64]:
     mesh = rodgers_solid().mesh
     assert mesh is not None
     return mesh.vertices.reshape(-1, 4, 3)
-
-
-def _floor(along: float) -> NDArray[np.float64]:
-    """Return the point [3] (m) of the hollow face of the Rodgers solid, a fraction of the way along its curve."""
-    return _faces()[round(along * (len(_faces()) - 1)), 2:].mean(axis=0)

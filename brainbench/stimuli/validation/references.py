@@ -50,20 +50,14 @@ def point_load_deflection(whisker: Whisker, force: float, at: float) -> float:
 
     δ = F a³/(3 E I_b) · r_b/r(a), exact for a linear taper.
     """
-    stiffness = _base_stiffness(whisker, at)
+    _check_at(whisker, at)
+    if whisker.curvature:
+        raise UsageError(
+            f"This closed form is for a straight whisker; this one has curvature {whisker.curvature:g} 1/m; "
+            "use elastica, which takes any curvature."
+        )
+    stiffness = float(whisker.bending_stiffness(0.0))
     return force * at**3 / (3 * stiffness) * whisker.base_radius / float(whisker.radius(at))
-
-
-def point_load_slope(whisker: Whisker, force: float, at: float) -> float:
-    """Return the slope [rad] at a transverse point load F at arc length a of a straight cone, small bending.
-
-    F Lc²/(E I_b) · (1 − u)²(1 + 2u)/(6u²) with u = r(a)/r_b and Lc = L r_b/(r_b − r_t); its limit
-    F a²/(2 E I) for a cylinder.
-    """
-    stiffness = _base_stiffness(whisker, at)
-    u = float(whisker.radius(at)) / whisker.base_radius
-    # a = Lc (1 − u), so Lc²(1 − u)² = a²: this form has no 0/0 for a cylinder.
-    return force * at**2 / stiffness * (1 + 2 * u) / (6 * u**2)
 
 
 def natural_frequencies(whisker: Whisker, count: int = 3) -> NDArray[np.float64]:
@@ -125,17 +119,16 @@ def elastica(whisker: Whisker, at: float, offset: float) -> Contact:
     return _Branch(whisker, at, 1 if offset >= rest else -1).reach(offset)
 
 
-def elastica_finite_peg(whisker: Whisker, centre: tuple[float, float], peg_radius: float, *, side: int = 1) -> Contact:
-    """Return the equilibrium with a frictionless round peg of radius ``peg_radius`` at ``centre`` [m].
+def elastica_finite_peg(whisker: Whisker, centre: tuple[float, float], peg_radius: float) -> Contact:
+    """Return the equilibrium with a frictionless round peg of radius ``peg_radius`` at ``centre`` [m], pushed to +y.
 
-    The rod's own radius counts: its centre line passes one radius sum from the axis. The peg pushes
-    towards +y for ``side`` 1 and towards −y for −1.
+    The rod's own radius counts: its centre line passes one radius sum from the axis.
 
     Raises:
         UsageError: there is no such equilibrium, or the peg does not touch.
     """
     _check_at(whisker, centre[0])
-    return _Branch(whisker, centre[0], side, peg_radius).reach(centre[1])
+    return _Branch(whisker, centre[0], 1, peg_radius).reach(centre[1])
 
 
 def peg_centre(whisker: Whisker, contact: Contact, peg_radius: float) -> tuple[float, float]:
@@ -148,14 +141,14 @@ def peg_centre(whisker: Whisker, contact: Contact, peg_radius: float) -> tuple[f
     return contact.point[0] + gap * math.sin(contact.slope), contact.point[1] - gap * math.cos(contact.slope)
 
 
-def slip_off_offset(whisker: Whisker, at: float, *, side: int = 1, peg_radius: float | None = None) -> float:
-    """Return the offset [m] at which a frictionless peg at distance ``at`` [m] loses the whisker.
+def slip_off_offset(whisker: Whisker, at: float, *, peg_radius: float | None = None) -> float:
+    """Return the offset [m] at which a frictionless peg at distance ``at`` [m], pushed to +y, loses the whisker.
 
     Beyond it no equilibrium exists: the contact has run to the tip, or the rod yields without limit. The offset
     is that of the centre-line point at the contact of a point peg, or of the axis of a round peg of ``peg_radius`` [m].
     """
     _check_at(whisker, at)
-    return _Branch(whisker, at, side, peg_radius).limit()
+    return _Branch(whisker, at, 1, peg_radius).limit()
 
 
 class _Branch:
@@ -168,8 +161,6 @@ class _Branch:
     _STRIDE = math.radians(2.0)
 
     def __init__(self, whisker: Whisker, at: float, side: int, peg_radius: float | None = None) -> None:
-        if side not in (1, -1):
-            raise UsageError(f"side is 1 (push towards +y) or -1 (towards -y); received {side!r}.")
         self.whisker, self.at, self.side, self.peg_radius = whisker, at, side, peg_radius
         self.curvature = side * whisker.curvature
 
@@ -307,14 +298,3 @@ class _Branch:
 
 def _check_at(whisker: Whisker, at: float) -> None:
     check_number("at (m), the distance from the base", at, above=0, most=whisker.arc_length)
-
-
-def _base_stiffness(whisker: Whisker, at: float) -> float:
-    """Return E I at the base of a straight whisker that is loaded ``at`` (m)."""
-    _check_at(whisker, at)
-    if whisker.curvature:
-        raise UsageError(
-            f"This closed form is for a straight whisker; this one has curvature {whisker.curvature:g} 1/m; "
-            "use elastica, which takes any curvature."
-        )
-    return float(whisker.bending_stiffness(0.0))

@@ -15,7 +15,7 @@ from functools import cache
 from importlib import resources
 from typing import Any, Literal
 
-from brainbench.core.errors import UsageError, check_name, unknown_name
+from brainbench.core.errors import UsageError, check_each, check_name, unknown_name
 from brainbench.stimuli.whiskers.selection import match_whiskers
 from brainbench.stimuli.whiskers.whisker import Whisker
 
@@ -164,9 +164,7 @@ class WhiskerArray:
         """
         own = {"position", "angles"}
         allowed = own | {field.name for field in dataclasses.fields(Whisker)}
-        for key in changes:
-            if key not in allowed:
-                raise unknown_name("whisker property", key, sorted(allowed))
+        check_each("whisker property", changes, sorted(allowed))
         mounted = {key: tuple(map(float, value)) for key, value in changes.items() if key in own}
         rod = {key: value for key, value in changes.items() if key not in own}
         chosen = set(self.select(pattern).mounts)
@@ -211,10 +209,15 @@ def _read(species: str) -> dict[str, Any]:
 @cache
 def _published(species: str) -> WhiskerArray:
     """Build one species' table: the right side."""
-    table = _read(species)
-    entries = (dict(zip(table["columns"], row, strict=True)) for row in table["whiskers"])
-    mounts = tuple(_mount(entry, species) for entry in entries)
-    return WhiskerArray(species=table["species"], mounts=mounts, citation=table["citation"])
+    table, mounts = _read(species), []
+    for values in table["whiskers"]:
+        entry = dict(zip(table["columns"], values, strict=True))
+        row, col = entry["row"], entry["column"]
+        position = (entry["x_mm"] * _MM, entry["y_mm"] * _MM, entry["z_mm"] * _MM)
+        angles = (entry["theta_rad"], entry["phi_rad"], entry["zeta_rad"])
+        whisker = published_whisker(entry["arc_length_mm"], entry["curvature_per_mm"], row, col, species=species)
+        mounts.append(MountedWhisker(entry["name"], "right", row, col, position, angles, whisker))
+    return WhiskerArray(species=table["species"], mounts=tuple(mounts), citation=table["citation"])
 
 
 @cache
@@ -247,14 +250,6 @@ def _evaluate(terms: dict[str, float], known: dict[str, float]) -> float:
     # The published equations are linear in row, column, the base-point coordinates and their squares.
     values = {"constant": 1.0, **known, **{f"{key}_squared": value**2 for key, value in known.items()}}
     return sum(factor * values[name] for name, factor in terms.items())
-
-
-def _mount(entry: dict[str, Any], species: str) -> MountedWhisker:
-    row, col = entry["row"], entry["column"]
-    position = (entry["x_mm"] * _MM, entry["y_mm"] * _MM, entry["z_mm"] * _MM)
-    angles = (entry["theta_rad"], entry["phi_rad"], entry["zeta_rad"])
-    whisker = published_whisker(entry["arc_length_mm"], entry["curvature_per_mm"], row, col, species=species)
-    return MountedWhisker(entry["name"], "right", row, col, position, angles, whisker)
 
 
 def _radii(arc_length: float, row: int, col: int, rule: dict[str, Any]) -> tuple[float, float]:

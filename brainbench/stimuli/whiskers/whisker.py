@@ -91,13 +91,9 @@ class Whisker:
         """Return the radius [m] at arc length ``s`` [m]."""
         return self.base_radius + (self.tip_radius - self.base_radius) * self._fraction(s)
 
-    def second_moment(self, s: ArrayLike) -> NDArray[np.float64]:
-        """Return the second moment of area π r⁴/4 [m⁴] at arc length ``s`` [m]."""
-        return np.pi * self.radius(s) ** 4 / 4
-
     def bending_stiffness(self, s: ArrayLike) -> NDArray[np.float64]:
-        """Return the flexural rigidity E I [N·m²] at arc length ``s`` [m]."""
-        return self.young_modulus * self.second_moment(s)
+        """Return the flexural rigidity E I [N·m²] at arc length ``s`` [m], with the second moment I = π r⁴/4."""
+        return self.young_modulus * (np.pi * self.radius(s) ** 4 / 4)
 
     @property
     def torsion_ratio(self) -> float:

@@ -6,12 +6,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from brainbench.geometry import Mesh
 from brainbench.stimuli import get_recipe, simulate
 from brainbench.stimuli.engines import get_engine
 from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.engines.protocol import Job, Load, StillFollicle
 from brainbench.stimuli.engines.trust import LARGEST_OVERLAP, LARGEST_STRAIN, LOST, halved, judge
-from brainbench.stimuli.objects.obstacle import Box, Capsule, Obstacle, Sphere, TriangleMesh
+from brainbench.stimuli.objects.obstacle import Box, Capsule, Obstacle, Sphere
 from brainbench.stimuli.validation.contact_scenes import contact_jobs
 from tests.factories.trust import facts
 from tests.factories.whiskers import C2
@@ -62,7 +63,7 @@ def _overlapping_boxes():
 
     boxes = [((-0.05, -0.05, -0.05), (0.05, 0.05, 0.05)), ((-0.06, -0.06, 0.002), (0.06, 0.06, 0.06))]
     mesh = trimesh.util.concatenate([trimesh.creation.box(bounds=some) for some in boxes])
-    return Obstacle((), surface=TriangleMesh(np.asarray(mesh.vertices), np.asarray(mesh.faces)))
+    return Obstacle((), surface=Mesh(np.asarray(mesh.vertices), np.asarray(mesh.faces)))
 
 
 def _struck(speed, *, engine="mujoco", step=1e-4):

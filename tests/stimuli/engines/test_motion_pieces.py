@@ -6,7 +6,7 @@ import pytest
 from brainbench.core.errors import UsageError
 from brainbench.stimuli.engines import get_engine
 from brainbench.stimuli.engines.fidelity import Fidelity
-from brainbench.stimuli.engines.motion_pieces import KNOT, MOST_PIECES, SPEED_ERROR, cut
+from brainbench.stimuli.engines.motion_pieces import KNOT, MOST_PIECES, SPEED_ERROR, Cutting
 from brainbench.stimuli.engines.mujoco.engine import MujocoWhiskerEngine
 from brainbench.stimuli.engines.protocol import Job, StillFollicle
 from brainbench.stimuli.engines.rod.engine import RodEngine
@@ -18,7 +18,7 @@ from tests.factories.whiskers import C2
 
 
 def _cut(motion, stop=0.05, *, step=1e-4, finest=None):
-    return cut(lambda t: motion(t)[:, None], 0.0, stop, step=step, tail=step, finest=finest, what="a test")
+    return Cutting(0.0, stop, step, step).cut(lambda t: motion(t)[:, None], finest, "a test")
 
 
 def _pulse(at, width, height=1.0):

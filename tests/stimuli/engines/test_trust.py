@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from brainbench.core.errors import UsageError
+from brainbench.geometry import Mesh
 from brainbench.stimuli.engines import get_engine
 from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.engines.protocol import Job, StillFollicle
@@ -27,7 +28,7 @@ from brainbench.stimuli.engines.trust import (
     step_travel,
     strongest_force,
 )
-from brainbench.stimuli.objects.obstacle import Capsule, Obstacle, Sphere, TriangleMesh
+from brainbench.stimuli.objects.obstacle import Capsule, Obstacle, Sphere
 from brainbench.stimuli.whiskers.whisker import Whisker
 from tests.factories.trust import facts
 
@@ -35,7 +36,7 @@ WHISKER = Whisker(0.02, 50e-6, 5e-6, young_modulus=4e9, density=1260.0, damping_
 TIMES = np.linspace(0.0, 0.01, 11)
 STILL = StillFollicle().pose(TIMES)
 CORNERS = np.array([[0.0, 0, 0], [1e-3, 0, 0], [0, 1e-3, 0], [0, 0, 1e-3]])
-TETRAHEDRON = TriangleMesh(CORNERS, np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]], dtype=np.int32))
+TETRAHEDRON = Mesh(CORNERS, np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]], dtype=np.int32))
 
 
 def _moving(place, turn=None):
@@ -61,7 +62,7 @@ def test_the_travel_of_a_step_adds_that_of_the_whisker_and_that_of_the_object():
     ("obstacle", "thickness"),
     [
         (Obstacle((Capsule((0.01, -0.02, -5e-3), (0.01, -0.02, 5e-3), 2e-4),), _moving((0, 4.0, 0))), 0.5),
-        (Obstacle((), _moving((0.0, 4.0, 0)), surface=TETRAHEDRON.moved(np.eye(3), np.array([0.01, -0.02, 0]))), 1.1),
+        (Obstacle((), _moving((0.0, 4.0, 0)), surface=TETRAHEDRON.transformed(np.eye(3), [0.01, -0.02, 0])), 1.1),
     ],
     ids=["part", "surface"],
 )

@@ -7,11 +7,12 @@ import pytest
 
 from brainbench.core.errors import UsageError
 from brainbench.core.rotations import euler_matrix
+from brainbench.geometry import Mesh
 from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.engines.protocol import Job, Load, StillFollicle
 from brainbench.stimuli.engines.rod.adjoint import RecordingSolver
 from brainbench.stimuli.gradients import GradientRun, JobParameters
-from brainbench.stimuli.objects.obstacle import Box, Capsule, Cylinder, Obstacle, Sphere, TriangleMesh
+from brainbench.stimuli.objects.obstacle import Box, Capsule, Cylinder, Obstacle, Sphere
 from brainbench.stimuli.validation.contact_scenes import contact_jobs
 from tests.factories.gradients import COARSE, WHISKER, Swing, gradient_errors, touching_job
 
@@ -21,14 +22,14 @@ OBJECT = ("object.x", "object.y", "object.z", "object.rx", "object.ry", "object.
 EDGE = (np.cos(np.pi / 8), 0.0, 0.0, np.sin(np.pi / 8))
 
 
-def _prism() -> TriangleMesh:
+def _prism() -> Mesh:
     corners = np.array([[x, y, z] for x in (-1e-3, 1e-3) for y in (-1e-3, 1e-3) for z in (-8e-3, 8e-3)])
     faces = np.array(
         [[0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1], [2, 3, 7], [2, 7, 6], [0, 2, 6], [0, 6, 4],
          [1, 5, 7], [1, 7, 3]]
     )  # fmt: skip
     turn = euler_matrix((0.1, 0.0, np.pi / 4))
-    return TriangleMesh(corners @ turn.T + [11e-3, 3e-3, 0.3e-3], faces.astype(np.int32))
+    return Mesh(corners @ turn.T + [11e-3, 3e-3, 0.3e-3], faces.astype(np.int32))
 
 
 SOLIDS = {

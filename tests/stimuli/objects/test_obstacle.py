@@ -7,6 +7,7 @@ import pytest
 
 from brainbench.core.errors import UsageError
 from brainbench.core.rotations import to_matrices
+from brainbench.geometry import Mesh
 from brainbench.stimuli.objects.obstacle import (
     Box,
     Capsule,
@@ -14,7 +15,6 @@ from brainbench.stimuli.objects.obstacle import (
     Cylinder,
     Obstacle,
     Sphere,
-    TriangleMesh,
 )
 
 TURN = (math.cos(math.pi / 8), 0.0, 0.0, math.sin(math.pi / 8))
@@ -46,7 +46,7 @@ def test_a_slanted_cylinder_stays_inside_its_bounds():
 @pytest.mark.parametrize("faces", [4, 5, 63, 64, 65, 500])
 def test_the_boxes_of_a_surface_hold_each_of_its_triangles_and_are_at_most_sixty_four(faces):
     generator = np.random.default_rng(faces)
-    surface = TriangleMesh(generator.normal(size=(40, 3)), generator.integers(0, 40, (faces, 3)))
+    surface = Mesh(generator.normal(size=(40, 3)), generator.integers(0, 40, (faces, 3)))
     corners = surface.vertices[surface.faces][:, None]
     inside = (corners >= surface.boxes[:, None, 0]) & (corners <= surface.boxes[:, None, 1])
     assert inside.all(axis=(2, 3)).any(axis=1).all()
@@ -68,9 +68,8 @@ def test_a_quarter_turn_about_z_takes_x_to_y():
         (lambda: ConvexPart(np.zeros((3, 3))), "at least four finite vertices"),
         (lambda: ConvexPart(np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0]])), "lie in one plane"),
         (lambda: Obstacle(()), "at least one part"),
-        (lambda: TriangleMesh(np.zeros((3, 3)), np.zeros((4, 3), int)), "at least four finite vertices"),
-        (lambda: TriangleMesh(np.eye(4, 3), np.array([[0, 1, 2]])), "at least four faces"),
-        (lambda: TriangleMesh(np.eye(4, 3), np.full((4, 3), 4)), "must name its 4 vertices"),
+        (lambda: Obstacle((), surface=Mesh(np.zeros((3, 3)), np.zeros((4, 3), int))), "at least four vertices"),
+        (lambda: Obstacle((), surface=Mesh(np.eye(4, 3), np.array([[0, 1, 2]]))), "four faces"),
         (lambda: Obstacle((Sphere((0, 0, 0), 1.0),), friction=-1.0), r"friction .*received -1"),
         (lambda: Obstacle(("ball",)), "part of an obstacle 'str'"),  # pyright: ignore[reportArgumentType]
     ],

@@ -17,7 +17,6 @@ from brainbench.stimuli.engines.protocol import Job, StillFollicle
 from brainbench.stimuli.motion.trajectories import Path, Spin, Translation
 from brainbench.stimuli.objects import procedural
 from brainbench.stimuli.objects.mesh_solids import mesh_solid, shape_solid, touchable
-from brainbench.stimuli.objects.obstacle import TriangleMesh
 from brainbench.stimuli.objects.placed_object import PlacedObject
 from brainbench.stimuli.objects.primitives import RODGERS_CONTROL, box, capsule, cylinder, rodgers_solid, sphere
 from brainbench.stimuli.whiskers.whisker import Whisker
@@ -252,7 +251,7 @@ def test_solids_from_meshes_have_the_surface_that_whiskers_touch_and_placing_it_
     vertices = solid.surface.vertices * 0.05 / solid.diagonal @ euler_matrix((0.3, -0.5, 1.2)).T + [0.01, 0.02, 0.03]
     np.testing.assert_allclose(surface.vertices, vertices, atol=1e-12)
     assert _volume(surface) == pytest.approx(expected * (0.05 / solid.diagonal) ** 3)
-    np.testing.assert_allclose([surface.boxes[:, 0].min(0), surface.boxes[:, 1].max(0)], surface.bounds())
+    np.testing.assert_allclose([surface.boxes[:, 0].min(0), surface.boxes[:, 1].max(0)], surface.bounds)
 
 
 def test_pieces_that_stand_for_a_solid_and_primitives_have_no_surface(tmp_path):
@@ -268,7 +267,7 @@ def test_a_surface_changes_the_configuration_only_where_the_parts_do_not_tell_it
     plain = rodgers_solid()
     # So stimuli of the recipe keep the configuration hash that they had before solids had surfaces.
     assert plain.config() == replace(plain, surface=None).config()
-    other = replace(plain, surface=TriangleMesh(plain.surface.vertices * 1.001, plain.surface.faces))
+    other = replace(plain, surface=Mesh(plain.surface.vertices * 1.001, plain.surface.faces))
     assert other.config()["hash"] != plain.config()["hash"]
 
 

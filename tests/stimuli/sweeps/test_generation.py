@@ -99,9 +99,9 @@ def test_objects_are_built_one_by_one_and_as_many_ahead_as_keep_processes_busy(p
             return done
 
     monkeypatch.setattr(running, "build_object", lambda item, *, settings, grid: BuiltObject(None, f"no {item.name}"))
-    for count, (task, prepared) in enumerate(running._built_ahead(plan.shards, Pool(), processes)):
+    for count, (task, objects) in enumerate(running._built_ahead(plan.shards, Pool(), processes)):
         assert len(asked) == min(8, ahead + count)
-        assert [one.reason for one in prepared.objects] == [f"no {item.name}" for item in task.objects]
+        assert [one.reason for one in objects] == [f"no {item.name}" for item in task.objects]
     assert asked == [item.name for task in plan.shards for item in task.objects]
 
 

@@ -17,7 +17,6 @@ from brainbench.stimuli.sweeps.shards import (
     UNUSABLE,
     _write_all,
     make_shard,
-    prepare_shard,
     simulate_shard,
     write_shard,
 )
@@ -74,7 +73,7 @@ def test_the_same_shard_has_the_same_bytes_and_its_hash_tells_of_its_content(tmp
     for folder in ("a", "b"):
         make_shard(task, str(tmp_path / folder), workers=1 + (folder == "b"))
     assert (tmp_path / "a" / task.name).read_bytes() == (tmp_path / "b" / task.name).read_bytes()
-    content = simulate_shard(task, prepare_shard(task))
+    content = simulate_shard(task)
     with h5py.File(tmp_path / "a" / task.name) as file:
         stored = {name: file[name][:] for name in content.arrays}
         assert hash_arrays(stored) == hash_arrays(content.arrays) == file.attrs["content_hash"]
@@ -128,7 +127,7 @@ def test_thousands_of_classes_fit_into_a_shard(tmp_path):
 @pytest.mark.parametrize("kept", [0, 100, 5000])
 def test_a_shard_that_was_cut_off_is_not_whole(tmp_path, kept):
     task = small_plan().shards[0]
-    write_shard(simulate_shard(task, prepare_shard(task)), tmp_path)
+    write_shard(simulate_shard(task), tmp_path)
     path = tmp_path / task.name
     assert is_complete(path, task)
     with h5py.File(path, "r+") as file:

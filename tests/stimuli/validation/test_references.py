@@ -47,17 +47,14 @@ def test_small_bending_of_the_elastica_is_the_tapered_cantilever():
     at, offset = 0.6 * C2.arc_length, 1e-5 * C2.arc_length
     contact = references.elastica(C2, at, offset)
     assert references.point_load_deflection(C2, contact.force[1], at) == pytest.approx(offset, rel=1e-6)
-    assert references.point_load_slope(C2, contact.force[1], at) == pytest.approx(contact.slope, rel=1e-6)
 
 
 @pytest.mark.parametrize("whisker", [C2, H, replace(H, tip_radius=50e-6)])
 @pytest.mark.parametrize("share", [0.2, 0.7, 1.0])
-def test_point_load_formulas_equal_quadrature_of_the_bending_energy(whisker, share):
+def test_the_point_load_formula_equals_quadrature_of_the_bending_energy(whisker, share):
     at = share * whisker.arc_length
     deflection = quad(lambda s: (at - s) ** 2 / whisker.bending_stiffness(s), 0, at, epsabs=0)[0]
-    slope = quad(lambda s: (at - s) / whisker.bending_stiffness(s), 0, at, epsabs=0)[0]
     assert references.point_load_deflection(whisker, 1.0, at) == pytest.approx(deflection, rel=1e-9)
-    assert references.point_load_slope(whisker, 1.0, at) == pytest.approx(slope, rel=1e-9)
 
 
 @pytest.mark.parametrize(

@@ -40,7 +40,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -57,18 +56,6 @@ from brainbench.stimuli.whiskers.chain import Chain
 
 ROOM = 2**26
 """Bytes that records of the steps of a launch may take; beyond them they are written down in parts."""
-
-
-@dataclass(frozen=True, eq=False)
-class OutputDerivatives:
-    """Derivatives of a number with respect to the results of a launch, whose shapes they have. SI units."""
-
-    wrench: NDArray[np.float64]
-    """[job, reading, 6]"""
-    points: NDArray[np.float64] | None = None
-    """[job, reading, node, 3] from the base point."""
-    contact_wrench: NDArray[np.float64] | None = None
-    """[job, reading, 6]"""
 
 
 class RecordingSolver(WhiskerSolver):
@@ -198,10 +185,13 @@ class RecordingSolver(WhiskerSolver):
             "contact_wrench": (found["contact"] / units).reshape(*found["contact"].shape[:3], 6),
         }
 
-    def reverse(self, outputs: OutputDerivatives) -> dict[str, NDArray[Any]]:
+    def reverse(
+        self, wrench: NDArray[np.float64], points: NDArray[np.float64], contact_wrench: NDArray[np.float64]
+    ) -> dict[str, NDArray[Any]]:
         """Go back over the last launch; return the derivatives by what was packed.
 
-        They have the names of ``kernels.adjoint.chain.PackedGradients``, those of shapes ``shape_…``.
+        They have the names of ``kernels.adjoint.chain.PackedGradients``, those of shapes ``shape_…``. Arguments are the
+        derivatives of a number by the results, of all nodes, in the shapes of :meth:`forward` without p. SI units.
         """
         from brainbench.stimuli.engines.rod.kernels import BUILDING, build_adjoint
 
@@ -210,9 +200,17 @@ class RecordingSolver(WhiskerSolver):
             adjoint = build_adjoint(self.kernels, "chain")
         chains, motions, shapes, jobs, options, *_ = self.inputs
         count, contacts = self.count, contacts_for(self.capacity)
+        units = np.array([MILLI, MICRO])[:, None]
+        acting, felt = (np.moveaxis(some.reshape(*some.shape[:2], 2, 3), 0, 2) for some in (wrench, contact_wrench))
+        outputs = {
+            # The kernels find the wrench of the base on the whisker, moment first.
+            "wrench": -acting[:, ::-1] / units[::-1, None],
+            "points": np.moveaxis(points, 0, 2) / MILLI,
+            "contact": felt / units[:, None],
+        }
         with turn(device):
             given = adjoint.OutputCotangents()
-            for name, values in self._kernel_units(outputs).items():
+            for name, values in outputs.items():
                 setattr(given, name, wp.array(values, dtype=structs.vec3, device=device))
             system = allocate(adjoint.ContactSystem, device, unit=(3 * contacts, self.capacity, count))
             gradients = allocate(
@@ -234,19 +232,3 @@ class RecordingSolver(WhiskerSolver):
             found = {name: getattr(gradients, name).numpy() for name in names}
             found |= {f"shape_{name}": getattr(gradients.shape, name).numpy() for name in places}
         return found
-
-    def _kernel_units(self, outputs: OutputDerivatives) -> dict[str, NDArray[np.float64]]:
-        """Return what the kernel's ``OutputCotangents`` hold."""
-        jobs, readings, _ = outputs.wrench.shape
-        wrench = np.moveaxis(outputs.wrench.reshape(jobs, readings, 2, 3), 0, 2)
-        # The kernels find the wrench of the base on the whisker, in mN and µN·m, moment first.
-        whole = {"wrench": -wrench[:, ::-1] / np.array([MICRO, MILLI])[None, :, None, None]}
-        contact = np.zeros((readings, 2, jobs, 3))
-        points = np.zeros((readings, self.capacity + 1, jobs, 3))
-        if outputs.contact_wrench is not None:
-            felt = np.moveaxis(outputs.contact_wrench.reshape(jobs, readings, 2, 3), 0, 2)
-            contact = felt / np.array([MILLI, MICRO])[None, :, None, None]
-        if outputs.points is not None:
-            nodes = outputs.points.shape[2]
-            points[:, :nodes] = np.moveaxis(outputs.points, 0, 2) / MILLI
-        return whole | {"contact": contact, "points": points}

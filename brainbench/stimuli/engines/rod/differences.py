@@ -18,14 +18,15 @@ from numpy.typing import NDArray
 
 from brainbench.core import rotations
 from brainbench.core.errors import UsageError
+from brainbench.geometry import Mesh
 from brainbench.stimuli.engines.motion_pieces import carried_pose
 from brainbench.stimuli.engines.protocol import Job, base_rotation
 from brainbench.stimuli.engines.rod.limits import LIGHT
 from brainbench.stimuli.engines.rod.packing import knots_alike, pack_chains, rotation_vectors
-from brainbench.stimuli.engines.rod.shapes import PackedShapes
+from brainbench.stimuli.engines.rod.shapes import PackedShapes, middle_of
 from brainbench.stimuli.engines.rod.tasks import JobTask, PackedTasks
 from brainbench.stimuli.engines.units import MILLI
-from brainbench.stimuli.objects.obstacle import Obstacle, TriangleMesh
+from brainbench.stimuli.objects.obstacle import ConvexPart, Obstacle
 from brainbench.stimuli.whiskers.chain import Chain, build_chain
 from brainbench.stimuli.whiskers.whisker import Whisker
 
@@ -191,13 +192,13 @@ def _shape(nominal: Any, moved: Any) -> tuple[NDArray[np.float64], NDArray[np.fl
         )
     if hasattr(nominal, "vertices"):
         turn, shift = _rigid(nominal, moved)
-        middle = nominal.bounds().mean(axis=0)
+        middle = middle_of(nominal.vertices)
         return (turn @ middle + shift) * MILLI, turn, np.ones(3)
     row = PackedShapes()._row(moved)
     return row["place"], rotations.to_matrices(row["turn"]), row["size"]
 
 
-def _rigid(nominal: TriangleMesh, moved: TriangleMesh) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _rigid(nominal: Mesh | ConvexPart, moved: Mesh | ConvexPart) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return rotation [3, 3] and shift [3] (m) of a mesh's vertices (Kabsch 1976, Acta Cryst. A32)."""
     a, b = nominal.vertices, moved.vertices
     _require("vertices of a mesh", len(b), len(a))

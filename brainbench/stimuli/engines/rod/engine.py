@@ -51,7 +51,6 @@ class RodEngine(WhiskerEngine):
     solvers = ("dynamic", "quasistatic")
     twists = True
     surfaces = True
-    retries = True
     batches = True
 
     def prepare(self, lengths: Iterable[float], fidelity: Fidelity, *, progress: NamedProgress | None = None) -> None:

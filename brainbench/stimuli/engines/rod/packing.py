@@ -106,10 +106,10 @@ class Track:
 
 def follicle_track(follicle: Follicle, size: float, cutting: Cutting) -> Track:
     """Return the track of a follicle whose whisker has the arc length ``size`` (m)."""
+    # Looking for motion takes as long as simulating a short whisker.
     if getattr(follicle, "finest", None) == math.inf:
         place, euler = (np.asarray(values, dtype=float) for values in follicle.pose(np.array([cutting.start])))
         return still_track(place[0], rotations.from_matrices(base_rotation(euler))[0])
-
     return _track(follicle.pose, base_rotation, cutting.follicle(follicle, size), cutting.start)
 
 

@@ -11,12 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from brainbench.core import rotations
-from brainbench.geometry.mesh import hull_faces
+from brainbench.geometry.mesh import Mesh, hull_faces
 from brainbench.stimuli.engines.rod import limits
 from brainbench.stimuli.engines.rod.mesh_bvh import WIDE, in_eights, spatial_order, tree_boxes
 from brainbench.stimuli.engines.rod.packing import PackedMotions, Track
 from brainbench.stimuli.engines.units import MILLI
-from brainbench.stimuli.objects.obstacle import Box, Capsule, ConvexPart, Cylinder, Obstacle, Sphere, TriangleMesh
+from brainbench.stimuli.objects.obstacle import Box, Capsule, ConvexPart, Cylinder, Obstacle, Sphere
 
 SLIVER = 1e-6
 """Height over longest side below which a triangle has no direction of its own: vertices are rounded to some 1e-9."""
@@ -122,7 +122,7 @@ class PackedShapes:
         self.columns[-1] |= columns
         self.first.extend(range(self.first[-1] + 1, self.first[-1] + count + 1))
 
-    def _row(self, solid: ConvexPart | Sphere | Capsule | Cylinder | Box | TriangleMesh) -> dict[str, Any]:
+    def _row(self, solid: ConvexPart | Sphere | Capsule | Cylinder | Box | Mesh) -> dict[str, Any]:
         """Return the columns of a solid in its body, but for those that its motion and friction give."""
         row: dict[str, Any] = {"size": np.ones(3), "place": np.zeros(3), "turn": np.array([1.0, 0, 0, 0])}
         row |= {"scale": 1.0, "face": 0, "faces": 0, "box": 0}
@@ -151,9 +151,9 @@ class PackedShapes:
                 return row | {"kind": kind, "size": size, "place": place, "turn": turn, "radius": radius}
             case _:
                 if id(solid) not in self._known:
-                    faces = solid.faces if isinstance(solid, TriangleMesh) else hull_faces(solid.vertices)
+                    faces = solid.faces if isinstance(solid, Mesh) else hull_faces(solid.vertices)
                     # About its own middle, where single precision is finest.
-                    middle = solid.bounds().mean(axis=0) * MILLI
+                    middle = middle_of(solid.vertices) * MILLI
                     surface = PackedSurface.of(solid.vertices * MILLI - middle, faces)
                     self._known[id(solid)] = self.add_mesh(surface) | {"place": middle, "radius": surface.radius}
                 return row | self._known[id(solid)] | {"kind": limits.MESH}
@@ -255,6 +255,11 @@ def _face_normals(
             break
         across[slim], normals[slim] = passed, beyond
     return normals, across
+
+
+def middle_of(points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the middle [3] of the bounds of points [n, 3]."""
+    return np.stack([points.min(axis=0), points.max(axis=0)]).mean(axis=0)
 
 
 def _mm(vector: Any) -> NDArray[np.float64]:

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from brainbench.core.contracts import CHANNELS
-from brainbench.core.errors import DataError, UsageError, check_each
+from brainbench.core.errors import DataError, check_each, check_once
 from brainbench.core.reading.ranges import check_number
 
 if TYPE_CHECKING:
@@ -87,8 +87,7 @@ def new_wrenches(
     import xarray as xr
 
     check_each("channel of a wrench", channels, CHANNELS)
-    if len(set(channels)) < len(channels):
-        raise UsageError(f"The channels of a wrench stand once each; received {list(channels)}.")
+    check_once("A wrench", channels)
     array = np.asarray(values, dtype=float)
     if array.ndim != 2 or array.shape[1] != len(channels):
         raise DataError(f"Wrenches are numbers [time, {len(channels)}]; received an array of shape {array.shape}.")

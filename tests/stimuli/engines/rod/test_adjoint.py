@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from brainbench.core.devices import pick_device
-from brainbench.stimuli.engines.rod.adjoint import OutputDerivatives, RecordingSolver
+from brainbench.stimuli.engines.rod.adjoint import RecordingSolver
 from brainbench.stimuli.engines.rod.engine import RodEngine
 from brainbench.stimuli.engines.rod.tasks import PackedTasks, make_task
 from brainbench.stimuli.objects.obstacle import Capsule
@@ -24,6 +24,11 @@ def _record(job, fidelity=FINE):
     packed = PackedTasks.of([task], shared=False)
     solver = RecordingSolver(packed.chains, fidelity, pick_device("cpu"), packed.shapes.needs, twists=task.twists)
     return solver, packed.launch(solver, record_shape=True)
+
+
+def _of_wrenches(solver, frames):
+    """Return the derivatives of the sum of all wrenches by the results of one job."""
+    return np.ones((1, frames, 6)), np.zeros((1, frames, solver.capacity + 1, 3)), np.zeros((1, frames, 6))
 
 
 def test_a_recorded_run_takes_the_steps_of_the_ordinary_one():
@@ -50,27 +55,27 @@ def test_forces_of_several_contacts_with_friction_are_solved_to_rounding():
     # Sweeps alone leave a seventh of the contact steps of this whisker on a mesh unsolved.
     job = contact_jobs(11, each=1)[31]
     solver, result = _record(job, replace(FINE, links=11))
-    found = solver.reverse(OutputDerivatives(np.ones((1, result.wrench.shape[1], 6))))["contacts"][0]
+    found = solver.reverse(*_of_wrenches(solver, result.wrench.shape[1]))["contacts"][0]
     assert result.steps[0, 0] > 2000
     assert found["slipped"] > 5
     assert found["degenerate"] == 0
 
 
 def test_short_runs_are_written_down_once_and_long_ones_in_parts_with_the_same_derivatives(monkeypatch):
-    outputs = OutputDerivatives(np.ones((1, 30, 6)))
     solver, _ = _record(touching_job(POST, friction=0.4))
+    outputs = _of_wrenches(solver, 30)
     assert len(solver.checkpoints) == 1
-    whole = solver.reverse(outputs)
+    whole = solver.reverse(*outputs)
     monkeypatch.setattr(RecordingSolver, "room", 0)
     solver, _ = _record(touching_job(POST, friction=0.4))
     assert len(solver.checkpoints) > 10
-    assert np.array_equal(whole["link"], solver.reverse(outputs)["link"])
+    assert np.array_equal(whole["link"], solver.reverse(*outputs)["link"])
 
 
 def test_going_back_twice_gives_the_same():
     solver, result = _record(touching_job(POST, friction=0.4))
-    outputs = OutputDerivatives(np.ones((1, result.wrench.shape[1], 6)))
-    first, second = solver.reverse(outputs), solver.reverse(outputs)
+    outputs = _of_wrenches(solver, result.wrench.shape[1])
+    first, second = solver.reverse(*outputs), solver.reverse(*outputs)
     for name in ("link", "knots", "shape_place"):
         assert np.abs(first[name]).max() > 0
         assert np.array_equal(first[name], second[name])

@@ -10,11 +10,12 @@ import numpy as np
 import pytest
 
 from brainbench.core.errors import UsageError
+from brainbench.geometry import Mesh
 from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.engines.protocol import Job, StillFollicle
 from brainbench.stimuli.engines.rod.engine import RodEngine
 from brainbench.stimuli.objects.collections import resolve_objects
-from brainbench.stimuli.objects.obstacle import Box, Capsule, Obstacle, TriangleMesh
+from brainbench.stimuli.objects.obstacle import Box, Capsule, Obstacle
 from brainbench.stimuli.sweeps.grid import SweepGrid
 from brainbench.stimuli.sweeps.sweep_scenes import GRIDS, SweepScenes
 from brainbench.stimuli.validation import bench_tests
@@ -39,7 +40,7 @@ def _box_mesh(low, high):
     import trimesh
 
     mesh = trimesh.creation.box(bounds=[low, high])
-    return TriangleMesh(np.asarray(mesh.vertices), np.asarray(mesh.faces))
+    return Mesh(np.asarray(mesh.vertices), np.asarray(mesh.faces))
 
 
 def _run(jobs, fidelity=COARSE, **options):
@@ -66,7 +67,7 @@ def test_nothing_thin_passes_through_a_whisker_in_steps_of_a_millisecond(kind):
         edge = blade.vertices.copy()
         front = edge[:, 1] > -0.003
         edge[front, 0] = 0.00805 + np.sign(edge[front, 0] - 0.00805) * 5e-7
-        thing = _moving((), (0.0, 0.06, 0.0), TriangleMesh(edge, blade.faces))
+        thing = _moving((), (0.0, 0.06, 0.0), Mesh(edge, blade.faces))
     trace = _run(Job(C2, StillFollicle(), (thing,), np.arange(1, 61) * 1e-3))[0]
     assert trace.status == "ok"
     # From y = -2 mm at 60 mm/s it reaches the whisker after 33 ms and has pushed it by 1.6 mm at the end.
@@ -86,7 +87,7 @@ def test_a_whisker_feels_the_wall_of_a_slot_and_not_its_hull():
         ],
         engine="manifold",
     )
-    surface = TriangleMesh(np.asarray(u.vertices), np.asarray(u.faces))
+    surface = Mesh(np.asarray(u.vertices), np.asarray(u.faces))
     thing = _moving((), (0.0, 0.05, 0.0), surface)
     # Its lower wall starts 3 mm below the whisker: after 60 ms it arrives.
     trace = _run(Job(C2, StillFollicle(), (thing,), np.arange(1, 91) * 1e-3))[0]

@@ -12,7 +12,7 @@ from brainbench.stimuli.engines.fidelity import Fidelity
 from brainbench.stimuli.engines.protocol import Job, StillFollicle, base_rotation
 from brainbench.stimuli.engines.rod.engine import RodEngine
 from brainbench.stimuli.objects.mesh_solids import shape_solid
-from brainbench.stimuli.objects.obstacle import Box, Capsule, ConvexPart, Cylinder, Obstacle, Sphere, TriangleMesh
+from brainbench.stimuli.objects.obstacle import Box, Capsule, ConvexPart, Cylinder, Obstacle, Sphere
 from brainbench.stimuli.objects.procedural import make
 from brainbench.stimuli.sweeps.grid import SweepGrid
 from brainbench.stimuli.sweeps.simulation import simulate_sweeps
@@ -88,7 +88,7 @@ def _sphere(radius):
     import trimesh
 
     mesh = trimesh.creation.icosphere(4, radius)
-    return TriangleMesh(np.asarray(mesh.vertices), np.asarray(mesh.faces))
+    return Mesh(np.asarray(mesh.vertices), np.asarray(mesh.faces))
 
 
 @pytest.mark.parametrize(
@@ -139,7 +139,7 @@ def test_an_object_that_moves_through_the_base_point_is_flagged_with_the_time(ki
     import trimesh
 
     box = trimesh.creation.box(extents=(2 * half, 2 * half, 0.02))
-    mesh = TriangleMesh(np.asarray(box.vertices), np.asarray(box.faces))
+    mesh = Mesh(np.asarray(box.vertices), np.asarray(box.faces))
     if kind == "mesh" and backend == "mujoco":
         pytest.skip("touches convex bodies only")
     # At .2 m/s it reaches the skin of the base, from y = -4 mm, after 20 ms but for its and the whisker's thickness.

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from brainbench.core.devices import to_struct
+from brainbench.geometry import Mesh
 from brainbench.stimuli.engines.rod.kernels import specialize
 from brainbench.stimuli.engines.rod.mesh_bvh import EMPTY, WIDE, spatial_order, tree_boxes
 from brainbench.stimuli.engines.rod.shapes import PackedShapes, PackedSurface
-from brainbench.stimuli.objects.obstacle import TriangleMesh
 from tests.factories.rod_threads import WARP, Memory, thread_warp
 
 wp = pytest.importorskip("warp")
@@ -20,7 +20,7 @@ def _surface(name="gear-0"):
 
     surface = resolve_objects([name], surfaces=True)[name].load().surface
     # The kernels' millimetres; trimesh takes small triangles in metres for points.
-    return TriangleMesh(surface.vertices * 1e3, surface.faces)
+    return Mesh(surface.vertices * 1e3, surface.faces)
 
 
 def _segments(surface, count, seed=0):
@@ -177,7 +177,7 @@ def test_a_link_outside_is_never_told_that_it_overlaps_wherever_the_search_begin
 
     # So small that every triangle is within sight.
     surface = _surface()
-    surface = TriangleMesh(surface.vertices * (3.0 / np.ptp(surface.vertices, axis=0).max()), surface.faces)
+    surface = Mesh(surface.vertices * (3.0 / np.ptp(surface.vertices, axis=0).max()), surface.faces)
     # Links that stand on a face, most of each further away than what is looked for on its own.
     rng = np.random.default_rng(0)
     corners = surface.vertices[surface.faces[rng.integers(len(surface.faces), size=120)]]
@@ -260,7 +260,7 @@ def test_triangles_measured_side_by_side_are_those_measured_one_by_one():
     wp.init()
     # The last leaf is not full, so that places without a triangle are met.
     surface = _surface()
-    surface = TriangleMesh(surface.vertices, surface.faces[:-3])
+    surface = Mesh(surface.vertices, surface.faces[:-3])
     arrays = _shapes(surface)
     assert arrays["faces"][0] % WIDE
     leaves = len(arrays["corners"])

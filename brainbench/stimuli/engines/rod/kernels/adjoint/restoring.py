@@ -22,7 +22,6 @@ class StepFrame:
     length: real
     reading: wp.int32
     pose: BodyMotion
-    after: BodyMotion
     base: SpatialAcceleration
 
 
@@ -56,7 +55,6 @@ def restore_step(
     pose = pose_at(motions, job.base, now)
     after = pose_at(motions, job.base, frame.later)
     frame.pose = pose
-    frame.after = after
     state = WhiskerState()
     for i in range(job.links):
         chain.angle[i] = records.angle[place, i, index]
