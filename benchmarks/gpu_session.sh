@@ -13,7 +13,7 @@
 #   device, 4…: bash /w/gpu.sh run PART …                             each at most as long as it says; all below 600 s
 #   or, on a machine of several GPUs, parts in the background and a look at them:
 #               bash /w/gpu.sh queue FILE 0a 0b 1a 1b …           two lanes a GPU, which take the next SEED:ARM[,ARM] of the
-#               file when they are done; 33 students, of which seven learn their network, took four GPUs 26 minutes
+#               file when they are done; 38 students, of which seven learn their network, took four H100 27 minutes
 #               bash /w/gpu.sh lane 0c tests                       a part in a lane of its own
 #               TASK=screwdriver NAME=-a CONFIG=default JUDGED=careful WITH="--seed 1" bash /w/gpu.sh lane 2a teacher-of
 #               JOB=NAME-0 MINUTES=25 bash /w/gpu.sh lane 1 teachers          a piece of a job, which another session goes on with
