@@ -35,7 +35,7 @@ from robotics_bridge.tasks.contact_model import CONTACTS
 
 if TYPE_CHECKING:
     from brainbench.core.records import Interval
-    from robotics_bridge.policies.report import StudentResult
+    from robotics_bridge.policies.report.results import StudentResult
     from robotics_bridge.policies.training.distill_config import DistillConfig
 
 NETWORK = "zhuang-intersection-ln-small"
@@ -252,15 +252,16 @@ def lay_out(options: argparse.Namespace) -> None:
 
     from benchmarks.report import table, with_notes, write_section
     from leaderboards import write_record
-    from robotics_bridge.policies import report
-    from robotics_bridge.policies.report import figure
+    from robotics_bridge.policies.report import figure, tables
+    from robotics_bridge.policies.report.records import records
+    from robotics_bridge.policies.report.results import read_agents, read_results
 
-    every = report.read_results(options.lay_out, at_least=options.at_least)
+    every = read_results(options.lay_out, at_least=options.at_least)
     results = [result for result in every if arm_of(result.config) not in NETWORKS]
-    agents = report.read_agents(options.lay_out)
-    title, columns, rows = report.concise([*report.rows(results), *report.agent_rows(agents)])
+    agents = read_agents(options.lay_out)
+    title, columns, rows = tables.concise([*tables.rows(results), *tables.agent_rows(agents)])
     named = {arm: result for arm in ARMS for result in results if arm_of(result.config) == arm}
-    notes = report.remarks([replace(result, left_out=()) for result in results])
+    notes = tables.remarks([replace(result, left_out=()) for result in results])
     left = [f"{arm} seed {item.seed} ({item.iterations})" for arm, r in named.items() for item in r.left_out]
     notes += [f"left out, after so many iterations: {', '.join(left)}"] if left else []
     parts = [f"{title}.", table(columns, rows)]
@@ -275,7 +276,7 @@ def lay_out(options: argparse.Namespace) -> None:
         write_section(f"Students of {options.task}", command, body, where=options.device, subject="policies")
     if options.records is not None:
         shipped = [replace(result, config=replace(result.config, teacher=str(options.teacher))) for result in every]
-        for record in report.records(shipped):
+        for record in records(shipped):
             print(write_record(record, options.records))
 
 
@@ -365,7 +366,7 @@ def differences(named: dict[str, StudentResult], logs: dict[tuple[str, int], lis
 
     from benchmarks.report import table
     from brainbench.metrics.inference.multiple import adjust
-    from robotics_bridge.policies.report import mixed_model
+    from robotics_bridge.policies.report.results import mixed_model
 
     least = min(learned or 0 for result in named.values() for learned in result.learned)
     model = mixed_model(list(named.values()))

@@ -12,7 +12,7 @@ from brainbench.core.errors import BrainbenchError, DataError
 from brainbench.core.reading.regular import check_file
 from brainbench.core.reading.tensors import check_finite
 from brainbench.models.export import onnx_session, require_onnx
-from robotics_bridge.policies.contract import MOST_NUMBERS
+from robotics_bridge.policies.schema import MOST_NUMBERS
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

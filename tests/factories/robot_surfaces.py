@@ -14,7 +14,8 @@ from robotics_bridge.deploy.frames import KEY, read_key
 from robotics_bridge.deploy.simulated_hand import Faults
 from robotics_bridge.hands.layouts import read_probes, write_probes
 from robotics_bridge.policies.contract import PolicyContract
-from robotics_bridge.policies.report import AGENTS, EVALUATION, agent_rows, read_agents, read_results, rows
+from robotics_bridge.policies.report.results import AGENTS, EVALUATION, read_agents, read_results
+from robotics_bridge.policies.report.tables import agent_rows, rows
 from robotics_bridge.policies.training.distill_config import DistillConfig
 from robotics_bridge.policies.training.student_files import load_student
 from robotics_bridge.policies.training.sweep import StudentSweep, read_sweep

@@ -18,7 +18,7 @@ from robotics_bridge.policies.encoders.calibration import HandCalibration
 from robotics_bridge.policies.encoders.timing import CONTROL_SUB_STEP
 from robotics_bridge.policies.evaluate import Policy, evaluate
 from robotics_bridge.policies.fit import with_contacts_of
-from robotics_bridge.policies.report import EVALUATION, GRADED
+from robotics_bridge.policies.report.results import EVALUATION, GRADED
 from robotics_bridge.policies.shipped import list_policies
 from robotics_bridge.policies.training.distill import DistillResult, distill
 from robotics_bridge.policies.training.distill_config import DistillConfig

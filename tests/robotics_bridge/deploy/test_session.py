@@ -20,7 +20,6 @@ from robotics_bridge.deploy.touch import PressureCalibration
 from robotics_bridge.policies.contract import PolicyContract
 from robotics_bridge.policies.evaluate import Policy
 from robotics_bridge.policies.export import export_policy
-from robotics_bridge.policies.schema import Values
 from robotics_bridge.policies.training.distill import describe_run
 from robotics_bridge.policies.training.distill_config import DistillConfig
 from robotics_bridge.policies.training.student_files import build_student
@@ -32,7 +31,7 @@ def _deployed(group: str, size: int = 1, **deployment: Any) -> DeployedPolicy:
     contract = contract_of()
     contract["inputs"][1] = [group, [size]]
     contract["deployment"] |= {"hand": "xhand1", **deployment}
-    return DeployedPolicy(Path("policy.onnx"), PolicyContract.of(Values("policy.onnx.json", contract)))
+    return DeployedPolicy(Path("policy.onnx"), PolicyContract.of(contract, "policy.onnx.json"))
 
 
 @pytest.mark.parametrize("group", ["goal", "priv_obj_state", "priv_proprio", "aux_goal_dist", "aux_obj_size"])

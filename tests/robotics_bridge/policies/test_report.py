@@ -13,19 +13,10 @@ from brainbench.core.files import content_hash, read_json, write_json
 from brainbench.core.statistics import newcombe_interval
 from leaderboards import rank, write_record
 from leaderboards.store import read_record
-from robotics_bridge.policies.report import (
-    COLUMNS,
-    LeftOut,
-    agent_rows,
-    command,
-    concise,
-    read_agents,
-    read_results,
-    records,
-    remarks,
-    rows,
-)
 from robotics_bridge.policies.report.figure import draw
+from robotics_bridge.policies.report.records import command, records
+from robotics_bridge.policies.report.results import LeftOut, read_agents, read_results
+from robotics_bridge.policies.report.tables import COLUMNS, agent_rows, concise, remarks, rows
 from robotics_bridge.policies.training.distill_config import DistillConfig
 from robotics_bridge.tasks.task import TASK_VERSION
 
