@@ -131,8 +131,7 @@ class SimulatedHand:
         self._positions = [int(model.joint(name).qposadr[0]) for name in self.joints]
         self._speeds = [int(model.joint(name).dofadr[0]) for name in self.joints]
         self._drives = [model.actuator(name).id for name in self.joints]
-        tips = {chain[-1]: finger for finger, chain in self.hand.fingers.items()}
-        self._rows = [self.fingers.index(tips[link]) for link in self.layout if link in tips]
+        self._rows = [self.hand.tips.index(link) for link in self.layout if link in self.hand.tips]
         # The first step and reading load what later ones use; real time begins after them.
         self.step()
         self.touch()
