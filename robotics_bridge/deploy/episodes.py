@@ -59,9 +59,6 @@ class SessionRecorder:
     """Keeps a session of a deployed policy; touch is one point per finger tip, where the hand senses it.
 
     Forces stay in the unit in which the hand reports pressure.
-
-    Args:
-        contract: Of the policy.
     """
 
     def __init__(self, contract: PolicyContract) -> None:
@@ -143,7 +140,8 @@ def write_lerobot(
     check_folder(folder, fps)
     import pandas
 
-    shapes = dict(zip(PARTS, [*[(len(joints),)] * 3, (len(points.links), 6), (6,)], strict=True))
+    sizes: list[tuple[int, ...]] = [*[(len(joints),)] * 3, (len(points.links), 6), (6,)]
+    shapes: dict[str, tuple[int, ...]] = dict(zip(PARTS, sizes, strict=True))
     table, length = _columns(frames, fps, shapes), len(frames[PARTS[0]])
     _write_frames(folder / _DATA.format(chunk_index=0, file_index=0), table, shapes)
     stats = {name: _stats(values) for name, values in table.items()}

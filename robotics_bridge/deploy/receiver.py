@@ -47,13 +47,7 @@ class SequenceWindow:
 
 
 class Receiver:
-    """One direction of one session.
-
-    Args:
-        key: Of the direction.
-        max_age: Oldest frame that has an effect (s).
-        offset: Of the sender's clock, where something of it is known already.
-    """
+    """One direction of one session; ``offset`` is what is known already of the sender's clock."""
 
     def __init__(self, key: bytes, max_age: float = MAX_AGE, offset: ClockOffset | None = None) -> None:
         self.key, self.max_age = key, max_age

@@ -81,7 +81,8 @@ class Simulation:
             return
         self.engine.set(ctrl=self.ctrl.numpy())
         self.engine.step(self._substeps)
-        self._pull()
+        self.qpos.copy_(torch.from_numpy(self.engine.qpos))
+        self.qvel.copy_(torch.from_numpy(self.engine.qvel))
 
     def apply_push(self) -> None:
         """Hand ``push`` (force and torque on bodies [B, nbody, 6], N and N·m, world axes) to the engine."""
@@ -137,9 +138,3 @@ class Simulation:
             inertia[first : first + 3] = values["body_mass"][body]
             inertia[first + 3 : first + 6] = values["body_inertia"][body]
         self.engine.set_fields(env, {**values, "dof_M0": inertia})
-
-    def _pull(self) -> None:
-        qpos, qvel = self.qpos.numpy(), self.qvel.numpy()
-        for env, data in enumerate(self.engine.data):
-            qpos[env] = data.qpos
-            qvel[env] = data.qvel

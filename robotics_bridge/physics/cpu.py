@@ -69,8 +69,12 @@ class MujocoEngine:
         """The ``mujoco.MjModel`` of every environment."""
         self._own_models = bool(varied)
         if varied:
-            own = [{name: rows[env] for name, rows in varied.items()} for env in range(num_envs)]
-            self.models = list(map(_with_fields, self.models, own))
+            self.models = list(map(copy.copy, self.models))
+            for env, own in enumerate(self.models):
+                for name, rows in varied.items():
+                    getattr(own, name)[...] = rows[env]
+                # Masses, inertias and the like enter constants that the compiler derived.
+                mujoco.mj_setConst(own, mujoco.MjData(own))
         self.data: list[Any] = [mujoco.MjData(m) for m in self.models]
         """The ``mujoco.MjData`` of every environment."""
         self.state: HandState = HandState.empty(num_envs, self.model.nbody, contacts * num_envs, "cpu")
@@ -262,12 +266,3 @@ class _Gatherer:
             enough = max(*(len(parts[1]) for parts in found), -(-total // len(self._data)))
             text = f"The engine found {total} contacts and has room for {room}; the last ones are lost. "
             warnings.warn(f"{text}Make it with contacts={enough}.", RuntimeWarning, stacklevel=2)
-
-
-def _with_fields(model: Any, values: Mapping[str, NDArray]) -> Any:
-    varied = copy.copy(model)
-    for name, value in values.items():
-        getattr(varied, name)[...] = value
-    # Masses, inertias and the like enter constants that the compiler derived.
-    mujoco.mj_setConst(varied, mujoco.MjData(varied))
-    return varied

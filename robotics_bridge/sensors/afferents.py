@@ -125,11 +125,7 @@ class AfferentFilter:
         return filtered
 
     def reset(self, env_ids: EnvIds | None = None, x: torch.Tensor | None = None) -> None:
-        """Forget the past of some environments (all by default).
-
-        Args:
-            env_ids: Numbers of environments, or a mask [B] bool.
-            x: [B, …] signal that counts as having lasted for ever there; zero if not given.
+        """Forget the past of some environments (all by default); there the signal ``x`` [B, …], or 0, has always been.
 
         Raises:
             UsageError: an environment does not exist, or the signal has another shape than before.

@@ -29,9 +29,7 @@ class Runtime(abc.ABC):
     Updates launch kernels and do nothing else, so that they can be recorded.
 
     Args:
-        sensors: by name.
         channels: planes of the storage.
-        context: of the suite.
         fusable: whether the sensor's kernel applies the noise itself when no crosstalk forbids it.
         active: which probes [N] are none of the fillers.
     """
@@ -133,12 +131,7 @@ class Runtime(abc.ABC):
 class ProbeRuntime(Runtime):
     """Probes of all sensors of a group, one after another, with their slots.
 
-    Args:
-        sensors: by name.
-        channels: planes of the storage.
-        context: of the suite.
-        reach: how far beyond its radius a probe looks (m); None is unlimited, and geometries need not be in contact.
-        fusable: whether the sensor's kernel applies the noise itself when no crosstalk forbids it.
+    A probe looks ``reach`` beyond its radius (m); None is unlimited, and geometries need not be in contact.
     """
 
     def __init__(
@@ -155,8 +148,14 @@ class ProbeRuntime(Runtime):
         tracked = {name: sensor.tracked(context.scene) for name, sensor in sensors.items()}
         self.kinds = context.solids.kinds_of(sorted({g for members in tracked.values() for g in members}))
         """Kinds of the geometries that they may meet."""
-        self.slots = [self._slot(sensor, tracked[name], reach) for name, sensor in sensors.items()]
+        self.slots: list[int] = []
         """Slot of each sensor in the pair table."""
+        for name, sensor in sensors.items():
+            link, (center, span) = context.scene.link_index(sensor.link), enclosing_sphere(sensor.probes)
+            contact = reach is not None and sensor.contact_only
+            far = 0.0 if reach is None or contact else span + reach
+            slot = context.pairs.slot(link, tracked[name], contact=contact, center=center, reach=far)
+            self.slots.append(slot)
         p = ProbeArrays()
         for name, dtype in (("position", wp.vec3f), ("normal", wp.vec3f), ("radius", float)):
             columns = [getattr(sensor.probes, name) for sensor in sensors.values()]
@@ -166,13 +165,6 @@ class ProbeRuntime(Runtime):
         counts = [part.count for part in self.slices.values()]
         p.slot, p.part, p.probe = context.array(np.repeat(self.slots, counts), int), self.part, self.probe
         self.probes = p
-
-    def _slot(self, sensor: ProbeSensor, members: tuple[int, ...], reach: float | None) -> int:
-        link = self.context.scene.link_index(sensor.link)
-        contact = reach is not None and sensor.contact_only
-        center, span = enclosing_sphere(sensor.probes)
-        far = 0.0 if reach is None or contact else span + reach
-        return self.context.pairs.slot(link, members, contact=contact, center=center, reach=far)
 
     def launch(self, kernel: Any, *inputs: Any) -> None:
         """Run a kernel over all environments and probes."""
@@ -189,12 +181,8 @@ def probe_rows(slices: Iterable[ReadoutSlice], context: LaunchContext, mode: int
     """Return rows (first, end, step, number of the sensor) [R, 4] of probes that one thread takes in turn.
 
     What all probes of an environment share is then read less often. On a GPU the rows of neighbouring threads are
-    interleaved, so that these touch neighbouring memory.
-
-    Args:
-        slices: of the sensors, in the order of their numbers.
-        context: of the suite.
-        mode: of the readout; noise in the same kernel leaves no registers to share.
+    interleaved, so that these touch neighbouring memory; noise in the same kernel (``mode``) leaves no registers to
+    share.
     """
     slices = list(slices)
     cuda = bool(context.device.is_cuda)

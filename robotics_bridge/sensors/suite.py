@@ -122,11 +122,7 @@ class SensorSuite:
         self._warned = False
 
     def update(self, state: HandState, dt: float = 0.01) -> None:
-        """Read the state with every sensor.
-
-        Args:
-            state: of ``num_envs`` environments on the suite's device.
-            dt: seconds since the last update.
+        """Read the state of ``num_envs`` environments with every sensor, ``dt`` seconds after the last update.
 
         Raises:
             UsageError: the state does not fit the suite, or dt is not a positive time.
@@ -198,9 +194,6 @@ class SensorSuite:
 
     def reset(self, env_ids: EnvIds | None = None) -> None:
         """Start a new episode in some environments (all by default): memories are cleared, new errors drawn.
-
-        Args:
-            env_ids: numbers of environments, or a mask [B] bool.
 
         Raises:
             UsageError: an environment does not exist, or these are neither numbers nor a mask.
@@ -277,12 +270,7 @@ class SensorSuite:
             raise UsageError(f"The state lies on {state.device}, the suite on {self.device}; build both on one device.")
 
     def runtime_of(self, name: str, kind: type[Sensor] = Sensor, what: str = "sensor") -> Runtime:
-        """Return the runtime of a sensor.
-
-        Args:
-            name: of the sensor.
-            kind: class that it must have.
-            what: what such a sensor is called in a message.
+        """Return the runtime of a sensor of a kind, which messages call ``what``.
 
         Raises:
             UsageError: there is no such sensor.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -159,7 +160,7 @@ def _bad_sweep(sweep: StudentSweep) -> bool:
 
 def _evaluation(folder: Path) -> Path:
     config = DistillConfig(task="in_palm_rotate")
-    write_json(folder / "config.json", {"distill": config.plain(), "task_version": TASK_VERSION})
+    write_json(folder / "config.json", {"distill": asdict(config), "task_version": TASK_VERSION})
     found = {"seed": 0, "success": [1.0, 0.0, 1.0], "goals": [2.0, None, 3.5], "iterations": 30}
     return write_json(folder / EVALUATION, [found, {**found, "seed": 1}])
 

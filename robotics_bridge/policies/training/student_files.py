@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -44,7 +45,7 @@ def build_student(
     tactile = config.tactile
     return TactilePolicy(
         example, {"student": groups}, "student", actions, hidden_dims=config.hidden, embedder=config.embedder,
-        tactile=tactile.plain() if tactile is not None else None,
+        tactile=asdict(tactile) if tactile is not None else None,
     )  # fmt: skip
 
 

@@ -11,7 +11,7 @@ import torch
 
 from brainbench.core.errors import DataError, UsageError
 from brainbench.core.files import read_mapping, write_json
-from brainbench.core.progress import Progress
+from brainbench.core.progress import Progress, track
 from robotics_bridge import tasks
 from robotics_bridge.policies.encoders.arms import ARMS, EncoderConfig
 from robotics_bridge.policies.encoders.calibration import HandCalibration
@@ -124,7 +124,7 @@ def _measure(tactile: EncoderConfig, env: Any, teacher: Any) -> HandCalibration:
     observations, felt = env.reset(), []
     for _ in range(_CALIBRATION_STEPS):
         felt.append(grid(observations["tactile"][:_CALIBRATION_ENVS]).cpu())
-        observations, *_ = env.step(teacher.act(observations))
+        observations, *_ = env.step(teacher(observations))
     try:
         return HandCalibration.fit(torch.stack(felt))
     except DataError:
@@ -142,7 +142,7 @@ def evaluate_student(
     """
     student, _ = load_student(folder, device=str(env.device))
     policy, found = Policy(student), []
-    for number, seed in enumerate(SEEDS[:evaluations]):
+    for seed in track(SEEDS[:evaluations], "evaluating", progress):
         result = evaluate(env, policy, episodes=episodes, seed=seed, name=Path(folder).name)
         found.append(
             {
@@ -151,7 +151,5 @@ def evaluate_student(
                 **{name: [float(item) for item in getattr(result, name)] for name in GRADED},
             }
         )  # fmt: skip
-        if progress is not None:
-            progress(number + 1, evaluations, "evaluating")
     write_json(Path(folder) / EVALUATION, found)
     return tuple(found)

@@ -96,7 +96,7 @@ class Trainer:
             tactile = self.sensing.tactile
             actor = {
                 "class_name": "robotics_bridge.policies.student:TactilePolicy", "embedder": self.sensing.embedder,
-                "tactile": tactile.plain() if tactile is not None else None,
+                "tactile": asdict(tactile) if tactile is not None else None,
             }  # fmt: skip
         self.config = self.settings.config(groups, actor)
         observations = self.env.get_observations()

@@ -175,13 +175,10 @@ def simulate(
     The error of the sensing radius needs the geometry and is left out.
 
     Args:
-        noise: Knobs.
         clean: [T, B, N, C] signal [unit of the sensor].
         dt: Time step [s].
-        seed: Seed of the experiment.
+        seed: Seed of the experiment; its numbers also depend on the ``name`` of the sensor.
         layout: (ny, nx) where crosstalk is wanted.
-        name: Name of the sensor.
-        device: ``cpu`` or ``cuda``.
         env_offset: Number of the first environment in the whole experiment.
 
     Raises:

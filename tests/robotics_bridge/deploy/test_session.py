@@ -48,7 +48,7 @@ def test_a_command_that_the_contract_states_needs_no_word_of_the_user() -> None:
 
 def test_touch_of_a_policy_without_touch_reaches_nothing_and_is_refused() -> None:
     deployed, hand = _deployed("command", command=[0.5]), SimpleNamespace(joints=(), fingers=())
-    inputs = {name: shape for name, shape in deployed.groups.items() if name != "tactile"}
+    inputs = {name: shape for name, shape in deployed.contract.inputs.items() if name != "tactile"}
     deployed = replace(deployed, contract=replace(deployed.contract, inputs=inputs, links=()))
     for options in ({"fallback": lambda reading: None}, {"calibration": PressureCalibration()}):
         with pytest.raises(UsageError, match="reads no touch"):

@@ -22,7 +22,7 @@ class Pusher:
     def __init__(self, actions: int) -> None:
         self.actions = actions
 
-    def act(self, obs) -> torch.Tensor:
+    def __call__(self, obs) -> torch.Tensor:
         return torch.tanh(obs["priv_proprio"][:, : self.actions])
 
 
