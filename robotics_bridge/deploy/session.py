@@ -37,31 +37,26 @@ class DeployedPolicy:
     path: Path
     contract: PolicyContract
 
-    def unmeasured(self, fingers: Sequence[str] | None = None) -> dict[str, str]:
-        """Return group → what a hand with these sensing fingers (all by default) cannot measure of it, in words."""
+    def require(self, given: Collection[str], fingers: Sequence[str] | None = None) -> dict[str, str]:
+        """Return group → what a hand with these sensing fingers (all by default) cannot measure of it, in words.
+
+        Raises:
+            UsageError: one of them is not among the groups that something else gives, or is privileged: no constant
+                stands for what only the simulation knows.
+        """
         contract = self.contract
+        check_measured(contract.inputs, "A policy on a hand")
         # What is told to the hand is no measurement; a contract that states it needs no word of the user.
         told = ("proprio", "tactile", *(("command",) if "command" in contract.more else ()))
         found = {
             name: f"{list(shape)}, {_MEANINGS.get(name, 'known to the simulation alone')}"
-            for name, shape in self.contract.inputs.items()
+            for name, shape in contract.inputs.items()
             if name not in told
         }
         chains = hands.load(contract.hand).fingers
         tips = {chain[-1] for finger, chain in chains.items() if fingers is None or finger in fingers}
         if blind := [link for link in contract.links if contract.observe not in REAL_TYPES or link not in tips]:
             found["tactile"] = f"{contract.observe!r} of {listing(blind, limit=3)}"
-        return found
-
-    def require(self, given: Collection[str], fingers: Sequence[str] | None = None) -> dict[str, str]:
-        """Return :meth:`unmeasured`.
-
-        Raises:
-            UsageError: one of them is not among the groups that something else gives, or is privileged: no constant
-                stands for what only the simulation knows.
-        """
-        check_measured(self.contract.inputs, "A policy on a hand")
-        found = self.unmeasured(fingers)
         if missing := [f"{name} ({what})" for name, what in found.items() if name not in given]:
             raise UsageError(
                 f"The policy was trained with what the hand cannot measure: {'; '.join(missing)}. Give each a constant "
@@ -85,7 +80,7 @@ class DeployedPolicy:
         Args:
             driver: The hand.
             limits: Changes of :class:`~robotics_bridge.deploy.safety.SafetyLimits`, such as ``timeout``.
-            sources: Group → what gives it, for every group of :attr:`unmeasured` but ``tactile``.
+            sources: Group → what gives it, for every group of :meth:`require` but ``tactile``.
             calibration: Of the hand's pressure.
             fallback: Simulated or constant touch where the hand senses nothing.
             threads: Of the network's computations.

@@ -71,6 +71,9 @@ class Env:
         self.device: torch.device = state.device
         self.num_envs, self.decimation, self.step_dt = options.num_envs, state.substeps, state.step_dt
         self.max_episode_length = task.max_episode_length
+        self.joint_names, self.action_names = state.model.joints, state.model.moved
+        """Driven joints J, and those A that actions move."""
+        self.num_actions = len(self.action_names)
         self.reset_episodes = EpisodeReset(state)
         self.apply_action: Callable[[EnvState], None] = apply_action
         """First part of a control step; replayed as a CUDA graph once it is recorded."""
@@ -89,21 +92,6 @@ class Env:
         self.reset()
         self.observation_shapes = {name: tuple(value.shape[1:]) for name, value in self.observations.items()}
         """Group → shape per environment."""
-
-    @property
-    def num_actions(self) -> int:
-        """Number of actions A."""
-        return len(self.model.moved)
-
-    @property
-    def joint_names(self) -> tuple[str, ...]:
-        """Driven joints J."""
-        return self.model.joints
-
-    @property
-    def action_names(self) -> tuple[str, ...]:
-        """Joints A that actions move."""
-        return self.model.moved
 
     @property
     def action_map(self) -> ActionMap:

@@ -88,7 +88,12 @@ class Runtime(abc.ABC):
         io.knobs, io.env_offset = self._noise.params, context.env_offset
         self.io = io
         """Warp structure of the readings: ``truth`` and ``measured``, planar."""
-        self._channels = channels
+        self.rings = self._noise.rings
+        """Those of delays that the user asked for."""
+        kept = [io.truth, io.measured, io.hysteresis, io.walk]
+        wanted = (True, self.noisy, *self.stores)
+        self.readings = [array for array, stored in zip(kept, wanted, strict=True) if stored] + self._noise.lasting
+        """Those of readings and their noise."""
 
     def update(self, state: HandState, dt: float) -> None:
         """Read the state; ``dt`` seconds have passed since the last update."""
@@ -107,25 +112,6 @@ class Runtime(abc.ABC):
     def measured(self) -> Any:
         """Return the planar Warp array of measured readings."""
         return self._noise.read(self.io.measured)
-
-    @property
-    def state_bytes(self) -> int:
-        """Lasting memory per environment [bytes], readings included, without history and delay."""
-        planes = 1 + int(self.noisy) + sum(self.stores)
-        return 4 * self._channels * self.count * planes + self._noise.state_bytes + self._bytes(self.lasting)
-
-    @property
-    def scratch_bytes(self) -> int:
-        """Memory per environment [bytes] that every update writes anew."""
-        return self._bytes(self.scratch)
-
-    @property
-    def ring_bytes(self) -> int:
-        """Memory per environment [bytes] of delays that the user asked for."""
-        return self._noise.ring_bytes
-
-    def _bytes(self, arrays: list[Any]) -> int:
-        return sum(array.size * wp.types.type_size_in_bytes(array.dtype) for array in arrays) // self.context.num_envs
 
 
 class ProbeRuntime(Runtime):
@@ -210,11 +196,7 @@ class History:
         self.part, self.length, self._context = part, length, context
         self.ring: Any = context.zeros((2 * length, channels, context.num_envs, part.count))
         """Warp array [2 T, C, B, N]: every reading is written twice."""
-
-    @property
-    def bytes(self) -> int:
-        """Memory per environment [bytes]."""
-        return self.ring.size * 4 // self._context.num_envs
+        self.rings = [self.ring]
 
     def launch(self, value: Any, counter: Any) -> None:
         """Append the reading of this update; ``counter`` [1] counts updates on the device."""

@@ -16,7 +16,7 @@ from brainbench.core.reading.ranges import check_number
 from robotics_bridge.physics.scene import TouchScene
 from robotics_bridge.physics.selection import EnvIds, select_envs
 from robotics_bridge.physics.state import DIVERGED, MOST_ENVS, UNFELT, HandState
-from robotics_bridge.sensors.context import SuiteContext
+from robotics_bridge.sensors.context import SuiteContext, memory_of
 from robotics_bridge.sensors.fidelity import SensorFidelity
 from robotics_bridge.sensors.plausibility import warn_of
 from robotics_bridge.sensors.probes.runtime import DistanceRuntime
@@ -245,10 +245,13 @@ class SensorSuite:
     def state_bytes(self) -> dict[str, int]:
         """Memory per environment [bytes]: ``sensors``, ``shared`` lists of contacts, ``rings`` that users asked for,
         and ``scratch`` that every update writes anew."""
-        rings = sum(runtime.ring_bytes for runtime in self.runtimes) + sum(h.bytes for h in self._histories.values())
-        sensors = sum(runtime.state_bytes for runtime in self.runtimes)
-        scratch = sum(runtime.scratch_bytes for runtime in self.runtimes)
-        return {"sensors": sensors, "shared": 8 + self.pairs.state_bytes, "rings": rings, "scratch": scratch}
+        owners = {
+            "sensors": [(*runtime.readings, *runtime.lasting) for runtime in self.runtimes],
+            "rings": [owner.rings for owner in (*self.runtimes, *self._histories.values())],
+            "scratch": [runtime.scratch for runtime in self.runtimes],
+        }
+        found = {name: sum(memory_of(held, self.num_envs) for held in lists) for name, lists in owners.items()}
+        return {**found, "shared": 8 + self.pairs.state_bytes}
 
     def _launch(self, state: HandState, dt: float) -> None:
         self.pairs.update(state)
