@@ -161,7 +161,6 @@ def record_exploration(
         objects: What to explore; labels differ.
         procedures: Names of :data:`~robotics_bridge.exploration.procedures.PROCEDURES`.
         hand: Name or file of the hand.
-        resolution: Of its taxels, as ``placement``.
         noisy: With the published imperfections of force taxels, drawn by ``seed``.
         frames: T, of 9 ms; a procedure is stretched over them.
         progress: Called with (frames done, frames, what).

@@ -136,11 +136,9 @@ def evaluate(
     Each environment contributes equally many episodes, so that short ones are not counted more often.
 
     Args:
-        env: the environments.
         policy: its ``reset(mask)``, if any, is called when episodes end.
         episodes: at least so many for every seed of the environments.
         seed: several are run one after the other.
-        name: of the agent, for reports.
         progress: called with seeds done, seeds and a word.
 
     Raises:

@@ -29,7 +29,6 @@ def read_policy(
     """Return an exported policy as a function of one step of one hand that remembers.
 
     Args:
-        path: The file.
         shapes: Group → shape, in the order of the contract's ``inputs``.
         threads: Threads that ONNX Runtime computes with; its own choice if None.
         actions: A; not checked if None.

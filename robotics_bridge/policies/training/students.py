@@ -138,7 +138,8 @@ def evaluate_student(
     """Run whole episodes with a student and write ``evaluation.json``, one entry per seed of the first ``evaluations``.
 
     An entry lists per episode ``success``, ``metric``, ``returns``, ``goals``, ``turn_rate`` (rad/s), ``seconds`` and
-    ``dropped`` (:class:`~robotics_bridge.policies.evaluate.Evaluation`), and holds the ``iterations`` learned so far.
+    ``dropped`` (:class:`~robotics_bridge.policies.evaluate.PolicyEvaluation`), and holds the ``iterations`` learned
+    so far.
     """
     student, _ = load_student(folder, device=str(env.device))
     policy, found = Policy(student), []

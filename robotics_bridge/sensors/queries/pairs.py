@@ -28,7 +28,6 @@ class PairTable:
     :meth:`freeze`, when all sensors have asked.
 
     Args:
-        context: of the suite.
         listed: geometries in contact with one link that are listed at once; None lists all, where that takes at most
             256 MiB, and 16 otherwise.
     """
