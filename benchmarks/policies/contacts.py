@@ -87,7 +87,7 @@ def make(name: str, envs: int) -> Env:
     contacts, integrator = MODELS[name]
     env = tasks.make(replace(tasks.load("in_palm_rotate", "careful"), contacts=contacts), num_envs=envs, threads=1)
     for number in range(envs):
-        option = env.simulation.engine.model_of(number).opt
+        option = env.simulation.engine.models[number].opt
         option.integrator = getattr(mujoco_module().mjtIntegrator, integrator)
     return env
 

@@ -164,7 +164,9 @@ def main() -> None:
             runs = [deploy(deployed, env, seed, limited=limited) for seed in seeds]
             ways[name] = {key: torch.cat([found[key] for found, _ in runs]).tolist() for key in runs[0][0]}
             reports += [report for _, own in runs for report in own] if limited else []
-    text = body(options.student, task, ways, reports) + f" What the policy reads: {', '.join(deployed.groups)}."
+    text = (
+        body(options.student, task, ways, reports) + f" What the policy reads: {', '.join(deployed.contract.inputs)}."
+    )
     text = with_notes(text, options.notes)
     print(text)
     if options.write:

@@ -27,7 +27,7 @@ from brainbench.core.errors import UsageError
 from brainbench.core.figures.style import COLORS, PALE, panels, save_figure
 from brainbench.core.files import read_json
 from brainbench.models.architecture import Architecture
-from robotics_bridge.policies.report import StudentResult, read_results
+from robotics_bridge.policies.report.results import StudentResult, read_results
 from robotics_bridge.policies.training.distill_config import DistillConfig
 
 PICTURE = Path(__file__).resolve().parents[2] / "docs" / "images" / "policy-score-success.png"

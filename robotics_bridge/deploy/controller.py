@@ -27,9 +27,6 @@ from robotics_bridge.policies.runners import Runner
 
 _log = logging.getLogger(__name__)
 
-LONGEST = 86400.0
-"""Seconds of the longest session."""
-
 
 class Clock:
     """The time of a control loop; tests have one of their own."""
@@ -71,7 +68,7 @@ class Report:
 
 def check_duration(seconds: float) -> None:
     """Raise :class:`UsageError` unless a session can last so long (s)."""
-    check_number("length of a session (s)", seconds, above=0, most=LONGEST)
+    check_number("length of a session (s)", seconds, above=0, most=86400)
 
 
 class Controller:

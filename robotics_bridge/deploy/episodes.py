@@ -1,9 +1,10 @@
-"""Episodes as a LeRobot data set (layout v3.0), written with our own Parquet and JSON; lerobot itself is not needed.
+"""A session as a LeRobot data set (layout v3.0), written with our own Parquet and JSON; lerobot itself is not needed.
 
 Per frame: ``observation.state`` (joint positions, rad), ``observation.velocity``, ``action`` (joint targets, rad),
 ``observation.tactile`` [N, 6] (force and torque of each point, link frame, about the link's origin) and
 ``observation.wrench`` [6] (their sum in the palm's frame, about its origin). Where the points sit, and the unit of the
-forces, stands once in ``meta/tactile.json``. Arrays of two axes are nested lists, as LeRobot stores them.
+forces, stands once in ``meta/tactile.json``. Arrays of two axes are nested lists, as LeRobot stores them. A session is
+one episode. Letters: T frame, J joint, N point.
 """
 
 from __future__ import annotations
@@ -25,53 +26,32 @@ from robotics_bridge.policies.contract import PolicyContract
 from robotics_bridge.policies.encoders.finger_axes import FingerAxes, finger_axes_of
 
 VERSION = "v3.0"
+PARTS = ("observation.state", "observation.velocity", "action", "observation.tactile", "observation.wrench")
+"""What is recorded in each frame."""
 _DATA = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
-_COUNTERS = ("frame_index", "episode_index", "index", "task_index")
 
 
 @dataclass(frozen=True, eq=False)
 class TactilePoints:
-    """Places of the points of ``observation.tactile``. Letters: N point, L link."""
+    """Places of the points of ``observation.tactile``."""
 
     links: tuple[str, ...]
-    """L."""
-    link: NDArray[np.int64]
-    """[N] number of each point's link."""
+    """[N] link of each point."""
     position: NDArray[np.float64]
     """[N, 3] in the link's frame (m)."""
     normal: NDArray[np.float64]
     """[N, 3] outward, link frame."""
 
 
-@dataclass(frozen=True, eq=False)
-class Episode:
-    """Frames of one episode; every array has a row per frame T."""
-
-    task: str
-    """Task that was done, in words."""
-    state: NDArray[np.floating]
-    """[T, J] joint positions (rad)."""
-    velocity: NDArray[np.floating]
-    """[T, J] (rad/s)."""
-    action: NDArray[np.floating]
-    """[T, J] joint targets (rad)."""
-    tactile: NDArray[np.floating]
-    """[T, N, 6]."""
-    wrench: NDArray[np.floating]
-    """[T, 6]."""
-
-
-def total_wrench(
-    points: NDArray[np.floating], links: Sequence[str], link: NDArray[np.int64], axes: FingerAxes
-) -> NDArray:
+def total_wrench(points: NDArray[np.floating], links: Sequence[str], axes: FingerAxes) -> NDArray:
     """Return the sum [6] of points' wrenches [N, 6] in the palm's frame, about its origin, fingers at reference."""
     total = np.zeros(6)
-    for number, name in enumerate(links):
-        force, torque = np.split(points[link == number].sum(axis=0), 2)
-        turn, origin = axes.place[name]
+    for point, link in zip(points, links, strict=True):
+        turn, origin = axes.place[link]
         # Wrenches moved to the palm's origin: F = R f, M = R m + x₀ × F, with the fingers at their reference position.
-        total[:3] += turn @ force
-        total[3:] += turn @ torque + np.cross(origin, turn @ force)
+        force = turn @ point[:3]
+        total[:3] += force
+        total[3:] += turn @ point[3:] + np.cross(origin, force)
     return total
 
 
@@ -79,25 +59,20 @@ class SessionRecorder:
     """Keeps a session of a deployed policy; touch is one point per finger tip, where the hand senses it.
 
     Forces stay in the unit in which the hand reports pressure.
-
-    Args:
-        contract: Of the policy.
     """
 
     def __init__(self, contract: PolicyContract) -> None:
         self.hand, self.contract = hands.load(contract.hand), contract
         layout = self.hand.layout("med", "tips")
         self.axes = finger_axes_of(self.hand, self.hand.layout("med", "hand"))
-        fingers = tuple(self.hand.fingers)
-        tips = {chain[-1]: finger for finger, chain in self.hand.fingers.items()}
-        self.rows = [fingers.index(tips[link]) for link in layout]
+        self.rows = [self.hand.tips.index(link) for link in layout]
         position, normal = (
             np.stack([getattr(probes, name)[probes.active].mean(axis=0) for probes in layout.values()])
             for name in ("position", "normal")
         )
-        self.points = TactilePoints(tuple(layout), np.arange(len(layout)), position, normal)
+        self.points = TactilePoints(tuple(layout), position, normal)
         self.frames: list[tuple[NDArray[np.floating], ...]] = []
-        """State, velocity, action, tactile and wrench of each tick."""
+        """:data:`PARTS` of each tick."""
 
     def __call__(self, reading: HandReading, obs: Any, action: Any, targets: NDArray[np.floating]) -> None:
         """Keep a tick, as a :class:`~robotics_bridge.deploy.controller.Controller` reports it."""
@@ -106,15 +81,17 @@ class SessionRecorder:
         force = -reading.pressure[self.rows][:, ::-1]
         torque = np.cross(self.points.position, force).astype(float)
         points = np.concatenate([force, torque], axis=1)
-        wrench = total_wrench(points, self.points.links, self.points.link, self.axes)
+        wrench = total_wrench(points, self.points.links, self.axes)
         self.frames.append((reading.position, reading.velocity, targets, points, wrench))
 
     def write(self, folder: Path, joints: tuple[str, ...]) -> Path:
         """Write the session as a data set; see :func:`write_lerobot`."""
-        task = self.contract.more.get("task", "deployed policy")
-        episode = Episode(task, *(np.array([frame[part] for frame in self.frames]) for part in range(5)))
-        about = {"robot": self.hand.name, "unit": "unit of the hand's pressure"}
-        return write_lerobot(folder, [episode], fps=self.contract.rate, joints=joints, points=self.points, **about)
+        frames = {name: np.array([frame[part] for frame in self.frames]) for part, name in enumerate(PARTS)}
+        about = {"task": self.contract.more.get("task", "deployed policy"), "robot": self.hand.name}
+        return write_lerobot(
+            folder, frames, fps=self.contract.rate, joints=joints, points=self.points,
+            unit="unit of the hand's pressure", **about,
+        )  # fmt: skip
 
 
 def check_folder(folder: Path, fps: float) -> None:
@@ -133,20 +110,22 @@ def check_folder(folder: Path, fps: float) -> None:
 
 
 def write_lerobot(
-    folder: str | Path,
-    episodes: Sequence[Episode],
+    folder: Path,
+    frames: Mapping[str, NDArray[np.floating]],
     *,
+    task: str,
     fps: float,
     joints: Sequence[str],
     points: TactilePoints,
-    robot: str = "xhand1",
-    unit: str = "N",
+    robot: str,
+    unit: str,
 ) -> Path:
-    """Write episodes as a data set that LeRobot opens.
+    """Write a session as a data set that LeRobot opens.
 
     Args:
         folder: Where to; must not exist or be empty.
-        episodes: At least one frame each.
+        frames: :data:`PARTS` by name, [T, J], [T, N, 6] and [T, 6]; at least one frame.
+        task: Task that was done, in words.
         fps: Frames per second; a whole number, as LeRobot demands.
         joints: Names of the joints J.
         points: Where the tactile points sit.
@@ -154,82 +133,76 @@ def write_lerobot(
         unit: Of forces; torques are in that times metres.
 
     Raises:
-        UsageError: the folder is not empty, or an episode does not fit.
+        UsageError: the folder is not empty, or the frames do not fit.
+        DataError: a frame holds values that are not finite.
         MissingDependencyError: pyarrow is not installed.
     """
-    folder = Path(folder)
     check_folder(folder, fps)
     import pandas
 
-    if not episodes:
-        raise UsageError("A data set needs episodes; received none.")
-    shapes = {
-        "observation.state": (len(joints),), "observation.velocity": (len(joints),), "action": (len(joints),),
-        "observation.tactile": (len(points.link), 6), "observation.wrench": (6,),
+    sizes: list[tuple[int, ...]] = [*[(len(joints),)] * 3, (len(points.links), 6), (6,)]
+    shapes: dict[str, tuple[int, ...]] = dict(zip(PARTS, sizes, strict=True))
+    table, length = _columns(frames, fps, shapes), len(frames[PARTS[0]])
+    _write_frames(folder / _DATA.format(chunk_index=0, file_index=0), table, shapes)
+    stats = {name: _stats(values) for name, values in table.items()}
+    episode = {
+        "episode_index": 0, "tasks": [task], "length": length, "dataset_from_index": 0, "dataset_to_index": length,
+        "data/chunk_index": 0, "data/file_index": 0, "meta/episodes/chunk_index": 0, "meta/episodes/file_index": 0,
+        **{f"stats/{name}/{key}": value for name, told in stats.items() for key, value in told.items()},
     }  # fmt: skip
-    tasks = list(dict.fromkeys(episode.task for episode in episodes))
-    tables, rows, first = [], [], 0
-    for number, episode in enumerate(episodes):
-        table = _frames(episode, number, first, tasks.index(episode.task), fps, shapes)
-        length = len(episode.state)
-        rows.append(_row(number, episode.task, first, length, table))
-        tables.append(table)
-        first += length
-    _write_frames(folder / _DATA.format(chunk_index=0, file_index=0), tables, shapes)
     # LeRobot reads the tasks as the index of a table.
     described = {
-        "episodes/chunk-000/file-000": pandas.DataFrame(rows),
-        "tasks": pandas.DataFrame({"task_index": range(len(tasks))}, index=pandas.Index(tasks, name="task")),
+        "episodes/chunk-000/file-000": pandas.DataFrame([episode]),
+        "tasks": pandas.DataFrame({"task_index": [0]}, index=pandas.Index([task], name="task")),
     }
-    for file, frame in described.items():
+    for file, rows in described.items():
         with atomic_path(folder / "meta" / f"{file}.parquet") as temporary:
-            frame.to_parquet(temporary)
-    whole = {name: np.concatenate([table[name] for table in tables]) for name in tables[0]}
-    write_json(folder / "meta" / "stats.json", {name: _stats(value) for name, value in whole.items()})
+            rows.to_parquet(temporary)
+    write_json(folder / "meta" / "stats.json", stats)
     names = {"observation.tactile": ["point", "channel"], "observation.wrench": ["Fx", "Fy", "Fz", "Mx", "My", "Mz"]}
-    features = {
+    features: dict[str, Any] = {
         name: {"dtype": "float32", "shape": list(shape), "names": names.get(name, list(joints))}
         for name, shape in shapes.items()
     }
-    features["timestamp"] = {"dtype": "float32", "shape": [1], "names": None}
-    features |= {name: {"dtype": "int64", "shape": [1], "names": None} for name in _COUNTERS}
+    features |= {
+        name: {"dtype": str(values.dtype), "shape": [1], "names": None}
+        for name, values in table.items()
+        if name not in shapes
+    }
     write_json(
         folder / "meta" / "tactile.json",
         {
             "frame": "link axes; torques about the link's origin", "units": [unit, f"{unit}·m"], "links": points.links,
-            "link": points.link, "position": points.position, "normal": points.normal,
+            "link": list(range(len(points.links))), "position": points.position, "normal": points.normal,
         },
     )  # fmt: skip
     # Last, so that a folder with it is complete.
     write_json(
         folder / "meta" / "info.json",
         {
-            "codebase_version": VERSION, "robot_type": robot, "total_episodes": len(episodes), "total_frames": first,
-            "total_tasks": len(tasks), "chunks_size": 1000, "data_files_size_in_mb": 100, "video_files_size_in_mb": 200,
-            "fps": round(fps), "splits": {"train": f"0:{len(episodes)}"}, "data_path": _DATA, "video_path": None,
+            "codebase_version": VERSION, "robot_type": robot, "total_episodes": 1, "total_frames": length,
+            "total_tasks": 1, "chunks_size": 1000, "data_files_size_in_mb": 100, "video_files_size_in_mb": 200,
+            "fps": round(fps), "splits": {"train": "0:1"}, "data_path": _DATA, "video_path": None,
             "features": features,
         },
     )  # fmt: skip
     return folder
 
 
-def _frames(
-    episode: Episode, number: int, first: int, task: int, fps: float, shapes: Mapping[str, tuple[int, ...]]
+def _columns(
+    frames: Mapping[str, NDArray[np.floating]], fps: float, shapes: Mapping[str, tuple[int, ...]]
 ) -> dict[str, NDArray]:
-    length = len(episode.state)
-    parts = (episode.state, episode.velocity, episode.action, episode.tactile, episode.wrench)
-    found: dict[str, NDArray] = {}
-    for (name, shape), part in zip(shapes.items(), parts, strict=True):
-        values = np.asarray(part, dtype=np.float32)
-        if not length or values.shape != (length, *shape):
-            raise UsageError(f"{name} of episode {number} has the shape {values.shape}; expected {(length, *shape)}.")
-        if not np.isfinite(values).all():
-            raise DataError(f"{name} of episode {number} holds values that are no numbers.")
-        found[name] = values
-    found["timestamp"] = (np.arange(length) / fps).astype(np.float32)
-    frame = np.arange(length)
-    counters = (frame, np.full(length, number), first + frame, np.full(length, task))
-    return found | dict(zip(_COUNTERS, counters, strict=True))
+    """Return the checked columns of the table, and those by which LeRobot counts."""
+    length, found = len(frames[PARTS[0]]), dict[str, NDArray]()
+    for name, shape in shapes.items():
+        found[name] = np.asarray(frames[name], dtype=np.float32)
+        if not length or found[name].shape != (length, *shape):
+            raise UsageError(f"{name} has the shape {found[name].shape}; expected {(length, *shape)}.")
+        if not np.isfinite(found[name]).all():
+            raise DataError(f"{name} holds values that are no numbers.")
+    frame, none = np.arange(length), np.zeros(length, dtype=np.int64)
+    counters = {"frame_index": frame, "episode_index": none, "index": frame, "task_index": none}
+    return {**found, "timestamp": (frame / fps).astype(np.float32), **counters}
 
 
 def _stats(values: NDArray) -> dict[str, list[Any]]:
@@ -238,31 +211,15 @@ def _stats(values: NDArray) -> dict[str, list[Any]]:
     return {**found, "count": [len(values)]}
 
 
-def _row(number: int, task: str, first: int, length: int, table: Mapping[str, NDArray]) -> dict[str, Any]:
-    row: dict[str, Any] = {
-        "episode_index": number, "tasks": [task], "length": length, "dataset_from_index": first,
-        "dataset_to_index": first + length, "data/chunk_index": 0, "data/file_index": 0,
-        "meta/episodes/chunk_index": 0, "meta/episodes/file_index": 0,
-    }  # fmt: skip
-    for name, values in table.items():
-        row |= {f"stats/{name}/{key}": value for key, value in _stats(values).items()}
-    return row
-
-
-def _write_frames(path: Path, tables: list[dict[str, NDArray]], shapes: Mapping[str, tuple[int, ...]]) -> None:
+def _write_frames(path: Path, table: Mapping[str, NDArray], shapes: Mapping[str, tuple[int, ...]]) -> None:
     import pyarrow as pa
     from pyarrow import parquet
 
-    def kind(name: str) -> Any:
-        if name not in shapes:
-            return pa.float32() if name == "timestamp" else pa.int64()
-        inner = pa.float32()
-        for size in reversed(shapes[name]):
-            inner = pa.list_(inner, size) if len(shapes[name]) == 1 else pa.list_(inner)
-        return inner
-
-    schema = pa.schema([(name, kind(name)) for name in tables[0]])
-    with atomic_path(path) as temporary, parquet.ParquetWriter(temporary, schema, compression="snappy") as writer:
-        for table in tables:  # a row group per episode, so that one can be read alone
-            columns = [pa.array(values.tolist(), type=schema.field(name).type) for name, values in table.items()]
-            writer.write_table(pa.Table.from_arrays(columns, schema=schema))
+    columns = {}
+    for name, values in table.items():
+        kind = pa.from_numpy_dtype(values.dtype)
+        for size in reversed(shapes.get(name, ())):
+            kind = pa.list_(kind, size) if values.ndim == 2 else pa.list_(kind)
+        columns[name] = pa.array(values.tolist(), type=kind)
+    with atomic_path(path) as temporary:
+        parquet.write_table(pa.table(columns), temporary, compression="snappy")

@@ -44,11 +44,7 @@ class HandLink:
         self._sequence = 0
 
     def receive(self, now: float) -> NDArray[np.float64] | None:
-        """Return the newest targets [J] (rad) to follow, or None without any.
-
-        Args:
-            now: Time of the clock of the reports (s).
-        """
+        """Return the newest targets [J] (rad) to follow, or None without any; ``now`` is of the reports' clock (s)."""
         targets = None
         for _ in range(MOST_AT_ONCE):
             try:

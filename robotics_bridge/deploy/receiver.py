@@ -11,8 +11,6 @@ Verdict = Literal["new", "late", "replayed", "stale"]
 """``late``: came after a newer one for the first time; ``replayed``: again; ``stale``: too old, by number or time."""
 MAX_AGE = 0.25
 """Oldest frame that has an effect (s); as long as a hand without commands moves on."""
-MOST_AGE = 5.0
-"""Longest age that may be allowed (s)."""
 
 
 class SequenceWindow:
@@ -47,16 +45,10 @@ class SequenceWindow:
 
 
 class Receiver:
-    """One direction of one session.
+    """One direction of one session; ``offset`` is what is known already of the sender's clock."""
 
-    Args:
-        key: Of the direction.
-        max_age: Oldest frame that has an effect (s).
-        offset: Of the sender's clock, where something of it is known already.
-    """
-
-    def __init__(self, key: bytes, max_age: float = MAX_AGE, offset: ClockOffset | None = None) -> None:
-        self.key, self.max_age = key, max_age
+    def __init__(self, key: bytes, offset: ClockOffset | None = None) -> None:
+        self.key = key
         self._window, self._offset = SequenceWindow(), offset or ClockOffset()
 
     def judge(self, frame: Frame, now: float) -> tuple[Verdict, int]:
@@ -64,4 +56,4 @@ class Receiver:
         verdict, skipped = self._window.judge(frame.sequence)
         # A number comes back after 2³² frames, a time never does.
         age = self._offset.age(frame.time, now, now) if verdict in ("new", "late") else 0.0
-        return ("stale", skipped) if age > self.max_age else (verdict, skipped)
+        return ("stale", skipped) if age > MAX_AGE else (verdict, skipped)

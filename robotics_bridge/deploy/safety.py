@@ -115,13 +115,7 @@ class ClockOffset:
         self._least = math.inf
 
     def age(self, stamp: float, arrived: float, now: float) -> float:
-        """Return how long ago something was sent (s), beyond the shortest way seen.
-
-        Args:
-            stamp: Time of the sender's clock (s).
-            arrived: Time of arrival (s).
-            now: The present (s).
-        """
+        """Return how long ago something was sent (s, ``stamp`` by the sender's clock), beyond the shortest way seen."""
         # The offset of the clocks is not known. Least of all differences: the way of the fastest report counts as none.
         self._least = min(self._least, arrived - stamp)
         return now - stamp - self._least

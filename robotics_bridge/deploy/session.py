@@ -37,40 +37,26 @@ class DeployedPolicy:
     path: Path
     contract: PolicyContract
 
-    @property
-    def groups(self) -> Mapping[str, tuple[int, ...]]:
-        """Group → shape of what it reads."""
-        return self.contract.inputs
+    def require(self, given: Collection[str], fingers: Sequence[str] | None = None) -> dict[str, str]:
+        """Return group → what a hand with these sensing fingers (all by default) cannot measure of it, in words.
 
-    def unmeasured(self, fingers: Sequence[str] | None = None) -> dict[str, str]:
-        """Return group → what a hand cannot measure of it, in words; empty if it measures all.
-
-        Args:
-            fingers: Fingers with a sensing tip; None for all of the hand that it was trained on.
+        Raises:
+            UsageError: one of them is not among the groups that something else gives, or is privileged: no constant
+                stands for what only the simulation knows.
         """
         contract = self.contract
+        check_measured(contract.inputs, "A policy on a hand")
         # What is told to the hand is no measurement; a contract that states it needs no word of the user.
         told = ("proprio", "tactile", *(("command",) if "command" in contract.more else ()))
         found = {
             name: f"{list(shape)}, {_MEANINGS.get(name, 'known to the simulation alone')}"
-            for name, shape in self.groups.items()
+            for name, shape in contract.inputs.items()
             if name not in told
         }
         chains = hands.load(contract.hand).fingers
         tips = {chain[-1] for finger, chain in chains.items() if fingers is None or finger in fingers}
         if blind := [link for link in contract.links if contract.observe not in REAL_TYPES or link not in tips]:
             found["tactile"] = f"{contract.observe!r} of {listing(blind, limit=3)}"
-        return found
-
-    def require(self, given: Collection[str], fingers: Sequence[str] | None = None) -> dict[str, str]:
-        """Return :meth:`unmeasured`.
-
-        Raises:
-            UsageError: one of them is not among the groups that something else gives, or is privileged: no constant
-                stands for what only the simulation knows.
-        """
-        check_measured(self.groups, "A policy on a hand")
-        found = self.unmeasured(fingers)
         if missing := [f"{name} ({what})" for name, what in found.items() if name not in given]:
             raise UsageError(
                 f"The policy was trained with what the hand cannot measure: {'; '.join(missing)}. Give each a constant "
@@ -94,7 +80,7 @@ class DeployedPolicy:
         Args:
             driver: The hand.
             limits: Changes of :class:`~robotics_bridge.deploy.safety.SafetyLimits`, such as ``timeout``.
-            sources: Group → what gives it, for every group of :attr:`unmeasured` but ``tactile``.
+            sources: Group → what gives it, for every group of :meth:`require` but ``tactile``.
             calibration: Of the hand's pressure.
             fallback: Simulated or constant touch where the hand senses nothing.
             threads: Of the network's computations.
@@ -104,17 +90,18 @@ class DeployedPolicy:
             UsageError: the hand or the sources do not fit the policy.
         """
         contract, body, sources = self.contract, hands.load(self.contract.hand), dict(sources or {})
+        inputs = contract.inputs
         self.require({*sources, *(("tactile",) if fallback is not None else ())}, driver.fingers)
         if "tactile" in sources:
             raise UsageError("Touch is measured; give what stands in where it is not as fallback, not among sources.")
-        if "tactile" not in self.groups and (calibration is not None or fallback is not None):
+        if "tactile" not in inputs and (calibration is not None or fallback is not None):
             raise UsageError("The policy reads no touch, so a calibration or fallback of it reaches nothing.")
-        if "command" in self.groups and "command" in contract.more:
-            sources.setdefault("command", constant("command", contract.more["command"], self.groups["command"]))
-        if "tactile" in self.groups:
+        if "command" in inputs and "command" in contract.more:
+            sources.setdefault("command", constant("command", contract.more["command"], inputs["command"]))
+        if "tactile" in inputs:
             sources["tactile"] = RealTouch(contract, driver.fingers, calibration=calibration, fallback=fallback)
         safe = SafetyLimits.of_hand(body, driver.joints, **dict(limits or {}))
-        run = read_policy(self.path, self.groups, threads=threads, actions=len(contract.moved))
+        run = read_policy(self.path, inputs, threads=threads, actions=len(contract.moved))
         return Controller(run, driver, contract, safe, sources=sources, **settings)
 
 
@@ -141,12 +128,7 @@ def read_deployed(path: str | Path) -> DeployedPolicy:
 
 
 def constant(name: str, values: Sequence[float], shape: tuple[int, ...]) -> Source:
-    """Return a source that always gives the same numbers, such as a command.
-
-    Args:
-        name: The group, for errors.
-        values: One number for all of the group, or one for each.
-        shape: Of the group.
+    """Return a source that always gives a group the same numbers, such as a command: one for all, or one for each.
 
     Raises:
         UsageError: there are not as many numbers as the policy reads, or one is not finite.

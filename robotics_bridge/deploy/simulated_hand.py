@@ -32,7 +32,6 @@ from robotics_bridge.sensors import SensorSuite
 from robotics_bridge.tasks.contact_model import CONTACTS, ContactModel, set_contacts
 from robotics_bridge.tasks.overrides import set_field
 
-_RATE = "reports per second of a simulated hand"
 HOLD_AFTER = 0.25
 """Seconds without a command after which the hand holds by itself."""
 
@@ -89,11 +88,8 @@ class SimulatedHand:
     """The physics and readings of the hand; the socket is :func:`serve`'s business.
 
     Args:
-        hand: Name of the hand.
         rate: Reports per second; also the rate of the physics.
         observe: Observation type that its skin gives; reports need ``agg_force`` on the tips.
-        placement: Of its taxels.
-        resolution: Of its taxels.
         twist: Torsional friction of force taxels (N·m·s); None: they hold what they touch.
         contacts: Firmness of contacts and strength of the drives.
 
@@ -112,7 +108,7 @@ class SimulatedHand:
         twist: float | None = None,
         contacts: ContactModel = CONTACTS["firm"],
     ) -> None:
-        check_number(_RATE, rate, least=10)
+        check_number("reports per second of a simulated hand", rate, least=10)
         self.hand, self.rate, self._substeps = hands.load(hand), rate, contacts.substeps
         body = holding(self.hand, timestep=1 / rate / contacts.substeps)
         set_contacts(body, contacts)
@@ -131,8 +127,7 @@ class SimulatedHand:
         self._positions = [int(model.joint(name).qposadr[0]) for name in self.joints]
         self._speeds = [int(model.joint(name).dofadr[0]) for name in self.joints]
         self._drives = [model.actuator(name).id for name in self.joints]
-        tips = {chain[-1]: finger for finger, chain in self.hand.fingers.items()}
-        self._rows = [self.fingers.index(tips[link]) for link in self.layout if link in tips]
+        self._rows = [self.hand.tips.index(link) for link in self.layout if link in self.hand.tips]
         # The first step and reading load what later ones use; real time begins after them.
         self.step()
         self.touch()
@@ -258,10 +253,8 @@ def _spoil(
         yield bytes(data)
 
 
-def _process(
-    name: str, rate: float, contacts: ContactModel, faults: Faults, seconds: float, key: bytes, ready: Any
-) -> None:
-    hand = SimulatedHand(name, rate, contacts=contacts)
+def _process(name: str, contacts: ContactModel, faults: Faults, seconds: float, key: bytes, ready: Any) -> None:
+    hand = SimulatedHand(name, contacts=contacts)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as link:
         link.bind((LOOPBACK, 0))
         ready.send((link.getsockname()[1], hand.joints, hand.fingers))
@@ -270,21 +263,20 @@ def _process(
 
 @contextlib.contextmanager
 def simulated_hand(
-    hand: str = "xhand1", *, rate: float = 200.0, contacts: ContactModel = CONTACTS["firm"],
-    faults: Faults | None = None, seconds: float = 600.0,
+    hand: str = "xhand1", *, contacts: ContactModel = CONTACTS["firm"], faults: Faults | None = None,
+    seconds: float = 600.0,
 ) -> Iterator[tuple[tuple[str, int], tuple[str, ...], tuple[str, ...], bytes]]:  # fmt: skip
     """Run a simulated hand in a process of its own; yield its address, joints, fingers and key.
 
     Raises:
-        UsageError: the rate, or the time until it ends by itself (s), is out of range.
+        UsageError: the time until it ends by itself (s) is out of range.
         DataError: the process did not start.
     """
-    check_number(_RATE, rate, least=10)
     check_number("seconds of a simulated hand", seconds, above=0)
     context = multiprocessing.get_context("spawn")
     ours, theirs = context.Pipe()
     key = new_key()
-    given = (hand, rate, contacts, faults or Faults(), seconds, key, theirs)
+    given = (hand, contacts, faults or Faults(), seconds, key, theirs)
     process = context.Process(target=_process, args=given, daemon=True)
     process.start()
     theirs.close()

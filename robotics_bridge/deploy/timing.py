@@ -74,12 +74,7 @@ class LatencyHistogram(list[float]):
 
 
 class RateMonitor:
-    """The rate of ticks over a sliding window.
-
-    Args:
-        rate: Nominal [Hz].
-        window: Seconds.
-    """
+    """The rate of ticks [Hz] over a sliding window (s), beside a nominal one."""
 
     def __init__(self, rate: float, window: float = 1.0) -> None:
         self.rate, self.window = rate, window

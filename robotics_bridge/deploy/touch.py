@@ -96,8 +96,9 @@ class RealTouch:
                 f"A real hand cannot measure {contract.observe!r}, one value per taxel; deploy a policy that was "
                 "trained on 'agg_force' or 'agg_bool', or simulate its touch beside the hand."
             )
-        tips = {chain[-1]: finger for finger, chain in hands.load(contract.hand).fingers.items()}
-        sensed = [(item, tips.get(link, "")) for item, link in enumerate(contract.links if real else ())]
+        hand = hands.load(contract.hand)
+        finger_of = dict(zip(hand.tips, hand.fingers, strict=True))
+        sensed = [(item, finger_of.get(link, "")) for item, link in enumerate(contract.links if real else ())]
         self.measured = [(item, fingers.index(finger)) for item, finger in sensed if finger in fingers]
 
     def __call__(self, reading: HandReading) -> NDArray[np.float32]:

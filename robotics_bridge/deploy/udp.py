@@ -19,7 +19,7 @@ from brainbench.core.reading.ranges import check_number
 from robotics_bridge.deploy import frames
 from robotics_bridge.deploy.driver import HandReading, LinkCounters
 from robotics_bridge.deploy.frames import Frame
-from robotics_bridge.deploy.receiver import MAX_AGE, MOST_AGE, Receiver
+from robotics_bridge.deploy.receiver import Receiver
 from robotics_bridge.deploy.safety import ClockOffset
 
 LOOPBACK = "127.0.0.1"
@@ -39,31 +39,21 @@ class UdpDriver:
         joints: Names of its joints, in its order.
         fingers: Names of its sensing fingers, in its order.
         key: Shared key (:func:`~robotics_bridge.deploy.frames.read_key`).
-        max_age: Oldest report that is used (s).
 
     Raises:
         UsageError: there is no such host or port, a name occurs twice, or a number or the key is out of range.
     """
 
-    def __init__(
-        self,
-        address: tuple[str, int],
-        joints: tuple[str, ...],
-        fingers: tuple[str, ...],
-        key: bytes,
-        *,
-        max_age: float = MAX_AGE,
-    ) -> None:
+    def __init__(self, address: tuple[str, int], joints: tuple[str, ...], fingers: tuple[str, ...], key: bytes) -> None:
         check_number("joints of a hand", len(joints), least=1, most=frames.MOST)
         check_number("fingers of a hand", len(fingers), most=frames.MOST)
         check_once("joints of a hand", joints)
         check_once("fingers of a hand", fingers)
         check_number("port of a hand", address[1], least=1, most=65535, whole=True)
         frames.check_key(key)
-        check_number("max_age (s)", max_age, above=0, most=MOST_AGE)
         self.address, self.joints, self.fingers = (address[0] or LOOPBACK, address[1]), joints, fingers
         self.counters = LinkCounters()
-        self._key, self._max_age = key, max_age
+        self._key = key
         self._nonce, self._greeted = b"", -np.inf
         self._send_key = b""
         self._receiver: Receiver | None = None
@@ -117,7 +107,7 @@ class UdpDriver:
         # The welcome was under way for at most GREET_EVERY: later reports cannot all be much older unnoticed.
         offset = ClockOffset()
         offset.age(welcome.time, now, now)
-        self._receiver, self._sequence = Receiver(key, self._max_age, offset), 0
+        self._receiver, self._sequence = Receiver(key, offset), 0
         self._command(frames.START)
         return True
 

@@ -40,9 +40,7 @@ class Contacts:
         self._suite = SensorSuite(scene, probes, num_envs=simulation.num_envs, device=device, seed=seed)
         (runtime,) = self._suite.runtimes
         self.planes: torch.Tensor = wp.to_torch(runtime.measured())
-        """[1, B, F] distances in the order of the suite (m)."""
-        order = [runtime.slices[tip].start for tip in tips]
-        self._order = torch.as_tensor(order, device=simulation.device)
+        """[1, B, F] distances (m)."""
         rows = np.full(len(scene.geometries), -1, dtype=np.int32)
         for row, link in enumerate((*tips, *model.objects)):
             rows[list(scene.geometries_of(link))] = row
@@ -90,4 +88,4 @@ class Contacts:
     @property
     def surface_distance(self) -> torch.Tensor:
         """Distance [B, F] from each finger tip to the object (m), at most 0.5."""
-        return self.planes[0].index_select(1, self._order).nan_to_num(_REACH)
+        return self.planes[0].nan_to_num(_REACH)

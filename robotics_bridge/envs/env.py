@@ -71,6 +71,9 @@ class Env:
         self.device: torch.device = state.device
         self.num_envs, self.decimation, self.step_dt = options.num_envs, state.substeps, state.step_dt
         self.max_episode_length = task.max_episode_length
+        self.joint_names, self.action_names = state.model.joints, state.model.moved
+        """Driven joints J, and those A that actions move."""
+        self.num_actions = len(self.action_names)
         self.reset_episodes = EpisodeReset(state)
         self.apply_action: Callable[[EnvState], None] = apply_action
         """First part of a control step; replayed as a CUDA graph once it is recorded."""
@@ -89,21 +92,6 @@ class Env:
         self.reset()
         self.observation_shapes = {name: tuple(value.shape[1:]) for name, value in self.observations.items()}
         """Group → shape per environment."""
-
-    @property
-    def num_actions(self) -> int:
-        """Number of actions A."""
-        return len(self.model.moved)
-
-    @property
-    def joint_names(self) -> tuple[str, ...]:
-        """Driven joints J."""
-        return self.model.joints
-
-    @property
-    def action_names(self) -> tuple[str, ...]:
-        """Joints A that actions move."""
-        return self.model.moved
 
     @property
     def action_map(self) -> ActionMap:
@@ -219,15 +207,17 @@ class Env:
         means = [value / episodes if episodes else float("nan") for value in sums]
         return {"episodes": episodes, **dict(zip(names, means, strict=True))}
 
-    def state_dict(self) -> dict[str, torch.Tensor]:
-        """Return copies of all that the future depends on, but for the memory of noisy or slow tactile sensors."""
+    def _memory(self) -> dict[str, torch.Tensor]:
+        """Return by name what :meth:`state_dict` copies."""
         state = self.state
-        own = {name: value.clone() for name, value in state.memory().items()}
-        own["generator"] = state.generator.get_state()
+        own = {**state.memory(), "generator": state.generator.get_state()}
         if self.touch is not None:
             own[_NOISE_SEED] = torch.tensor(self.touch.suite.context.seed)
-        own |= {f"simulation.{name}": value for name, value in state.simulation.state_dict().items()}
-        return own | {f"observations.{name}": value.clone() for name, value in state.observations.items()}
+        return own | {f"observations.{name}": value for name, value in state.observations.items()}
+
+    def state_dict(self) -> dict[str, torch.Tensor]:
+        """Return copies of all that the future depends on, but for the memory of noisy or slow tactile sensors."""
+        return {name: value.clone() for name, value in self._memory().items()}
 
     def load_state_dict(self, values: Mapping[str, torch.Tensor]) -> None:
         """Take up what :meth:`state_dict` returned.
@@ -236,7 +226,7 @@ class Env:
             UsageError: it is the state of other environments: a part is missing, or has another shape.
         """
         state = self.state
-        for name, own in self.state_dict().items():
+        for name, own in self._memory().items():
             # States that were kept before the noise could be seeded anew have the seed of the options.
             if name == _NOISE_SEED and name not in values:
                 continue
@@ -255,7 +245,7 @@ class Env:
         for name, value in state.memory().items():
             value.copy_(values[name])
         state.generator.set_state(values["generator"].cpu())
-        state.simulation.load_state_dict(under("simulation."))
+        state.simulation.restored(under("simulation."))
         if state.task_state is not None:
             state.task_state.restored()
         state.started = True

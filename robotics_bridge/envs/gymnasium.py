@@ -30,8 +30,6 @@ IDS = {
     "brainbench/HotBall-v0": "hot_ball",
 }
 """Registered id → task."""
-REACH = ACTION_LIMIT
-"""Actions of this size reach any target from any rest position, as an action of 1 is half a joint's range."""
 
 
 class GymVectorEnv(VectorEnv):
@@ -58,7 +56,7 @@ class GymVectorEnv(VectorEnv):
         shapes, box = env.observation_shapes, gymnasium.spaces.Box
         spaces: Any = {name: box(-np.inf, np.inf, shapes[name], np.float32) for name in self._groups}
         self.single_observation_space = gymnasium.spaces.Dict(spaces)
-        self.single_action_space = box(-REACH, REACH, (env.num_actions,), np.float32)
+        self.single_action_space = box(-ACTION_LIMIT, ACTION_LIMIT, (env.num_actions,), np.float32)
         batch = gymnasium.vector.utils.batch_space
         self.observation_space = batch(self.single_observation_space, self.num_envs)
         self.action_space = batch(self.single_action_space, self.num_envs)

@@ -64,7 +64,7 @@ class Simulation:
         self.state = self.engine.state
         self.pose: torch.Tensor = self.state.pose_torch
         """[B, L, 7] world poses of links (m; x y z, qx qy qz qw) as of the last step or refresh; a view."""
-        self._time = self.state.time_torch
+        self._time = warp().to_torch(self.state.time)
         self.warp_device = pick_device(device)
         self.start = self.qpos.clone()
         self._pushed = False
@@ -81,7 +81,8 @@ class Simulation:
             return
         self.engine.set(ctrl=self.ctrl.numpy())
         self.engine.step(self._substeps)
-        self._pull()
+        self.qpos.copy_(torch.from_numpy(self.engine.qpos))
+        self.qvel.copy_(torch.from_numpy(self.engine.qvel))
 
     def apply_push(self) -> None:
         """Hand ``push`` (force and torque on bodies [B, nbody, 6], N and N·m, world axes) to the engine."""
@@ -109,31 +110,21 @@ class Simulation:
             return
         for env in torch.nonzero(mask).flatten().tolist():
             data = self.engine.data[env]
-            mujoco.mj_resetData(self.engine.model_of(env), data)
+            mujoco.mj_resetData(self.engine.models[env], data)
             data.qpos[:] = self.qpos[env].numpy()
             self._write_fields(env)
 
-    def state_dict(self) -> dict[str, torch.Tensor]:
-        """Return everything that the next step depends on."""
+    def memory(self) -> dict[str, torch.Tensor]:
+        """Return what the next step depends on, by name: the tensors themselves, but for C MuJoCo's own state."""
         own = {"ctrl": self.ctrl, "push": self.push, "qpos": self.qpos, "qvel": self.qvel}
         own |= {f"field.{name}": value for name, value in self.fields.items()}
         if self.uses_warp:
-            own["warmstart"] = self._warmstart
-            own["time"] = self._time
-        else:
-            own["integration"] = torch.from_numpy(self.engine.integration_state())
-        return {name: value.clone() for name, value in own.items()}
+            return {**own, "warmstart": self._warmstart, "time": self._time}
+        return {**own, "integration": torch.from_numpy(self.engine.integration_state())}
 
-    def load_state_dict(self, values: Mapping[str, torch.Tensor]) -> None:
-        """Take up what :meth:`state_dict` returned."""
-        for name, value in self.fields.items():
-            value.copy_(values[f"field.{name}"])
-        for name in ("ctrl", "push", "qpos", "qvel"):
-            getattr(self, name).copy_(values[name])
-        if self.uses_warp:
-            self._warmstart.copy_(values["warmstart"])
-            self._time.copy_(values["time"])
-        else:
+    def restored(self, values: Mapping[str, torch.Tensor]) -> None:
+        """Take note that values were written to :meth:`memory`; C MuJoCo takes its own state from there."""
+        if not self.uses_warp:
             for env in range(self.num_envs):
                 self._write_fields(env)
             self.engine.set_integration_state(values["integration"].numpy())
@@ -142,14 +133,8 @@ class Simulation:
     def _write_fields(self, env: int) -> None:
         values = {name: value[env].numpy() for name, value in self.fields.items()}
         # C MuJoCo takes the inertia of free bodies from here, not from their masses.
-        inertia = np.array(self.engine.model_of(env).dof_M0)
+        inertia = np.array(self.engine.models[env].dof_M0)
         for body, first in self._free.items():
             inertia[first : first + 3] = values["body_mass"][body]
             inertia[first + 3 : first + 6] = values["body_inertia"][body]
         self.engine.set_fields(env, {**values, "dof_M0": inertia})
-
-    def _pull(self) -> None:
-        qpos, qvel = self.qpos.numpy(), self.qvel.numpy()
-        for env, data in enumerate(self.engine.data):
-            qpos[env] = data.qpos
-            qvel[env] = data.qvel

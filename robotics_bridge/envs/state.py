@@ -167,8 +167,9 @@ class EnvState:
         self._tactile_links = integers([scene.link_index(link) for link in links])
 
     def memory(self) -> dict[str, torch.Tensor]:
-        """Return the tensors themselves that the future depends on, by name, of all parts but the physics."""
+        """Return the tensors themselves that the future depends on, by name, of all parts."""
         parts = {"actuators": self.actuators, "goals": self.goals, "contacts": self.contacts}
+        parts["simulation"] = self.simulation
         if self.task_state is not None:
             parts["task_state"] = self.task_state
         found = self.episode.tensors()

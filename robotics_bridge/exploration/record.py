@@ -20,7 +20,7 @@ from brainbench import __version__
 from brainbench.core.contracts import CHANNELS, GRID_SHAPE, check_stimulus_set
 from brainbench.core.errors import DataError, UsageError, check_each, check_once, listing
 from brainbench.core.files import content_hash, to_json
-from brainbench.core.progress import Progress
+from brainbench.core.progress import Progress, track
 from brainbench.core.reading.ranges import check_fields, check_number
 from brainbench.core.rotations import from_matrices, from_rpy, to_matrices
 from brainbench.models.network import SUB_STEP_SECONDS, SUB_STEPS
@@ -161,7 +161,6 @@ def record_exploration(
         objects: What to explore; labels differ.
         procedures: Names of :data:`~robotics_bridge.exploration.procedures.PROCEDURES`.
         hand: Name or file of the hand.
-        resolution: Of its taxels, as ``placement``.
         noisy: With the published imperfections of force taxels, drawn by ``seed``.
         frames: T, of 9 ms; a procedure is stretched over them.
         progress: Called with (frames done, frames, what).
@@ -182,15 +181,13 @@ def record_exploration(
     sensors = sensors_for("force_torque", grid.layout, noisy=noisy, track=(OBJECT,), twist=TWIST)
     suite = SensorSuite(world.engine.scene, sensors, num_envs=len(conditions), seed=seed)
     felt = []
-    for frame in range(frames):
+    for frame in track(range(frames), "exploring", progress):
         for sub_step in range(_STEPS):
             world.move(conditions, (frame * _STEPS + sub_step) / (frames * _STEPS))
             suite.update(world.engine.state, world.engine.timestep)
         readings = {link: suite.read(link).clone() for link in grid.layout}
         taxels = observe("force_torque", readings, grid.layout).view(len(conditions), 1, grid.items, 6)
         felt.append(grid(taxels).flatten(2).transpose(1, 2).numpy())
-        if progress is not None:
-            progress(frame + 1, frames, "exploring")
     labels = [f"{item.label}/{name}" if len(procedures) > 1 else item.label for item, name in conditions]
     # What is no number stays so from step to step.
     if bad := [label for label, flaw in zip(labels, suite.diverged.tolist(), strict=True) if flaw]:

@@ -7,7 +7,7 @@ import os
 import warnings
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -16,11 +16,9 @@ from brainbench.core.devices import mujoco_module
 from brainbench.core.errors import UsageError, unknown_name
 from brainbench.core.reading.ranges import check_number
 from robotics_bridge.physics.scene import TouchScene
+from robotics_bridge.physics.selection import EnvIds, select_envs
 from robotics_bridge.physics.state import MOST_ENVS, HandState
 from robotics_bridge.physics.variants import check_fields, model_fields
-
-if TYPE_CHECKING:
-    from robotics_bridge.physics.selection import EnvIds
 
 mujoco = mujoco_module()
 
@@ -67,15 +65,21 @@ class MujocoEngine:
         self.scene: TouchScene = TouchScene.from_mujoco(models[0], models[1:], assignment)
         self.num_envs = num_envs
         varied = check_fields(models[0], fields or {}, num_envs)
-        self._models = [models[order[env % len(order)]] for env in range(num_envs)]
+        self.models: list[Any] = [models[order[env % len(order)]] for env in range(num_envs)]
+        """The ``mujoco.MjModel`` of every environment."""
         self._own_models = bool(varied)
         if varied:
-            own = [{name: rows[env] for name, rows in varied.items()} for env in range(num_envs)]
-            self._models = list(map(_with_fields, self._models, own))
-        self._data = [mujoco.MjData(m) for m in self._models]
+            self.models = list(map(copy.copy, self.models))
+            for env, own in enumerate(self.models):
+                for name, rows in varied.items():
+                    getattr(own, name)[...] = rows[env]
+                # Masses, inertias and the like enter constants that the compiler derived.
+                mujoco.mj_setConst(own, mujoco.MjData(own))
+        self.data: list[Any] = [mujoco.MjData(m) for m in self.models]
+        """The ``mujoco.MjData`` of every environment."""
         self.state: HandState = HandState.empty(num_envs, self.model.nbody, contacts * num_envs, "cpu")
         """Refreshed by :meth:`step`, :meth:`forward` and :meth:`reset`."""
-        self._gatherer = _Gatherer(self.model, self._data, self.state)
+        self._gatherer = _Gatherer(self.model, self.data, self.state)
         workers = max(1, min(threads or os.cpu_count() or 1, num_envs))
         self._pool = ThreadPoolExecutor(workers) if workers > 1 else None
         self._chunks = np.array_split(np.arange(num_envs), workers)
@@ -87,19 +91,14 @@ class MujocoEngine:
         return float(self.model.opt.timestep)
 
     @property
-    def data(self) -> Sequence[Any]:
-        """The ``mujoco.MjData`` of every environment."""
-        return self._data
-
-    @property
     def qpos(self) -> NDArray[np.float64]:
         """Positions [B, nq], a copy; write with :meth:`set`."""
-        return np.stack([data.qpos for data in self._data])
+        return np.stack([data.qpos for data in self.data])
 
     @property
     def qvel(self) -> NDArray[np.float64]:
         """Velocities [B, nv], a copy; write with :meth:`set`."""
-        return np.stack([data.qvel for data in self._data])
+        return np.stack([data.qvel for data in self.data])
 
     def set(self, **values: ArrayLike) -> None:
         """Write ``qpos``, ``qvel``, ``ctrl``, … of every environment [B, n] (or one row [n] for all).
@@ -108,46 +107,42 @@ class MujocoEngine:
             UsageError: the simulation has no such array, or it has another shape.
         """
         for name, value in values.items():
-            if not isinstance(own := getattr(self._data[0], name, None), np.ndarray):
-                raise unknown_name("array of the simulation", name, model_fields(self._data[0]))
+            if not isinstance(own := getattr(self.data[0], name, None), np.ndarray):
+                raise unknown_name("array of the simulation", name, model_fields(self.data[0]))
             shape = (self.num_envs, *own.shape)
             try:
                 rows = np.broadcast_to(np.asarray(value, dtype=float), shape)
             except ValueError:
                 raise UsageError(f"{name} has the shape {shape} here; received {np.shape(value)}.") from None
-            for data, row in zip(self._data, rows, strict=True):
+            for data, row in zip(self.data, rows, strict=True):
                 getattr(data, name)[...] = row
-
-    def model_of(self, env: int) -> Any:
-        """Return the ``mujoco.MjModel`` of one environment."""
-        return self._models[env]
 
     def set_fields(self, env: int, values: Mapping[str, ArrayLike]) -> None:
         """Write model fields of one environment, in an engine made with ``fields``, but no derived constants."""
         if not self._own_models:
             raise UsageError("The environments share one model; make the engine with fields={...} to change them.")
         for name, value in values.items():
-            getattr(self._models[env], name)[...] = value
+            getattr(self.models[env], name)[...] = value
 
     def integration_state(self) -> NDArray[np.float64]:
         """Return all that the next step of every environment depends on, [B, n]."""
         kind = int(mujoco.mjtState.mjSTATE_INTEGRATION)
         rows = np.zeros((self.num_envs, mujoco.mj_stateSize(self.model, kind)))
         for env, row in enumerate(rows):
-            mujoco.mj_getState(self._models[env], self._data[env], row, kind)
+            mujoco.mj_getState(self.models[env], self.data[env], row, kind)
         return rows
 
     def set_integration_state(self, rows: NDArray[np.float64]) -> None:
         """Take up what :meth:`integration_state` returned."""
         kind = int(mujoco.mjtState.mjSTATE_INTEGRATION)
         for env, row in enumerate(rows):
-            mujoco.mj_setState(self._models[env], self._data[env], row, kind)
+            mujoco.mj_setState(self.models[env], self.data[env], row, kind)
 
     def kinematics(self) -> None:
         """Refresh poses and velocities of the state at the current positions; contacts stay those of the last step."""
 
         def work(env: int) -> None:
-            model, data = self._models[env], self._data[env]
+            model, data = self.models[env], self.data[env]
             mujoco.mj_kinematics(model, data)
             mujoco.mj_comPos(model, data)
             mujoco.mj_comVel(model, data)
@@ -157,11 +152,11 @@ class MujocoEngine:
     def step(self, steps: int = 1) -> None:
         """Advance every environment by so many steps and refresh the state."""
         check_number("steps of an engine", steps, least=1, whole=True)
-        self._each(lambda env: mujoco.mj_step(self._models[env], self._data[env], steps))
+        self._each(lambda env: mujoco.mj_step(self.models[env], self.data[env], steps))
 
     def forward(self) -> None:
         """Refresh the state at the current positions and velocities, without advancing."""
-        self._each(lambda env: mujoco.mj_forward(self._models[env], self._data[env]))
+        self._each(lambda env: mujoco.mj_forward(self.models[env], self.data[env]))
 
     def reset(self, env_ids: EnvIds | None = None) -> None:
         """Put environments (all by default), given by numbers or a mask, back to the model's start.
@@ -169,10 +164,8 @@ class MujocoEngine:
         Raises:
             UsageError: an environment does not exist, or these are neither numbers nor a mask.
         """
-        from robotics_bridge.physics.selection import select_envs
-
         for env in select_envs(env_ids, self.num_envs, "cpu").nonzero().flatten().tolist():
-            mujoco.mj_resetData(self._models[env], self._data[env])
+            mujoco.mj_resetData(self.models[env], self.data[env])
         self.forward()
 
     def _each(self, work: Any) -> None:
@@ -273,12 +266,3 @@ class _Gatherer:
             enough = max(*(len(parts[1]) for parts in found), -(-total // len(self._data)))
             text = f"The engine found {total} contacts and has room for {room}; the last ones are lost. "
             warnings.warn(f"{text}Make it with contacts={enough}.", RuntimeWarning, stacklevel=2)
-
-
-def _with_fields(model: Any, values: Mapping[str, NDArray]) -> Any:
-    varied = copy.copy(model)
-    for name, value in values.items():
-        getattr(varied, name)[...] = value
-    # Masses, inertias and the like enter constants that the compiler derived.
-    mujoco.mj_setConst(varied, mujoco.MjData(varied))
-    return varied

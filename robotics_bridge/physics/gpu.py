@@ -69,16 +69,17 @@ class MujocoWarpEngine:
             # friction of joints.
             rows = 4 * contacts + 2 * self.model.njnt + 6 * self.model.neq + 2 * self.model.ntendon + self.model.nv
             room = {"nconmax": contacts, "njmax": rows}
-            self._d = self._engine.make_data(self.model, nworld=num_envs, **room)
+            self.data: Any = self._engine.make_data(self.model, nworld=num_envs, **room)
+            """The ``mujoco_warp.Data`` behind the state."""
             if set(varied) & set(_MASSES):
-                self._engine.set_const(self._m, self._d)
+                self._engine.set_const(self._m, self.data)
             self._root = wp.array(np.asarray(self.model.body_rootid, dtype=np.int32), dtype=wp.int32)
-        contact = self._d.contact
+        contact = self.data.contact
         blank = HandState.empty(num_envs, self.model.nbody, contact.worldid.shape[0], self._device)
         # The engine's own arrays serve where they have the form of the state's.
         self.state: HandState = replace(
             blank, contact_geom=contact.geom, contact_env=contact.worldid, contact_distance=contact.dist,
-            contact_position=contact.pos, contact_count=self._d.nacon, time=self._d.time,
+            contact_position=contact.pos, contact_count=self.data.nacon, time=self.data.time,
         )  # fmt: skip
         self._replay: Callable[[], None] | None = None
         self.forward()
@@ -89,24 +90,19 @@ class MujocoWarpEngine:
         return float(self.model.opt.timestep)
 
     @property
-    def data(self) -> Any:
-        """The ``mujoco_warp.Data`` behind the state."""
-        return self._d
-
-    @property
     def qpos(self) -> torch.Tensor:
         """Positions [B, nq], a view."""
-        return warp().to_torch(self._d.qpos)
+        return warp().to_torch(self.data.qpos)
 
     @property
     def qvel(self) -> torch.Tensor:
         """Velocities [B, nv], a view."""
-        return warp().to_torch(self._d.qvel)
+        return warp().to_torch(self.data.qvel)
 
     @property
     def ctrl(self) -> torch.Tensor:
         """Controls [B, nu], a view."""
-        return warp().to_torch(self._d.ctrl)
+        return warp().to_torch(self.data.ctrl)
 
     def field(self, name: str) -> torch.Tensor:
         """Return a model field [B, ...], a view to write to; derived constants are the caller's business.
@@ -124,7 +120,7 @@ class MujocoWarpEngine:
         wp = warp()
         with wp.ScopedDevice(self._device):
             for stage in (self._engine.kinematics, self._engine.com_pos, self._engine.com_vel):
-                stage(self._m, self._d)
+                stage(self._m, self.data)
             self._fill_links()
 
     def set(self, **values: ArrayLike | torch.Tensor) -> None:
@@ -135,8 +131,8 @@ class MujocoWarpEngine:
         """
         wp = warp()
         for name, value in values.items():
-            if not isinstance(own := getattr(self._d, name, None), wp.array):
-                arrays = [key for key, item in vars(self._d).items() if isinstance(item, wp.array)]
+            if not isinstance(own := getattr(self.data, name, None), wp.array):
+                arrays = [key for key, item in vars(self.data).items() if isinstance(item, wp.array)]
                 raise unknown_name("array of the simulation", name, arrays)
             view = wp.to_torch(own)
             rows = value if isinstance(value, torch.Tensor) else torch.as_tensor(np.array(value))
@@ -162,7 +158,7 @@ class MujocoWarpEngine:
     def forward(self) -> None:
         """Refresh the state at the current positions and velocities, without advancing."""
         with warp().ScopedDevice(self._device):
-            self._engine.forward(self._m, self._d)
+            self._engine.forward(self._m, self.data)
             self._fill()
 
     def reset(self, env_ids: EnvIds | None = None) -> None:
@@ -176,21 +172,21 @@ class MujocoWarpEngine:
             mask = None
             if env_ids is not None:
                 mask = wp.from_torch(select_envs(env_ids, self.num_envs, wp.device_to_torch(self._device)))
-            self._engine.reset_data(self._m, self._d, mask)
+            self._engine.reset_data(self._m, self.data, mask)
         self.forward()
 
     def _step(self) -> None:
-        self._engine.step(self._m, self._d)
+        self._engine.step(self._m, self.data)
         self._fill()
 
     def _fill_links(self) -> None:
-        wp, d, state = warp(), self._d, self.state
+        wp, d, state = warp(), self.data, self.state
         # MuJoCo's quaternions are (w, x, y, z); the kernel stores them as Warp's (x, y, z, w).
         poses = [d.xpos, d.xquat, d.cvel, d.subtree_com, self._root, state.pose, state.velocity]
         wp.launch(fill_links, dim=(self.num_envs, self.model.nbody), inputs=poses, device=self._device)
 
     def _fill(self) -> None:
-        wp, d, state = warp(), self._d, self.state
+        wp, d, state = warp(), self.data, self.state
         self._fill_links()
         pyramidal = int(self.model.opt.cone == 0)
         c = d.contact

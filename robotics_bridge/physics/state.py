@@ -125,11 +125,6 @@ class HandState:
         """Velocities [B, L, 6] (linear of the origin, angular), a view of the same memory."""
         return warp().to_torch(self.velocity)
 
-    @property
-    def time_torch(self) -> torch.Tensor:
-        """Times [B] (s), a view of the same memory."""
-        return warp().to_torch(self.time)
-
     def set_pose(self, pose: ArrayLike | torch.Tensor) -> None:
         """Write world poses [B, L, 7] (or one [L, 7] for all) as (x, y, z, qw, qx, qy, qz), quaternions normalised.
 

@@ -10,28 +10,78 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
-from brainbench.core.errors import DataError, UsageError
-from brainbench.core.files import to_json
+import msgspec
+from msgspec import Meta
+
+from brainbench.core.errors import DataError, UsageError, repeats
+from brainbench.core.files import read_mapping, to_json
 from robotics_bridge.hands.observations import OBSERVATIONS
-from robotics_bridge.policies.schema import Values
+from robotics_bridge.policies.schema import Groups, Name, Names, from_json, shapes_of, wrong
 from robotics_bridge.tasks.contact_model import CONTACTS, ContactModel
 
 RATE = (1.0, 1000.0)
 """Control steps per second [Hz]."""
-ANGLE = (-4 * math.pi, 4 * math.pi)
-"""Positions of joints (rad)."""
 MOST_TWIST = 100.0
 """N·m·s."""
-SCALE = (-10.0, 10.0)
-"""Radians per unit of action; 0 is not allowed."""
-JOINTS = 255
-"""Most joints; a frame counts them in one byte."""
-MOST_NUMBERS = 10_000_000
-"""Most numbers of all observations, and of a policy's memory."""
 REQUIRED = ("action_map", "contacts", "frozen", "hand", "joints", "rate", "twist")
 """What ``deployment`` must say before a hand can run the policy."""
+_Angle = Annotated[float, Meta(ge=-4 * math.pi, le=4 * math.pi)]
+"""Position of a joint (rad)."""
+_Scale = Annotated[float, Meta(ge=-10, le=10)]
+"""Radians per unit of action; 0 is not allowed."""
+
+
+class TrainedMap(msgspec.Struct, frozen=True):
+    """The map from actions to targets as it stands in a file; ValueError where it is none."""
+
+    names: Names
+    """Joints A that actions move."""
+    default: tuple[_Angle, ...]
+    scale: tuple[_Scale, ...]
+    low: tuple[_Angle, ...]
+    high: tuple[_Angle, ...]
+
+    def __post_init__(self) -> None:
+        if twice := repeats(self.names):
+            raise ValueError(f"'names' has {twice[0][:80]!r} twice")
+        for name, row in self.rows().items():
+            if len(row) != len(self.names):
+                raise ValueError(f"{name!r} has {len(row)} numbers for {len(self.names)} joints")
+        for low, high, scale in zip(self.low, self.high, self.scale, strict=True):
+            if not low < high:
+                raise ValueError(f"'low' must be less than 'high'; received {low:g} and {high:g}")
+            if scale == 0:
+                raise ValueError("'scale' of a joint that actions move must not be 0")
+
+    def rows(self) -> dict[str, tuple[float, ...]]:
+        """Return ``default``, ``scale``, ``low`` and ``high`` [A] (rad) by name."""
+        return {"default": self.default, "scale": self.scale, "low": self.low, "high": self.high}
+
+
+class _Deployment(msgspec.Struct):
+    rate: Annotated[float, Meta(ge=RATE[0], le=RATE[1])]
+    hand: Name
+    joints: Names
+    action_map: TrainedMap
+    frozen: dict[str, _Angle]
+    twist: Annotated[float, Meta(ge=0, le=MOST_TWIST)] | None
+    links: tuple[Name, ...] = ()
+    observe: str = "none"
+    task: Name | None = None
+    placement: Name | None = None
+    resolution: Name | None = None
+    sub_steps: Annotated[int, Meta(ge=1, le=1000)] | None = None
+    command: tuple[Annotated[float, Meta(ge=-1e6, le=1e6)], ...] | None = None
+    action_limit: Annotated[float, Meta(ge=1e-6, le=1e6)] | None = None
+
+
+class _Written(msgspec.Struct):
+    format: Literal["onnx"]
+    inputs: Groups
+    deployment: _Deployment
+    sha256: str = ""
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,59 +121,60 @@ class PolicyContract:
             DataError: the file is no contract, or a value is out of range, not finite or of another kind.
             UsageError: it does not say what a hand needs; export the policy from a trained run.
         """
-        return cls.of(Values.read(path))
+        return cls.of(read_mapping(path, "JSON file of names and values"), path.name)
 
     @classmethod
-    def of(cls, found: Values) -> PolicyContract:
-        """Return the contract of a file's values; errors as :meth:`read`."""
-        if not {"inputs", "format", "deployment"} <= set(found.values):
-            raise DataError(f"{found.where!r} is not the contract of a policy.")
-        if found.values["format"] == "jit":
+    def of(cls, document: Mapping[str, Any], where: str) -> PolicyContract:
+        """Return the contract of the values of a file; errors as :meth:`read`."""
+        deployment = document.get("deployment")
+        if not {"inputs", "format"} <= set(document) or not isinstance(deployment, dict):
+            raise DataError(f"{where!r} is not the contract of a policy: it needs 'format', 'inputs' and 'deployment'.")
+        if document["format"] == "jit":
             raise DataError(
-                f"{found.where!r} is of TorchScript, a program that may read and write files; a hand runs ONNX alone: "
+                f"{where!r} is of TorchScript, a program that may read and write files; a hand runs ONNX alone: "
                 "export the policy again."
             )
-        found.text("format", ("onnx",))
-        given = found.part("deployment")
-        if missing := [name for name in REQUIRED if name not in given.values]:
+        if missing := [name for name in REQUIRED if name not in deployment]:
             raise UsageError(
-                f"The contract {found.where!r} does not say {missing[0]!r}, so no hand can run the policy; "
+                f"The contract {where!r} does not say {missing[0]!r}, so no hand can run the policy; "
                 "export it from a trained run."
             )
-        inputs, joints = found.shapes("inputs", MOST_NUMBERS), given.texts("joints", JOINTS)
-        if (numbers := sum(map(math.prod, inputs.values()))) > MOST_NUMBERS:
-            raise found.error("inputs", f"at most {MOST_NUMBERS:,} numbers", numbers)
-        moved, action_map = read_action_map(given.part("action_map"))
-        still = given.part("frozen")
-        frozen = {name: still.number(name, *ANGLE) for name in still.values}
-        if sorted((*moved, *frozen)) != sorted(joints):
-            raise given.error("joints", "every joint once, either in 'action_map' or in 'frozen'", list(joints))
+        found = from_json(_Written, document, where)
+        given, inputs = found.deployment, shapes_of(found.inputs, where, "inputs")
+        joints, moved = given.joints, given.action_map.names
+        if sorted((*moved, *given.frozen)) != sorted(joints) or repeats(joints):
+            allowed = "every joint stands there once, and either in 'action_map' or in 'frozen'"
+            raise wrong(where, "deployment.joints", joints, allowed)
         size = 2 * len(joints) + len(moved)
         if inputs.get("proprio", (size,)) != (size,):
-            allowed = f"({size},) with {len(joints)} joints and {len(moved)} actions"
-            raise found.error("inputs.proprio", allowed, inputs["proprio"])
-        links, observe = (), "none"
+            allowed = f"with {len(joints)} joints and {len(moved)} actions it is ({size},)"
+            raise wrong(where, "inputs.proprio", inputs["proprio"], allowed)
+        links, observe = (given.links, given.observe) if "tactile" in inputs else ((), "none")
         if "tactile" in inputs:
-            links, observe = given.texts("links", MOST_NUMBERS), given.text("observe", OBSERVATIONS)
-            kind, shape = OBSERVATIONS[observe], inputs["tactile"]
-            fits = len(shape) == 3 and shape[2] == kind.channels and (not kind.per_link or shape[1] == len(links))
-            if not fits:
-                items = len(links) if kind.per_link else "N"
-                raise found.error("inputs.tactile", f"(S, {items}, {kind.channels}) for {observe!r}", shape)
-        said = ("task", "placement", "resolution")
-        more: dict[str, Any] = {name: given.text(name) for name in said if name in given.values}
-        if "sub_steps" in given.values:
-            more["sub_steps"] = given.whole("sub_steps", 1, 1000)
-        if "command" in given.values and "command" in inputs:
-            more["command"] = given.numbers("command", math.prod(inputs["command"]), -1e6, 1e6)
-        if given.values.get("action_limit") is not None:
-            more["action_limit"] = given.number("action_limit", 1e-6, 1e6)
-        more["twist"] = None if given.values["twist"] is None else given.number("twist", 0.0, MOST_TWIST)
-        more["contacts"] = trained_contacts(given.values, found.where)
+            _check_touch(given, inputs["tactile"], where)
+        more = {name: getattr(given, name) for name in ("task", "placement", "resolution", "sub_steps", "action_limit")}
+        if "command" in inputs and given.command is not None:
+            if len(given.command) != (count := math.prod(inputs["command"])):
+                raise wrong(where, "deployment.command", given.command, f"the policy reads {count} numbers")
+            more["command"] = given.command
+        more = {name: value for name, value in more.items() if value is not None}
+        more |= {"twist": given.twist, "contacts": trained_contacts(deployment, where)}
         return cls(
-            inputs, given.number("rate", *RATE), given.text("hand"), joints, moved,
-            action_map, frozen, links, observe, found.text("sha256") if "sha256" in found.values else "", more,
+            inputs, given.rate, given.hand, joints, moved, given.action_map.rows(), given.frozen, links, observe,
+            found.sha256, more,
         )  # fmt: skip
+
+
+def _check_touch(given: _Deployment, shape: tuple[int, ...], where: str) -> None:
+    """Raise DataError unless observation type, links and shape of the touch that a policy reads fit one another."""
+    if given.observe not in OBSERVATIONS:
+        raise wrong(where, "deployment.observe", given.observe, f"one of {', '.join(OBSERVATIONS)} is allowed")
+    if not given.links or repeats(given.links):
+        raise wrong(where, "deployment.links", given.links, "different names of links are needed")
+    kind = OBSERVATIONS[given.observe]
+    items = len(given.links) if kind.per_link else "N"
+    if len(shape) != 3 or shape[2] != kind.channels or (kind.per_link and shape[1] != items):
+        raise wrong(where, "inputs.tactile", shape, f"(S, {items}, {kind.channels}) is that of {given.observe!r}")
 
 
 def trained_contacts(described: Mapping[str, Any], where: str = "config.json") -> ContactModel:
@@ -134,30 +185,11 @@ def trained_contacts(described: Mapping[str, Any], where: str = "config.json") -
     Raises:
         DataError: a value is of another kind, or out of range.
     """
-    if described.get("contacts") is None:
-        return CONTACTS["published"]
-    found = Values(where, described).part("contacts").fields(ContactModel)
-    plain: dict[str, Any] = {key: tuple(value) if isinstance(value, list) else value for key, value in found.items()}
-    try:
-        return ContactModel(**plain)
-    except UsageError as error:
-        raise DataError(f"{where!r} is damaged: {error}") from error
-
-
-def read_action_map(given: Values) -> tuple[tuple[str, ...], dict[str, tuple[float, ...]]]:
-    """Return the joints that actions move, and by name the numbers of each; DataError where they make no map."""
-    moved = given.texts("names", JOINTS)
-    ranges = {"default": ANGLE, "scale": SCALE, "low": ANGLE, "high": ANGLE}
-    numbers = {name: given.numbers(name, len(moved), *ends) for name, ends in ranges.items()}
-    for joint, low, high, scale in zip(moved, numbers["low"], numbers["high"], numbers["scale"], strict=True):
-        if not low < high:
-            raise given.error("low", f"less than 'high' ({high:g}) for {joint!r}", low)
-        if scale == 0:
-            raise given.error("scale", f"not 0 for {joint!r}, which actions move", scale)
-    return moved, numbers
+    given = described.get("contacts")
+    return CONTACTS["published"] if given is None else from_json(ContactModel, given, f"contacts of {where}")
 
 
 def check_contract(contract: Mapping[str, Any], name: str) -> None:
     """Check what is about to be written as the contract ``name``, if it says all that a hand needs (errors: ``of``)."""
     if set(REQUIRED) <= set(contract["deployment"]):
-        PolicyContract.of(Values(name, json.loads(to_json(contract))))
+        PolicyContract.of(json.loads(to_json(contract)), name)

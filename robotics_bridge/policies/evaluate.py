@@ -12,7 +12,7 @@ import torch
 from numpy.typing import ArrayLike
 
 from brainbench.core.errors import UsageError, check_name
-from brainbench.core.progress import Progress
+from brainbench.core.progress import Progress, track
 from brainbench.core.statistics import wilson_interval
 from robotics_bridge.envs.env import Env
 from robotics_bridge.policies.shipped import AGENTS
@@ -104,12 +104,10 @@ class Policy:
         self.actor: Any = actor.eval()
         self.actor.reset()
 
-    def act(self, observations: Mapping[str, torch.Tensor]) -> torch.Tensor:
+    def __call__(self, observations: Mapping[str, torch.Tensor]) -> torch.Tensor:
         """Return the mean actions [B, A]."""
         with torch.inference_mode():
             return self.actor(observations)
-
-    __call__ = act
 
     def reset(self, dones: torch.Tensor | None = None) -> None:
         """Forget the past of all environments, or of those [B] that are done."""
@@ -138,11 +136,9 @@ def evaluate(
     Each environment contributes equally many episodes, so that short ones are not counted more often.
 
     Args:
-        env: the environments.
         policy: its ``reset(mask)``, if any, is called when episodes end.
         episodes: at least so many for every seed of the environments.
         seed: several are run one after the other.
-        name: of the agent, for reports.
         progress: called with seeds done, seeds and a word.
 
     Raises:
@@ -156,7 +152,7 @@ def evaluate(
     limit = None if env.task.goal is None else env.task.goal.limit
     rows: list[list[Any]] = []
     rates = []
-    for index, number in enumerate(seeds):
+    for number in track(seeds, f"evaluating {name}", progress):
         env.seed(number)
         observations = env.reset()
         if forget is not None:
@@ -179,8 +175,6 @@ def evaluate(
             left -= done.long()
         rates.append(sum(row[0] >= env.task.success.threshold for row in found) / len(found))
         rows += found
-        if progress:
-            progress(index + 1, len(seeds), f"evaluating {name}")
     metric, returns, lengths, diverged, goals, turned, dropped, shapes = zip(*rows, strict=True)
     seconds = tuple(n * env.step_dt for n in lengths)
     return PolicyEvaluation(

@@ -83,7 +83,6 @@ def export_policy(
     """Write a policy and compare the file with it, step by step with resets; a file that differs is not kept.
 
     Args:
-        policy: What is written.
         path: The suffix .onnx is added when there is none.
         deployment: What a robot needs besides (rate, joints, limits, …); kept in the contract.
         name: What the contract calls the policy.

@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from brainbench.core.errors import DataError, UsageError
-from robotics_bridge.policies.contract import read_action_map, trained_contacts
-from robotics_bridge.policies.schema import Values
+from robotics_bridge.policies.contract import TrainedMap, trained_contacts
+from robotics_bridge.policies.schema import from_json
 from robotics_bridge.policies.shipped import stored
 from robotics_bridge.tasks.contact_model import contacts_name
 from robotics_bridge.tasks.task import MEASURED, TASK_VERSION, Task
@@ -59,18 +59,16 @@ def check_actions(described: Mapping[str, Any], env: Env, name: str) -> None:
 
     Tasks and their configurations differ in the pose from which actions are counted. Earlier runs do not state theirs.
     """
-    given = Values(name, described)
-    given = given.part("deployment") if "deployment" in described else given
-    if "action_map" not in given.values:
+    given = from_json(dict, described.get("deployment", described), f"deployment of {name}")
+    if "action_map" not in given:
         return
-    names, own = read_action_map(given.part("action_map"))
-    here = env.action_map
-    if names != here.names:
+    own, here = from_json(TrainedMap, given["action_map"], f"action_map of {name}"), env.action_map
+    if own.names != here.names:
         raise UsageError(
-            f"The policy {name!r} moves {', '.join(names)} (task {str(given.values.get('task'))[:80]!r}), and the task "
+            f"The policy {name!r} moves {', '.join(own.names)} (task {str(given.get('task'))[:80]!r}), and the task "
             f"{env.task.name!r} moves {', '.join(here.names)}: take the task in which it was trained."
         )
-    for joint, trained, rest in zip(names, own["default"], here.default.tolist(), strict=True):
+    for joint, trained, rest in zip(own.names, own.default, here.default.tolist(), strict=True):
         if abs(trained - rest) > _SAME_ANGLE:
             raise UsageError(
                 f"Actions of the policy {name!r} are counted from {joint} = {trained:g} rad, and here from {rest:g} "

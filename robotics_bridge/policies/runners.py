@@ -12,7 +12,7 @@ from brainbench.core.errors import BrainbenchError, DataError
 from brainbench.core.reading.regular import check_file
 from brainbench.core.reading.tensors import check_finite
 from brainbench.models.export import onnx_session, require_onnx
-from robotics_bridge.policies.contract import MOST_NUMBERS
+from robotics_bridge.policies.schema import MOST_NUMBERS
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -29,7 +29,6 @@ def read_policy(
     """Return an exported policy as a function of one step of one hand that remembers.
 
     Args:
-        path: The file.
         shapes: Group → shape, in the order of the contract's ``inputs``.
         threads: Threads that ONNX Runtime computes with; its own choice if None.
         actions: A; not checked if None.

@@ -1,145 +1,63 @@
-"""Values of a JSON file, read one at a time with their kind and range; errors name the place in the file."""
+"""Parsed JSON as classes whose annotations state kinds and ranges; errors name the place in the file."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
-from dataclasses import MISSING, dataclass, fields
-from pathlib import Path
-from typing import Any
+import math
+import re
+from collections.abc import Mapping
+from dataclasses import is_dataclass
+from typing import Annotated, Any, TypeVar
 
-from brainbench.core.errors import DataError, check_name
-from brainbench.core.reading.texts import read_mapping
+import msgspec
+from msgspec import Meta
 
-_SHOWN = 80
-_ABSENT = object()
+from brainbench.core.errors import DataError, check_each, repeats, shown
 
+JOINTS = 255
+"""Most joints; a frame counts them in one byte."""
+MOST_NUMBERS = 10_000_000
+"""Most numbers of all observations, and of a policy's memory."""
+Name = Annotated[str, Meta(min_length=1, max_length=4096)]
+Names = Annotated[tuple[Name, ...], Meta(min_length=1, max_length=JOINTS)]
+Sizes = Annotated[tuple[Annotated[int, Meta(ge=1, le=MOST_NUMBERS)], ...], Meta(min_length=1, max_length=3)]
+Groups = Annotated[tuple[tuple[Name, Sizes], ...], Meta(min_length=1)]
+"""Group and shape of each observation; a list, since JSON keeps the order of lists alone."""
 
-@dataclass(frozen=True)
-class Values:
-    """Names and values somewhere in a file. Every method raises :class:`DataError` where a value is not as asked."""
-
-    where: str
-    """The file."""
-    values: Mapping[str, Any]
-    prefix: str = ""
-    """Place in the file, with a dot at its end."""
-
-    @classmethod
-    def read(cls, path: Path) -> Values:
-        """Read a JSON file; raise DataError if it cannot be read, or holds no names and values."""
-        return cls(path.name, read_mapping(path, "JSON file of names and values"))
-
-    def error(self, name: str, allowed: str, received: Any) -> DataError:
-        """Return the error for a value, of which 80 characters are shown."""
-        shown = "missing" if received is _ABSENT else repr(received)
-        shown = shown if len(shown) <= _SHOWN else f"{shown[:_SHOWN]}…"
-        return DataError(f"{self.prefix + str(name)[:_SHOWN]!r} in {self.where!r} is {shown}; allowed: {allowed}.")
-
-    def get(self, name: str, good: Callable[[Any], bool], allowed: str) -> Any:
-        """Return a value for which ``good`` holds."""
-        value = self.values.get(name, _ABSENT)
-        if not good(value):
-            raise self.error(name, allowed, value)
-        return value
-
-    def part(self, name: str) -> Values:
-        """Return names and values that stand under a name."""
-        found = self.get(name, lambda value: isinstance(value, dict), "names and values")
-        return Values(self.where, found, f"{self.prefix}{name}.")
-
-    def text(self, name: str, options: Iterable[str] = ()) -> str:
-        """Return a text, one of the options if there are any."""
-        known = tuple(options)
-
-        def good(value: Any) -> bool:
-            return isinstance(value, str) and (value in known if known else 0 < len(value) <= 4096)
-
-        return self.get(name, good, ", ".join(known) or "a text of at most 4096 characters")
-
-    def texts(self, name: str, most: int) -> tuple[str, ...]:
-        """Return different texts, at least one."""
-
-        def good(value: Any) -> bool:
-            texts = _list(value, 1, most) and all(isinstance(item, str) and item for item in value)
-            return texts and len(set(value)) == len(value)
-
-        return tuple(self.get(name, good, f"1 to {most} different names"))
-
-    def whole(self, name: str, low: int, high: int) -> int:
-        """Return a whole number."""
-        allowed = f"a whole number from {low} to {high}"
-        return self.get(name, lambda value: type(value) is int and low <= value <= high, allowed)
-
-    def number(self, name: str, low: float, high: float) -> float:
-        """Return a finite number."""
-        return float(self.get(name, lambda value: _within(value, low, high), f"a number from {low:.4g} to {high:.4g}"))
-
-    def numbers(self, name: str, count: int, low: float, high: float) -> tuple[float, ...]:
-        """Return so many finite numbers."""
-
-        def good(value: Any) -> bool:
-            return _list(value, count, count) and all(_within(item, low, high) for item in value)
-
-        return tuple(map(float, self.get(name, good, f"{count} numbers from {low:.4g} to {high:.4g}")))
-
-    def _shape(self, name: str, received: Any, most: int) -> tuple[int, ...]:
-        sizes = received if _list(received, 1, 3) else [0]
-        count = 1
-        for size in sizes:
-            count *= min(size, most + 1) if type(size) is int and size > 0 else 0
-        if not 0 < count <= most:
-            raise self.error(name, f"one to three sizes, together at most {most:,} numbers", received)
-        return tuple(sizes)
-
-    def shapes(self, name: str, most: int) -> dict[str, tuple[int, ...]]:
-        """Return group → shape of a list of [group, shape], each group once."""
-
-        def good(value: Any) -> bool:
-            rows = isinstance(value, list) and all(isinstance(row, list) and len(row) == 2 for row in value)
-            names = [row[0] for row in value] if rows else []
-            return all(isinstance(key, str) and key for key in names) and len(set(names)) == len(names) > 0
-
-        found = self.get(name, good, "a list of [group, shape], each group once")
-        return {key: self._shape(f"{name}.{key}", shape, most) for key, shape in found}
-
-    def fields(self, kind: type) -> dict[str, Any]:
-        """Return all values as those of a dataclass's fields, by the annotation of each; UsageError for others."""
-        known = {item.name: str(item.type) for item in fields(kind)}
-        for name in self.values:
-            check_name(f"setting in {self.where!r}", str(name)[:_SHOWN], known)
-        required = {item.name for item in fields(kind) if item.default is item.default_factory is MISSING}
-        if missing := sorted(required - set(self.values)):
-            raise self.error(missing[0], known[missing[0]], _ABSENT)
-        found = {}
-        for name, annotation in ((name, known[name]) for name in self.values):
-            plain, _, optional = annotation.partition(" | ")
-            good, empty = _KINDS.get(plain, _KINDS["str"]), bool(optional)
-            found[name] = self.get(name, lambda value, g=good, e=empty: g(value) or (e and value is None), annotation)
-        return found
+T = TypeVar("T")
 
 
-def _list(value: Any, low: int, high: int) -> bool:
-    return isinstance(value, list) and low <= len(value) <= high
+def from_json(kind: type[T], values: Any, where: str) -> T:
+    """Return parsed JSON of ``where``, a file or a place in one, as a class.
+
+    Raises:
+        DataError: a value is missing, of another kind or out of range.
+        UsageError: a dataclass has no field of a name; other classes take what they have fields for.
+    """
+    if is_dataclass(kind) and isinstance(values, Mapping):
+        check_each(f"setting in {where!r}", values, kind.__dataclass_fields__)
+    try:
+        return msgspec.convert(values, kind)
+    except msgspec.ValidationError as error:
+        fault, _, place = str(error).partition(" - at `$")
+        found = values
+        for step in re.findall(r"\w+|\[\.\.\.\]", place):
+            if step == "[...]":  # an entry of a mapping, whose name is not told
+                break
+            found = found[int(step)] if isinstance(found, list) else found[step]
+        raise wrong(where, place.strip(".`"), found, fault) from error
 
 
-def _within(value: Any, low: float, high: float) -> bool:
-    # Every comparison with NaN is false; True and False are no numbers here.
-    return type(value) in (int, float) and low <= value <= high
+def wrong(where: str, place: str, received: Any, allowed: str) -> DataError:
+    """Return the error for a value at a place of a file."""
+    what = f"{place!r} in {where!r}" if place else repr(where)
+    return DataError(f"{what} is {shown(received)}: {allowed.rstrip('.')}.")
 
 
-_KINDS: dict[str, Callable[[Any], bool]] = {
-    "str": lambda value: isinstance(value, str) and len(value) <= 400,
-    "bool": lambda value: isinstance(value, bool),
-    "int": lambda value: type(value) is int and abs(value) <= 10**12,
-    "float": lambda value: _within(value, -1e12, 1e12),
-    "Mapping[str, Any]": lambda value: isinstance(value, dict),
-    "HandCalibration": lambda value: value is None or isinstance(value, dict),
-    "tuple[int, ...]": lambda value: (
-        _list(value, 1, 32) and all(type(item) is int and 0 < item <= 65536 for item in value)
-    ),
-    "tuple[float, float]": lambda value: _list(value, 2, 2) and all(_within(item, -1e12, 1e12) for item in value),
-    "tuple[float, float, float]": lambda value: (
-        _list(value, 3, 3) and all(_within(item, -1e12, 1e12) for item in value)
-    ),
-}
-"""Annotation of a field → whether a JSON value is of its kind; literals are texts, which their class checks."""
+def shapes_of(groups: Groups, where: str, place: str) -> dict[str, tuple[int, ...]]:
+    """Return group → shape; DataError if a group stands there twice or all together have too many numbers."""
+    shapes = dict(groups)
+    if len(shapes) < len(groups):
+        raise wrong(where, place, repeats(name for name, _ in groups), "each group stands there once")
+    if (numbers := sum(map(math.prod, shapes.values()))) > MOST_NUMBERS:
+        raise wrong(where, place, numbers, f"at most {MOST_NUMBERS:,} numbers are allowed")
+    return shapes

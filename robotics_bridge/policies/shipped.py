@@ -7,8 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from brainbench.core.errors import check_name
-from brainbench.core.files import read_json
-from robotics_bridge.policies.schema import Values
+from brainbench.core.files import read_json, read_mapping
 
 AGENTS = ("zero", "random")
 """Agents that every trained one is held against."""
@@ -42,7 +41,7 @@ def stored(name: str | os.PathLike[str]) -> dict[str, Any]:
     """Return what the ``config.json`` of a policy by name, folder or model file says; nothing for other agents."""
     path = Path(name) if Path(name).exists() else FOLDER / str(name)
     path = student_folder(path if path.is_dir() else path.parent) / "config.json"
-    return dict(Values.read(path).values) if path.is_file() else {}
+    return read_mapping(path, "configuration of a policy") if path.is_file() else {}
 
 
 def student_folder(run: Path) -> Path:

@@ -11,6 +11,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
+from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -169,7 +170,7 @@ class TactilePolicy(MLPModel):
         )
         self.core: PolicyCore = core
         self.config: dict[str, Any] = {
-            "tactile": config.plain() if config is not None else None,
+            "tactile": asdict(config) if config is not None else None,
             "embedder": embedder,
             "hidden_dims": list(hidden_dims),
             "activation": activation,
@@ -202,15 +203,13 @@ class TactilePolicy(MLPModel):
         It starts anew after a step where ``ended`` [L, B]. With ``features`` [L, B, F] of the frozen encoder instead of
         its readings, the memory is [B, ``core.kept_size``].
         """
-        flat = self._normalised(obs)
+        flat: list[torch.Tensor] = []
+        if self.obs_groups:
+            joined = torch.cat([obs[name] for name in self.obs_groups], -1)
+            flat = list(self.obs_normalizer(joined).split(self._sizes, -1))
         if features is not None:
             return self.core.unroll(flat, features, h_in, ended, kept=True)
         return self.core.unroll(flat, obs[TACTILE] if self.core.tactile is not None else None, h_in, ended)
-
-    def _normalised(self, obs: Any) -> list[torch.Tensor]:
-        if not self.obs_groups:
-            return []
-        return list(self.obs_normalizer(torch.cat([obs[name] for name in self.obs_groups], -1)).split(self._sizes, -1))
 
     def action_of(self, latent: torch.Tensor) -> torch.Tensor:
         """Return the deterministic actions [B, A] of a latent."""

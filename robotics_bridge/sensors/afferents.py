@@ -7,15 +7,14 @@ update on the device of the signal. Letters: B environment, … anything else.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.signal import butter, sosfilt_zi
 
 from brainbench.core.errors import UsageError, check_each, shown
-from brainbench.core.reading.ranges import check_fields, check_number
+from brainbench.core.reading.ranges import check_number
 
 if TYPE_CHECKING:
     import torch
@@ -23,44 +22,27 @@ if TYPE_CHECKING:
     from robotics_bridge.physics.selection import EnvIds
 
 
-@dataclass(frozen=True)
-class Band:
-    """A pass band.
+AFFERENTS = {"SA-I": (0.0, 5.0), "FA-I": (5.0, 50.0), "FA-II": (40.0, 400.0)}
+"""Lower and upper edge [Hz] of the bands of table 2.1; 0 passes static signals."""
+_ORDER = 2
+"""Order of the Butterworth filter at each edge."""
+
+
+def band_sections(name: str, rate: float) -> np.ndarray:
+    """Return the second-order sections [n, 6] of one of :data:`AFFERENTS` at a sample rate (Hz).
 
     Raises:
-        UsageError: the edges are not in order.
+        UsageError: the band does not fit below half the rate.
     """
-
-    low: float
-    """Lower edge [Hz]; 0 passes static signals."""
-    high: float
-    """Upper edge [Hz]."""
-    order: int = 2
-    """Order of the Butterworth filter at each edge."""
-
-    def __post_init__(self) -> None:
-        check_fields(self, "low", least=0)
-        check_fields(self, "high", above=self.low)
-        check_fields(self, "order", least=1, most=8, whole=True)
-
-    def sections(self, rate: float) -> np.ndarray:
-        """Return the second-order sections [n, 6] at a sample rate (Hz).
-
-        Raises:
-            UsageError: the band does not fit below half the rate.
-        """
-        if self.high >= rate / 2:
-            raise UsageError(
-                f"A band up to {self.high:g} Hz needs more than {2 * self.high:g} readings per second; "
-                f"received {rate:g}. Read the sensor at every sub-step, or leave the band out."
-            )
-        if self.low == 0:
-            return np.asarray(butter(self.order, self.high, "lowpass", fs=rate, output="sos"))
-        return np.asarray(butter(self.order, (self.low, self.high), "bandpass", fs=rate, output="sos"))
-
-
-AFFERENTS: dict[str, Band] = {"SA-I": Band(0.0, 5.0), "FA-I": Band(5.0, 50.0), "FA-II": Band(40.0, 400.0)}
-"""Bands of table 2.1."""
+    low, high = AFFERENTS[name]
+    if high >= rate / 2:
+        raise UsageError(
+            f"A band up to {high:g} Hz needs more than {2 * high:g} readings per second; received {rate:g}. Read the "
+            "sensor at every sub-step, or leave the band out."
+        )
+    if low == 0:
+        return np.asarray(butter(_ORDER, high, "lowpass", fs=rate, output="sos"))
+    return np.asarray(butter(_ORDER, (low, high), "bandpass", fs=rate, output="sos"))
 
 
 class AfferentFilter:
@@ -68,8 +50,7 @@ class AfferentFilter:
 
     Args:
         rate: Updates per second [Hz].
-        bands: Names of :data:`AFFERENTS`, or name → band.
-        rectify: Whether fast bands give magnitudes, as firing rates do.
+        bands: Names of :data:`AFFERENTS`.
 
     Raises:
         UsageError: there is no band, or one is unknown or does not fit below half the rate.
@@ -80,22 +61,13 @@ class AfferentFilter:
         bands = afferents.step(suite.read("tip"))  # {"SA-I": [B, N], "FA-I": …}
     """
 
-    def __init__(
-        self,
-        rate: float,
-        bands: Sequence[str] | Mapping[str, Band] = ("SA-I", "FA-I", "FA-II"),
-        *,
-        rectify: bool = False,
-    ) -> None:
+    def __init__(self, rate: float, bands: Sequence[str] = tuple(AFFERENTS)) -> None:
         check_number("rate (Hz)", rate, above=0)
-        if not isinstance(bands, Mapping):
-            names = (bands,) if isinstance(bands, str) else tuple(bands)
-            check_each("afferent", names, AFFERENTS)
-            bands = {name: AFFERENTS[name] for name in names}
-        if not bands:
+        self.rate, self.bands = rate, (bands,) if isinstance(bands, str) else tuple(bands)
+        check_each("afferent", self.bands, AFFERENTS)
+        if not self.bands:
             raise UsageError(f"A filter needs a band, such as {next(iter(AFFERENTS))!r}; received none.")
-        self.rate, self.bands, self.rectify = rate, dict(bands), rectify
-        self._sections = {name: band.sections(rate) for name, band in self.bands.items()}
+        self._sections = {name: band_sections(name, rate) for name in self.bands}
         self._state: dict[str, list[list[torch.Tensor]]] = {}
 
     def step(self, x: torch.Tensor) -> dict[str, torch.Tensor]:
@@ -121,15 +93,11 @@ class AfferentFilter:
                 first.copy_(b1 * y - a1 * out + second)
                 second.copy_(b2 * y - a2 * out)
                 y = out
-            filtered[name] = y.abs() if self.rectify and self.bands[name].low > 0 else y
+            filtered[name] = y
         return filtered
 
     def reset(self, env_ids: EnvIds | None = None, x: torch.Tensor | None = None) -> None:
-        """Forget the past of some environments (all by default).
-
-        Args:
-            env_ids: Numbers of environments, or a mask [B] bool.
-            x: [B, …] signal that counts as having lasted for ever there; zero if not given.
+        """Forget the past of some environments (all by default); there the signal ``x`` [B, …], or 0, has always been.
 
         Raises:
             UsageError: an environment does not exist, or the signal has another shape than before.

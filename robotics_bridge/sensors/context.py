@@ -6,7 +6,7 @@ Letters: B environment, N probe, C channel; readings are stored planar [C, B, N]
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
@@ -25,6 +25,11 @@ if TYPE_CHECKING:
 
 _MOST = 512
 """Packed launches that are kept."""
+
+
+def memory_of(arrays: Iterable[Any], num_envs: int) -> int:
+    """Return the memory of Warp arrays per environment [bytes]."""
+    return sum(array.size * warp().types.type_size_in_bytes(array.dtype) for array in arrays) // num_envs
 
 
 def fill(kind: Any, source: Any, **own: Any) -> Any:

@@ -15,7 +15,7 @@ import numpy as np
 from brainbench.core.devices import warp
 from robotics_bridge.physics.state import HandState
 from robotics_bridge.sensors.context import LaunchContext, ReadoutSlice, SuiteContext
-from robotics_bridge.sensors.kernels.readout import CLEAN, FUSED, STAGED, ProbeArrays, ReadoutArrays, append_history
+from robotics_bridge.sensors.kernels.readout import CLEAN, FUSED, STAGED, ProbeArrays, ReadoutArrays
 from robotics_bridge.sensors.noise.stages import ReadingNoise
 from robotics_bridge.sensors.probes.placement import enclosing_sphere
 from robotics_bridge.sensors.sensor import ProbeSensor, Sensor
@@ -29,9 +29,7 @@ class Runtime(abc.ABC):
     Updates launch kernels and do nothing else, so that they can be recorded.
 
     Args:
-        sensors: by name.
         channels: planes of the storage.
-        context: of the suite.
         fusable: whether the sensor's kernel applies the noise itself when no crosstalk forbids it.
         active: which probes [N] are none of the fillers.
     """
@@ -90,7 +88,12 @@ class Runtime(abc.ABC):
         io.knobs, io.env_offset = self._noise.params, context.env_offset
         self.io = io
         """Warp structure of the readings: ``truth`` and ``measured``, planar."""
-        self._channels = channels
+        self.rings = self._noise.rings
+        """Those of delays that the user asked for."""
+        kept = [io.truth, io.measured, io.hysteresis, io.walk]
+        wanted = (True, self.noisy, *self.stores)
+        self.readings = [array for array, stored in zip(kept, wanted, strict=True) if stored] + self._noise.lasting
+        """Those of readings and their noise."""
 
     def update(self, state: HandState, dt: float) -> None:
         """Read the state; ``dt`` seconds have passed since the last update."""
@@ -110,35 +113,11 @@ class Runtime(abc.ABC):
         """Return the planar Warp array of measured readings."""
         return self._noise.read(self.io.measured)
 
-    @property
-    def state_bytes(self) -> int:
-        """Lasting memory per environment [bytes], readings included, without history and delay."""
-        planes = 1 + int(self.noisy) + sum(self.stores)
-        return 4 * self._channels * self.count * planes + self._noise.state_bytes + self._bytes(self.lasting)
-
-    @property
-    def scratch_bytes(self) -> int:
-        """Memory per environment [bytes] that every update writes anew."""
-        return self._bytes(self.scratch)
-
-    @property
-    def ring_bytes(self) -> int:
-        """Memory per environment [bytes] of delays that the user asked for."""
-        return self._noise.ring_bytes
-
-    def _bytes(self, arrays: list[Any]) -> int:
-        return sum(array.size * wp.types.type_size_in_bytes(array.dtype) for array in arrays) // self.context.num_envs
-
 
 class ProbeRuntime(Runtime):
     """Probes of all sensors of a group, one after another, with their slots.
 
-    Args:
-        sensors: by name.
-        channels: planes of the storage.
-        context: of the suite.
-        reach: how far beyond its radius a probe looks (m); None is unlimited, and geometries need not be in contact.
-        fusable: whether the sensor's kernel applies the noise itself when no crosstalk forbids it.
+    A probe looks ``reach`` beyond its radius (m); None is unlimited, and geometries need not be in contact.
     """
 
     def __init__(
@@ -155,8 +134,14 @@ class ProbeRuntime(Runtime):
         tracked = {name: sensor.tracked(context.scene) for name, sensor in sensors.items()}
         self.kinds = context.solids.kinds_of(sorted({g for members in tracked.values() for g in members}))
         """Kinds of the geometries that they may meet."""
-        self.slots = [self._slot(sensor, tracked[name], reach) for name, sensor in sensors.items()]
+        self.slots: list[int] = []
         """Slot of each sensor in the pair table."""
+        for name, sensor in sensors.items():
+            link, (center, span) = context.scene.link_index(sensor.link), enclosing_sphere(sensor.probes)
+            contact = reach is not None and sensor.contact_only
+            far = 0.0 if reach is None or contact else span + reach
+            slot = context.pairs.slot(link, tracked[name], contact=contact, center=center, reach=far)
+            self.slots.append(slot)
         p = ProbeArrays()
         for name, dtype in (("position", wp.vec3f), ("normal", wp.vec3f), ("radius", float)):
             columns = [getattr(sensor.probes, name) for sensor in sensors.values()]
@@ -166,13 +151,6 @@ class ProbeRuntime(Runtime):
         counts = [part.count for part in self.slices.values()]
         p.slot, p.part, p.probe = context.array(np.repeat(self.slots, counts), int), self.part, self.probe
         self.probes = p
-
-    def _slot(self, sensor: ProbeSensor, members: tuple[int, ...], reach: float | None) -> int:
-        link = self.context.scene.link_index(sensor.link)
-        contact = reach is not None and sensor.contact_only
-        center, span = enclosing_sphere(sensor.probes)
-        far = 0.0 if reach is None or contact else span + reach
-        return self.context.pairs.slot(link, members, contact=contact, center=center, reach=far)
 
     def launch(self, kernel: Any, *inputs: Any) -> None:
         """Run a kernel over all environments and probes."""
@@ -189,12 +167,8 @@ def probe_rows(slices: Iterable[ReadoutSlice], context: LaunchContext, mode: int
     """Return rows (first, end, step, number of the sensor) [R, 4] of probes that one thread takes in turn.
 
     What all probes of an environment share is then read less often. On a GPU the rows of neighbouring threads are
-    interleaved, so that these touch neighbouring memory.
-
-    Args:
-        slices: of the sensors, in the order of their numbers.
-        context: of the suite.
-        mode: of the readout; noise in the same kernel leaves no registers to share.
+    interleaved, so that these touch neighbouring memory; noise in the same kernel (``mode``) leaves no registers to
+    share.
     """
     slices = list(slices)
     cuda = bool(context.device.is_cuda)
@@ -213,23 +187,3 @@ def probe_rows(slices: Iterable[ReadoutSlice], context: LaunchContext, mode: int
             starts = range(part.start, end, most)
             rows += [(start, min(start + most, end), 1, number) for start in starts]
     return np.array(rows, dtype=np.int32).reshape(-1, 4)
-
-
-class History:
-    """The last readings of one sensor, ready as one contiguous window."""
-
-    def __init__(self, part: ReadoutSlice, channels: int, length: int, context: LaunchContext) -> None:
-        self.part, self.length, self._context = part, length, context
-        self.ring: Any = context.zeros((2 * length, channels, context.num_envs, part.count))
-        """Warp array [2 T, C, B, N]: every reading is written twice."""
-
-    @property
-    def bytes(self) -> int:
-        """Memory per environment [bytes]."""
-        return self.ring.size * 4 // self._context.num_envs
-
-    def launch(self, value: Any, counter: Any) -> None:
-        """Append the reading of this update; ``counter`` [1] counts updates on the device."""
-        c = self._context
-        dim = (c.num_envs, self.part.count)
-        c.launch(append_history, dim, value, self.part.start, counter, c.age, self.ring)

@@ -28,7 +28,7 @@ from trimesh.triangles import closest_point
 
 from brainbench.core.figures.style import panels, save_figure
 from brainbench.core.files import write_json
-from brainbench.core.progress import Progress
+from brainbench.core.progress import Progress, track
 from brainbench.geometry import Mesh, winding_number
 from robotics_bridge.physics import Geometry, HandState, TouchScene
 from robotics_bridge.sensors.probes.placement import Probes
@@ -56,11 +56,7 @@ def measure_tradeoff(path: Path | None = None, *, progress: Progress | None = No
     jobs = [partial(_mesh_point, "mesh", "sdf", n) for n in RESOLUTIONS]
     jobs += [partial(_mesh_point, "mesh", "raycast", None), partial(_mesh_point, "primitive", "sdf", None)]
     jobs += [partial(_points_point, n) for n in POINTS] + [partial(_taxels_point, n) for n in TAXELS]
-    rows = []
-    for done, job in enumerate(jobs, start=1):
-        rows.append(job())
-        if progress:
-            progress(done, len(jobs), "settings")
+    rows = [job() for job in track(jobs, "settings", progress)]
     if path is not None:
         about = {
             "error": "relative RMS of forces against double precision",

@@ -38,10 +38,7 @@ def unit_vector(name: str, value: Any, count: int) -> tuple[float, ...]:
 def check_parameters(of: str, function: Callable[..., Any], given: Iterable[str]) -> None:
     """Check that a function of a :class:`~robotics_bridge.tasks.step_context.StepContext` can be called by these names.
 
-    Args:
-        of: what the function is, for the message (``reward 'work' of task 'mine'``).
-        function: takes the context first, then its parameters.
-        given: names of the parameters that it will be given.
+    It takes the context first. Messages call it ``of`` (``reward 'work' of task 'mine'``).
 
     Raises:
         UsageError: it is no function, a name is none of its parameters (with the nearest), or a needed one is missing.

@@ -92,9 +92,7 @@ def with_thermal(thermal: ThermalSettings) -> Task:
         episode=20.0,
         noise=ObservationNoise(position=0.005, velocity=0.005),
         groups={
-            **dict.fromkeys(
-                ("actor", "critic", "rnd_state", "teacher"), ("priv_proprio", "priv_obj_state", "priv_thermal")
-            ),
+            **dict.fromkeys(("actor", "critic", "rnd_state"), ("priv_proprio", "priv_obj_state", "priv_thermal")),
             "student": ("proprio", "thermal"),
         },
         teacher=TeacherSettings(iterations=5000),

@@ -58,9 +58,7 @@ def published() -> Task:
         goal_terms=("orientation", "difference", "angle"),
         groups={
             "actor": ("goal", "priv_proprio", "priv_obj_state"),
-            "critic": ("goal", "priv_proprio", "priv_obj_state", "priv_obj_props"),
-            "rnd_state": ("goal", "priv_proprio", "priv_obj_state", "priv_obj_props"),
-            "teacher": ("goal", "priv_proprio", "priv_obj_state"),
+            **dict.fromkeys(("critic", "rnd_state"), ("goal", "priv_proprio", "priv_obj_state", "priv_obj_props")),
             "student": ("proprio", "goal"),
         },
         # The released teacher of this task was trained without curiosity.

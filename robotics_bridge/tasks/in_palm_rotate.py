@@ -65,9 +65,7 @@ def published() -> Task:
         auxiliary=("aux_obj_size", "aux_goal_dist"),
         groups={
             "actor": ("goal", "priv_proprio", "priv_obj_state"),
-            "critic": ("goal", "priv_proprio", "priv_obj_state", "priv_obj_props"),
-            "rnd_state": ("goal", "priv_proprio", "priv_obj_state", "priv_obj_props"),
-            "teacher": ("goal", "priv_proprio", "priv_obj_state"),
+            **dict.fromkeys(("critic", "rnd_state"), ("goal", "priv_proprio", "priv_obj_state", "priv_obj_props")),
             # Table 4.7 gives the student the goal; the released settings of this task leave it out.
             "student": ("proprio", "goal"),
         },

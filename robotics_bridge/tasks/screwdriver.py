@@ -93,10 +93,7 @@ def published() -> Task:
         distances_in="priv_obj_state",
         auxiliary=("aux_obj_tilt", "aux_rotation_progress"),
         groups={
-            "actor": ("priv_proprio", "priv_obj_state"),
-            "critic": ("priv_proprio", "priv_obj_state"),
-            "rnd_state": ("priv_proprio", "priv_obj_state"),
-            "teacher": ("priv_proprio", "priv_obj_state"),
+            **dict.fromkeys(("actor", "critic", "rnd_state"), ("priv_proprio", "priv_obj_state")),
             "student": ("proprio",),
         },
         decoders=(

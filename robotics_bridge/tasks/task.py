@@ -262,7 +262,7 @@ class Task:
     auxiliary: tuple[str, ...] = ()
     """Further groups for decoders: ``aux_obj_size``, ``aux_goal_dist``, ``aux_obj_tilt``, ``aux_rotation_progress``."""
     groups: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
-    """Observation set (actor, critic, rnd_state, teacher, student) → groups."""
+    """Observation set (actor, critic, rnd_state, student) → groups."""
     decoders: tuple[AuxiliaryDecoder, ...] = ()
     teacher: TeacherSettings = field(default_factory=TeacherSettings)
     student: StudentSettings = field(default_factory=StudentSettings)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import asdict
 
 import pytest
 from typer.testing import CliRunner
@@ -36,7 +37,7 @@ def test_sweep_counts_table_4_10() -> None:
 def test_report_prints_a_table_and_writes_records(tmp_path) -> None:
     for seed in range(3):
         config = DistillConfig(task="screwdriver", observe="bool", seed=seed)
-        write_json(tmp_path / config.name / "config.json", {"distill": config.plain(), "task_version": TASK_VERSION})
+        write_json(tmp_path / config.name / "config.json", {"distill": asdict(config), "task_version": TASK_VERSION})
         found = [{"seed": 0, "success": [1.0, 0.0, 1.0 * (seed > 0), 1.0], "metric": [1.0] * 4}]
         write_json(tmp_path / config.name / "evaluation.json", found)
     text = _run("report", tmp_path, "--records", tmp_path / "records", "--picture", tmp_path / "report.png")
@@ -51,7 +52,7 @@ def test_report_tests_students_against_each_other_beyond_the_spread_of_seeds(tmp
         for seed, share in enumerate(shares):
             config = DistillConfig(task="screwdriver", observe=observe, seed=seed)
             write_json(
-                tmp_path / config.name / "config.json", {"distill": config.plain(), "task_version": TASK_VERSION}
+                tmp_path / config.name / "config.json", {"distill": asdict(config), "task_version": TASK_VERSION}
             )
             found = [{"seed": 0, "success": [float(index < 20 * share) for index in range(20)]}]
             write_json(tmp_path / config.name / "evaluation.json", found)

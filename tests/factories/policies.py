@@ -75,7 +75,7 @@ def student_folder(folder: Path) -> Path:
         torch.manual_seed(0)
         student = build_student(config, shapes, list(shapes), 2)
     described = {
-        "brainbench_student": 1, "task_version": TASK_VERSION, "distill": config.plain(), "network": student.config,
+        "brainbench_student": 1, "task_version": TASK_VERSION, "distill": asdict(config), "network": student.config,
         "groups": [[name, list(shape)] for name, shape in shapes.items()], "actions": 2,
         "deployment": contract_of()["deployment"],
     }  # fmt: skip

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,8 @@ from robotics_bridge.deploy.frames import KEY, read_key
 from robotics_bridge.deploy.simulated_hand import Faults
 from robotics_bridge.hands.layouts import read_probes, write_probes
 from robotics_bridge.policies.contract import PolicyContract
-from robotics_bridge.policies.report import AGENTS, EVALUATION, agent_rows, read_agents, read_results, rows
+from robotics_bridge.policies.report.results import AGENTS, EVALUATION, read_agents, read_results
+from robotics_bridge.policies.report.tables import agent_rows, rows
 from robotics_bridge.policies.training.distill_config import DistillConfig
 from robotics_bridge.policies.training.student_files import load_student
 from robotics_bridge.policies.training.sweep import StudentSweep, read_sweep
@@ -158,7 +160,7 @@ def _bad_sweep(sweep: StudentSweep) -> bool:
 
 def _evaluation(folder: Path) -> Path:
     config = DistillConfig(task="in_palm_rotate")
-    write_json(folder / "config.json", {"distill": config.plain(), "task_version": TASK_VERSION})
+    write_json(folder / "config.json", {"distill": asdict(config), "task_version": TASK_VERSION})
     found = {"seed": 0, "success": [1.0, 0.0, 1.0], "goals": [2.0, None, 3.5], "iterations": 30}
     return write_json(folder / EVALUATION, [found, {**found, "seed": 1}])
 

@@ -27,7 +27,7 @@ from robotics_bridge.sensors import (
     TemperatureGrid,
 )
 from robotics_bridge.sensors.audio.materials import Modes
-from robotics_bridge.sensors.noise import simulate
+from robotics_bridge.sensors.noise.stages import simulate
 from tests.factories.touch_scenes import falling, pyramid
 
 KEPT = Path(__file__).parents[1] / "robotics_bridge" / "sensors" / "episode.npz"

@@ -94,5 +94,5 @@ class TouchWorld:
 class Follower:
     """The teacher of the world above: it sees the aim."""
 
-    def act(self, obs) -> torch.Tensor:
+    def __call__(self, obs) -> torch.Tensor:
         return obs["aux_aim"] - obs["proprio"]

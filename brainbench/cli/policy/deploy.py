@@ -136,7 +136,7 @@ def _inputs(deployed: DeployedPolicy, words: list[str]) -> dict[str, Any]:
     from brainbench.core.errors import UsageError, check_each, check_once
     from robotics_bridge.deploy.session import constant
 
-    wanted = [name for name in deployed.groups if name != "proprio"]
+    wanted = [name for name in deployed.contract.inputs if name != "proprio"]
     found: dict[str, Any] = {}
     for word in words:
         name, _, text = word.partition("=")
@@ -146,7 +146,7 @@ def _inputs(deployed: DeployedPolicy, words: list[str]) -> dict[str, Any]:
             raise UsageError(f"An input is NAME=NUMBER or NAME=NUMBER,NUMBER…; received {word[:80]!r}.") from None
     check_once("--input", [word.partition("=")[0] for word in words])
     check_each("input that the policy reads and a constant can replace", found, wanted)
-    return {name: constant(name, values, deployed.groups[name]) for name, values in found.items()}
+    return {name: constant(name, values, deployed.contract.inputs[name]) for name, values in found.items()}
 
 
 def _remote(text: str, key: Path | None, deployed: DeployedPolicy) -> tuple[Any, Any, Any, bytes]:

@@ -104,7 +104,7 @@ def touch_of(names: list[str]) -> dict[str, Any]:
         UsageError: students with different senses are asked for at once.
     """
     from brainbench.core.errors import UsageError
-    from robotics_bridge.policies.schema import Values
+    from robotics_bridge.policies.schema import from_json
     from robotics_bridge.policies.shipped import stored
 
     found: dict[str, dict[str, Any]] = {}
@@ -113,7 +113,8 @@ def touch_of(names: list[str]) -> dict[str, Any]:
             # Loads the students' networks, which other agents do not need.
             from robotics_bridge.policies.training.distill_config import DistillConfig
 
-            kept = Values("config.json", facts).part("distill").fields(DistillConfig)
+            kept = from_json(dict, facts.get("distill"), "distill of config.json")
+            from_json(DistillConfig, kept, "config.json")
             found[name] = {key: kept[key] for key in TOUCH if key in kept}
     if any(senses != next(iter(found.values())) for senses in found.values()):
         raise UsageError(f"The students {', '.join(found)} feel differently; evaluate them one at a time.")

@@ -13,7 +13,7 @@ from brainbench.cli.output import JsonOption, emit, table, table_of
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from robotics_bridge.policies.report import StudentResult
+    from robotics_bridge.policies.report.results import StudentResult
 
 
 def report(
@@ -41,11 +41,12 @@ def report(
     all students of a task and hand, with draws of encoders and training seeds as random factors; p is corrected for the
     pairs (Holm).
     """
-    from robotics_bridge.policies import report as students
+    from robotics_bridge.policies.report import records as student_records
+    from robotics_bridge.policies.report import tables
+    from robotics_bridge.policies.report.results import read_agents, read_results
 
-    results, agents = students.read_results(folders, at_least=at_least), students.read_agents(folders)
-    rows = [*students.rows(results), *students.agent_rows(agents)]
-    title, columns, rows = students.concise(rows)
+    results, agents = read_results(folders, at_least=at_least), read_agents(folders)
+    title, columns, rows = tables.concise([*tables.rows(results), *tables.agent_rows(agents)])
     first = columns.index("success")
     text = table(title, columns, rows, right=tuple(range(first, len(columns))))
     if picture is not None:
@@ -56,7 +57,7 @@ def report(
     if records is not None:
         from leaderboards import write_record
 
-        written = [str(write_record(record, records)) for record in students.records(results)]
+        written = [str(write_record(record, records)) for record in student_records.records(results)]
     data = [
         {
             "student": result.name, "success": result.value, "seeds": result.seeds,
@@ -72,7 +73,7 @@ def report(
         for result in results
     ]  # fmt: skip
     pairs = _pairs(results) if differences else []
-    lines = [text, *(f"Note: {note}." for note in students.remarks(results))]
+    lines = [text, *(f"Note: {note}." for note in tables.remarks(results))]
     if differences:
         shown = {
             "first": "{0[first]}",
@@ -91,7 +92,7 @@ def _pairs(results: Sequence[StudentResult]) -> list[dict[str, Any]]:
     from itertools import combinations, groupby
 
     from brainbench.metrics.inference.multiple import adjust
-    from robotics_bridge.policies.report import mixed_model
+    from robotics_bridge.policies.report.results import mixed_model
 
     found = []
     for place, members in groupby(results, key=lambda result: result.world):

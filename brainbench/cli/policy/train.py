@@ -144,7 +144,7 @@ def sweep(
     as_json: JsonOption = False,
 ) -> None:
     """Distil every student of a sweep that is not finished yet; what was interrupted goes on."""
-    from robotics_bridge.policies.report import EVALUATION
+    from robotics_bridge.policies.report.results import EVALUATION
     from robotics_bridge.policies.training.students import train_student
     from robotics_bridge.policies.training.sweep import PUBLISHED, read_sweep
 

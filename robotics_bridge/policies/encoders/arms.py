@@ -8,7 +8,7 @@ sizes are those of the thesis (section 4.3.4). Letters: B batch, S sub-step, N i
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import MISSING, asdict, dataclass, field, fields
+from dataclasses import MISSING, dataclass, field, fields
 from functools import partial
 from typing import Any
 
@@ -16,7 +16,7 @@ import torch
 from torch import nn
 
 from brainbench.core.contracts import GRID_SHAPE
-from brainbench.core.errors import UsageError, check_each, check_name, shown, unknown_name
+from brainbench.core.errors import UsageError, check_each, check_kind, check_name, shown, unknown_name
 from brainbench.core.reading.ranges import check_fields
 from brainbench.models.architecture import Architecture
 from brainbench.models.cells import GRU
@@ -103,11 +103,12 @@ class EncoderConfig:
         if isinstance(value, EncoderConfig):
             return value
         check_each("setting of a tactile encoder", value, cls.__dataclass_fields__)
-        return cls(**{**value, "calibration": HandCalibration.of(value.get("calibration"))})
-
-    def plain(self) -> dict[str, Any]:
-        """Return the fields as JSON types; :meth:`of` undoes it."""
-        return asdict(self)
+        unit = value.get("calibration") or {}
+        if not isinstance(unit, HandCalibration):
+            check_kind("calibration of a tactile encoder", unit, Mapping, "a mapping of 'force' and 'moment'")
+            check_each("field of a hand calibration", unit, HandCalibration.__dataclass_fields__)
+            unit = HandCalibration(**unit)
+        return cls(**{**value, "calibration": unit})
 
     @property
     def arm(self) -> str:

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 
@@ -57,17 +55,6 @@ class HandCalibration:
         if not moment > 0:
             raise DataError("The recording holds forces without any moment; calibrate on readings of a whole grid.")
         return cls(force, moment)
-
-    @classmethod
-    def of(cls, value: HandCalibration | Mapping[str, Any] | None) -> HandCalibration:
-        """Return a calibration from itself, a mapping of its fields, or None for the default."""
-        if isinstance(value, cls):
-            return value
-        if value is None:
-            return cls()
-        if not isinstance(value, Mapping) or not set(value) <= {"force", "moment"}:
-            raise UsageError(f"A hand calibration has the fields 'force' and 'moment'; received {value!r}.")
-        return cls(**value)
 
     def gains(self, sub_steps: int) -> list[float]:
         """Return the factor of each channel (sub-step-major) from SI on the hand to SI at a whisker's base."""

@@ -35,7 +35,7 @@ class FrontEnd(nn.Module):
         grid: The map from taxels to its input.
         time: ``native`` or ``resampled`` (:mod:`~robotics_bridge.policies.encoders.timing`).
         learning: ``frozen`` computes no gradients and never leaves evaluation mode.
-        calibration: What a unit of force is to the network; a mapping of its fields will do.
+        calibration: What a unit of force is to the network.
 
     Raises:
         UsageError: a name is unknown, or the network is no causal network of [T, 30, 5, 7].
@@ -51,7 +51,7 @@ class FrontEnd(nn.Module):
         *,
         time: Time = "native",
         learning: Learning = "frozen",
-        calibration: HandCalibration | Mapping[str, Any] | None = None,
+        calibration: HandCalibration | None = None,
         seed: int = 0,
         pretrained: str | os.PathLike[str] | None = None,
         options: Mapping[str, Any] | None = None,
@@ -75,7 +75,7 @@ class FrontEnd(nn.Module):
         self.learning: Learning = learning
         self.step: StreamingStep = StreamingStep(network)
         self.sub_steps: int = network.spec.sub_steps
-        gains = torch.tensor(HandCalibration.of(calibration).gains(self.sub_steps)).view(-1, 1, 1)
+        gains = torch.tensor((calibration or HandCalibration()).gains(self.sub_steps)).view(-1, 1, 1)
         self.register_buffer("gain", gains, persistent=False)
         values = network.spec.input_shape[0] // self.sub_steps * GRID_SHAPE[0] * GRID_SHAPE[1]
         self.resampler = Resampler(values, sub_steps=self.sub_steps) if time == "resampled" else None

@@ -13,8 +13,6 @@ from typing import Literal
 import torch
 from torch import nn
 
-from brainbench.core.errors import UsageError
-from brainbench.core.reading.ranges import check_number
 from brainbench.models.network import SUB_STEP_SECONDS
 
 Time = Literal["native", "resampled"]
@@ -27,30 +25,15 @@ class Resampler(nn.Module):
     """Turns control steps [B, S, V] into an encoder's steps [B, S, V], with all memory in one array per row.
 
     Row by row, time starts at the reset (a state of zeros); before it nothing touches. Of q control steps p complete a
-    step of the encoder (5 of 9 at 5 ms and 9 ms). A step shows what was felt up to 45 ms · (its number). A control
-    sub-step lasts ``seconds``, an encoder's ``target`` (s).
-
-    Raises:
-        UsageError: a number is no time, or control is slower than the encoder, so that one control step would complete
-            several steps.
+    step of the encoder (5 of 9). A step shows what was felt up to 45 ms · (its number).
     """
 
     weights: torch.Tensor
     """[q, S, K]: interpolation at each phase; zeros where no step ends."""
 
-    def __init__(
-        self, values: int, *, sub_steps: int = 5, seconds: float = CONTROL_SUB_STEP, target: float = SUB_STEP_SECONDS
-    ) -> None:
+    def __init__(self, values: int, *, sub_steps: int = 5) -> None:
         super().__init__()
-        check_number("sub_steps of a resampler", sub_steps, least=1, whole=True)
-        for name, time in {"seconds": seconds, "target": target}.items():
-            check_number(f"{name} of a resampler (s)", time, above=0)
-        ratio = Fraction(seconds / target).limit_denominator(1000)
-        if not 0 < ratio <= 1:
-            raise UsageError(
-                f"Readings every {seconds * 1e3:g} ms cannot be resampled to {target * 1e3:g} ms: control must be at "
-                "least as fast as the encoder; use time='native'."
-            )
+        ratio = Fraction(CONTROL_SUB_STEP / SUB_STEP_SECONDS).limit_denominator(1000)
         self.values, self.sub_steps = values, sub_steps
         self.advance, self.cycle = ratio.numerator, ratio.denominator
         # How far before the last reading sample i of a step lies, counted in readings.

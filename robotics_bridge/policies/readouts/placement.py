@@ -61,7 +61,6 @@ def choose_taxels(
         features: [T, B, N, F].
         wanted: [T, B, D] targets.
         valid: [T, B] bool, steps that count.
-        count: Taxels that are chosen.
 
     Raises:
         UsageError: there are fewer environments than folds.
@@ -190,8 +189,7 @@ def read_placements(
         layout: The hand's, whose active taxels are those of the rollout.
         count: Taxels of a placement.
         others: Further placements, name → taxels.
-        draws: Random placements.
-        seed: Of the random ones.
+        draws: Random placements, by the seed.
         progress: Called with parts done, in all, and a word.
 
     Raises:

@@ -8,7 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from brainbench.core.figures.style import COLORS, PALE, panels, save_figure
-from robotics_bridge.policies.report import StudentResult, sense
+from robotics_bridge.policies.report.results import StudentResult
+from robotics_bridge.policies.report.tables import sense
 
 
 def draw(results: Sequence[StudentResult], path: str | Path, *, agents: Sequence[Mapping[str, Any]] = ()) -> Path:

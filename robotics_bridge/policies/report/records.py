@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from typing import Any
 
 from brainbench.core.files import content_hash, provenance
@@ -65,7 +65,7 @@ def records(results: Sequence[StudentResult]) -> list[ResultRecord]:
         settings = {
             "episodes": result.episodes, "metric": result.metric, "iterations_learned": result.iterations,
             "seeds": list(result.seeds), **{f"mean_{name}": mean for name, (mean, _) in result.graded.items()},
-            **config.plain(),
+            **asdict(config),
         }  # fmt: skip
         facts = {
             "recordings": {"source": source, "content_hash": content_hash(protocol)},

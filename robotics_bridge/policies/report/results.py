@@ -12,7 +12,7 @@ import logging
 import math
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -201,7 +201,7 @@ class _Member:
 
 def _check_same(name: str, members: Sequence[_Member]) -> None:
     """Check that students of one name differ in nothing but seed, draw and what does not reach their weights."""
-    told = [member.config.plain() for member in members]
+    told = [asdict(member.config) for member in members]
     for plain in told:
         own = plain.pop("encoder_settings")
         plain |= {f"encoder_settings.{key}": own[key] for key in own if key not in _DRAWN}

@@ -218,7 +218,7 @@ class _Run:
             now = {name: obs[name][None] for name in self.groups}
             latent, memory = self.student.unroll(now, self.memory, None, None if features is None else features[None])
             own = self.student.action_of(latent[0]).float()
-            right = self.teacher.act(obs).float()
+            right = self.teacher(obs).float()
             # Ross et al. 2011: the student's own states are visited, a share of actions being the teacher's, and the
             # teacher labels them all.
             taught = torch.rand(len(own), 1, device=self.device) < share
@@ -294,7 +294,7 @@ class _Run:
     def _claim(self) -> None:
         """Write the run's configuration, or check that the folder holds this run."""
         path = self.out / CONFIG
-        mine = to_plain(self.config.plain())
+        mine = to_plain(asdict(self.config))
         if path.is_file():
             known = read_mapping(path)
             check_version(known, str(self.out))
@@ -349,7 +349,7 @@ def describe_run(config: DistillConfig, student: TactilePolicy, env: Any) -> dic
         "brainbench_student": 1,
         "task_version": TASK_VERSION,
         "contacts": asdict(env.task.contacts),
-        "distill": config.plain(),
+        "distill": asdict(config),
         "network": student.config,
         # A list: the order counts, and JSON keeps that of lists alone.
         "groups": [[name, list(shape)] for name, shape in student.shapes.items()],

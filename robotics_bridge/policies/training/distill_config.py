@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -124,10 +124,6 @@ class DistillConfig:
         """Return a configuration from a mapping of its fields; raise UsageError for a field that does not exist."""
         check_each("setting of a student", value, cls.__dataclass_fields__)
         return cls(**value)
-
-    def plain(self) -> dict[str, Any]:
-        """Return the fields as JSON types; :meth:`of` undoes it."""
-        return asdict(self)
 
     def resolved(self, settings: StudentSettings) -> DistillConfig:
         """Return the configuration with the task's own settings where it has none."""

@@ -3,25 +3,34 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
+import msgspec
 import torch
 from safetensors import safe_open
 
 from brainbench.core.errors import DataError
+from brainbench.core.files import read_mapping
 from brainbench.core.reading.regular import readable
 from brainbench.core.reading.tensors import read_tensors
-from robotics_bridge.policies.contract import JOINTS, MOST_NUMBERS
 from robotics_bridge.policies.encoders.arms import EncoderConfig
 from robotics_bridge.policies.fit import check_version
-from robotics_bridge.policies.schema import Values
+from robotics_bridge.policies.schema import JOINTS, Groups, from_json, shapes_of
 from robotics_bridge.policies.shipped import policy_path, student_folder
 from robotics_bridge.policies.student import TACTILE, TactilePolicy
 from robotics_bridge.policies.training.distill_config import DistillConfig
 from robotics_bridge.policies.training.state_tree import odd_shape
 
 CONFIG, MODEL = "config.json", "model.safetensors"
+
+
+class _Described(msgspec.Struct):
+    distill: dict[str, Any]
+    groups: Groups
+    actions: Annotated[int, msgspec.Meta(ge=1, le=JOINTS)]
+    deployment: dict[str, Any]
 
 
 def build_student(
@@ -36,7 +45,7 @@ def build_student(
     tactile = config.tactile
     return TactilePolicy(
         example, {"student": groups}, "student", actions, hidden_dims=config.hidden, embedder=config.embedder,
-        tactile=tactile.plain() if tactile is not None else None,
+        tactile=asdict(tactile) if tactile is not None else None,
     )  # fmt: skip
 
 
@@ -69,24 +78,23 @@ def load_student(folder: str | Path, *, device: str = "cpu") -> tuple[TactilePol
         DataError: the folder holds no student, or a value or weight is damaged, out of range or not finite.
     """
     folder = student_folder(policy_path("student", folder))
-    described = Values.read(folder / CONFIG)
-    if described.values.get("brainbench_student") != 1:
+    described = read_mapping(folder / CONFIG, "configuration of a student")
+    if described.get("brainbench_student") != 1:
         raise DataError(f"{str(folder)!r} holds no student; brainbench policy distill makes one.")
     if not (folder / MODEL).is_file():
         raise DataError(f"The student in {str(folder)!r} has no weights yet; its run was interrupted early.")
-    check_version(described.values, str(folder))
-    given = described.part("distill")
-    config = DistillConfig.of(given.fields(DistillConfig))
-    if config.encoder_settings:
-        given.part("encoder_settings").fields(EncoderConfig)
-    shapes, actions = described.shapes("groups", MOST_NUMBERS), described.whole("actions", 1, JOINTS)
-    described.part("deployment")
+    check_version(described, str(folder))
+    found = from_json(_Described, described, CONFIG)
+    config = from_json(DistillConfig, found.distill, CONFIG)
+    own = {name: value for name, value in config.encoder_settings.items() if value is not None}
+    from_json(EncoderConfig, own, f"encoder_settings of {CONFIG}")
+    shapes, actions = shapes_of(found.groups, CONFIG, "groups"), found.actions
     with readable(folder / MODEL, "student", "It is damaged, or of another student."):
         _require_sizes(folder / MODEL, config, shapes)
         with torch.random.fork_rng(devices=[]):
             student = build_student(config, shapes, list(shapes), actions)
         student.load_state_dict(read_tensors(folder / MODEL, "file of weights (safetensors)"))
-    return student.to(device).eval(), dict(described.values)
+    return student.to(device).eval(), described
 
 
 def _require_sizes(path: Path, config: DistillConfig, shapes: Mapping[str, tuple[int, ...]]) -> None:

@@ -11,14 +11,14 @@ import torch
 
 from brainbench.core.errors import DataError, UsageError
 from brainbench.core.files import read_mapping, write_json
-from brainbench.core.progress import Progress
+from brainbench.core.progress import Progress, track
 from robotics_bridge import tasks
 from robotics_bridge.policies.encoders.arms import ARMS, EncoderConfig
 from robotics_bridge.policies.encoders.calibration import HandCalibration
 from robotics_bridge.policies.encoders.timing import CONTROL_SUB_STEP
 from robotics_bridge.policies.evaluate import Policy, evaluate
 from robotics_bridge.policies.fit import with_contacts_of
-from robotics_bridge.policies.report import EVALUATION, GRADED
+from robotics_bridge.policies.report.results import EVALUATION, GRADED
 from robotics_bridge.policies.shipped import list_policies
 from robotics_bridge.policies.training.distill import DistillResult, distill
 from robotics_bridge.policies.training.distill_config import DistillConfig
@@ -124,7 +124,7 @@ def _measure(tactile: EncoderConfig, env: Any, teacher: Any) -> HandCalibration:
     observations, felt = env.reset(), []
     for _ in range(_CALIBRATION_STEPS):
         felt.append(grid(observations["tactile"][:_CALIBRATION_ENVS]).cpu())
-        observations, *_ = env.step(teacher.act(observations))
+        observations, *_ = env.step(teacher(observations))
     try:
         return HandCalibration.fit(torch.stack(felt))
     except DataError:
@@ -138,11 +138,12 @@ def evaluate_student(
     """Run whole episodes with a student and write ``evaluation.json``, one entry per seed of the first ``evaluations``.
 
     An entry lists per episode ``success``, ``metric``, ``returns``, ``goals``, ``turn_rate`` (rad/s), ``seconds`` and
-    ``dropped`` (:class:`~robotics_bridge.policies.evaluate.Evaluation`), and holds the ``iterations`` learned so far.
+    ``dropped`` (:class:`~robotics_bridge.policies.evaluate.PolicyEvaluation`), and holds the ``iterations`` learned
+    so far.
     """
     student, _ = load_student(folder, device=str(env.device))
     policy, found = Policy(student), []
-    for number, seed in enumerate(SEEDS[:evaluations]):
+    for seed in track(SEEDS[:evaluations], "evaluating", progress):
         result = evaluate(env, policy, episodes=episodes, seed=seed, name=Path(folder).name)
         found.append(
             {
@@ -151,7 +152,5 @@ def evaluate_student(
                 **{name: [float(item) for item in getattr(result, name)] for name in GRADED},
             }
         )  # fmt: skip
-        if progress is not None:
-            progress(number + 1, evaluations, "evaluating")
     write_json(Path(folder) / EVALUATION, found)
     return tuple(found)

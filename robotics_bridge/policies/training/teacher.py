@@ -32,7 +32,7 @@ from robotics_bridge.envs.rsl_rl import RslRlEnv
 from robotics_bridge.policies.acting import ActingModel
 from robotics_bridge.policies.evaluate import Policy
 from robotics_bridge.policies.fit import check_fit, check_version
-from robotics_bridge.policies.schema import Values
+from robotics_bridge.policies.schema import from_json
 from robotics_bridge.policies.shipped import SENSING, policy_path
 from robotics_bridge.policies.training import state_tree
 from robotics_bridge.policies.training.distill import describe_run
@@ -96,7 +96,7 @@ class Trainer:
             tactile = self.sensing.tactile
             actor = {
                 "class_name": "robotics_bridge.policies.student:TactilePolicy", "embedder": self.sensing.embedder,
-                "tactile": tactile.plain() if tactile is not None else None,
+                "tactile": asdict(tactile) if tactile is not None else None,
             }  # fmt: skip
         self.config = self.settings.config(groups, actor)
         observations = self.env.get_observations()
@@ -341,9 +341,8 @@ def _resume(trainer: Trainer, run: Path, facts: dict[str, Any]) -> None:
         return
     known = read_mapping(config)
     check_version(known, str(run))
-    with readable(config, "configuration of a run"):
-        # Settings that came later than the run had their defaults in it.
-        known["settings"] = asdict(TeacherSettings(**_plain(known["settings"])))
+    # Settings that came later than the run had their defaults in it.
+    known["settings"] = asdict(from_json(TeacherSettings, known.get("settings"), f"settings of {config}"))
     names = ("task", "hand", "num_envs", "seed", "settings", "observe", "contacts")
     check_same(run, json.loads(json.dumps(known)), {name: json.loads(json.dumps(facts[name])) for name in names})
     if not (run / RESUME).exists():
@@ -402,10 +401,9 @@ def load_teacher(run: str | Path, env: Env) -> Policy:
     """
     path = Path(run)
     file = model_file(path)
-    facts = Values.read(file.parent / "config.json")
-    check_fit(facts.values, env, str(run))
-    found = _plain(facts.part("settings").fields(TeacherSettings))
-    hidden = found.get("hidden", env.task.teacher.hidden)
+    facts = read_mapping(file.parent / "config.json", "configuration of a teacher")
+    check_fit(facts, env, str(run))
+    hidden = from_json(TeacherSettings, facts.get("settings"), "settings of config.json").hidden
     weights = state_tree.load(file).get("actor")
     weights = weights if isinstance(weights, dict) else {}
     check_finite(weights, str(file))
@@ -420,16 +418,12 @@ def load_teacher(run: str | Path, env: Env) -> Policy:
     except BrainbenchError:
         raise
     except (RuntimeError, TypeError, ValueError, LookupError, AttributeError) as error:
-        task, hand = (str(facts.values.get(name))[:80] for name in ("task", "hand"))
+        task, hand = (str(facts.get(name))[:80] for name in ("task", "hand"))
         raise DataError(
             f"The policy of {str(path)!r} was trained on {task!r} with hand {hand!r} and does not "
             f"fit this environment ({env.task.name!r}, {env.hand.name!r})."
         ) from error
     return Policy(actor.to(env.device))
-
-
-def _plain(settings: Mapping[str, Any]) -> dict[str, Any]:
-    return {name: tuple(value) if isinstance(value, list) else value for name, value in settings.items()}
 
 
 def _now(device: torch.device) -> float:

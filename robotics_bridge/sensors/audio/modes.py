@@ -39,7 +39,6 @@ def find_modes(
     Args:
         solid: A box, sphere, ellipsoid, cylinder or closed mesh; link and pose do not matter.
         material: What it is made of; decays follow from its Rayleigh damping.
-        count: Number of modes.
         cells: Elements along the longest edge.
         strike: Point [3] (m, frame of the solid) that is struck; the nearest of the surface counts. None takes the root
             mean square over the surface.

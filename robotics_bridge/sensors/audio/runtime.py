@@ -61,7 +61,11 @@ class ContactAudioRuntime(Runtime):
             check_number(
                 f"contact_time (s) of {name!r}, which ends within the time step,", sensor.contact_time, most=dt
             )
-        self._warn_silent(self.samples / dt / 2)
+            if all(value >= self.samples / dt / 2 for value in sensor.modes.frequency):
+                warnings.warn(
+                    f"Impacts of {name!r} are silent: all its modes lie above {self.samples / dt / 2:g} Hz, half the "
+                    "sample rate. Take more samples.", RuntimeWarning, stacklevel=5,
+                )  # fmt: skip
         self._dt = dt
         step = dt / self.samples
         poles = np.zeros((3, self._quads * 4, len(self._sensors)))
@@ -86,14 +90,6 @@ class ContactAudioRuntime(Runtime):
             quads = values.reshape(self._quads, 4, -1).transpose(0, 2, 1)
             array.assign(np.ascontiguousarray(quads, dtype=np.float32))
         self._own.sources.assign(self.context.array(sources, SourceParams))
-
-    def _warn_silent(self, highest: float) -> None:
-        for name, sensor in self._sensors.items():
-            if all(frequency >= highest for frequency in sensor.modes.frequency):
-                warnings.warn(
-                    f"Impacts of {name!r} are silent: all its modes lie above {highest:g} Hz, half the sample rate. "
-                    "Take more samples.", RuntimeWarning, stacklevel=6,
-                )  # fmt: skip
 
     def run_kernels(self, state: HandState, dt: float) -> None:
         """Make the next block from the contacts."""

@@ -55,11 +55,7 @@ class Calibration:
 
 
 def calibrate(log: Log, *, max_delay: float = 0.5) -> Calibration:
-    """Fit the knobs to a log.
-
-    Args:
-        log: The recording.
-        max_delay: Longest delay that is tried [s].
+    """Fit the knobs to a log, with delays of at most ``max_delay`` [s].
 
     Raises:
         UsageError: the longest delay is negative or not finite.

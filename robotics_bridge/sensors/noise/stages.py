@@ -64,12 +64,16 @@ class ReadingNoise:
         self._walk = self._zeros(staged and any(noise.walk for noise in noises))
         self._mixes = staged and any(noise.crosstalk for noise in noises)
         self._buffers = [self._zeros(self._mixes) for _ in range(2)]
+        self.lasting = [self._hysteresis, self._walk, *self._buffers]
+        """Warp arrays of the memory, without the delay."""
         if self._mixes:
             self._crosstalk = self._prepare_crosstalk()
         self._delay = context.array([noise.read_delay for noise in noises], float)
         self._jitter = context.array([noise.jitter for noise in noises], float)
         self._longest = max(noise.read_delay + noise.jitter for noise in noises)
         self._late, self._ring = self._zeros(self._longest > 0), None
+        self.rings = [self._late]
+        """Warp arrays of the delay; its ring exists from the first launch on."""
 
     def _draw_keys(self) -> Any:
         structures = [part.noise.params(self._context.seed, part.name) for part in self._slices]
@@ -102,18 +106,6 @@ class ReadingNoise:
             shape[row], strength[row] = part.layout, part.noise.crosstalk
         return context.array(shape, int), context.array(strength, float), context.array(weights, float)
 
-    @property
-    def state_bytes(self) -> int:
-        """Memory per environment [bytes], without the delay."""
-        arrays = (self._hysteresis, self._walk, *self._buffers)
-        return sum(array.size for array in arrays) * 4 // self._context.num_envs
-
-    @property
-    def ring_bytes(self) -> int:
-        """Memory per environment [bytes] of the delay; its ring exists from the first launch on."""
-        ring = 0 if self._ring is None else self._ring.size
-        return (ring + self._late.size) * 4 // self._context.num_envs
-
     def launch(self, x: Any, out: Any, dt: float) -> None:
         """Measure the signal ``x`` [C, B, N] (after radius noise) into ``out``, if that is staged, and record ``out``.
 
@@ -138,6 +130,7 @@ class ReadingNoise:
             slots = math.ceil(self._longest / dt - 1e-4) + 1
             if self._ring is None:
                 self._ring = self._zeros(True, (slots,))
+                self.rings.append(self._ring)
             if slots > self._ring.shape[0]:
                 raise UsageError(
                     f"A delay of {self._longest:g} s needs {slots} readings at a time step of {dt:g} s, but the first "
@@ -175,13 +168,10 @@ def simulate(
     The error of the sensing radius needs the geometry and is left out.
 
     Args:
-        noise: Knobs.
         clean: [T, B, N, C] signal [unit of the sensor].
         dt: Time step [s].
-        seed: Seed of the experiment.
+        seed: Seed of the experiment; its numbers also depend on the ``name`` of the sensor.
         layout: (ny, nx) where crosstalk is wanted.
-        name: Name of the sensor.
-        device: ``cpu`` or ``cuda``.
         env_offset: Number of the first environment in the whole experiment.
 
     Raises:

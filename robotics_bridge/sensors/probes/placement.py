@@ -89,8 +89,6 @@ class Probes:
             rows: number across ``along``.
             columns: number along ``along``.
             size: extent (along the rows' direction, along the columns' direction) between the outermost probes (m).
-            center: middle of the grid.
-            normal: out of the plane.
             along: direction in which the column number grows; its part along the normal is removed.
             radius: sensing radius (m).
         """
@@ -128,13 +126,10 @@ class Probes:
         """Spread probes evenly over a patch of a mesh (in the link's frame), with its normals.
 
         Args:
-            mesh: the surface.
-            count: number of probes.
             radius: sensing radius (m).
             facing: keep triangles whose normal lies within ``within`` degrees of this direction.
             within: that angle (degrees).
             box: keep triangles whose centre lies between two corners [2, 3] (m).
-            seed: of the sampling.
 
         Raises:
             UsageError: no triangle is left, or a number lies outside its range.

@@ -37,7 +37,6 @@ def sample_field(mesh: Mesh, resolution: int = 64, device: Any = "cpu") -> Field
         mesh: its surface; where it has holes, inside is where its winding number exceeds one half.
         resolution: cells along the longest edge of the bounding box; the grid extends a quarter of that edge beyond the
             box on every side, further out distances are extrapolated.
-        device: where it is computed.
 
     Raises:
         UsageError: the resolution is below 4 or above 512.

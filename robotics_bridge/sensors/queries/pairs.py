@@ -28,7 +28,6 @@ class PairTable:
     :meth:`freeze`, when all sensors have asked.
 
     Args:
-        context: of the suite.
         listed: geometries in contact with one link that are listed at once; None lists all, where that takes at most
             256 MiB, and 16 otherwise.
     """
@@ -53,11 +52,9 @@ class PairTable:
         center: ArrayLike = (0.0, 0.0, 0.0),
         reach: float = 0.0,
     ) -> int:
-        """Return the number of the slot for a sensor link.
+        """Return the number of the slot for a sensor link and the geometries that it may meet.
 
         Args:
-            link: number of the sensor link.
-            members: geometries it may meet.
             contact: list those in contact only; otherwise all within reach.
             center: middle of the probes in the link frame (m).
             reach: how far beyond it a geometry can matter (m); 0 lists all.

@@ -67,14 +67,9 @@ def tessellate(geometry: Geometry) -> Mesh:
 
 
 class Solids:
-    """Device copy of a scene's geometries.
+    """Device copy of a scene's geometries; those that differ between environments take one row each.
 
-    Args:
-        scene: what there is.
-        num_envs: B; geometries that differ between environments take one row each.
-        device: where.
-        queries: ``sdf`` or ``raycast`` and the geometry of all that is asked.
-        resolution: of the fields.
+    ``queries`` are ``sdf`` or ``raycast`` and the geometry of all that is asked.
     """
 
     def __init__(

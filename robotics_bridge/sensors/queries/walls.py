@@ -50,13 +50,7 @@ def as_solid(mesh: Mesh) -> Mesh:
 
 
 def wall_thickness(mesh: Mesh, cell: float, device: Any) -> float:
-    """Return the thickness (m) of the walls of a mesh that cells of a distance field cannot resolve, or 0 without any.
-
-    Args:
-        mesh: a closed surface.
-        cell: edge of a cell (m).
-        device: where it is measured.
-    """
+    """Return the thickness (m) of walls of a closed mesh that cells of a distance field (m) cannot resolve, or 0."""
     wp, tree = warp(), mesh_tree(mesh, device)
     points, faces = sample_surface(mesh, _SAMPLES, np.random.default_rng(0))
     normal = face_areas(mesh.vertices[mesh.faces[faces]])[1]

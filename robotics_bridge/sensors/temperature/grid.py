@@ -127,10 +127,6 @@ class TemperatureGrid(Sensor):
 def link_temperature(suite: SensorSuite, name: str) -> torch.Tensor:
     """Return the temperatures [B, L] (°C) of the links that a grid may touch, a view to write to.
 
-    Args:
-        suite: The sensors.
-        name: A TemperatureGrid of the suite.
-
     Raises:
         UsageError: the suite has no such temperature grid.
     """

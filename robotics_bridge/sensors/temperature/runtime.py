@@ -139,12 +139,7 @@ def diffusion(cells: int, edge: float, spread: float) -> NDArray[np.float64]:
     """Return the matrix [n, n] that spreads heat along a row of cells with insulated ends.
 
     The exponential of the second difference: no entry is negative, rows and columns sum to one, so that no new
-    extreme arises and no heat is lost, at any time step.
-
-    Args:
-        cells: n.
-        edge: Length of a cell [m].
-        spread: α Δt [m²].
+    extreme arises and no heat is lost, at any time step. ``edge`` is the length of a cell [m], ``spread`` α Δt [m²].
     """
     # The second difference with insulated ends is diagonal in cosines (DCT-II) with eigenvalues 2 (1 − cos(π m / n)) /
     # edge²; mode 0 has the rate zero, which keeps the mean.

@@ -1,4 +1,4 @@
-"""Episodes in LeRobot's layout, read back by pandas and pyarrow."""
+"""Sessions in LeRobot's layout, read back by pandas and pyarrow."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from pyarrow import parquet
 from brainbench.core.errors import DataError, UsageError
 from robotics_bridge import hands
 from robotics_bridge.deploy.driver import HandReading
-from robotics_bridge.deploy.episodes import Episode, SessionRecorder, TactilePoints, total_wrench, write_lerobot
+from robotics_bridge.deploy.episodes import PARTS, SessionRecorder, TactilePoints, total_wrench, write_lerobot
 from robotics_bridge.policies.contract import PolicyContract
 from robotics_bridge.policies.encoders.finger_axes import finger_axes_of
 from robotics_bridge.policies.encoders.taxel_grid import TaxelGrid
@@ -20,58 +20,57 @@ from robotics_bridge.policies.encoders.taxel_grid import TaxelGrid
 HAND = hands.load("xhand1")
 PROBES = HAND.layout("low", "tips")
 PLACES = [[getattr(probes, name)[probes.active] for probes in PROBES.values()] for name in ("position", "normal")]
-POINTS = TactilePoints(
-    tuple(PROBES), np.repeat(range(5), list(map(len, PLACES[0]))), np.concatenate(PLACES[0]), np.concatenate(PLACES[1])
-)
+LINKS = tuple(np.repeat(list(PROBES), list(map(len, PLACES[0]))).tolist())
+POINTS = TactilePoints(LINKS, *map(np.concatenate, PLACES))
+SETTINGS = {"task": "turn the ball", "fps": 40, "joints": HAND.joints, "points": POINTS, "robot": "xhand1", "unit": "N"}
 
 
-def _episode(length: int, task: str = "turn the ball", seed: int = 0) -> Episode:
-    rng = np.random.default_rng(seed)
-    shapes = ((12,), (12,), (12,), (45, 6), (6,))
-    frames = [[rng.normal(size=shape) for shape in shapes] for _ in range(length)]
-    return Episode(task, *(np.array([frame[part] for frame in frames]) for part in range(5)))
+def _frames(length: int) -> dict[str, np.ndarray]:
+    rng = np.random.default_rng(0)
+    shapes = dict(zip(PARTS, ((12,), (12,), (12,), (45, 6), (6,)), strict=True))
+    return {name: rng.normal(size=(length, *shape)) for name, shape in shapes.items()}
 
 
 @pytest.fixture
 def folder(tmp_path):
-    episodes = [_episode(4), _episode(3, "hold it", 1)]
-    return write_lerobot(tmp_path / "set", episodes, fps=40, joints=HAND.joints, points=POINTS)
+    return write_lerobot(tmp_path / "set", _frames(4), **SETTINGS)
 
 
 def test_frames_are_those_that_were_recorded(folder) -> None:
     info = json.loads((folder / "meta" / "info.json").read_text())
-    assert (info["codebase_version"], info["total_frames"], info["fps"]) == ("v3.0", 7, 40)
-    path = folder / info["data_path"].format(chunk_index=0, file_index=0)
-    frames = pd.read_parquet(path)
-    assert set(frames.columns) == set(info["features"])
-    second = _episode(3, seed=1)
-    np.testing.assert_allclose(np.stack(frames["action"])[4:], second.action, rtol=1e-6)
-    tactile = np.array([np.stack(row) for row in frames["observation.tactile"]])
-    assert tactile.shape == (7, 45, 6)
-    np.testing.assert_allclose(tactile[4:], second.tactile, rtol=1e-6)
-    assert frames["frame_index"].tolist() == [0, 1, 2, 3, 0, 1, 2]
-    assert frames["index"].tolist() == list(range(7))
-    np.testing.assert_allclose(frames["timestamp"], np.array([0, 1, 2, 3, 0, 1, 2]) / 40)
+    assert (info["codebase_version"], info["total_frames"], info["fps"]) == ("v3.0", 4, 40)
+    found = pd.read_parquet(folder / info["data_path"].format(chunk_index=0, file_index=0))
+    assert set(found.columns) == set(info["features"])
+    given = _frames(4)
+    np.testing.assert_allclose(np.stack(found["action"]), given["action"], rtol=1e-6)
+    tactile = np.array([np.stack(row) for row in found["observation.tactile"]])
+    np.testing.assert_allclose(tactile, given["observation.tactile"], rtol=1e-6)
+    assert found["frame_index"].tolist() == found["index"].tolist() == [0, 1, 2, 3]
+    np.testing.assert_allclose(found["timestamp"], np.arange(4) / 40)
     for name, feature in info["features"].items():
         if name.startswith(("observation", "action")):
-            shape = np.stack(frames[name].iloc[0]).shape
-            assert list(shape) == feature["shape"]
-    # One row group per episode, so that an episode can be read alone.
-    assert parquet.read_metadata(path).num_row_groups == 2
+            assert list(np.stack(found[name].iloc[0]).shape) == feature["shape"]
+        else:
+            assert str(found[name].dtype) == feature["dtype"]
+
+
+def test_columns_have_the_types_that_lerobot_stores(folder) -> None:
+    kinds = parquet.read_schema(folder / "data" / "chunk-000" / "file-000.parquet")
+    told = {name: str(kinds.field(name).type) for name in kinds.names}
+    assert told["action"] == "fixed_size_list<element: float>[12]"
+    assert told["observation.tactile"] == "list<element: list<element: float>>"
+    assert (told["timestamp"], told["index"]) == ("float", "int64")
 
 
 def test_episodes_and_tasks_are_found_as_lerobot_looks_for_them(folder) -> None:
     tasks = pd.read_parquet(folder / "meta" / "tasks.parquet")
-    assert tasks.index.tolist() == ["turn the ball", "hold it"]
-    assert tasks.loc["hold it", "task_index"] == 1
-    episodes = pd.read_parquet(folder / "meta" / "episodes" / "chunk-000" / "file-000.parquet")
-    assert episodes["dataset_from_index"].tolist() == [0, 4]
-    assert episodes["dataset_to_index"].tolist() == [4, 7]
-    assert [list(row) for row in episodes["tasks"]] == [["turn the ball"], ["hold it"]]
+    assert tasks.loc["turn the ball", "task_index"] == 0
+    (episode,) = pd.read_parquet(folder / "meta" / "episodes" / "chunk-000" / "file-000.parquet").to_dict("records")
+    assert (episode["dataset_from_index"], episode["dataset_to_index"], *episode["tasks"]) == (0, 4, "turn the ball")
     stats = json.loads((folder / "meta" / "stats.json").read_text())
-    both = np.concatenate([_episode(4).wrench, _episode(3, seed=1).wrench])
-    np.testing.assert_allclose(stats["observation.wrench"]["mean"], both.mean(axis=0), rtol=1e-5)
-    np.testing.assert_allclose(episodes["stats/action/max"][1], np.max(_episode(3, seed=1).action, axis=0), rtol=1e-6)
+    given = _frames(4)
+    np.testing.assert_allclose(stats["observation.wrench"]["mean"], given["observation.wrench"].mean(axis=0), rtol=1e-5)
+    np.testing.assert_allclose(episode["stats/action/max"], given["action"].max(axis=0), rtol=1e-6)
     points = json.loads((folder / "meta" / "tactile.json").read_text())
     assert len(points["position"]) == len(points["link"]) == 45
     assert set(points["links"]) == set(HAND.tips)
@@ -93,7 +92,7 @@ def test_the_wrench_is_the_sum_of_the_points() -> None:
     axes = finger_axes_of(HAND, HAND.layout("med", "hand"))
     rng = np.random.default_rng(2)
     points = rng.normal(size=(45, 6))
-    total = total_wrench(points, POINTS.links, POINTS.link, axes)
+    total = total_wrench(points, POINTS.links, axes)
     import torch
 
     grid = TaxelGrid("xhand1", placement="tips", resolution="low")
@@ -103,17 +102,16 @@ def test_the_wrench_is_the_sum_of_the_points() -> None:
     np.testing.assert_allclose(total, [*force, *moment], atol=1e-4)
 
 
-def test_episodes_that_do_not_fit_are_refused(tmp_path) -> None:
-    settings = {"joints": HAND.joints, "points": POINTS}
+def test_sessions_that_do_not_fit_are_refused(tmp_path) -> None:
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "x").write_text("")
     with pytest.raises(UsageError, match=r"/full' .*empty"):
-        write_lerobot(tmp_path / "full", [_episode(2)], fps=40, **settings)
+        write_lerobot(tmp_path / "full", _frames(2), **SETTINGS)
     with pytest.raises(UsageError, match=r"whole number.* 33\.3"):
-        write_lerobot(tmp_path / "a", [_episode(2)], fps=33.3, **settings)
-    with pytest.raises(UsageError, match=r"observation.state .*\(0,\)"):
-        write_lerobot(tmp_path / "b", [_episode(0)], fps=40, **settings)
-    spoiled = _episode(2)
-    spoiled.wrench[1][0] = np.nan
+        write_lerobot(tmp_path / "a", _frames(2), **{**SETTINGS, "fps": 33.3})
+    with pytest.raises(UsageError, match=r"observation.state .*\(0, 12\)"):
+        write_lerobot(tmp_path / "b", _frames(0), **SETTINGS)
+    spoiled = _frames(2)
+    spoiled["observation.wrench"][1][0] = np.nan
     with pytest.raises(DataError, match=r"observation.wrench .* no numbers"):
-        write_lerobot(tmp_path / "c", [spoiled], fps=40, **settings)
+        write_lerobot(tmp_path / "c", spoiled, **SETTINGS)

@@ -42,7 +42,7 @@ def test_a_jump_by_half_of_all_numbers_takes_no_memory_and_no_number_from_behind
 
 
 def test_old_frames_are_stale_although_their_number_is_new() -> None:
-    receiver = Receiver(b"", max_age=0.25)
+    receiver = Receiver(b"")
 
     def judge(number, sent, arrived):
         return receiver.judge(Frame(COMMAND, 1, 0, number, sent), arrived)[0]

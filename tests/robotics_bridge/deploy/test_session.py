@@ -20,7 +20,6 @@ from robotics_bridge.deploy.touch import PressureCalibration
 from robotics_bridge.policies.contract import PolicyContract
 from robotics_bridge.policies.evaluate import Policy
 from robotics_bridge.policies.export import export_policy
-from robotics_bridge.policies.schema import Values
 from robotics_bridge.policies.training.distill import describe_run
 from robotics_bridge.policies.training.distill_config import DistillConfig
 from robotics_bridge.policies.training.student_files import build_student
@@ -32,7 +31,7 @@ def _deployed(group: str, size: int = 1, **deployment: Any) -> DeployedPolicy:
     contract = contract_of()
     contract["inputs"][1] = [group, [size]]
     contract["deployment"] |= {"hand": "xhand1", **deployment}
-    return DeployedPolicy(Path("policy.onnx"), PolicyContract.of(Values("policy.onnx.json", contract)))
+    return DeployedPolicy(Path("policy.onnx"), PolicyContract.of(contract, "policy.onnx.json"))
 
 
 @pytest.mark.parametrize("group", ["goal", "priv_obj_state", "priv_proprio", "aux_goal_dist", "aux_obj_size"])
@@ -49,7 +48,7 @@ def test_a_command_that_the_contract_states_needs_no_word_of_the_user() -> None:
 
 def test_touch_of_a_policy_without_touch_reaches_nothing_and_is_refused() -> None:
     deployed, hand = _deployed("command", command=[0.5]), SimpleNamespace(joints=(), fingers=())
-    inputs = {name: shape for name, shape in deployed.groups.items() if name != "tactile"}
+    inputs = {name: shape for name, shape in deployed.contract.inputs.items() if name != "tactile"}
     deployed = replace(deployed, contract=replace(deployed.contract, inputs=inputs, links=()))
     for options in ({"fallback": lambda reading: None}, {"calibration": PressureCalibration()}):
         with pytest.raises(UsageError, match="reads no touch"):

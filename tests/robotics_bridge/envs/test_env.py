@@ -191,7 +191,7 @@ def test_changed_masses_are_what_mujoco_derives_itself() -> None:
     mujoco = mujoco_module()
     env = _make(3, _calm(object_changes=ObjectRandomisation(friction=(0.5, 1.5), mass_offset=(0.0, 0.1))))
     for number in range(3):
-        model = env.simulation.engine.model_of(number)
+        model = env.simulation.engine.models[number]
         derived = {name: getattr(model, name).copy() for name in ("body_subtreemass", "body_invweight0", "dof_M0")}
         body = model.body("object").id
         assert model.body_mass[body] == pytest.approx(float(env.state.episode.mass[number]), rel=1e-6)

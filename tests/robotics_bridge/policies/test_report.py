@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from dataclasses import asdict
 
 import numpy as np
 import pytest
@@ -13,26 +14,17 @@ from brainbench.core.files import content_hash, read_json, write_json
 from brainbench.core.statistics import newcombe_interval
 from leaderboards import rank, write_record
 from leaderboards.store import read_record
-from robotics_bridge.policies.report import (
-    COLUMNS,
-    LeftOut,
-    agent_rows,
-    command,
-    concise,
-    read_agents,
-    read_results,
-    records,
-    remarks,
-    rows,
-)
 from robotics_bridge.policies.report.figure import draw
+from robotics_bridge.policies.report.records import command, records
+from robotics_bridge.policies.report.results import LeftOut, read_agents, read_results
+from robotics_bridge.policies.report.tables import COLUMNS, agent_rows, concise, remarks, rows
 from robotics_bridge.policies.training.distill_config import DistillConfig
 from robotics_bridge.tasks.task import TASK_VERSION
 
 
 def _write(folder, shares, *, seed=0, **changes) -> None:
     config = DistillConfig(task="in_palm_rotate", seed=seed, **changes)
-    write_json(folder / config.name / "config.json", {"distill": config.plain(), "task_version": TASK_VERSION})
+    write_json(folder / config.name / "config.json", {"distill": asdict(config), "task_version": TASK_VERSION})
     found = [
         {"seed": index, "success": [float(i < round(20 * share)) for i in range(20)], "metric": [share] * 20}
         for index, share in enumerate(shares)
@@ -216,7 +208,7 @@ def test_what_happened_beside_success_stands_in_the_table_and_in_records(tmp_pat
         {"seed": seed, "success": [0.0] * 50, "turn_rate": rate, "goals": [0.0] * 50, "iterations": 40}
         for seed, rate in enumerate(rates)
     ]
-    write_json(tmp_path / config.name / "config.json", {"distill": config.plain(), "task_version": TASK_VERSION})
+    write_json(tmp_path / config.name / "config.json", {"distill": asdict(config), "task_version": TASK_VERSION})
     write_json(tmp_path / config.name / "evaluation.json", found)
     agent = {"agent": "runs/teacher", "task": "in_palm_rotate", "success_rate": 0.1, "success_interval": [0.05, 0.2]}
     write_json(tmp_path / "agents.json", [agent | {"turn_rate": 0.5, "turn_rate_half_width": 0.01}])

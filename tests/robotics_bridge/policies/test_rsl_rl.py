@@ -32,7 +32,7 @@ class World(VecEnv):
 
     def get_observations(self) -> TensorDict:
         values = {name: value.clone() for name, value in self.world.observations.items()}
-        values["best"] = Follower().act(self.world.observations)
+        values["best"] = Follower()(self.world.observations)
         return TensorDict(values, batch_size=[self.num_envs])
 
     def step(self, actions):

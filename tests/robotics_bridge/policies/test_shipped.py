@@ -29,7 +29,7 @@ def test_every_teacher_fits_its_task_and_has_a_card(name: str) -> None:
     assert sum(path.stat().st_size for path in (FOLDER / name).iterdir()) < 1.8e6
     env = tasks.make(facts["task"], num_envs=2, hand=facts["hand"], threads=1)
     assert list(env.action_names) == facts["action_names"]
-    action = load_teacher(name, env).act(env.reset())
+    action = load_teacher(name, env)(env.reset())
     assert action.shape == (2, env.num_actions)
     assert torch.isfinite(action).all()
 

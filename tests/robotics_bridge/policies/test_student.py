@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from dataclasses import asdict
 
 import numpy as np
 import pytest
@@ -196,7 +197,7 @@ def test_running_scale_counts_only_what_touches() -> None:
 
 def test_configurations_survive_a_file_and_name_what_is_wrong() -> None:
     config = EncoderConfig(name="mlp", calibration=EncoderConfig().calibration)
-    assert EncoderConfig.of(config.plain()) == config
+    assert EncoderConfig.of(asdict(config)) == config
     assert EncoderConfig(observe="agg_bool").arm == "rnn"
     assert EncoderConfig(observe="force").arm == "tactile_convrnn"
     with pytest.raises(UsageError, match="did you mean 'resolution'"):
@@ -315,7 +316,7 @@ def test_settings_that_an_encoder_does_not_have_are_refused(name, own, told) -> 
 @pytest.mark.parametrize("name", [*ARMS, "zhuang-small"])
 def test_settings_at_their_defaults_are_of_every_encoder(name) -> None:
     config = EncoderConfig(name=name)
-    assert EncoderConfig.of(config.plain()) == config
+    assert EncoderConfig.of(asdict(config)) == config
 
 
 @pytest.mark.parametrize("own", ["hand", "observe", "placement", "resolution", "name"])

@@ -110,7 +110,7 @@ def test_every_task_shares_the_actuator_randomisation(name: str) -> None:
 def test_groups_are_those_of_table_4_7(name: str) -> None:
     groups = tasks.load(name, "published").groups
     goal = () if name == "screwdriver" else ("goal",)
-    assert groups["teacher"] == groups["actor"] == (*goal, "priv_proprio", "priv_obj_state")
+    assert groups["actor"] == (*goal, "priv_proprio", "priv_obj_state")
     props = () if name == "screwdriver" else ("priv_obj_props",)
     assert groups["critic"] == (*goal, "priv_proprio", "priv_obj_state", *props)
     assert groups["student"] == ("proprio", *goal)
@@ -203,7 +203,7 @@ def test_settings_are_those_released(reference: Path, name: str, hand: str) -> N
     assert list(a.kick_ratio) == events["kick"]["torque_kick_range"]
     assert a.torque_noise == events["torque_noise"]["rfi_scale"]
     groups = c["runner_options"]["obs_groups"]
-    for kind in ("actor", "critic", "rnd_state", "teacher"):
+    for kind in ("actor", "critic", "rnd_state"):
         assert list(task.groups[kind]) == groups[kind]
     proprio = c["observation_options"]["proprio"]
     assert task.noise.position == proprio["dofs_pos"]["noise"]["std"]

@@ -8,6 +8,7 @@ import torch
 from brainbench import load_model
 from brainbench.core.errors import DataError, UsageError
 from brainbench.models.normaliser import FORCE_SCALE, MOMENT_SCALE, Normaliser
+from robotics_bridge.policies.encoders.arms import EncoderConfig
 from robotics_bridge.policies.encoders.calibration import HandCalibration
 from robotics_bridge.policies.encoders.front_end import FrontEnd
 from robotics_bridge.policies.encoders.taxel_grid import TaxelGrid
@@ -115,8 +116,8 @@ def test_a_fitted_calibration_gives_touched_sites_unit_size() -> None:
         HandCalibration.fit(torch.full((3, 30, 5, 7), torch.nan))
     with pytest.raises(UsageError, match=r"force .*received -1"):
         HandCalibration(force=-1)
-    with pytest.raises(UsageError, match="'force' and 'moment'; received"):
-        HandCalibration.of({"mass": 1})
+    with pytest.raises(UsageError, match=r"calibration 'mass'.*'force', 'moment'"):
+        EncoderConfig.of({"name": NAME, "calibration": {"mass": 1}})
 
 
 def test_a_frozen_network_learns_nothing_and_a_finetuned_one_does() -> None:

@@ -2,14 +2,9 @@
 
 from __future__ import annotations
 
-import math
-
 import pytest
 import torch
-from hypothesis import given
-from hypothesis import strategies as st
 
-from brainbench.core.errors import UsageError
 from robotics_bridge.policies.encoders.timing import Resampler
 
 
@@ -48,21 +43,6 @@ def test_waves_are_kept_within_the_error_of_linear_interpolation(frequency) -> N
     assert error <= (omega * 0.005) ** 2 / 8 + 1e-5
 
 
-def test_equal_rates_pass_readings_on() -> None:
-    found = _run(Resampler(1, target=0.005), lambda t: (7 * t)[:, None], 6)
-    assert len(found) == 6
-    torch.testing.assert_close(found[3][1][:, 0], 7 * 0.005 * torch.arange(16, 21))
-
-
-@given(st.integers(2, 12))
-def test_any_slower_encoder_gets_a_ramp_at_its_own_times(milliseconds) -> None:
-    target = max(milliseconds, 5) * 1e-3
-    found = _run(Resampler(1, target=target), lambda t: t[:, None], 40)
-    for number, (_, step) in enumerate(found):
-        times = 5 * target * number + target * torch.arange(1, 6)
-        torch.testing.assert_close(step[:, 0], times, atol=1e-5, rtol=1e-5)
-
-
 def test_rows_keep_their_own_clock() -> None:
     resampler = Resampler(1)
     state = torch.zeros(2, resampler.state_size)
@@ -71,15 +51,3 @@ def test_rows_keep_their_own_clock() -> None:
     state[1] = 0  # the reset of one environment
     after = [resampler(torch.ones(2, 5, 1), state)[1]]
     assert after[0].tolist() == [[True], [False]]
-
-
-def test_slow_control_is_refused() -> None:
-    with pytest.raises(UsageError, match="use time='native'"):
-        Resampler(1, seconds=0.02)
-
-
-@pytest.mark.parametrize("options", [{"seconds": math.nan}, {"seconds": 0}, {"target": 0.0}, {"sub_steps": 0}])
-def test_times_that_are_none_are_refused(options) -> None:
-    ((name, value),) = options.items()
-    with pytest.raises(UsageError, match=f"{name} of a resampler .*{value}"):
-        Resampler(2, **options)

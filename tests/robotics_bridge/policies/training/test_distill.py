@@ -107,7 +107,7 @@ def test_the_teacher_acts_in_its_share_of_steps(tmp_path) -> None:
         matched: tuple[int, int] = (0, 0)
 
         def step(self, action):
-            right = Follower().act(self.observations)
+            right = Follower()(self.observations)
             hits = int((action == right).all(1).sum())
             self.matched = (self.matched[0] + hits, self.matched[1] + len(action))
             return super().step(action)
@@ -138,9 +138,9 @@ def test_a_loss_that_is_no_number_ends_the_run_with_its_last_good_state(tmp_path
     class Mad(Follower):
         calls = 0
 
-        def act(self, obs):
+        def __call__(self, obs):
             self.calls += 1
-            return super().act(obs) * (float("nan") if self.calls > 2 * 8 else 1.0)
+            return super().__call__(obs) * (float("nan") if self.calls > 2 * 8 else 1.0)
 
     result = _run(tmp_path, teacher=Mad(), iterations=4)
     assert result.status == "diverged"

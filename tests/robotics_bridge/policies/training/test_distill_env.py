@@ -22,7 +22,7 @@ class Pusher:
     def __init__(self, actions: int) -> None:
         self.actions = actions
 
-    def act(self, obs) -> torch.Tensor:
+    def __call__(self, obs) -> torch.Tensor:
         return torch.tanh(obs["priv_proprio"][:, : self.actions])
 
 
@@ -63,7 +63,7 @@ def test_an_exported_student_knows_its_hand(tmp_path) -> None:
     student, described = load_student(tmp_path / "run")
     found = export_policy(student, tmp_path / "policy", deployment=described["deployment"])
     deployed = read_deployed(found.path)
-    assert list(deployed.groups) == ["proprio", "command", "tactile"]
+    assert list(deployed.contract.inputs) == ["proprio", "command", "tactile"]
     assert (deployed.contract.rate, deployed.contract.hand) == (40, "xhand1")
     assert len(deployed.contract.links) == 5
     env = tasks.make("in_palm_rotate", num_envs=2, observe="agg_force", placement="tips")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from dataclasses import replace
+from dataclasses import asdict, replace
 
 import pytest
 
@@ -30,7 +30,7 @@ def test_a_networks_hand_calibration_is_measured_while_the_teacher_acts_and_then
     assert found["force"] == pytest.approx(0.2 / 3**0.5, rel=0.25)
     assert config.tactile is not None
     assert config.tactile.calibration.force == found["force"]
-    write_json(tmp_path / "config.json", {"distill": config.plain()})
+    write_json(tmp_path / "config.json", {"distill": asdict(config)})
     again = calibrated(_config(), TouchWorld(16, seed=5), Follower(), tmp_path)
     assert again == config
 

@@ -100,7 +100,7 @@ def test_a_trained_actor_acts_alike_after_loading(tmp_path: Path) -> None:
     policy = load_teacher(tmp_path, env)
     action = policy(env.observations)
     assert action.shape == (4, 5)
-    assert torch.equal(action, load_teacher(newest(tmp_path), env).act(env.observations))
+    assert torch.equal(action, load_teacher(newest(tmp_path), env)(env.observations))
     policy.reset(torch.ones(4, dtype=torch.bool))
 
 

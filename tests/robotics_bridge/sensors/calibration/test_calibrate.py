@@ -10,7 +10,8 @@ import pytest
 from brainbench.core.errors import DataError
 from robotics_bridge.sensors.calibration.calibrate import calibrate
 from robotics_bridge.sensors.calibration.log import Log, find_quantum, read_log
-from robotics_bridge.sensors.noise import Noise, simulate
+from robotics_bridge.sensors.noise.model import Noise
+from robotics_bridge.sensors.noise.stages import simulate
 
 DT = 0.005
 
