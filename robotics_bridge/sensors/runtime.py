@@ -15,7 +15,7 @@ import numpy as np
 from brainbench.core.devices import warp
 from robotics_bridge.physics.state import HandState
 from robotics_bridge.sensors.context import LaunchContext, ReadoutSlice, SuiteContext
-from robotics_bridge.sensors.kernels.readout import CLEAN, FUSED, STAGED, ProbeArrays, ReadoutArrays
+from robotics_bridge.sensors.kernels.readout import CLEAN, FUSED, STAGED, ProbeArrays, ReadoutArrays, append_history
 from robotics_bridge.sensors.noise.stages import ReadingNoise
 from robotics_bridge.sensors.probes.placement import enclosing_sphere
 from robotics_bridge.sensors.sensor import ProbeSensor, Sensor
@@ -187,3 +187,19 @@ def probe_rows(slices: Iterable[ReadoutSlice], context: LaunchContext, mode: int
             starts = range(part.start, end, most)
             rows += [(start, min(start + most, end), 1, number) for start in starts]
     return np.array(rows, dtype=np.int32).reshape(-1, 4)
+
+
+class History:
+    """The last readings of one sensor, ready as one contiguous window."""
+
+    def __init__(self, part: ReadoutSlice, channels: int, length: int, context: LaunchContext) -> None:
+        self.part, self.length, self._context = part, length, context
+        self.ring: Any = context.zeros((2 * length, channels, context.num_envs, part.count))
+        """Warp array [2 T, C, B, N]: every reading is written twice."""
+        self.rings = [self.ring]
+
+    def launch(self, value: Any, counter: Any) -> None:
+        """Append the reading of this update; ``counter`` [1] counts updates on the device."""
+        c = self._context
+        dim = (c.num_envs, self.part.count)
+        c.launch(append_history, dim, value, self.part.start, counter, c.age, self.ring)

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, ClassVar, Literal
 
 from brainbench.core.errors import check_kind, check_name
+from brainbench.core.reading.ranges import check_fields
 from robotics_bridge.sensors.noise.model import BASE_KNOBS, PROBE_KNOBS, Noise
 from robotics_bridge.sensors.probes.placement import Probes
 
@@ -22,13 +23,15 @@ class Sensor(abc.ABC):
     """Configuration of a sensor on one link.
 
     Raises:
-        UsageError: the link has no name, or a noise knob is set that the sensor does not have.
+        UsageError: the link has no name, a noise knob is set that the sensor does not have, or the history is negative.
     """
 
     link: str
     """The link that carries it."""
     noise: Noise = field(default_factory=Noise)
     """Imperfections of the measured reading."""
+    history: int = 0
+    """Last readings kept, at the rate of updates; 0 keeps none."""
 
     channels: ClassVar[int] = 0
     """Channels of a reading; 0 is a scalar per probe."""
@@ -44,6 +47,7 @@ class Sensor(abc.ABC):
         check_kind("link of a sensor", self.link, str, "a name")
         check_kind("noise of a sensor", self.noise, Noise, "Noise(...)")
         self.noise.check(self.knobs, type(self).__name__)
+        check_fields(self, "history", least=0, whole=True)
 
     @abc.abstractmethod
     def layout(self) -> tuple[int, ...]:

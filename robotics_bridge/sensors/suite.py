@@ -1,4 +1,4 @@
-"""SensorSuite: all sensors of a hand behind one interface. Letters: B environment, N probe."""
+"""SensorSuite: all sensors of a hand behind one interface. Letters: B environment, N probe, T reading of the past."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ from robotics_bridge.sensors.fidelity import SensorFidelity
 from robotics_bridge.sensors.plausibility import warn_of
 from robotics_bridge.sensors.probes.runtime import DistanceRuntime
 from robotics_bridge.sensors.probes.sensors import SurfaceDistanceProbe
-from robotics_bridge.sensors.queries.kernels.pairs import reset_clock
+from robotics_bridge.sensors.queries.kernels.pairs import count_update, reset_clock
 from robotics_bridge.sensors.queries.pairs import PairTable
 from robotics_bridge.sensors.queries.solids import Solids
-from robotics_bridge.sensors.runtime import Runtime
+from robotics_bridge.sensors.runtime import History, Runtime
 from robotics_bridge.sensors.sensor import Sensor
 
 wp = warp()
@@ -109,6 +109,13 @@ class SensorSuite:
             ]
             self._owner = {name: runtime for runtime in self.runtimes for name in runtime.slices}
             self.pairs.freeze()
+            self._updates = 0
+            self._counter = context.zeros(1, int)
+            self._histories = {
+                name: History(self._owner[name].slices[name], max(sensor.channels, 1), sensor.history, context)
+                for name, sensor in self.sensors.items()
+                if sensor.history
+            }
         # An update as a CUDA graph, for one state and time step (s).
         self._recorded: tuple[Callable[[], None], HandState, float] | None = None
         self._status: Any = None
@@ -127,8 +134,8 @@ class SensorSuite:
             self._launch(state, dt)
             self._warn_crowded()
         elif self.device.is_capturing:
-            if not all(runtime.recordable for runtime in self.runtimes):
-                raise UsageError("Sensors with meshes that move cannot be part of another recording.")
+            if self._histories or not all(runtime.recordable for runtime in self.runtimes):
+                raise UsageError("Sensors with a history or with meshes that move cannot be part of another recording.")
             self._launch(state, dt)
         elif self._recorded and self._recorded[1] is state and self._recorded[2] == dt:
             self._recorded[0]()
@@ -142,6 +149,7 @@ class SensorSuite:
                 self._launch(state, dt)
             self._recorded = None
         self._status = state.status
+        self._updates += 1
 
     def read(self, name: str) -> torch.Tensor:
         """Return the measured reading of a sensor, [B, N] or [B, rows, columns], and channels last; a view.
@@ -154,6 +162,22 @@ class SensorSuite:
     def read_ground_truth(self, name: str) -> torch.Tensor:
         """Return the reading without noise, in the shape of :meth:`read`; a view."""
         return self._view(name, self.runtime_of(name).io.truth)
+
+    def read_history(self, name: str) -> torch.Tensor:
+        """Return the last measured readings [B, T, N(, C)], oldest first; zeros before the reset. A view.
+
+        Raises:
+            UsageError: the sensor keeps no history.
+        """
+        self.runtime_of(name)
+        if name not in self._histories:
+            raise UsageError(f"The sensor {name!r} keeps no history; configure it with history=<readings>.")
+        kept = self._histories[name]
+        first = self._updates % kept.length
+        # Every reading stands twice in the ring, so the window is a slice of it and no copy.
+        window = wp.to_torch(kept.ring)[first : first + kept.length]
+        tensor = window.permute(2, 0, 3, 1).unflatten(2, kept.part.layout)
+        return tensor.squeeze(-1) if kept.part.scalar else tensor
 
     def read_nearest(self, name: str) -> torch.Tensor:
         """Return the nearest surface points [B, N, 3] of a SurfaceDistanceProbe (m, link frame); a view.
@@ -223,7 +247,7 @@ class SensorSuite:
         and ``scratch`` that every update writes anew."""
         owners = {
             "sensors": [(*runtime.readings, *runtime.lasting) for runtime in self.runtimes],
-            "rings": [runtime.rings for runtime in self.runtimes],
+            "rings": [owner.rings for owner in (*self.runtimes, *self._histories.values())],
             "scratch": [runtime.scratch for runtime in self.runtimes],
         }
         found = {name: sum(memory_of(held, self.num_envs) for held in lists) for name, lists in owners.items()}
@@ -233,6 +257,10 @@ class SensorSuite:
         self.pairs.update(state)
         for runtime in self.runtimes:
             runtime.update(state, dt)
+        for name, history in self._histories.items():
+            history.launch(self._owner[name].measured(), self._counter)
+        if self._histories:
+            self.context.launch(count_update, 1, self._counter)
 
     def _check(self, state: HandState) -> None:
         wanted = (self.num_envs, len(self.scene.links))

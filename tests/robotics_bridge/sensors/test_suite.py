@@ -150,6 +150,20 @@ def test_a_diverged_environment_reads_nan_and_harms_no_other() -> None:
     assert torch.equal(suite.read("depth")[1], alone.read("depth")[0])
 
 
+def test_history_holds_the_last_readings_oldest_first_and_is_cleared_by_reset() -> None:
+    suite = _suite({"depth": ContactDepthProbe(link="hand", probes=GRID, history=3)}, envs=2)
+    read = []
+    for height in (0.0145, 0.0143, 0.0141, 0.0139):
+        suite.update(state_of(suite.scene, _touching(2, height)))
+        read.append(suite.read("depth").clone())
+    assert torch.equal(suite.read_history("depth"), torch.stack(read[1:], dim=1))
+    suite.reset([0])
+    suite.update(state_of(suite.scene, _touching(2)))
+    kept = suite.read_history("depth")
+    assert (kept[0, :2] == 0).all()
+    assert torch.equal(kept[1, 1], read[3][1])
+
+
 def test_readings_do_not_depend_on_batch_pose_or_order_of_probes() -> None:
     rng = np.random.default_rng(3)
     scene = pad_scene(BALL)
@@ -273,6 +287,8 @@ def test_states_and_names_that_do_not_fit_are_refused() -> None:
         suite.update(state_of(suite.scene, _touching(2)), dt=0.0)
     with pytest.raises(UsageError, match="did you mean 'depth'"):
         suite.read("dept")
+    with pytest.raises(UsageError, match=r"'depth' .*history="):
+        suite.read_history("depth")
     with pytest.raises(UsageError, match=r"'depth' .*nearest=True"):
         suite.read_nearest("depth")
     with pytest.raises(UsageError, match="are 0 to 1"):

@@ -68,6 +68,13 @@ class PairArrays:
 
 
 @wp.kernel(module="unique")
+def count_update(age: wp.array(dtype=wp.int32)):
+    """Count an update. Thread: a counter."""
+    env = wp.tid()
+    age[env] = age[env] + 1
+
+
+@wp.kernel(module="unique")
 def reset_clock(mask: wp.array(dtype=wp.bool), age: wp.array(dtype=wp.int32), episode: wp.array(dtype=wp.int32)):
     """Start an episode in chosen environments. Thread: environment [B]."""
     env = wp.tid()
