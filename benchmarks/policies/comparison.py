@@ -23,8 +23,9 @@ from brainbench.core.files import read_json
 from brainbench.core.records import Interval
 from brainbench.metrics.inference.multiple import adjust
 from leaderboards import write_record
-from robotics_bridge.policies import report
-from robotics_bridge.policies.report import StudentResult, figure, mixed_model
+from robotics_bridge.policies.report import figure, tables
+from robotics_bridge.policies.report.records import records
+from robotics_bridge.policies.report.results import StudentResult, mixed_model, read_agents, read_results
 from robotics_bridge.policies.training.distill_config import DistillConfig
 
 TASK, TEACHER = "in_palm_rotate", "in_palm_rotate.teacher"
@@ -160,12 +161,12 @@ def main() -> None:
     parser.add_argument("--write", action="store_true")
     parser.add_argument("--records", type=Path, help="folder for records of what is laid out")
     options = parser.parse_args()
-    every = report.read_results(options.folders, at_least=options.at_least)
+    every = read_results(options.folders, at_least=options.at_least)
     results = [result for result in every if arm_of(result.config) in ARMS]
     named = {arm: result for arm in ARMS for result in results if arm_of(result.config) == arm}
-    agents = report.read_agents(options.folders)
-    title, columns, rows = report.concise([*report.rows(results), *report.agent_rows(agents)])
-    notes = report.remarks([replace(result, left_out=()) for result in results])
+    agents = read_agents(options.folders)
+    title, columns, rows = tables.concise([*tables.rows(results), *tables.agent_rows(agents)])
+    notes = tables.remarks([replace(result, left_out=()) for result in results])
     left = [f"{arm} seed {item.seed} ({item.iterations})" for arm, r in named.items() for item in r.left_out]
     notes += [f"left out, after so many iterations: {', '.join(left)}"] if left else []
     parts = [f"{title}.", table(columns, rows)]
@@ -180,7 +181,7 @@ def main() -> None:
         write_section(f"Students of {TASK}", command, body, where=options.device, subject="policies")
     if options.records is not None:
         shipped = [replace(result, config=replace(result.config, teacher=TEACHER)) for result in every]
-        for record in report.records(shipped):
+        for record in records(shipped):
             print(write_record(record, options.records))
 
 
