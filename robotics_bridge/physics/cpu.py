@@ -31,7 +31,8 @@ class MujocoEngine:
 
     Args:
         model: a compiled ``mujoco.MjModel``, or variants of one that differ in numbers only (see
-            :func:`~robotics_bridge.physics.variants.compile_variants`); its flag ``autoreset`` is switched off.
+            :func:`~robotics_bridge.physics.variants.compile_variants`); copies are simulated, without the flag
+            ``autoreset``.
         num_envs: B.
         threads: how many work at once, at least 1; every processor by default.
         fields: values per environment [B, ...] of any model field, e.g. ``{"body_mass": …}``.
@@ -55,9 +56,9 @@ class MujocoEngine:
         check_number("environments of an engine", num_envs, least=1, most=MOST_ENVS, whole=True)
         if threads is not None:
             check_number("threads of an engine", threads, least=1, whole=True)
-        models: list[Any] = list(model) if isinstance(model, (list, tuple)) else [model]
+        models: list[Any] = list(map(copy.copy, model if isinstance(model, (list, tuple)) else [model]))
         self.model: Any = models[0]
-        """The model, or the first of its variants."""
+        """A copy of the model, or of the first of its variants."""
         for each in models:
             # An environment that diverges shows it; C MuJoCo would put it back to its start and go on.
             each.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET

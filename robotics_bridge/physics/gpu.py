@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
@@ -11,7 +12,7 @@ import torch
 from numpy.typing import ArrayLike
 
 from brainbench.core.cuda_graphs import record_launches
-from brainbench.core.devices import pick_device, warp
+from brainbench.core.devices import mujoco_module, pick_device, warp
 from brainbench.core.errors import UsageError, missing_dependency, unknown_name
 from brainbench.core.reading.ranges import check_number
 from robotics_bridge.physics.kernels.state import fill_contacts, fill_links
@@ -19,6 +20,8 @@ from robotics_bridge.physics.scene import TouchScene
 from robotics_bridge.physics.selection import EnvIds, select_envs
 from robotics_bridge.physics.state import MOST_ENVS, HandState
 from robotics_bridge.physics.variants import check_fields, differing_fields
+
+mujoco = mujoco_module()
 
 _DERIVED = ("dof_length",)
 """Fields that the compiler derives for the thresholds of sleeping bodies; the first variant's serve all."""
@@ -216,6 +219,9 @@ def _put_model(engine: Any, model: Any, varied: Mapping[str, np.ndarray], num_en
             f"MuJoCo Warp keeps {', '.join(fixed)} equal in all environments; use MujocoEngine, or variants that "
             "differ in sizes, masses, meshes and other numbers only."
         )
+    model = copy.copy(model)
+    # MuJoCo Warp never puts an environment back to its start, and refuses to be told so.
+    model.opt.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
     device_model = engine.put_model(model, batch_sizes=dict.fromkeys(usable, num_envs))
     for name, value in usable.items():
         target = getattr(device_model, name)

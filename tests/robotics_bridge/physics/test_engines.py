@@ -179,6 +179,14 @@ def test_a_state_tells_which_environments_diverged_and_when_contacts_were_lost()
     assert state.status.numpy().tolist() == [2, 3, 2]
 
 
+def test_an_engine_leaves_the_model_that_it_is_given_as_it_is() -> None:
+    model = pyramid()
+    flags = model.opt.disableflags
+    engine = MujocoEngine(model, 1, contacts=128)
+    assert model.opt.disableflags == flags
+    assert engine.model.opt.disableflags != flags
+
+
 @pytest.mark.slow
 def test_mujoco_warp_agrees_with_c_mujoco() -> None:
     """The published pyramid, 20 steps; MuJoCo Warp runs on the processor here, in single precision."""
