@@ -110,8 +110,9 @@ class NeuralResponses:
         from brainbench.metrics.reliability.units import reliable_units
 
         animals = []
-        for subject, sessions in self.trials(kept).items():
-            trials = tuple(replace(item, responses=without_time(item.responses, options.time)) for item in sessions)
+        for subject, sessions in self.trials(kept, averaged=options.time == "mean").items():
+            # Bins that are kept are features like units.
+            trials = tuple(replace(item, responses=item.responses.reshape(len(item.labels), -1)) for item in sessions)
             trials, note = reliable_units(trials, len(kept), least=options.units_reliability, seed=options.seed)
             animal = metric.animal(subject, trials, len(kept), stimuli=kept, seed=options.seed)
             if not trials and note:
@@ -121,14 +122,17 @@ class NeuralResponses:
             animals.append(animal)
         return tuple(animals)
 
-    def trials(self, kept: tuple[str, ...]) -> dict[str, tuple[Trials, ...]]:
-        """Return the sessions of each animal with trials of the labels ``kept``, numbered in that order."""
+    def trials(self, kept: tuple[str, ...], *, averaged: bool = False) -> dict[str, tuple[Trials, ...]]:
+        """Return the sessions of each animal with trials of the labels ``kept``, numbered in that order.
+
+        ``averaged`` rates are those of the whole window.
+        """
         from brainbench.datasets.trials.session_trials import trials_by_subject
 
         index = np.full(len(self.vocabulary), -1)
         index[[self.vocabulary.index(label) for label in kept]] = np.arange(len(kept))
         found = {}
-        for subject, sessions in trials_by_subject(self.dataset).items():
+        for subject, sessions in trials_by_subject(self.dataset, averaged=averaged).items():
             kept_trials = [session.take(index[session.labels] >= 0) for session in sessions]
             found[subject] = tuple(replace(item, labels=index[item.labels]) for item in kept_trials)
         return found
@@ -159,15 +163,3 @@ def _short(source: str | os.PathLike[str]) -> str:
     while glob.has_magic(path.name):
         path = path.parent
     return path.name or path.resolve().name
-
-
-def without_time(values: NDArray[np.floating], time: str) -> NDArray[np.floating]:
-    """Return [R or K, T, F] as [R or K, F'] by the time rule; a step that was not recorded does not count."""
-    if time == "concatenate":
-        return values.reshape(len(values), -1)
-    missing = np.isnan(values)
-    if not missing.any():
-        return values.mean(axis=1)
-    seen = (~missing).sum(axis=1)
-    total = np.where(missing, 0.0, values).sum(axis=1)
-    return np.divide(total, seen, out=np.full(total.shape, np.nan), where=seen > 0)

@@ -7,15 +7,7 @@ from brainbench.datasets import write_recordings
 from brainbench.datasets.sessions import make_session
 from brainbench.datasets.synthetic import PopulationDesign, ResponseGeometry
 from brainbench.models.features import write_features
-from brainbench.scoring.neural_responses import without_time
 from tests.factories.recordings import as_recordings
-
-
-def test_the_time_rule_averages_only_what_was_recorded():
-    responses = np.array([[[1.0, np.nan], [3.0, np.nan]], [[np.nan, 4.0], [5.0, 8.0]]])
-    np.testing.assert_array_equal(without_time(responses, "mean"), [[2.0, np.nan], [5.0, 6.0]])
-    assert without_time(responses, "concatenate").shape == (2, 4)
-
 
 # Recordings that are too little, or not what they should be: a status with its reason, or one sentence.
 
