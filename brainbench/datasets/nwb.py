@@ -71,6 +71,7 @@ def read_nwb(file: h5py.File, path: Path) -> Session:
         notes=tuple(notes),
         series=dict([*_series(file.get("acquisition")), *licks]),
         stimuli=stimuli.removeprefix(STIMULI) if stimuli.startswith(STIMULI) else "",
+        guessed=bool(notes) and subject == path.stem,
     )
 
 

@@ -214,6 +214,8 @@ class Session:
     """Acquired signals by path; their samples stay in the file."""
     stimuli: str = ""
     """Recipe of the stimuli that this session's animal felt, where the file names one."""
+    guessed: bool = False
+    """True when the file does not name its subject, and another name stands for it."""
 
     def table(self, name: str) -> SessionTable:
         """Return one interval table.

@@ -40,6 +40,11 @@ def test_the_subject_comes_from_the_file_else_from_its_name(tmp_path):
     )
     assert (guessed["subject"].values[0], guessed["session"].values[0]) == ("k2", "3")
     assert re.search("subject_id.*'k2'", "".join(guessed.attrs["notes"]))
+    for name in ("one", "two"):
+        write_nwb(tmp_path / "unnamed" / f"{name}.nwb", subject="")
+    assert "'one', 'two'" in " ".join(
+        open_recordings(tmp_path / "unnamed", conditions="trials:texture").attrs["doubts"]
+    )
 
 
 def test_files_without_units_are_skipped_in_a_folder_and_refused_alone(tmp_path):
