@@ -6,12 +6,14 @@ import glob
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from brainbench.core.errors import UsageError, listing
+from brainbench.core.files import content_hash
 from brainbench.core.labels import join_labels
 from brainbench.core.progress import Progress
 from brainbench.scoring.demo import DEMOS, HIDDEN_NETWORK, demo_identity, demo_recordings
@@ -52,21 +54,37 @@ class NeuralResponses:
         """True when the recordings were made by a program."""
         return bool(self.dataset.attrs["synthetic"])
 
+    @cached_property
+    def content_hash(self) -> str:
+        """Hash of the recordings: the one that they state, or another one for a part that was taken of them."""
+        stated, whole = str(self.dataset.attrs["content_hash"]), self.dataset.attrs.get("sizes")
+        if whole is None or whole == dict(self.dataset.sizes):
+            return stated
+        arrays = [self.dataset[name].values for name in ("counts", "duration")]
+        names = ("stimulus", "subject", "session", "unit_subject", "unit_session")
+        return content_hash(stated, *arrays, *(self.dataset[name].values.astype(str).tolist() for name in names))
+
     @property
     def origin(self) -> dict[str, Any]:
         """Provenance of the recordings."""
-        names = ("content_hash", "window", "selection", "removed", "synthetic")
+        names = ("window", "selection", "removed", "synthetic")
         # Boards of the demo say whether the network that made it was found.
         truth = {"truth": HIDDEN_NETWORK} if self.source == "demo" and self.synthetic else {}
         truth |= {"config_hash": self.definition} if self.definition else {}
         truth |= {"title": self.title} if self.title else {}
         truth |= {"skipped": skipped} if (skipped := self.dataset.attrs.get("skipped")) else {}
-        return {"source": self.source, **{name: self.dataset.attrs[name] for name in names}, **truth}
+        stated = {name: self.dataset.attrs[name] for name in names}
+        return {"source": self.source, "content_hash": self.content_hash, **stated, **truth}
 
     @property
     def label_doubt(self) -> str:
         """Reason why the labels cannot be trusted; empty where they can."""
         return str(self.dataset.attrs.get("label_doubt", ""))
+
+    @property
+    def doubts(self) -> tuple[str, ...]:
+        """Notes on the recordings that every result must state."""
+        return tuple(map(str, self.dataset.attrs.get("doubts", ())))
 
     @property
     def published(self) -> bool:
