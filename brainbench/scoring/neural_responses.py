@@ -82,6 +82,12 @@ class NeuralResponses:
         return str(self.dataset.attrs.get("label_doubt", ""))
 
     @property
+    def dependent(self) -> bool:
+        """True when so many trials share spikes with another one of their stimulus that noise looks reliable."""
+        # Rows that stand twice in a table are a half; in a random order of many stimuli it is less than a third.
+        return float(self.dataset.attrs.get("overlap", 0.0)) > 1 / 3
+
+    @property
     def doubts(self) -> tuple[str, ...]:
         """Notes on the recordings that every result must state."""
         return tuple(map(str, self.dataset.attrs.get("doubts", ())))

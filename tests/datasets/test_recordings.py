@@ -215,6 +215,18 @@ def test_files_of_animals_that_may_be_one_are_told(tmp_path):
     assert all(name in told for name in names if name != "m2")
 
 
+def test_trials_whose_windows_overlap_are_told(tmp_path):
+    # Twelve trials of 1 s every 2 s, with the labels a, b and c by turns.
+    path = write(tmp_path / "a.h5")
+    expected = {"start..stop": (0, 0), "start..+2": (0, 0), "start..+3": (11, 0), "start..+6.5": (9, 7)}
+    for window, (every, alike) in expected.items():
+        found = open_recordings(path, conditions="trials:stimulus", window=window)
+        trials = found.sizes["trial"]
+        assert found.attrs["overlap"] == alike / trials
+        told = f"{every} of {trials} trials begin before that of an earlier one ends ({alike} of"
+        assert any(told in doubt for doubt in found.attrs["doubts"]) == (every > 0), found.attrs["doubts"]
+
+
 def test_a_session_that_loses_all_trials_is_told(tmp_path):
     write(tmp_path / "a.h5", subject="m1")
     write(tmp_path / "b.h5", subject="m2", columns={"stimulus": np.array([""] * 12)})

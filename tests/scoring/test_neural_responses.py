@@ -7,6 +7,7 @@ from brainbench.datasets import write_recordings
 from brainbench.datasets.sessions import make_session
 from brainbench.datasets.synthetic import PopulationDesign, ResponseGeometry
 from brainbench.models.features import write_features
+from brainbench.scoring.scores import score_record
 from tests.factories.recordings import as_recordings
 
 # Recordings that are too little, or not what they should be: a status with its reason, or one sentence.
@@ -98,6 +99,26 @@ def _session(folder, **columns):
     spikes = [np.sort(np.random.default_rng(unit).uniform(0, 60, 200)) for unit in range(4)]
     tables = {"trials": {"start_time": begin, "stop_time": begin + 0.5, **columns}}
     return write_recordings(folder / "a.h5", make_session("m1", "1", spikes, tables))
+
+
+def test_noise_of_trials_that_share_spikes_is_not_reliable(features, tmp_path):
+    """Neurons without tuning, stimuli in blocks: windows of 3 s each second make the halves of a block alike."""
+    begin, names = 2.0 + np.arange(120), np.repeat([f"s{index + 1}" for index in range(12)], 10)
+    for animal in range(4):
+        random = np.random.default_rng(animal)
+        spikes = [np.sort(np.append(random.uniform(0, 130, 300), [0.0, 130.0])) for _ in range(30)]
+        table = {"start_time": begin, "stop_time": begin + 0.9, "stimulus": names}
+        write_recordings(
+            tmp_path / "noise" / f"{animal}.h5", make_session(f"m{animal}", "1", spikes, {"trials": table})
+        )
+    apart, shared = (
+        score_record(features(), recordings=tmp_path / "noise", conditions="trials:stimulus", window=window)
+        for window in ("start..stop", "start-1..+3")
+    )
+    assert apart.score.reliability < 0.5 < shared.score.reliability
+    for found in (shared.score, shared.animal_to_animal):
+        assert found.status == "unreliable"
+        assert "share spikes" in found.reasons[0]
 
 
 def test_recordings_without_labels_say_what_is_there(features, tmp_path):

@@ -51,6 +51,12 @@ def join_sessions(
         what = "trial" if not trials else "unit"
         reasons = "; ".join(f"{rule} removed {number}" for rule, number in removed.items() if number)
         raise DataError(f"No {what} remains of {source}: {reasons or 'the tables are empty'}.")
+    overlapping, alike = np.sum([_overlaps(part) for part in parts], axis=0).tolist()
+    if overlapping:
+        doubts.append(
+            f"the windows of {overlapping} of {trials} trials begin before that of an earlier one ends ({alike} of one "
+            "with the same label): such trials share spikes, so their noise is not independent"
+        )
     vocabulary = options.vocabulary or natural_vocabulary(row for part in parts for row in part.values)
     present = {label for part in parts for label in part.labels}
     if len(present) < 2:
@@ -101,6 +107,7 @@ def join_sessions(
         "sessions": [_about(part) for part in everything],
         "notes": [*notes, *doubts, *(note for part in everything for note in part.tally.notes)],
         "doubts": doubts,
+        "overlap": alike / trials,
         "source": source,
         "synthetic": any(part.synthetic for part in everything),
         # The recipe that all sessions name; "" where they name none, or different ones.
@@ -126,6 +133,17 @@ def _doubtful_names(parts: list[SessionCounts]) -> Iterator[str]:
     for names in folded.values():
         if len(names) > 1:
             yield f"animals whose names differ only in case or blanks count as different ones: {listing(names)}"
+
+
+def _overlaps(part: SessionCounts) -> tuple[int, int]:
+    """Count the trials whose window begins before that of an earlier trial ends, and before one of their label does."""
+
+    def count(edges: NDArray[np.float64]) -> int:
+        begin, end = edges[np.argsort(edges[:, 0])].T
+        return int((begin[1:] < np.maximum.accumulate(end)[:-1] - 1e-9).sum())
+
+    labels = np.array(part.labels)
+    return count(part.edges), sum(count(part.edges[labels == label]) for label in set(part.labels))
 
 
 def _covariate(parts: list[SessionCounts], name: str) -> NDArray[np.float64]:
