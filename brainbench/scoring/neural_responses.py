@@ -135,8 +135,7 @@ class NeuralResponses:
 
         animals = []
         for subject, sessions in self.trials(kept, averaged=options.time == "mean").items():
-            # Bins that are kept are features like units.
-            trials = tuple(replace(item, responses=item.responses.reshape(len(item.labels), -1)) for item in sessions)
+            trials = tuple(replace(item, responses=_flat(item.responses)) for item in sessions)
             trials, note = reliable_units(trials, len(kept), least=options.units_reliability, seed=options.seed)
             animal = metric.animal(subject, trials, len(kept), stimuli=kept, seed=options.seed)
             if not trials and note:
@@ -179,6 +178,13 @@ def open_neural_responses(recordings: Any, *, progress: Progress | None, **selec
     several = not isinstance(recordings, (str, os.PathLike))
     name = ", ".join(map(_short, recordings if several else [recordings]))
     return NeuralResponses(open_recordings(recordings, **selection, progress=progress), name)
+
+
+def _flat(responses: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return responses [R, T, U] as [R, T·U]: bins are features like units."""
+    trials, bins, units = responses.shape
+    # Without a trial (all had labels that were dropped) numpy cannot tell the second size.
+    return responses.reshape(trials, bins * units)
 
 
 def _short(source: str | os.PathLike[str]) -> str:
