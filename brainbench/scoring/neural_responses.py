@@ -90,7 +90,13 @@ class NeuralResponses:
     @property
     def doubts(self) -> tuple[str, ...]:
         """Notes on the recordings that every result must state."""
-        return tuple(map(str, self.dataset.attrs.get("doubts", ())))
+        trials, units = (
+            dict.fromkeys(zip(*(self.dataset[name].values.astype(str).tolist() for name in pair), strict=True))
+            for pair in (("session", "subject"), ("unit_session", "unit_subject"))
+        )
+        lost = [f"session {session} of {subject}" for session, subject in trials if (session, subject) not in units]
+        told = [f"{', '.join(lost)}: no unit is left, so the trials are left out"] if lost else []
+        return (*map(str, self.dataset.attrs.get("doubts", ())), *told)
 
     @property
     def published(self) -> bool:

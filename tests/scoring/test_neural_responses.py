@@ -76,6 +76,14 @@ def test_an_animal_without_a_stimulus_is_named_and_the_others_are_scored(feature
     assert any("synthetic02" in reason for reason in found.reasons) == (animal.status == "undefined")
 
 
+def test_an_animal_without_units_is_named(features, tmp_path):
+    dataset = make_recordings(animals=4)
+    dataset = dataset.isel(unit=dataset["unit_subject"].values != "synthetic02")
+    found = score(features(), recordings=dataset)
+    assert len(found.subjects) == 3
+    assert any("synthetic02" in reason for reason in found.reasons), found.reasons
+
+
 @pytest.mark.parametrize(
     "make",
     [
