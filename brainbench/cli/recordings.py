@@ -76,7 +76,7 @@ def rdm(
             "": _verdict,
         },
     )
-    text += "".join(f"\n{line}" for line in left_out(brain.origin))
+    text += "".join(f"\n{line}" for line in (*left_out(brain.origin), *(f"Note: {doubt}." for doubt in brain.doubts)))
     if len(labels) <= _LARGEST_SHOWN:
         for item in animals:
             text += "\n\n" + _matrix(f"RDM of animal {item.subject}", labels, item.rdm)

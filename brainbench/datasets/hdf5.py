@@ -109,7 +109,8 @@ def read_sessions(file: h5py.File, path: Path) -> list[Session]:
     for name, group in _need(file, "sessions", path).items():
         source, tables = f"{path}:{name}", _need(group, "tables", path).items()
         units = SessionTable("units", dict(_need(group, "units", path).items()), source)
-        stated = {key: text(group.attrs.get(key, "")) for key in ("subject", "session", "start")}
+        # A blank more or less makes no other animal.
+        stated = {key: text(group.attrs.get(key, "")).strip() for key in ("subject", "session", "start")}
         sessions.append(
             Session(
                 subject=stated["subject"] or name,
@@ -121,6 +122,7 @@ def read_sessions(file: h5py.File, path: Path) -> list[Session]:
                 format=f"{FORMAT} {VERSION}",
                 synthetic=bool(group.attrs.get("synthetic", False)),
                 stimuli=text(group.attrs.get("stimuli", "")),
+                guessed=not stated["subject"],
             )
         )
     return sessions

@@ -71,6 +71,7 @@ def read_nwb(file: h5py.File, path: Path) -> Session:
         notes=tuple(notes),
         series=dict([*_series(file.get("acquisition")), *licks]),
         stimuli=stimuli.removeprefix(STIMULI) if stimuli.startswith(STIMULI) else "",
+        guessed=bool(notes) and subject == path.stem,
     )
 
 
@@ -87,7 +88,13 @@ def _interval_tables(file: h5py.File, path: Path) -> dict[str, SessionTable]:
 def _table(group: h5py.Group, name: str, path: Path) -> SessionTable:
     import h5py
 
-    columns = {key: item for key, item in group.items() if isinstance(item, h5py.Dataset)}
+    columns: dict[str, Any] = {key: item for key, item in group.items() if isinstance(item, h5py.Dataset)}
+    for key in [key for key, item in columns.items() if _type(item) == "EnumData" and f"{key}_elements" in columns]:
+        # Numbers follow the first appearance in each file, so only the names mean the same in all files.
+        names, numbers = decode(columns.pop(f"{key}_elements")[...]), columns[key][...]
+        if len(numbers) and not int(numbers.max()) < len(names):
+            raise DataError(f"Column {key!r} of table {name!r} of {path} has the number {numbers.max()} of no element.")
+        columns[key] = names[numbers]
     declared = [text(key) for key in group.attrs.get("colnames", ())]
     order = [key for key in declared if key in columns] + [key for key in columns if key not in declared]
     return SessionTable(name, {key: columns[key] for key in order}, str(path))
@@ -124,7 +131,7 @@ def _groups(parent: Any) -> list[tuple[str, h5py.Group]]:
     return groups
 
 
-def _type(group: h5py.Group) -> str:
+def _type(group: h5py.Group | h5py.Dataset) -> str:
     return text(group.attrs.get("neurodata_type", ""))
 
 

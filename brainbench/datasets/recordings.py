@@ -73,7 +73,8 @@ def open_recordings(
         unit_id, depth, layer, inhibitory`` per unit, ``time`` (begin of the bin, s from the window's begin), and
         attributes: vocabulary, conditions, layout, window, bin, selection, removed (rule → trials or units that it
         removed, each counted once, in the order of the rules), missing (subject → labels without a trial), sessions,
-        notes, skipped (why a file is left out), source, synthetic, content_hash.
+        notes, doubts (notes that every result must state), overlap (share of trials whose window overlaps with that of
+        an earlier one of their label), skipped (why a file is left out), sizes, source, synthetic, content_hash.
 
     Raises:
         DataFileNotFoundError: the source names nothing.

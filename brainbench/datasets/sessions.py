@@ -214,6 +214,8 @@ class Session:
     """Acquired signals by path; their samples stay in the file."""
     stimuli: str = ""
     """Recipe of the stimuli that this session's animal felt, where the file names one."""
+    guessed: bool = False
+    """True when the file does not name its subject, and another name stands for it."""
 
     def table(self, name: str) -> SessionTable:
         """Return one interval table.
@@ -292,7 +294,7 @@ def decode(values: Any) -> NDArray[Any]:
     """Turn HDF5 text (bytes or objects) into ``str`` arrays; leave the rest."""
     array = np.asarray(values)
     if array.dtype.kind == "S":
-        return np.char.decode(array, "utf-8", "replace")
+        return np.array([text(item) for item in array.ravel().tolist()], dtype=str).reshape(array.shape)
     if array.dtype.kind == "O":
         flat = [text(item) if isinstance(item, (bytes, str)) else None for item in array.ravel()]
         if all(item is not None for item in flat):
@@ -302,7 +304,13 @@ def decode(values: Any) -> NDArray[Any]:
 
 def text(value: Any) -> str:
     """Return bytes or text as ``str``."""
-    return value.decode("utf-8", "replace") if isinstance(value, bytes) else str(value)
+    if not isinstance(value, bytes):
+        return str(value)
+    try:
+        return value.decode("utf-8")
+    except UnicodeDecodeError:
+        # Latin-1 has a letter for every byte; one sign for all that is not UTF-8 would make two labels one.
+        return value.decode("latin-1")
 
 
 def as_labels(values: NDArray[Any]) -> NDArray[np.str_]:

@@ -6,12 +6,14 @@ import glob
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from brainbench.core.errors import UsageError, listing
+from brainbench.core.files import content_hash
 from brainbench.core.labels import join_labels
 from brainbench.core.progress import Progress
 from brainbench.scoring.demo import DEMOS, HIDDEN_NETWORK, demo_identity, demo_recordings
@@ -52,21 +54,49 @@ class NeuralResponses:
         """True when the recordings were made by a program."""
         return bool(self.dataset.attrs["synthetic"])
 
+    @cached_property
+    def content_hash(self) -> str:
+        """Hash of the recordings: the one that they state, or another one for a part that was taken of them."""
+        stated, whole = str(self.dataset.attrs["content_hash"]), self.dataset.attrs.get("sizes")
+        if whole is None or whole == dict(self.dataset.sizes):
+            return stated
+        arrays = [self.dataset[name].values for name in ("counts", "duration")]
+        names = ("stimulus", "subject", "session", "unit_subject", "unit_session")
+        return content_hash(stated, *arrays, *(self.dataset[name].values.astype(str).tolist() for name in names))
+
     @property
     def origin(self) -> dict[str, Any]:
         """Provenance of the recordings."""
-        names = ("content_hash", "window", "selection", "removed", "synthetic")
+        names = ("window", "selection", "removed", "synthetic")
         # Boards of the demo say whether the network that made it was found.
         truth = {"truth": HIDDEN_NETWORK} if self.source == "demo" and self.synthetic else {}
         truth |= {"config_hash": self.definition} if self.definition else {}
         truth |= {"title": self.title} if self.title else {}
         truth |= {"skipped": skipped} if (skipped := self.dataset.attrs.get("skipped")) else {}
-        return {"source": self.source, **{name: self.dataset.attrs[name] for name in names}, **truth}
+        stated = {name: self.dataset.attrs[name] for name in names}
+        return {"source": self.source, "content_hash": self.content_hash, **stated, **truth}
 
     @property
     def label_doubt(self) -> str:
         """Reason why the labels cannot be trusted; empty where they can."""
         return str(self.dataset.attrs.get("label_doubt", ""))
+
+    @property
+    def dependent(self) -> bool:
+        """True when so many trials share spikes with another one of their stimulus that noise looks reliable."""
+        # Rows that stand twice in a table are a half; in a random order of many stimuli it is less than a third.
+        return float(self.dataset.attrs.get("overlap", 0.0)) > 1 / 3
+
+    @property
+    def doubts(self) -> tuple[str, ...]:
+        """Notes on the recordings that every result must state."""
+        trials, units = (
+            dict.fromkeys(zip(*(self.dataset[name].values.astype(str).tolist() for name in pair), strict=True))
+            for pair in (("session", "subject"), ("unit_session", "unit_subject"))
+        )
+        lost = [f"session {session} of {subject}" for session, subject in trials if (session, subject) not in units]
+        told = [f"{', '.join(lost)}: no unit is left, so the trials are left out"] if lost else []
+        return (*map(str, self.dataset.attrs.get("doubts", ())), *told)
 
     @property
     def published(self) -> bool:
@@ -110,8 +140,8 @@ class NeuralResponses:
         from brainbench.metrics.reliability.units import reliable_units
 
         animals = []
-        for subject, sessions in self.trials(kept).items():
-            trials = tuple(replace(item, responses=without_time(item.responses, options.time)) for item in sessions)
+        for subject, sessions in self.trials(kept, averaged=options.time == "mean").items():
+            trials = tuple(replace(item, responses=_flat(item.responses)) for item in sessions)
             trials, note = reliable_units(trials, len(kept), least=options.units_reliability, seed=options.seed)
             animal = metric.animal(subject, trials, len(kept), stimuli=kept, seed=options.seed)
             if not trials and note:
@@ -121,14 +151,17 @@ class NeuralResponses:
             animals.append(animal)
         return tuple(animals)
 
-    def trials(self, kept: tuple[str, ...]) -> dict[str, tuple[Trials, ...]]:
-        """Return the sessions of each animal with trials of the labels ``kept``, numbered in that order."""
+    def trials(self, kept: tuple[str, ...], *, averaged: bool = False) -> dict[str, tuple[Trials, ...]]:
+        """Return the sessions of each animal with trials of the labels ``kept``, numbered in that order.
+
+        ``averaged`` rates are those of the whole window.
+        """
         from brainbench.datasets.trials.session_trials import trials_by_subject
 
         index = np.full(len(self.vocabulary), -1)
         index[[self.vocabulary.index(label) for label in kept]] = np.arange(len(kept))
         found = {}
-        for subject, sessions in trials_by_subject(self.dataset).items():
+        for subject, sessions in trials_by_subject(self.dataset, averaged=averaged).items():
             kept_trials = [session.take(index[session.labels] >= 0) for session in sessions]
             found[subject] = tuple(replace(item, labels=index[item.labels]) for item in kept_trials)
         return found
@@ -153,21 +186,16 @@ def open_neural_responses(recordings: Any, *, progress: Progress | None, **selec
     return NeuralResponses(open_recordings(recordings, **selection, progress=progress), name)
 
 
+def _flat(responses: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return responses [R, T, U] as [R, T·U]: bins are features like units."""
+    trials, bins, units = responses.shape
+    # Without a trial (all had labels that were dropped) numpy cannot tell the second size.
+    return responses.reshape(trials, bins * units)
+
+
 def _short(source: str | os.PathLike[str]) -> str:
     """Return the name of a file or a folder; of a pattern, that of the folder it searches."""
     path = Path(source)
     while glob.has_magic(path.name):
         path = path.parent
     return path.name or path.resolve().name
-
-
-def without_time(values: NDArray[np.floating], time: str) -> NDArray[np.floating]:
-    """Return [R or K, T, F] as [R or K, F'] by the time rule; a step that was not recorded does not count."""
-    if time == "concatenate":
-        return values.reshape(len(values), -1)
-    missing = np.isnan(values)
-    if not missing.any():
-        return values.mean(axis=1)
-    seen = (~missing).sum(axis=1)
-    total = np.where(missing, 0.0, values).sum(axis=1)
-    return np.divide(total, seen, out=np.full(total.shape, np.nan), where=seen > 0)

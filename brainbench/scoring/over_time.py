@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from brainbench.core.errors import DataError
+from brainbench.core.errors import DataError, UsageError, listing
 from brainbench.core.progress import Progress, stages
 from brainbench.metrics.measures.rsa import RSA
 from brainbench.metrics.reliability.units import reliable_units
@@ -35,7 +35,7 @@ def time_course(
 
     Raises:
         DataError: the recordings have no bins of time.
-        UsageError: fewer than 3 bins or 4 stimuli.
+        UsageError: fewer than 3 bins or 4 stimuli, or bins that do not follow one another from the window's begin.
     """
     if "time" not in brain.dataset.coords or brain.dataset.sizes["time"] < 3:
         raise DataError(
@@ -44,6 +44,14 @@ def time_course(
         )
     begins = brain.dataset["time"].values.astype(np.float64)
     width = float(np.median(np.diff(begins)))
+    # Bins between which others were left out are shorter than the distances of their begins.
+    longest = float(brain.dataset["duration"].values.max())
+    if not np.allclose(begins, longest * np.arange(len(begins)), rtol=0, atol=1e-6 * longest):
+        raise UsageError(
+            "Scores over time need bins that follow one another from the begin of the window; those of these "
+            f"recordings begin at {listing(f'{begin:g}' for begin in begins[:4])} … s: take the whole recordings, or "
+            "another window (--window)."
+        )
     seconds = width * len(begins) if network.seconds is None else network.seconds
     sessions = brain.trials(kept)
     how: dict[str, Any] = {"method": metric.brain_method, "noise": metric.noise, "comparison": metric.comparison}

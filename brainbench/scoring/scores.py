@@ -228,7 +228,11 @@ def _compare(
     if brain.label_doubt:
         scores = [_doubted(item, brain.label_doubt) for item in scores]
         between = between and _doubted(between, brain.label_doubt)
-    return scores, between
+    if brain.dependent:
+        told = "many trials share spikes with another one of their stimulus, which makes noise look reliable"
+        scores, between = [_doubted(item, told) for item in scores], between and _doubted(between, told)
+    scores = [replace(item, reasons=(*item.reasons, *brain.doubts)) for item in scores]
+    return scores, between and replace(between, reasons=(*between.reasons, *brain.doubts))
 
 
 def _doubted(score: Score, doubt: str) -> Score:

@@ -158,13 +158,14 @@ def test_only_a_score_of_the_same_question_is_known_or_replaced(run, files, tmp_
     (tmp_path / "match.csv").write_text("a,b\nb,a\n")
     paired = f"match = '{tmp_path / 'match.csv'}'"
     states = []
-    for option in ("", "layer = 'gru'", "normalize = false", "window = 'start..+0.3'", paired, "", paired):
+    titled = "title = 'pilot'"
+    for option in ("", "layer = 'gru'", "normalize = false", "window = 'start..+0.3'", paired, titled, "", paired):
         batch.write_text(f'[options]\n{given}{option}\n[[entries]]\nmodels = ["{files["model"]}"]\n')
         result = run("leaderboard", "add", "--batch", str(batch), "--to", str(to), "--prune", "--json")
         assert result.status == 0, result.err
         states += [item["state"] for item in json.loads(result.out)["results"]]
-    assert states == ["scored"] * 5 + ["known"] * 2
-    assert len(list(to.glob("*.json"))) == 5
+    assert states == ["scored"] * 6 + ["known"] * 2
+    assert len(list(to.glob("*.json"))) == 6
     copied = run("leaderboard", "add", str(to), "--to", str(tmp_path / "copy"), "--json")
     assert {item["state"] for item in json.loads(copied.out)["results"]} == {"added"}
 

@@ -40,6 +40,11 @@ def test_the_subject_comes_from_the_file_else_from_its_name(tmp_path):
     )
     assert (guessed["subject"].values[0], guessed["session"].values[0]) == ("k2", "3")
     assert re.search("subject_id.*'k2'", "".join(guessed.attrs["notes"]))
+    for name in ("one", "two"):
+        write_nwb(tmp_path / "unnamed" / f"{name}.nwb", subject="")
+    assert "'one', 'two'" in " ".join(
+        open_recordings(tmp_path / "unnamed", conditions="trials:texture").attrs["doubts"]
+    )
 
 
 def test_files_without_units_are_skipped_in_a_folder_and_refused_alone(tmp_path):
@@ -107,6 +112,25 @@ def test_a_table_name_that_occurs_twice_carries_its_module(tmp_path):
         file.copy("processing/behavior/pokes", "intervals/pokes")
         session = read_nwb(file, path)
         assert set(session.tables) == {"trials", "pokes", "behavior/pokes"}
+
+
+def test_enumerated_labels_are_names_since_their_numbers_differ_between_files(tmp_path):
+    for path, names in ((tmp_path / "a.nwb", "ab"), (tmp_path / "b.nwb", "ba")):
+        write_nwb(path, subject=path.stem, session=path.stem)
+        with h5py.File(path, "a") as file:
+            trials = file["intervals/trials"]
+            rows = len(trials["id"])
+            trials["kind"] = np.array([names.index("ab"[row % 2]) for row in range(rows)], np.uint8)
+            trials["kind"].attrs["neurodata_type"] = "EnumData"
+            trials["kind_elements"] = [name.encode() for name in names]
+    dataset = open_recordings(tmp_path, conditions="trials:kind")
+    assert dataset.attrs["vocabulary"] == ["a", "b"]
+    one, two = (dataset["stimulus"].values[dataset["subject"].values == name].tolist() for name in "ab")
+    assert one == two
+    with h5py.File(path, "a") as file:
+        file["intervals/trials/kind"][0] = 2
+    with pytest.raises(DataError, match=r"'kind'.* 2 "):
+        open_recordings(path, conditions="trials:kind")
 
 
 @pytest.mark.filterwarnings("ignore")

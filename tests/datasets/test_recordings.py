@@ -198,6 +198,41 @@ def test_a_misspelt_value_to_remove_is_told_and_one_that_is_absent_is_not(tmp_pa
     assert not [note for note in notes if "'spoil'" in note]
 
 
+def test_files_of_animals_that_may_be_one_are_told(tmp_path):
+    def doubts(*subjects):
+        for number, subject in enumerate(subjects):
+            write(tmp_path / f"day{number}.h5", subject=subject, session=str(number), seed=number)
+        dataset = open_recordings(tmp_path, conditions="trials:stimulus")
+        return sorted(set(dataset["subject"].values.tolist())), " ".join(dataset.attrs["doubts"])
+
+    assert doubts("m1", "m1 ", " m1") == (["m1"], "")
+    names, told = doubts("m1", "M1", "m2")
+    assert names == ["M1", "m1", "m2"]
+    assert "'M1', 'm1'" in told
+    assert "m2" not in told
+    names, told = doubts("", "", "m2")
+    assert len(names) == 3
+    assert all(name in told for name in names if name != "m2")
+
+
+def test_trials_whose_windows_overlap_are_told(tmp_path):
+    # Twelve trials of 1 s every 2 s, with the labels a, b and c by turns.
+    path = write(tmp_path / "a.h5")
+    expected = {"start..stop": (0, 0), "start..+2": (0, 0), "start..+3": (11, 0), "start..+6.5": (9, 7)}
+    for window, (every, alike) in expected.items():
+        found = open_recordings(path, conditions="trials:stimulus", window=window)
+        trials = found.sizes["trial"]
+        assert found.attrs["overlap"] == alike / trials
+        told = f"{every} of {trials} trials begin before that of an earlier one ends ({alike} of"
+        assert any(told in doubt for doubt in found.attrs["doubts"]) == (every > 0), found.attrs["doubts"]
+
+
+def test_a_session_that_loses_all_trials_is_told(tmp_path):
+    write(tmp_path / "a.h5", subject="m1")
+    write(tmp_path / "b.h5", subject="m2", columns={"stimulus": np.array([""] * 12)})
+    assert "of m2" in " ".join(open_recordings(tmp_path, conditions="trials:stimulus").attrs["doubts"])
+
+
 def test_a_chosen_animal_without_units_is_told_and_not_called_unknown(tmp_path):
     write_nwb(tmp_path / "a.nwb", subject="m1", units=False)
     export(write(tmp_path / "b.h5", subject="m2"), tmp_path / "b.nwb")

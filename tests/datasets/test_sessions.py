@@ -9,6 +9,12 @@ from brainbench.datasets.nwb_writer import write_nwb
 from brainbench.datasets.sessions import SessionTable, as_labels, decode, make_session, natural_key
 
 
+def test_texts_that_are_not_utf8_stay_different():
+    for texts in (np.array([b"h\xe4rt", b"h\xf6rt"]), np.array([b"h\xe4rt", b"h\xf6rt"], dtype=object)):
+        assert decode(texts).tolist() == ["härt", "hört"]
+    assert decode(np.array(["härt".encode(), b""])).tolist() == ["härt", ""]
+
+
 def test_numbers_become_the_text_a_person_would_write():
     assert as_labels(np.array([1, 2], dtype=np.uint8)).tolist() == ["1", "2"]
     assert as_labels(np.array([1.0, 0.25, np.nan])).tolist() == ["1", "0.25", ""]

@@ -70,6 +70,17 @@ def test_too_few_animals_or_stimuli_give_no_ranks_and_the_board_says_what_it_nee
     assert what in conclusions(board)[0]
 
 
+def test_animals_that_are_not_reliable_do_not_make_a_board_large_enough():
+    def cut(score):
+        first, rest = score.subjects[:3], score.subjects[3:]
+        return replace(score, subjects=(*first, *(replace(item, status="unreliable") for item in rest)))
+
+    records = draw_board({"a": 0.9, "b": 0.1}, animals=8)
+    (board,) = rank(replace(record, score=cut(record.score)) for record in records)
+    assert board.lacks == "at least 4 animals (here 3)"
+    assert not any("not told apart from any" in sentence for sentence in conclusions(board))
+
+
 def test_records_of_earlier_versions_are_listed_without_a_rank_and_the_reason_is_said():
     new, old = draw_board({"new": 0.5, "old": 0.9})
     board = _board([new, _with(old, chance=math.nan, attainable=math.nan, without_stimulus=())])

@@ -7,15 +7,8 @@ from brainbench.datasets import write_recordings
 from brainbench.datasets.sessions import make_session
 from brainbench.datasets.synthetic import PopulationDesign, ResponseGeometry
 from brainbench.models.features import write_features
-from brainbench.scoring.neural_responses import without_time
+from brainbench.scoring.scores import score_record
 from tests.factories.recordings import as_recordings
-
-
-def test_the_time_rule_averages_only_what_was_recorded():
-    responses = np.array([[[1.0, np.nan], [3.0, np.nan]], [[np.nan, 4.0], [5.0, 8.0]]])
-    np.testing.assert_array_equal(without_time(responses, "mean"), [[2.0, np.nan], [5.0, 6.0]])
-    assert without_time(responses, "concatenate").shape == (2, 4)
-
 
 # Recordings that are too little, or not what they should be: a status with its reason, or one sentence.
 
@@ -83,6 +76,14 @@ def test_an_animal_without_a_stimulus_is_named_and_the_others_are_scored(feature
     assert any("synthetic02" in reason for reason in found.reasons) == (animal.status == "undefined")
 
 
+def test_an_animal_without_units_is_named(features, tmp_path):
+    dataset = make_recordings(animals=4)
+    dataset = dataset.isel(unit=dataset["unit_subject"].values != "synthetic02")
+    found = score(features(), recordings=dataset)
+    assert len(found.subjects) == 3
+    assert any("synthetic02" in reason for reason in found.reasons), found.reasons
+
+
 @pytest.mark.parametrize(
     "make",
     [
@@ -101,11 +102,42 @@ def test_recordings_that_hold_too_little_get_a_status_with_its_reason(features, 
     assert found.reasons or found.status == "ok"
 
 
+@pytest.mark.parametrize("time", ["mean", "concatenate"])
+def test_a_session_of_dropped_labels_alone_is_left_out(features, tmp_path, time):
+    for session, labels in (("1", [f"s{1 + index % 13}" for index in range(120)]), ("2", ["s13"] * 120)):
+        spikes = [np.sort(np.random.default_rng(unit).uniform(0, 122, 900)) for unit in range(20)]
+        table = {"start_time": 1.0 + np.arange(120), "stop_time": 1.5 + np.arange(120), "stimulus": labels}
+        write_recordings(tmp_path / "two" / f"{session}.h5", make_session("m1", session, spikes, {"trials": table}))
+    how = {"conditions": "trials:stimulus", "match": {"s13": None}, "bin": 0.25, "time": time}
+    found = score(features(), recordings=tmp_path / "two", **how)
+    assert any("1 of 2 sessions left out" in reason for reason in found.reasons), found.reasons
+
+
 def _session(folder, **columns):
     begin = np.arange(0.0, 60.0)
     spikes = [np.sort(np.random.default_rng(unit).uniform(0, 60, 200)) for unit in range(4)]
     tables = {"trials": {"start_time": begin, "stop_time": begin + 0.5, **columns}}
     return write_recordings(folder / "a.h5", make_session("m1", "1", spikes, tables))
+
+
+def test_noise_of_trials_that_share_spikes_is_not_reliable(features, tmp_path):
+    """Neurons without tuning, stimuli in blocks: windows of 3 s each second make the halves of a block alike."""
+    begin, names = 2.0 + np.arange(120), np.repeat([f"s{index + 1}" for index in range(12)], 10)
+    for animal in range(4):
+        random = np.random.default_rng(animal)
+        spikes = [np.sort(np.append(random.uniform(0, 130, 300), [0.0, 130.0])) for _ in range(30)]
+        table = {"start_time": begin, "stop_time": begin + 0.9, "stimulus": names}
+        write_recordings(
+            tmp_path / "noise" / f"{animal}.h5", make_session(f"m{animal}", "1", spikes, {"trials": table})
+        )
+    apart, shared = (
+        score_record(features(), recordings=tmp_path / "noise", conditions="trials:stimulus", window=window)
+        for window in ("start..stop", "start-1..+3")
+    )
+    assert apart.score.reliability < 0.5 < shared.score.reliability
+    for found in (shared.score, shared.animal_to_animal):
+        assert found.status == "unreliable"
+        assert "share spikes" in found.reasons[0]
 
 
 def test_recordings_without_labels_say_what_is_there(features, tmp_path):

@@ -6,7 +6,7 @@ import pytest
 import brainbench
 from brainbench.cli import main
 from brainbench.core.errors import DataError, UsageError
-from brainbench.datasets import write_recordings
+from brainbench.datasets import open_recordings, write_recordings
 from brainbench.datasets.sessions import make_session
 from brainbench.models.features import write_features
 from brainbench.scoring.scores import score_record
@@ -85,6 +85,13 @@ def test_without_the_option_a_score_has_no_time(moving):
         str(moving / "layers.hdf5"), recordings=str(moving / "m*.h5"), conditions="trials:stimulus", baselines=False
     )
     assert "time_course" not in record.score.provenance.statistics
+
+
+@pytest.mark.parametrize("part", [slice(3, None), slice(None, None, 2)], ids=["late", "every second"])
+def test_bins_that_do_not_follow_from_the_begin_of_the_window_are_refused(moving, part):
+    whole = open_recordings(str(moving / "m*.h5"), conditions="trials:stimulus", bin=BIN)
+    with pytest.raises(UsageError, match="begin of the window"):
+        score_record(str(moving / "layers.hdf5"), recordings=whole.isel(time=part), over_time=True, baselines=False)
 
 
 def test_metrics_without_rdms_and_recordings_without_time_are_refused(moving):

@@ -158,6 +158,25 @@ def test_a_subject_without_a_stimulus_is_named_and_the_others_still_count(truth:
     assert math.isfinite(score.value)
 
 
+def test_recordings_in_memory_that_are_a_part_have_another_hash(truth: Path, recordings: xr.Dataset, tmp_path: Path):
+    def told(dataset):
+        return score_record(truth, recordings=dataset, baselines=False).score.provenance.recordings_hash
+
+    first = recordings["subject"].values != recordings["subject"].values[0]
+    parts = [recordings.isel(trial=first), recordings.isel(trial=slice(5, None)), recordings.isel(unit=slice(5, None))]
+    whole, *hashes = map(told, (recordings, *parts))
+    assert whole == recordings.attrs["content_hash"]
+    assert len({whole, *hashes}) == 4
+    assert told(write_recordings(tmp_path / "part.h5", parts[0])) == hashes[0]
+    assert told(write_recordings(tmp_path / "whole.h5", recordings)) == whole
+
+
+def test_doubts_about_recordings_are_reasons_of_every_score(truth: Path, recordings: xr.Dataset):
+    record = score_record(truth, recordings=recordings.assign_attrs(doubts=["two animals may be one"]))
+    for found in (record.score, record.animal_to_animal, *record.baselines.values()):
+        assert "two animals may be one" in found.reasons
+
+
 def test_dropped_labels_leave_the_comparison(truth: Path, recordings: xr.Dataset):
     score = brainbench.score(str(truth), recordings=recordings, match={"f": None})
     assert score.stimuli == LABELS[:5]

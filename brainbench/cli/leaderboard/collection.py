@@ -71,7 +71,8 @@ def _present(to: Path) -> list[tuple[Path, ResultRecord]]:
 def _question(record: ResultRecord) -> str:
     """Return what two records share when they answer the same question, the old one with what has since changed."""
     origin = record.score.provenance
-    return to_json([record.score.name, origin.recordings.get("source"), origin.pairing, full_settings(origin.settings)])
+    named = [origin.recordings.get(name) for name in ("source", "title")]
+    return to_json([record.score.name, *named, origin.pairing, full_settings(origin.settings)])
 
 
 def score_jobs(

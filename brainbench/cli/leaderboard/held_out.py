@@ -85,7 +85,8 @@ def split(whole: xr.Dataset, kind: str, names: list[str]) -> xr.Dataset:
     else:
         part = whole.isel(trial=whole["stimulus"].isin(names).values)
     labels = [label for label in whole.attrs["vocabulary"] if kind == "animals" or label in names]
-    return part.assign_attrs(vocabulary=labels, content_hash=content_hash(whole.attrs["content_hash"], kind, names))
+    named = content_hash(whole.attrs["content_hash"], kind, names)
+    return part.assign_attrs(vocabulary=labels, content_hash=named, sizes=dict(part.sizes))
 
 
 def score_held_out(record: ResultRecord, told: Commitment, secret: Path) -> dict[str, Any]:

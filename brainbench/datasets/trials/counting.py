@@ -70,6 +70,8 @@ class SessionCounts:
     synthetic: bool
     stimuli: str = ""
     """Recipe of the stimuli, where the file names one."""
+    guessed: bool = False
+    """True when the file does not name its subject."""
 
 
 def count_session(session: Session, options: ReadingOptions) -> SessionCounts:
@@ -135,6 +137,7 @@ def count_session(session: Session, options: ReadingOptions) -> SessionCounts:
         units=len(session.units),
         synthetic=session.synthetic,
         stimuli=session.stimuli,
+        guessed=session.guessed,
     )
 
 

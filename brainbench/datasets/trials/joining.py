@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from brainbench.core.errors import DataError
+from brainbench.core.errors import DataError, listing
 from brainbench.core.files import content_hash
 from brainbench.datasets.sessions import natural_key
 from brainbench.datasets.trials.conditions import natural_vocabulary
@@ -36,7 +37,7 @@ def join_sessions(
 
     # The order must not depend on that of the files: equal data then have equal content hashes.
     parts = sorted(parts, key=lambda part: (natural_key(part.subject), natural_key(part.session)))
-    notes = [*notes, *check_values(part.tally for part in parts)]
+    doubts = [*check_values(part.tally for part in parts), *_doubtful_names(parts)]
     removed: Counter[str] = Counter()
     for part in parts:
         removed.update(part.tally.removed)
@@ -44,12 +45,18 @@ def join_sessions(
     everything, parts = parts, [part for part in parts if part.labels] or parts
     empty = [part for part in everything if not part.labels]
     lost = "no trial is left, so its {} units are left out"
-    notes = [*notes, *(f"{part.source}: {lost.format(len(part.unit_ids))}" for part in empty)]
+    doubts += [f"session {part.session} of {part.subject}: {lost.format(len(part.unit_ids))}" for part in empty]
     trials, units = sum(len(part.labels) for part in parts), sum(len(part.unit_ids) for part in parts)
     if not trials or not units:
         what = "trial" if not trials else "unit"
         reasons = "; ".join(f"{rule} removed {number}" for rule, number in removed.items() if number)
         raise DataError(f"No {what} remains of {source}: {reasons or 'the tables are empty'}.")
+    overlapping, alike = np.sum([_overlaps(part) for part in parts], axis=0).tolist()
+    if overlapping:
+        doubts.append(
+            f"the windows of {overlapping} of {trials} trials begin before that of an earlier one ends ({alike} of one "
+            "with the same label): such trials share spikes, so their noise is not independent"
+        )
     vocabulary = options.vocabulary or natural_vocabulary(row for part in parts for row in part.values)
     present = {label for part in parts for label in part.labels}
     if len(present) < 2:
@@ -98,15 +105,45 @@ def join_sessions(
         "selection": {"name": options.selection.name, "rules": list(options.selection.lines())},
         "removed": dict(removed),
         "sessions": [_about(part) for part in everything],
-        "notes": [*notes, *(note for part in everything for note in part.tally.notes)],
+        "notes": [*notes, *doubts, *(note for part in everything for note in part.tally.notes)],
+        "doubts": doubts,
+        "overlap": alike / trials,
         "source": source,
         "synthetic": any(part.synthetic for part in everything),
         # The recipe that all sessions name; "" where they name none, or different ones.
         "stimuli": recipes.pop() if len(recipes) == 1 else "",
         "content_hash": content_hash(vocabulary, *content),
+        # By which a part that somebody takes is known from the whole that the hash names.
+        "sizes": {str(name): size for name, size in dataset.sizes.items()},
     }
     dataset.attrs["missing"] = missing_labels(dataset)
     return dataset
+
+
+def _doubtful_names(parts: list[SessionCounts]) -> Iterator[str]:
+    """Say which animals may be one: every animal is taken for a sample of its own."""
+    subjects = sorted({part.subject for part in parts}, key=natural_key)
+    guessed = {part.subject for part in parts if part.guessed}
+    if guessed and len(subjects) > 1:
+        named = listing(name for name in subjects if name in guessed)
+        yield f"files that do not name their animal count as an animal each, after their own name: {named}"
+    folded: dict[str, list[str]] = {}
+    for name in subjects:
+        folded.setdefault("".join(name.lower().split()), []).append(name)
+    for names in folded.values():
+        if len(names) > 1:
+            yield f"animals whose names differ only in case or blanks count as different ones: {listing(names)}"
+
+
+def _overlaps(part: SessionCounts) -> tuple[int, int]:
+    """Count the trials whose window begins before that of an earlier trial ends, and before one of their label does."""
+
+    def count(edges: NDArray[np.float64]) -> int:
+        begin, end = edges[np.argsort(edges[:, 0])].T
+        return int((begin[1:] < np.maximum.accumulate(end)[:-1] - 1e-9).sum())
+
+    labels = np.array(part.labels)
+    return count(part.edges), sum(count(part.edges[labels == label]) for label in set(part.labels))
 
 
 def _covariate(parts: list[SessionCounts], name: str) -> NDArray[np.float64]:

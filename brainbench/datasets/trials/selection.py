@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 
 from brainbench.core.errors import UsageError, check_once, nearest, shown, unknown_name
 from brainbench.core.reading.ranges import check_fields
-from brainbench.datasets.sessions import SessionTable, as_label, as_labels, natural_key
+from brainbench.datasets.sessions import SessionTable, as_label, as_labels, as_number, natural_key
 
-_TRUTH = {"true": ("true", "1"), "false": ("false", "0")}
+_TRUTH = (("true", "1"), ("false", "0"))
 _RULE = re.compile(r"^\s*(?:(?P<scope>trials|units)\.)?(?P<column>[^=!<>]+?)\s*(?P<sign>!=|=)\s*(?P<values>.+?)\s*$")
 _RANGE = re.compile(r"^(?P<low>[-+.\deE]*)\.\.(?P<high>[-+.\deE]*)$")
 
@@ -30,8 +30,8 @@ def _check_texts(what: str, texts: Any) -> None:
 class Rule:
     """One condition on one column; rows that fail it are removed and counted.
 
-    Values are compared as text, so ``1``, ``"1"`` and ``1.0`` agree, and ``"true"`` also matches 1.
-    A row without a value fails ``allow``, ``low`` and ``high`` and passes ``refuse``.
+    Values are compared as text. In a column of numbers ``1`` and ``1.0`` agree, and in every column ``true`` and ``1``.
+    A row without a value fails ``allow``, ``low`` and ``high`` and passes ``refuse``, unless the value is ``nan``.
 
     Raises:
         UsageError: it states nothing, an empty value, a text for several, or a range that no number is in.
@@ -73,7 +73,8 @@ class Rule:
     def keep(self, table: SessionTable, seen: dict[Rule, set[str]] | None = None) -> NDArray[np.bool_] | None:
         """Return which rows of ``table`` pass [rows], or None where an optional column is absent.
 
-        ``seen`` takes the values that the column has, for :func:`check_values`.
+        ``seen`` takes the values that the column has, and those of the rule that some row has in another spelling, for
+        :func:`check_values`.
 
         Raises:
             UsageError: a required column is absent (the nearest is named).
@@ -88,11 +89,14 @@ class Rule:
         if seen is not None and (self.allow or self.refuse):
             seen.setdefault(self, set()).update(labels.tolist())
         labels = np.char.lower(labels)
+        has = {value: np.isin(labels, _spellings(value, values.dtype)) for value in (*self.allow, *self.refuse)}
+        if seen is not None:
+            seen.get(self, set()).update(value for value, rows in has.items() if rows.any())
         keep = np.ones(len(labels), dtype=bool)
         if self.allow:
-            keep &= np.isin(labels, _spellings(self.allow))
+            keep &= np.any([has[value] for value in self.allow], axis=0)
         if self.refuse:
-            keep &= ~np.isin(labels, _spellings(self.refuse))
+            keep &= ~np.any([has[value] for value in self.refuse], axis=0)
         if self.low is not None or self.high is not None:
             numbers = table.times(self.column)
             # Comparisons with NaN are false, so a row without a value fails even a bound that is open.
@@ -232,7 +236,7 @@ def check_values(tallies: Iterable[Tally]) -> list[str]:
     for rule, values in found.items():
         known = sorted(values - {""}, key=natural_key)
         for value in (*rule.allow, *rule.refuse):
-            if any(item.lower() in _spellings((value,)) for item in known):
+            if value in values:
                 continue
             if value in rule.allow:
                 raise unknown_name(f"{rule.column} value", value, known)
@@ -241,8 +245,17 @@ def check_values(tallies: Iterable[Tally]) -> list[str]:
     return notes
 
 
-def _spellings(values: tuple[str, ...]) -> list[str]:
-    return [spelling for value in values for spelling in _TRUTH.get(value.lower(), (value.lower(),))]
+def _spellings(value: str, dtype: np.dtype[Any]) -> list[str]:
+    """Return the texts, in lower case, that rows of a column may have for the value of a rule."""
+    found = [value.lower()]
+    if dtype.kind == "f":
+        # Single precision holds .1 as another number, which is what its rows say; NaN is a row without a value.
+        with np.errstate(over="ignore"):
+            number = float(dtype.type(as_number(value)))
+        found += [as_label(number)] if math.isfinite(number) or value.lower() == "nan" else []
+    elif dtype.kind != "U" and math.isfinite(number := as_number(value)):
+        found.append(as_label(number))
+    return found + [one for pair in _TRUTH for one in pair if {*pair} & {*found}]
 
 
 def _rule(column: str, sign: str, values: str) -> Rule:

@@ -8,6 +8,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from brainbench.core.contracts import check_recordings
 from brainbench.core.errors import check_name
@@ -18,6 +19,7 @@ from brainbench.datasets.trials.covariates import COVARIATES
 if TYPE_CHECKING:
     import xarray as xr
 
+Floats = NDArray[np.float64]
 POOLS = ("subject", "session", "all")
 ALL = "all"
 """Name of the one subject that pooling all animals makes."""
@@ -69,11 +71,12 @@ def missing_labels(dataset: xr.Dataset) -> dict[str, list[str]]:
     return {subject: labels for subject, labels in gaps.items() if labels}
 
 
-def trials_by_subject(dataset: xr.Dataset) -> dict[str, tuple[Trials, ...]]:
+def trials_by_subject(dataset: xr.Dataset, *, averaged: bool = False) -> dict[str, tuple[Trials, ...]]:
     """Return firing rates [R, T, U] in Hz of every session by subject, both in the order of the data set.
 
-    Covariates are those of :mod:`brainbench.datasets.trials.covariates` that the data set holds. Trials and units
-    without any recorded value are left out, and so are sessions and subjects without a trial left.
+    ``averaged`` rates [R, 1, U] are those of the whole window. Covariates are those of
+    :mod:`brainbench.datasets.trials.covariates` that the data set holds. Trials and units without any recorded value
+    are left out, and so are sessions and subjects without a trial left.
 
     Raises:
         DataError: ``dataset`` is not a recordings data set.
@@ -104,13 +107,26 @@ def trials_by_subject(dataset: xr.Dataset) -> dict[str, tuple[Trials, ...]]:
         seconds = np.where(duration[rows] > 0, duration[rows], np.nan)
         found.setdefault(subject, []).append(
             Trials(
-                responses=own / seconds[:, :, None],
+                responses=_average(own / seconds[:, :, None], seconds) if averaged else own / seconds[:, :, None],
                 labels=labels[rows],
                 keys=_unique([f"{subject}/{session}/{ids[row]}" for row in rows]),
                 covariates={name: dataset[name].values[rows].astype(np.float64) for name in known},
             )
         )
     return {subject: tuple(items) for subject, items in found.items()}
+
+
+def _average(rates: Floats, seconds: Floats) -> Floats:
+    """Return rates [R, T, U] averaged over the seconds [R, T] in which each unit was recorded, [R, 1, U]."""
+    # A bin that the end of the window cuts short weighs less: one spike in its few milliseconds is a rate of hundreds.
+    weights = seconds / np.fmax.reduce(seconds, axis=1)[:, None]
+    weights[weights > 1 - 1e-6] = 1.0
+    missing = np.isnan(rates)
+    if not missing.any() and (weights == 1).all():
+        return rates.mean(axis=1, keepdims=True)
+    seen = np.where(missing, 0.0, weights[:, :, None])
+    total, weight = (np.where(missing, 0.0, rates) * seen).sum(axis=1), seen.sum(axis=1)
+    return np.divide(total, weight, out=np.full(total.shape, np.nan), where=weight > 0)[:, None]
 
 
 def _unique(keys: list[str]) -> tuple[str, ...]:

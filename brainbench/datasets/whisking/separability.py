@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from brainbench.core.errors import DataError, UsageError, check_each, missing_dependency
+from brainbench.core.errors import DataError, UsageError, check_each, check_once, missing_dependency
 from brainbench.core.progress import Progress
 from brainbench.core.reading.ranges import check_number
 from brainbench.core.records import Interval, Status
@@ -77,7 +77,7 @@ def separability(
     ``sweeps_per_class`` are drawn evenly from the objects of each.
 
     Raises:
-        UsageError: a class is unknown, or there are fewer classes than ``counts`` asks for.
+        UsageError: a class is unknown or named twice, or there are fewer classes than ``counts`` asks for.
         DataError: a class has fewer than two objects.
         MissingDependencyError: scikit-learn is not installed.
     """
@@ -162,7 +162,8 @@ def _choose_classes(
 ) -> tuple[str, ...]:
     if asked is not None:
         check_each("class", asked, known)
-        if len(set(asked)) < most:
+        check_once("The list of classes", asked)
+        if len(asked) < most:
             raise UsageError(f"{most} classes at a time need {most} different classes; received {', '.join(asked)}.")
         return tuple(asked)
     sizes = {name: len(np.unique(objects[labels == number])) for number, name in enumerate(known)}

@@ -83,11 +83,14 @@ class PermutationTest:
 def tail_p(null: Floats, observed: ArrayLike | None = None) -> Floats:
     """Return P(statistic ≥ observed) over null statistics [N, ...]; the first of them is the observed one.
 
-    The given order of labels counts among the random ones, which is (b+1)/(n+1).
+    The given order of labels counts among the random ones, which is (b+1)/(n+1). An order without a statistic, NaN or
+    −∞, counts for nothing.
     """
     # Ties within a relative tolerance count as reached, so that rounding cannot make p smaller.
     reached = null[0] if observed is None else np.asarray(observed)
-    return (null >= reached - TIE * np.maximum(1.0, np.abs(reached))).mean(axis=0)
+    above = null >= reached - TIE * np.maximum(1.0, np.abs(reached))
+    # Counted as below, orders without a statistic would make p too small.
+    return np.asarray(above.sum(axis=0) / np.maximum((null > -np.inf).sum(axis=0), 1))
 
 
 def make_test(null: Floats, *, exact: bool, smallest: float | None = None) -> PermutationTest:

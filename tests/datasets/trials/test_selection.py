@@ -5,7 +5,7 @@ import pytest
 
 from brainbench.core.errors import DataError, UsageError
 from brainbench.datasets.sessions import SessionTable
-from brainbench.datasets.trials.selection import Rule, Selection, Tally
+from brainbench.datasets.trials.selection import Rule, Selection, Tally, check_values
 
 
 def make_table(**columns):
@@ -23,6 +23,32 @@ def test_each_row_is_counted_under_the_first_rule_that_removes_it():
 @pytest.mark.parametrize("values", [[True, False], [1, 0], [1.0, 0.0], ["True", "False"], ["1", "0"]])
 def test_truth_is_recognised_however_the_file_spells_it(values):
     assert Rule("flag", refuse=("true",)).keep(make_table(flag=values)).tolist() == [False, True]
+
+
+@pytest.mark.parametrize(
+    ("value", "column"),
+    [
+        ("1", [True, False]),
+        ("1.0", [True, False]),
+        ("1", ["True", "False"]),
+        ("1.0", [1, 2]),
+        ("01", [1.0, 2.0]),
+        (".10", [0.1, 0.2]),
+        (".1", np.array([0.1, 0.2], np.float32)),
+        ("nan", [np.nan, 2.0]),
+    ],
+)
+def test_a_number_is_recognised_however_the_rule_spells_it(value, column):
+    tally = Tally()
+    assert Rule("a", refuse=(value,)).keep(make_table(a=column), tally.seen).tolist() == [False, True]
+    assert Rule("a", allow=(value,)).keep(make_table(a=column), tally.seen).tolist() == [True, False]
+    assert check_values([tally]) == []
+
+
+def test_texts_and_numbers_out_of_range_are_compared_as_they_are():
+    assert Rule("a", refuse=("1.0",)).keep(make_table(a=["1", "01"])).all()
+    assert Rule("a", refuse=("1e300",)).keep(make_table(a=np.array([1, np.nan], np.float32))).all()
+    assert Rule("a", refuse=("nan",)).keep(make_table(a=["", "b"])).all()
 
 
 def test_a_missing_value_fails_what_is_asked_for_and_passes_what_is_refused():

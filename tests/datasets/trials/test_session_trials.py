@@ -45,6 +45,25 @@ def test_units_lost_in_some_trials_stay_missing_there(tmp_path):
     assert np.isfinite(responses[:, [0, 2]]).all()
 
 
+@pytest.mark.parametrize("bin", [0.3, 0.4, 0.499])
+def test_bins_cut_short_do_not_change_the_average(tmp_path, bin):
+    whole, bins = (make_dataset(tmp_path, bin=width) for width in (None, bin))
+    assert bins["duration"].values[:, -1].max() < bin - 1e-3
+    for one, two in zip(trials_by_subject(whole)["m1"], trials_by_subject(bins, averaged=True)["m1"], strict=True):
+        assert one.responses.shape == two.responses.shape
+        np.testing.assert_allclose(one.responses, two.responses)
+
+
+def test_bins_that_were_not_recorded_do_not_count_in_the_average(tmp_path):
+    dataset = make_dataset(tmp_path, bin=0.25)
+    counts, duration = dataset["counts"].values, dataset["duration"].values
+    counts[:, 0, 0], counts[0, :, 1] = np.nan, np.nan
+    found = trials_by_subject(dataset, averaged=True)["m1"][0].responses[:, 0]
+    np.testing.assert_allclose(found[:, 0], np.nansum(counts[:12, :, 0], 1) / duration[:12, 1:].sum(1))
+    assert np.isnan(found[0, 1])
+    assert np.isfinite(found[:, 2]).all()
+
+
 def test_other_data_sets_are_refused():
     with pytest.raises(DataError, match="variable 'counts'"):
         trials_by_subject(xr.Dataset())

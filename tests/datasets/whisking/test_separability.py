@@ -123,3 +123,5 @@ def test_classes_that_the_data_set_does_not_have_are_named(data):
         separability(data)
     with pytest.raises(UsageError, match="received cone, brick"):
         separability(data, classes=("cone", "brick"), counts=(2, 3))
+    with pytest.raises(UsageError, match="'cone' more than once"):
+        separability(data, classes=("cone", "cone", "brick"), counts=(2,))

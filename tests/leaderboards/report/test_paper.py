@@ -27,7 +27,7 @@ def test_markdown_holds_methods_tables_figures_and_references(make_record, tmp_p
     assert "2 models (2 records) were compared with demo (2 animals, 6 stimuli)" in text
     assert "| net.simclr | 0.700 | \\[0.600, 0.800\\]" in text
     assert "| other \\| one | 0.300 |" in text
-    assert "ranks need at least 4 animals (here 2)" in text
+    assert "ranks need at least 4 animals (here 1)" in text  # of two, one is reliable
     assert "Not drawn:" in text
     assert "brainbench score net.simclr" in text
     links = re.findall(r"\]\(([^)]+\.svg)\)", text)

@@ -10,7 +10,7 @@ from scipy import stats
 
 from brainbench.core.errors import UsageError
 from brainbench.metrics import compare, permutation_test
-from brainbench.metrics.inference.permutation import label_orders, layer_p, make_test
+from brainbench.metrics.inference.permutation import label_orders, layer_p, make_test, tail_p
 from brainbench.metrics.rdms.pairs import permuted_pairs, square
 from tests.factories.animals import make_rdm
 
@@ -151,6 +151,13 @@ def test_misuse_is_told_in_a_sentence():
         permutation_test(np.ones((2, 15)), np.ones(15))
     with pytest.raises(UsageError, match="of the same stimuli"):
         permutation_test(np.ones(15), np.ones(6))
+
+
+def test_orders_without_a_value_do_not_make_p_smaller():
+    null = np.array([1.0, 2.0, 0.0, 0.0, -np.inf, np.nan, -np.inf, np.nan])
+    assert tail_p(null) == 0.5
+    assert tail_p(np.stack([null, np.arange(8.0)], axis=1)).tolist() == [0.5, 1.0]
+    assert make_test(null, exact=True).p == 0.5
 
 
 def test_orders_without_a_value_take_no_part_in_the_largest_layer_or_in_the_words():
