@@ -49,7 +49,7 @@ def repair(mesh: Mesh) -> Repair:
         fixed = _turn(fixed, done)
     diagnosis = fixed.diagnosis
     remaining = []
-    if not diagnosis.watertight or diagnosis.inconsistent:
+    if not diagnosis.watertight or diagnosis.inconsistent or diagnosis.folded_edges:
         remaining.append(f"the mesh is not a closed solid: {diagnosis}")
     elif diagnosis.bodies > 1:
         remaining.append(f"the mesh has {diagnosis.bodies} separate bodies; they are kept as one rigid object")
