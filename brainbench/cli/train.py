@@ -117,6 +117,7 @@ class SweepFolder:
             whole.verify(again=False, progress=progress)
         self.classes = whole.classes
         self.summary: Mapping[str, Any] = whole.summary
+        self.cells = whole.cells
         self.manifest = whole.manifest
 
     def _open(self, split: str, **options: Any) -> WhiskingDataset:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import io
 import os
+import re
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -42,6 +44,8 @@ class Diagnosis:
     """Triangles that another triangle with the same corners repeats."""
     inside_out: bool = False
     """True for a closed surface that faces inward."""
+    folded_edges: int = 0
+    """Edges whose two triangles lie back to back: a concave polygon of the file was cut into a fan."""
 
     @property
     def watertight(self) -> bool:
@@ -56,6 +60,7 @@ class Diagnosis:
             f"{self.duplicate_faces} duplicate triangles": self.duplicate_faces,
             "triangles that disagree on inside and outside": self.inconsistent,
             "a surface that is inside out": self.inside_out,
+            f"{self.folded_edges} edges with triangles back to back (export polygons as triangles)": self.folded_edges,
         }
         return ", ".join(text for text, found in faults.items() if found) or "watertight"
 
@@ -136,6 +141,7 @@ class Mesh:
             inconsistent=not consistent,
             duplicate_faces=len(self.faces) - distinct,
             inside_out=open_edges == 0 and consistent and self.volume < 0,
+            folded_edges=_folded_edges(self, solid.face_adjacency) if consistent else 0,
         )
 
     @cached_property
@@ -224,11 +230,22 @@ def face_owners(mesh: Mesh) -> NDArray[np.int64]:
     return connected_component_labels(edges, node_count=len(mesh.vertices))[mesh.faces[:, 0]]
 
 
-def load_mesh(path: str | os.PathLike[str], *, unit: str) -> Mesh:
+def _folded_edges(mesh: Mesh, pairs: NDArray[np.int64]) -> int:
+    """Count pairs [n, 2] of neighbouring faces with an area whose normals are opposite within .08°."""
+    a, b, c = np.moveaxis(mesh.vertices[mesh.faces], 1, 0)
+    normals = np.cross(b - a, c - a)
+    doubled = np.linalg.norm(normals, axis=1)
+    units = normals / np.maximum(doubled, np.finfo(float).tiny)[:, None]
+    wide = (doubled > 2e-12 * mesh.diagonal**2)[pairs].all(axis=1)
+    return int((wide & (np.einsum("pi,pi->p", units[pairs[:, 0]], units[pairs[:, 1]]) < -1 + 1e-6)).sum())
+
+
+def load_mesh(path: str | os.PathLike[str], *, unit: str, apart: bool = False) -> Mesh:
     """Read a mesh file (OBJ, STL, PLY, GLB, OFF, …); equal vertices are merged, nothing else is repaired.
 
     A scene with several meshes is joined into one. ``unit`` is that of the file's numbers, one of :data:`UNITS` (most
-    formats carry none).
+    formats carry none). With ``apart``, closed bodies that touch keep vertices of their own, so that
+    :meth:`Mesh.pieces` tells them apart.
 
     Raises:
         UsageError: the unit is unknown.
@@ -239,7 +256,7 @@ def load_mesh(path: str | os.PathLike[str], *, unit: str) -> Mesh:
     check_name("length unit", unit, UNITS)
     path = check_file(path, "mesh file")
     with readable(path, "mesh"):
-        loaded: Any = trimesh.load(path, force="mesh", process=False)
+        loaded: Any = _scene(path).to_mesh()
         if not isinstance(loaded, trimesh.Trimesh) or not len(loaded.faces):
             raise DataError(f"{os.fspath(path)!r} holds no triangles.")
         # Exactly equal vertices only: a tolerance would depend on the unit.
@@ -247,7 +264,61 @@ def load_mesh(path: str | os.PathLike[str], *, unit: str) -> Mesh:
         faces = np.asarray(loaded.faces)
         if faces.min() < 0 or faces.max() >= len(merged.reshape(-1)):
             raise DataError(f"{os.fspath(path)!r} has faces that name missing vertices.")
-        return Mesh(vertices * UNITS[unit], merged.reshape(-1)[faces], path.stem)
+        mesh = Mesh(vertices, merged.reshape(-1)[faces], path.stem)
+        if apart and (bodies := _bodies(path)) is not None and len(bodies.pieces()) > len(mesh.pieces()):
+            mesh = bodies
+        return mesh.scaled(UNITS[unit])
+
+
+def _scene(path: Path, **options: Any) -> Any:
+    """Read a file by trimesh; indices of an OBJ that count back from their line are made absolute first."""
+    import trimesh
+
+    if path.suffix.lower() == ".obj":
+        text = path.read_text(errors="replace")
+        if re.search(r"^f\b.*[\s/]-\d", text, re.MULTILINE):
+            text = _absolute(text)
+            return trimesh.load_scene(io.StringIO(text), file_type="obj", process=False, **options)
+    return trimesh.load_scene(path, process=False, **options)
+
+
+def _absolute(text: str) -> str:
+    """Return the text of an OBJ file with the indices of its faces counted from the first vertex."""
+    seen = dict.fromkeys(("v", "vt", "vn"), 0)
+    lines = []
+    for line in text.splitlines():
+        kind, *words = line.split() or [""]
+        if kind in seen:
+            seen[kind] += 1
+        elif kind == "f":
+            corners = [
+                "/".join(
+                    str(total + int(index) + 1) if index.startswith("-") else index
+                    for index, total in zip(word.split("/"), seen.values(), strict=False)
+                )
+                for word in words
+            ]
+            line = " ".join(["f", *corners])
+        lines.append(line)
+    return "\n".join(lines)
+
+
+def _bodies(path: Path) -> Mesh | None:
+    """Return a file's bodies with vertices of their own, if its indices, or else its objects, make closed ones."""
+    import trimesh
+
+    scene = _scene(path, **({"split_objects": True} if path.suffix.lower() == ".obj" else {}))
+    parts = [part for part in scene.dump() if isinstance(part, trimesh.Trimesh)]
+    joined: Any = trimesh.util.concatenate(parts)
+    mesh = Mesh(joined.vertices, joined.faces, path.stem)
+    objects = np.repeat(np.arange(len(parts)), [len(part.faces) for part in parts])
+    for owner in (face_owners(mesh), objects):
+        own = np.column_stack([mesh.vertices[mesh.faces].reshape(-1, 3), np.repeat(owner, 3)])
+        keys, merged = np.unique(own, axis=0, return_inverse=True)
+        bodies = Mesh(np.asarray(keys[:, :3], float), merged.reshape(-1, 3), path.stem)
+        if bodies.diagnosis.watertight:
+            return bodies
+    return None
 
 
 def save_mesh(path: str | os.PathLike[str], mesh: Mesh, *, unit: str) -> Path:

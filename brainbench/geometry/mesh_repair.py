@@ -49,7 +49,7 @@ def repair(mesh: Mesh) -> Repair:
         fixed = _turn(fixed, done)
     diagnosis = fixed.diagnosis
     remaining = []
-    if not diagnosis.watertight or diagnosis.inconsistent:
+    if not diagnosis.watertight or diagnosis.inconsistent or diagnosis.folded_edges:
         remaining.append(f"the mesh is not a closed solid: {diagnosis}")
     elif diagnosis.bodies > 1:
         remaining.append(f"the mesh has {diagnosis.bodies} separate bodies; they are kept as one rigid object")
@@ -143,16 +143,19 @@ def _turn(mesh: Mesh, done: list[str]) -> Mesh:
 
 
 def _within_another(bodies: Mapping[int, Mesh], label: int) -> bool:
-    """Return whether a body lies inside an odd number of the others."""
-    corner = bodies[label].vertices[bodies[label].faces[0, 0]]
+    """Return whether a body lies inside an odd number of the others, as a whole."""
+    low, high = bodies[label].bounds
     around = [
         body
         for other, body in bodies.items()
-        if other != label and ((corner > body.bounds[0]) & (corner < body.bounds[1])).all()
+        if other != label and (low > body.bounds[0]).all() and (high < body.bounds[1]).all()
     ]
+    # Of a body that only overlaps another some corner lies outside; a few hundred corners tell.
+    corners = bodies[label].vertices
+    corners = corners[:: -(-len(corners) // 300)]
     # A winding number above one half is inside (Jacobson et al. 2013), and shells in shells alternate
     # between wall and cavity.
-    return sum(abs(float(winding_number(body, corner)[0])) > 0.5 for body in around) % 2 == 1
+    return sum(bool((np.abs(winding_number(body, corners)) > 0.5).all()) for body in around) % 2 == 1
 
 
 def _count(number: int, what: str) -> str:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import logging
+import math
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -24,6 +26,7 @@ if TYPE_CHECKING:
     from brainbench.scoring.options import ScoreOptions
     from brainbench.stimuli import Stimuli
 
+_LOG = logging.getLogger(__name__)
 DEFAULT_STIMULI = "rodgers"
 RANDOM_FEATURES = 512
 """Width of the random-features baseline."""
@@ -105,6 +108,9 @@ class ResolvedModel:
             from brainbench.models.activations import extract
 
             values, comparable, note = _network_input(self.module, shown, options.normalize)
+            if card.objective not in (None, "untrained") and (other := _unlike_training(self.module, shown)):
+                _LOG.warning("%s was trained on other stimuli: here %s.", card.name, other)
+                note += f"; unlike its training: {other}"
             activations = extract(self.module, values, layers=options.layers, readout=options.readout)
             card = replace(card, input=note)
             steps = comparable if comparable.ndim > 2 else comparable[:, None, :]
@@ -244,6 +250,21 @@ def _network_input(module: torch.nn.Module, stimuli: Stimuli, normalize: bool) -
     if stimuli.dataset is None:
         return given, scaled, "as given"
     return (scaled, scaled, "forces in 1e-4 N, moments in 1e-6 N·m") if normalize else (given, scaled, "SI (N, N·m)")
+
+
+def _unlike_training(module: Any, stimuli: Stimuli) -> str:
+    """Return how the frames of simulated stimuli differ from those that a network of ours is made for; else ''."""
+    spec: Any = getattr(module, "spec", None)
+    dataset = stimuli.dataset
+    if not hasattr(spec, "sample_rate") or dataset is None:
+        return ""
+    told = []
+    gaps, axes = np.diff(dataset["time"].values), dataset.attrs.get("axes", "world")
+    if len(gaps) and not math.isclose(rate := 1 / (spec.sub_steps * np.median(gaps)), spec.sample_rate, rel_tol=0.05):
+        told.append(f"{rate:.4g} time steps per second, there {spec.sample_rate:.4g}")
+    if not spec.frame.startswith(axes):
+        told.append(f"{axes} axes, there {spec.frame.partition(' ')[0]} axes")
+    return " and ".join(told)
 
 
 def reduce_time(values: NDArray[np.floating], time: str) -> NDArray[np.floating]:

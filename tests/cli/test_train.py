@@ -7,6 +7,8 @@ import h5py
 import pytest
 
 from brainbench.datasets.whisking.files import Shard
+from brainbench.models.training import trainer
+from brainbench.models.training.augmentation import Augmentation
 from brainbench.stimuli.sweeps.generation import generate
 from tests.factories.sweep_batches import small_plan
 
@@ -42,6 +44,13 @@ def test_a_model_is_trained_scored_by_its_folder_and_exported(run, folder, tmp_p
     assert exported.status == 0, exported.err
     assert json.loads(exported.out)["difference"] < 1e-4
     assert json.loads((tmp_path / "s4.pt2.json").read_text())["outputs"]["features"] == ["batch", 96]
+
+
+def test_physical_augmentation_keeps_to_the_whiskers_of_the_data(run, folder, tmp_path, monkeypatch):
+    made = []
+    monkeypatch.setattr(trainer, "Augmentation", lambda *values: made.append(Augmentation(*values)) or made[-1])
+    assert run("train", "s4-small", *_options(folder, tmp_path / "run"), "--stop-after", "0").status == 0
+    assert [(item.kind, item.cells) for item in made] == [("physical", (16, 17, 22))]
 
 
 def test_a_stopped_run_goes_on_and_options_come_from_a_file(run, folder, tmp_path):

@@ -150,3 +150,50 @@ def test_a_turned_mesh_keeps_its_size_and_its_outside():
     for matrix in (np.diag([1, 1, -1]), 2 * np.eye(3), np.eye(2), np.full((3, 3), np.nan)):
         with pytest.raises(UsageError, match=r"rotation matrix .*; received \[\["):
             box.transformed(matrix)
+
+
+def _blocks(path, *, relative=False, normals=False):
+    """Three cubes that touch in an L, as objects of one file."""
+    lines, seen = [], 0
+    corners = [(x, y, z) for z in (0, 1) for x, y in ((0, 0), (1, 0), (1, 1), (0, 1))]
+    quads = [(1, 4, 3, 2), (5, 6, 7, 8), (1, 2, 6, 5), (2, 3, 7, 6), (3, 4, 8, 7), (4, 1, 5, 8)]
+    for at in ((0, 0), (1, 0), (0, 1)):
+        lines += [f"o block-{at[0]}{at[1]}", *(f"v {x + at[0]} {y + at[1]} {z}" for x, y, z in corners)]
+        lines += ["vn 0 0 1"] * normals
+        start = seen - (seen + 8 + 1 if relative else 0)
+        lines += ["f " + " ".join(f"{start + i}//1" if normals else str(start + i) for i in quad) for quad in quads]
+        seen += 8
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
+@pytest.mark.parametrize("relative", [False, True])
+@pytest.mark.parametrize("normals", [False, True])
+def test_bodies_that_touch_stay_apart_where_they_shall(tmp_path, relative, normals):
+    path = _blocks(tmp_path / "blocks.obj", relative=relative, normals=normals)
+    apart = load_mesh(path, unit="m", apart=True)
+    assert [piece.volume for piece in apart.pieces()] == pytest.approx([1, 1, 1])
+    assert len(load_mesh(path, unit="m").pieces()) == 1
+
+
+def test_indices_that_count_back_from_their_line_find_their_vertices(tmp_path):
+    there = load_mesh(_blocks(tmp_path / "there.obj"), unit="m")
+    back = load_mesh(_blocks(tmp_path / "back.obj", relative=True), unit="m")
+    np.testing.assert_array_equal(back.vertices, there.vertices)
+    np.testing.assert_array_equal(back.faces, there.faces)
+
+
+@pytest.mark.parametrize("first", range(6))
+def test_a_concave_polygon_that_was_cut_into_a_fan_is_diagnosed(tmp_path, first):
+    corners = [(x, y, z) for z in (0, 1) for x, y in ((0, 0), (2, 0), (2, 1), (1, 1), (1, 2), (0, 2))]
+    cap = [(first + i) % 6 + 1 for i in range(6)]
+    walls = [(i + 1, (i + 1) % 6 + 1, (i + 1) % 6 + 7, i + 7) for i in range(6)]
+    faces = [cap[::-1], [i + 6 for i in cap], *walls]
+    path = tmp_path / "bracket.obj"
+    lines = ["v {} {} {}".format(*corner) for corner in corners] + ["f " + " ".join(map(str, f)) for f in faces]
+    path.write_text("\n".join(lines))
+    mesh = load_mesh(path, unit="m")
+    area = np.linalg.norm(np.cross(*np.diff(mesh.vertices[mesh.faces], axis=1).swapaxes(0, 1)), axis=1).sum() / 2
+    # A fan that is right covers 14 m²; what lies outside the bracket is covered twice.
+    assert (mesh.diagnosis.folded_edges > 0) == (area > 14.1)
+    assert ("back to back" in str(mesh.diagnosis)) == (area > 14.1)

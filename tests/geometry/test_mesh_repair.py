@@ -103,6 +103,15 @@ def test_only_the_bodies_that_are_inside_out_are_turned():
     assert "2 separate bodies" in result.remaining[0]
 
 
+@pytest.mark.parametrize("side", [-1, 1])
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_a_body_that_overlaps_another_is_no_cavity_of_it(side, axis):
+    moved = _ball(0.8, side * 0.9 * np.eye(3)[axis])
+    result = repair(_joined(_ball(), _flipped(moved)))
+    assert [piece.volume for piece in result.mesh.pieces()] == pytest.approx([_ball().volume, moved.volume])
+    assert result.done == ("1 of 2 bodies were inside out and were turned",)
+
+
 def test_the_wall_of_a_cavity_keeps_pointing_inward():
     shell = _joined(_ball(), _flipped(_ball(0.5)))
     result = repair(shell)

@@ -15,7 +15,10 @@ from brainbench.core.errors import UsageError
 from brainbench.datasets import open_recordings, write_recordings
 from brainbench.datasets.sessions import make_session
 from brainbench.models.features import write_features
+from brainbench.scoring.model_responses import resolve_model
+from brainbench.scoring.options import ScoreOptions
 from brainbench.scoring.scores import score_record
+from brainbench.stimuli import Frames, Scene, WhiskerArray, simulate
 from leaderboards.changes import differences
 
 LABELS = ("a", "b", "c", "d", "e", "f")
@@ -358,3 +361,19 @@ def test_the_published_estimators_use_correlation_distances(truth: Path, recordi
     assert "correlation RDM, pearson" in brainbench.score(str(truth), recordings=recordings, estimator="thesis").metric
     with pytest.raises(UsageError, match="'ridge'"):
         brainbench.score(str(truth), recordings=recordings, estimator="thesis", metric="ridge")
+
+
+@pytest.mark.parametrize(
+    ("model", "frames", "told"),
+    [
+        ("resnet18-small.supervised", Frames(count=10), ""),
+        ("resnet18-small.supervised", Frames(interval=1e-3, count=10), "200 time steps per second, there 22.22"),
+        ("resnet18-small.supervised", Frames(count=10, axes="follicle"), "follicle axes, there world axes"),
+        ("resnet18-small", Frames(interval=1e-3, count=10), ""),
+    ],
+)
+def test_frames_unlike_those_of_the_training_are_told(model: str, frames: Frames, told: str, caplog):
+    air = simulate(Scene("air", WhiskerArray.mouse(whiskers="C2"), frames=frames), fidelity="fast", cache=False)
+    card = resolve_model(model).respond(ScoreOptions(stimuli=air)).card
+    assert card.input == "SI (N, N·m); normalised inside the model" + f"; unlike its training: {told}" * bool(told)
+    assert (told in caplog.text) if told else "was trained on" not in caplog.text

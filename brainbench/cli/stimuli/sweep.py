@@ -13,7 +13,7 @@ from brainbench.cli.destinations import out_folder_option
 from brainbench.cli.options import SchedulerOption, WorkersOption, with_options
 from brainbench.cli.output import JsonOption, emit, facts, progress_bar
 from brainbench.cli.stimuli.scenes import BackendOption, FidelityOption, WhiskersOption
-from brainbench.core.errors import UsageError, check_name
+from brainbench.core.errors import UsageError, check_name, listing
 from brainbench.stimuli.engines import DEFAULT_ENGINE
 
 if TYPE_CHECKING:
@@ -122,12 +122,14 @@ def _generate(
         "files": [out / shard["name"] for shard in manifest["shards"]],
     }
     unusable = {name: item["unusable"] for name, item in manifest["objects"].items() if "unusable" in item}
+    untouched = [name for name, item in manifest["objects"].items() if "untouched" in item]
     rows = {
         "steps": f"{manifest['steps']:,} of {manifest['steps_in_full']:,} computed"
         + f" ({saved:.0%} saved)" * (saved >= 0),
         "not solved": f"contact forces of {unsolved:,} time steps" if unsolved else "",
         "unstable": f"{manifest['unstable']:,} of {manifest['sweeps']:,} sweeps, marked in the shards",
         "unusable": "\n".join(f"{name}: {reason}" for name, reason in unusable.items()),
+        "untouched": f"in all sweeps: {listing(untouched, limit=6)}" if untouched else "",
         "hash": manifest["content_hash"],
         "time": f"{seconds:.1f} s in this run",
         "data set": f"{out} (manifest.json, {len(manifest['shards'])} shards)",

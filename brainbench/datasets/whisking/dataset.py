@@ -188,6 +188,11 @@ class WhiskingDataset:
         return self._gathered([shard.indices for shard in self._shards])
 
     @property
+    def cells(self) -> tuple[int, ...]:
+        """Cells of the grid, row · 7 + column, that hold a whisker, ascending."""
+        return tuple(np.unique(self._shards[0].cells).tolist())
+
+    @property
     def summary(self) -> dict[str, Any]:
         """Hash, number of classes, and the sweeps of each split that are used and in all left out: for a card."""
         used = self._splits[self._where].tolist()

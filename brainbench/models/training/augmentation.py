@@ -16,7 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, partial
 
 import torch
 from torch.nn import functional
@@ -28,6 +28,8 @@ from brainbench.models.normaliser import Normaliser
 
 LAST_COLUMNS = (4, 4, 6, 6, 5)
 """Last whisker of rows A–E of the mouse (Bresee et al. 2023); columns count from 0, the other cells are empty."""
+MOUSE = tuple(row * GRID_SHAPE[1] + col for row, last in enumerate(LAST_COLUMNS) for col in range(last + 1))
+"""Cells of the grid, row · 7 + column, that hold a whisker of the mouse."""
 
 _MIRRORED = {"vertical": "z", "horizontal": "y"}
 
@@ -44,6 +46,8 @@ class Augmentation:
     """``none``, ``physical``, ``thesis`` or ``image``."""
     masking: float = 0.0
     """Share of the time steps that are set to zero (temporal masking; published with 0.75)."""
+    cells: tuple[int, ...] = MOUSE
+    """Cells of the grid that hold a whisker in these data, ascending; ``physical`` keeps to them."""
 
     def __post_init__(self) -> None:
         check_name("augmentation", self.kind, KINDS)
@@ -57,7 +61,8 @@ class Augmentation:
         number-th sweep of a larger batch, from rank on; each sweep is then treated as it would be in the whole batch.
         """
         draw = SampledAugmentation(generator, *part)
-        y = KINDS[self.kind](x, draw)
+        change = partial(_physical, cells=self.cells) if self.kind == "physical" else KINDS[self.kind]
+        y = change(x, draw)
         return mask_steps(y, self.masking, draw) if self.masking else y
 
 
@@ -79,8 +84,8 @@ class SampledAugmentation:
         return (self.uniform(len(x)) < probability).to(x.device).view(-1, *(1,) * (x.ndim - 1))
 
 
-def flip(x: torch.Tensor, direction: str) -> torch.Tensor:
-    """Mirror sweeps physically: ``vertical`` (z → −z) or ``horizontal`` (y → −y).
+def flip(x: torch.Tensor, direction: str, cells: tuple[int, ...] = MOUSE) -> torch.Tensor:
+    """Mirror sweeps physically: ``vertical`` (z → −z) or ``horizontal`` (y → −y); ``cells`` hold whiskers.
 
     Raises:
         UsageError: there is no such direction, or ``x`` is not [B, T, S·6, 5, 7].
@@ -95,7 +100,7 @@ def flip(x: torch.Tensor, direction: str) -> torch.Tensor:
     normal = _MIRRORED[direction]
     signs = tuple(-1.0 if (name[1] == normal) == (name[0] == "F") else 1.0 for name in CHANNELS)
     turned = _constant(signs * (x.shape[2] // len(CHANNELS)), x.device).to(x.dtype)
-    places = _constant(_places(direction), x.device)
+    places = _constant(_places(direction, cells), x.device)
     return (x.flatten(3).index_select(3, places) * turned[:, None]).unflatten(3, GRID_SHAPE)
 
 
@@ -122,11 +127,12 @@ def _constant(values: tuple[float, ...], device: torch.device) -> torch.Tensor:
         return torch.tensor(values, device=device)
 
 
-def _places(direction: str) -> tuple[int, ...]:
+@cache
+def _places(direction: str, cells: tuple[int, ...]) -> tuple[int, ...]:
     """Return for every cell of the grid the cell whose whisker comes to it: the order of a row or column reversed."""
     rows, columns = GRID_SHAPE
     places = list(range(rows * columns))
-    held = [(row, column) for row in range(rows) for column in range(LAST_COLUMNS[row] + 1)]
+    held = [divmod(cell, columns) for cell in cells]
     along = 0 if direction == "horizontal" else 1
     for which in range(GRID_SHAPE[along]):
         line = [row * columns + column for row, column in held if (row, column)[along] == which]
@@ -135,10 +141,10 @@ def _places(direction: str) -> tuple[int, ...]:
     return tuple(places)
 
 
-def _physical(x: torch.Tensor, draw: SampledAugmentation) -> torch.Tensor:
+def _physical(x: torch.Tensor, draw: SampledAugmentation, cells: tuple[int, ...] = MOUSE) -> torch.Tensor:
     # Both flips together are the half turn, so three fair coins draw the eight motions evenly.
     for direction in _MIRRORED:
-        x = torch.where(draw.coins(x), flip(x, direction), x)
+        x = torch.where(draw.coins(x), flip(x, direction, cells), x)
     return torch.where(draw.coins(x), reverse_time(x), x)
 
 

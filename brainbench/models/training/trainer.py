@@ -30,7 +30,7 @@ from brainbench.core.writing.locks import lock_folder
 from brainbench.models.activations import evaluating
 from brainbench.models.ops.seeding import seeded
 from brainbench.models.registry import load_model
-from brainbench.models.training.augmentation import Augmentation
+from brainbench.models.training.augmentation import MOUSE, Augmentation
 from brainbench.models.training.batches import Batches, BatchOptions, Data
 from brainbench.models.training.card import checkpoint_info, model_card
 from brainbench.models.training.checkpoints import WEIGHTS, load_weights, save_checkpoint
@@ -170,7 +170,9 @@ class _Run:
             record=config.compile == "graphs",
             average=where.average if where.count > 1 else None,
         )
-        self.augmentation = Augmentation(config.augmentation, config.masking)
+        # Data in memory need not say where their whiskers are.
+        cells: tuple[int, ...] = getattr(data, "cells", MOUSE)
+        self.augmentation = Augmentation(config.augmentation, config.masking, cells)
         batches = self._batches("train", shuffle=True)
         if batches is None:
             raise DataError("The data set has no split 'train', so there is nothing to train on.")

@@ -192,10 +192,11 @@ class Path(_Motion):
 
     Positions follow a natural cubic spline and orientations a rotation spline, so velocity and acceleration are
     continuous, angular ones too. The body moves off with the velocity of the first stretch; repeat the first
-    keyframe to start from rest.
+    keyframe to start from rest. Between keyframes it turns the shorter way.
 
     Raises:
-        UsageError: the lists differ in length, times do not ascend from 0, or the first keyframe is displaced.
+        UsageError: the lists differ in length, times do not ascend from 0, the first keyframe is displaced, or the
+            angles of two keyframes go the longer way round.
     """
 
     times: tuple[float, ...]
@@ -219,6 +220,28 @@ class Path(_Motion):
         if len(times) < 2 or times[0] != 0 or not np.isfinite(times).all() or (np.diff(times) <= 0).any():
             raise UsageError(f"The times of a path ascend from 0 and are at least two; received {self.times!r}.")
         object.__setattr__(self, "times", tuple(times.tolist()))
+        self._check_turns()
+
+    def _check_turns(self) -> None:
+        from scipy.spatial.transform import Rotation
+
+        angles = np.array(self.rotations)
+        begin = Rotation.from_euler("xyz", angles[:-1])
+        way = begin.inv() * Rotation.from_euler("xyz", angles[1:])
+        # Angles of a tracked head that pass from 180° to -180° also differ much, but it turns little.
+        wrapped = (way.magnitude() > 1e-6) & (way.magnitude() < math.pi / 6)
+        longer = np.zeros(len(angles) - 1, dtype=bool)
+        for share in (1 / 3, 1 / 2):  # several whole turns agree at one of them
+            between = Rotation.from_euler("xyz", angles[:-1] + share * np.diff(angles, axis=0))
+            shorter = begin * Rotation.from_rotvec(share * way.as_rotvec())
+            longer |= ((shorter.inv() * between).magnitude() > math.pi / 2) & ~wrapped
+        if longer.any():
+            first = int(np.argmax(longer))
+            told = [[round(math.degrees(angle), 3) for angle in row] for row in self.rotations[first : first + 2]]
+            raise UsageError(
+                f"Between keyframes a path turns the shorter way; from {told[0]} to {told[1]}° that is not the way of "
+                "the angles: add keyframes less than half a turn apart."
+            )
 
     @property
     def finest(self) -> float:

@@ -42,7 +42,7 @@ def mesh_solid(
         MissingDependencyError: the decomposition needs a package that is not installed.
     """
     check_name("collision geometry", collision, COLLISIONS)
-    repaired = repair(load_mesh(path, unit=unit))
+    repaired = repair(load_mesh(path, unit=unit, apart=collision == "pieces"))
     solid = touchable(repaired.mesh, collision, decomposition)
     # Separate bodies are what "pieces" is for.
     expected = collision == "pieces" and repaired.mesh.diagnosis.watertight
@@ -104,7 +104,7 @@ def touchable(mesh: Mesh, collision: str, settings: DecompositionSettings | None
 
 def _exact(mesh: Mesh) -> Solid:
     """Make a solid that is touched at its surface, and at its hull by other engines if it is convex."""
-    if not mesh.diagnosis.watertight or mesh.diagnosis.inconsistent:
+    if not mesh.diagnosis.watertight or mesh.diagnosis.inconsistent or mesh.diagnosis.folded_edges:
         raise UsageError(
             f"The mesh {mesh.name!r} is not closed ({mesh.diagnosis}), so it has no inside to keep whiskers out of; use"
             " collision = 'hull' (its concavities filled), or close it."
@@ -120,4 +120,6 @@ def _exact(mesh: Mesh) -> Solid:
 
 
 def _is_concave(mesh: Mesh, hull: Mesh) -> bool:
-    return not mesh.diagnosis.watertight or mesh.volume < 0.999 * hull.volume
+    # Bodies that overlap count their common part several times: together they can have the volume of their hull.
+    volume = min(mesh.volume, max(piece.volume for piece in mesh.pieces()))
+    return not mesh.diagnosis.watertight or volume < 0.999 * hull.volume

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 from collections.abc import Iterable
 from pathlib import Path
@@ -15,12 +16,13 @@ from brainbench.core.files import content_hash, provenance
 from brainbench.core.reading.hdf5 import open_hdf5
 from brainbench.core.reading.regular import readable
 from brainbench.stimuli.sweeps.plan import GenerationPlan, PlannedShard
-from brainbench.stimuli.sweeps.shards import COUNTS, UNUSABLE
+from brainbench.stimuli.sweeps.shards import COUNTS, OK, UNUSABLE
 from brainbench.stimuli.sweeps.split import SPLITS
 
 if TYPE_CHECKING:
     from brainbench.stimuli.sweeps.conversion import SweepTable
 
+_LOG = logging.getLogger(__name__)
 MANIFEST = "manifest.json"
 
 _COUNTS = (*COUNTS, "unstable", "unusable")
@@ -54,10 +56,18 @@ def make_manifest(plan: GenerationPlan | SweepTable, folder: str | os.PathLike[s
         DataError: a shard is missing or damaged, or an object differs between shards.
     """
     objects: dict[str, dict[str, Any]] = {
-        name: {"label": item.label, "source": item.source, "hash": None, "sweeps": {}}
+        name: {"label": item.label, "source": item.source, "hash": None, "sweeps": {}, "untouched": True}
         for name, item in plan.objects.items()
     }
     shards = [_read(Path(folder) / task.name, task, objects) for task in plan.shards]
+    for name, entry in objects.items():
+        if not entry["untouched"]:
+            del entry["untouched"]
+            continue
+        _LOG.warning(
+            "%s: no whisker touches this object in any of its %d sweeps; heights of sweeps are those of its origin, so "
+            "move the mesh until its origin is in its middle.", name, sum(entry["sweeps"].values()),
+        )  # fmt: skip
     totals = {name: sum(shard[name] for shard in shards) for name in _COUNTS}
     about = provenance()
     del about["time"]
@@ -80,6 +90,8 @@ def _read(path: Path, task: PlannedShard, objects: dict[str, dict[str, Any]]) ->
         digest = str(file.attrs["content_hash"])
         hashes = [value.decode() for value in file["object_hash"][:]]
         owner, status, reasons = file["owner"][:], file["status"][:], file["reason"][:]
+        # Sweeps that failed, and converted ones whose contacts are NaN, are not known to be untouched.
+        touched = ((file["contact"][:] != 0) | (status != OK)).any(axis=1)
     for index, item in enumerate(task.objects):
         mine, entry = np.flatnonzero(owner == index), objects[item.name]
         if entry["hash"] not in (None, hashes[index]):
@@ -90,6 +102,7 @@ def _read(path: Path, task: PlannedShard, objects: dict[str, dict[str, Any]]) ->
             )
         entry["hash"] = hashes[index]
         entry["sweeps"][task.split] = entry["sweeps"].get(task.split, 0) + len(mine)
+        entry["untouched"] &= not touched[mine].any()
         broken = mine[(status[mine] == UNUSABLE).any(axis=1)]
         if len(broken) and (reason := reasons[broken[0]].decode()):
             entry["unusable"] = reason

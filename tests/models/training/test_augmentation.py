@@ -61,6 +61,19 @@ def test_a_flip_loses_nothing_keeps_empty_cells_empty_and_undoes_itself(seed, di
     assert torch.equal(flip(y, direction), x)
 
 
+@pytest.mark.parametrize("direction", ["vertical", "horizontal"])
+@pytest.mark.parametrize(
+    "cells", [(14, 15, 16, 17), (0, 2, 28, 33), (29, 30, 31, 32, 33, 34)], ids=["C0-C3", "A", "rat E"]
+)
+def test_whiskers_of_a_part_of_the_array_change_places_with_one_another_alone(direction, cells):
+    held = torch.zeros(35).index_fill(0, torch.tensor(cells), 1.0).view(5, 7)
+    x = torch.randn(64, 3, 30, 5, 7) * held
+    y = flip(x, direction, cells)
+    assert not y[..., held == 0].any()
+    torch.testing.assert_close(y.flatten(3).abs().sort().values, x.flatten(3).abs().sort().values)
+    assert not Augmentation("physical", cells=cells)(x, _generator())[..., held == 0].any()
+
+
 def test_time_runs_backwards_sub_step_by_sub_step():
     x = torch.arange(6.0 * 5).view(1, 6, 5, 1, 1, 1).expand(1, 6, 5, 6, 5, 7).reshape(1, 6, 30, 5, 7)
     y = reverse_time(x).unflatten(2, (5, 6))[0, :, :, 0, 0, 0].flatten()

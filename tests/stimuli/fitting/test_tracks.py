@@ -98,6 +98,15 @@ def test_whisk_traces_are_chosen_by_label_and_turned_by_follicle(tmp_path, write
         read_shapes(path, _options())
 
 
+def test_two_traces_of_a_frame_with_one_label_are_refused(tmp_path):
+    traces, labels, follicles = _two_whiskers()
+    path = tracks.write_whiskers(tmp_path / "a.whiskers", traces)
+    # As whisk writes it before the whiskers are told apart.
+    table = tracks.write_measurements(tmp_path / "a.csv", dict.fromkeys(labels, 0), follicles)
+    with pytest.raises(UsageError, match="several traces of the label 0"):
+        read_shapes(path, _options(identities=str(table)))
+
+
 def test_a_single_trace_needs_no_identity_and_its_base_is_the_end_that_moves_less(tmp_path):
     traces = {(frame, 7 + frame): points[:: 1 if frame % 3 else -1] for frame, points in enumerate(PIXELS)}
     found = read_shapes(tracks.write_whiskers(tmp_path / "a.whiskers", traces), _options())

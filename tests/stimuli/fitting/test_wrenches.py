@@ -39,6 +39,19 @@ def test_a_unit_of_the_other_kind_is_refused(tmp_path):
         read_wrenches(tmp_path / "a.csv")
 
 
+@pytest.mark.parametrize("head", ["Mz_µNm", "Mz_μNm", "Mz (µN·m)", "Mz [uN m]", "Mz_uN.m", "Mz_mN*mm"])
+def test_units_are_read_however_they_are_written(tmp_path, head):
+    (tmp_path / "a.csv").write_text(f"time,Fy_mN,{head}\n0,1,2\n1,2,3\n", encoding="utf-8")
+    np.testing.assert_allclose(read_wrenches(tmp_path / "a.csv")["wrench"].values[0], [1e-3, 2e-6])
+
+
+@pytest.mark.parametrize("head", ["Mz_gmm", "mz", "Mz_raw"])
+def test_a_component_with_an_unknown_unit_is_not_left_out(tmp_path, head):
+    (tmp_path / "a.csv").write_text(f"time,Fy_mN,Fy_raw,{head}\n0,1,1,2\n1,2,1,3\n")
+    with pytest.raises(DataError, match=head):
+        read_wrenches(tmp_path / "a.csv")
+
+
 def test_hdf5_and_time_series_are_read(tmp_path):
     with h5py.File(tmp_path / "a.h5", "w") as file:
         file["wrench"], file["time"] = VALUES, TIMES

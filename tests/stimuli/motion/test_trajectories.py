@@ -4,11 +4,13 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 
 from brainbench.core.errors import UsageError
 from brainbench.stimuli.motion.trajectories import (
     ROTATIONS,
     ArrayFollicle,
+    Path,
     Spin,
     Still,
     Translation,
@@ -153,3 +155,22 @@ def test_a_travelling_head_carries_its_follicles():
 def test_a_velocity_needs_three_numbers():
     with pytest.raises(UsageError, match=r"m/s\) .*received \(1\.0, 2\.0\)"):
         Translation((1.0, 2.0))
+
+
+def _turned(*degrees):
+    rows = tuple((0.0, 0.0, math.radians(angle)) for angle in degrees)
+    return Path(tuple(0.1 * place for place in range(len(rows))), ((0.0, 0.0, 0.0),) * len(rows), rows)
+
+
+@pytest.mark.parametrize("degrees", [(0, 270), (0, 360), (0, 720), (0, 1080), (0, -90, -270), (0, 90, 300)])
+def test_keyframes_that_go_the_longer_way_round_are_refused(degrees):
+    with pytest.raises(UsageError, match="shorter way"):
+        _turned(*degrees)
+
+
+@pytest.mark.parametrize("degrees", [(0, 180), (0, -180), (0, 120, 240), (0, -120, -240), (0, 90, 175, -175)])
+def test_keyframes_less_than_half_a_turn_apart_turn_as_their_angles_say(degrees):
+    times = np.linspace(0, 0.1 * (len(degrees) - 1), 41)
+    turns = Rotation.from_matrix(_turned(*degrees).turn(times))
+    whole = math.degrees((turns[1:] * turns[:-1].inv()).as_rotvec()[:, 2].sum())
+    assert whole == pytest.approx(185 if degrees[-1] == -175 else degrees[-1])

@@ -7,13 +7,16 @@ from collections import namedtuple
 from concurrent.futures import Future
 
 import pytest
+import trimesh
 
 from brainbench.core.devices import warp
 from brainbench.core.errors import DataError, UsageError
 from brainbench.stimuli.engines.fidelity import Fidelity, list_presets
+from brainbench.stimuli.objects.collections import resolve_objects
 from brainbench.stimuli.sweeps import running
 from brainbench.stimuli.sweeps.generation import generate
-from brainbench.stimuli.sweeps.plan import GenerationSettings
+from brainbench.stimuli.sweeps.grid import SweepGrid
+from brainbench.stimuli.sweeps.plan import GenerationPlan, GenerationSettings
 from brainbench.stimuli.sweeps.shards import BuiltObject
 from tests.factories.sweep_batches import GRID, files_of, small_plan
 
@@ -50,6 +53,22 @@ def test_the_manifest_tells_of_every_shard_object_and_split(plan, unbroken):
     assert 0 < manifest["steps"] < 3 * manifest["steps_in_full"]
     assert manifest["unsolved"] == 0
     assert "time" not in manifest["provenance"]
+
+
+def test_an_object_that_every_sweep_misses_is_named(tmp_path, caplog):
+    # The origin of a part of a larger drawing may lie far away from it.
+    part = trimesh.creation.box((24, 24, 24))
+    part.export(tmp_path / "near.stl")
+    part.apply_translation((0, 0, 200))
+    part.export(tmp_path / "far.stl")
+    objects = resolve_objects([str(tmp_path / "*.stl")], unit="mm")
+    settings = GenerationSettings(Fidelity.preset("fast"))
+    plan = GenerationPlan("mine", SweepGrid(speed=(0.06,), start=0.016), objects, settings, whiskers="C2")
+    manifest = generate(plan, tmp_path / "out", workers=1)
+    assert {name: item.get("untouched", False) for name, item in manifest["objects"].items()} == {
+        "far": True, "near": False,
+    }  # fmt: skip
+    assert [record.args[0] for record in caplog.records if "no whisker touches" in record.msg] == ["far"]
 
 
 def test_shards_that_are_there_are_left_alone_and_missing_ones_are_made_again(plan, unbroken, tmp_path):

@@ -162,7 +162,8 @@ def _sides(pieces: MotionPieces) -> NDArray[np.float64]:
 
 
 def _is_straight(knots: NDArray[np.float64]) -> bool:
-    straight = np.abs(np.diff(knots[:, 3:6], axis=0)).max() < 1e-9 and not knots[:, 10:13].any()
+    # All velocities together: from one knot to the next that of a very slow motion hardly changes.
+    straight = np.ptp(knots[:, 3:6], axis=0).max() < 1e-9 and not knots[:, 10:13].any()
     # Further away one straight piece would lose digits.
     return bool(straight and np.linalg.norm(knots[-1, :3] - knots[0, :3]) < 10 * GRID)
 

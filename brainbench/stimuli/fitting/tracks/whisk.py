@@ -51,12 +51,13 @@ def read_whisk(path: str | os.PathLike[str], options: TrackOptions) -> tuple[NDA
         chosen = {key: label for key, label in labels.items() if str(label) == wanted and key in segments}
     else:
         chosen = {key: 0 for key in segments if wanted is None or str(key[1]) == wanted}
-        frames = [frame for frame, _ in chosen]
-        if len(set(frames)) < len(frames):
-            raise UsageError(
-                f"Frames of {name} hold several traces; give the table of whisk's measurements (CSV) as identities, "
-                "and the whisker's label as track."
-            )
+    frames = [frame for frame, _ in chosen]
+    if len(set(frames)) < len(frames):
+        of = f" of the label {wanted}" if labels else ""
+        raise UsageError(
+            f"Frames of {name} hold several traces{of}; give the table of whisk's measurements (CSV), in which each "
+            "trace of a frame has a label of its own, as identities, and the whisker's label as track."
+        )
     traces = {key[0]: segments[key] for key in chosen}
     if not traces:
         raise DataError(f"{name} holds no trace of the whisker {shown(wanted)}.")

@@ -24,7 +24,8 @@ TIMES = {"time": 1.0, "time_s": 1.0, "t": 1.0, "timestamps": 1.0, "time_ms": 1e-
 """Names of a column of times, and their unit in s."""
 _SCALES = {"N": 1.0, "mN": 1e-3, "uN": 1e-6, "nN": 1e-9, "Nm": 1.0, "mNm": 1e-3, "uNm": 1e-6, "nNm": 1e-9, "Nmm": 1e-3,
            "mNmm": 1e-6, "uNmm": 1e-9}  # fmt: skip
-_COLUMN = re.compile(r"([FM][xyz])(?:[_ \[(]+([munµ]?N(?:\.?m{1,2})?)[\])]?)?")
+# The micro sign and the Greek letter are two characters that look alike.
+_COLUMN = re.compile(r"([FM][xyz])(?:[_ \[(]+([munµμ]?N(?:[.·* ]?m{1,2})?)[\])]?)?")
 
 
 def read_wrenches(
@@ -65,7 +66,7 @@ def _read_csv(path: str | os.PathLike[str]) -> xr.Dataset:
     channels, columns = [], []
     for index, name in enumerate(names):
         if found := _COLUMN.fullmatch(name):
-            unit = (found[2] or ("N" if name[0] == "F" else "Nm")).replace("µ", "u").replace(".", "")
+            unit = re.sub("[.·* ]", "", re.sub("[µμ]", "u", found[2] or ("N" if name[0] == "F" else "Nm")))
             if ("m" in unit.partition("N")[2]) != (name[0] == "M"):
                 raise DataError(f"The column {name!r} of {shown(os.fspath(path))} has the unit of the other kind.")
             channels.append(found[1])
@@ -74,6 +75,13 @@ def _read_csv(path: str | os.PathLike[str]) -> xr.Dataset:
         raise DataError(
             f"{shown(os.fspath(path))} has no column of forces or moments; they are called Fx … Mz, or Fy_mN, Mz_uNm. "
             f"It has {listing(names)}."
+        )
+    # Other columns may stand beside a channel that is read, such as Fx_raw beside Fx.
+    unread = [name for name in names if re.match(r"[FM][xyz](?![a-z])", name, re.IGNORECASE)]
+    if unread := [name for name in unread if name[:2].capitalize() not in channels]:
+        raise DataError(
+            f"The columns {listing(unread)} of {shown(os.fspath(path))} have a name or a unit that is not known; "
+            f"forces and moments are called Fx … Mz, with a unit as in Fy_mN or Mz_uNm: {', '.join(_SCALES)}."
         )
     return new_wrenches(times, np.stack(columns, axis=1), channels, source=os.fspath(path))
 

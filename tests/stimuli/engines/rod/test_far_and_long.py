@@ -130,3 +130,24 @@ def test_a_still_whisker_touched_after_a_long_rest_feels_it_as_at_once():
     soon = _felt(StillFollicle(), [ball(0.0)])
     late = _felt(StillFollicle(), [ball(20.0)], 20.0 + TIMES)
     assert max(_far(late.wrench, soon.wrench)) < 1e-3
+
+
+def test_an_object_that_takes_minutes_follows_its_way_as_a_faster_one_does():
+    """Its velocity changes by less from one millisecond to the next than that of a straight motion may."""
+    felt = []
+    for duration in (2.0, 100.0):
+
+        def motion(times, duration=duration):
+            u = np.clip(times / duration, 0.0, 1.0)[:, None]
+            return 1e-3 * u * u * (3 - 2 * u) * np.array([0.0, 1.0, 0.0]), np.tile(
+                [1.0, 0.0, 0.0, 0.0], (len(times), 1)
+            )
+
+        motion.finest = duration
+        bar = Obstacle((Capsule((0.008, -0.6e-3, -8e-3), (0.008, -0.6e-3, 8e-3), 0.5e-3),), motion, 0.0)
+        felt.append(
+            _felt(
+                StillFollicle(), [bar], duration * np.linspace(0.1, 1.0, 10), Fidelity(links=8, time_step=1e-3)
+            ).wrench
+        )
+    assert max(_far(felt[1], felt[0])) < 5e-3
