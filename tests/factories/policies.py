@@ -11,12 +11,12 @@ import torch
 from tensordict import TensorDict
 
 from brainbench.core.files import read_json, to_plain, write_json
+from brainbench.core.writing.tensors import write_tensors
 from robotics_bridge import hands
 from robotics_bridge.policies.export import export_policy
 from robotics_bridge.policies.shipped import FOLDER
 from robotics_bridge.policies.student import TactilePolicy
 from robotics_bridge.policies.training.distill_config import DistillConfig
-from robotics_bridge.policies.training.state_tree import write_tensors
 from robotics_bridge.policies.training.student_files import build_student
 from robotics_bridge.tasks.contact_model import CONTACTS
 from robotics_bridge.tasks.task import TASK_VERSION

@@ -49,9 +49,9 @@ def save_checkpoint(
         DataError: a parameter is not finite, or not in ``dtype``.
     """
     import torch
-    from safetensors.torch import save_file
 
-    from brainbench.core.files import atomic_path, write_json, write_text
+    from brainbench.core.files import write_json, write_text
+    from brainbench.core.writing.tensors import write_tensors
 
     check_name("precision of weights", dtype, DTYPES)
     kind = getattr(torch, dtype)
@@ -63,10 +63,9 @@ def save_checkpoint(
         # Asked after the rounding: what is finite in float32 may exceed the largest float16, 65,504.
         if stored.is_floating_point() and not torch.isfinite(stored).all():
             raise DataError(f"The weight {name!r} is not finite in {dtype}, so no checkpoint was written to {folder}.")
-        state[name] = stored.contiguous().clone()
+        state[name] = stored
     folder = Path(folder)
-    with atomic_path(folder / WEIGHTS) as temporary:
-        save_file(state, temporary, metadata={"format": "pt"})
+    write_tensors(folder / WEIGHTS, state, format="pt")
     if card:
         write_text(folder / CARD, card)
     stated = {"brainbench_model": FORMAT, "architecture": architecture, "options": dict(options), "dtype": dtype}

@@ -19,10 +19,11 @@ import torch
 from torch import nn
 
 from brainbench.core.errors import DataError, install_command, shown
-from brainbench.core.files import atomic_path, read_mapping, write_json, write_text
+from brainbench.core.files import read_mapping, write_json, write_text
 from brainbench.core.reading.regular import check_file, readable, reason
 from brainbench.core.reading.tensors import check_finite
 from brainbench.core.writing.same_run import check_same
+from brainbench.core.writing.tensors import write_tensors
 
 _log = logging.getLogger(__name__)
 
@@ -54,8 +55,6 @@ def mark(folder: Path, **values: Any) -> None:
 
 def save_state(path: Path, learner: nn.Module, optimizer: torch.optim.Optimizer, plain: Mapping[str, Any]) -> None:
     """Write weights, optimiser, random states and plain values."""
-    from safetensors.torch import save_file
-
     tensors = {f"learner.{name}": value for name, value in learner.state_dict().items()}
     packed = optimizer.state_dict()
     scalars: dict[str, dict[str, Any]] = {}
@@ -70,9 +69,7 @@ def save_state(path: Path, learner: nn.Module, optimizer: torch.optim.Optimizer,
     if torch.cuda.is_available():
         tensors["random.cuda"] = torch.cuda.get_rng_state()
     header = {"groups": packed["param_groups"], "scalars": scalars, "plain": dict(plain)}
-    stored = {name: value.detach().cpu().contiguous().clone() for name, value in tensors.items()}
-    with atomic_path(path) as temporary:
-        save_file(stored, temporary, metadata={"state": json.dumps(header)})
+    write_tensors(path, tensors, state=json.dumps(header))
 
 
 def load_state(path: Path, learner: nn.Module, optimizer: torch.optim.Optimizer) -> dict[str, Any]:

@@ -27,6 +27,7 @@ from brainbench.core.progress import Progress
 from brainbench.core.reading.ranges import check_number
 from brainbench.core.reading.regular import readable
 from brainbench.core.writing.locks import lock_folder
+from brainbench.core.writing.tensors import write_tensors
 from brainbench.models.activations import evaluating
 from brainbench.models.ops.seeding import seeded
 from brainbench.models.registry import load_model
@@ -35,7 +36,15 @@ from brainbench.models.training.batches import Batches, BatchOptions, Data
 from brainbench.models.training.card import checkpoint_info, model_card
 from brainbench.models.training.checkpoints import WEIGHTS, load_weights, save_checkpoint
 from brainbench.models.training.config import TrainingConfig, config_warnings
-from brainbench.models.training.evaluation import TWIN, Evaluation, baselines, evaluate, fit_probe, sweeps_hash
+from brainbench.models.training.evaluation import (
+    CONTROLS,
+    TWIN,
+    Evaluation,
+    baselines,
+    evaluate,
+    fit_probe,
+    sweeps_hash,
+)
 from brainbench.models.training.gradients import Gradients, compiled
 from brainbench.models.training.objectives import make_learner
 from brainbench.models.training.optimizers import make_optimizer, rate_factor
@@ -394,16 +403,14 @@ class _Run:
             self.at = msgspec.convert(plain, _Position)
 
     def _keep_failure(self, views: tuple[torch.Tensor, ...], labels: torch.Tensor, loss: float, norm: float) -> str:
-        from safetensors.torch import save_file
-
         reason = (
             f"at step {self.at.step + 1} the loss was {loss:g} and the gradient's norm {norm:g}; the last good model "
             f"is kept and the batch is in {FAILED}. A lower learning rate, a smaller clipping norm or the -ln variant "
             "of the network may help"
         )
         if self.where.first:
-            tensors = {f"view{index}": view.cpu().contiguous() for index, view in enumerate(views)}
-            save_file({**tensors, "labels": labels.cpu()}, self.out / FAILED, metadata={"step": str(self.at.step)})
+            tensors = {f"view{index}": view for index, view in enumerate(views)}
+            write_tensors(self.out / FAILED, {**tensors, "labels": labels}, step=str(self.at.step))
             # Before the first validation there is no best model: the last saved state takes its place.
             if not (self.out / BEST / WEIGHTS).is_file() and (self.out / STATE).is_file():
                 load_state(self.out / STATE, self.learner, self.optimizer)
@@ -430,4 +437,5 @@ class _Run:
 
 
 def _evaluations(plain: Mapping[str, Any]) -> dict[str, Evaluation]:
-    return {name: Evaluation.from_plain(found) for name, found in plain.items()}
+    # In the order in which they were made, which files do not keep: a card that is written again stays the same.
+    return {name: Evaluation.from_plain(plain[name]) for name in CONTROLS if name in plain}

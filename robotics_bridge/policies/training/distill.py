@@ -28,6 +28,7 @@ from brainbench.core.progress import Progress
 from brainbench.core.reading.ranges import check_number
 from brainbench.core.writing.locks import lock_folder
 from brainbench.core.writing.same_run import check_same
+from brainbench.core.writing.tensors import write_tensors
 from brainbench.models.training.run_folder import RunLog, load_state, save_state
 from robotics_bridge.policies.encoders.arms import perceptron
 from robotics_bridge.policies.evaluate import Policy
@@ -36,7 +37,6 @@ from robotics_bridge.policies.student import TACTILE, TactilePolicy
 from robotics_bridge.policies.training.cuda_graph_step import ChunkStep
 from robotics_bridge.policies.training.distill_config import DistillConfig
 from robotics_bridge.policies.training.rollouts import Recorder, Rollout
-from robotics_bridge.policies.training.state_tree import write_tensors
 from robotics_bridge.policies.training.student_files import CONFIG, MODEL, begin_with, build_student
 from robotics_bridge.tasks.task import TASK_VERSION, check_measured
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import torch
 from safetensors.torch import load_file
 
-from robotics_bridge.policies.training.state_tree import write_tensors
+from brainbench.core.writing.tensors import write_tensors
 
 
 @dataclass

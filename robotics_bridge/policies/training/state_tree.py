@@ -9,11 +9,10 @@ from typing import Any
 
 import torch
 from safetensors import safe_open
-from safetensors.torch import save_file
 
 from brainbench.core.errors import DataError
-from brainbench.core.files import atomic_path
 from brainbench.core.reading.regular import check_file, readable
+from brainbench.core.writing.tensors import write_tensors
 
 _LEAF = "__tensor__"
 
@@ -59,13 +58,6 @@ def save(path: str | os.PathLike[str], tree: Any) -> None:
     """Write a tree to one safetensors file, replaced as a whole."""
     tensors, rest = flatten(tree)
     write_tensors(path, tensors, tree=json.dumps(rest))
-
-
-def write_tensors(path: str | os.PathLike[str], tensors: Mapping[str, torch.Tensor], **metadata: str) -> None:
-    """Write tensors of any device to one safetensors file, replaced as a whole."""
-    ready = {name: value.detach().cpu().contiguous().clone() for name, value in tensors.items()}
-    with atomic_path(path) as target:
-        save_file(ready, str(target), metadata=metadata or None)
 
 
 def load(path: str | os.PathLike[str], device: str = "cpu") -> Any:

@@ -27,6 +27,7 @@ from brainbench.core.reading.regular import readable
 from brainbench.core.reading.tensors import check_finite
 from brainbench.core.writing.locks import lock_folder
 from brainbench.core.writing.same_run import check_same
+from brainbench.core.writing.tensors import write_tensors
 from brainbench.models.training.run_folder import LOG, RESTART, trim_log
 from robotics_bridge.envs.rsl_rl import RslRlEnv
 from robotics_bridge.policies.acting import ActingModel
@@ -38,7 +39,6 @@ from robotics_bridge.policies.training import state_tree
 from robotics_bridge.policies.training.distill import describe_run
 from robotics_bridge.policies.training.loggers import Loggers, check_loggers
 from robotics_bridge.policies.training.sensing import sensed_groups, sensing_policy
-from robotics_bridge.policies.training.state_tree import write_tensors
 from robotics_bridge.policies.training.student_files import CONFIG, MODEL
 from robotics_bridge.tasks.settings import TeacherSettings
 from robotics_bridge.tasks.task import TASK_VERSION

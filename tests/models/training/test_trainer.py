@@ -175,6 +175,8 @@ def test_a_run_is_compared_with_raw_input_random_features_and_its_twin_once(tmp_
     other = train(_config(epochs=1, learning_rate=1e-2), tiny(), out=shared / "b", controls=shared, device="cpu")
     again = train(_config(epochs=1), tiny(), out=shared / "a", controls=shared, device="cpu")
     assert first.controls == other.controls == again.controls
+    # The second one found them in a file, whose order is another one.
+    assert list(other.controls) == list(first.controls)
     assert not computed
     train(_config(epochs=1, batch_size=6), tiny(), out=shared / "h", controls=shared, device="cpu")
     assert computed.pop()  # the probes see the sweeps in another order
