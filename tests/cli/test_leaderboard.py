@@ -40,6 +40,8 @@ def scored(run, files) -> tuple[Path, str]:
 def test_a_record_is_added_known_and_confirmed_by_scoring_again(run, scored, tmp_path):
     path, where = scored
     board = tmp_path / "board"
+    board.mkdir()
+    (board / f".{path.name}").write_text("{")  # of an addition that was killed at its first record
     first = json.loads(run("leaderboard", "add", str(path), "--to", str(board), "--json").out)
     assert [item["state"] for item in first["results"]] == ["added"]
     again = json.loads(run("leaderboard", "add", str(path), "--to", str(board), "--json").out)

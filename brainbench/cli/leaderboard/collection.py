@@ -63,7 +63,7 @@ def _take_in_one(
 
 def _present(to: Path) -> list[tuple[Path, ResultRecord]]:
     """Return the records of a folder."""
-    if not to.is_dir() or not any(to.rglob("*.json")):
+    if not to.is_dir() or not record_files([to]):
         return []
     return [(item.path, item.record) for item in read_records(to) if item.record is not None]
 
