@@ -81,6 +81,12 @@ def read_record(path: str | os.PathLike[str]) -> ResultRecord:
     return record
 
 
+def record_files(folder: Path) -> list[Path]:
+    """Return the record files of a folder and its sub-folders, sorted."""
+    # A hidden name is another process's unfinished write.
+    return sorted(path for path in folder.rglob("*.json") if not path.name.startswith("."))
+
+
 def read_records(source: str | os.PathLike[str] | Iterable[str | os.PathLike[str]]) -> list[StoredRecord]:
     """Read every record of a folder (with its sub-folders), a file, or a list of either.
 
@@ -95,8 +101,7 @@ def read_records(source: str | os.PathLike[str] | Iterable[str | os.PathLike[str
     for item in sources:
         if not item.exists():
             raise DataFileNotFoundError(f"There is no file or folder {os.fspath(item)!r} of records; {MAKE_ONE}")
-        # A hidden name is another process's unfinished write.
-        paths += [path for path in item.rglob("*.json") if path.name[0] != "."] if item.is_dir() else [item]
+        paths += record_files(item) if item.is_dir() else [item]
     if not paths:
         places = ", ".join(repr(os.fspath(item)) for item in sources) or "the empty list of files"
         raise DataFileNotFoundError(f"No result records (*.json) in {places}; {MAKE_ONE}")

@@ -87,7 +87,7 @@ class NeuralResponses:
         # Rows that stand twice in a table are a half; in a random order of many stimuli it is less than a third.
         return float(self.dataset.attrs.get("overlap", 0.0)) > 1 / 3
 
-    @property
+    @cached_property
     def doubts(self) -> tuple[str, ...]:
         """Notes on the recordings that every result must state."""
         trials, units = (

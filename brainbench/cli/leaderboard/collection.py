@@ -13,17 +13,16 @@ from brainbench.core.errors import DataFileNotFoundError
 from brainbench.core.files import to_json
 from brainbench.core.records import ResultRecord
 from leaderboards.audit import computation, conflicting, remarks
-from leaderboards.store import StoredRecord, read_records, write_record
+from leaderboards.store import StoredRecord, read_records, record_files, write_record
 
 
-def record_files(sources: list[Path]) -> list[Path]:
+def given_files(sources: list[Path]) -> list[Path]:
     """Return the record files among files and folders; a :class:`DataFileNotFoundError` for one that is missing."""
     found: list[Path] = []
     for source in sources:
         if not source.exists():
             raise DataFileNotFoundError(f"There is no record file or folder {str(source)!r}.")
-        inside = (path for path in source.rglob("*.json") if not path.name.startswith("."))
-        found += sorted(inside) if source.is_dir() else [source]
+        found += record_files(source) if source.is_dir() else [source]
     return found
 
 
@@ -63,7 +62,7 @@ def _take_in_one(
 
 def _present(to: Path) -> list[tuple[Path, ResultRecord]]:
     """Return the records of a folder."""
-    if not to.is_dir() or not record_files([to]):
+    if not to.is_dir() or not record_files(to):
         return []
     return [(item.path, item.record) for item in read_records(to) if item.record is not None]
 

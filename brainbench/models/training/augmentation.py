@@ -16,7 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from functools import cache, partial
+from functools import cache
 
 import torch
 from torch.nn import functional
@@ -61,8 +61,7 @@ class Augmentation:
         number-th sweep of a larger batch, from rank on; each sweep is then treated as it would be in the whole batch.
         """
         draw = SampledAugmentation(generator, *part)
-        change = partial(_physical, cells=self.cells) if self.kind == "physical" else KINDS[self.kind]
-        y = change(x, draw)
+        y = KINDS[self.kind](x, draw, self.cells)
         return mask_steps(y, self.masking, draw) if self.masking else y
 
 
@@ -141,14 +140,14 @@ def _places(direction: str, cells: tuple[int, ...]) -> tuple[int, ...]:
     return tuple(places)
 
 
-def _physical(x: torch.Tensor, draw: SampledAugmentation, cells: tuple[int, ...] = MOUSE) -> torch.Tensor:
+def _physical(x: torch.Tensor, draw: SampledAugmentation, cells: tuple[int, ...]) -> torch.Tensor:
     # Both flips together are the half turn, so three fair coins draw the eight motions evenly.
     for direction in _MIRRORED:
         x = torch.where(draw.coins(x), flip(x, direction, cells), x)
     return torch.where(draw.coins(x), reverse_time(x), x)
 
 
-def _thesis(x: torch.Tensor, draw: SampledAugmentation) -> torch.Tensor:
+def _thesis(x: torch.Tensor, draw: SampledAugmentation, _cells: tuple[int, ...]) -> torch.Tensor:
     drawn = torch.rand(4, generator=draw.generator, device=draw.generator.device).to(x.device)
     rows, columns = x.shape[3:]
     # Nothing is read back from the device: every outcome is a table, and the one drawn is looked up.
@@ -175,7 +174,7 @@ def _turned_places(rows: int, columns: int) -> tuple[int, ...]:
     return tuple(found)
 
 
-def _image(x: torch.Tensor, draw: SampledAugmentation) -> torch.Tensor:
+def _image(x: torch.Tensor, draw: SampledAugmentation, _cells: tuple[int, ...]) -> torch.Tensor:
     # Pictures have one unit per pixel: work in the units the networks see.
     units = tuple(Normaliser.physical(x.shape[2] // len(CHANNELS)).scale.flatten().tolist())
     scale = _constant(units, x.device).to(x.dtype).view(-1, 1, 1)
@@ -199,8 +198,8 @@ def _image(x: torch.Tensor, draw: SampledAugmentation) -> torch.Tensor:
     return y * scale
 
 
-KINDS: Mapping[str, Callable[[torch.Tensor, SampledAugmentation], torch.Tensor]] = {
-    "none": lambda x, draw: x,
+KINDS: Mapping[str, Callable[[torch.Tensor, SampledAugmentation, tuple[int, ...]], torch.Tensor]] = {
+    "none": lambda x, draw, cells: x,
     "physical": _physical,
     "thesis": _thesis,
     "image": _image,
