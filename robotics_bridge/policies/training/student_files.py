@@ -87,7 +87,8 @@ def load_student(folder: str | Path, *, device: str = "cpu") -> tuple[TactilePol
     found = from_json(_Described, described, CONFIG)
     config = from_json(DistillConfig, found.distill, CONFIG)
     own = {name: value for name, value in config.encoder_settings.items() if value is not None}
-    from_json(EncoderConfig, own, f"encoder_settings of {CONFIG}")
+    # Which settings it may have depends on the encoder's name.
+    from_json(EncoderConfig, {**own, "name": config.encoder}, f"encoder_settings of {CONFIG}")
     shapes, actions = shapes_of(found.groups, CONFIG, "groups"), found.actions
     with readable(folder / MODEL, "student", "It is damaged, or of another student."):
         _require_sizes(folder / MODEL, config, shapes)

@@ -102,6 +102,25 @@ def test_a_loaded_student_acts_as_the_one_that_was_saved_and_forgets_on_reset(tm
     torch.testing.assert_close(policy(world.observations), first[0])
 
 
+@pytest.mark.parametrize(
+    "changes",
+    [
+        # As `policy distill` leaves every network: with the calibration that it measured.
+        {"encoder": "zhuang-small", "encoder_settings": {"calibration": {"force": 2.0, "moment": 0.1}}},
+        {"encoder": "zhuang-small", "encoder_settings": {"learning": "finetuned", "options": {"unroll": "full"}}},
+        {"encoder": "zhuang-small.simclr", "encoder_settings": {"time": "resampled"}},
+        {"encoder": "rnn", "encoder_settings": {"units": 9}},
+        {"encoder": "reservoir", "encoder_settings": {"seed": 3, "features": 16}},
+    ],
+)
+def test_a_student_whose_encoder_has_settings_is_read_again_with_them(tmp_path, changes) -> None:
+    config = _config(**changes)
+    _run(tmp_path, iterations=1, **changes)
+    student, described = load_student(tmp_path)
+    assert DistillConfig.of(described["distill"]).tactile == config.tactile
+    assert torch.isfinite(Policy(student)(TouchWorld(3).observations)).all()
+
+
 def test_the_teacher_acts_in_its_share_of_steps(tmp_path) -> None:
     class Counting(TouchWorld):
         matched: tuple[int, int] = (0, 0)
