@@ -38,8 +38,9 @@ def holding(hand: Hand, **settings: float) -> Any:
 def holding_spec(hand: Hand, *, radius: float = 0.03, timestep: float = 0.002, reach: float = 0.6) -> Any:
     """Return the ``mujoco.MjSpec`` behind :func:`holding`: the palm's surface below the ball is at z = 0.
 
-    A hand whose file has no drives (a URDF) gets a weak position servo on every hinge and slide. The ball of 100 g has
-    a ``radius`` [m] and lies between the middle of the palm (``reach`` 0) and the roots of the fingers (1).
+    A hand gets a weak position servo on every hinge and slide unless all drives of its file are position servos of one
+    joint each. The ball of 100 g has a ``radius`` [m] and lies between the middle of the palm (``reach`` 0) and the
+    roots of the fingers (1).
 
     Raises:
         UsageError: the palm's side is unknown, or the radius is not positive.
@@ -53,7 +54,7 @@ def holding_spec(hand: Hand, *, radius: float = 0.03, timestep: float = 0.002, r
     spec.option.timestep = timestep
     for number, joint in enumerate(spec.joints):
         joint.name = joint.name or f"joint{number}"
-    if not hand.model.nu:
+    if _servoed(hand) is None:
         replace_drives(spec)
     palm = spec.body(hand.palm)
     # The shortest turn onto z is that of z onto the direction mirrored at z.
@@ -124,22 +125,38 @@ def _between(hand: Hand, spec: Any, jaws: dict[int, tuple[float, float]]) -> Any
 
 
 def closing(hand: Hand, share: float) -> NDArray[np.float64]:
-    """Return servo targets [joints] (rad, m) at which every joint is flexed, or closed, by a share of its range.
+    """Return targets (rad, m) of the servos of :func:`holding`, in their order: :func:`flexed` of their joints.
+
+    Raises:
+        UsageError: the share is not between 0 and 1.
+    """
+    target, joints = flexed(hand, share), _servoed(hand)
+    return target[np.isin(hand.model.jnt_type, (2, 3)) if joints is None else joints]
+
+
+def flexed(hand: Hand, share: float) -> NDArray[np.float64]:
+    """Return positions (rad, m) of all joints, by number, at which each is flexed, or closed, by a share of its range.
 
     Raises:
         UsageError: the share is not between 0 and 1.
     """
     check_number("share by which a hand closes", share, least=0, most=1)
-    model = hand.model
-    joints = model.actuator_trnid[:, 0] if model.nu else np.arange(model.njnt)
-    low, high = model.jnt_range[joints].T
+    low, high = hand.model.jnt_range.T
     # Flexion is the longer side of a joint's range.
     target = np.where(np.abs(high) >= np.abs(low), high, low) * share
     # Joints that spread the fingers stay in their middle.
-    target = np.where(np.abs(high + low) < 0.5 * np.ptp(model.jnt_range[joints], axis=1), 0.0, target)
+    target = np.where(np.abs(high + low) < 0.5 * (high - low), 0.0, target)
     for joint, (opened, closed) in jaw_ends(hand).items():
-        target[joints == joint] = opened + share * (closed - opened)
+        target[joint] = opened + share * (closed - opened)
     return target
+
+
+def _servoed(hand: Hand) -> NDArray[np.int32] | None:
+    """Return the joint of every drive of a hand's file; None unless all are position servos of a joint."""
+    model = hand.model
+    # Joint targets mean nothing to motors and tendons.
+    servos = (model.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT) & (model.actuator_biasprm[:, 1] < 0)
+    return model.actuator_trnid[:, 0] if model.nu and servos.all() else None
 
 
 def replace_drives(spec: Any) -> None:

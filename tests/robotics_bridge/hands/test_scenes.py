@@ -48,6 +48,27 @@ def test_an_impossible_ball_is_refused():
         holding(hands.load("xhand1"), reach=float("nan"))
 
 
+@pytest.mark.parametrize("drive", ['<motor joint="{0}"/>', '<position tendon="t{0}" kp="9"/>', '<position joint="{0}"/>'])
+def test_joints_flex_whatever_drives_the_file_has_and_in_whatever_order(tmp_path, drive):
+    spans = {"a": "0 1", "b": "0 .8", "c": "-1.2 0"}
+    bodies = "".join(
+        f'<body pos="0 {y} 0" name="{name}"><joint name="{name}" axis="0 1 0" range="{spans[name]}"/>'
+        '<geom type="capsule" size=".01" fromto="0 0 0 0 0 .05"/></body>'
+        for y, name in zip((-0.05, 0, 0.05), spans, strict=True)
+    )
+    tendons = "".join(f'<fixed name="t{name}"><joint joint="{name}" coef="1"/></fixed>' for name in spans)
+    (tmp_path / "hand.xml").write_text(
+        f'<mujoco><compiler angle="radian"/><worldbody><body name="palm"><geom type="box" size=".05 .05 .01"/>{bodies}'
+        f"</body></worldbody><tendon>{tendons}</tendon><actuator>"
+        f"{''.join(drive.format(name) for name in reversed(spans))}</actuator></mujoco>"
+    )
+    hand = hands.load(tmp_path / "hand.xml")
+    model = holding(hand, radius=0.02)
+    driven = [model.joint(number).name for number in model.actuator_trnid[:, 0]]
+    assert (model.actuator_biasprm[:, 1] < 0).all()
+    assert dict(zip(driven, closing(hand, 0.5).round(9), strict=True)) == {"a": 0.5, "b": 0.4, "c": -0.6}
+
+
 @pytest.mark.parametrize("share", [float("nan"), float("inf"), -0.1, 1.1, 72, None])
 def test_a_hand_closes_by_a_share_between_none_and_all(share):
     with pytest.raises(UsageError, match=f"closes .*received {share}"):
