@@ -107,6 +107,8 @@ def play(
             rewards.append(float(reward))
             over = bool(terminated | truncated)
             ended += over
+            if over and (forget := getattr(act, "reset", None)) is not None:
+                forget(terminated | truncated)
             full = limit is not None and float(info["goals"]) >= limit
             dropped += bool(terminated) and not bool(info["diverged"]) and not full
             if over or step == steps - 1:
