@@ -107,11 +107,13 @@ def extent(lags: NDArray[np.int64], guess: tuple[int, int]) -> tuple[int, int]:
 
 
 def calm(model: NDArray[np.float64], y: NDArray[np.float64], longest: int) -> float:
-    """Return the noise's variance in readings [T, N] where lags of up to ``longest`` matter least (a quarter of them)."""
+    """Return the noise's variance in the quarter of readings [T, N] for which lags of up to ``longest`` matter least."""
     rows = np.arange(longest, len(model))
+    if len(rows) < 2:
+        return np.inf
     moves = np.ptp(model[rows[:, None] - np.arange(longest + 1)], axis=1)
-    still = moves <= np.quantile(moves, 0.25)
-    return float(np.mean(np.diff(y[rows], axis=0)[still[1:] & still[:-1]] ** 2)) / 2
+    either = np.maximum(moves[1:], moves[:-1])
+    return float(np.mean(np.diff(y[rows], axis=0)[either <= np.quantile(either, 0.25)] ** 2)) / 2
 
 
 def _level(rest: NDArray, moves: NDArray, noise: float) -> NDArray:

@@ -48,7 +48,9 @@ def test_an_impossible_ball_is_refused():
         holding(hands.load("xhand1"), reach=float("nan"))
 
 
-@pytest.mark.parametrize("drive", ['<motor joint="{0}"/>', '<position tendon="t{0}" kp="9"/>', '<position joint="{0}"/>'])
+@pytest.mark.parametrize(
+    "drive", ['<motor joint="{0}"/>', '<position tendon="t{0}" kp="9"/>', '<position joint="{0}"/>']
+)
 def test_joints_flex_whatever_drives_the_file_has_and_in_whatever_order(tmp_path, drive):
     spans = {"a": "0 1", "b": "0 .8", "c": "-1.2 0"}
     bodies = "".join(
