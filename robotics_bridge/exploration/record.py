@@ -231,7 +231,7 @@ class _World:
         joint = model.body(OBJECT).jntadr[0]
         self._at, self._speed = int(model.jnt_qposadr[joint]), int(model.jnt_dofadr[joint])
         self._place = model.body(OBJECT).pos.copy()
-        self._drives = [model.actuator(name).id for name in self.hand.joints] if all(self.hand.joints) else slice(None)
+        self._drives = [model.actuator(name).id for name in self.hand.joints]
         # Jaws are not at zero when they are open.
         driven = np.isin(self.hand.model.jnt_type, (2, 3))
         self._open, self._closed = (flexed(self.hand, share)[driven] for share in (0.0, 1.0))

@@ -52,8 +52,6 @@ def holding_spec(hand: Hand, *, radius: float = 0.03, timestep: float = 0.002, r
     surface = surface + reach * step
     spec = hand.mjspec()
     spec.option.timestep = timestep
-    for number, joint in enumerate(spec.joints):
-        joint.name = joint.name or f"joint{number}"
     if _servoed(hand) is None:
         replace_drives(spec)
     palm = spec.body(hand.palm)
@@ -154,8 +152,9 @@ def flexed(hand: Hand, share: float) -> NDArray[np.float64]:
 def _servoed(hand: Hand) -> NDArray[np.int32] | None:
     """Return the joint of every drive of a hand's file; None unless all are position servos of a joint."""
     model = hand.model
-    # Joint targets mean nothing to motors and tendons.
+    # Joint targets mean nothing to motors and tendons, and something else behind a gear or another unit.
     servos = (model.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT) & (model.actuator_biasprm[:, 1] < 0)
+    servos &= (model.actuator_gainprm[:, 0] == -model.actuator_biasprm[:, 1]) & (model.actuator_gear[:, 0] == 1)
     return model.actuator_trnid[:, 0] if model.nu and servos.all() else None
 
 

@@ -173,10 +173,12 @@ def _drives(hand: Hand) -> dict[str, tuple[float, float, float]]:
         stiffness, damping = _STIFFNESS, _DAMPING
         if joint in servos:
             index = servos[joint]
-            stiffness = float(-model.actuator_biasprm[index, 1])
-            damping = float(-model.actuator_biasprm[index, 2])
+            # Behind a gear, the servo's length and force are those of the motor.
+            gear = abs(float(model.actuator_gear[index, 0]))
+            stiffness = float(-model.actuator_biasprm[index, 1]) * gear**2
+            damping = float(-model.actuator_biasprm[index, 2]) * gear**2
             limited = bool(model.actuator_forcelimited[index])
-            effort = float(model.actuator_forcerange[index, 1]) if limited else 10 * stiffness
+            effort = float(model.actuator_forcerange[index, 1]) * gear if limited else 10 * stiffness
         found[model.joint(joint).name] = (stiffness, damping, effort)
     return found
 

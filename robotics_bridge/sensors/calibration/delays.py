@@ -107,7 +107,7 @@ def extent(lags: NDArray[np.int64], guess: tuple[int, int]) -> tuple[int, int]:
 
 
 def calm(model: NDArray[np.float64], y: NDArray[np.float64], longest: int) -> float:
-    """Return the noise's variance in the quarter of readings [T, N] for which lags of up to ``longest`` matter least."""
+    """Return the noise's variance in the quarter of readings [T, N] that lags of up to ``longest`` move least."""
     rows = np.arange(longest, len(model))
     if len(rows) < 2:
         return np.inf

@@ -49,7 +49,13 @@ def test_an_impossible_ball_is_refused():
 
 
 @pytest.mark.parametrize(
-    "drive", ['<motor joint="{0}"/>', '<position tendon="t{0}" kp="9"/>', '<position joint="{0}"/>']
+    "drive",
+    [
+        '<motor joint="{0}"/>',
+        '<position tendon="t{0}" kp="9"/>',
+        '<position joint="{0}"/>',
+        '<position joint="{0}" gear="2"/>',
+    ],
 )
 def test_joints_flex_whatever_drives_the_file_has_and_in_whatever_order(tmp_path, drive):
     spans = {"a": "0 1", "b": "0 .8", "c": "-1.2 0"}
