@@ -6,12 +6,12 @@ import contextlib
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from brainbench.core.devices import mujoco_module
 from brainbench.core.errors import UsageError
 from brainbench.core.reading.ranges import check_number
-from brainbench.core.rotations import from_z_axis, to_matrices
+from brainbench.core.rotations import from_matrices, from_z_axis, to_matrices
 from robotics_bridge.hands.facing import half_open, link_middle, palmar_directions, slide_of
 from robotics_bridge.hands.hand import Hand
 from robotics_bridge.hands.spec import add_servo
@@ -54,10 +54,9 @@ def holding_spec(hand: Hand, *, radius: float = 0.03, timestep: float = 0.002, r
     spec.option.timestep = timestep
     if _servoed(hand) is None:
         replace_drives(spec)
-    palm = spec.body(hand.palm)
     # The shortest turn onto z is that of z onto the direction mirrored at z.
     turn = from_z_axis(up * (-1.0, -1.0, 1.0))
-    palm.quat, palm.pos = turn, -to_matrices(turn) @ surface
+    place_palm(hand, spec, -to_matrices(turn) @ surface, turn)
     ball = spec.worldbody.add_body(name=OBJECT, pos=(0.0, 0.0, radius + 1e-3))
     ball.add_freejoint()
     ball.add_geom(
@@ -65,6 +64,26 @@ def holding_spec(hand: Hand, *, radius: float = 0.03, timestep: float = 0.002, r
         friction=(1.0, 0.01, 1e-4),
     )  # fmt: skip
     return spec
+
+
+def place_palm(hand: Hand, spec: Any, place: ArrayLike, turn: ArrayLike) -> Any:
+    """Put the palm to a place [3] (m) and orientation (w, x, y, z) of the world; return the body that was moved.
+
+    That is the palm, or what carries it: a wrist and forearm stay attached.
+    """
+    model, palm = hand.model, hand.model.body(hand.palm).id
+    body = spec.body(model.body(model.body_rootid[palm]).name)
+    if body.name != hand.palm:
+        data = mujoco.MjData(model)
+        mujoco.mj_kinematics(model, data)
+        own, root = (data.xmat[number].reshape(3, 3) for number in (palm, model.body_rootid[palm]))
+        moved = to_matrices(turn) @ own.T
+        place = np.asarray(place) + moved @ (data.xpos[model.body_rootid[palm]] - data.xpos[palm])
+        turn = from_matrices(moved @ root)
+    # An orientation that the file gives as angles would come before the quaternion.
+    body.alt.type = mujoco.mjtOrientation.mjORIENTATION_QUAT
+    body.pos, body.quat = place, turn
+    return body
 
 
 def _raised(model: Any) -> Any:
@@ -98,10 +117,11 @@ def jaw_ends(hand: Hand) -> dict[int, tuple[float, float]]:
 def _between(hand: Hand, spec: Any, jaws: dict[int, tuple[float, float]]) -> Any:
     """Return the model of a gripper that starts with the ball between its jaws, which all but touch it."""
     model, data = hand.model, half_open(hand.model)
-    palm, body = data.body(hand.palm), spec.body(hand.palm)
+    root = data.body(model.body_rootid[model.body(hand.palm).id])
+    body = spec.body(root.name)
     middle = np.mean([link_middle(model, data, model.body(tip).id) for tip in hand.tips], axis=0)
     ball = spec.body(OBJECT)
-    ball.pos = body.pos + to_matrices(body.quat) @ palm.xmat.reshape(3, 3).T @ (middle - palm.xpos)
+    ball.pos = body.pos + to_matrices(body.quat) @ root.xmat.reshape(3, 3).T @ (middle - root.xpos)
     starts = {joint: np.array(model.body_pos[model.jnt_bodyid[joint]]) for joint in jaws}
     made = None
     for smaller in range(6):
