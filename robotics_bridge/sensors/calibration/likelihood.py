@@ -158,7 +158,7 @@ def fit_dynamics(parts: list[Aligned], dt: float, quantum: float, *, moving: boo
     noise, plain_cost = minimum(
         lambda p: dynamics_of(p[0], p[1], 0.0, no_lag), [math.log(spread / 2), math.log(spread / 20)]
     )
-    plain = dynamics_of(*noise, 0.0, no_lag)
+    plain = dynamics_of(noise[0], noise[1], 0.0, no_lag)
     best, cost = plain, plain_cost
     if moving:
         # The likelihood has several maxima in τ: starts spread over the decades that the log can tell.
