@@ -27,7 +27,7 @@ from brainbench.models.network import SUB_STEP_SECONDS, SUB_STEPS
 from robotics_bridge import hands
 from robotics_bridge.exploration.procedures import PROCEDURES, STEP, Pose
 from robotics_bridge.hands.observations import observe, sensors_for
-from robotics_bridge.hands.scenes import OBJECT, closing, holding_spec, replace_drives
+from robotics_bridge.hands.scenes import OBJECT, flexed, holding_spec, replace_drives
 from robotics_bridge.physics import Geometry, MujocoEngine
 from robotics_bridge.physics.variants import compile_variants
 from robotics_bridge.policies.encoders.calibration import HandCalibration
@@ -231,9 +231,10 @@ class _World:
         joint = model.body(OBJECT).jntadr[0]
         self._at, self._speed = int(model.jnt_qposadr[joint]), int(model.jnt_dofadr[joint])
         self._place = model.body(OBJECT).pos.copy()
-        self._drives = [model.actuator(name).id for name in self.hand.joints] if all(self.hand.joints) else slice(None)
+        self._drives = [model.actuator(name).id for name in self.hand.joints]
         # Jaws are not at zero when they are open.
-        self._open, self._closed = closing(self.hand, 0.0), closing(self.hand, 1.0)
+        driven = np.isin(self.hand.model.jnt_type, (2, 3))
+        self._open, self._closed = (flexed(self.hand, share)[driven] for share in (0.0, 1.0))
         # How far the lowest point of a held object lies below its body's origin (m), by the support function downwards:
         # row 2 of the rotation is the vertical in the object's frame.
         self._bottoms = {id(item): float(item.geometry.reach(-to_matrices(item.quaternion)[2])) for item in kinds}

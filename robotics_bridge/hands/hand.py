@@ -175,8 +175,8 @@ class Hand:
 def read_mjspec(path: Path) -> Any:
     """Read a URDF or MJCF file.
 
-    Meshes for display only are dropped (their files are often absent), degenerate inertias are bounded, and mesh
-    paths given from the file's own folder are found too.
+    Meshes for display only are dropped (their files are often absent), degenerate inertias are bounded, mesh paths
+    given from the file's own folder are found too, and bodies and joints without a name are numbered.
 
     Raises:
         DataFileNotFoundError: the file is missing.
@@ -200,6 +200,9 @@ def read_mjspec(path: Path) -> Any:
         root = spec.worldbody.first_body()
         kinds = {"type": mujoco.mjtSensor.mjSENS_FRAMEPOS, "objtype": mujoco.mjtObj.mjOBJ_BODY}
         spec.add_sensor(name="palm_pose", objname=root.name, **kinds)
+    for kind, items in (("link", spec.bodies), ("joint", spec.joints)):
+        for number, item in enumerate(items):
+            item.name = item.name or f"{kind}{number}"
     spec.compiler.boundmass = max(spec.compiler.boundmass, 1e-6)
     spec.compiler.boundinertia = max(spec.compiler.boundinertia, 1e-9)
     return spec

@@ -6,12 +6,12 @@ import contextlib
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from brainbench.core.devices import mujoco_module
 from brainbench.core.errors import UsageError
 from brainbench.core.reading.ranges import check_number
-from brainbench.core.rotations import from_z_axis, to_matrices
+from brainbench.core.rotations import from_matrices, from_z_axis, to_matrices
 from robotics_bridge.hands.facing import half_open, link_middle, palmar_directions, slide_of
 from robotics_bridge.hands.hand import Hand
 from robotics_bridge.hands.spec import add_servo
@@ -38,8 +38,9 @@ def holding(hand: Hand, **settings: float) -> Any:
 def holding_spec(hand: Hand, *, radius: float = 0.03, timestep: float = 0.002, reach: float = 0.6) -> Any:
     """Return the ``mujoco.MjSpec`` behind :func:`holding`: the palm's surface below the ball is at z = 0.
 
-    A hand whose file has no drives (a URDF) gets a weak position servo on every hinge and slide. The ball of 100 g has
-    a ``radius`` [m] and lies between the middle of the palm (``reach`` 0) and the roots of the fingers (1).
+    A hand gets a weak position servo on every hinge and slide unless all drives of its file are position servos of one
+    joint each. The ball of 100 g has a ``radius`` [m] and lies between the middle of the palm (``reach`` 0) and the
+    roots of the fingers (1).
 
     Raises:
         UsageError: the palm's side is unknown, or the radius is not positive.
@@ -51,14 +52,11 @@ def holding_spec(hand: Hand, *, radius: float = 0.03, timestep: float = 0.002, r
     surface = surface + reach * step
     spec = hand.mjspec()
     spec.option.timestep = timestep
-    for number, joint in enumerate(spec.joints):
-        joint.name = joint.name or f"joint{number}"
-    if not hand.model.nu:
+    if _servoed(hand) is None:
         replace_drives(spec)
-    palm = spec.body(hand.palm)
     # The shortest turn onto z is that of z onto the direction mirrored at z.
     turn = from_z_axis(up * (-1.0, -1.0, 1.0))
-    palm.quat, palm.pos = turn, -to_matrices(turn) @ surface
+    place_palm(hand, spec, -to_matrices(turn) @ surface, turn)
     ball = spec.worldbody.add_body(name=OBJECT, pos=(0.0, 0.0, radius + 1e-3))
     ball.add_freejoint()
     ball.add_geom(
@@ -66,6 +64,26 @@ def holding_spec(hand: Hand, *, radius: float = 0.03, timestep: float = 0.002, r
         friction=(1.0, 0.01, 1e-4),
     )  # fmt: skip
     return spec
+
+
+def place_palm(hand: Hand, spec: Any, place: ArrayLike, turn: ArrayLike) -> Any:
+    """Put the palm to a place [3] (m) and orientation (w, x, y, z) of the world; return the body that was moved.
+
+    That is the palm, or what carries it: a wrist and forearm stay attached.
+    """
+    model, palm = hand.model, hand.model.body(hand.palm).id
+    body = spec.body(model.body(model.body_rootid[palm]).name)
+    if body.name != hand.palm:
+        data = mujoco.MjData(model)
+        mujoco.mj_kinematics(model, data)
+        own, root = (data.xmat[number].reshape(3, 3) for number in (palm, model.body_rootid[palm]))
+        moved = to_matrices(turn) @ own.T
+        place = np.asarray(place) + moved @ (data.xpos[model.body_rootid[palm]] - data.xpos[palm])
+        turn = from_matrices(moved @ root)
+    # An orientation that the file gives as angles would come before the quaternion.
+    body.alt.type = mujoco.mjtOrientation.mjORIENTATION_QUAT
+    body.pos, body.quat = place, turn
+    return body
 
 
 def _raised(model: Any) -> Any:
@@ -99,10 +117,11 @@ def jaw_ends(hand: Hand) -> dict[int, tuple[float, float]]:
 def _between(hand: Hand, spec: Any, jaws: dict[int, tuple[float, float]]) -> Any:
     """Return the model of a gripper that starts with the ball between its jaws, which all but touch it."""
     model, data = hand.model, half_open(hand.model)
-    palm, body = data.body(hand.palm), spec.body(hand.palm)
+    root = data.body(model.body_rootid[model.body(hand.palm).id])
+    body = spec.body(root.name)
     middle = np.mean([link_middle(model, data, model.body(tip).id) for tip in hand.tips], axis=0)
     ball = spec.body(OBJECT)
-    ball.pos = body.pos + to_matrices(body.quat) @ palm.xmat.reshape(3, 3).T @ (middle - palm.xpos)
+    ball.pos = body.pos + to_matrices(body.quat) @ root.xmat.reshape(3, 3).T @ (middle - root.xpos)
     starts = {joint: np.array(model.body_pos[model.jnt_bodyid[joint]]) for joint in jaws}
     made = None
     for smaller in range(6):
@@ -124,22 +143,39 @@ def _between(hand: Hand, spec: Any, jaws: dict[int, tuple[float, float]]) -> Any
 
 
 def closing(hand: Hand, share: float) -> NDArray[np.float64]:
-    """Return servo targets [joints] (rad, m) at which every joint is flexed, or closed, by a share of its range.
+    """Return targets (rad, m) of the servos of :func:`holding`, in their order: :func:`flexed` of their joints.
+
+    Raises:
+        UsageError: the share is not between 0 and 1.
+    """
+    target, joints = flexed(hand, share), _servoed(hand)
+    return target[np.isin(hand.model.jnt_type, (2, 3)) if joints is None else joints]
+
+
+def flexed(hand: Hand, share: float) -> NDArray[np.float64]:
+    """Return positions (rad, m) of all joints, by number, at which each is flexed, or closed, by a share of its range.
 
     Raises:
         UsageError: the share is not between 0 and 1.
     """
     check_number("share by which a hand closes", share, least=0, most=1)
-    model = hand.model
-    joints = model.actuator_trnid[:, 0] if model.nu else np.arange(model.njnt)
-    low, high = model.jnt_range[joints].T
+    low, high = hand.model.jnt_range.T
     # Flexion is the longer side of a joint's range.
     target = np.where(np.abs(high) >= np.abs(low), high, low) * share
     # Joints that spread the fingers stay in their middle.
-    target = np.where(np.abs(high + low) < 0.5 * np.ptp(model.jnt_range[joints], axis=1), 0.0, target)
+    target = np.where(np.abs(high + low) < 0.5 * (high - low), 0.0, target)
     for joint, (opened, closed) in jaw_ends(hand).items():
-        target[joints == joint] = opened + share * (closed - opened)
+        target[joint] = opened + share * (closed - opened)
     return target
+
+
+def _servoed(hand: Hand) -> NDArray[np.int32] | None:
+    """Return the joint of every drive of a hand's file; None unless all are position servos of a joint."""
+    model = hand.model
+    # Joint targets mean nothing to motors and tendons, and something else behind a gear or another unit.
+    servos = (model.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT) & (model.actuator_biasprm[:, 1] < 0)
+    servos &= (model.actuator_gainprm[:, 0] == -model.actuator_biasprm[:, 1]) & (model.actuator_gear[:, 0] == 1)
+    return model.actuator_trnid[:, 0] if model.nu and servos.all() else None
 
 
 def replace_drives(spec: Any) -> None:

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 _LOG = logging.getLogger(__name__)
 _SAME_ANGLE = 1e-4
-"""Difference of two rest positions that is rounding [rad]."""
+"""Difference of two positions that is rounding [rad]."""
 
 
 def with_contacts_of(task: Task, policies: Iterable[str]) -> Task:
@@ -57,7 +57,8 @@ def check_version(described: Mapping[str, Any], name: str) -> None:
 def check_actions(described: Mapping[str, Any], env: Env, name: str) -> None:
     """Check that an action means the target that it meant in training; raise UsageError where it does not.
 
-    Tasks and their configurations differ in the pose from which actions are counted. Earlier runs do not state theirs.
+    Tasks, their configurations and hands differ in the pose from which actions are counted, and in their units. Earlier
+    runs do not state theirs.
     """
     given = from_json(dict, described.get("deployment", described), f"deployment of {name}")
     if "action_map" not in given:
@@ -68,12 +69,13 @@ def check_actions(described: Mapping[str, Any], env: Env, name: str) -> None:
             f"The policy {name!r} moves {', '.join(own.names)} (task {str(given.get('task'))[:80]!r}), and the task "
             f"{env.task.name!r} moves {', '.join(here.names)}: take the task in which it was trained."
         )
-    for joint, trained, rest in zip(own.names, own.default, here.default.tolist(), strict=True):
-        if abs(trained - rest) > _SAME_ANGLE:
-            raise UsageError(
-                f"Actions of the policy {name!r} are counted from {joint} = {trained:g} rad, and here from {rest:g} "
-                "rad: take the task and the configuration (--config) in which it was trained."
-            )
+    for what, theirs, ours in (("are counted from", own.default, here.default), ("move by", own.scale, here.scale)):
+        for joint, trained, now in zip(own.names, theirs, ours.tolist(), strict=True):
+            if abs(trained - now) > _SAME_ANGLE:
+                raise UsageError(
+                    f"Actions of the policy {name!r} {what} {joint} = {trained:g} rad, and here {now:g} rad: take the "
+                    "task, the hand and the configuration (--config) in which it was trained."
+                )
 
 
 def check_fit(described: Mapping[str, Any], env: Env, name: str) -> None:

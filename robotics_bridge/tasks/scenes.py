@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from brainbench.core.devices import mujoco_module
 from brainbench.core.errors import UsageError, check_each
 from robotics_bridge.hands.hand import Hand
-from robotics_bridge.hands.scenes import palm_surface
+from robotics_bridge.hands.scenes import palm_surface, place_palm
 from robotics_bridge.physics.scene import excluded_links
 from robotics_bridge.tasks.contact_model import ContactModel, set_contacts
 from robotics_bridge.tasks.objects import ObjectShape, add_object, slots, with_sizes
@@ -121,8 +121,7 @@ def _hand_spec(task: Task, hand: Hand) -> tuple[Any, dict[str, tuple[float, floa
     option.timestep = solver.timestep / task.contacts.substeps
     option.iterations, option.ls_iterations = solver.iterations, solver.line_search
     option.tolerance, option.integrator = solver.tolerance, mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-    palm = spec.body(hand.palm)
-    palm.pos, palm.quat = task.hand_poses[hand.name] if hand.name in task.hand_poses else palm_up(hand)
+    body = place_palm(hand, spec, *(task.hand_poses.get(hand.name) or palm_up(hand)))
     scale = task.contacts.drive_scale
     drives = {name: (scale * k, scale * d, scale * most) for name, (k, d, most) in _drives(hand).items()}
     while spec.actuators:
@@ -134,17 +133,17 @@ def _hand_spec(task: Task, hand: Hand) -> tuple[Any, dict[str, tuple[float, floa
     for axis, ((low, high), stiffness, damping, effort) in task.carriage.items():
         # The carriage moves along world axes, while a joint's axis is given in the frame of its body: rows of Rᵀ.
         matrix = np.zeros(9)
-        mujoco.mju_quat2Mat(matrix, np.array(palm.quat, dtype=float))
+        mujoco.mju_quat2Mat(matrix, np.array(body.quat, dtype=float))
         name = f"carriage_{axis}"
-        palm.add_joint(
+        body.add_joint(
             name=name, type=mujoco.mjtJoint.mjJNT_SLIDE, axis=matrix.reshape(3, 3)["xyz".index(axis)],
             range=(low, high), limited=True, armature=1.0,
         )  # fmt: skip
         slides[name] = (stiffness, damping, effort)
     if slides:
         # A robot arm bears the weight of the hand.
-        for body in spec.bodies:
-            body.gravcomp = 1.0
+        for each in spec.bodies:
+            each.gravcomp = 1.0
     drives |= slides
     for name, (_, _, effort) in drives.items():
         spec.add_actuator(
@@ -173,10 +172,12 @@ def _drives(hand: Hand) -> dict[str, tuple[float, float, float]]:
         stiffness, damping = _STIFFNESS, _DAMPING
         if joint in servos:
             index = servos[joint]
-            stiffness = float(-model.actuator_biasprm[index, 1])
-            damping = float(-model.actuator_biasprm[index, 2])
+            # Behind a gear, the servo's length and force are those of the motor.
+            gear = abs(float(model.actuator_gear[index, 0]))
+            stiffness = float(-model.actuator_biasprm[index, 1]) * gear**2
+            damping = float(-model.actuator_biasprm[index, 2]) * gear**2
             limited = bool(model.actuator_forcelimited[index])
-            effort = float(model.actuator_forcerange[index, 1]) if limited else 10 * stiffness
+            effort = float(model.actuator_forcerange[index, 1]) * gear if limited else 10 * stiffness
         found[model.joint(joint).name] = (stiffness, damping, effort)
     return found
 

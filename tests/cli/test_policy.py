@@ -6,6 +6,7 @@ import json
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 from typer.testing import CliRunner
@@ -69,6 +70,29 @@ def _student(folder: Path) -> Path:
     words = ("--teacher", "in_palm_rotate.teacher", "--observe", "force_torque", "--envs", "1", "--stop-at", "1")
     _run("distill", "in_palm_rotate", *words, "--iterations", "1", "--episodes", "0", "--out", str(folder / "felt"))
     return folder / "felt"
+
+
+def test_a_policy_that_plays_forgets_an_episode_that_ended(quick: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    import torch
+
+    steps = []
+
+    class Remembering:
+        def __init__(self, _: str, env: Any, **__: Any) -> None:
+            self.action = torch.zeros(1, env.num_actions)
+            steps.append(0)
+
+        def __call__(self, _: object) -> torch.Tensor:
+            steps[-1] += 1
+            return self.action
+
+        def reset(self, mask: torch.Tensor) -> None:
+            assert mask.tolist() == [True]
+            steps.append(0)
+
+    monkeypatch.setattr("brainbench.cli.policy.play.agent_of", Remembering)
+    _run("play", "quick", "--task-file", str(quick), "--seconds", "0.25")
+    assert steps == [4, 4, 2]
 
 
 def test_playing_needs_no_package_for_training_and_checks_names_first() -> None:

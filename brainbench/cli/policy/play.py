@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any
@@ -88,7 +89,7 @@ def play(
     steps = max(round(seconds / env.step_dt), 1)
     rewards: list[float] = []
     ended, dropped, goals, turned = 0, 0, 0, 0.0
-    limit = env.task.goal.limit if env.task.goal is not None else None
+    limit = (env.task.goal.limit if env.task.goal is not None else None) or math.inf
     with progress_bar() as progress:
         size = (width, round(width * 5 / 6))
         stage = drawing.Stage(env, size) if pictures else None
@@ -107,8 +108,9 @@ def play(
             rewards.append(float(reward))
             over = bool(terminated | truncated)
             ended += over
-            full = limit is not None and float(info["goals"]) >= limit
-            dropped += bool(terminated) and not bool(info["diverged"]) and not full
+            if over and (forget := getattr(act, "reset", None)) is not None:
+                forget(terminated | truncated)
+            dropped += bool(terminated) and not bool(info["diverged"]) and float(info["goals"]) < limit
             if over or step == steps - 1:
                 goals, turned = goals + int(info["goals"]), turned + float(info["turned"])
             progress(step + 1, steps, "playing")

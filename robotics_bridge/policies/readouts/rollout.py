@@ -57,9 +57,11 @@ def collect(env: Env, policy: Acting, seconds: float) -> TouchRollout:
     """
     if env.options.observe != "force_torque" or env.touch is None:
         raise UsageError("A probe reads force and torque: make the environment with observe='force_torque'.")
-    # Episodes begin at different times, so that no step holds only beginnings.
-    observations = env.reset()
+    observations, forget = env.reset(), getattr(policy, "reset", None)
     age = torch.zeros(env.num_envs, dtype=torch.long, device=env.device)
+    if forget is not None:
+        # A policy may remember what it did before this rollout.
+        forget(age == 0)
     kept: dict[str, list[torch.Tensor]] = {}
     for _ in range(round(seconds / env.step_dt)):
         velocity, spin = env.state.target_velocity
@@ -71,7 +73,7 @@ def collect(env: Env, policy: Acting, seconds: float) -> TouchRollout:
             kept.setdefault(name, []).append(value.clone())
         observations, _, terminated, truncated, _ = env.step(policy(observations))
         done = terminated | truncated
-        if (forget := getattr(policy, "reset", None)) is not None:
+        if forget is not None:
             forget(done)
         age = torch.where(done, 0, age + 1)
     stacked = {name: torch.stack(rows) for name, rows in kept.items()}

@@ -97,7 +97,8 @@ class Listener:
         rate, age, block = self.samples / dt, c.age, (self.samples, envs)
         # The ring holds the longest delay, reach / c, a few samples for the interpolation, and the block being written.
         blocks = math.ceil((m.reach / m.speed_of_sound * rate + 3) / self.samples) + 1
-        if self._ring is None:
+        fresh = self._ring is None
+        if fresh:
             self._ring = c.zeros((blocks * self.samples, envs, len(self._sources)))
         if self._ring.shape[0] != blocks * self.samples:
             raise UsageError(f"The time step of a microphone stays as it was; received another, {dt:g} s.")
@@ -109,7 +110,9 @@ class Listener:
             c.launch(k.record_source, block, runtime.io.truth, part.start, part.count, self._slot, index, self._ring)
         # Lengths at the start and the end of the block: the kernel lets them change evenly in between.
         place, paths = warp().vec3f(*m.position), [self._now, self._before]
-        c.launch(k.measure_paths, self._now.shape, state.pose, self._links, self._link, place, age, *paths)
+        # Before the first block, the way was that of its end.
+        for _ in range(1 + fresh):
+            c.launch(k.measure_paths, self._now.shape, state.pose, self._links, self._link, place, age, *paths)
         inputs = [self._ring, self._slot, self.samples, rate, m.speed_of_sound, m.nearest, m.power, age]
         c.launch(k.mix_sources, block, *inputs, *paths, self._out)
         warp().to_torch(self._out).masked_fill_(self.diverged, math.nan)

@@ -14,7 +14,7 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -23,9 +23,9 @@ from scipy.stats import beta
 
 from brainbench.core.errors import DataError
 from brainbench.core.reading.ranges import check_number
-from robotics_bridge.sensors.calibration.delays import align, extent, find_delays, find_lags
+from robotics_bridge.sensors.calibration.delays import align, calm, extent, find_delays, find_lags
 from robotics_bridge.sensors.calibration.likelihood import Z95, Estimate, Fit, fit_dynamics
-from robotics_bridge.sensors.calibration.log import SHORTEST, Log, find_dead, find_quantum, segments
+from robotics_bridge.sensors.calibration.log import SHORTEST, Episode, Log, find_dead, find_quantum, segments
 from robotics_bridge.sensors.noise.model import Noise
 
 NOT_FITTED = ("radius", "crosstalk")
@@ -83,17 +83,26 @@ def calibrate(log: Log, *, max_delay: float = 0.5) -> Calibration:
     how = "all readings are its multiples" if quantum else "none found"
     estimates["quantum"] = Estimate(quantum, quantum, quantum, how)
     moving = log.reference is not None
-    guess = find_delays(living, round(max_delay / log.step)) if moving else (0, 0)
+    longest = round(max_delay / log.step)
+    guess = find_delays(living, longest) if moving else (0, 0)
+    if moving and guess[1] == longest < find_delays(living, longest + 1)[1]:
+        raise DataError(
+            f"The readings come later after the reference than the longest delay that was tried ({max_delay:g} s, "
+            f"{longest} readings); allow a longer one (max_delay)."
+        )
     fit = fit_dynamics(align(living, *guess), log.step, quantum, moving=moving)
     lags = np.zeros(0, int)
-    for _ in range(_ROUNDS if moving and guess[1] else 0):
-        aligned, found = find_lags(living, guess, log.step, fit)
-        # Lags and dynamics are fitted in turn: each is simple where the other is known. Ends when the lags stay as they
-        # are.
-        settled, lags = np.array_equal(found, lags), found
-        if settled or (guess[0] == guess[1] and np.all(lags == guess[0])):
-            break
-        fit = fit_dynamics(aligned, log.step, quantum, moving=True, known=fit)
+    if moving and guess[1]:
+        # Hysteresis can stand for a part of a delay that varies, so lags are also sought without it.
+        starts = [fit] + [replace(fit, dynamics=fit.dynamics._replace(hysteresis=0.0))] * bool(fit.dynamics.hysteresis)
+        settled = [_settle(living, guess, log.step, quantum, start) for start in starts]
+        fit, lags = min(settled, key=lambda found: _spread(found[0]))
+        rest = [calm(fit.dynamics.response(x, log.step), y, 2 * guess[1]) for x, y in living]
+        if _spread(fit) > 2 * np.median(rest):
+            notes.append(
+                "Where the reference moves, readings differ more from the model than where it rests: delay, jitter, "
+                "hysteresis and white noise may be wrong; log more presses."
+            )
     if log.reference is None:
         notes.append("Without a column 'reference' the true signal counts as 0: gain, delay, hysteresis and dead "
                      "probes were not fitted.")  # fmt: skip
@@ -109,6 +118,24 @@ def calibrate(log: Log, *, max_delay: float = 0.5) -> Calibration:
     estimates = {name: estimates[name] for name in ORDER if name in estimates}
     about = {"readings": int(log.readings.size), "probes": list(log.probes), "episodes": len(parts), "step": log.step}
     return Calibration(_noise(estimates), estimates, tuple(notes), about)
+
+
+def _spread(fit: Fit) -> float:
+    return fit.dynamics.white**2 + fit.dynamics.walk**2
+
+
+def _settle(
+    living: list[Episode], guess: tuple[int, int], step: float, quantum: float, fit: Fit
+) -> tuple[Fit, NDArray[np.int64]]:
+    """Return dynamics and certain lags: each is simple where the other is known, so they are fitted in turn."""
+    lags = np.zeros(0, int)
+    for _ in range(_ROUNDS):
+        aligned, found = find_lags(living, guess, step, fit)
+        settled, lags = np.array_equal(found, lags), found
+        if settled or (guess[0] == guess[1] and np.all(lags == guess[0])):
+            break
+        fit = fit_dynamics(aligned, step, quantum, moving=True, known=fit)
+    return fit, lags
 
 
 def _noise(estimates: Mapping[str, Estimate]) -> Noise:

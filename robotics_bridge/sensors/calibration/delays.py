@@ -19,9 +19,9 @@ _WINDOW = 40
 
 
 def blur(x: NDArray[np.float64], first: int, last: int) -> NDArray[np.float64]:
-    """Return the mean of ``x`` over lags of ``first`` to ``last`` readings; it was 0 before."""
+    """Return the mean of ``x`` over lags of ``first`` to ``last`` readings; before, it had its first value."""
     # Running mean as a difference of two sums: its cost does not depend on the range of lags.
-    total = np.cumsum(np.pad(x, (last + 1, 0)))
+    total = np.cumsum(np.pad(x, (last + 1, 0), mode="edge"))
     end = np.arange(len(x)) + last + 1
     return (total[end - first] - total[end - last - 1]) / (last - first + 1)
 
@@ -83,7 +83,8 @@ def find_lags(
                 f"({guess[1]} readings); record longer ones, or allow shorter delays."
             )
         shown = model[rows[:, None] - lags]
-        noise = dynamics.white**2 + dynamics.walk**2
+        # Dynamics that were fitted to misplaced readings call noise what is late.
+        noise = min(dynamics.white**2 + dynamics.walk**2, 4 * calm(model, y, int(lags[-1])))
         level = _level(y[rows] - np.outer(model[rows - middle], gain), np.ptp(shown, axis=1), noise)
         rest = y[rows] - level
         # Σ (rest − gain · shown)² for every lag, from its three terms.
@@ -102,7 +103,17 @@ def extent(lags: NDArray[np.int64], guess: tuple[int, int]) -> tuple[int, int]:
     """Return the smallest and largest lag that occur more often than mistakes do (2 % of the certain ones)."""
     values, counts = np.unique(lags, return_counts=True)
     kept = values[counts > 0.02 * max(len(lags), 1)]
-    return (int(kept.min()), int(kept.max())) if len(kept) and len(lags) >= 20 else guess
+    return (int(kept.min()), int(kept.max())) if len(kept) and len(lags) >= 8 else guess
+
+
+def calm(model: NDArray[np.float64], y: NDArray[np.float64], longest: int) -> float:
+    """Return the noise's variance in the quarter of readings [T, N] that lags of up to ``longest`` move least."""
+    rows = np.arange(longest, len(model))
+    if len(rows) < 2:
+        return np.inf
+    moves = np.ptp(model[rows[:, None] - np.arange(longest + 1)], axis=1)
+    either = np.maximum(moves[1:], moves[:-1])
+    return float(np.mean(np.diff(y[rows], axis=0)[either <= np.quantile(either, 0.25)] ** 2)) / 2
 
 
 def _level(rest: NDArray, moves: NDArray, noise: float) -> NDArray:

@@ -21,6 +21,8 @@ Z95 = 1.959963984540054
 """Half width of a 95 % interval in standard errors."""
 _SIGNIFICANT = 6.63
 """Twice the gain in log-likelihood (χ², one degree, 1 %) that drift or hysteresis must bring to be kept."""
+_UNTOLD = 7.0
+"""Half width of the interval of a logarithm, a factor of a thousand, at which a log does not tell a number."""
 
 
 @dataclass(frozen=True)
@@ -60,7 +62,7 @@ class Dynamics(NamedTuple):
         return math.exp(self.log_tau)
 
     def response(self, x: NDArray[np.float64], dt: float) -> NDArray[np.float64]:
-        """Return x + β ξ (4.26, 4.27) for a signal that was 0 before."""
+        """Return x + β ξ (4.26, 4.27) for a signal that had its first value before."""
         return x + self.hysteresis * maxwell(x, math.exp(-dt / self.tau))
 
 
@@ -76,8 +78,8 @@ class Fit:
 
 
 def maxwell(x: NDArray[np.float64], keep: float) -> NDArray[np.float64]:
-    """Return ξ of 4.26 for a signal that was 0 before."""
-    return np.asarray(lfilter([1.0, -1.0], [1.0, -keep], x))
+    """Return ξ of 4.26 for a signal that had its first value before, as a device that was loaded for a while."""
+    return np.asarray(lfilter([1.0, -1.0], [1.0, -keep], x - x[0]))
 
 
 def _sine(values: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -144,15 +146,19 @@ def fit_dynamics(parts: list[Aligned], dt: float, quantum: float, *, moving: boo
     spread = math.sqrt(float(np.mean([np.mean(y**2) for y in target.y]))) or 1e-12
     duration, no_lag = max(len(x) for x in target.x) * dt, math.log(10 * dt)
 
+    def dynamics_of(white: float, walk: float, hysteresis: float, tau: float) -> Dynamics:
+        # White noise far below the drift changes nothing. Hysteresis of less than a reading is a delay by another name.
+        return Dynamics(max(white, walk - 14), walk, hysteresis, min(max(tau, math.log(dt)), math.log(100 * duration)))
+
     def minimum(dynamics: Callable[[list[float]], Dynamics], start: list[float]) -> tuple[list[float], float]:
         options = {"xatol": 1e-6, "fatol": 1e-7, "maxiter": 4000, "maxfev": 4000}
         found = minimize(lambda p: target(dynamics(p)), start, method="Nelder-Mead", options=options)
         return [float(value) for value in found.x], float(found.fun)
 
     noise, plain_cost = minimum(
-        lambda p: Dynamics(p[0], p[1], 0.0, no_lag), [math.log(spread / 2), math.log(spread / 20)]
+        lambda p: dynamics_of(p[0], p[1], 0.0, no_lag), [math.log(spread / 2), math.log(spread / 20)]
     )
-    plain = Dynamics(noise[0], noise[1], 0.0, no_lag)
+    plain = dynamics_of(noise[0], noise[1], 0.0, no_lag)
     best, cost = plain, plain_cost
     if moving:
         # The likelihood has several maxima in τ: starts spread over the decades that the log can tell.
@@ -160,11 +166,9 @@ def fit_dynamics(parts: list[Aligned], dt: float, quantum: float, *, moving: boo
         if known and known.dynamics.hysteresis:
             taus = [known.dynamics.tau]
         for tau in taus:
-            found, value = minimum(
-                lambda p: Dynamics(p[0], p[1], p[2], min(max(p[3], -20.0), 10.0)), [*noise, 0.1, math.log(tau)]
-            )
+            found, value = minimum(lambda p: dynamics_of(*p), [*noise, 0.1, math.log(tau)])
             if value < cost - 1e-9:
-                best, cost = Dynamics._make(found), value
+                best, cost = dynamics_of(*found), value
     # Likelihood-ratio tests: a knob must earn its place, or every log would have a little drift and hysteresis.
     hysteresis = moving and 2 * (plain_cost - cost) > _SIGNIFICANT + 2.6
     if not hysteresis:
@@ -172,7 +176,7 @@ def fit_dynamics(parts: list[Aligned], dt: float, quantum: float, *, moving: boo
     tiny = math.log(1e-6) + best.log_white
 
     def without_drift(p: list[float]) -> Dynamics:
-        return Dynamics(p[0], tiny, p[1] if hysteresis else 0.0, p[2])
+        return dynamics_of(p[0], tiny, p[1] if hysteresis else 0.0, p[2])
 
     found, value = minimum(without_drift, [best.log_white, best.hysteresis, best.log_tau])
     drifts = 2 * (value - cost) > _SIGNIFICANT
@@ -213,12 +217,14 @@ def _estimates(best: Dynamics, errors: dict[str, float], quantum: float) -> dict
     how = "likelihood of the differences"
 
     def spread(name: str) -> tuple[float, float, float]:
-        value, error = getattr(best, name), Z95 * errors[name]
+        value, error = getattr(best, name), min(Z95 * errors[name], _UNTOLD)
         return math.exp(value), math.exp(value - error), math.exp(value + error)
 
     # Rounding to steps q has the variance q²/12, which the fit has counted as white noise.
     white = [math.sqrt(max(value**2 - quantum**2 / 12, 0.0)) for value in spread("log_white")]
     found = {"white": Estimate(white[0], white[1], white[2], how)}
+    if Z95 * errors["log_white"] >= _UNTOLD:
+        found["white"] = Estimate(0.0, 0.0, math.nan, "too little beside the drift to be told")
     if "log_walk" in errors:
         found["walk"] = Estimate(*spread("log_walk"), how)
     else:

@@ -10,8 +10,10 @@ from brainbench import load_model
 from brainbench.core.errors import DataError, UsageError
 from brainbench.stimuli import load_stimuli
 from brainbench.stimuli.stimulus_set import hash_stimulus_set
+from robotics_bridge import hands
 from robotics_bridge.exploration.procedures import PROCEDURES
 from robotics_bridge.exploration.record import Explored, record_exploration
+from robotics_bridge.hands.scenes import closing
 from robotics_bridge.physics import Geometry, MujocoEngine
 from robotics_bridge.policies.encoders.taxel_grid import TaxelGrid
 
@@ -71,6 +73,21 @@ def test_every_procedure_touches_on_both_hands(hand, name) -> None:
     assert found.labels == ("ball",)
     occupied = TaxelGrid(hand).occupied.flatten().numpy()
     assert not found.wrench[0, :, ~occupied].any()
+
+
+@pytest.mark.parametrize("name", hands.list_hands())
+def test_each_joint_is_flexed_by_a_share_of_its_own_range(monkeypatch, name) -> None:
+    step, asked = MujocoEngine.step, {}
+
+    def note(engine: MujocoEngine) -> None:
+        asked.update({drive: engine.data[0].ctrl[index] for index, drive in enumerate(drives)})
+        step(engine)
+
+    hand = hands.load(name)
+    drives = [hand.model.actuator(index).name for index in range(hand.model.nu)]
+    monkeypatch.setattr(MujocoEngine, "step", note)
+    record_exploration([_box()], ["lateral_motion"], hand=name, resolution="low", frames=5)
+    assert asked == dict(zip(drives, closing(hand, 0.3), strict=True))
 
 
 def test_requests_that_make_no_sense_are_refused() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+from dataclasses import replace
 
 import mujoco
 import numpy as np
@@ -11,10 +12,11 @@ import pytest
 
 from brainbench.core.errors import DataError, UsageError
 from brainbench.core.rotations import from_rpy
-from robotics_bridge import hands
+from robotics_bridge import hands, tasks
 from robotics_bridge.hands.hand import UNKNOWN_SPEED, palmar_directions
 from robotics_bridge.hands.layouts import RESOLUTIONS, active_count, fillers, read_probes, write_probes
 from robotics_bridge.hands.spec import CapsuleGeometry, HandSpec, Joint, Link, build
+from robotics_bridge.tasks.scenes import build as build_task
 
 URDF = {
     "xhand1": "hands/xhand1/xhand_right_updated_effort.urdf",
@@ -190,6 +192,28 @@ def test_a_menagerie_like_file_becomes_a_hand_with_probes_on_its_palmar_sides(tm
         assert np.linalg.norm(away, axis=1) == pytest.approx(0.008, abs=1e-9)
     palm = hand.layout("low", "palm")["palm"]
     assert palm.position[:, 0] == pytest.approx(0.02)
+
+
+def test_bodies_and_joints_without_a_name_are_told_apart(tmp_path):
+    names, counts = re.compile(r'(<(?:body|joint)) name="(?!palm")\w+"'), {}
+    for name, text in {"named": MENAGERIE_LIKE, "bare": names.sub(r"\1", MENAGERIE_LIKE)}.items():
+        (tmp_path / f"{name}.xml").write_text(text)
+        hand = hands.load(tmp_path / f"{name}.xml")
+        assert all(hand.joints)
+        counts[name] = (len(set(hand.joints)), [len(chain) for chain in hand.fingers.values()])
+        counts[name] += ([active_count({"": probes}) for probes in hand.layout("low").values()],)
+        assert build_task(replace(tasks.load("in_palm_rotate"), moves=()), hand).joints == hand.joints
+    assert counts["bare"] == counts["named"]
+
+
+def test_a_servo_behind_a_gear_drives_its_joint_as_stiffly_as_in_its_file(tmp_path):
+    found = []
+    for gear in (1, 3):
+        servos = f'<actuator><position joint="f1_a" kp="{9 / gear**2}" gear="{gear}" forcerange="-6 6"/></actuator>'
+        (tmp_path / "hand.xml").write_text(MENAGERIE_LIKE.replace("</worldbody>", f"</worldbody>{servos}"))
+        made = build_task(replace(tasks.load("in_palm_rotate"), moves=()), hands.load(tmp_path / "hand.xml"))
+        found.append((made.stiffness[0], made.effort[0] / gear))
+    assert found[0] == pytest.approx(found[1])
 
 
 def test_speeds_that_no_file_states_are_told_with_their_joints(tmp_path, caplog):

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import mujoco
 import numpy as np
 import pytest
 
 from brainbench.core.errors import UsageError
-from robotics_bridge import hands
+from robotics_bridge import hands, tasks
 from robotics_bridge.hands.scenes import OBJECT, closing, holding
+from robotics_bridge.tasks.scenes import build
 
 
 @pytest.mark.parametrize("name", hands.list_hands())
@@ -46,6 +49,68 @@ def test_an_impossible_ball_is_refused():
         holding(hands.load("xhand1"), radius=0.0)
     with pytest.raises(UsageError, match=r"reach .*received nan"):
         holding(hands.load("xhand1"), reach=float("nan"))
+
+
+@pytest.mark.parametrize(
+    "drive",
+    [
+        '<motor joint="{0}"/>',
+        '<position tendon="t{0}" kp="9"/>',
+        '<position joint="{0}"/>',
+        '<position joint="{0}" gear="2"/>',
+    ],
+)
+def test_joints_flex_whatever_drives_the_file_has_and_in_whatever_order(tmp_path, drive):
+    spans = {"a": "0 1", "b": "0 .8", "c": "-1.2 0"}
+    bodies = "".join(
+        f'<body pos="0 {y} 0" name="{name}"><joint name="{name}" axis="0 1 0" range="{spans[name]}"/>'
+        '<geom type="capsule" size=".01" fromto="0 0 0 0 0 .05"/></body>'
+        for y, name in zip((-0.05, 0, 0.05), spans, strict=True)
+    )
+    tendons = "".join(f'<fixed name="t{name}"><joint joint="{name}" coef="1"/></fixed>' for name in spans)
+    (tmp_path / "hand.xml").write_text(
+        f'<mujoco><compiler angle="radian"/><worldbody><body name="palm"><geom type="box" size=".05 .05 .01"/>{bodies}'
+        f"</body></worldbody><tendon>{tendons}</tendon><actuator>"
+        f"{''.join(drive.format(name) for name in reversed(spans))}</actuator></mujoco>"
+    )
+    hand = hands.load(tmp_path / "hand.xml")
+    model = holding(hand, radius=0.02)
+    driven = [model.joint(number).name for number in model.actuator_trnid[:, 0]]
+    assert (model.actuator_biasprm[:, 1] < 0).all()
+    assert dict(zip(driven, closing(hand, 0.5).round(9), strict=True)) == {"a": 0.5, "b": 0.4, "c": -0.6}
+
+
+FOREARM = """<mujoco><compiler angle="radian"/><worldbody><body name="forearm" {}>
+  <geom type="cylinder" size=".03 .05"/>
+  <body name="palm" pos="0 0 .1"><joint name="wrist" axis="0 1 0" range="-.5 .5"/><geom type="box" size=".02 .05 .04"/>
+    <body name="one" pos="0 .03 .05"><joint name="a" axis="0 1 0" range="0 1.6"/>
+      <geom type="capsule" size=".01" fromto="0 0 0 0 0 .05"/></body>
+    <body name="two" pos="0 -.03 .05"><joint name="b" axis="0 1 0" range="0 1.6"/>
+      <geom type="capsule" size=".01" fromto="0 0 0 0 0 .05"/></body></body></body></worldbody></mujoco>"""
+
+
+@pytest.mark.parametrize("pose", ["", 'quat="0 1 0 1" pos=".1 .2 .3"', 'euler=".3 .2 1"'])
+def test_a_palm_is_up_wherever_its_forearm_lies_in_the_file_and_stays_on_it(tmp_path, pose):
+    (tmp_path / "hand.xml").write_text(FOREARM.format(pose))
+    hand = hands.load(tmp_path / "hand.xml")
+    task = replace(tasks.load("hot_ball"), moves=())
+    for model, height in ((holding(hand), -0.02), (build(task, hand).models[0], 0.4775)):
+        data = mujoco.MjData(model)
+        mujoco.mj_forward(model, data)
+        palm, forearm = data.body("palm"), data.body("forearm")
+        # Fingers bend towards x of the palm.
+        assert palm.xmat.reshape(3, 3)[:, 0] == pytest.approx([0, 0, 1], abs=1e-6)
+        assert palm.xpos[2] == pytest.approx(height, abs=1e-6)
+        assert forearm.xmat.reshape(3, 3).T @ (palm.xpos - forearm.xpos) == pytest.approx([0, 0, 0.1], abs=1e-6)
+
+
+def test_a_palm_whose_orientation_the_file_gives_in_angles_is_up_too(tmp_path):
+    bodies = FOREARM[: FOREARM.index("<body")] + FOREARM[FOREARM.index('<body name="palm"') :]
+    text = bodies.replace('pos="0 0 .1"><joint name="wrist" axis="0 1 0" range="-.5 .5"/>', 'euler=".3 .2 1">')
+    (tmp_path / "hand.xml").write_text(text.replace("</body></body></worldbody>", "</body></worldbody>"))
+    data = mujoco.MjData(model := holding(hands.load(tmp_path / "hand.xml")))
+    mujoco.mj_forward(model, data)
+    assert data.body("palm").xmat.reshape(3, 3)[:, 0] == pytest.approx([0, 0, 1], abs=1e-6)
 
 
 @pytest.mark.parametrize("share", [float("nan"), float("inf"), -0.1, 1.1, 72, None])

@@ -17,6 +17,7 @@ from robotics_bridge.policies.contract import trained_contacts
 from robotics_bridge.policies.fit import check_fit, with_contacts_of
 from robotics_bridge.policies.shipped import stored
 from robotics_bridge.tasks.contact_model import CONTACTS, ContactModel
+from robotics_bridge.tasks.overrides import apply_overrides
 from robotics_bridge.tasks.task import TASK_VERSION
 from tests.factories.policies import teacher_in
 
@@ -40,8 +41,11 @@ def test_actions_counted_from_another_pose_are_refused() -> None:
     for name in ("in_palm_rotate.teacher", "in_palm_rotate.student"):
         described = stored(name)
         check_fit(described, tasks.make("in_palm_rotate", num_envs=1, threads=1), name)
-        with pytest.raises(UsageError, match=r"thumb_bend_joint = 1\.2 rad, and here from 0 rad.*--config"):
+        with pytest.raises(UsageError, match=r"from \S*thumb_bend_joint = 1\.2 rad, and here 0 rad.*--config"):
             check_fit(described, tasks.make("in_palm_rotate", config="published", num_envs=1, threads=1), name)
+        twice = apply_overrides(tasks.load("in_palm_rotate"), ["action_ratio=1"])
+        with pytest.raises(UsageError, match=r"by \S*thumb_bend_joint = 0\.916 rad, and here 1\.832 rad"):
+            check_fit(described, tasks.make(twice, num_envs=1, threads=1), name)
         with pytest.raises(UsageError, match="take the task in which it was trained"):
             check_fit(described, tasks.make("screwdriver", num_envs=1, threads=1), name)
     with pytest.raises(DataError, match="action_map"):

@@ -140,3 +140,26 @@ def test_what_is_read_does_not_set_the_unit_of_the_encoders() -> None:
     again = collect(env, agent("random", env), 0.5)
     env.seed(3)
     torch.testing.assert_close(collect(env, agent("random", env), 0.5).taxels, again.taxels)
+
+
+def test_a_policy_forgets_what_it_did_before_the_rollout() -> None:
+    class Counting:
+        def __init__(self) -> None:
+            self.steps = torch.zeros(2)
+
+        def __call__(self, _: object) -> torch.Tensor:
+            self.steps += 1
+            return 0.01 * self.steps[:, None].expand(2, env.num_actions)
+
+        def reset(self, mask: torch.Tensor) -> None:
+            self.steps[mask] = 0
+
+    env, policy, found = (
+        tasks.make("in_palm_rotate", num_envs=2, observe="force_torque", resolution="low"),
+        Counting(),
+        [],
+    )
+    for _ in range(2):
+        env.seed(0)
+        found.append(collect(env, policy, 0.2).proprio[..., -env.num_actions :])
+    assert torch.equal(*found)

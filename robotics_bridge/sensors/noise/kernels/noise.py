@@ -19,6 +19,8 @@ wp.set_module_options({"fuse_fp": False})
 
 EPISODE, RADIUS, JITTER, CHANNELS = 0, 1, 2, 16
 """Purposes of random numbers: of an episode, the radius, the delay, and from 16 on of pairs of channels."""
+PAIRS = 256 - CHANNELS
+"""Purposes of pairs of channels."""
 
 
 @wp.struct
@@ -136,7 +138,9 @@ def decay(t: float) -> float:
 @wp.func
 def pair_normals(p: NoiseParams, env: int, probe: int, pair: int, age: int, episode: int) -> wp.vec4:
     """Return (white, walk) of channel 2 ``pair`` and of the next, from one Philox call."""
-    w0, w1, w2, w3 = draw(p, env, probe, age, episode, wp.static(CHANNELS) + pair)
+    # A purpose has eight bits: pairs beyond count as those of another probe, far above any there is.
+    other = probe + (pair // wp.static(PAIRS)) * wp.static(1 << 20)
+    w0, w1, w2, w3 = draw(p, env, other, age, episode, wp.static(CHANNELS) + pair % wp.static(PAIRS))
     first = normals(w0, w1)
     second = normals(w2, w3)
     return wp.vec4(first[0], first[1], second[0], second[1])

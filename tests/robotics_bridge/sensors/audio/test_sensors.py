@@ -16,6 +16,7 @@ from robotics_bridge.sensors.audio.materials import Modes
 from robotics_bridge.sensors.audio.microphone import Microphone
 from robotics_bridge.sensors.audio.modes import find_modes
 from robotics_bridge.sensors.audio.sensors import ActuationAudio, ContactAudio, joint_drive
+from robotics_bridge.sensors.noise.model import Noise
 from robotics_bridge.sensors.suite import SensorSuite
 from tests.factories.sensor_episode import require_processor
 
@@ -217,6 +218,33 @@ def test_a_microphone_hears_late_by_r_over_c_and_weaker_by_one_over_r(distance):
     lag = distance / 343 * RATE
     late = np.interp(np.arange(len(source)) - lag, np.arange(-1, len(source)), [0.0, *source], left=0.0) / distance
     assert heard == pytest.approx(late, abs=1e-3 * np.abs(late).max())
+
+
+def test_a_microphone_set_up_during_an_episode_is_no_louder_at_first():
+    sensor = ActuationAudio(link="box", joints=1, samples=K, hum=1.0, hum_frequency=400.0)
+    suite, state = SensorSuite(_scene(), {"drives": sensor}, num_envs=1), HandState.empty(1, 3)
+    pose = np.tile([1.0, 0, 0, 1, 0, 0, 0], (3, 1))
+    pose[0, 0] = 0.0
+    state.set_pose(pose)
+    suite.update(state, DT)
+    listener, peaks = Microphone().build(suite), []
+    for _ in range(4):
+        suite.update(state, DT)
+        listener.update(state, DT)
+        peaks.append(float(listener.read().abs().max()))
+    assert peaks[0] < 1.1 * peaks[3]
+
+
+@pytest.mark.parametrize("samples", [160, 960, 3000])
+def test_samples_of_a_block_of_any_length_have_noise_of_their_own(samples):
+    noisy = Noise(white=1.0)
+    sensor = ContactAudio(link="box", modes=MODES, samples=samples, noise=noisy)
+    suite, state, heard = SensorSuite(_scene(), {"sound": sensor}, num_envs=1), HandState.empty(1, 3), []
+    for _ in range(3):
+        suite.reset()
+        suite.update(state, DT)
+        heard.append(suite.read("sound")[0, 0].numpy().copy())
+    assert len(np.unique(heard)) == pytest.approx(3 * samples, rel=0.01)
 
 
 def test_sources_add_up_and_the_power_of_distance_is_chosen():

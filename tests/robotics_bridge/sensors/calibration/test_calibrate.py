@@ -77,6 +77,45 @@ def test_jitter_is_recovered_with_what_it_would_otherwise_blur(jitter, seed):
     assert found.noise.hysteresis_tau == pytest.approx(0.06, rel=0.1)
 
 
+@pytest.mark.parametrize(("delay", "seed"), [(0.02, 0), (0.03, 1), (0.02, 4)])
+def test_jitter_is_told_from_few_presses(delay, seed):
+    found = calibrate(_log(Noise(white=0.02, read_delay=delay, jitter=0.01), steps=1500, probes=6, seed=seed))
+    assert (found.noise.read_delay, found.noise.jitter) == pytest.approx((delay, 0.01), abs=1e-9)
+    assert found.noise.white == pytest.approx(0.02, rel=0.05)
+    assert abs(found.noise.hysteresis) < 0.02
+
+
+def test_presses_that_the_model_does_not_explain_are_told():
+    knobs = {"white": 0.02, "gain": (0.8, 1.2), "hysteresis": 0.4, "hysteresis_tau": 0.06, "bias": 0.1}
+    told = [calibrate(_log(Noise(**knobs, read_delay=0.02, jitter=j), 1500, 6, seed=2)).notes for j in (0.0, 0.01)]
+    assert [any("differ more from the model" in note for note in notes) for notes in told] == [False, True]
+
+
+def test_a_log_may_begin_under_load():
+    noise = Noise(white=0.02, hysteresis=0.4, hysteresis_tau=0.06, gain=(0.8, 1.2), read_delay=0.03)
+    log = _log(noise, 1500, 12)
+    assert log.reference[200] > 0.5
+    found = calibrate(Log(log.time[200:], log.readings[200:], log.reference[200:])).noise
+    assert (found.read_delay, found.jitter) == pytest.approx((0.03, 0.0), abs=1e-9)
+    assert (found.hysteresis, found.hysteresis_tau) == pytest.approx((0.4, 0.06), rel=0.05)
+
+
+def test_a_delay_beyond_the_longest_that_is_tried_is_refused():
+    log = _log(Noise(white=0.02, read_delay=0.03), 1500, 6)
+    assert calibrate(log, max_delay=0.03).noise.read_delay == pytest.approx(0.03)
+    with pytest.raises(DataError, match=r"0\.02 s, 4 readings.*max_delay"):
+        calibrate(log, max_delay=0.02)
+
+
+@pytest.mark.parametrize("reference", [False, True])
+def test_drift_without_white_noise_is_drift_alone(reference):
+    log = _log(Noise(walk=0.01), 1500, 6)
+    still = Log(log.time, log.readings - log.reference[:, None])
+    found = calibrate(log if reference else still)
+    assert found.noise.walk == pytest.approx(0.01, rel=0.05)
+    assert found.noise.white < 1e-3
+
+
 @pytest.mark.slow
 def test_intervals_cover_the_planted_values_as_often_as_they_claim():
     noise = Noise(white=0.03, walk=0.003, hysteresis=0.3, hysteresis_tau=0.05, gain=(0.9, 1.1), bias=0.02)
