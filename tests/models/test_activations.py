@@ -140,6 +140,28 @@ def test_time_is_found_wherever_it_is(count):
     np.testing.assert_allclose(ours["lstm"], expected, atol=1e-5, rtol=1e-4)
 
 
+@pytest.mark.parametrize("count", [1, 2, T, 7])
+@pytest.mark.parametrize("blank", [0, 4])
+def test_rows_of_all_steps_of_all_stimuli_are_told_from_rows_of_all_stimuli_of_all_steps(count, blank):
+    class Joined(nn.Module):
+        def __init__(self, time_first):
+            super().__init__()
+            self.time_first, self.wide, self.drop = time_first, nn.Linear(1050, 9), nn.Identity()
+
+        def forward(self, x):
+            rows = (x.transpose(0, 1) if self.time_first else x).flatten(2).flatten(0, 1)
+            return self.drop(self.wide(rows)[: len(x)])
+
+    x = torch.randn(count, T, 30, 5, 7)
+    x[:blank] = 0  # alike in every step, they do not tell the order
+    ours, theirs = Joined(False), Joined(True)
+    theirs.load_state_dict(ours.state_dict())
+    with torch.no_grad():
+        expected = ours.wide(x.flatten(2))
+    for model in (ours, theirs):
+        np.testing.assert_allclose(extract(model, x, layers=["wide"], chunk=3)["wide"], expected, atol=1e-5)
+
+
 def test_calls_of_unequal_shape_are_kept_apart(stimuli):
     class Shared(nn.Module):
         def __init__(self):
