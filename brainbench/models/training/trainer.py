@@ -333,6 +333,9 @@ class _Run:
                 self.progress(self._steps, self._steps, "fitting the linear probe")
                 train = self._batches("train", shuffle=False, part=False) or ()
                 fit_probe(self.model, train, classes=len(self.data.classes), device=self.where.device, **self._probe)
+                # The probe is rounded too where the weights are.
+                self._publish(None)
+                load_weights(self.model, self.out / BEST / WEIGHTS, what=self.config.model)
             # The split that was used least for training, of those that the data set has.
             for split in ("test", "validation", "train"):
                 batches = self._batches(split, shuffle=False, part=False)

@@ -13,6 +13,7 @@ from safetensors.torch import load_file
 
 from brainbench.core.errors import DataError, UsageError
 from brainbench.models.registry import describe_model, load_model
+from brainbench.models.training import trainer
 from brainbench.models.training.batches import BatchOptions
 from brainbench.models.training.config import TrainingConfig
 from brainbench.models.training.evaluation import evaluate, fit_probe
@@ -258,6 +259,16 @@ def test_mixed_precision_trains_and_half_precision_weights_are_evaluated_as_ship
     with torch.no_grad():
         again = (load_model(f"local-dir:{result.folder}")(x).argmax(1) == labels).float().mean()
     assert again == pytest.approx(result.evaluation.top1)
+
+
+def test_the_probe_of_half_precision_weights_is_evaluated_as_shipped(tmp_path, monkeypatch):
+    data, probes = tiny(), []
+    monkeypatch.setattr(
+        trainer, "evaluate", lambda model, *given, **how: probes.append(model) or evaluate(model, *given, **how)
+    )
+    result = train(_config("ae", epochs=1, weights_dtype="bfloat16"), data, out=tmp_path, device="cpu")
+    shipped = load_model(f"local-dir:{result.folder}").decoder.state_dict()
+    assert all(torch.equal(value, shipped[name]) for name, value in probes[0].decoder.state_dict().items())
 
 
 @pytest.mark.parametrize(("precision", "stored"), [("bf16", torch.bfloat16), ("float32", torch.float32)])
