@@ -43,7 +43,9 @@ def test_a_model_is_trained_scored_by_its_folder_and_exported(run, folder, tmp_p
     )
     assert exported.status == 0, exported.err
     assert json.loads(exported.out)["difference"] < 1e-4
-    assert json.loads((tmp_path / "s4.pt2.json").read_text())["outputs"]["features"] == ["batch", 96]
+    contract = json.loads((tmp_path / "s4.pt2.json").read_text())
+    assert contract["outputs"]["features"] == ["batch", 96]
+    assert contract["sample_rate"] == pytest.approx(20)  # five frames of these data, 10 ms apart
 
 
 def test_physical_augmentation_keeps_to_the_whiskers_of_the_data(run, folder, tmp_path, monkeypatch):

@@ -181,7 +181,8 @@ class _Run:
         )
         # Data in memory need not say where their whiskers are.
         cells: tuple[int, ...] = getattr(data, "cells", MOUSE)
-        self.augmentation = Augmentation(config.augmentation, config.masking, cells)
+        axes: str = getattr(data, "axes", "world")
+        self.augmentation = Augmentation(config.augmentation, config.masking, cells, axes)
         batches = self._batches("train", shuffle=True)
         if batches is None:
             raise DataError("The data set has no split 'train', so there is nothing to train on.")
