@@ -95,7 +95,9 @@ def extract(
         for start, stop in _chunks(len(values), chunk, avoid=values.shape[1]):
             part = torch.as_tensor(_writable(values[start:stop])).to(device=like.device, dtype=like.dtype)
             for name, activity in _run(reader, part, model, values).items():
-                rows = activity.detach().to("cpu", dtype=torch.float32).flatten(2).numpy()
+                # Real and imaginary parts are features of their own.
+                real = torch.view_as_real(activity.resolve_conj()) if activity.is_complex() else activity
+                rows = real.detach().to("cpu", dtype=torch.float32).flatten(2).numpy()
                 if name not in result:
                     result[name] = _room(name, (len(values), *rows.shape[1:]), folder)
                 elif result[name].shape[1:] != rows.shape[1:]:

@@ -162,6 +162,16 @@ def test_rows_of_all_steps_of_all_stimuli_are_told_from_rows_of_all_stimuli_of_a
         np.testing.assert_allclose(extract(model, x, layers=["wide"], chunk=3)["wide"], expected, atol=1e-5)
 
 
+def test_complex_activations_keep_both_parts(stimuli):
+    class Phases(nn.Module):
+        def forward(self, x):
+            return torch.fft.fft(x.flatten(2), dim=1)
+
+    found = extract(Phases(), stimuli)["output"]
+    expected = np.fft.fft(stimuli.reshape(K, T, -1), axis=1)
+    np.testing.assert_allclose(found[..., ::2] + 1j * found[..., 1::2], expected, atol=1e-8)
+
+
 def test_calls_of_unequal_shape_are_kept_apart(stimuli):
     class Shared(nn.Module):
         def __init__(self):
