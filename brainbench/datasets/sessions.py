@@ -64,7 +64,8 @@ class SessionTable:
         if (names := (values.dtype.metadata or {}).get("enum")) is not None:
             # The numbers of an HDF5 enumeration may differ between files; its names are what was meant.
             known = {number: word for word, number in names.items()}
-            values = np.array([known.get(number, str(number)) for number in values.ravel().tolist()]).reshape(values.shape)
+            words = [known.get(number, str(number)) for number in values.ravel().tolist()]
+            values = np.array(words, dtype=str).reshape(values.shape)
         values = decode(values)
         if values.ndim != 1 or values.dtype.kind not in "biufU":
             raise DataError(

@@ -189,7 +189,8 @@ def resolve_model(model: Any, *, seed: int = 0) -> ResolvedModel:
         )
     count = sum(parameter.numel() for parameter in module.parameters())
     layer = card.layer or getattr(module, "committed_layer", None)
-    return ResolvedModel(replace(card, parameters=count, weights=weights_hash(module), graph=graph_of(module), layer=layer), module)
+    facts = {"parameters": count, "weights": weights_hash(module), "graph": graph_of(module), "layer": layer}
+    return ResolvedModel(replace(card, **facts), module)
 
 
 def _trained(config: Mapping[str, Any] | None) -> dict[str, Any]:
