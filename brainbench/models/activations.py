@@ -97,7 +97,7 @@ def extract(
             for name, activity in _run(reader, part, model, values).items():
                 # Real and imaginary parts are features of their own.
                 real = torch.view_as_real(activity.resolve_conj()) if activity.is_complex() else activity
-                rows = real.detach().to("cpu", dtype=torch.float32).flatten(2).numpy()
+                rows = real.detach().to("cpu", dtype=torch.float32).reshape(*real.shape[:2], -1).numpy()
                 if name not in result:
                     result[name] = _room(name, (len(values), *rows.shape[1:]), folder)
                 elif result[name].shape[1:] != rows.shape[1:]:

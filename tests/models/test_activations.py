@@ -162,6 +162,22 @@ def test_rows_of_all_steps_of_all_stimuli_are_told_from_rows_of_all_stimuli_of_a
         np.testing.assert_allclose(extract(model, x, layers=["wide"], chunk=3)["wide"], expected, atol=1e-5)
 
 
+def test_a_layer_of_one_number_has_one_feature(stimuli):
+    class Sums(nn.Module):
+        def __init__(self):
+            super().__init__()
+            self.steps, self.each, self.all = nn.Identity(), nn.Identity(), nn.Identity()
+
+        def forward(self, x):
+            joined = self.steps(x.flatten(2).flatten(0, 1).sum(1)).unflatten(0, x.shape[:2])
+            return self.all(torch.stack([self.each(joined[:, t]) for t in range(x.shape[1])], 1).sum(1))
+
+    found = extract(Sums(), stimuli)
+    sums = stimuli.reshape(K, T, -1).sum(axis=2)
+    for name, expected in (("steps", sums), ("each", sums), ("all", sums.sum(axis=1, keepdims=True))):
+        np.testing.assert_allclose(found[name], expected[..., None], rtol=1e-3, atol=1e-6)
+
+
 def test_complex_activations_keep_both_parts(stimuli):
     class Phases(nn.Module):
         def forward(self, x):
