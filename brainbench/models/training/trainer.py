@@ -244,6 +244,10 @@ class _Run:
     def _advance(self, x: torch.Tensor, labels: torch.Tensor, steps: int) -> str:
         """Take one optimiser step; return why it could not be taken, or ''."""
         config = self.config
+        if len(x) < 2 and config.objective == "simsiam":
+            # The rest of an epoch: the batch norms of the head have no statistics of a single sweep.
+            self.at.step += 1
+            return ""
         x, labels = x.to(self.where.device, non_blocking=True), labels.to(self.where.device, non_blocking=True)
         views = self._views(x, self.at.step)
         span = {"epochs": config.epochs, "warmup_epochs": config.warmup_epochs}

@@ -73,6 +73,12 @@ def test_on_the_cpu_precision_is_single_unless_asked_otherwise(tmp_path):
     assert json.loads((tmp_path / "run.json").read_text())["run"]["precision"] == "float32"
 
 
+def test_an_epoch_may_end_with_a_single_sweep(tmp_path):
+    config = _config("simsiam", model="s4-small", epochs=1, augmentation="physical", probe_epochs=0)
+    result = train(config, tiny(train=9), out=tmp_path, device="cpu")
+    assert (result.status, result.steps) == ("finished", 2)
+
+
 @pytest.mark.parametrize("objective", ["simclr", pytest.param("simsiam", marks=pytest.mark.slow), "ae"])
 def test_self_supervised_runs_end_with_a_linear_probe(objective, tmp_path):
     result = train(_config(objective, augmentation="physical"), tiny(), out=tmp_path, device="cpu")
