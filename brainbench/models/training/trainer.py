@@ -83,7 +83,8 @@ class TrainingResult:
     best_epoch: int | None
     """Epoch of the best validation, from 1."""
     evaluation: Evaluation | None
-    """Accuracy on the test split (else validation, else training); None until the run is finished."""
+    """Accuracy on the test split (else validation, else training); None until the run is finished, and for a
+    self-supervised network without passes of a probe."""
     controls: Mapping[str, Evaluation]
     """Accuracy of :data:`~brainbench.models.training.evaluation.CONTROLS` on the same sweeps; empty until then, and
     without passes of a probe."""
@@ -334,7 +335,8 @@ class _Run:
             if not (self.out / BEST / WEIGHTS).is_file():
                 self._publish(None)
             load_weights(self.model, self.out / BEST / WEIGHTS, what=self.config.model)
-            if self.config.objective != "supervised" and self.config.probe_epochs:
+            probed = self.config.objective != "supervised"
+            if probed and self.config.probe_epochs:
                 self.progress(self._steps, self._steps, "fitting the linear probe")
                 train = self._batches("train", shuffle=False, part=False) or ()
                 fit_probe(self.model, train, classes=len(self.data.classes), device=self.where.device, **self._probe)
@@ -342,7 +344,8 @@ class _Run:
                 self._publish(None)
                 load_weights(self.model, self.out / BEST / WEIGHTS, what=self.config.model)
             # The split that was used least for training, of those that the data set has.
-            for split in ("test", "validation", "train"):
+            # Without a probe the decoder of a self-supervised network is random, and its accuracy says nothing.
+            for split in () if probed and not self.config.probe_epochs else ("test", "validation", "train"):
                 batches = self._batches(split, shuffle=False, part=False)
                 if batches is not None:
                     result = evaluate(self.model, batches, device=self.where.device)

@@ -77,6 +77,8 @@ def test_an_epoch_may_end_with_a_single_sweep(tmp_path):
     config = _config("simsiam", model="s4-small", epochs=1, augmentation="physical", probe_epochs=0)
     result = train(config, tiny(train=9), out=tmp_path, device="cpu")
     assert (result.status, result.steps) == ("finished", 2)
+    assert result.evaluation is None  # no probe, no accuracy
+    assert "top-1" not in (result.folder / "README.md").read_text()
 
 
 @pytest.mark.parametrize("objective", ["simclr", pytest.param("simsiam", marks=pytest.mark.slow), "ae"])
