@@ -206,7 +206,7 @@ class WhiskingDataset:
         Time steps [s] and axes are told where they are not the usual ones.
         """
         step = self.substeps * self._shards[0].interval
-        unusual = {} if np.isclose(step, _STEP, rtol=1e-6) else {"time_step": step}
+        unusual: dict[str, Any] = {} if np.isclose(step, _STEP, rtol=1e-6) else {"time_step": step}
         if self.axes != "world":
             unusual["axes"] = self.axes
         used = self._splits[self._where].tolist()

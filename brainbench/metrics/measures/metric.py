@@ -16,8 +16,7 @@ from brainbench.core.trials import Trials
 from brainbench.metrics.animal_to_animal import score_agreement
 from brainbench.metrics.animals import gated
 from brainbench.metrics.arrays import fetch
-from brainbench.metrics.inference.permutation import SMALLEST_STIMULI
-from brainbench.metrics.inference.permutation import canonical_order
+from brainbench.metrics.inference.permutation import SMALLEST_STIMULI, canonical_order
 from brainbench.metrics.rdms.pairs import Floats, Ints
 from brainbench.metrics.reliability.denoising import simulated_animals
 from brainbench.metrics.reliability.noise_correction import Corrected
